@@ -291,6 +291,7 @@ def status(
 
     from acquisition.monitor.reading import read_session
     from acquisition.session.folder import journal_path
+    from acquisition.session.mending.redaction import secrets_warning
     from acquisition.status import status_json, status_lines
 
     journal_path(session)
@@ -299,6 +300,25 @@ def status(
         print(json.dumps(status_json(view, now), indent=2))
     else:
         print("\n".join(status_lines(view, now)))
+    if warning := secrets_warning(session):
+        print(f"warning: {warning}", file=sys.stderr)
+
+
+@app.command(epilog=EXIT_CODES)
+def redact(session: Annotated[Path, typer.Argument(help="Session folder.")]) -> None:
+    """Take passwords and secret addresses out of the settings of a session that older software took.
+
+    Reads and writes SESSION/session.toml; frames and journal stay as they are. The projector's password is removed, of
+    sequence.notify the host or the program's name is left. Sessions that this software takes hold no secret.
+    """
+    from acquisition.session.mending.redaction import SETTINGS_FILE
+    from acquisition.session.mending.redaction import redact as take_out
+
+    found = take_out(session)
+    if found:
+        print(f"{session / SETTINGS_FILE}: {' and '.join(found)} taken out; change it where copies are about")
+    else:
+        print(f"{session / SETTINGS_FILE}: holds no secret")
 
 
 @app.command(epilog=EXIT_CODES)

@@ -7,11 +7,12 @@ from __future__ import annotations
 
 import difflib
 import math
+import os
 import shlex
 import tomllib
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, cast
 from urllib.parse import urlsplit
 
 import tomli_w
@@ -19,6 +20,7 @@ from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Fie
 
 from drivers.camera import ExposureSettings
 from foundation.errors import ConfigurationError
+from foundation.trust.secret_texts import MASK, is_webhook, target_label
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
@@ -26,31 +28,9 @@ NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 _SECRETS = ("sequence.notify", "lab.projector.password")
 """Keys whose values are in no message, nor in `session.toml`: a session is copied, shown and published."""
 
-
-MASK = "…"
-"""What stands for a secret."""
-
-
-def is_webhook(target: str) -> bool:
-    """Return whether a target is a URL to post to, rather than a command."""
-    return target.lower().startswith(("http://", "https://"))
-
-
-def target_label(target: str) -> str:
-    """Return what may be shown of a target: a URL's scheme and host, or a command's first word.
-
-    The rest may be a secret: a webhook's path is one, and so are user names, queries and most arguments.
-
-    Examples
-    --------
-    >>> target_label("https://user:word@ntfy.example/lab?auth=tk_1"), target_label("curl -H 'Authorization: x' y")
-    ('https://ntfy.example/…', 'curl …')
-    """
-    if is_webhook(target):
-        parts = urlsplit(target)
-        return f"{parts.scheme}://{parts.netloc.rpartition('@')[2]}/{MASK}"
-    words = shlex.split(target)
-    return " ".join([*words[:1], *([MASK] if words[1:] else [])])
+_SECRET_BYTES = 4096
+"""A file that is named for a secret is read as far as this: passwords and addresses are shorter, and a file that is
+longer was named by mistake."""
 
 
 def _require_target(target: str) -> None:
@@ -130,8 +110,8 @@ class SequenceSettings(_Settings):
     there, or burns on, so that the next run needs no warm-up. After Ctrl-C it is left as it is."""
     notify: Annotated[str, AfterValidator(_target_checked), Field(repr=False)] = ""
     """Who is told when a run pauses, goes on and ends: a URL that gets JSON by POST, or a command that gets the same on
-    its standard input; empty: nobody. Kept out of messages and `session.toml`, but for the host or the program's
-    name."""
+    its standard input; empty: nobody. Or ``{ env = "NAME" }`` or ``{ file = "PATH" }``, where that is found. Kept out
+    of messages and `session.toml`, but for the host or the program's name."""
 
 
 class LimitSettings(_Settings):
@@ -231,7 +211,7 @@ class ProjectorCable(_Settings):
     port: Annotated[int, Field(ge=1, le=65535)] | None = None
     """TCP port where it is not the language's own."""
     password: Annotated[str | None, Field(repr=False)] = None
-    """PJLink password; not in `session.toml`."""
+    """PJLink password, or ``{ env = "NAME" }`` or ``{ file = "PATH" }``, where it is found; not in `session.toml`."""
     device: str | None = None
     """Serial port, such as /dev/ttyUSB0."""
     baud: Annotated[int, Field(ge=300)] | None = None
@@ -324,14 +304,14 @@ def load_lab(path: Path) -> LabSettings:
         The file is missing, not TOML, or holds an unknown key or an unusable value.
     """
     try:
-        text = path.read_text(encoding="utf-8")
+        text = path.read_text(encoding="utf-8-sig")
     except OSError as error:
         raise ConfigurationError(
             f"cannot read settings {path}: {error.strerror}; examples/ has a file to begin with"
         ) from error
     except UnicodeDecodeError as error:
         raise ConfigurationError(f"{path} is no text in UTF-8: {error}; save it as such") from error
-    settings = parse_lab(text, str(path))
+    settings = parse_lab(text, str(path), path.resolve().parent)
     if settings.rig == "replay" and settings.replay is None:
         raise ConfigurationError(f"{path}: rig = 'replay' needs [replay] with session = 'FOLDER' of the recording")
     folder = path.resolve().parent
@@ -341,12 +321,30 @@ def load_lab(path: Path) -> LabSettings:
     return settings.model_copy(update=changes)
 
 
-def parse_lab(text: str, where: str) -> LabSettings:
-    """Return the settings in a TOML text, paths as they stand there; `where` names it in errors."""
+def parse_lab(text: str, where: str, folder: Path | None = None) -> LabSettings:
+    """Return the settings in a TOML text, paths as they stand there.
+
+    Parameters
+    ----------
+    text
+        The settings.
+    where
+        Names them in errors.
+    folder
+        What files that hold secrets are relative to; None where secrets are not looked up: in a session's own settings
+        there are none.
+
+    Raises
+    ------
+    ConfigurationError
+        The text is not TOML, holds an unknown key or an unusable value, or names a secret that is not there.
+    """
     try:
         document = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
+    except (ValueError, RecursionError) as error:
         raise ConfigurationError(f"{where} is not TOML: {error}") from error
+    if folder is not None:
+        _look_up_secrets(document, folder, where)
     try:
         settings = LabSettings.model_validate(document)
     except ValidationError as error:
@@ -356,11 +354,65 @@ def parse_lab(text: str, where: str) -> LabSettings:
             raise unknown_key(key, _known_keys(first["loc"][:-1]), where) from error
         if first["type"] == "missing":
             raise ConfigurationError(f"{where}: {key} is missing; add it") from error
-        given = MASK if key in _SECRETS else repr(first["input"])
+        # What is above a secret holds it, and so does what is below it.
+        secret = any(f"{known}.".startswith(f"{key}.") or key.startswith(f"{known}.") for known in _SECRETS)
+        given = MASK if secret else repr(first["input"])
         # The cause has the value, too.
         reason = first["msg"].removeprefix("Value error, ")
-        raise ConfigurationError(f"{where}: {key} = {given}: {reason}") from (None if key in _SECRETS else error)
+        raise ConfigurationError(f"{where}: {key} = {given}: {reason}") from (None if secret else error)
     return settings.read_from(where)
+
+
+def _look_up_secrets(document: dict[str, Any], folder: Path, where: str) -> None:
+    """Put the secrets in the place of what says where they are found.
+
+    A password of devices that this rig does not have is left out: nobody has to know it to rehearse a session.
+    """
+    for key in _SECRETS:
+        *tables, last = key.split(".")
+        holder: Any = document
+        for table in tables:
+            holder = cast("dict[str, Any]", holder).get(table) if isinstance(holder, dict) else None
+        found = cast("dict[str, Any]", holder).get(last) if isinstance(holder, dict) else None
+        if isinstance(found, dict):
+            place = cast("dict[str, Any]", found)
+            if tables[0] == "lab" and document.get("rig") != "lab":
+                del holder[last]
+            else:
+                holder[last] = _found_secret(key, place, folder, where)
+
+
+def _found_secret(key: str, place: dict[str, Any], folder: Path, where: str) -> str:
+    """Return the secret of a key from an environment variable, or the first line of a file."""
+    match place:
+        case {"env": str(name), **more} if not more:
+            secret = os.environ.get(name, "")
+            if not secret:
+                raise ConfigurationError(
+                    f"{where}: {key}: the environment has no {name}; set it for this command, as in: "
+                    f"read -rs {name} && export {name}"
+                )
+        case {"file": str(name), **more} if not more:
+            path = folder / name
+            try:
+                # Neither a device nor a pipe: these never end.
+                if path.exists() and not path.is_file():
+                    raise ConfigurationError(f"{where}: {key}: {path} is no file; name one that holds the secret alone")
+                with path.open(encoding="utf-8-sig") as stream:
+                    secret = stream.read(_SECRET_BYTES).partition("\n")[0].strip()
+            except (OSError, UnicodeDecodeError, ValueError) as error:
+                reason = (error.strerror if isinstance(error, OSError) else None) or "it is no text"
+                raise ConfigurationError(
+                    f"{where}: {key}: cannot read {path}: {reason}; name a readable file"
+                ) from error
+            if not secret:
+                raise ConfigurationError(f"{where}: {key}: the first line of {path} is empty; write the secret there")
+        case _:
+            raise ConfigurationError(
+                f'{where}: {key}: expected the text itself, {{ env = "NAME" }} or {{ file = "PATH" }}, '
+                "and nothing beside"
+            )
+    return secret
 
 
 def _known_keys(location: tuple[int | str, ...]) -> Iterable[str]:

@@ -22,6 +22,10 @@ LAST = 5
 """Verdicts, and events, that are shown: chosen, a screen has room for them beside the rest."""
 
 
+BEYOND = " (beyond; it follows from another cause, or is followed)"
+"""What marks a value outside its limits that refused no frame."""
+
+
 def status_lines(view: SessionView, now: datetime) -> list[str]:
     """Return a session's state for people, line by line.
 
@@ -122,7 +126,7 @@ def _check_text(check: Check) -> str:
         (True, False): f", at least {check.low}",
         (True, True): f", {check.low} to {check.high}",
     }[check.low is not None, check.high is not None]
-    return f"{check.name} {check.value:.4g}{unit}{limits}"
+    return f"{check.name} {check.value:.4g}{unit}{limits}{BEYOND if check.is_beyond and check.passed else ''}"
 
 
 def _block(title: str, lines: list[str]) -> list[str]:

@@ -327,7 +327,7 @@ CASES: Final[tuple[NamedCase, ...]] = (
     NamedCase(
         "leak",
         "light of the room, 1 % of white, in half of the lights and in no dark frame",
-        r"room|ambient|stray|leak|dark",
+        r"room light|light of the room|ambient|stray light|\bleak",
         rf"{_STAINED}|{_BRILLIANT}|{_HAND}",
         _lights_alone("red", "blue", "warm", "violet", situation=Situation(ambient=(0.01, 0.01, 0.01))),
     ),
@@ -342,7 +342,7 @@ CASES: Final[tuple[NamedCase, ...]] = (
     NamedCase(
         "stain",
         "a thumb's stain on the print, in every frame",
-        r"stain|clean|print it anew|dirt",
+        r"probably a stain",
         rf"{_BRILLIANT}|\bhands?\b",
         room={"stain_mm": 25.0, "stain_depth": 0.3},
     ),

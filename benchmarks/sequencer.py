@@ -7,13 +7,16 @@
 - in real time on the machine at hand, frames of 25 MB at 30 MB/s, exposure 0.5 s, settling 0.2 s, decoded and judged;
 - a frame saved, hashed and judged against the same bytes written, flushed and hashed by a few lines.
 
-``python -m benchmarks.sequencer quick`` takes a tenth of the frames in simulated time.
+``python -m benchmarks.sequencer quick`` takes a tenth of the frames in simulated time. Frames are judged as in a
+session (`acquisition.judge.judge.LiveJudge`); with ``exposure`` among the words by their exposure alone, as it was
+before.
 
 The unavoidable time of a frame is release, exposure and readout, and then the longer of settling and download: a body
 does not expose while it sends, and the light may change when it has announced the frame. What is flattered: files are
 prepared (two, a dark and a lit one, with the slices of a 550D and without its previews), cable and body do their work
-without a processor of this machine, the latencies are constants, and no frame is refused. In simulated time work of
-this machine takes none; the figures in real time have it.
+without a processor of this machine, the latencies are constants, and no frame is refused: the judge measures and
+compares each as in a session without frames of the primaries, before a bare wall, and what it says of a light that does
+not change is passed over. In simulated time work of this machine takes none; the figures in real time have it.
 """
 
 from __future__ import annotations
@@ -27,7 +30,7 @@ import tempfile
 import time
 from collections.abc import Generator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import datetime
 from pathlib import Path
 from typing import BinaryIO
@@ -37,13 +40,15 @@ import numpy as np
 from acquisition.chart.layout import design_chart
 from acquisition.config import LabSettings, SequenceSettings
 from acquisition.judge.exposure import ExposureJudge
+from acquisition.judge.judge import LiveJudge
 from acquisition.lights.illuminations import Illumination, plan_illuminations
 from acquisition.run.devices import Devices
 from acquisition.run.sequencer import take_session
 from acquisition.run.taking.pipeline import Taken
 from acquisition.session.folder import Session
 from acquisition.session.journal import Journal
-from acquisition.session.plan import plan_steps
+from acquisition.session.judgement import Judgement
+from acquisition.session.plan import SessionStep, plan_steps
 from drivers.camera import CameraIdentity, CapturedFrame, ExposureSettings
 from drivers.presenter import BLACK, Colour
 from drivers.projector import Fault, Lamp, Power, ProjectorIdentity
@@ -117,6 +122,7 @@ class PacedProjector:
 
     def __init__(self, clock: Clock, latencies: Latencies) -> None:
         self.clock, self.latencies = clock, latencies
+        self.state = Power.ON
 
     def _ask(self) -> None:
         self.clock.sleep(self.latencies.question_s)
@@ -126,15 +132,16 @@ class PacedProjector:
         return ProjectorIdentity("CroP", "paced", "")
 
     def power(self) -> Power:
-        """Say that the lamp burns."""
+        """Say that the lamp burns, or cools when it was switched off."""
         self._ask()
-        return Power.ON
+        return self.state
 
     def switch_on(self) -> None:
         """Do nothing."""
 
     def switch_off(self) -> None:
-        """Do nothing."""
+        """Do so: one that went on burning would be looked at for five seconds more, a tenth of a short session."""
+        self.state = Power.COOLING
 
     def muted(self) -> bool:
         """Say that it is not."""
@@ -230,6 +237,42 @@ def _file(signal: np.ndarray[tuple[int, int], np.dtype[np.float64]], rng: np.ran
         return file.read_bytes()
 
 
+class PassingJudge:
+    """The judge of a session, whose refusals of a frame that was seen before are passed over.
+
+    What is refused for anything else is not: the judge did not look at it whole.
+    """
+
+    def __init__(self) -> None:
+        settings = LabSettings.model_validate(
+            {
+                "rig": "replay",  # of which no frame is refused for its noise
+                "chart": "chart.json",
+                "illuminations": "lights.csv",
+                "replay": {"session": "recorded"},
+                "judge": {"chart": False},
+            }
+        )
+        self._judge = LiveJudge(settings, design_chart(bits=1), LIGHTS)
+
+    def judge(self, file: Path, step: SessionStep) -> Judgement:
+        """Return the judgement with all its numbers, accepted."""
+        judgement = self._judge.judge(file, step)
+        passed = all(check.passed or check.name == "light" for check in judgement.checks)
+        if not passed:
+            return judgement
+        return replace(
+            judgement,
+            checks=tuple(replace(check, reason="") for check in judgement.checks),
+            voids=False,
+            lasting=False,
+        )
+
+    def recall(self, step: SessionStep, measurement: bytes, accepted: bool) -> None:
+        """Take in a frame of an earlier run."""
+        self._judge.recall(step, measurement, accepted)
+
+
 def _settings(settle_s: float) -> LabSettings:
     return LabSettings(
         rig="simulated",
@@ -255,7 +298,9 @@ class Measured:
         return self.unavoidable_s / self.taken_s
 
 
-def measure(clock: Clock, latencies: Latencies, settle_s: float, lights: int, files: dict[str, bytes]) -> Measured:
+def measure(
+    clock: Clock, latencies: Latencies, settle_s: float, lights: int, files: dict[str, bytes], live: bool = True
+) -> Measured:
     """Take a session of `lights` lights; files are removed when they are judged, so that the disk need not hold all."""
     screen = PacedScreen(clock, latencies)
     camera = PacedCamera(screen, clock, latencies, files)
@@ -273,7 +318,8 @@ def measure(clock: Clock, latencies: Latencies, settle_s: float, lights: int, fi
 
             begun, machine = clock.monotonic(), time.perf_counter()
             devices = Devices(camera, screen, PacedProjector(clock, latencies), clock)
-            assert take_session(session, devices, settings, ExposureJudge(settings), tidy).complete
+            judge = PassingJudge() if live else ExposureJudge(settings)
+            assert take_session(session, devices, settings, judge, tidy).complete
             taken_s, machine_s = clock.monotonic() - begun, time.perf_counter() - machine
             parts = list(session.journal.timings().values())
     medians = {name: statistics.median(part[name] for part in parts) for name in parts[0]}
@@ -325,10 +371,10 @@ def counted_writes() -> Generator[list[float]]:
             setattr(Journal, name, method)
 
 
-def compare_saving(files: dict[str, bytes]) -> None:
+def compare_saving(files: dict[str, bytes], live: bool) -> None:
     """Compare what becomes of a frame on this machine with plain saving of the same bytes."""
     instant = Latencies(0, 0, 1e15, 0, 0, 0)
-    measured = measure(SimulatedClock(), instant, 0.0, SAVED - 4, files)
+    measured = measure(SimulatedClock(), instant, 0.0, SAVED - 4, files, live)
     with tempfile.TemporaryDirectory() as scratch:
         begun = time.perf_counter()
         for number in range(measured.frames):
@@ -354,15 +400,17 @@ def main(argv: list[str]) -> int:
     files = prepared_files()
     report("size of a frame", len(files["lit"]) / 1e6, "MB")
     report("load of the machine when begun", os.getloadavg()[0], "processes", f"{os.cpu_count()} processors")
-    compare_saving(files)
+    live = "exposure" not in argv
+    report("judged", float(live), "", "1: by the live judge, 0: by exposure alone")
+    compare_saving(files, live)
     real = Latencies(0, 0, 30e6, 0, 0, 0)
     with counted_writes() as spent:
-        measured = measure(SystemClock(), real, 0.2, REAL_LIGHTS, files)
+        measured = measure(SystemClock(), real, 0.2, REAL_LIGHTS, files, live)
     report_session("real time", measured)
     report("real time: journal's writes a frame", sum(spent) / measured.frames, "s")
     lights = len(LIGHTS) // 10 if "quick" in argv else len(LIGHTS)
-    report_session("simulated time", measure(SimulatedClock(), Latencies(), 0.5, lights, files))
-    slow = measure(SimulatedClock(), Latencies(question_s=0.02), 0.5, len(LIGHTS) // 10, files)
+    report_session("simulated time", measure(SimulatedClock(), Latencies(), 0.5, lights, files, live))
+    slow = measure(SimulatedClock(), Latencies(question_s=0.02), 0.5, len(LIGHTS) // 10, files, live)
     report_session("simulated time, a projector that takes 20 ms an answer", slow)
     return 0
 

@@ -12,11 +12,13 @@ import typer
 from foundation import console
 from foundation.console import EXIT_CODES, Quiet, Verbose, Version, new_app, shows_progress
 from foundation.errors import FormatError, InputError
+from foundation.trust.secret_texts import masked, printable
 
 if TYPE_CHECKING:
     from acquisition.session.folder import Session
     from calibration.pipeline.build import TableProgress
     from calibration.pipeline.options import BuildOptions
+    from calibration.table.lut import Lut
     from calibration.verdict.result import BuildResult
 
 app = new_app()
@@ -190,6 +192,16 @@ def build_lut(
             show_default=False,
         ),
     ] = None,
+    expect: Annotated[
+        str | None,
+        typer.Option(
+            "--expect",
+            metavar="SHA256",
+            help="With --fetch, the table's hash as --info prints it, told by somebody you trust; another table is "
+            "refused.",
+            show_default=False,
+        ),
+    ] = None,
     verbose: Verbose = 0,
     quiet: Quiet = False,
     version: Version = False,
@@ -212,6 +224,8 @@ def build_lut(
             f"{next(name for name, value in made.items() if value)} is about how a table is made, and {given[0]} reads "
             "one; leave one of them out"
         )
+    if expect is not None and fetch is None:
+        raise InputError("--expect goes with --fetch; leave it out")
     told = {"--json": as_json, "--out": out, "--chart": chart}
     if compare is None and any(told.values()):
         raise InputError(f"{next(name for name, value in told.items() if value)} goes with --compare; leave it out")
@@ -226,7 +240,7 @@ def build_lut(
     elif publish is not None:
         _publish(*publish)
     elif fetch is not None:
-        _fetch(*fetch)
+        _fetch(*fetch, expect)
     else:
         from acquisition.framing.corners import parse_corners
         from calibration.pipeline.options import BuildOptions
@@ -308,14 +322,14 @@ def _print_table(folder: Path) -> None:
     from calibration.table.lut import open_lut
 
     for name, value in describe(open_lut(folder)):
-        print(f"{name + ':':17}{value}")
+        print(f"{name + ':':17}{printable(value)}")
 
 
 def _verify(folder: Path, session: Path | None) -> None:
     from calibration.table.lut import open_lut
     from calibration.table.verification import find_faults
 
-    lut = open_lut(folder)
+    lut = open_lut(folder, check=False)
     with _bar("reading the samples") as progress:
         faults = find_faults(lut, lambda done, total: progress(done, total, "reading the samples"))
     if session is not None:
@@ -379,15 +393,29 @@ def _publish(folder: Path, url: str) -> None:
     lut = open_lut(folder)
     with _bar("writing lights") as progress:
         publish(lut, url, lambda done, total: progress(done, total, "writing lights"))
-    print(f"{url}: {len(lut.samples)} lights of {folder}; others get them by build-lut --fetch {url} LUT")
+    print(f"{masked(url)}: {len(lut.samples)} lights of {folder}; others get them by")
+    print(f"build-lut --fetch {masked(url)} LUT --expect {lut.sha256}")
 
 
-def _fetch(url: str, folder: Path) -> None:
+def _fetch(url: str, folder: Path, expect: str | None) -> None:
     from calibration.table.zarr_store import fetch
 
     with _bar("reading lights") as progress:
-        lut = fetch(url, folder, lambda done, total: progress(done, total, "reading lights"))
-    print(f"{folder}: {len(lut.samples)} lights, {lut.provenance.camera}; every byte is as it was published")
+        lut = fetch(url, folder, lambda done, total: progress(done, total, "reading lights"), expect)
+    print(f"{folder}: {len(lut.samples)} lights, {printable(lut.provenance.camera)}; {_vouched(lut, expect)}")
+
+
+def _vouched(lut: Lut, expect: str | None) -> str:
+    """Return in words what is known of a table that was fetched."""
+    if not lut.provenance.lights_sha256:
+        return "it has no hashes, so that nobody can say whether it is as it was built"
+    covered = "every file is" if lut.provenance.has_sums else "ground truth and samples are (it is an older table)"
+    if expect is not None:
+        return f"it is the table expected, and {covered} as it was built"
+    return (
+        f"{covered} as its own hashes say; that it is the table you mean shows its hash, {lut.sha256}: compare it with "
+        "the one you were told, or give that with --expect"
+    )
 
 
 @contextmanager

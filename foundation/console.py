@@ -24,6 +24,7 @@ import typer
 
 from foundation.errors import EXIT_INTERRUPTED, CropError, InputError, StorageError
 from foundation.files import disk_remedy_of, remedy_of
+from foundation.trust.secret_texts import masked, printable
 
 EXIT_CODES = (
     "Exit codes: 0 done; 2 something given cannot be used; 3 a device failed; 4 the data are not good enough; "
@@ -34,9 +35,12 @@ _WRITING_FAULTS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS)
 
 
 def say_error(message: str) -> None:
-    """Print one error line to stderr; where nobody reads it any more, the exit code says enough."""
+    """Print one error line to stderr, secrets of addresses masked; where nobody reads it, the exit code says enough.
+
+    Names of foreign files may hold what a terminal obeys, or what is no text: both are printed as escapes.
+    """
     with suppress(OSError):
-        print(f"error: {message}", file=sys.stderr)
+        print(f"error: {printable(masked(message))}", file=sys.stderr)
 
 
 def run(command: Callable[[], object], *, keeps: bool = True) -> int:

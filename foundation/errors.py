@@ -26,14 +26,25 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from foundation.trust.secret_texts import masked
+
 EXIT_INTERRUPTED = 130
 """Exit code of a command that Ctrl-C ended; 128 + SIGINT, as shells have it."""
 
 
+_LONGEST = 8000
+"""Longest sentence of an error: names and values that stand in it may be a stranger's, and as long as he likes."""
+
+
 class CropError(Exception):
-    """Root of the tree: a foreseeable fault, described in one sentence."""
+    """Root of the tree: a foreseeable fault, described in one sentence that holds no secret of an address."""
 
     exit_code = 1
+
+    def __str__(self) -> str:
+        """Return the sentence, users, passwords and tokens of addresses in it masked; cut where it has no end."""
+        text = masked(super().__str__())
+        return text if len(text) <= _LONGEST else f"{text[: _LONGEST // 2]} … {text[-_LONGEST // 4 :]}"
 
 
 class InputError(CropError):

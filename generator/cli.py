@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Final
 from foundation.console import EXIT_CODES, new_app, run
 from foundation.errors import InputError
 from foundation.processors import processor_count
+from foundation.trust.secret_texts import masked, printable
 from generator.command.grouping import grouped
 from generator.command.likeness_options import LikenessOptions, choose
 from generator.command.options import (
@@ -167,7 +168,8 @@ def _make_share(plan: Plan, out: str, shard: str, workers: Workers) -> None:
     with shown_progress(sum(map(plan.images_of, shards))) as callbacks:
         done, every = make_share(plan, out, share, workers, callbacks)
     finish = f"make a dataset of them with generate --finish {out}"
-    print(f"{done} of {every} shards of {out} are done; {finish if done == every else 'others are still to be made'}")
+    left = finish if done == every else "others are still to be made"
+    print(masked(f"{done} of {every} shards of {out} are done; {left}"))
 
 
 def _print_cells(plan: Plan, shards: range) -> None:
@@ -184,7 +186,7 @@ def _print_summary(dataset: Dataset, out: str) -> None:
     pictures = _counted(made.sources, "picture")
     if different < made.sources:
         pictures += f", {different} of them different,"
-    print(f"{out}: {_counted(made.images, 'image')} of {pictures} under {_counted(lights, 'light')}")
+    print(f"{masked(out)}: {_counted(made.images, 'image')} of {pictures} under {_counted(lights, 'light')}")
     if made.splits:
         print(", ".join(f"{images} for {part}" for part, images in made.splits.items()))
     if made.skipped:
@@ -221,14 +223,14 @@ def _verify(out: str, workers: int | None) -> Dataset:
     faults = 0
     with progress("files") as shown:
         for fault in file_faults(out, shown, workers=at_once):
-            print(fault)
+            print(printable(fault))
             faults += 1
     if faults:
         raise QualityError(
             f"{out} is not as it was made: {_counted(faults, 'fault')}, listed above; make it again, or copy it again"
         )
     dataset = open_dataset(out)
-    print(f"{out}: {_counted(dataset.description.images, 'image')}, every file as it was made")
+    print(f"{masked(out)}: {_counted(dataset.description.images, 'image')}, every file as it was made")
     return dataset
 
 

@@ -20,6 +20,7 @@ SLOW = (
     "acquisition/chart/test_model.py",
     "acquisition/chart/test_printing.py",
     "acquisition/chart/test_proof.py",
+    "acquisition/check/test_foretelling.py",
     "acquisition/check/test_rooms.py",
     "acquisition/framing/test_annotated.py",
     "acquisition/framing/test_finding.py",

@@ -7,7 +7,7 @@ picture is shown.
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -17,6 +17,8 @@ import numpy.typing as npt
 from acquisition.chart.model import Chart, load_chart
 from acquisition.check.exposure import judge_exposure
 from acquisition.check.findings import CheckReport, Finding, not_checked
+from acquisition.check.foretelling.figures import ForetoldTable, foretell, foretell_lights, smallest_cell_px
+from acquisition.check.foretelling.findings import foretold_findings
 from acquisition.check.light import (
     judge_evenness,
     judge_flicker,
@@ -38,7 +40,7 @@ from acquisition.check.taking import Photographer
 from acquisition.config import LabSettings
 from acquisition.framing.corners import Corners
 from acquisition.judge.exposure import disagreement
-from acquisition.lights.illuminations import load_illuminations
+from acquisition.lights.illuminations import Illumination, load_illuminations
 from acquisition.run.devices import Devices
 from acquisition.run.lamp import make_ready
 from acquisition.run.patience import Patience
@@ -119,7 +121,7 @@ def check_lab(
     findings = [
         *_exposure_findings(seen, settings, recorded),
         *_chart_findings(seen, figures, chart, options),
-        *_light_findings(seen, figures, chart, bool(lights)),
+        *_light_findings(seen, figures, chart, bool(lights), settings.judge.dark_percent),
         *_sensor_findings(seen, camera.timings, figures, chart, options),
         *screen,
         judge_disk(options.session or Path(settings.file).parent, frames, seen.first.size),
@@ -127,7 +129,11 @@ def check_lab(
     ]
     if seen.used_s != seen.first.shutter_s:
         lines.append(f"frames      all but exposure and clipping judged at {seen.used_s:.4g} s")
-    report = CheckReport(tuple(lines), tuple(findings))
+    table = _foretold(seen, chart, lights)
+    why_not = "the chart was not found" if seen.chart is None else "" if seen.usable else CLIPPED
+    findings += foretold_findings(table, chart, why_not)
+    outcome = None if seen.chart is None else table.outcome
+    report = CheckReport(tuple(lines), tuple(findings), outcome, table.figures, table.not_known)
     if options.picture is not None:
         from acquisition.check.picture import check_png
 
@@ -167,7 +173,7 @@ def _chart_findings(
         judge_print(figures.state, chart, place.matched),
         *judge_evenness(figures.light, chart),
     )
-    if evenness.grade == "fault" and print_found.grade in ("fault", "remark"):
+    if evenness.grade != "good" and print_found.grade in ("fault", "remark"):
         said = f"{print_found.said}; the light is so uneven that it may be an edge of the light"
         print_found = replace(print_found, said=said)
     lit = [print_found, evenness, coloured]
@@ -176,14 +182,37 @@ def _chart_findings(
     return [
         judge_chart(framing, chart),
         *lit,
-        judge_sharpness(figures.blur, chart, framing.module_px),
+        judge_sharpness(figures.blur, chart, framing.module_px, smallest_cell_px(chart, figures.placed)),
         judge_turn(framing),
         judge_tilt(framing, chart, seen.focal_px),
         judge_size(framing, chart, place),
     ]
 
 
-def _light_findings(seen: CheckFrames, figures: ChartFigures | None, chart: Chart, plan_has: bool) -> list[Finding]:
+def _foretold(seen: CheckFrames, chart: Chart, lights: Sequence[Illumination]) -> ForetoldTable:
+    """Return what can be said of the table at the settings' exposure."""
+    if seen.chart is None:
+        return ForetoldTable()
+    if not seen.usable:
+        return ForetoldTable({"brightest_share": 1.0})
+    saturation = seen.saturation.counts
+    table = foretell(chart, seen.chart, seen.whites, seen.dark, saturation)
+    figures = dict(table.figures)
+    ratio = seen.first.shutter_s / seen.used_s
+    if "brightest_share" in figures:
+        figures["brightest_share"] *= ratio
+    if seen.primaries is not None:
+        figures |= foretell_lights(lights, seen.primaries, ratio)
+        levels = seen.primaries
+        if float(levels["white"].min()) >= 100.0:
+            alone = np.sum([levels[name] for name in ("red", "green", "blue")], axis=0)
+            figures["additivity"] = float(np.abs((alone - 2 * levels["black"]) / levels["white"] - 1).max())
+    return ForetoldTable(figures, table.causes)
+
+
+def _light_findings(
+    seen: CheckFrames, figures: ChartFigures | None, chart: Chart, plan_has: bool, dark_percent: float
+) -> list[Finding]:
     if not seen.usable:
         names = ("room light", "brightest light", "additivity", "flicker", "brightness")
         return [not_checked(name, CLIPPED) for name in names]
@@ -198,7 +227,8 @@ def _light_findings(seen: CheckFrames, figures: ChartFigures | None, chart: Char
             for shot in (seen.dark, seen.muted)
         )
         assert dark is not None
-        findings = [judge_room_light(chart, points, white, dark, muted, seen.why_not_muted)]
+        room = judge_room_light(chart, points, white, dark, muted, seen.why_not_muted)
+        findings = [_as_the_run_refuses(room, dark_percent)]
     recorded = "a recording cannot be exposed anew"
     if seen.primaries is None:
         names = ("brightest light", "additivity", "flicker", "brightness")
@@ -208,6 +238,14 @@ def _light_findings(seen: CheckFrames, figures: ChartFigures | None, chart: Char
         return [*findings, *(not_checked(name, "white is too dim") for name in names)]
     whites = [_paper_level(shot_levels) for shot_levels in _whites(seen, figures, chart)]
     return [*findings, *judge_primaries(seen.primaries, plan_has), *judge_flicker(whites, seen.used_s)]
+
+
+def _as_the_run_refuses(found: Finding, dark_percent: float) -> Finding:
+    """Return the finding on the room's light with the run's own limit for a fault."""
+    if found.value is None or found.grade == "good":
+        return found
+    beyond = found.value > dark_percent / 100
+    return replace(found, grade="fault" if beyond else "remark", tolerable=(None, dark_percent / 100))
 
 
 def _whites(seen: CheckFrames, figures: ChartFigures | None, chart: Chart) -> list[_Array]:

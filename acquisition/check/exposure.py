@@ -17,7 +17,7 @@ import numpy.typing as npt
 
 from acquisition.check.findings import LIMITS, Finding, Grade, amount, judged, percent
 from acquisition.check.taking import Shot
-from acquisition.framing.planes import CHANNELS, PAPER_PERCENTILE, frame_black, phases
+from acquisition.framing.planes import CHANNELS, CLIPPING_SHARE, PAPER_PERCENTILE, frame_black, phases
 from acquisition.run.shutter import holds_whole_turns
 from drivers.raw.rawfile import Mosaic
 
@@ -41,8 +41,9 @@ PROPORTIONAL = 0.9
 LEAST_RANGE = 0.25
 """Share of the stated range from which on counts may be saturation: noise in the dark is not proportional either."""
 
-OVERFLOW = 0.95
-"""Share of saturation from which on white is taken for clipped: nothing is known of how bright it is."""
+USABLE = (0.3, 0.9)
+"""White's share of saturation at which what is not the exposure's matter is judged well enough; else it is judged at a
+better time."""
 
 _Array = npt.NDArray[np.float64]
 
@@ -151,7 +152,7 @@ def level_of(shot: Shot, saturation: Saturation, white: _Array | None = None) ->
     ranges = np.array([saturation.counts - np.mean([black[place] for place in found[channel]]) for channel in CHANNELS])
     white = shot.brightest(99.0) if white is None else white
     red, green, blue = (white / ranges).tolist()
-    return Trial(shot.shutter_s, (red, green, blue), max(red, green, blue) >= OVERFLOW)
+    return Trial(shot.shutter_s, (red, green, blue), max(red, green, blue) >= CLIPPING_SHARE)
 
 
 def search(first: Trial, measure: Callable[[float], Trial], times_s: Sequence[float]) -> tuple[Trial, ...]:

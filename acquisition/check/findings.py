@@ -6,8 +6,9 @@ Rules that hold inside:
   open on a side where it is None.
 - What could not be looked at is `not checked`, with the reason; it is never good.
 - A finding that is not good says what to do about it.
-- What lies beyond `tolerable` spoils the table or is refused later, by the run or by `build-lut`
-  (`calibration.verdict.thresholds` has the limits of a table).
+- What lies beyond `tolerable` is refused later, by the run or by `build-lut`, whose numbers these are
+  (`acquisition.limits.table`). Where `good` is narrower than what a table is accepted with, it is a warning while
+  something can be mended, and the limit's source says so.
 """
 
 from __future__ import annotations
@@ -18,8 +19,10 @@ from dataclasses import asdict, dataclass, field
 from types import MappingProxyType
 from typing import Any, Literal
 
-from acquisition.framing.sharpness import MAX_BLUR_PX
-from acquisition.framing.visibility import MIN_CELL_PX
+from acquisition.limits.table import TABLE_LIMITS, TableOutcome
+
+CELL_PHOTOSITES = 100
+"""Photosites under the 25 samples of a cell, each of which has four: any of them may be hot."""
 
 Grade = Literal["fault", "remark", "not checked", "good"]
 GRADES: tuple[Grade, ...] = ("fault", "remark", "not checked", "good")
@@ -127,10 +130,20 @@ class CheckReport:
         What answered, a line each, and what was done with it.
     findings
         In the order in which they were looked at.
+    foretold
+        What `build-lut` would say, as far as these frames show it: "accept", "accept with remarks" or "refuse"; None
+        where the chart was not found.
+    figures
+        The table's figures that are known, by their names in `report.json`.
+    not_known
+        The names of those that are known only when there are frames of a session.
     """
 
     devices: tuple[str, ...]
     findings: tuple[Finding, ...]
+    foretold: TableOutcome | None = None
+    figures: Mapping[str, float] = field(default_factory=dict[str, float])
+    not_known: tuple[str, ...] = ()
 
     def of(self, grade: Grade) -> tuple[Finding, ...]:
         """Return the findings of one grade."""
@@ -148,14 +161,26 @@ class CheckReport:
             for grade in GRADES
             for finding in self.of(grade)
         ]
-        return *self.devices, *told
+        return *self.devices, *told, *self._foretold_lines()
+
+    def _foretold_lines(self) -> list[str]:
+        if self.foretold is None:
+            return []
+        names = ", ".join(name.replace("_", " ") for name in self.not_known)
+        return [
+            f"table       build-lut would say {self.foretold!r} by the {len(self.figures)} figures known now",
+            f"            not known before the session: {names}",
+        ]
 
     def to_json(self) -> str:
-        """Return the report as JSON: `devices`, `faults` (their number), `findings` as `Finding` has them."""
+        """Return the report as JSON: `devices`, `faults` (their number), `findings` as `Finding` has them, `table`."""
         document = {
             "devices": list(self.devices),
             "faults": len(self.of("fault")),
             "findings": [_plain(asdict(finding)) for finding in self.findings],
+            "table": None
+            if self.foretold is None
+            else {"outcome": self.foretold, "figures": _plain(dict(self.figures)), "not_known": list(self.not_known)},
         }
         return json.dumps(document, indent=1, ensure_ascii=False, allow_nan=False)
 
@@ -229,12 +254,22 @@ def _plain(value: Any) -> Any:
 
 
 _SIMULATED = "measured on simulated frames"
+_VERDICT = "the limits of a table's verdict"
+_EARLY = "a warning while it can be mended; no table is refused for it"
 
 _LIMITS = (
     Limit(
-        "exposure", "White under the brightest light, of measured saturation", "share", (0.6, 0.8), (0.3, 0.9),
+        "exposure", "White under the brightest light, of measured saturation", "share", (0.6, 0.8),
+        (None, TABLE_LIMITS["brightest_share"].refuse),
         "above, lights and places of the print that are brighter clip; below, dark colours drown in noise",
-        "0.8 leaves room for uneven light and the lamp's drift; each stop less doubles the noise of dark cells",
+        "0.8 leaves room for uneven light and the lamp's drift; each stop less doubles the noise of dark cells; a "
+        "table is refused where paper clips, or its darkest light has no signal",
+    ),
+    Limit(
+        "darkest light", "Bare paper under the plan's darkest light, foretold from the primaries", "counts",
+        *TABLE_LIMITS["darkest_counts"].ranges,
+        "25 samples of 300 counts have a mean good to 1 %, a print's dark colours a thirtieth of that",
+        _VERDICT,
     ),
     Limit(
         "clipping", "Photosites at 98 % of saturation and more, white frame", "share", (None, 0.0002), (None, 0.001),
@@ -242,72 +277,98 @@ _LIMITS = (
         "0.1 % is the run's own limit; hot photosites and reflections on pins stay below 0.02 %",
     ),
     Limit(
-        "brightest light", "A primary alone over white, channel by channel", "share", (None, 1.005), (None, 1.05),
+        "brightest light", "A primary alone over white, channel by channel", "share", (None, 1.005), (None, None),
         "the exposure is judged by white, and another light is brighter and may clip",
-        "light adds: white holds every primary in full; 0.5 % is the lamp's flicker between two frames",
+        "light adds: white holds every primary in full; 0.5 % is the lamp's flicker between two frames; " + _EARLY,
     ),
     Limit(
-        "additivity", "White against the sum of the primaries", "share", (-0.02, 0.02), (None, None),
+        "additivity", "White against the sum of the primaries", "share",
+        (-TABLE_LIMITS["additivity"].accept, TABLE_LIMITS["additivity"].accept), (None, None),
         "the projector mixes colours in its own way, so that lights are not what their codes say; "
         "the table is valid all the same",
-        "the limit of a table's verdict",
+        _VERDICT,
     ),
     Limit(
-        "evenness", "Light missing at the chart's darkest place, of its brightest", "share", (None, 0.55), (None, 0.7),
+        "evenness", "Light missing at the chart's darkest place, of its brightest", "share", (None, 0.55), (None, None),
         "dark corners have too little light for their colours, and the smooth field that divides it out is not known "
         "there well enough",
-        _SIMULATED + ": fields whose corners have 42 to 52 % of the centre are divided out to 0.2 %",
+        _SIMULATED + ": fields whose corners have 42 to 52 % of the centre are divided out to 0.2 %; " + _EARLY,
     ),
     Limit(
-        "colour evenness", "Change of white's R/G or B/G over the chart", "share", (None, 0.12), (None, 0.3),
+        "colour evenness", "Change of white's R/G or B/G over the chart", "share", (None, 0.12), (None, None),
         "one end of the chart is lit by another colour than the other",
-        "projectors change by some per cent, simulated ones by 4 %; a stain on much of a small chart shows here, too",
+        "projectors change by some per cent, simulated ones by 4 %; a stain on much of a small chart shows here, too; "
+        + _EARLY,
     ),
     Limit(
-        "room light", "Paper under the black picture, of paper under white", "share", (None, 0.005), (None, 0.02),
+        "references", "White references about the flat field, under white", "share",
+        *TABLE_LIMITS["reference_spread"].ranges,
+        "a reflection, a stain, a fold or a shadow is not smooth, so that the flat field leaves it in the samples",
+        _VERDICT,
+    ),
+    Limit(
+        "room light", "Paper under the black picture, of paper under white", "share",
+        (None, TABLE_LIMITS["leak_share"].accept), (None, 0.05),
         "every light contains it, and the deep colours among the lights become paler",
-        "a contrast of 1 : 1500 gives 0.07 %; a pure primary gives the other channels 2 to 10 % of white, "
-        "of which 2 % are a fifth and more",
+        "good as in a table's verdict; a contrast of 1 : 1500 gives 0.07 %; the run refuses dark frames from "
+        "judge.dark_percent on, half of what a table is refused for",
     ),
     Limit(
-        "sharpness", "Blur of printed edges, worst place", "px", (None, 0.8), (None, MAX_BLUR_PX),
+        "sharpness", "Light of neighbouring cells in the worst sample, by the blur of printed edges", "share",
+        *TABLE_LIMITS["bleed"].ranges,
         "the samples of a cell take in light from its neighbours",
-        "a cell of 10 px has 0.2 % of its neighbours' light at 0.7 px and 1 % at 1 px",
+        _VERDICT + ", which go by the median of all places; the worst place is remarked on; a cell of 10 px has 0.2 % "
+        "at a blur of 0.7 px and 1 % at 1 px",
     ),
     Limit(
-        "turn", "Angle between the chart's rows and the picture's", "°", (-5.0, 5.0), (-20.0, 20.0),
+        "turn", "Angle between the chart's rows and the picture's", "°", (-5.0, 5.0), (None, None),
         "the windows of samples stand along the picture's rows, and their corners come near the neighbouring cells",
-        "geometry: 5 px of samples in a cell of 10 px",
+        "geometry: 5 px of samples in a cell of 10 px; " + _EARLY,
     ),
     Limit(
-        "tilt", "Longer over shorter of two opposite sides, less 1", "share", (None, 0.1), (None, 0.25),
+        "tilt", "Longer over shorter of two opposite sides, less 1", "share", (None, 0.1), (None, None),
         "cells are smaller on the far side, and it lies out of the plane of focus",
+        "judgement; size and sharpness are judged by themselves; " + _EARLY,
     ),
     Limit(
-        "size", "Smallest cell", "px", (8.6, None), (MIN_CELL_PX, None),
+        "size", "Smallest cell", "px", *TABLE_LIMITS["cell_px"].ranges,
         "25 samples do not lie safely inside a cell",
-        "geometry: half of 5 px, 0.5 px of rounding, 0.25 px of registration, and the blur",
+        "geometry: half of 5 px, 0.5 px of rounding, 0.25 px of registration, and the blur; " + _VERDICT,
     ),
     Limit(
-        "stains", "Cells or references that are not of their codes' colours", "share", (None, 0.0), (None, 0.001),
+        "unfit cells", "Cells outside the picture, clipped or stained under white", "share",
+        *TABLE_LIMITS["unfit_share"].ranges,
+        "colours without samples are missing from every picture",
+        _VERDICT,
+    ),
+    Limit(
+        "stains", "Cells or references that are not of their codes' colours", "share", (None, 0.0), (None, None),
         "the table would hold the colours of a dirty or creased print; build-lut lists such cells as unfit",
-        "a stain of 60 mm covers 0.3 % of an A0 chart's cells, a thumb's 0.05 %",
+        "a stain of 60 mm covers 0.3 % of an A0 chart's cells, a thumb's 0.05 %; how many make a table useless is "
+        "judged by unfit cells; " + _EARLY,
     ),
     Limit(
-        "flicker", "Standard deviation of white's R/G over repeated frames", "share", (None, 0.005), (None, 0.01),
+        "grey tint", "Tint of the print's greys against paper", "°", *TABLE_LIMITS["grey_tint_deg"].ranges,
+        "greys are not neutral; methods that rely on grey are judged by another grey than paper's",
+        _VERDICT,
+    ),
+    Limit(
+        "flicker", "Angle of white from the first of repeated frames", "°", *TABLE_LIMITS["white_drift_deg"].ranges,
         "frames that catch parts of a turn of the colour wheel have colours of their own",
-        "0.24 % at 0.5 s and 0.11 % at 1 s behind a wheel with 0.5 ms of jitter, 7 % at 1/60 s; "
-        "six frames state it to a third",
+        _VERDICT + " on a session's white frames, of which these are the first; 0.24 % of R/G at 0.5 s behind a wheel "
+        "with 0.5 ms of jitter are 0.1°, 7 % at 1/60 s 3°",
     ),
     Limit(
-        "brightness", "Standard deviation of white over repeated frames", "share", (None, 0.01), (None, 0.03),
+        "brightness", "Largest less smallest white of repeated frames", "share", *TABLE_LIMITS["white_drift"].ranges,
         "the lamp is not steady, or exposures differ",
-        "build-lut remarks on 1 % between white frames",
+        _VERDICT + " on a session's white frames, of which these are the first",
     ),
     Limit(
-        "hot photosites", "Photosites of a million that stand out in the dark", "", (None, 50.0), (None, 1000.0),
+        "hot photosites", "Photosites of a million that stand out in the dark", "",
+        (None, TABLE_LIMITS["unfit_share"].accept * 1e6 / CELL_PHOTOSITES),
+        (None, (TABLE_LIMITS["unfit_share"].refuse or 1.0) * 1e6 / CELL_PHOTOSITES),
         "each makes a cell unfit whose samples it lies under",
-        "100 photosites lie under a cell's samples: 50 of a million reach 0.5 % of the cells",
+        "100 photosites lie under a cell's samples: 50 of a million reach 0.5 % of the cells; " + _VERDICT,
     ),
     Limit(
         "noise reduction", "Time after the exposure that grows with it, of the exposure", "share", (None, 0.5),
@@ -317,9 +378,10 @@ _LIMITS = (
         "without it a file's transfer takes as long after any exposure",
     ),
     Limit(
-        "linearity", "Deviation from proportion to light, 5 to 95 % of saturation", "share", (None, 0.01), (None, 0.05),
+        "linearity", "Deviation from proportion to light, 5 to 95 % of saturation", "share",
+        *TABLE_LIMITS["linearity"].ranges,
         "chromaticities change with brightness",
-        "EMVA 1288 asks for the range; 1 % is the limit of a table's verdict",
+        "EMVA 1288 asks for the range; " + _VERDICT,
     ),
     Limit(
         "disk", "Free space over what the plan needs", "", (1.0, None), (1.0, None),

@@ -19,6 +19,7 @@ from acquisition.framing.planes import CHANNELS
 from acquisition.measures.least_squares import least_squares
 from acquisition.measures.paper import MIN_REFERENCES, PaperReader
 from acquisition.measures.polynomials import page_polynomial, page_powers
+from foundation.angles import angles_deg
 from foundation.robust import huber_weights, sigma_of
 
 LEAST_COUNTS = 300.0
@@ -300,22 +301,23 @@ def judge_flicker(whites: Sequence[_Array], shutter_s: float) -> list[Finding]:
     """
     seen = np.stack(whites)
     ratio = seen[:, 0] / seen[:, 1]
-    spread = float(ratio.std(ddof=1) / ratio.mean())
+    angle = float(angles_deg(seen, seen[0]).max())
     strongest = int(np.argmax(seen.mean(axis=0)))
-    bright = float(seen[:, strongest].std(ddof=1) / seen[:, strongest].mean())
+    bright = float((np.ptp(seen, axis=0) / seen.mean(axis=0)).max())
     told = f"over {len(seen)} frames of {shutter_s:.4g} s"
     return [
         judged(
             LIMITS["flicker"],
-            spread,
-            f"white's R/G has a standard deviation of {percent(spread)} {told}",
+            angle,
+            f"white is up to {angle:.2f}° from the first one, its R/G has a standard deviation of "
+            f"{percent(float(ratio.std(ddof=1) / ratio.mean()))} {told}",
             "expose for 0.5 s or more, and for whole turns of the colour wheel (set lab.projector.colour_wheel_hz)",
             {"red_over_green": ratio.tolist()},
         ),
         judged(
             LIMITS["brightness"],
             bright,
-            f"white has a standard deviation of {percent(bright)} {told}",
+            f"white changes by {percent(bright)} {told}",
             "let the lamp warm up, switch off its eco mode and dynamic contrast, keep other light away",
             {"counts": seen[:, strongest].tolist()},
         ),

@@ -13,8 +13,16 @@ import numpy as np
 import numpy.typing as npt
 
 from acquisition.chart.model import Chart
-from acquisition.check.exposure import Saturation, Trial, best_of, fitting_times, level_of, measure_saturation, search
-from acquisition.check.findings import LIMITS
+from acquisition.check.exposure import (
+    USABLE,
+    Saturation,
+    Trial,
+    best_of,
+    fitting_times,
+    level_of,
+    measure_saturation,
+    search,
+)
 from acquisition.check.light import SmoothLight, measure_light
 from acquisition.check.optics import BlurMap, measure_blur
 from acquisition.check.places import ChartMap, Levels, levels, place_chart, window_px
@@ -226,7 +234,7 @@ def look(
             again = search(found.level(shot, saturation), measure, times)
             trials = (found.level(first, saturation), *again)
             best = best_of(trials)
-    usable = LIMITS["exposure"].grade(trials[0].highest) != "fault" and not trials[0].clipped
+    usable = USABLE[0] <= trials[0].highest <= USABLE[1] and not trials[0].clipped
     used_s = first.shutter_s if usable else best.shutter_s
     whites = tuple(camera.take(WHITE, used_s) for _ in range(REPEATS))
     dark = camera.take(BLACK, used_s)

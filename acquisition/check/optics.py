@@ -5,19 +5,20 @@ The blur of every tag's edges is a map; a chart without tags has one of its fiel
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
 
 from acquisition.chart.model import Chart
-from acquisition.check.findings import LIMITS, Finding, amount, judged, not_checked, percent, worst
+from acquisition.check.findings import LIMITS, Finding, Grade, amount, judged, not_checked, percent, worst
 from acquisition.check.light import AREAS, area_name
 from acquisition.check.places import ChartMap
 from acquisition.framing.finding import Framing
 from acquisition.framing.homography import project
 from acquisition.framing.sharpness import edge_blurs
 from acquisition.framing.tags import MIN_MODULE_PX
+from acquisition.limits.bleed import bleed, largest_blur_px
 
 USUAL_FOCAL_DIAGONALS = 1.3
 """Focal length over the frame's diagonal where the file states none: 35 mm on APS-C (chosen)."""
@@ -40,8 +41,18 @@ def measure_blur(framing: Framing) -> BlurMap:
     return BlurMap(project(back, places), sigma)
 
 
-def judge_sharpness(blur: BlurMap, chart: Chart, module_px: float) -> Finding:
-    """Return the finding on sharpness: the worst area of the chart counts; tags too small to measure it are not."""
+def judge_sharpness(blur: BlurMap, chart: Chart, module_px: float, cell_px: float) -> Finding:
+    """Return the finding on sharpness: the worst area of the chart counts, for a fault the median of all places.
+
+    Parameters
+    ----------
+    blur, chart
+        The blur from place to place, and the chart.
+    module_px
+        Of the tags, half-size px; too small ones are not looked at.
+    cell_px
+        Shorter side of the smallest cell, half-size px.
+    """
     if module_px < MIN_MODULE_PX:
         return not_checked(
             "sharpness", f"a tag module is {module_px:.1f} px wide, {MIN_MODULE_PX:g} needed to see its edges",
@@ -56,6 +67,7 @@ def judge_sharpness(blur: BlurMap, chart: Chart, module_px: float) -> Finding:
     softest, sharpest = max(found, key=lambda each: found[each]), min(found, key=lambda each: found[each])
     names = {number: area_name(number // columns, number % columns) for number in found}
     middle = float(np.median(blur.sigma_px))
+    worst_bleed, usual_bleed = (bleed(cell_px, sigma) for sigma in (found[softest], middle))
     aside = found[softest] - found[sharpest] > 0.25
     remedy = (
         f"turn the camera so that the sensor is parallel to the print ({names[softest]} is farther out of focus), stop "
@@ -63,14 +75,25 @@ def judge_sharpness(blur: BlurMap, chart: Chart, module_px: float) -> Finding:
         if aside
         else "focus the lens by hand on a magnified live view, stop down to f/8, and see that nothing shakes the camera"
     )
-    return judged(
-        LIMITS["sharpness"],
-        found[softest],
+    limit = LIMITS["sharpness"]
+    judgement = judged(
+        limit,
+        worst_bleed,
         f"blur σ {found[softest]:.2f} px at {names[softest]}, {found[sharpest]:.2f} px at {names[sharpest]}, "
-        f"{middle:.2f} px on the whole",
+        f"{middle:.2f} px on the whole, so that the worst sample of a cell of {cell_px:.1f} px has "
+        f"{percent(worst_bleed)} of its neighbours' light there and {percent(usual_bleed)} on the whole",
         remedy,
-        {"areas_px": {names[number]: sigma for number, sigma in found.items()}, "median_px": middle},
-    )
+        {"areas_px": {names[number]: sigma for number, sigma in found.items()}, "median_px": middle,
+         "cell_px": cell_px, "median_bleed": usual_bleed},
+    )  # fmt: skip
+    # A table is judged by the median; one soft corner is worth a remark.
+    refused = limit.grade(usual_bleed) == "fault" or middle > largest_blur_px(cell_px)
+    grade: Grade = "fault" if refused else "remark" if judgement.grade == "fault" else judgement.grade
+    if refused and judgement.grade == "good":
+        most = largest_blur_px(cell_px)
+        why = f"at most σ {most:.2f} px wanted: build-lut does not find cells so soft to parts of a pixel"
+        return replace(judgement, grade=grade, reason=why, remedy=remedy)
+    return replace(judgement, grade=grade)
 
 
 def judge_turn(framing: Framing) -> Finding:
@@ -170,10 +193,13 @@ def judge_size(framing: Framing, chart: Chart, place: ChartMap) -> Finding:
     if not wrong:
         return found
     reasons, remedies = ("; ".join(part) for part in zip(*wrong, strict=True))
-    return Finding(
-        found.name, "fault", found.said, found.value, found.unit, found.good, found.tolerable, reasons, remedies,
-        found.details,
-    )  # fmt: skip
+    # What is cut off, or not found for it, is judged by the cells and tags that are lacking.
+    return replace(
+        found,
+        grade=worst((found.grade, "remark")),
+        reason="; ".join(filter(None, (found.reason, reasons))),
+        remedy="; ".join(filter(None, (found.remedy, remedies))),
+    )
 
 
 def judge_chart(framing: Framing, chart: Chart) -> Finding:

@@ -13,10 +13,12 @@ import numpy as np
 import numpy.typing as npt
 
 from acquisition.chart.model import Chart
-from acquisition.check.findings import GRADES, LIMITS, CheckReport
+from acquisition.check.findings import GRADES, CheckReport
 from acquisition.check.light import light_share
 from acquisition.check.looking import ChartFigures, CheckFrames
+from acquisition.check.print_state import Spot
 from acquisition.framing.annotated import annotated_png
+from acquisition.framing.sharpness import MAX_BLUR_PX
 
 COLOURS = {"fault": "#b42318", "remark": "#b54708", "not checked": "#667085", "good": "#027a48"}
 """Of the grades: dark enough to be read on white."""
@@ -80,16 +82,28 @@ def _draw_frame(axes: Any, seen: CheckFrames, figures: ChartFigures | None, char
     axes.set_yticks([])
     if figures is not None and figures.state is not None:
         for spot in figures.state.spots:
-            centre = figures.placed.place.to_pixels([spot.centre_mm])[0]
-            edge = figures.placed.place.to_pixels([(spot.centre_mm[0] + spot.size_mm / 2, spot.centre_mm[1])])[0]
-            radius = max(float(np.linalg.norm(edge - centre)), 6.0)
-            axes.add_patch(_circle(centre, radius))
+            to_pixels = figures.placed.place.to_pixels
+            axes.add_patch(_outline(np.array([to_pixels([place])[0] for place in _rim_mm(spot, 0.0)]), 6.0))
 
 
-def _circle(centre: npt.NDArray[np.float64], radius: float) -> Any:
-    from matplotlib.patches import Circle
+def _rim_mm(spot: Spot, least_mm: float) -> npt.NDArray[np.float64]:
+    """Return (N, 2) mm, an ellipse about a spot: a circle, or along a crease; its half axes are no less than given."""
+    turn = np.linspace(0, 2 * np.pi, 60, endpoint=False)
+    along, across = (max(side / 2, least_mm) for side in (spot.size_mm, spot.width_mm or spot.size_mm))
+    angle = np.radians(spot.angle_deg)
+    x, y = along * np.cos(turn), across * np.sin(turn)
+    turned = [x * np.cos(angle) - y * np.sin(angle), x * np.sin(angle) + y * np.cos(angle)]
+    return np.stack(turned, axis=1) + np.array(spot.centre_mm)
 
-    return Circle((float(centre[0]), float(centre[1])), radius, fill=False, edgecolor="#d400ff", linewidth=2)
+
+def _outline(rim: npt.NDArray[np.float64], least: float) -> Any:
+    """Return the outline through points (N, 2), made as large as can be seen."""
+    from matplotlib.patches import Polygon
+
+    middle = rim.mean(axis=0)
+    reach = float(np.linalg.norm(rim - middle, axis=1).max())
+    shown = middle + (rim - middle) * max(1.0, least / max(reach, 1e-9))
+    return Polygon(shown, closed=True, fill=False, edgecolor="#d400ff", linewidth=2)
 
 
 def _page(axes: Any, chart: Chart, title: str) -> None:
@@ -123,7 +137,7 @@ def _per_cent(share: float) -> str:
 
 def _draw_sharpness(axes: Any, figures: ChartFigures, chart: Chart) -> None:
     points, sigma = figures.blur.points_mm, figures.blur.sigma_px
-    worst = LIMITS["sharpness"].tolerable[1] or 1.0
+    worst = MAX_BLUR_PX
     marks = axes.scatter(
         points[:, 0], points[:, 1], c=sigma, s=380, cmap="RdYlGn_r", vmin=0.3, vmax=worst + 0.3, edgecolors="0.3"
     )
@@ -146,7 +160,7 @@ def _draw_print(axes: Any, figures: ChartFigures, chart: Chart) -> None:
         points[:, 0], points[:, 1], c=100 * value, s=size, marker="s", cmap="RdBu", vmin=-6, vmax=6, linewidths=0
     )
     for spot in state.spots:
-        axes.add_patch(_circle(np.array(spot.centre_mm), max(spot.size_mm / 2, 3.0)))
+        axes.add_patch(_outline(_rim_mm(spot, 3.0), 0.0))
         axes.annotate(str(spot), spot.centre_mm, xytext=(0, 14), textcoords="offset points", ha="center", fontsize=8)
     axes.figure.colorbar(marks, ax=axes, shrink=0.8, label="%, seen over expected")
     what = "references" if state.by_references else "cells' surroundings"

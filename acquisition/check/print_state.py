@@ -71,6 +71,8 @@ class Spot:
         Light there over what is expected, less 1, of the channel that deviates most.
     crease
         Whether it is long and narrow.
+    width_mm, angle_deg
+        Of a crease: its width, and its direction, clockwise from the right.
     """
 
     centre_mm: tuple[float, float]
@@ -78,6 +80,8 @@ class Spot:
     patches: int
     deviation: float
     crease: bool
+    width_mm: float = 0.0
+    angle_deg: float = 0.0
 
     def __str__(self) -> str:
         """Return "a stain or shadow of 58 mm at 420, 310 mm, 34 % darker"."""
@@ -249,7 +253,8 @@ def _spots(points: _Array, deviation: _Array, off: _Mask, area_mm2: float, least
 
 def _spot(places: _Array, deviation: _Array, area_mm2: float) -> Spot:
     centre = places.mean(axis=0)
-    spread = np.linalg.svd(places - centre, compute_uv=False) / len(places) ** 0.5
+    _, lengths, axes = np.linalg.svd(places - centre, full_matrices=False)
+    spread = lengths / len(places) ** 0.5
     # A square's standard deviation is its side over √12; a single row of cells has a width, too.
     length, width = (
         float((12 * value**2 + area_mm2) ** 0.5) for value in (spread[0], spread[1] if len(spread) > 1 else 0.0)
@@ -258,7 +263,9 @@ def _spot(places: _Array, deviation: _Array, area_mm2: float) -> Spot:
     size = length if crease else 2 * float((len(places) * area_mm2 / np.pi) ** 0.5)
     known = deviation[np.isfinite(deviation)]
     value = float(np.median(known)) if len(known) else float("nan")
-    return Spot((float(centre[0]), float(centre[1])), size, len(places), value, crease)
+    angle = float(np.degrees(np.arctan2(axes[0, 1], axes[0, 0]))) % 180
+    at = float(centre[0]), float(centre[1])
+    return Spot(at, size, len(places), value, crease, width if crease else size, angle if crease else 0.0)
 
 
 def names_of(spots: Sequence[Spot]) -> list[str]:

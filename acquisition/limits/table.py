@@ -53,6 +53,13 @@ class TableLimit:
         return "accept" if sign * value <= sign * self.accept else "accept with remarks"
 
     @property
+    def ranges(self) -> tuple[tuple[float | None, float | None], tuple[float | None, float | None]]:
+        """Lowest and highest value that is accepted, and that is not refused; None where open."""
+        if self.sense == "at most":
+            return (None, self.accept), (None, self.refuse)
+        return (self.accept, None), (self.refuse, None)
+
+    @property
     def numbers(self) -> tuple[str, Sense, float, float | None]:
         """Unit, sense and both limits, as `calibration.verdict.thresholds.Threshold` takes them."""
         return self.unit, self.sense, self.accept, self.refuse
@@ -80,3 +87,17 @@ TABLE_LIMITS: Mapping[str, TableLimit] = MappingProxyType(
     }
 )
 """By the names of the figures, as in `report.json`. What each number rests on stands with its threshold."""
+
+ONLY_OF_A_SESSION: tuple[str, ...] = (
+    # Of the registration, which is finer than what a check takes the time for.
+    "tag_residual_px", "tag_final_px", "block_residual_px", "blocks_good", "agreement",
+    # Of frames against each other.
+    "softer_bleed", "unlike_scatter", "unlike_block", "moved_anew", "black_drift_counts", "drift_left",
+    "other_camera", "other_lens", "other_exposure",
+    # Of the lights.
+    "truth_median_deg", "truth_worst_deg", "off_brightness", "white_short", "exchanged_lights", "exchange_deg",
+    "held_share", "white_frame_deg", "white_frame_brightness", "primaries_lacking",
+    # Of the noise of the cells.
+    "noise_misfit", "noisy_share",
+)  # fmt: skip
+"""Figures of a table that a check cannot know, by their names in `report.json`; all others are in `TABLE_LIMITS`."""

@@ -31,6 +31,8 @@ class SessionView:
     ----------
     name
         Name of its folder.
+    given
+        The same as it was named by who asked, for the sentence that says what comes next.
     steps, lights
         The plan, and the lights that it shows; no lights if their file cannot be read.
     records
@@ -48,11 +50,14 @@ class SessionView:
     attempts: tuple[AttemptView, ...]
     events: tuple[EventView, ...]
     heartbeat: Heartbeat | None
+    given: str = ""
 
     def head(self, now: datetime) -> Head:
         """Return how it stands at the wall clock's `now`; the process that takes it is looked for."""
         alive = self.heartbeat.process.is_alive() if self.heartbeat else None
-        return head_of(self.steps, self.attempts, self.heartbeat, now, process_alive=alive, name=self.name)
+        return head_of(
+            self.steps, self.attempts, self.heartbeat, now, process_alive=alive, name=self.given or self.name
+        )
 
     def whites(self) -> dict[int, tuple[float, float, float] | None]:
         """Return by attempt what was seen of the white frame that it is held against.
@@ -110,7 +115,7 @@ def read_session(folder: Path, before: SessionView | None = None) -> SessionView
     starts = [event.at for event in events if event.what == RUN_STARTS]
     attempts = with_seconds([known[number] for number in sorted(known)], starts)
     lights = before.lights if before else _lights_of(folder)
-    return SessionView(folder.resolve().name, steps, lights, records, attempts, events, heartbeat)
+    return SessionView(folder.resolve().name, steps, lights, records, attempts, events, heartbeat, str(folder))
 
 
 def _lights_of(folder: Path) -> tuple[Illumination, ...]:

@@ -12,6 +12,8 @@ Rules that hold inside:
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable, Iterable
 from contextlib import suppress
 from typing import Final
 
@@ -19,12 +21,16 @@ from acquisition.config import SequenceSettings
 from acquisition.run.patience import PAUSE_S, Patience, Pause
 from acquisition.session.progress import duration_text
 from drivers.projector import Power, Projector, ReportsPictureFault, Severity
+from foundation.clock import Clock
 from foundation.errors import DeviceError, DeviceFault, DeviceRefused, LinkError
 
 POWER_LIMIT_S: Final = 300.0
 """How long a lamp may take to light; makers state up to 130 s with repeated ignition."""
 RELIGHT_S: Final = 15.0
 """No lamp is lit again, and its projector back on the network, in less."""
+
+ASKING: Final = 0.01
+"""Share of a frame's time that questions may always take: five answers of 4 ms in 2.3 s."""
 
 _NAME: Final = "the projector"
 
@@ -68,26 +74,94 @@ def require_healthy(projector: Projector) -> None:
     DeviceFault
         It is off, muted, frozen, without a signal, or reports an error.
     """
+    for require in _REQUIRED:
+        require(projector)
+
+
+def _require_no_error(projector: Projector) -> None:
     if (error := reported_error(projector)) is not None:
         raise error
+
+
+def _require_on(projector: Projector) -> None:
     power = projector.power()
     if power is not Power.ON:
         remedy = "it is waited for" if power is Power.WARMING else "switch it on"
         raise DeviceFault(f"the projector is in {power.value} during the session; {remedy}")
+
+
+def _require_unmuted(projector: Projector) -> None:
     if projector.muted():
         raise DeviceFault("the projector's picture is muted; release mute on its remote control")
+
+
+def _require_picture(projector: Projector) -> None:
     if isinstance(projector, ReportsPictureFault) and (fault := projector.picture_fault()):
         raise DeviceFault(fault)
 
 
-def health_fault(projector: Projector | None) -> DeviceError | None:
-    """Return why the projector is not known to be healthy now, as `require_healthy` raises it; None where it is."""
+_REQUIRED: Final = (_require_no_error, _require_on, _require_unmuted, _require_picture)
+"""What is asked of a projector, one question or two each; what explains the others comes first."""
+
+
+def health_fault(
+    projector: Projector | None, required: Iterable[Callable[[Projector], None]] = _REQUIRED
+) -> DeviceError | None:
+    """Return why the projector is not known to be healthy now, as `require_healthy` raises it; None where it is.
+
+    Parameters
+    ----------
+    required
+        What is asked; all of it if not given.
+    """
     try:
         if projector is not None:
-            require_healthy(projector)
+            for require in required:
+                require(projector)
     except DeviceError as fault:
         return fault
     return None
+
+
+class HealthWatch:
+    """Asks for a projector's health between frames, all of it where that costs next to nothing, else in turn.
+
+    A projector on a slow line takes as long to answer as a frame can be shortened by. What the judge sees in a frame, a
+    lamp that is out, a picture that is muted or stands still, needs not be asked each time; where it cannot see
+    that, in the dark, or where it saw something, all is asked.
+
+    Parameters
+    ----------
+    projector
+        Which is asked; None: nobody is, and nothing is wrong.
+    clock
+        Measures what answers cost.
+    """
+
+    def __init__(self, projector: Projector | None, clock: Clock) -> None:
+        self._projector = projector
+        self._clock = clock
+        self._begun = clock.monotonic()
+        self._cost_s = math.inf
+        self._next = 0
+
+    def fault(self, thorough: bool) -> DeviceError | None:
+        """Return why the projector is not known to be healthy, of what is asked now; None where it is.
+
+        Parameters
+        ----------
+        thorough
+            Whether all is asked, whatever it costs.
+        """
+        begun = self._clock.monotonic()
+        frame_s, self._begun = begun - self._begun, begun
+        if thorough or math.isinf(self._cost_s) or self._cost_s <= ASKING * frame_s:
+            fault = health_fault(self._projector)
+            self._cost_s = self._clock.monotonic() - begun
+            return fault
+        asked = _REQUIRED[self._next]
+        self._next = (self._next + 1) % len(_REQUIRED)
+        return health_fault(self._projector, (asked,))
 
 
 def await_health(projector: Projector, sequence: SequenceSettings, patience: Patience) -> None:

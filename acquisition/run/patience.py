@@ -38,6 +38,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from typing import Final, Protocol, TypeVar
 
+from acquisition.session.journal_file import HeldJournalError
 from acquisition.session.progress import duration_text
 from foundation import errors
 from foundation.clock import Clock
@@ -76,7 +77,7 @@ class Beat(Protocol):
 
 def is_curable(fault: CropError) -> bool:
     """Return whether waiting may help: any fault of a device or of the disk, but nothing that the user gave."""
-    return isinstance(fault, DeviceError | StorageError)
+    return isinstance(fault, DeviceError | StorageError) and not isinstance(fault, HeldJournalError)
 
 
 class Patience:

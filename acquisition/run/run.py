@@ -20,6 +20,7 @@ from acquisition.run.taking.pipeline import Taken
 from acquisition.run.taking.resuming import check_frames, require_same_devices, tie
 from acquisition.session.folder import Session, session_exists
 from acquisition.session.heartbeat import signs_of_life
+from acquisition.session.mending.redaction import secrets_warning
 from foundation.console import Ending
 from foundation.errors import CropError, InputError
 
@@ -113,6 +114,8 @@ def _taken_up(settings: LabSettings, folder: Path, announce: Callable[[str], obj
     session = Session.open_for_run(folder, settings.sequence.patience_s, announce)
     try:
         require_same(session, settings)
+        if warning := secrets_warning(folder):
+            announce(warning)
     except BaseException:
         session.close()
         raise

@@ -6,7 +6,6 @@ the lines are printed.
 
 from __future__ import annotations
 
-import statistics
 import sys
 import time
 from collections import deque
@@ -17,7 +16,7 @@ from typing import Self
 from acquisition.run.taking.agenda import step_name
 from acquisition.run.taking.pipeline import Taken
 from acquisition.session.judgement import Check, Judgement
-from acquisition.session.progress import duration_text
+from acquisition.session.progress import duration_text, time_left
 
 REMEMBERED = 25
 """Frames whose time says how long the rest will take: enough for a median, few enough to follow a change."""
@@ -39,10 +38,12 @@ class TimeLeft:
         self._clock = clock
         self._since: float | None = None
         self._seconds: deque[float] = deque(maxlen=REMEMBERED)
+        self._accepted: deque[bool] = deque(maxlen=REMEMBERED)
 
-    def taken(self) -> None:
-        """Note that a frame was taken now."""
+    def taken(self, accepted: bool = True) -> None:
+        """Note that a frame was taken now, and whether it counts."""
         now = self._clock()
+        self._accepted.append(accepted)
         if self._since is not None:
             self._seconds.append(now - self._since)
         self._since = now
@@ -52,8 +53,8 @@ class TimeLeft:
         self._since = None
 
     def left_s(self, frames: int) -> float | None:
-        """Return seconds that so many frames will take; None before the second frame."""
-        return statistics.median(self._seconds) * frames if self._seconds else None
+        """Return seconds that so many frames will take, retaken ones included; None before the second frame."""
+        return time_left(self._seconds, len(self._accepted), sum(self._accepted), frames)
 
 
 def verdict_line(taken: Taken) -> str:
@@ -67,7 +68,7 @@ def verdict_line(taken: Taken) -> str:
 def number_text(check: Check) -> str:
     """Return a check's name and number, as in ``light 0.21°``."""
     unit = "" if not check.unit else check.unit if check.unit.startswith("°") else f" {check.unit}"
-    return f"{check.name} {check.value:.3g}{unit}"
+    return f"{check.name} {check.value:.3g}{unit}{' (beyond its limit)' if check.is_beyond else ''}"
 
 
 def _of_name(judgement: Judgement, name: str) -> list[Check]:
@@ -117,7 +118,7 @@ class Terminal:
 
     def taken(self, taken: Taken) -> None:
         """Show the verdict of a frame, and take its time for that of those to come."""
-        self._time.taken()
+        self._time.taken(taken.judgement.accepted)
         self._bar.update(self._task, said=verdict_line(taken))
 
     def announce(self, sentence: str) -> None:

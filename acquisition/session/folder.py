@@ -23,6 +23,7 @@ from acquisition.chart.model import Chart, load_chart
 from acquisition.lights.illuminations import Illumination, load_illuminations, save_illuminations
 from acquisition.session.incoming import IncomingFile, ReceivedFile
 from acquisition.session.journal import JOURNAL_FILE, PATIENCE_S, Journal, time_text
+from acquisition.session.journal_schema import MOST_BYTES
 from acquisition.session.judgement import Judgement
 from acquisition.session.mending.retaking import BAD, lights_text, newest_report, parse_lights
 from acquisition.session.mending.verification import require_frames_folder, unsound_files
@@ -33,6 +34,7 @@ from drivers.presenter import Colour
 from foundation.errors import FormatError, InputError
 from foundation.files import is_partial, reading_error, require_free, storage_error, whole_folder, write_whole
 from foundation.held_folders import held_folder
+from foundation.trust.foreign_folders import require_plain_folder
 
 FRAME_COLUMNS = ("kind", "illumination", "file", "sha256", "taken_at", "exposure_s", "verdict")
 """Columns of `frames.csv` (docs/formats.md)."""
@@ -55,6 +57,7 @@ class Session:
         self.folder = folder
         self.journal = journal
         self._hold = hold
+        require_plain_folder(folder, MOST_BYTES, ("frames", "previews"))
         self.chart: Chart = load_chart(folder / "chart.json")
         self.illuminations: tuple[Illumination, ...] = load_illuminations(folder / "illuminations.csv")
         self.steps: tuple[SessionStep, ...] = journal.steps()

@@ -27,9 +27,11 @@ from pathlib import Path
 from typing import TypeVar
 from urllib.parse import quote
 
+from acquisition.session.journal_schema import MOST_BYTES, limit_values, require_plain_schema, require_sound_rows
 from foundation.errors import FormatError, InputError, StorageError
 from foundation.files import disk_remedy_of, partial_path, storage_error, sync_folder
 from foundation.files import reading_error as file_reading_error
+from foundation.trust.foreign_folders import require_plain_folder
 
 _T = TypeVar("_T")
 _log = logging.getLogger(__name__)
@@ -109,6 +111,10 @@ _NETWORK = {"nfs", "nfs4", "cifs", "smb3", "smbfs", "fuse.sshfs", "9p", "afs", "
 """File systems on which several machines work and share no memory, as /proc/self/mounts names them."""
 
 
+class HeldJournalError(StorageError):
+    """Another program held the journal for as long as a write waits: waiting once more would only double that."""
+
+
 class LockPatience:
     """Waits while another program holds the journal.
 
@@ -170,6 +176,7 @@ def open_to_read(path: Path) -> tuple[sqlite3.Connection, int]:
     FormatError
         The journal cannot be read, is damaged, or of a version not known here.
     """
+    require_plain_folder(path.parent, MOST_BYTES)
     try:
         # A run has all three; without the third nobody is at work, and reading in place would make it.
         if _is_write_ahead(path) and not _beside(path, "-shm").exists():
@@ -193,6 +200,7 @@ def open_for_run(path: Path, patience: LockPatience) -> sqlite3.Connection:
     StorageError
         It can be read, but not written.
     """
+    require_plain_folder(path.parent, MOST_BYTES)
     try:
         connection = patience.insist(lambda: _connect(path, "rw"))
         version = patience.insist(lambda: _checked(path, connection))
@@ -254,10 +262,13 @@ def reading_error(path: Path, error: OSError | sqlite3.DatabaseError) -> FormatE
 def writing_error(path: Path, error: sqlite3.DatabaseError) -> FormatError | InputError | StorageError:
     """Return why a journal cannot be written, and what helps; the disk itself is asked what ails it."""
     if is_busy(error):
-        remedy = "end the other program that holds the session"
-    elif (fault := _disk_fault(path)) is not None:
+        return HeldJournalError(
+            f"cannot write {path}: {error}; end the other program that holds the session, then run the same command "
+            "again"
+        )
+    if (fault := _disk_fault(path)) is not None:
         return storage_error(path, fault)
-    elif _primary_code(error) == sqlite3.SQLITE_FULL:
+    if _primary_code(error) == sqlite3.SQLITE_FULL:
         remedy = "free space"
     elif _primary_code(error) in (sqlite3.SQLITE_READONLY, sqlite3.SQLITE_PERM, sqlite3.SQLITE_CANTOPEN):
         remedy = "see that the folder may be written and the disk is there"
@@ -380,6 +391,8 @@ def _is_write_ahead(path: Path) -> bool:
 def _checked(path: Path, connection: sqlite3.Connection) -> int:
     """Return the journal's version; close the connection and refuse what is not known or lacks a table."""
     try:
+        limit_values(connection)
+        require_plain_schema(path, connection)
         version = connection.execute("PRAGMA user_version").fetchone()[0]
         tables = {name for (name,) in connection.execute("SELECT name FROM sqlite_master WHERE type = 'table'")}
         if version not in READABLE:
@@ -391,6 +404,7 @@ def _checked(path: Path, connection: sqlite3.Connection) -> int:
             raise FormatError(
                 f"{path} is damaged: it lacks its table {' and '.join(sorted(lacking))}; restore it from a copy"
             )
+        require_sound_rows(path, connection, version)
     except BaseException:
         connection.close()
         raise

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import statistics
-from collections.abc import Sequence
+from collections.abc import Collection
 
 
-def time_left(intervals: Sequence[float], attempts: int, gained: int, left: int) -> float | None:
+def time_left(intervals: Collection[float], attempts: int, gained: int, left: int) -> float | None:
     """Return how long the frames that are left will take, seconds; None while that is unknown.
 
     Each frame costs as many attempts as frames have cost lately, retakes and references included; each attempt the

@@ -370,9 +370,10 @@ def _finish(
     result = BuildResult(figures, judge(judged_values(figures), thresholds), out)
     if figures.lights.drift is not None and not result.verdict.refused:
         _correct_drift(work.writer, figures.lights.drift)
-    _write_table(work, figures)
+    # The table lists the hashes of its report.
     if report is not None:
         report(result, job.session, unfinished.folder)
+    _write_table(work, figures)
     if result.verdict.refused:
         unfinished.discard()
         raise _refused(result, out, unfinished.folder)

@@ -5,8 +5,18 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from calibration.table.file_names import FRAMES
+from calibration.table.file_names import FRAMES, SUMS
 from calibration.table.lut import Lut
+from calibration.table.provenance import Provenance
+
+
+def _hashes(known: Provenance) -> str:
+    """Return in words what of a table its recorded hashes cover."""
+    if known.has_sums:
+        return f"every file, in {SUMS}, whose own names the table"
+    if known.lights_sha256:
+        return "ground truth and samples; the table is older than the list of every file"
+    return "none: the table was made before they were recorded, so that changes are not noticed"
 
 
 def describe(lut: Lut) -> list[tuple[str, str]]:
@@ -58,6 +68,7 @@ def describe(lut: Lut) -> list[tuple[str, str]]:
         ("Session", session),
         ("Chart", known.chart_sha256),
         ("Samples", known.samples_sha256 or "no hash recorded"),
+        ("Hashes", _hashes(known)),
         ("Table", lut.sha256),
     ]
 

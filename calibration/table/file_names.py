@@ -25,6 +25,9 @@ REPORT_PAGE: Final = "report.html"
 REPORT_JSON: Final = "report.json"
 """The report for programs."""
 
+SUMS: Final = "SHA256SUMS"
+"""Hashes of all other files of the table, as `sha256sum -c` reads them; absent in tables made before it was written."""
+
 REPORT_FORMAT: Final = "crop.report"
 REPORT_VERSION: Final = 1
 """`format` and `version` of `report.json` (docs/formats.md)."""

@@ -21,15 +21,21 @@ import numpy as np
 import numpy.typing as npt
 
 from acquisition.lights.illuminations import Illumination, load_illuminations
-from calibration.table.file_names import FRAMES, ILLUMINATIONS, PROVENANCE, SAMPLES
+from calibration.table.file_names import FRAMES, ILLUMINATIONS, PROVENANCE, SAMPLES, SUMS
 from calibration.table.provenance import Provenance, parse_provenance
-from calibration.table.sample_hashes import light_sha256
+from calibration.table.sample_hashes import light_sha256, map_samples
 from calibration.table.source_frames import SourceFrame, load_frames
+from calibration.table.sums import require_listed, require_plain_table
 from foundation.errors import FormatError
 from foundation.files import partial_path
+from foundation.hashing import file_sha256
 
 WHITE_COLUMNS: Final = ("white_r", "white_g", "white_b")
 """Columns of `illuminations.csv` with the ground truth, after those of the lights."""
+
+MOST_WHITE: Final = 1_000_000
+"""A ground truth is below this, in units of samples of 16 bits: what is larger was not measured, and its chromaticity
+might not be a number."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,15 +69,13 @@ class Lut:
 
     @cached_property
     def sha256(self) -> str:
-        """SHA-256 over the folder's provenance and ground truth, the table's name in a dataset.
+        """SHA-256 that names the table, as a dataset records it: of `SHA256SUMS`, which has the hash of every file.
 
-        `lut.json` holds the hash of the samples, so it stands for them without reading gigabytes. In tables made
-        before that was recorded it holds the hash over all frames, from which the samples came.
+        In tables made before that was written it is over `lut.json` and `illuminations.csv`: `lut.json` holds the hash
+        of the samples, so it stands for them without reading gigabytes, or at least the hash over all frames, from
+        which the samples came.
         """
-        digest = hashlib.sha256()
-        for name in (PROVENANCE, ILLUMINATIONS):
-            digest.update((self.folder / name).read_bytes())
-        return digest.hexdigest()
+        return table_sha256(self.folder, self.provenance)
 
     def require_unchanged(self, light: int) -> None:
         """Raise unless a light's samples are those that were measured; costs the reading of a light, once for each.
@@ -93,6 +97,17 @@ class Lut:
             )
         self._unchanged.add(light)
 
+    def light_samples(self, light: int) -> npt.NDArray[np.uint16]:
+        """Return the samples (8**bits, S, 3) uint16 of a light, as they are on the disk, after `require_unchanged`.
+
+        Raises
+        ------
+        FormatError
+            They are not those that were measured.
+        """
+        self.require_unchanged(light)
+        return self.samples[light]
+
     @cached_property
     def _unchanged(self) -> set[int]:
         return set()
@@ -109,15 +124,35 @@ class Lut:
         return load_frames(self.folder / FRAMES)
 
 
-def open_lut(folder: Path) -> Lut:
+def table_sha256(folder: Path, provenance: Provenance) -> str:
+    """Return the hash that names a table of that `lut.json`; see `Lut.sha256`."""
+    if provenance.has_sums:
+        return file_sha256(folder / SUMS)
+    digest = hashlib.sha256()
+    for name in (PROVENANCE, ILLUMINATIONS):
+        digest.update((folder / name).read_bytes())
+    return digest.hexdigest()
+
+
+def open_lut(folder: Path, *, check: bool = True) -> Lut:
     """Open a LUT folder; costs milliseconds whatever its size.
+
+    Parameters
+    ----------
+    folder
+        The table.
+    check
+        Whether its files but the samples are held against their recorded hashes; `calibration.table.verification` does
+        so itself, to name all that have changed. Samples are held against theirs when a light is first used.
 
     Raises
     ------
     FormatError
-        The folder is no table, of a version not known here, or its files disagree.
+        The folder is no table, of a version not known here, a file has changed since it was built, or its files
+        disagree.
     """
     path = folder / PROVENANCE
+    require_plain_table(folder)
     try:
         text = path.read_bytes()
     except OSError as error:
@@ -131,17 +166,9 @@ def open_lut(folder: Path) -> Lut:
     provenance = parse_provenance(text, path)
     lights = load_illuminations(folder / ILLUMINATIONS, computed=True)
     white = _load_white(folder / ILLUMINATIONS)
-    try:
-        samples = np.load(folder / SAMPLES, mmap_mode="r", allow_pickle=False)
-    except (OSError, ValueError, EOFError) as error:
-        raise FormatError(f"cannot read {folder / SAMPLES}: {error}; build the table again") from error
-    expected = (len(lights), 8**provenance.bits)
-    if samples.dtype != np.dtype("<u2") or samples.ndim != 4 or samples.shape[:2] != expected or samples.shape[3] != 3:
-        raise FormatError(
-            f"{folder / SAMPLES} holds {samples.dtype} {samples.shape}, expected uint16 "
-            f"({expected[0]}, {expected[1]}, samples, 3); build the table again"
-        )
-    return Lut(folder, samples, lights, white, provenance)
+    if check:
+        require_listed(folder, provenance, len(lights))
+    return Lut(folder, map_samples(folder / SAMPLES, len(lights), provenance.bits), lights, white, provenance)
 
 
 def _load_white(path: Path) -> npt.NDArray[np.float64]:
@@ -150,6 +177,6 @@ def _load_white(path: Path) -> npt.NDArray[np.float64]:
         white = np.array([[float(row[column]) for column in WHITE_COLUMNS] for row in rows])
     except (KeyError, TypeError, ValueError) as error:
         raise FormatError(f"{path}: expected numbers under {','.join(WHITE_COLUMNS)}; build the table again") from error
-    if not (np.isfinite(white).all() and (white > 0).all()):
-        raise FormatError(f"{path}: a ground truth is not above 0; build the table again")
+    if not ((white > 0).all() and (white < MOST_WHITE).all()):
+        raise FormatError(f"{path}: a ground truth is not between 0 and {MOST_WHITE}; build the table again")
     return white

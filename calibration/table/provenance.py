@@ -3,15 +3,22 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, Final, Literal
+from typing import Annotated, Any, Final, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from foundation.errors import FormatError
 
 FORMAT: Final = "crop.lut"
 VERSION: Final = 1
 """The only version so far: keys that were added since are optional."""
+
+
+Sha256 = Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
+"""A SHA-256 as 64 lowercase hexadecimal digits."""
+
+FileName = Annotated[str, Field(pattern=r"^[A-Za-z0-9_][A-Za-z0-9_.-]{0,99}$")]
+"""Name of a file that lies in the table's own folder."""
 
 
 class Unfit(BaseModel):
@@ -51,6 +58,8 @@ class Provenance(BaseModel):
         light; empty in tables made before they were recorded.
     files_sha256
         Of further files of the table, `references.csv`; empty in tables made before they were recorded.
+    has_sums
+        Whether `SHA256SUMS` lists every file of the table; false in tables made before it was written.
     computed
         Where the table was computed from spectra and a model of the sensor and nothing was photographed: by what,
         and with which settings. None where it was made from frames.
@@ -68,11 +77,20 @@ class Provenance(BaseModel):
     chart_sha256: str
     software: str
     unfit: list[Unfit] = []
-    samples_sha256: str | None = None
-    illuminations_sha256: str | None = None
-    lights_sha256: list[str] = []
-    files_sha256: dict[str, str] = {}
+    samples_sha256: Sha256 | None = None
+    illuminations_sha256: Sha256 | None = None
+    lights_sha256: list[Sha256] = []
+    files_sha256: dict[FileName, Sha256] = {}
+    has_sums: bool = False
     computed: dict[str, Any] | None = None
+
+    @model_validator(mode="after")
+    def _require_colours(self) -> Self:
+        """Require that unfit cells are cells of the chart."""
+        beyond = [cell.colour for cell in self.unfit if cell.colour >= 8**self.bits]
+        if beyond:
+            raise ValueError(f"unfit: colour {beyond[0]} is none of the {8**self.bits} of {self.bits} bits a channel")
+        return self
 
     def to_json(self) -> str:
         """Return the text of `lut.json`; `computed` stands in it where the table was computed."""
@@ -115,4 +133,5 @@ def parse_provenance(text: bytes, path: Path) -> Provenance:
         return Provenance.model_validate_json(text)
     except ValidationError as error:
         first = error.errors()[0]
-        raise FormatError(f"{path} is damaged: {'.'.join(map(str, first['loc']))}: {first['msg']}") from error
+        where = "".join(f"{part}: " for part in (".".join(map(str, first["loc"])),) if part)
+        raise FormatError(f"{path} is damaged: {where}{first['msg']}; restore it from a copy") from error

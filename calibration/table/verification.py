@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from calibration.table.file_names import FRAMES, ILLUMINATIONS, PROVENANCE, SAMPLES
+from calibration.table.file_names import FRAMES, PROVENANCE, SAMPLES
 from calibration.table.lut import Lut
 from calibration.table.sample_hashes import samples_sha256
 from calibration.table.source_frames import frames_sha256
+from calibration.table.sums import changed_files, known_sums
 from foundation.errors import FormatError, InputError, first_of
-from foundation.hashing import file_sha256
 
 
 def find_faults(lut: Lut, progress: Callable[[int, int], None] | None = None) -> list[str]:
@@ -33,29 +33,29 @@ def find_faults(lut: Lut, progress: Callable[[int, int], None] | None = None) ->
             f"{lut.folder} records no hashes ({known.software} wrote none), so it cannot be verified; "
             "build it again from its session"
         )
-    faults: list[str] = []
-    if file_sha256(lut.folder / ILLUMINATIONS) != known.illuminations_sha256:
-        faults.append(f"{ILLUMINATIONS} is not as it was built: lights or ground truth have changed")
-    faults += [
-        f"{name} is not as it was built, or is gone"
-        for name, then in known.files_sha256.items()
-        if not (lut.folder / name).is_file() or file_sha256(lut.folder / name) != then
-    ]
+    sums = known_sums(lut.folder, known)
+    faults = list(changed_files(lut.folder, sums))
     whole, lights = samples_sha256(lut.folder / SAMPLES, lut.samples, progress)
     changed = [light for light, (now, then) in enumerate(zip(lights, known.lights_sha256, strict=True)) if now != then]
     if changed:
         named = first_of(changed, 20)
         faults.append(f"{SAMPLES}: the samples of {len(changed)} of {len(lights)} lights have changed: {named}")
-    elif whole != known.samples_sha256:
+    elif whole != sums[SAMPLES]:
         faults.append(f"{SAMPLES}: its first bytes, before the samples, have changed")
+    if not known.has_sums:
+        faults += _frame_list_faults(lut)
+    return faults
+
+
+def _frame_list_faults(lut: Lut) -> list[str]:
+    """Return what is wrong with the list of frames of a table that does not have its hash, but that of its content."""
     try:
         frames = lut.frames
     except FormatError as error:
-        faults.append(str(error))
-    else:
-        if frames_sha256(frames) != known.session_sha256:
-            faults.append(f"{FRAMES} does not list the frames that {PROVENANCE} was made of")
-    return faults
+        return [str(error)]
+    if frames_sha256(frames) != lut.provenance.session_sha256:
+        return [f"{FRAMES} does not list the frames that {PROVENANCE} was made of"]
+    return []
 
 
 def require_match(one: Lut, other: Lut) -> None:

@@ -13,11 +13,12 @@ import numpy as np
 import numpy.typing as npt
 
 from acquisition.lights.illuminations import COLUMNS, NAME, Illumination
-from calibration.table.file_names import FRAMES, ILLUMINATIONS, PROVENANCE, SAMPLES
+from calibration.table.file_names import FRAMES, ILLUMINATIONS, PROVENANCE, SAMPLES, SUMS
 from calibration.table.lut import WHITE_COLUMNS
 from calibration.table.provenance import Provenance
 from calibration.table.sample_hashes import light_sha256, samples_sha256
 from calibration.table.source_frames import SourceFrame, frames_csv
+from calibration.table.sums import sums_of
 from foundation.errors import StorageError
 from foundation.files import storage_error, write_whole
 from foundation.hashing import sha256_of
@@ -115,7 +116,9 @@ class LutWriter:
         frames: Sequence[SourceFrame] = (),
         files: Mapping[str, str] = MappingProxyType({}),
     ) -> None:
-        """Write the frames, the ground truth and the provenance; after this the folder is a table.
+        """Write the frames, the ground truth, the hashes and the provenance; after this the folder is a table.
+
+        A report of the table must be in the folder by now: its hash is written too.
 
         Parameters
         ----------
@@ -154,8 +157,11 @@ class LutWriter:
             "samples_sha256": whole,
             "illuminations_sha256": sha256_of(truth.encode()),
             "lights_sha256": lights,
+            "has_sums": True,
         }
-        write_whole(self._folder / PROVENANCE, provenance.model_copy(update=hashes).to_json())
+        described = provenance.model_copy(update=hashes).to_json()
+        write_whole(self._folder / SUMS, sums_of(self._folder, whole, sha256_of(described.encode())))
+        write_whole(self._folder / PROVENANCE, described)
 
 
 def _ground_truth_csv(illuminations: Sequence[Illumination], white: npt.NDArray[np.float64]) -> str:

@@ -8,6 +8,7 @@ Rules that hold inside:
 
 - The attributes are completed last: an array without the attribute `whole` was never finished.
 - Nothing is overwritten but such an array.
+- Nothing that a store says of itself is believed before it fits together: sizes, names and codecs are bounded.
 - A table that is fetched appears in its folder whole and verified, or not at all.
 
 Needs zarr, the extra `cluster`.
@@ -16,31 +17,42 @@ Needs zarr, the extra `cluster`.
 from __future__ import annotations
 
 import base64
+import math
 from collections.abc import Callable
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any, Final, cast
+from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
 
-from calibration.table.file_names import FRAMES, ILLUMINATIONS, PROVENANCE, REFERENCES, REPORT_JSON, SAMPLES
+from acquisition.lights.illuminations import load_illuminations
+from calibration.table.file_names import ILLUMINATIONS, PROVENANCE, SAMPLES
 from calibration.table.lut import Lut, open_lut
+from calibration.table.provenance import parse_provenance
+from calibration.table.published_claims import (
+    FORMAT,
+    HASH,
+    TEXTS,
+    VERSION,
+    attributes_of,
+    described_at,
+    head_of,
+    reason_of,
+    require_expected,
+    require_room,
+    require_shape,
+    texts_of,
+)
 from calibration.table.sample_hashes import light_sha256
+from calibration.table.sums import known_sums, require_listed
 from foundation.errors import CropError, FormatError, InputError, StorageError
 from foundation.files import require_free, storage_error, whole_folder, write_whole
 from foundation.hashing import file_sha256
 
-FORMAT: Final = "crop.lut.published"
-VERSION: Final = 1
-"""The only version so far."""
-
 SHARD_LIGHTS: Final = 32
 """Lights of one object of the store: 100 MB compressed of a full table, a size that stores and networks like."""
-
-_TEXTS: Final = (ILLUMINATIONS, FRAMES, REFERENCES, REPORT_JSON, PROVENANCE)
-"""Files that go along where the table has them, the one that makes a folder a table last."""
 
 ReportLights = Callable[[int, int], None]
 """Called with the number of lights copied, and the number of all."""
@@ -83,10 +95,10 @@ def publish(lut: Lut, url: str, progress: ReportLights | None = None) -> None:
         )
         for first in range(0, lights, SHARD_LIGHTS):
             last = min(first + SHARD_LIGHTS, lights)
-            array[first:last] = np.asarray(lut.samples[first:last])
+            array[first:last] = np.stack([lut.light_samples(light) for light in range(first, last)])
             if progress is not None:
                 progress(last, lights)
-        texts = {name: (lut.folder / name).read_text("utf-8") for name in _TEXTS if (lut.folder / name).is_file()}
+        texts = {name: (lut.folder / name).read_text("utf-8") for name in TEXTS if (lut.folder / name).is_file()}
         with (lut.folder / SAMPLES).open("rb") as stream:
             head = stream.read((lut.folder / SAMPLES).stat().st_size - lut.samples.nbytes)
         array.attrs.update({"version": VERSION, "files": texts, "head": base64.b64encode(head).decode(), "whole": True})
@@ -95,12 +107,15 @@ def publish(lut: Lut, url: str, progress: ReportLights | None = None) -> None:
     except Exception as error:
         # Every store raises errors of its own.
         raise StorageError(
-            f"cannot write {url}: {_reason(error)}; check the address and that you may write there"
+            f"cannot write {url}: {reason_of(error)}; check the address and that you may write there"
         ) from error
 
 
-def fetch(url: str, folder: Path, progress: ReportLights | None = None) -> Lut:
+def fetch(url: str, folder: Path, progress: ReportLights | None = None, expect: str | None = None) -> Lut:
     """Copy a published table to a folder, where it is memory-mapped.
+
+    What a store claims is believed only as far as it fits together and on the disk: the texts come first, and say how
+    large the samples are; each light is held against its hash when it has come.
 
     Parameters
     ----------
@@ -110,20 +125,26 @@ def fetch(url: str, folder: Path, progress: ReportLights | None = None) -> Lut:
         Must be free; appears when the table is complete and verified.
     progress
         Called with the number of lights read, and the number of all.
+    expect
+        The table's hash as `Lut.sha256`, told by somebody who is trusted; None for any.
 
     Raises
     ------
     InputError
-        The folder is taken, or zarr is not installed.
+        The folder is taken, `expect` is no hash, or zarr is not installed.
     FormatError
-        There is no table, it was never finished, or what came is not what was published.
+        There is no table, it was never finished, it is another one than expected, or what came is not what was
+        published.
     StorageError
         The disk is full or read-only.
     """
     zarr = _zarr()
+    if expect is not None and not HASH.fullmatch(expect):
+        raise InputError(f"{expect!r} is no hash of a table; give the 64 digits that build-lut --info prints as Table")
     require_free(folder, "the table")
-    attributes = _attributes(url)
-    if attributes is None or not attributes.get("whole"):
+    described = described_at(url)
+    attributes = attributes_of(described)
+    if described is None or attributes is None or attributes.get("whole") is not True:
         raise FormatError(
             f"{url} holds no table, or one that was never finished; check the address, or publish it again"
         )
@@ -131,73 +152,66 @@ def fetch(url: str, folder: Path, progress: ReportLights | None = None) -> Lut:
         raise FormatError(
             f"{url} is published in version {attributes.get('version')!r}, this software reads {VERSION}; update it"
         )
-    array: Any = zarr.open_array(url, mode="r")
+    files = texts_of(attributes, url)
     with whole_folder(folder, "the table") as partial:
+        for name in TEXTS:
+            if name in files:
+                write_whole(partial / name, files[name])
+        known = parse_provenance(files[PROVENANCE].encode(), partial / PROVENANCE)
+        require_expected(partial, known, expect, url)
+        lights = len(load_illuminations(partial / ILLUMINATIONS, computed=True))
+        require_listed(partial, known, lights)
+        shape = require_shape(described, (lights, 8**known.bits), url)
+        head = head_of(attributes, shape, url)
+        require_room(partial, len(head) + math.prod(shape) * 2, url)
+        try:
+            array: Any = zarr.open_array(url, mode="r")
+        except Exception as error:
+            # Every store raises errors of its own.
+            raise FormatError(f"cannot read {url}: {reason_of(error)}; publish the table again") from error
         path = partial / SAMPLES
         try:
             with path.open("wb") as stream:
-                stream.write(base64.b64decode(attributes["head"]))
-                for light in range(array.shape[0]):
-                    stream.write(_light(array, light, url).tobytes())
+                stream.write(head)
+                for light in range(lights):
+                    samples = _light(array, light, shape, url)
+                    if known.lights_sha256 and light_sha256(samples) != known.lights_sha256[light]:
+                        raise FormatError(
+                            f"the samples of light {light} from {url} are not those that were measured; publish again"
+                        )
+                    stream.write(samples.tobytes())
                     if progress is not None:
-                        progress(light + 1, array.shape[0])
+                        progress(light + 1, lights)
         except OSError as error:
             raise storage_error(path, error) from error
-        files: dict[str, str] = attributes["files"]
-        for name in _TEXTS:
-            if name in files:
-                write_whole(partial / name, files[name])
-        _verify(open_lut(partial), url)
+        open_lut(partial)
+        whole = known_sums(partial, known).get(SAMPLES)
+        if whole is not None and file_sha256(path) != whole:
+            raise FormatError(f"the samples from {url} are not those that were measured; publish the table again")
     return open_lut(folder)
 
 
-def _light(array: Any, light: int, url: str) -> npt.NDArray[np.uint16]:
+def _light(array: Any, light: int, shape: tuple[int, int, int, int], url: str) -> npt.NDArray[np.uint16]:
     try:
-        return np.asarray(array[light], dtype="<u2")
+        samples = np.asarray(array[light], dtype="<u2")
+        if samples.shape != shape[1:]:
+            raise ValueError(f"it is of shape {samples.shape}")
     except Exception as error:
         # Every store raises errors of its own, and a damaged chunk those of its codec.
-        raise FormatError(f"cannot read light {light} of {url}: {_reason(error)}; publish the table again") from error
-
-
-def _verify(lut: Lut, url: str) -> None:
-    """Refuse a table whose samples do not have the recorded hashes; the first tables of version 1 have none."""
-    known = lut.provenance
-    for light, then in enumerate(known.lights_sha256):
-        if light_sha256(lut.samples[light]) != then:
-            raise FormatError(
-                f"the samples of light {light} from {url} are not those that were measured; publish again"
-            )
-    if known.samples_sha256 is not None and file_sha256(lut.folder / SAMPLES) != known.samples_sha256:
-        raise FormatError(f"the samples from {url} are not those that were measured; publish the table again")
+        raise FormatError(f"cannot read light {light} of {url}: {reason_of(error)}; publish the table again") from error
+    return samples
 
 
 def _require_free(url: str) -> None:
     from fsspec.core import url_to_fs
 
-    attributes = _attributes(url)
+    attributes = attributes_of(described_at(url))
     if attributes is not None and attributes.get("whole"):
         raise InputError(f"{url} already holds a table; name another place, or remove what is there")
     if attributes is None:
         files, root = url_to_fs(url)
         if files.exists(root) and files.find(root):
             raise InputError(f"{url} already holds something else; name another place, or remove what is there")
-
-
-def _attributes(url: str) -> dict[str, Any] | None:
-    """Return the attributes of a published table, finished or not; None where there is none."""
-    zarr = _zarr()
-    try:
-        array: Any = zarr.open_array(url, mode="r")
-    except (FileNotFoundError, KeyError):
-        return None
-    except Exception as error:
-        raise InputError(f"cannot look into {url}: {_reason(error)}; check the address") from error
-    attributes = cast("dict[str, Any]", dict(array.attrs))
-    return attributes if attributes.get("format") == FORMAT else None
-
-
-def _reason(error: Exception) -> str:
-    return " ".join(f"{type(error).__name__}: {error}".split()).rstrip(".")
 
 
 def _zarr() -> Any:

@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from evaluation.scene import SceneSet
+from foundation.trust.secret_texts import masked
 from generator.dataset.reader import Dataset, Entry, open_dataset
 
 
@@ -83,7 +84,7 @@ def open_generated(place: Path | str) -> SceneSet:
     return SceneSet(
         name=_name_of(str(place)),
         layout="generated",
-        place=str(place),
+        place=masked(str(place)),
         scenes=tuple(
             (GeneratedScene if len(entry.lights) == 1 else GeneratedMixedScene)(dataset, entry)
             for entry in dataset.entries

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import io
 import sys
 from collections.abc import Generator, Iterable, Iterator
 from contextlib import contextmanager
@@ -12,6 +11,7 @@ from itertools import groupby
 from typing import Final
 
 from foundation.errors import FormatError, InputError
+from foundation.trust.foreign_folders import bounded_lines
 from generator.dataset.production.records import (
     GROUND_TRUTH,
     GROUND_TRUTH_COLUMNS,
@@ -135,16 +135,18 @@ def _shown(text: str) -> str:
 
 
 @contextmanager
-def _text(store: Store, name: str) -> Generator[io.TextIOWrapper]:
-    """Open a file of text to be read line by line."""
-    with store.open(name) as stream, io.TextIOWrapper(stream, "utf-8-sig", "replace", newline="") as text:
-        yield text
+def _text(store: Store, name: str) -> Generator[Iterator[str]]:
+    """Open a file of text to be read line by line; a FormatError tells of a line that does not end."""
+    with store.open(name) as stream:
+        lines = bounded_lines(stream, f"{store.place}/{name}")
+        yield (line.decode("utf-8-sig" if number == 0 else "utf-8", "replace") for number, line in enumerate(lines))
 
 
 def _number(image: str) -> int:
     """Return the number of an image by its name; -1 if it has none."""
     digits = image.partition(".")[0]
-    return int(digits) if digits.isdecimal() else -1
+    # Ten digits count all images that a dataset holds.
+    return int(digits) if digits.isdecimal() and len(digits) <= 10 else -1
 
 
 @lru_cache(maxsize=_KEPT)

@@ -21,18 +21,18 @@ from __future__ import annotations
 
 import csv
 import io
-import json
 from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path, PurePosixPath
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
 from pydantic import ValidationError
 
 from foundation.errors import FormatError, InputError
+from foundation.trust.foreign_folders import MOST_JSON_BYTES, parse_json_object
 from generator.dataset.entries import read_entries
 from generator.dataset.production.layouts.by_name import read_member
 from generator.dataset.production.layouts.samples import member_name
@@ -43,13 +43,17 @@ from generator.dataset.production.records import (
     VERSION,
     Description,
     Entry,
+    ReadingOptions,
     SourceRecord,
     shard_key,
 )
 from generator.files.formats import decode_image
 from generator.masks.maps import decode_ground_truth, decode_weights
 from generator.stores.places import DESCRIPTION
-from generator.stores.store import Store, open_store
+from generator.stores.store import Store, open_store, read_bounded
+
+MOST_LIST_BYTES: Final = 4 << 30
+"""Lists that are read whole have a line an image or source, some hundred bytes: this is forty million of them."""
 
 __all__ = ["Dataset", "Description", "Entry", "open_dataset"]
 
@@ -81,11 +85,11 @@ class Dataset:
             The file is missing, damaged or no image of its format.
         """
         name = self._name(entry.image, entry.split, "images")
-        return decode_image(self._bytes(name), self.description.options["format"], f"{self.store.place}/{name}")
+        return decode_image(self._bytes(name), self._options.format, f"{self.store.place}/{name}")
 
     def read_preview(self, entry: Entry) -> bytes | None:
         """Return the JPEG file of an image's preview, or None if the dataset has none."""
-        if not self.description.options["previews"]:
+        if not self._options.previews:
             return None
         return self._beside(entry, "previews", ".jpg")
 
@@ -117,7 +121,11 @@ class Dataset:
     @property
     def layout(self) -> str:
         """Its layout: ``folder``, ``webdataset`` or ``parquet``."""
-        return str(self.description.options.get("layout", "folder"))
+        return self._options.layout
+
+    @cached_property
+    def _options(self) -> ReadingOptions:
+        return ReadingOptions.model_validate(self.description.options)
 
     @cached_property
     def sources(self) -> tuple[SourceRecord, ...]:
@@ -129,16 +137,16 @@ class Dataset:
             Their list is damaged.
         """
         rows: Iterable[dict[str, Any]]
-        if self.store.has(SOURCES):
-            rows = csv.DictReader(io.StringIO(self.store.get(SOURCES).decode("utf-8", "replace")))
-        else:
-            rows = json.loads(self.store.get(DESCRIPTION))["sources"]  # Version 1 had them there.
         try:
+            if self.store.has(SOURCES):
+                rows = csv.DictReader(io.StringIO(self._list(SOURCES)))
+            else:
+                rows = _content(self.store)["sources"]  # Version 1 had them there.
             return tuple(
                 SourceRecord.model_validate({key: None if value == "" else value for key, value in row.items()})
                 for row in rows
             )
-        except ValidationError as error:
+        except (ValidationError, csv.Error, KeyError, TypeError, AttributeError) as error:
             raise FormatError(f"{self.store.place}/{SOURCES} is damaged; make the dataset again") from error
 
     @cached_property
@@ -152,17 +160,23 @@ class Dataset:
         """
         if not self.store.has(IMAGES):
             return {}
-        rows = csv.DictReader(io.StringIO(self.store.get(IMAGES).decode("utf-8", "replace")))
+        rows = csv.DictReader(io.StringIO(self._list(IMAGES)))
         try:
             return {row.pop("image"): row for row in rows}
+        except csv.Error as error:
+            raise FormatError(f"{self.store.place}/{IMAGES} is no CSV: {error}; make the dataset again") from error
         except KeyError as error:
             raise FormatError(f"{self.store.place}/{IMAGES} has no column image; make the dataset again") from error
+
+    def _list(self, name: str) -> str:
+        """Return the text of a list."""
+        return read_bounded(self.store, name, MOST_LIST_BYTES).decode("utf-8", "replace")
 
     def _name(self, file: str, split: str | None, kind: str) -> str:
         if self.layout == "folder":
             return f"{kind}/{file}"
         number = int(file.partition(".")[0])
-        shard = shard_key(number // int(self.description.options["shard_images"]))
+        shard = shard_key(number // self._options.shard_images)
         return f"{split or 'data'}/{shard}.{'tar' if self.layout == 'webdataset' else 'parquet'}/{file}"
 
     def _map(self, entry: Entry, kind: str, ending: str) -> bytes:
@@ -221,10 +235,11 @@ def open_dataset(place: Path | str) -> Dataset:
 def _load_description(store: Store) -> Description:
     name = f"{store.place}/{DESCRIPTION}"
     try:
-        content: dict[str, Any] = json.loads(store.get(DESCRIPTION))
+        content = _content(store)
         if content["version"] == 1:
             content = _upgraded(content)
-        return Description.model_validate(content)
+        description = Description.model_validate(content)
+        ReadingOptions.model_validate(description.options)
     except ValidationError as error:
         first = error.errors()[0]
         raise FormatError(
@@ -232,7 +247,13 @@ def _load_description(store: Store) -> Description:
             f"reads {FORMAT} of versions 1 to {VERSION}"
         ) from error
     except (ValueError, KeyError, TypeError) as error:
-        raise FormatError(f"{name} is damaged ({error}); make the dataset again") from error
+        raise FormatError(f"{name} is damaged ({type(error).__name__}: {error}); make the dataset again") from error
+    return description
+
+
+def _content(store: Store) -> dict[str, Any]:
+    """Return the object of `dataset.json` as it stands there."""
+    return parse_json_object(read_bounded(store, DESCRIPTION, MOST_JSON_BYTES), f"{store.place}/{DESCRIPTION}")
 
 
 def _upgraded(content: dict[str, Any]) -> dict[str, Any]:

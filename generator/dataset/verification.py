@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
+from typing import Final
 
 from foundation.errors import FormatError
 from foundation.hashing import stream_sha256
 from foundation.processors import ordered_map
+from foundation.trust.foreign_folders import bounded_lines, is_inside_name
 from generator.dataset.production.records import SUMS
 from generator.stores.places import DESCRIPTION
 from generator.stores.store import Store, open_store
+
+_LINE: Final = re.compile("[0-9a-f]{64}")
+"""A hash as `sha256sum` writes it."""
 
 
 def file_faults(
@@ -34,19 +40,18 @@ def file_faults(
         There is no dataset, or it has no list of hashes.
     """
     store = open_store(place)
+    sums = f"{store.place}/{SUMS}"
     if not store.has(DESCRIPTION):
         raise FormatError(f"{place} is no dataset: it has no {DESCRIPTION}; make one with generate")
     with store.open(SUMS) as listed:
-        total = sum(1 for _ in listed)
+        total = sum(1 for _ in bounded_lines(listed, sums))
     known: set[str] = {SUMS}
     verified = 0
     with store.open(SUMS) as listed:
-        for name, fault in ordered_map(partial(_verify_line, store), enumerate(listed, start=1), workers):
+        lines = _named(bounded_lines(listed, sums), known)
+        for fault in ordered_map(partial(_verify_named, store), lines, workers):
             if fault is not None:
                 yield fault
-            if not name:
-                continue
-            known.add(name)
             verified += 1
             if progress is not None:
                 progress(verified, total)
@@ -54,19 +59,30 @@ def file_faults(
         yield f"{name} is no part of the dataset"
 
 
-def _verify_line(store: Store, numbered: tuple[int, bytes]) -> tuple[str, str | None]:
-    """Return the name that a numbered line of the list has, empty if it has none, and what is wrong."""
-    number, line = numbered
-    digest, _, name = line.decode("utf-8", "replace").rstrip("\n").partition("  ")
-    if not name:
-        return "", f"{SUMS}, line {number}: expected a hash, two blanks and a name"
-    return name, _fault_of(store, name, digest)
+def _named(lines: Iterator[bytes], known: set[str]) -> Iterator[tuple[str, str, str | None]]:
+    """Yield name and hash of each line, and what is wrong with it; names are added to `known`, once each."""
+    for number, line in enumerate(lines, start=1):
+        digest, _, name = line.decode("utf-8", "replace").rstrip("\n").partition("  ")
+        if not _LINE.fullmatch(digest) or not is_inside_name(name):
+            yield "", "", f"{SUMS}, line {number}: expected a hash, two blanks and a name inside the dataset"
+        elif name in known:
+            # Whoever lists one file a million times would have it read a million times.
+            yield "", "", f"{SUMS}, line {number}: {name} is listed twice"
+        else:
+            known.add(name)
+            yield name, digest, None
+
+
+def _verify_named(store: Store, line: tuple[str, str, str | None]) -> str | None:
+    name, digest, fault = line
+    return _fault_of(store, name, digest) if fault is None else fault
 
 
 def _fault_of(store: Store, name: str, digest: str) -> str | None:
     try:
         with store.open(name) as stream:
             found = stream_sha256(stream)
-    except FormatError:
-        return f"{name} is missing or cannot be read"
+    except FormatError as error:
+        missing = isinstance(error.__cause__, FileNotFoundError)
+        return f"{name} is missing" if missing else f"{name} is missing or cannot be read: {error}"
     return None if found == digest else f"{name} has changed"

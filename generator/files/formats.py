@@ -14,6 +14,7 @@ This is the room's door: code of other rooms imports this file and no other of `
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Final, Literal, get_args
@@ -35,6 +36,7 @@ __all__ = [
     "encode_pieces",
     "encode_preview",
     "libraries_of",
+    "require_plausible",
     "smallest_side",
     "suffix_of",
 ]
@@ -53,6 +55,10 @@ _LIBRARIES: Final[dict[Format, tuple[str, ...]]] = {
 
 _JPEG_QUALITY: Final = 92
 """Of previews, on libjpeg's scale to 100: no blocks are visible."""
+
+
+_DEFLATE_RATIO: Final = 1032
+"""Bytes that deflate makes of one at most (RFC 1951: 258 of two bits)."""
 
 
 def suffix_of(form: Format) -> str:
@@ -184,6 +190,7 @@ def decode_image(data: bytes, form: Format, what: str) -> npt.NDArray[np.uint16]
         from generator.files.dng import half_size
 
         return half_size(decode_raw(data, Path(what)).counts)
+    require_plausible(data, what)
     try:
         image = decode_array(data, form)
     except InputError:
@@ -194,6 +201,39 @@ def decode_image(data: bytes, form: Format, what: str) -> npt.NDArray[np.uint16]
     if image.dtype != np.uint16 or image.ndim != 3 or image.shape[2] != 3:
         raise FormatError(f"{what} holds {image.dtype} {image.shape}, expected uint16 (height, width, 3)")
     return image.astype(np.uint16, copy=False)
+
+
+def require_plausible(data: bytes, what: str) -> None:
+    """Refuse a PNG file that claims more pixels or bytes than it can hold; says nothing of other formats.
+
+    Deflate makes at most 1032 bytes of one (zlib's "Maximum Compression Factor"): a decoder that believed the head
+    would fill memory before it found that there is nothing (ISO/IEC 15948, 5.3 and 11.2.2).
+
+    Parameters
+    ----------
+    data
+        The file's bytes.
+    what
+        Name of the image in messages.
+
+    Raises
+    ------
+    FormatError
+        It does.
+    """
+    if len(data) < 26 or data[:8] != b"\x89PNG\r\n\x1a\n":
+        return
+    width, height, depth, colour = struct.unpack(">IIBB", data[16:26])
+    channels = {2: 3, 4: 2, 6: 4}.get(colour, 1)
+    claimed = height * (1 + width * channels * depth // 8)
+    if claimed > _DEFLATE_RATIO * len(data):
+        raise FormatError(f"{what} claims {width}x{height} px, which its {len(data)} bytes cannot hold; make it again")
+    place = 8
+    while place + 12 <= len(data):
+        (size,) = struct.unpack(">I", data[place : place + 4])
+        if size > len(data) - place - 12:
+            raise FormatError(f"{what} claims {size} bytes where {len(data) - place - 12} are left; make it again")
+        place += size + 12
 
 
 def decode_array(data: bytes, form: Format) -> npt.NDArray[np.generic]:

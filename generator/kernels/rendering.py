@@ -333,6 +333,8 @@ def read_light(lut: Lut, light: int, pixels: int = WHOLE_LIGHT_PIXELS) -> npt.ND
     ------
     InputError
         The table has no such light, or it is no whole number.
+    FormatError
+        Its samples are not those that were measured.
     """
     try:
         number = operator.index(light)
@@ -340,7 +342,7 @@ def read_light(lut: Lut, light: int, pixels: int = WHOLE_LIGHT_PIXELS) -> npt.ND
         raise InputError(f"light {light!r} is no number of a light; give a whole one from 0") from error
     if not 0 <= number < len(lut.samples):
         raise InputError(f"there is no light {number}; the table {lut.folder} has lights 0 to {len(lut.samples) - 1}")
-    mapped = lut.samples[number]
+    mapped = lut.light_samples(number)
     return np.array(mapped) if pixels >= WHOLE_LIGHT_PIXELS else mapped
 
 

@@ -116,7 +116,7 @@ class Mixture:
         if picture is not None and pixels < WHOLE_LIGHT_PIXELS:
             # To find the colours of a large picture takes as long as to mix all.
             colours = colours_in(picture, lut.provenance.bits)
-        tables = [lut.samples[light] for light in self.lights]
+        tables = [lut.light_samples(light) for light in self.lights]
         return mixed_table(tables, self.weights, white_level=lut.provenance.white_level, seed=seed, colours=colours)
 
     def _require(self, lut: Lut) -> None:

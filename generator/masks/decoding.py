@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from foundation.errors import FormatError
+from generator.files.formats import require_plausible
 
 
 def decode_values(file: bytes, what: Path | str) -> npt.NDArray[Any]:
@@ -21,6 +22,7 @@ def decode_values(file: bytes, what: Path | str) -> npt.NDArray[Any]:
     """
     import cv2
 
+    require_plausible(file, str(what))
     data = np.frombuffer(file, np.uint8)
     image = cast("npt.NDArray[Any] | None", cv2.imdecode(data, cv2.IMREAD_UNCHANGED)) if data.size else None
     if image is None or image.ndim not in (2, 3):

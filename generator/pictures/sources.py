@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, Final, Protocol
 import numpy as np
 
 from foundation.errors import FormatError, InputError, StorageError
+from foundation.trust.secret_texts import masked
 from generator import philox
 from generator.pictures.picture import LARGEST_SIDE, UNPREPARED, Cut, Picture, Preparation, open_picture
 from generator.stores.places import DESCRIPTION, filesystem, is_remote, local_path
@@ -97,7 +98,7 @@ class PictureFile:
     @property
     def name(self) -> str:
         """Its name in the dataset: its path below the folder, with hexadecimal escapes for bytes that are no text."""
-        name = self.below or PurePosixPath(self.root.replace(os.sep, "/")).name
+        name = self.below or PurePosixPath(masked(self.root).replace(os.sep, "/")).name
         text = name.encode("utf-8", "surrogateescape").decode("utf-8", "backslashreplace")
         # Many readers of CSV end a line at a carriage return, quoted or not.
         return text.replace("\r", "\\r")

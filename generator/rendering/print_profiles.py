@@ -119,7 +119,7 @@ def profile_of(lut: Lut, light: int) -> PrintProfile:
     ((64, 3), True)
     """
     white = plain(light).white(lut)
-    samples = lut.samples[light]
+    samples = lut.light_samples(light)
     means = samples.mean(axis=1, dtype=np.float64)
     usable = (samples.max(axis=(1, 2)) < lut.provenance.white_level) & ~odd_cells(samples, means)
     # A channel that sees nothing of a cell, in noise about 0, has no relative difference to anything.

@@ -25,7 +25,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, BinaryIO, Final, Protocol, cast
 
 from foundation.errors import CropError, FormatError, StorageError
-from foundation.files import is_partial, partial_path, storage_error, sync_folder
+from foundation.files import is_partial, partial_path, reading_error, storage_error, sync_folder
+from foundation.trust.foreign_folders import is_inside_name, open_inside
+from foundation.trust.secret_texts import masked
 from generator.stores.places import filesystem, is_remote, local_path
 
 Pieces = Iterable[bytes | memoryview]
@@ -44,7 +46,7 @@ class Store(Protocol):
 
     @property
     def place(self) -> str:
-        """The path or URL, as a user writes it."""
+        """The path or URL, as a user writes it but for its secrets; for messages and records."""
         ...
 
     def put(self, name: str, data: bytes | Pieces) -> None:
@@ -140,16 +142,19 @@ class LocalStore:
     @contextmanager
     def open(self, name: str) -> Generator[BinaryIO]:
         """Open a file to be read."""
-        path = self.root / name
         try:
-            with path.open("rb") as stream:
+            # A dataset may be a stranger's, and its lists may name anything.
+            with open_inside(self.root, name) as stream:
                 yield stream
         except OSError as error:
-            raise FormatError(f"cannot read {path}: {error.strerror or error}; make the dataset again") from error
+            raise reading_error(self.root / name, error, "make the dataset again") from error
 
     def has(self, name: str) -> bool:
         """Return whether there is such a file."""
-        return (self.root / name).is_file()
+        try:
+            return is_inside_name(name) and (self.root / name).is_file()
+        except OSError as error:
+            raise reading_error(self.root / name, error, "see that it may be read") from error
 
     def names(self, folder: str = "") -> Iterator[str]:
         """Return the names of all files below `folder`."""
@@ -197,8 +202,8 @@ class RemoteStore:
 
     @property
     def place(self) -> str:
-        """The URL."""
-        return self.url.rstrip("/")
+        """The URL, for people: user, password and other secrets in it are masked."""
+        return masked(self.url.rstrip("/"))
 
     @property
     def _files(self) -> AbstractFileSystem:
@@ -231,12 +236,14 @@ class RemoteStore:
 
     def get(self, name: str) -> bytes:
         """Return an object's bytes."""
+        _require_inside(self.place, name)
         with self._translated_errors(name, reading=True):
             return self._files.cat_file(self._path(name))
 
     @contextmanager
     def open(self, name: str) -> Generator[BinaryIO]:
         """Open an object to be read."""
+        _require_inside(self.place, name)
         with self._translated_errors(name, reading=True):
             stream = self._files.open(self._path(name), "rb")
         with stream:
@@ -270,7 +277,7 @@ class RemoteStore:
         except (CropError, MemoryError):
             raise
         except Exception as error:
-            reason = " ".join(f"{type(error).__name__}: {error}".split())
+            reason = masked(" ".join(f"{type(error).__name__}: {error}".split()))
             if reading:
                 raise FormatError(
                     f"cannot read {self.place}/{name}: {reason}; check the address and that you may read there"
@@ -279,6 +286,24 @@ class RemoteStore:
                 f"cannot write {self.place}/{name}: {reason}; check the address and that you may write there, then run "
                 "the same command again"
             ) from error
+
+
+def _require_inside(place: str, name: str) -> None:
+    if not is_inside_name(name):
+        raise FormatError(
+            f"{place}: {name!r} is no name of a file inside the dataset; it is damaged, or not to be trusted"
+        )
+
+
+def read_bounded(store: Store, name: str, most_bytes: int) -> bytes:
+    """Return the bytes of a file; a FormatError says why they cannot be read, or that there are more than expected."""
+    with store.open(name) as stream:
+        data = stream.read(most_bytes + 1)
+    if len(data) > most_bytes:
+        raise FormatError(
+            f"{store.place}/{name} has more than {most_bytes} bytes, which no dataset's has; it is damaged"
+        )
+    return data
 
 
 def joined(pieces: Pieces) -> bytes:

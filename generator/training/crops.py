@@ -257,6 +257,8 @@ class Crops:
         ------
         InputError
             There is no such item, or `out` is of another shape or type.
+        FormatError
+            Samples of the table are not those that were measured; each light is looked at when it is first used.
         """
         numbers = np.asarray(items, dtype=np.int64)
         if numbers.ndim != 1 or not numbers.size or numbers.min() < 0 or numbers.max() >= self.length:
@@ -270,6 +272,9 @@ class Crops:
         windows[:, 0], windows[:, 1] = _below(across, free[:, 1]), _below(down, free[:, 0])
         windows[:, 2:] = width, height
         lights = _below(light, len(self.lights))
+        for used in set(map(int, lights)):
+            for number in self.lights[used].lights:
+                self.lut.require_unchanged(number)
         least, most = np.log2(self.exposure)
         gains = np.exp2(least + (most - least) * (stops / 2.0**32))
         seeds = low.astype(np.uint64) | high.astype(np.uint64) << _HALF

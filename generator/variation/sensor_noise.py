@@ -105,7 +105,7 @@ def measured_noise(lut: Lut) -> SensorNoise:
     means: list[npt.NDArray[np.float64]] = []
     variances: list[npt.NDArray[np.float64]] = []
     for light in map(int, lights):
-        samples = np.delete(np.asarray(lut.samples[light]), unfit, axis=0)
+        samples = np.delete(np.asarray(lut.light_samples(light)), unfit, axis=0)
         samples = samples[(samples > 0).all(axis=(1, 2))].astype(np.float32)
         if count > 1:
             means.append(samples.mean(axis=1, dtype=np.float64))

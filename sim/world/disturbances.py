@@ -19,6 +19,7 @@ from typing import Annotated, Any, ClassVar, Final, Literal, get_args
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
+from pydantic_core import ErrorDetails
 
 from drivers.presenter import BLACK, Colour
 from foundation.errors import ConfigurationError
@@ -421,8 +422,33 @@ def read_disturbances(listed: Sequence[Any], where: str, key: str = "simulated.e
         first = error.errors()[0]
         place = [part for part in first["loc"] if part not in KINDS]
         at = ".".join([f"{key}[{place[0]}]" if place else key, *(str(part) for part in place[1:])])
-        hint = f"; known are {', '.join(KINDS)}" if first["type"].startswith("union_tag") else ""
-        raise ConfigurationError(f"{where}: {at}: {first['msg']}, got {first['input']!r}{hint}") from error
+        raise ConfigurationError(f"{where}: {at}{_said_of(first)}") from error
+
+
+def _said_of(fault: ErrorDetails) -> str:
+    """Return what is wrong with a table or a key of it, behind its place, and what is expected."""
+    given = f" = {fault['input']!r}"
+    kinds = ", ".join(KINDS)
+    known = {"union_tag_not_found": f"{given} does not say what happens; add what, one of {kinds}"}
+    known["union_tag_invalid"] = f"{given}: there is no such event; what is one of {kinds}"
+    known["extra_forbidden"] = known["unexpected_keyword_argument"] = " is no key of this event; remove it"
+    known["missing"] = " is missing; add it"
+    for words, expected in _EXPECTED.items():
+        if fault["type"].startswith(words):
+            return f"{given}: {expected} is expected; correct it"
+    return known.get(fault["type"], f"{given}: {fault['msg'].removeprefix('Value error, ')}; correct it")
+
+
+_EXPECTED: Final = {
+    "float_": "a number",
+    "int_": "a whole number",
+    "bool_": "true or false",
+    "tuple_type": "a list of numbers",
+    "too_": "a shorter list",
+    "dataclass_type": "a table",
+    "model_attributes_type": "a table",
+}
+"""What a value should have been, by the first words of the kind of fault."""
 
 
 def drawn(seed: int, frames: int, count: int, kinds: Iterable[str] = KINDS) -> Disturbances:

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import math
+import os
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
-from acquisition.config import LabSettings, load_lab, parse_lab, target_label
+from acquisition.config import LabSettings, load_lab, parse_lab
 from acquisition.run.shutter import require_whole_turns
 from foundation.errors import ConfigurationError
+from foundation.trust.secret_texts import target_label
 
 MINIMAL = 'rig = "simulated"\nchart = "c/chart.json"\nilluminations = "lights.csv"\n'
 
@@ -175,3 +178,80 @@ def test_a_missing_file_is_named(tmp_path: Path) -> None:
 def test_the_examples_are_read(name: str) -> None:
     settings = load_lab(Path(__file__).parents[2] / "examples" / name)
     require_whole_turns(settings.camera, settings.lab.projector)
+
+
+REAL = (
+    MINIMAL.replace("simulated", "lab")
+    + """
+[lab.projector]
+control = "pjlink"
+host = "h"
+"""
+)
+
+
+@pytest.fixture
+def lab_with(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Path]:
+    """Return a maker of a LAB.toml beside a file with a secret in it."""
+    monkeypatch.setenv("PJLINK", "s3cret-env")
+    monkeypatch.delenv("NOWHERE", raising=False)
+    (tmp_path / "word.txt").write_bytes(b"\xef\xbb\xbf s3cret-file \r\nsecond line\n")
+    (tmp_path / "empty.txt").write_text("\ns3cret")
+    (tmp_path / "binary").write_bytes(b"\xff\xfes3cret")
+    os.mkfifo(tmp_path / "pipe")
+
+    def make(line: str, text: str = REAL) -> Path:
+        path = tmp_path / "LAB.toml"
+        path.write_text(text + line + "\n")
+        return path
+
+    return make
+
+
+@pytest.mark.parametrize(
+    ("line", "found"),
+    [
+        ('password = "s3cret-key"', "s3cret-key"),
+        ('password = { env = "PJLINK" }', "s3cret-env"),
+        ('password = { file = "word.txt" }', "s3cret-file"),
+    ],
+)
+def test_a_secret_is_found_where_the_settings_say(lab_with: Callable[..., Path], line: str, found: str) -> None:
+    settings = load_lab(lab_with(line))
+    assert settings.lab.projector.password == found
+    assert "s3cret" not in settings.to_toml()
+    assert "s3cret" not in repr(settings)
+    notify = REAL + "[sequence]\n" + line.replace("password", "notify")
+    assert load_lab(lab_with("", notify)).sequence.notify == found
+
+
+@pytest.mark.parametrize(
+    ("place", "expected"),
+    [
+        ('{ env = "NOWHERE" }', "the environment has no NOWHERE; set it"),
+        ('{ file = "gone.txt" }', "gone.txt: No such file or directory; name a readable file"),
+        ('{ file = "empty.txt" }', "the first line of .*empty.txt is empty"),
+        ('{ file = "binary" }', "binary: it is no text; name a readable file"),
+        ('{ file = "pipe" }', "pipe is no file; name one"),
+        ('{ env = "PJLINK", file = "word.txt" }', "and nothing beside"),
+        ("{ env = 3 }", "expected the text itself"),
+        ("{}", "expected the text itself"),
+    ],
+)
+def test_a_secret_that_is_not_there_is_named(lab_with: Callable[..., Path], place: str, expected: str) -> None:
+    with pytest.raises(ConfigurationError, match=rf"lab\.projector\.password: .*{expected}") as caught:
+        load_lab(lab_with(f"password = {place}"))
+    assert "s3cret" not in str(caught.value)
+
+
+def test_nobody_needs_a_password_to_rehearse(lab_with: Callable[..., Path]) -> None:
+    settings = load_lab(lab_with('password = { env = "NOWHERE" }', REAL.replace('"lab"', '"simulated"')))
+    assert settings.lab.projector.password is None
+
+
+@pytest.mark.parametrize("line", ['[lab]\nprojector = "s3cret"', '[[lab.projector]]\npassword = "s3cret"'])
+def test_what_holds_a_secret_is_not_shown_either(line: str) -> None:
+    with pytest.raises(ConfigurationError) as caught:
+        parse_lab(MINIMAL + line, "LAB.toml")
+    assert "s3cret" not in str(caught.value)
+    assert caught.value.__cause__ is None

@@ -104,7 +104,7 @@ def test_a_published_table_comes_back_byte_by_byte(lut: Path, command: Command, 
     assert f"{len(LIGHTS)} lights" in out
     code, out, _ = command("--fetch", tmp_path / "published", tmp_path / "fetched")
     assert code == 0
-    assert "every byte is as it was published" in out
+    assert "every file is as its own hashes say" in out
     assert (tmp_path / "fetched" / "samples.npy").read_bytes() == (lut / "samples.npy").read_bytes()
     code, _, err = command("--fetch", tmp_path / "nothing", tmp_path / "again")
     assert code == 2

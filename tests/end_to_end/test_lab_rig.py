@@ -44,8 +44,10 @@ from sim.projectors.projector import SimulatedProjector
 from sim.projectors.screen import Screen, SimulatedPresenter
 from sim.projectors.serial import PEERS, BenqPeer, EpsonPeer
 from sim.world.world import World
+from tests.found_texts import files_with
 
 FRAMES = 10
+PASSWORD = "pj-5ecret-word"
 ROOM = """
 [camera]
 shutter_s = 0.1
@@ -106,9 +108,11 @@ def test_a_real_lab_takes_the_frames_of_the_simulated_one(
         text = text.replace("[sequence]\n", "[sequence]\nsettle_s = 0.0\nwarm_up_s = 0.0\n")
         if cables == "network":
             _, port = opened.enter_context(serve_ptpip(eos, 0)).address
-            _, control = opened.enter_context(serve_pjlink(beamer, 0, "secret")).address
+            _, control = opened.enter_context(serve_pjlink(beamer, 0, PASSWORD)).address
+            monkeypatch.setenv("LAB_PROJECTOR", PASSWORD)
             text += f'[lab.camera]\nconnection = "ptpip"\nhost = "127.0.0.1"\nport = {port}\n'
-            text += f'[lab.projector]\ncontrol = "pjlink"\nhost = "127.0.0.1"\nport = {control}\npassword = "secret"\n'
+            text += f'[lab.projector]\ncontrol = "pjlink"\nhost = "127.0.0.1"\nport = {control}\n'
+            text += 'password = { env = "LAB_PROJECTOR" }\n'
         else:
             bus.plug(PtpUsbDevice(eos))
             terminal = opened.enter_context(PseudoTerminal(PEERS["benq"](beamer)))
@@ -119,6 +123,7 @@ def test_a_real_lab_takes_the_frames_of_the_simulated_one(
         assert run_session(load_lab(lab), folder / "real", lambda done, total: None).complete
         assert beamer.power() is not Power.ON, "a complete session switches the lamp off"
         assert look() == Colour(0, 0, 0), "the screen is black when the lab is left"
+    assert files_with(folder / "real", PASSWORD) == []
     with Session.open(folder / "simulated") as simulated, Session.open(folder / "real") as real:
         pairs = list(zip(simulated.frames(), real.frames(), strict=True))
         assert len(pairs) == FRAMES

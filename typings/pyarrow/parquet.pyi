@@ -23,9 +23,23 @@ class ParquetWriter:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None: ...
 
+class RowGroupMetaData:
+    num_rows: int
+    total_byte_size: int
+
+class FileMetaData:
+    def row_group(self, i: int) -> RowGroupMetaData: ...
+
 class ParquetFile:
     num_row_groups: int
     schema_arrow: Schema
-    def __init__(self, source: str | BinaryIO) -> None: ...
+    metadata: FileMetaData
+    def __init__(
+        self,
+        source: str | BinaryIO,
+        *,
+        thrift_string_size_limit: int | None = None,
+        thrift_container_size_limit: int | None = None,
+    ) -> None: ...
     def read_row_group(self, i: int, columns: Sequence[str] | None = None) -> Table: ...
     def read(self, columns: Sequence[str] | None = None) -> Table: ...

@@ -264,7 +264,9 @@ function drawChoice(frames) {
   );
   $("checks").tBodies[0].replaceChildren(
     ...(frame.checks ?? []).map(([name, unit, value, low, high, reason]) => {
-      const found = value !== null ? withUnit(value, unit) : reason ? "refused" : "no fault";
+      const beyond = value !== null && ((low !== null && value < low) || (high !== null && value > high));
+      const mark = beyond && !reason ? " beyond its limit: it follows from another cause, or is followed" : "";
+      const found = value !== null ? `${withUnit(value, unit)}${mark}` : reason ? "refused" : "no fault";
       return element(
         "tr",
         reason ? { class: "bad" } : {},

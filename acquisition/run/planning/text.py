@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 
-from acquisition.config import LabSettings, target_label
+from acquisition.config import LabSettings
 from acquisition.run.planning.answers import Answers
 from acquisition.run.planning.plan import RunPlan, is_offered
 from acquisition.run.planning.sizes import RETAKEN_SHARE, bytes_text
@@ -13,6 +13,7 @@ from acquisition.run.shutter import holds_whole_turns, light_period_s
 from acquisition.session.plan import KINDS
 from acquisition.session.progress import duration_text
 from foundation.errors import counted
+from foundation.trust.secret_texts import target_label
 
 
 def plan_lines(plan: RunPlan) -> tuple[str, ...]:

@@ -29,7 +29,7 @@ from typing import TypeVar
 
 from acquisition.config import LabSettings
 from acquisition.run.devices import Devices
-from acquisition.run.lamp import await_health, health_fault
+from acquisition.run.lamp import HealthWatch, await_health
 from acquisition.run.patience import Patience, Pause, is_curable
 from acquisition.run.taking.agenda import Agenda, step_name
 from acquisition.run.taking.following import followed_changes
@@ -146,6 +146,8 @@ class Pipeline:
         self._void_ahead: dict[int, str] = {}
         self._pauses: dict[str, Pause] = {}
         self._begun_after = max((attempt.id for attempt in session.journal.attempts()), default=0)
+        self._health = HealthWatch(devices.projector, devices.clock)
+        self._doubtful = False
         self._lasting = ""
         self._lasts_for: SessionStep | None = None
         self._probing: tuple[Pause, float] | None = None
@@ -197,7 +199,7 @@ class Pipeline:
         # While it is doubtful whether frames can be had at all, one is taken at a time.
         ahead = 0 if self._probing else AHEAD
         following = self._show_following() if ahead else None
-        attempt = replace(attempt, checks=(*attempt.checks, *self._projector_check()))
+        attempt = replace(attempt, checks=(*attempt.checks, *self._projector_check(attempt.step)))
         self._hand_over(attempt)
         self._collect(ahead)
         if attempt.device_fault:
@@ -263,11 +265,12 @@ class Pipeline:
             return (Check("screen", reason=str(error)),)
         return (Check("screen"),)
 
-    def _projector_check(self) -> tuple[Check, ...]:
+    def _projector_check(self, step: SessionStep) -> tuple[Check, ...]:
         """Ask the projector for its health; it answers while the next light settles."""
         if self._devices.projector is None:
             return ()
-        fault = health_fault(self._devices.projector)
+        fault = self._health.fault(thorough=step.kind == "dark" or self._doubtful)
+        self._doubtful = False
         return (Check("projector", reason="" if fault is None else str(fault)),)
 
     def _hand_over(self, attempt: _Attempt) -> None:
@@ -415,6 +418,7 @@ class Pipeline:
         return step.kind == "light" or step.number == self._lasts_for.number
 
     def _refuse(self, step: SessionStep, judgement: Judgement) -> None:
+        self._doubtful = True
         first = judgement.lasting or (judgement.voids and step.kind in REFERENCES)
         again = self._agenda.refuse(step, judgement.reason, before_others=first)
         # What would be taken again without a good reference would be voided again, all night.
@@ -484,4 +488,4 @@ class Pipeline:
 
 def of_disk(fault: CropError) -> bool:
     """Return whether a fault is one of the disk."""
-    return isinstance(fault, StorageError)
+    return isinstance(fault, StorageError) and is_curable(fault)

@@ -1,11 +1,13 @@
 """Whether the raw files of a session are still what was taken: their bytes against the hashes in the journal.
 
 What is missing, cut off or altered is found by its cause; the session voids it (`Session.verify`), so that the next
-run takes it again. Nothing is deleted. A file that cannot be read stops the check: it may be sound, the cable loose.
+run takes it again. Nothing is deleted. A few files that the disk does not read are taken again, too; where it
+fails at more, or permissions are in the way, files may be sound, and an error names them when all were looked at.
 """
 
 from __future__ import annotations
 
+import errno
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -14,6 +16,9 @@ from foundation.errors import FormatError, StorageError
 from foundation.files import storage_error
 from foundation.hashing import file_sha256
 from foundation.processors import ordered_map, processor_count
+
+MOST_UNREADABLE = 3
+"""Files that the disk does not read (EIO) and that are given up: bad sectors are few; of a loose cable all are."""
 
 MOST_THREADS = 8
 """Files hashed at a time at most: chosen; SHA-256 runs at .5 to 2 GB/s a thread, faster together than any disk."""
@@ -36,7 +41,7 @@ def unsound_files(folder: Path, frames: Sequence[AcceptedFile], observe: Callabl
     FormatError
         The folder of the frames is missing.
     StorageError
-        A file is there and cannot be read.
+        Files are there and cannot be read, more than `MOST_UNREADABLE` of them, or for another reason than the disk's.
     """
     try:
         require_frames_folder(folder)
@@ -46,10 +51,15 @@ def unsound_files(folder: Path, frames: Sequence[AcceptedFile], observe: Callabl
     threads = min(processor_count(), MOST_THREADS)
     observe(0, len(frames))
     reasons = ordered_map(lambda frame: _fault(folder, frame), frames, threads)
+    unread: list[tuple[AcceptedFile, OSError]] = []
     for done, (frame, reason) in enumerate(zip(frames, reasons, strict=True), 1):
-        if reason:
+        if isinstance(reason, OSError):
+            unread.append((frame, reason))
+            found[frame.attempt] = f"{frame.file} cannot be read: {reason.strerror}; it is taken again"
+        elif reason:
             found[frame.attempt] = reason
         observe(done, len(frames))
+    _require_readable(folder, unread)
     newest = {frame.step: frame for frame in frames if frame.attempt not in found}
     for frame in frames:
         if frame.attempt not in found and newest[frame.step] is not frame:
@@ -74,8 +84,21 @@ def require_frames_folder(folder: Path) -> None:
         )
 
 
-def _fault(folder: Path, frame: AcceptedFile) -> str:
-    """Return what is wrong with a frame's file; empty if nothing is."""
+def _require_readable(folder: Path, unread: Sequence[tuple[AcceptedFile, OSError]]) -> None:
+    """Refuse files that cannot be read where they may be sound: their frames are not given up for a cable."""
+    others = [(frame, error) for frame, error in unread if error.errno != errno.EIO]
+    lasting = others or (unread if len(unread) > MOST_UNREADABLE else ())
+    if lasting:
+        frame, error = lasting[0]
+        more = f" and {len(lasting) - 1} more" if lasting[1:] else ""
+        raise StorageError(
+            f"cannot read {folder / frame.file}{more}: {error.strerror}; check the disk, its cable and the "
+            "permissions, or remove the files to have their frames taken again, then run the same command again"
+        ) from error
+
+
+def _fault(folder: Path, frame: AcceptedFile) -> str | OSError:
+    """Return what is wrong with a frame's file, or why it cannot be read; empty if nothing is."""
     path = folder / frame.file
     try:
         size = path.stat().st_size
@@ -85,8 +108,5 @@ def _fault(folder: Path, frame: AcceptedFile) -> str:
     except (FileNotFoundError, NotADirectoryError, IsADirectoryError):
         return f"{frame.file} is missing; it is taken again"
     except OSError as error:
-        raise StorageError(
-            f"cannot read {path}: {error.strerror}; check the disk and the file's permissions, or remove the file to "
-            "have its frame taken again, then run the same command again"
-        ) from error
+        return error
     return f"{frame.file} has changed since it was taken: its SHA-256 is another; it is taken again" if changed else ""

@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from foundation.errors import InputError
+from foundation.trust.secret_texts import masked_values
 from foundation.version import software
 from generator.dataset.production.layouts.by_name import require_libraries
 from generator.dataset.production.options import DatasetOptions
@@ -173,7 +174,8 @@ class Plan:
             recorded["variation"] = options.variation.describe()
         if options.crops > 1:
             recorded["crops"] = options.crops
-        return json.loads(json.dumps(recorded))
+        # A data set is published: addresses in it have no secrets.
+        return json.loads(json.dumps(masked_values(recorded)))
 
 
 def split_of(shares: tuple[float, float, float] | None, seed: int, sha256: str | None, name: str) -> Split | None:

@@ -9,7 +9,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any, Final, Literal
 
-from pydantic import BaseModel, ConfigDict, SerializerFunctionWrapHandler, model_serializer
+from pydantic import BaseModel, ConfigDict, Field, SerializerFunctionWrapHandler, model_serializer
+
+from generator.files.formats import Format
 
 FORMAT: Final = "crop.dataset"
 VERSION: Final = 2
@@ -48,6 +50,15 @@ class _RecordWithOptional(_Record):
         return {key: value for key, value in serialise(self).items() if value is not None or key not in left_out}
 
 
+class ReadingOptions(_Record):
+    """What of the options of a dataset its readers need; they refuse values that no dataset is made with."""
+
+    format: Format
+    layout: Layout = "folder"
+    previews: bool
+    shard_images: int = Field(default=256, ge=1, le=1 << 32)
+
+
 class TableRecord(_RecordWithOptional):
     """The table a dataset was made from; `sha256` as `calibration.table.lut.Lut.sha256`.
 
@@ -57,9 +68,9 @@ class TableRecord(_RecordWithOptional):
 
     sha256: str
     camera: str
-    bits: int
-    samples: int
-    white_level: int
+    bits: int = Field(ge=1, le=8)
+    samples: int = Field(ge=1)
+    white_level: int = Field(ge=1, le=65535)
     software: str
     computed: dict[str, Any] | None = None
 
@@ -207,11 +218,11 @@ class Description(_Record):
     table: TableRecord
     seed: int
     options: dict[str, Any]
-    planned: int
-    images: int
-    sources: int
-    pixels: int
-    replaced_pixels: int
+    planned: int = Field(ge=0, le=1 << 32)
+    images: int = Field(ge=0, le=1 << 32)
+    sources: int = Field(ge=0, le=1 << 32)
+    pixels: int = Field(ge=0)
+    replaced_pixels: int = Field(ge=0)
     splits: dict[str, int] = {}
     lights: list[Light]
     skipped: list[Skipped]

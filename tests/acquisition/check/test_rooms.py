@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from acquisition.chart.layout import paper_chart
@@ -15,8 +16,9 @@ from acquisition.check.check import CheckOptions, check_lab
 from acquisition.check.findings import CheckReport, Finding
 from acquisition.cli import main
 from acquisition.config import load_lab
-from sim.world.wear import Stain
-from sim.world.world import World
+from sim.world import world
+from sim.world.room import Room
+from sim.world.wear import Stain, worn
 from tests.acquisition.check.conftest import Check, lab_toml
 
 UNTOLD = {"battery", "card", "noise reduction"}
@@ -44,12 +46,11 @@ def test_a_good_room_has_nothing_to_remark_on(check: Check, bits: int, seed: int
 @pytest.mark.parametrize(
     ("room", "bad", "grade", "said"),
     [
-        ({"white_level_share": 0.02}, "exposure", "fault", "set camera.shutter_s = "),
-        ({"white_level_share": 0.93}, "exposure", "fault", "set camera.shutter_s = 0.4 (tried: 7"),
-        ({"ambient": 0.04}, "room light", "fault", "with the picture muted: the room's light"),
+        ({"white_level_share": 0.02}, "exposure", "remark", "set camera.shutter_s = "),
+        ({"white_level_share": 0.93}, "exposure", "remark", "set camera.shutter_s = 0.4 (tried: 7"),
+        ({"ambient": 0.07}, "room light", "fault", "with the picture muted: the room's light"),
         ({"black_leak": 0.01}, "room light", "remark", "the projector's black"),
         ({"vignetting": 0.7, "projector_falloff": 0.5}, "evenness", "remark", "lens and projector together"),
-        ({"blur_px": 1.1}, "sharpness", "fault", "focus the lens"),
         ({"roll_deg": 180.0}, "turn", "remark", "upside down, turned by 180°"),
         ({"roll_deg": 8.0, "fill": 0.8}, "turn", "remark", "its rows +8.0°"),
         ({"pan_deg": 14.0, "fill": 0.8}, "tilt", "remark", "right and top nearer"),
@@ -61,7 +62,31 @@ def test_a_room_with_one_thing_wrong(check: Check, room: dict[str, Any], bad: st
     found = of(report, bad)
     assert found.grade == grade
     assert said in found.sentence()
-    assert not_good(report) == {bad}
+    # A field that falls off so far leaves more of the references beside it, which the verdict remarks on as well.
+    # So does the darkest light of a plan where white is dim.
+    also = {
+        "evenness": {"references"},
+        "exposure": {"darkest light"} if "darkest light" in not_good(report) else set[str](),
+    }
+    assert not_good(report) == {bad} | also.get(bad, set())
+
+
+def test_blur_is_judged_by_what_it_does_to_cells_of_their_size(check: Check) -> None:
+    small, large = (of(check(bits, blur_px=1.05), "sharpness") for bits in (3, 2))
+    assert (small.grade, large.grade) == ("fault", "good")
+    assert "focus the lens" in small.remedy
+    assert small.details["cell_px"] < large.details["cell_px"]
+
+
+def test_what_is_not_known_yet_is_named(check: Check) -> None:
+    report = check(3)
+    assert report.foretold == "accept"
+    assert {"white_drift", "off_codes_deg", "agreement"} <= set(report.not_known)
+    assert "not known before the session: " in report.lines()[-1]
+    assert ", white drift, " in report.lines()[-1]
+    table = json.loads(report.to_json())["table"]
+    assert table["outcome"] == "accept"
+    assert table["figures"]["cell_px"] > 8.6
 
 
 @pytest.mark.parametrize("room", [{"vignetting": 0.4}, {"ambient": 0.003}, {"blur_px": 0.65}, {"wheel_hz": 60.0}])
@@ -72,7 +97,7 @@ def test_the_right_side_of_a_limit(check: Check, room: dict[str, Any]) -> None:
 def test_a_light_that_falls_off_by_80_per_cent(check: Check) -> None:
     report = check(3, projector_falloff=0.8)
     found = of(report, "evenness")
-    assert found.grade == "fault"
+    assert found.grade == "remark"
     assert found.value == pytest.approx(0.85, abs=0.07)
     stains = of(report, "stains")
     assert stains.grade == "good" or "may be an edge of the light" in stains.said
@@ -88,7 +113,8 @@ def test_a_room_in_which_white_saturates_at_every_time(check: Check) -> None:
 
 def test_a_dark_room_is_not_called_saturated(check: Check) -> None:
     report = check(2, white_level_share=0.0002)
-    assert of(report, "exposure").grade == "fault"
+    assert of(report, "exposure").grade == "remark"
+    assert of(report, "darkest light").grade == "fault"
     assert not of(report, "exposure").details["saturation_measured"]
     assert "lower f-number" in of(report, "exposure").remedy
     assert of(report, "clipping").grade == "good"
@@ -97,13 +123,13 @@ def test_a_dark_room_is_not_called_saturated(check: Check) -> None:
 def test_a_dim_projector_with_stray_light(check: Check) -> None:
     report = check(2, white_level_share=0.02, ambient=0.025)
     assert of(report, "exposure").details["proposed_shutter_s"] > 10
-    assert of(report, "room light").grade == "fault"
+    assert of(report, "room light").grade == "remark"
 
 
 @pytest.mark.parametrize("bits", [1, 2, 3])
 def test_a_stain_of_60_mm_is_told(check: Check, bits: int) -> None:
     found = of(check(bits, stain_mm=60.0), "stains")
-    assert found.grade == "fault"
+    assert found.grade == "remark"
     assert found.details["spots"][0]["size_mm"] == pytest.approx(65, abs=18)
 
 
@@ -116,13 +142,13 @@ def test_a_faint_thumb_s_stain_has_place_and_size(check: Check) -> None:
 
 
 def test_a_stained_corner_is_no_falloff(check: Check, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    whole = World._wear  # pyright: ignore[reportPrivateUsage]
+    whole = worn
 
-    def stained(world: World) -> Any:
-        width, height = world.sheet.page_mm
-        return Stain((width - 36, height - 30), 26.0, (0.8, 0.7, 0.5)), whole(world)[1]
+    def stained(room: Room, page_mm: tuple[float, float], random: np.random.Generator) -> Any:
+        width, height = page_mm
+        return Stain((width - 36, height - 30), 26.0, (0.8, 0.7, 0.5)), whole(room, page_mm, random)[1]
 
-    monkeypatch.setattr(World, "_wear", stained)
+    monkeypatch.setattr(world, "worn", stained)
     report = check(3)
     (spot,) = of(report, "stains").details["spots"]
     width, height = load_chart(folder / "chart3.json").page_mm
@@ -131,7 +157,7 @@ def test_a_stained_corner_is_no_falloff(check: Check, folder: Path, monkeypatch:
 
 
 def test_a_fold_is_told(check: Check) -> None:
-    assert of(check(3, fold_mm=5.0), "stains").grade == "fault"
+    assert of(check(3, fold_mm=5.0), "stains").grade == "remark"
 
 
 def test_partial_turns_of_a_wheel_are_told(check: Check) -> None:
@@ -179,7 +205,7 @@ def test_the_command_prints_faults_first_and_ends_with_4(
     folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     lab = folder / "command.toml"
-    lab.write_text(lab_toml("chart2.json", ambient=0.05, black_leak=0.0))
+    lab.write_text(lab_toml("chart2.json", ambient=0.07, black_leak=0.0))
     picture = tmp_path / "check.png"
     assert main(["check", str(lab), "--picture", str(picture)]) == 4
     printed = capsys.readouterr()
@@ -210,7 +236,7 @@ def test_a_recording_is_judged_as_it_was_taken(folder: Path, tmp_path: Path) -> 
         f"[replay]\nsession = {json.dumps(str(tmp_path / 'session'))}\n"
     )
     report = check_lab(load_lab(replay))
-    assert of(report, "exposure").grade in ("fault", "remark")
+    assert of(report, "exposure").grade == "remark"
     assert "cannot be exposed anew" in of(report, "exposure").remedy
     for name in ("brightest light", "additivity", "flicker", "brightness"):
         assert of(report, name).grade == "not checked", name

@@ -5,16 +5,17 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from itertools import pairwise
+from typing import cast
 
 import pytest
 
 from acquisition.config import SequenceSettings
-from acquisition.run.lamp import POWER_LIMIT_S, RELIGHT_S, await_health, make_ready, require_healthy
+from acquisition.run.lamp import POWER_LIMIT_S, RELIGHT_S, HealthWatch, await_health, make_ready, require_healthy
 from acquisition.run.patience import PAUSE_S, Patience
 from drivers.links.link import Link
 from drivers.pjlink.projector import PjLinkProjector
 from drivers.pjlink.wire import NoResolution
-from drivers.projector import Fault, Lamp, Power, Severity
+from drivers.projector import Fault, Lamp, Power, Projector, Severity
 from drivers.serial_projectors.optoma import OptomaProjector
 from foundation.errors import DeviceFault, LinkClosed, LinkTimeout
 from sim.buses.serial_cable import SerialPeerLink
@@ -274,3 +275,66 @@ def test_a_picture_muted_for_good_ends_the_run_with_its_cause() -> None:
     with pytest.raises(DeviceFault, match=r"muted; .*; the run waited 10 min 00 s"):
         await_health(room.projector, SEQUENCE, room.patience)
     assert room.clock.monotonic() == pytest.approx(600)
+
+
+class Slow:
+    """A projector that takes its time, and says what it was asked."""
+
+    def __init__(self, clock: SimulatedClock, answer_s: float) -> None:
+        self.clock, self.answer_s = clock, answer_s
+        self.asked: list[str] = []
+        self.is_muted = False
+
+    def _ask(self, what: str) -> None:
+        self.clock.sleep(self.answer_s)
+        self.asked.append(what)
+
+    def power(self) -> Power:
+        self._ask("power")
+        return Power.ON
+
+    def muted(self) -> bool:
+        self._ask("muted")
+        return self.is_muted
+
+    def faults(self) -> tuple[Fault, ...]:
+        self._ask("faults")
+        return ()
+
+    def picture_fault(self) -> str | None:
+        self._ask("picture")
+        return None
+
+
+ALL = ["faults", "power", "muted", "picture"]
+
+
+@pytest.mark.parametrize(("answer_s", "asked"), [(0.004, ALL), (0.02, ["faults"])])
+def test_a_slow_projector_is_asked_in_turn(answer_s: float, asked: list[str]) -> None:
+    clock = SimulatedClock()
+    projector = Slow(clock, answer_s)
+    watch = HealthWatch(cast("Projector", projector), clock)
+    assert watch.fault(thorough=False) is None
+    assert projector.asked == ALL, "what it costs is not known before"
+    projector.asked.clear()
+    clock.sleep(2.3)
+    assert watch.fault(thorough=False) is None
+    assert projector.asked == asked
+    projector.asked.clear()
+    assert watch.fault(thorough=True) is None
+    assert projector.asked == ALL
+
+
+def test_what_a_slow_projector_reports_is_known_within_a_round() -> None:
+    clock = SimulatedClock()
+    projector = Slow(clock, 0.1)
+    watch = HealthWatch(cast("Projector", projector), clock)
+    watch.fault(thorough=False)
+    projector.is_muted = True
+    said: list[str] = []
+    for _ in range(len(ALL)):
+        clock.sleep(2.0)
+        said.append(str(watch.fault(thorough=False) or ""))
+    assert [sentence for sentence in said if sentence] == [
+        "the projector's picture is muted; release mute on its remote control"
+    ]

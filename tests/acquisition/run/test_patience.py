@@ -17,6 +17,7 @@ from acquisition.lights.illuminations import Illumination
 from acquisition.run.patience import PAUSE_S, RETRY_S, Patience
 from acquisition.run.rig.opening import open_rig
 from acquisition.session.folder import Session
+from acquisition.session.journal_file import HeldJournalError
 from acquisition.session.plan import plan_steps
 from drivers.camera import keep_awake
 from drivers.presenter import WHITE
@@ -302,3 +303,14 @@ def test_a_full_disk_never_loses_the_frame_in_the_camera(tmp_path: Path) -> None
     assert received.captured.released_at == released_at
     assert read_raw(received.path).counts.size > 0
     assert [path.name for path in session.frames_folder.iterdir()] == [received.path.name]
+
+
+def test_a_journal_that_another_program_held_for_the_whole_patience_is_not_waited_for_again() -> None:
+    def held() -> None:
+        raise HeldJournalError("cannot write journal.sqlite: database is locked")
+
+    clock = SimulatedClock()
+    begun = clock.monotonic()
+    with pytest.raises(StorageError, match="database is locked"):
+        Patience(clock, 600).attempt(held, "the disk")
+    assert clock.monotonic() == begun

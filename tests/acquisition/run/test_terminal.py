@@ -16,6 +16,8 @@ STEP = SessionStep(7, "light", 5, Colour(1, 2, 3))
 def test_the_verdict_has_its_numbers() -> None:
     checks = (Check("file"), Check("movement", 0.031, None, 0.2, "px"), Check("light", 0.2134, None, 0.5, "°"))
     assert verdict_line(Taken(STEP, Judgement(checks), 3)) == "light 5 accepted, light 0.213°, movement 0.031 px"
+    followed = Judgement((Check("lamp", -4.0, -1.0, 1.0, "%"), Check("light", 0.7, None, 0.5, "°")))
+    assert verdict_line(Taken(STEP, followed, 3)) == "light 5 accepted, light 0.7° (beyond its limit)"
     dark = Judgement((Check("exposure", 0.4, None, None, "%", "too dark"),))
     assert verdict_line(Taken(STEP, dark, 3)) == "light 5 refused, exposure 0.4 %"
 
@@ -34,6 +36,10 @@ def test_the_time_left_is_that_of_the_last_frames_without_pauses() -> None:
     now[0] += 2
     left.taken()
     assert left.left_s(10) == 20
+    for _ in range(6):
+        now[0] += 2
+        left.taken(accepted=False)
+    assert left.left_s(10) == 40, "each frame costs two attempts of late, as the page has it"
 
 
 def test_lines_stay_where_there_is_no_terminal(capsys: pytest.CaptureFixture[str]) -> None:

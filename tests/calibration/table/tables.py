@@ -20,8 +20,10 @@ FRAMES = [SourceFrame("white", None, "frames/0000_white.dng", "00" * 32)] + [
 ]
 
 
-def write(folder: Path, seed: int = 0, chart: str = "cd" * 32, lights: int = len(LIGHTS)) -> Lut:
-    folder.mkdir()
+def write(folder: Path, seed: int = 0, chart: str = "cd" * 32, lights: int = len(LIGHTS), report: str = "") -> Lut:
+    folder.mkdir(exist_ok=bool(report))
+    if report:
+        (folder / "report.html").write_text(report)
     writer = LutWriter(folder, lights, 8, 25)
     values = np.random.default_rng(seed).integers(0, 14000, (lights, 8, 25, 3), dtype=np.uint16)
     for light in reversed(range(lights)):

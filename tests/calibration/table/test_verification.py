@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import json
+import os
 import shutil
+import subprocess
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
+from calibration.table.description import describe
 from calibration.table.lut import Lut, open_lut
 from calibration.table.verification import find_faults, require_match
 from foundation.errors import FormatError
@@ -22,6 +26,35 @@ def spoil_the_frames(folder: Path) -> None:
     (folder / "frames.csv").write_text("a\nb\n")
 
 
+def lose(name: str) -> Callable[[Path], None]:
+    return lambda folder: (folder / name).unlink()
+
+
+def add_references(folder: Path) -> None:
+    (folder / "references.csv").write_text("light,name\n")
+
+
+def forget_the_sums(folder: Path) -> None:
+    path = folder / "lut.json"
+    path.write_text(path.read_text().replace('"has_sums": true', '"has_sums": false'))
+
+
+def raise_saturation(folder: Path) -> None:
+    path = folder / "lut.json"
+    path.write_text(path.read_text().replace('"white_level": 11000', '"white_level": 12000'))
+
+
+def lengthen(folder: Path) -> None:
+    with (folder / "samples.npy").open("ab") as stream:
+        stream.write(b"12")
+
+
+def older(folder: Path) -> None:
+    """Make of a table what software before the list of every file wrote."""
+    forget_the_sums(folder)
+    (folder / "SHA256SUMS").unlink()
+
+
 @pytest.mark.parametrize(
     ("change", "fault"),
     [
@@ -29,16 +62,18 @@ def spoil_the_frames(folder: Path) -> None:
         (flip("samples.npy", 128 + 2 * 1200 + 7), f"1 of {len(LIGHTS)} lights have changed: 2"),
         (flip("samples.npy", 128 + 1199), f"1 of {len(LIGHTS)} lights have changed: 0"),
         (flip("illuminations.csv", -3), "ground truth have changed"),
-        (flip("frames.csv", -3), "does not list the frames"),
-        (lose_the_frames, "does not list the frames"),
-        (spoil_the_frames, "frames.csv is damaged"),
+        (flip("frames.csv", -3), "frames.csv is not as it was built"),
+        (lose_the_frames, "frames.csv is gone"),
+        (spoil_the_frames, "frames.csv is not as it was built"),
+        (raise_saturation, "lut.json is not as it was built"),
+        (add_references, "references.csv is no part of the table"),
     ],
 )
 def test_damage_is_found_and_named(tmp_path: Path, change: Callable[[Path], None], fault: str) -> None:
     lut = write(tmp_path / "lut")
     change(lut.folder)
     seen: list[tuple[int, int]] = []
-    faults = find_faults(open_lut(lut.folder), lambda done, total: seen.append((done, total)))
+    faults = find_faults(open_lut(lut.folder, check=False), lambda done, total: seen.append((done, total)))
     assert len(faults) == 1
     assert fault in faults[0]
     assert seen[-1] == (len(LIGHTS), len(LIGHTS))
@@ -60,7 +95,124 @@ def test_tables_that_do_not_correspond_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "codes" / "illuminations.csv"
     path.write_text(path.read_text().replace("0,uniform,,0,255,0,", "0,uniform,,0,254,0,"))
     with pytest.raises(FormatError, match="other codes under 1 lights: 0"):
-        require_match(one, open_lut(tmp_path / "codes"))
+        require_match(one, open_lut(tmp_path / "codes", check=False))
+
+
+@pytest.mark.parametrize(
+    ("change", "fault"),
+    [
+        (flip("illuminations.csv", -3), "illuminations.csv is not as it was built: lights or ground truth"),
+        (flip("frames.csv", -3), "frames.csv is not as it was built"),
+        (lose_the_frames, "frames.csv is gone"),
+        (raise_saturation, "lut.json is not as it was built"),
+        (add_references, "references.csv is no part of the table"),
+        (flip("SHA256SUMS", 3), "is not as it was built"),
+        (lose("SHA256SUMS"), "cannot read .*SHA256SUMS"),
+        (lose("samples.npy"), "cannot read .*samples.npy"),
+        (lose("illuminations.csv"), "cannot read illuminations"),
+        (forget_the_sums, "lut.json does not know of SHA256SUMS"),
+        (lengthen, "samples.npy has 6130 bytes, 6128 expected"),
+    ],
+)
+def test_no_small_file_can_change_unnoticed(tmp_path: Path, change: Callable[[Path], None], fault: str) -> None:
+    lut = write(tmp_path / "lut")
+    change(lut.folder)
+    with pytest.raises(FormatError, match=fault):
+        open_lut(lut.folder)
+
+
+def test_samples_are_looked_at_when_a_light_is_first_used(tmp_path: Path) -> None:
+    lut = write(tmp_path / "lut")
+    flip("samples.npy", -1)(lut.folder)
+    opened = open_lut(lut.folder)
+    assert opened.light_samples(0).shape == (8, 25, 3)
+    with pytest.raises(FormatError, match=f"the samples of light {len(LIGHTS) - 1} are not those"):
+        opened.light_samples(len(LIGHTS) - 1)
+
+
+def test_the_report_is_listed_and_may_be_left_out(tmp_path: Path) -> None:
+    (tmp_path / "lut").mkdir()
+    lut = write(tmp_path / "lut", report="<html>accept</html>")
+    assert "report.html" in (lut.folder / "SHA256SUMS").read_text()
+    flip("report.html", 7)(lut.folder)
+    with pytest.raises(FormatError, match=r"report\.html is not as it was built"):
+        open_lut(lut.folder)
+    lose("report.html")(lut.folder)
+    assert open_lut(lut.folder).sha256 == lut.sha256
+    assert find_faults(lut) == []
+
+
+def test_sha256sum_reads_the_list(tmp_path: Path) -> None:
+    lut = write(tmp_path / "lut")
+    done = subprocess.run(
+        ["sha256sum", "--check", "--strict", "SHA256SUMS"], cwd=lut.folder, capture_output=True, text=True, check=True
+    )
+    assert set(done.stdout.split()) >= {"samples.npy:", "illuminations.csv:", "lut.json:", "frames.csv:"}
+    named = subprocess.run(["sha256sum", "SHA256SUMS"], cwd=lut.folder, capture_output=True, text=True, check=True)
+    assert named.stdout.split()[0] == lut.sha256
+
+
+def test_an_older_table_is_held_against_what_it_recorded(tmp_path: Path) -> None:
+    lut = write(tmp_path / "lut")
+    named = lut.sha256
+    older(lut.folder)
+    opened = open_lut(lut.folder)
+    assert dict(describe(opened))["Hashes"].startswith("ground truth and samples")
+    assert opened.sha256 != named
+    assert find_faults(opened) == []
+    flip("frames.csv", -3)(lut.folder)
+    assert find_faults(open_lut(lut.folder)) == ["frames.csv does not list the frames that lut.json was made of"]
+    flip("illuminations.csv", -3)(lut.folder)
+    with pytest.raises(FormatError, match=r"illuminations\.csv is not as it was built: lights or ground truth"):
+        open_lut(lut.folder)
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "fault"),
+    [
+        ("unfit", [{"colour": 8, "cause": "x"}], "unfit: colour 8 is none of the 8"),
+        ("lights_sha256", ["00" * 32], "has hashes of 1 lights, the table has 5 lights"),
+        ("lights_sha256", ["x"] * 5, "lights_sha256.0"),
+        ("files_sha256", {"../frames.csv": "00" * 32}, "files_sha256"),
+        ("bits", 2, r"expected uint16 \(5, 64, samples, 3\)"),
+        ("camera", {"a": 1}, "camera"),
+    ],
+)
+def test_a_description_that_does_not_fit_is_refused(tmp_path: Path, key: str, value: object, fault: str) -> None:
+    lut = write(tmp_path / "lut")
+    older(lut.folder)
+    path = lut.folder / "lut.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | {key: value}))
+    with pytest.raises(FormatError, match=fault):
+        open_lut(lut.folder)
+
+
+@pytest.mark.parametrize("name", ["samples.npy", "illuminations.csv", "lut.json", "frames.csv", "SHA256SUMS", "more"])
+@pytest.mark.parametrize("kind", ["pipe", "link out", "device", "lost link"])
+def test_a_table_of_no_plain_files_is_refused(tmp_path: Path, name: str, kind: str) -> None:
+    lut = write(tmp_path / "lut")
+    path = lut.folder / name
+    path.unlink(missing_ok=True)
+    match kind:
+        case "pipe":
+            os.mkfifo(path)
+        case "link out":
+            (tmp_path / "outside").write_text("secret")
+            path.symlink_to(tmp_path / "outside")
+        case "device":
+            path.symlink_to("/dev/zero")
+        case _:
+            path.symlink_to("nowhere")
+    with pytest.raises(FormatError, match=f"{name} is a "):
+        open_lut(lut.folder)
+
+
+def test_a_file_of_absurd_size_is_not_read(tmp_path: Path) -> None:
+    lut = write(tmp_path / "lut")
+    with (lut.folder / "lut.json").open("r+b") as stream:
+        stream.truncate(1 << 40)
+    with pytest.raises(FormatError, match=r"lut.json has 1099511627776 bytes, at most"):
+        open_lut(lut.folder)
 
 
 def _with(lut: Lut, folder: Path, bits: int) -> Lut:

@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
+import os
+from collections.abc import Callable
 from importlib import import_module
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -12,6 +17,7 @@ import pytest
 from fsspec.implementations.memory import MemoryFileSystem
 
 from acquisition.lights.illuminations import Illumination
+from calibration.cli import main
 from calibration.table.lut import Lut, open_lut
 from calibration.table.provenance import Provenance
 from calibration.table.source_frames import SourceFrame
@@ -133,3 +139,147 @@ def test_what_is_not_there_or_not_installed(lut: Lut, tmp_path: Path, monkeypatc
     monkeypatch.setattr("calibration.table.zarr_store.find_spec", find_spec)
     with pytest.raises(InputError, match=r"need zarr; install it with: pip install zarr"):
         publish(lut, str(tmp_path / "published"))
+
+
+def edit(published: Path, change: Callable[[dict[str, Any]], object]) -> None:
+    path = published / "zarr.json"
+    described = json.loads(path.read_text())
+    change(described)
+    path.write_text(json.dumps(described))
+
+
+def brighten_the_truth(described: dict[str, Any]) -> None:
+    files = described["attributes"]["files"]
+    files["illuminations.csv"] = files["illuminations.csv"].replace("900.000000", "990.000000", 1)
+
+
+def retell_everything(described: dict[str, Any]) -> None:
+    """Change the ground truth, and every hash that stands for it: what only another's word can show."""
+    files = described["attributes"]["files"]
+    for before in ("illuminations.csv", "lut.json"):
+        old = hashlib.sha256(files[before].encode()).hexdigest()
+        if before == "illuminations.csv":
+            brighten_the_truth(described)
+        new = hashlib.sha256(files[before].encode()).hexdigest()
+        for name in ("lut.json", "SHA256SUMS"):
+            told = files["lut.json"]
+            files[name] = files[name].replace(old, new)
+            if name == "lut.json" and before == "illuminations.csv":
+                files["SHA256SUMS"] = files["SHA256SUMS"].replace(
+                    hashlib.sha256(told.encode()).hexdigest(), hashlib.sha256(files[name].encode()).hexdigest()
+                )
+
+
+def test_a_published_truth_that_was_edited_is_refused(lut: Lut, tmp_path: Path) -> None:
+    publish(lut, str(tmp_path / "published"))
+    edit(tmp_path / "published", brighten_the_truth)
+    with pytest.raises(FormatError, match=r"illuminations\.csv is not as it was built: lights or ground truth"):
+        fetch(str(tmp_path / "published"), tmp_path / "back")
+    assert not (tmp_path / "back").exists()
+
+
+def test_a_table_is_the_one_that_was_told_of(lut: Lut, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    url = str(tmp_path / "published")
+    publish(lut, url)
+    assert main(["--info", str(lut.folder)]) == 0
+    assert f"Table:           {lut.sha256}" in capsys.readouterr().out
+    assert main(["--fetch", url, str(tmp_path / "told"), "--expect", lut.sha256]) == 0
+    assert "it is the table expected, and every file is as it was built" in capsys.readouterr().out
+    assert main(["--fetch", url, str(tmp_path / "untold")]) == 0
+    assert f"its hash, {lut.sha256}: compare it" in capsys.readouterr().out
+    edit(tmp_path / "published", retell_everything)
+    # All of it fits together: nothing but a hash from elsewhere can tell.
+    assert main(["--fetch", url, str(tmp_path / "other")]) == 0
+    assert open_lut(tmp_path / "other").white[0, 0] == 990
+    capsys.readouterr()
+    assert main(["--fetch", url, str(tmp_path / "refused"), "--expect", lut.sha256]) == 2
+    assert "is not the table that was expected: its hash is" in capsys.readouterr().err
+    assert not (tmp_path / "refused").exists()
+    assert main(["--fetch", url, str(tmp_path / "refused"), "--expect", lut.sha256[:12]]) == 2
+    assert "is no hash of a table" in capsys.readouterr().err
+
+
+def test_a_table_without_hashes_is_said_to_have_none(
+    lut: Lut, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def forget(described: dict[str, Any]) -> None:
+        files = described["attributes"]["files"]
+        del files["SHA256SUMS"]
+        known = json.loads(files["lut.json"])
+        for key in ("samples_sha256", "illuminations_sha256", "lights_sha256", "files_sha256", "has_sums"):
+            del known[key]
+        files["lut.json"] = json.dumps(known)
+
+    publish(lut, str(tmp_path / "published"))
+    edit(tmp_path / "published", forget)
+    assert main(["--fetch", str(tmp_path / "published"), str(tmp_path / "back")]) == 0
+    assert "it has no hashes, so that nobody can say" in capsys.readouterr().out
+    arguments = ["--fetch", str(tmp_path / "published"), str(tmp_path / "again"), "--expect", "0" * 64]
+    assert main(arguments) == 2
+    assert "does not vouch for them" in capsys.readouterr().err
+
+
+Change = Callable[[dict[str, Any]], object]
+
+CLAIMS: list[tuple[Change, str]] = [
+    (lambda said: said.update(shape=[10**6, 64, 25, 3]), "not stored as published tables are"),
+    (lambda said: said.update(shape=[LIGHTS, 64, 10**9, 3]), "not stored as published tables are"),
+    (lambda said: said.update(shape=[LIGHTS, 64, "25", 3]), "not stored|cannot read|head of the samples"),
+    (lambda said: said.update(shape=None), "not stored as published tables are"),
+    (lambda said: said.update(data_type="float64"), "not stored as published tables are"),
+    (lambda said: said.update(codecs=[]), "not stored as published tables are"),
+    (lambda said: said["codecs"][0]["configuration"]["codecs"].append({"name": "numcodecs.bz2"}), "not stored"),
+    (lambda said: said["codecs"][0]["configuration"].update(chunk_shape=[LIGHTS, 64, 25, 3]), "not stored"),
+    (lambda said: said["attributes"].update(files=[1]), "does not hold the files of a table"),
+    (lambda said: said["attributes"]["files"].update({"../x": "y"}), "which is no file of a table"),
+    (lambda said: said["attributes"]["files"].update({"lut.json": 3}), "which is no file of a table"),
+    (lambda said: said["attributes"]["files"].pop("lut.json"), "lacks lut.json"),
+    (lambda said: said["attributes"]["files"].pop("SHA256SUMS"), "cannot read .*SHA256SUMS"),
+    (lambda said: said["attributes"].update(head="AAAA"), "the head of the samples"),
+    (lambda said: said["attributes"].update(head=7), "the head of the samples"),
+    (lambda said: said["attributes"].update(whole="no"), "holds no table, or one that was never finished"),
+    (lambda said: said["attributes"].update(version=[2]), r"published in version \[2\]"),
+]
+
+
+@pytest.mark.parametrize(("change", "fault"), CLAIMS)
+def test_what_a_store_claims_has_to_fit_together(lut: Lut, tmp_path: Path, change: Change, fault: str) -> None:
+    publish(lut, str(tmp_path / "published"))
+    edit(tmp_path / "published", change)
+    with pytest.raises(FormatError, match=fault):
+        fetch(str(tmp_path / "published"), tmp_path / "back")
+    assert [path.name for path in tmp_path.iterdir() if path.name not in ("lut", "published")] == []
+
+
+def test_claimed_lights_do_not_fill_the_disk(lut: Lut, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    publish(lut, str(tmp_path / "published"))
+
+    def nearly_full(place: Path) -> SimpleNamespace:
+        return SimpleNamespace(free=lut.samples.nbytes)
+
+    monkeypatch.setattr("calibration.table.published_claims.shutil.disk_usage", nearly_full)
+    with pytest.raises(StorageError, match=r"0\.0 GB are free at .*; free space or choose another disk"):
+        fetch(str(tmp_path / "published"), tmp_path / "back")
+
+
+@pytest.mark.parametrize("kind", ["pipe", "link"])
+def test_a_published_folder_of_no_plain_files_is_refused(lut: Lut, tmp_path: Path, kind: str) -> None:
+    publish(lut, str(tmp_path / "published"))
+    shard = next(path for path in (tmp_path / "published" / "c").rglob("*") if path.is_file())
+    shard.unlink()
+    if kind == "pipe":
+        os.mkfifo(shard)
+    else:
+        shard.symlink_to(lut.folder / "samples.npy")
+    with pytest.raises(FormatError, match=f"is a {kind}, a regular file expected"):
+        fetch(str(tmp_path / "published"), tmp_path / "back")
+
+
+def test_damaged_samples_are_not_published(lut: Lut, tmp_path: Path) -> None:
+    with (lut.folder / "samples.npy").open("r+b") as stream:
+        stream.seek(-1, 2)
+        stream.write(b"\x7f")
+    with pytest.raises(FormatError, match=f"the samples of light {LIGHTS - 1} are not those that were measured"):
+        publish(open_lut(lut.folder), str(tmp_path / "published"))
+    with pytest.raises(FormatError, match="never finished"):
+        fetch(str(tmp_path / "published"), tmp_path / "back")

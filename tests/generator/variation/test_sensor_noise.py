@@ -26,11 +26,13 @@ def table(read: float, shot: float, response: float = 0.0, texture: float = 0.0,
     samples = means[..., None, None] + noise * rng.normal(size=(8, 512, 25, 3))
     samples += texture * rng.normal(size=(8, 512, 1, 1)) * rng.choice([-1, 1], (8, 512, 25, 1))
     samples[:, list(unfit)] = rng.uniform(0, 9000, (8, len(unfit), 25, 3))
+    counts = np.rint(samples).clip(0).astype(np.uint16)
     return cast(
         "Lut",
         SimpleNamespace(
             folder=Path("lut"),
-            samples=np.rint(samples).clip(0).astype(np.uint16),
+            samples=counts,
+            light_samples=counts.__getitem__,
             white=means[:, -1:].repeat(3, axis=1),
             provenance=SimpleNamespace(computed=None, unfit=[SimpleNamespace(colour=colour) for colour in unfit]),
         ),
@@ -51,7 +53,8 @@ def test_samples_that_are_no_photograph_are_refused() -> None:
     wild = np.asarray(lut.samples).astype(np.float64) + rng.choice([0, 40], (8, 512, 1, 1)) * rng.normal(
         size=(8, 512, 25, 1)
     )
-    object.__setattr__(lut, "samples", wild.clip(1, 65535).astype(np.uint16))
+    counts = wild.clip(1, 65535).astype(np.uint16)
+    vars(lut).update(samples=counts, light_samples=counts.__getitem__)
     with pytest.raises(InputError, match="photon-transfer curve"):
         measured_noise(lut)
 

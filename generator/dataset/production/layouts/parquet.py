@@ -21,7 +21,7 @@ from contextlib import ExitStack
 from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any, BinaryIO, Final, Self
 
-from foundation.errors import FormatError, InputError
+from foundation.errors import CropError, FormatError, InputError
 from foundation.hashing import HashingWriter
 from generator.dataset.production.layouts.samples import ExitReason, Sample, in_memory, metadata_of
 from generator.dataset.production.records import FileSum, shard_key
@@ -35,6 +35,13 @@ _GROUP_BYTES: Final = 4 << 20
 """Bytes from which a group of rows is written: what a reader has to read to get at one image."""
 _GROUP_ROWS: Final = 64
 """Rows of a group at most: small images stay quick to reach too."""
+
+_MOST_THRIFT_BYTES: Final = 64 << 20
+"""Longest text in the description of a shard, of which the longest of ours are a few kilobytes."""
+_MOST_THRIFT_ITEMS: Final = 1 << 20
+"""Things that a list in it may hold: ours hold columns and groups, some hundred."""
+_MOST_ROWS: Final = 1 << 16
+"""Rows of a group that is read: a thousand times those that are written."""
 
 _COLUMNS: Final = {"images": "image", "previews": "preview", "ground_truth": "ground_truth"}
 
@@ -194,20 +201,33 @@ def read_member(store: Store, container: str, file: str) -> bytes:
         The Parquet file is missing or damaged, or there is no such file in it.
     """
     require_pyarrow()
-    import pyarrow as pa
     import pyarrow.parquet as pq
 
     number = int(file.partition(".")[0])
     column, place = _cell_of(file)
     with store.open(container) as stream:
         try:
-            table = pq.ParquetFile(stream)
+            size = stream.seek(0, 2)
+            table = pq.ParquetFile(
+                stream, thrift_string_size_limit=_MOST_THRIFT_BYTES, thrift_container_size_limit=_MOST_THRIFT_ITEMS
+            )
             for group in range(table.num_row_groups):
+                # Our writer compresses nothing: a group that claims more than the file has is none of ours.
+                known = table.metadata.row_group(group)
+                if not (0 <= known.num_rows <= _MOST_ROWS and 0 <= known.total_byte_size <= 2 * size + 65536):
+                    raise ValueError(f"it claims {known.num_rows} rows of {known.total_byte_size} bytes in a group")
                 numbers = table.read_row_group(group, ["number"]).column("number").to_pylist()
                 if number in numbers:
                     cells = table.read_row_group(group, [column]).column(column).to_pylist()
                     cell = cells[numbers.index(number)]
-                    return (cell if place is None else cell[place])["bytes"]
-        except (pa.ArrowException, LookupError, ValueError, OSError) as error:
-            raise FormatError(f"{store.place}/{container} is damaged: {error}; make the dataset again") from error
+                    data = (cell if place is None else cell[place])["bytes"]
+                    if not isinstance(data, bytes):
+                        raise ValueError(f"{file} is no file")
+                    return data
+        except CropError:
+            raise
+        except Exception as error:
+            # Whatever a foreign file makes of the library: its own errors, and those of values that are missing.
+            reason = " ".join(f"{type(error).__name__}: {error}".split())
+            raise FormatError(f"{store.place}/{container} is damaged: {reason}; make the dataset again") from error
     raise FormatError(f"{store.place}/{container} holds no {file}; make the dataset again")

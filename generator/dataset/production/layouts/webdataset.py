@@ -14,8 +14,9 @@ from __future__ import annotations
 import io
 import json
 import tarfile
+from collections.abc import Iterator
 from contextlib import ExitStack
-from typing import Any, Self, cast
+from typing import Any, BinaryIO, Self, cast
 
 from foundation.errors import FormatError
 from foundation.hashing import HashingWriter
@@ -71,6 +72,9 @@ class TarWriter:
 def read_member(store: Store, container: str, file: str) -> bytes:
     """Return the bytes of the file called `file` in the tar file called `container`.
 
+    Only members that are plain files are looked at: a tar file may also hold links and sparse files, and claim sizes
+    that it does not have.
+
     Raises
     ------
     FormatError
@@ -78,10 +82,34 @@ def read_member(store: Store, container: str, file: str) -> bytes:
     """
     with store.open(container) as stream:
         try:
-            with tarfile.open(fileobj=stream, mode="r:") as tar:
-                for header in tar:
-                    if header.name == file and (member := tar.extractfile(header)) is not None:
-                        return member.read()
-        except tarfile.TarError as error:
+            for name, offset, size in _members(stream):
+                if name == file:
+                    stream.seek(offset)
+                    return stream.read(size)
+        except (tarfile.TarError, ValueError, OSError) as error:
             raise FormatError(f"{store.place}/{container} is damaged: {error}; make the dataset again") from error
     raise FormatError(f"{store.place}/{container} holds no {file}; make the dataset again")
+
+
+def _members(stream: BinaryIO) -> Iterator[tuple[str, int, int]]:
+    """Yield name, offset and size of the plain files of a tar file (POSIX.1-1988, ustar), as they follow each other.
+
+    Raises
+    ------
+    tarfile.TarError
+        A header is damaged, or its member is longer than the file.
+    """
+    end = stream.seek(0, io.SEEK_END)
+    offset = 0
+    while offset < end:
+        stream.seek(offset)
+        block = stream.read(tarfile.BLOCKSIZE)
+        if not any(block):
+            return
+        header = tarfile.TarInfo.frombuf(block, "utf-8", "surrogateescape")
+        offset += tarfile.BLOCKSIZE
+        if not 0 <= header.size <= end - offset:
+            raise tarfile.ReadError(f"{header.name!r} claims {header.size} bytes, {end - offset} are left")
+        if header.type in (tarfile.REGTYPE, tarfile.AREGTYPE):
+            yield header.name, offset, header.size
+        offset += -(-header.size // tarfile.BLOCKSIZE) * tarfile.BLOCKSIZE

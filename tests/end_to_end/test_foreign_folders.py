@@ -1,0 +1,59 @@
+"""Folders that somebody else made may hold anything; `tests/fuzz/fuzz_folders.py` tries a million of them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from tests.fuzz.foreign.seeds import Seed, make_seeds
+from tests.fuzz.foreign.trial import READERS, Trials
+
+COUNT = 40
+"""Mutated folders of each kind: some seconds; what they found once stands in KNOWN."""
+
+KNOWN = (
+    ("dataset folder", 73),  # a list of hashes that names a file of a terabyte without a byte
+    ("dataset folder", 1710),  # a mask of a thousand million pixels in a hundred bytes
+    ("dataset tiff", 85),
+    ("dataset tar", 1685),  # a name of 70 000 characters, in a message
+    ("session", 126),  # settings that are a link to a file outside
+    ("session", 128),  # a chart of a terabyte without a byte
+    ("session", 1864),  # a number of 5000 digits
+    ("session", 2981),
+    ("published", 1448),
+)
+
+
+@pytest.fixture(scope="module")
+def trials(tmp_path_factory: pytest.TempPathFactory) -> Trials:
+    return Trials(tmp_path_factory.mktemp("work"))
+
+
+@pytest.fixture(scope="module")
+def seeds(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Seed]:
+    return make_seeds(tmp_path_factory.mktemp("work") / "seeds")
+
+
+@pytest.mark.parametrize("what", sorted(READERS))
+def test_mutated_folders_are_read_or_refused(trials: Trials, seeds: dict[str, Seed], what: str) -> None:
+    kinds = [kind for kind in seeds if kind.split()[0] == what]
+    assert kinds
+    for kind in kinds:
+        for number in range(COUNT):
+            assert trials.judge(kind, seeds[kind], number) is None, (kind, number)
+
+
+@pytest.mark.parametrize(("kind", "number"), KNOWN)
+def test_what_was_found_once_stays_mended(trials: Trials, seeds: dict[str, Seed], kind: str, number: int) -> None:
+    assert trials.judge(kind, seeds[kind], number) is None
+
+
+def test_sound_folders_are_read(trials: Trials, seeds: dict[str, Seed], tmp_path: Path) -> None:
+    for kind, seed in seeds.items():
+        folder = tmp_path / kind
+        for name, data in seed.items():
+            (folder / name).parent.mkdir(parents=True, exist_ok=True)
+            (folder / name).write_bytes(data)
+        with trials.watch.armed():
+            READERS[kind.split()[0]](folder, tmp_path / f"spare {kind}")

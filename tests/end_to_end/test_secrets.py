@@ -1,0 +1,117 @@
+"""Passwords and secret addresses are in no file that a run and a table leave, nor on the terminal."""
+
+from __future__ import annotations
+
+import json
+import socket
+from importlib import import_module
+from pathlib import Path
+
+import pytest
+
+from acquisition.chart.model import Chart, load_chart
+from acquisition.config import load_lab
+from acquisition.lights.illuminations import Illumination, load_illuminations
+from acquisition.monitor.server import open_monitor
+from acquisition.run.run import run_session
+from acquisition.session.folder import Session
+from acquisition.session.mending.redaction import held_secrets
+from tests.found_texts import files_with
+
+PASSWORD = "pj-5ecret-word"
+TOKEN = "ntfy-t0ken-path"
+
+LAB = """
+rig = "simulated"
+chart = "chart/chart.json"
+illuminations = "illuminations.csv"
+[sequence]
+notify = "{notify}"
+[simulated]
+body = "Test"
+seed = 11
+[lab.projector]
+control = "pjlink"
+host = "192.0.2.7"
+password = "{password}"
+"""
+
+
+def command(module: str, *arguments: object) -> int:
+    return int(import_module(module).main([*map(str, arguments)]))
+
+
+@pytest.fixture
+def lab(tmp_path: Path) -> Path:
+    """Return a LAB.toml with a password and a webhook that nobody answers."""
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    folder = tmp_path / "private"
+    folder.mkdir()
+    assert command("acquisition.cli", "chart", folder / "chart", "--bits", 3, "--no-tiff") == 0
+    lights = folder / "illuminations.csv"
+    assert command("acquisition.cli", "illuminations", lights, "--grid", 1, "--blackbodies", "2500:7500:2500") == 0
+    path = folder / "LAB.toml"
+    path.write_text(LAB.format(notify=f"http://u:{PASSWORD}@127.0.0.1:{port}/{TOKEN}?auth={TOKEN}", password=PASSWORD))
+    return path
+
+
+def test_no_file_of_a_session_and_its_table_holds_a_secret(
+    lab: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    public = tmp_path / "public"
+    public.mkdir()
+    session = public / "session"
+    said: list[str] = []
+    seen: list[list[str]] = []
+
+    def look(done: int, total: int) -> None:
+        # While the run is under way its journal has a write-ahead log.
+        seen.append([*files_with(public, PASSWORD), *files_with(public, TOKEN)])
+
+    settings = load_lab(lab)
+    assert run_session(settings, session, look, said.append, state=said.append).complete
+    assert any("http://127.0.0.1" in sentence and "could not be told" in sentence for sentence in said)
+    assert command("acquisition.cli", "status", session) == 0
+    assert command("acquisition.cli", "status", session, "--json") == 0
+    assert command("acquisition.cli", "report", session) == 0
+    assert command("acquisition.cli", "run", lab, session, "--dry-run") == 0
+    assert command("calibration.cli", session, public / "lut") in (0, 4)
+    with open_monitor(session, 0) as server:
+        shown = server.page.text + json.dumps(server.watch.state(""), default=str)
+    seen.append([*files_with(public, PASSWORD), *files_with(public, TOKEN)])
+    assert len(seen) > 6
+    assert not any(seen)
+    told = "".join(capsys.readouterr()) + "".join(said) + shown
+    assert PASSWORD not in told
+    assert TOKEN not in told
+
+
+def test_the_secrets_of_an_older_session_are_told_and_taken_out(
+    lab: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    session = tmp_path / "session"
+    with Session.create(session, LAB.format(notify=f"curl -H {TOKEN}", password=PASSWORD), *_designed(lab)):
+        pass
+    assert held_secrets(session) == ("lab.projector.password", "sequence.notify")
+    assert command("acquisition.cli", "status", session) == 0
+    told = capsys.readouterr().err
+    assert "holds a secret in clear text (lab.projector.password, sequence.notify)" in told
+    assert f"acquire redact {session}" in told
+    said: list[str] = []
+    run_session(load_lab(lab), session, lambda done, total: None, said.append)
+    assert any("acquire redact" in sentence for sentence in said)
+    assert command("acquisition.cli", "redact", session) == 0
+    assert "lab.projector.password and sequence.notify taken out" in capsys.readouterr().out
+    assert files_with(session, PASSWORD) == files_with(session, TOKEN) == []
+    assert command("acquisition.cli", "redact", session) == 0
+    assert "holds no secret" in capsys.readouterr().out
+    assert command("acquisition.cli", "status", session) == 0
+    assert "redact" not in capsys.readouterr().err
+    # It is still the session of these settings.
+    run_session(load_lab(lab), session, lambda done, total: None, said.append)
+
+
+def _designed(lab: Path) -> tuple[Chart, tuple[Illumination, ...]]:
+    return load_chart(lab.parent / "chart" / "chart.json"), load_illuminations(lab.parent / "illuminations.csv")

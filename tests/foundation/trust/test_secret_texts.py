@@ -1,0 +1,54 @@
+"""No address shows who asks, whatever the message it stands in."""
+
+from __future__ import annotations
+
+import pytest
+
+from foundation.console import run
+from foundation.errors import InputError, StorageError
+from foundation.trust.secret_texts import masked, masked_values, printable
+
+
+@pytest.mark.parametrize(
+    ("text", "shown"),
+    [
+        ("ftp://lab:s3cret@store.example/t", "ftp://…@store.example/t"),
+        ("ftp://s3cret@store.example", "ftp://…@store.example"),
+        ("ftp://lab:s3@cret@store.example/t", "ftp://…@store.example/t"),
+        ("simplecache::ftp://lab:s3cret@store/t", "simplecache::ftp://…@store/t"),
+        ("ab://x:s3cret@y then cd://z:s3cret@w", "ab://…@y then cd://…@w"),
+        ("https://s/a?sv=1&sig=s3cret%3D&sr=c", "https://s/a?sv=1&sig=…&sr=c"),
+        ("https://s/a?X-Amz-Credential=s3cret&X-Amz-Date=1", "https://s/a?X-Amz-Credential=…&X-Amz-Date=1"),
+        ("https://s/a?AWSAccessKeyId=s3cret", "https://s/a?AWSAccessKeyId=…"),
+        ("https://s/a?access_token=s3cret#x", "https://s/a?access_token=…"),
+        ("s3://bucket/a@b/c", "s3://bucket/a@b/c"),
+        ("mail a@b.example, key=3", "mail a@b.example, key=3"),
+    ],
+)
+def test_addresses_lose_their_secrets(text: str, shown: str) -> None:
+    assert masked(text).startswith(shown)
+    assert "s3cret" not in masked(text)
+    assert masked(masked(text)) == masked(text)
+
+
+def test_values_for_json_keep_their_shape() -> None:
+    value = {"a": ["ftp://u:p@h/x", 3, None], "ftp://u:p@h": True}
+    assert masked_values(value) == {"a": ["ftp://…@h/x", 3, None], "ftp://u:p@h": True}
+
+
+def test_every_error_is_masked(capsys: pytest.CaptureFixture[str]) -> None:
+    def fails() -> None:
+        raise StorageError("cannot write ftp://lab:s3cret@h/x")
+
+    assert str(InputError("no ftp://lab:s3cret@h/x")) == "no ftp://…@h/x"
+    assert run(fails) == 5
+    assert capsys.readouterr().err == "error: cannot write ftp://…@h/x\n"
+
+
+def test_a_terminal_obeys_no_name(capsys: pytest.CaptureFixture[str]) -> None:
+    def fails() -> None:
+        raise InputError("no \x1b]0;title\x07\udcff.png")
+
+    assert run(fails) == 2
+    assert capsys.readouterr().err == "error: no \\x1b]0;title\\x07\\udcff.png\n"
+    assert printable("two\nlines\tand a tab, ä €") == "two\nlines\tand a tab, ä €"

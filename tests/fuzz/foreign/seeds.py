@@ -1,0 +1,110 @@
+"""Small sound folders of each kind that a stranger may send: the beginnings of everything that is fuzzed."""
+
+from __future__ import annotations
+
+import shutil
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from acquisition.chart.layout import design_chart
+from acquisition.config import LabSettings
+from acquisition.lights.illuminations import Illumination
+from acquisition.session.folder import Session
+from acquisition.session.judgement import Check, Judgement
+from acquisition.session.plan import plan_steps
+from calibration.table.lut import Lut, open_lut
+from calibration.table.provenance import Provenance, Unfit
+from calibration.table.source_frames import SourceFrame, frames_sha256
+from calibration.table.writer import LutWriter
+from calibration.table.zarr_store import publish
+from drivers.camera import CapturedFrame
+from drivers.presenter import Colour
+from generator.dataset.making import DatasetOptions, generate_dataset
+from generator.lights.choices import ListedLights, SimultaneousLights
+from generator.masks.request import parse_masks
+from generator.pictures.sources import random_scenes
+
+if TYPE_CHECKING:
+    from typing import BinaryIO
+
+LIGHTS = tuple(Illumination(number, "uniform", None, Colour(255, 200, 9 * number)) for number in range(3))
+FRAMES = [SourceFrame("light", light.index, f"frames/{light.index}.dng", f"{light.index}" * 64) for light in LIGHTS]
+
+Seed = dict[str, bytes]
+"""The files of a folder by name."""
+
+
+def files_of(folder: Path) -> Seed:
+    """Return the files below a folder by name."""
+    return {
+        path.relative_to(folder).as_posix(): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()
+    }
+
+
+def make_seeds(work: Path) -> dict[str, Seed]:
+    """Return sound folders by kind: ``table``, ``published``, ``session``, ``dataset …``."""
+    shutil.rmtree(work, ignore_errors=True)
+    work.mkdir(parents=True)
+    lut = _table(work / "table")
+    publish(lut, str(work / "published"))
+    _session(work / "session")
+    several = SimultaneousLights(ListedLights((0, 1)), 2, parse_masks("half-plane", 2, 1))
+    scenes = random_scenes(2, 12, 8)
+    options = {
+        "dataset folder": DatasetOptions(split=(0.5, 0.5, 0.0)),
+        "dataset tiff": DatasetOptions(form="tiff", previews=False, crops=1),
+        "dataset exr": DatasetOptions(form="exr", previews=False),
+        "dataset tar": DatasetOptions(layout="webdataset", shard_images=2),
+        "dataset parquet": DatasetOptions(layout="parquet", shard_images=2),
+    }
+    for kind, chosen in options.items():
+        lights = several if kind in ("dataset folder", "dataset tar") else ListedLights((0, 2))
+        generate_dataset(lut, work / kind, scenes, lights, options=chosen)
+    return {path.name: files_of(path) for path in sorted(work.iterdir())}
+
+
+def _table(folder: Path) -> Lut:
+    folder.mkdir()
+    (folder / "report.json").write_text('{"format": "crop.report"}\n')
+    writer = LutWriter(folder, len(LIGHTS), 8, 4)
+    rng = np.random.default_rng(1)
+    for light in range(len(LIGHTS)):
+        writer.put(light, rng.integers(100, 9000, (8, 4, 3)).astype(np.uint16))
+    known = Provenance(
+        camera="Test",
+        bits=1,
+        white_level=11000,
+        session_sha256=frames_sha256(FRAMES),
+        chart_sha256="2" * 64,
+        software="test 1",
+        unfit=[Unfit(colour=3, cause="a test")],
+    )
+    references = "light,name,r,g,b,r_error,g_error,b_error\n0,white,9000,9000,9000,1,1,1\n"
+    writer.finish(LIGHTS, np.full((len(LIGHTS), 3), 9000.0), known, FRAMES, {"references.csv": references})
+    return open_lut(folder)
+
+
+def _session(folder: Path) -> None:
+    settings = LabSettings(rig="simulated", chart=Path("chart.json"), illuminations=Path("illuminations.csv"))
+    steps = plan_steps(LIGHTS, 25)
+    at = datetime(2026, 1, 1, tzinfo=UTC)
+    with Session.create(folder, settings.to_toml(), design_chart(bits=1), LIGHTS, steps) as session:
+        for step in steps:
+            at += timedelta(seconds=2)
+            stem = f"{step.number:04d}_{step.kind}"
+            attempt = session.journal.begin(step, f"frames/{stem}", at)
+
+            def fill(into: BinaryIO, number: int = step.number, at: datetime = at) -> CapturedFrame:
+                return CapturedFrame("a.CR2", into.write(b"raw %d" % number), at)
+
+            checks = (Check("light", 0.1, None, 0.5, "degrees", ""),)
+            judgement = Judgement(checks, seen=(1.0, 2.0, 3.0))
+            received = session.receive(stem, fill)
+            session.commit(attempt, received, judgement, {"expose": 0.5}, exposure_s=0.5, ended_at=at)
+        session.journal.note(at, "paused", "a test")
+        session.journal.beat("ended", "it ended", at)
+        session.journal.record("camera", "Test")
+        session.write_frames_csv()

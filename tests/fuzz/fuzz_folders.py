@@ -1,0 +1,85 @@
+"""Fuzzing of everything that reads a folder which somebody else made: run by hand, never by pytest.
+
+    python -m tests.fuzz.fuzz_folders --count 100000 --workers 2 [--kind table] [--from 0]
+
+Each number is a mutated folder, the same on every machine: `--from N --count 1 --kind KIND` tries one again. What must
+hold stands in `tests.fuzz.foreign.trial`; a short run of the same is `tests/end_to_end/test_foreign_folders.py`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import faulthandler
+import multiprocessing
+import os
+import resource
+import tempfile
+import time
+from collections import Counter
+from pathlib import Path
+
+from tests.fuzz.foreign.seeds import Seed, make_seeds
+from tests.fuzz.foreign.trial import Trials
+
+MEMORY = 8 << 30
+"""Bytes that a process may claim: a folder of kilobytes that asks for more fails for it."""
+
+
+def _work(task: tuple[dict[str, Seed], str, int, int, int]) -> list[str]:
+    seeds, place, first, count, step = task
+    resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))
+    work = Path(place) / str(os.getpid())
+    work.mkdir(parents=True, exist_ok=True)
+    trials = Trials(work)
+    kinds = sorted(seeds)
+    found: list[str] = []
+    for number in range(first, first + count, step):
+        for kind in kinds:
+            # A loop in a library hears no signal.
+            faulthandler.dump_traceback_later(120, exit=True)
+            (work / "number").write_text(f"{kind} {number}")
+            fault = trials.judge(kind, seeds[kind], number)
+            if fault is not None:
+                found.append(f"--kind '{kind}' --from {number}\n{fault}")
+    return found
+
+
+def main() -> int:
+    """Try mutated folders; print what went wrong, and return how many did, 99 at most."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--count", type=int, default=10000, help="mutated folders of each kind")
+    parser.add_argument("--from", dest="first", type=int, default=0, help="first number")
+    parser.add_argument("--kind", action="append", help="table, published, session, 'dataset tar' …; all by default")
+    parser.add_argument("--workers", type=int, default=1)
+    chosen = parser.parse_args()
+    memory = "/dev/shm" if Path("/dev/shm").is_dir() else None
+    faults = Counter[str]()
+    with tempfile.TemporaryDirectory(prefix="crop-fuzz-", dir=memory) as place:
+        seeds = make_seeds(Path(place) / "seeds")
+        seeds = {kind: seed for kind, seed in seeds.items() if not chosen.kind or kind in chosen.kind}
+        begun = time.monotonic()
+        tasks = [
+            (seeds, place, first, min(200, chosen.first + chosen.count - first), 1)
+            for first in range(chosen.first, chosen.first + chosen.count, 200)
+        ]
+        done = 0
+        if chosen.workers == 1:
+            results = map(_work, tasks)
+        else:
+            pool = multiprocessing.get_context("fork").Pool(chosen.workers)
+            results = pool.imap_unordered(_work, tasks)
+        for found in results:
+            done += 200 * len(seeds)
+            for fault in found:
+                last = fault.strip().splitlines()[-1]
+                faults[last[:100]] += 1
+                if faults[last[:100]] <= 2:
+                    print(fault, flush=True)
+            print(f"{done} folders, {sum(faults.values())} faults, {time.monotonic() - begun:.0f} s", flush=True)
+    for fault, count in faults.most_common():
+        print(f"{count:6} {fault}")
+    return min(sum(faults.values()), 99)
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
