@@ -157,7 +157,8 @@ def place_errors(
     # Cells whose edges differ strongly would outvote those beside them, those that hardly differ would bring noise.
     strength = np.zeros(len(points))
     strength[known] = np.linalg.eigvalsh(information[known])[:, 0]
-    weight = np.minimum(strength, _LEAST_SHARE * np.median(strength[known]) if len(chi2) else 0.0)
+    most = _LEAST_SHARE * float(np.median(strength[known])) if len(chi2) else 0.0
+    weight = np.minimum(strength, most)
 
     def around(values: _Array) -> _Array:
         return np.asarray(box_mean(values.reshape(shape), _AROUND_CELLS), dtype=np.float64)
@@ -165,7 +166,9 @@ def place_errors(
     total = np.maximum(around(weight), 1e-6)
     asked = (around(weight * own[:, 0]) / total) ** 2 + (around(weight * own[:, 1]) / total) ** 2
     noise = 2 * scatter * around(weight**2 / np.maximum(strength, 1e-6)) / (_AROUND_CELLS * total) ** 2
+    # In the margin and beside tags it would be one cell's noise.
+    asked[total < 0.5 * most] = 0.0
     # What a displacement cannot follow swings about it: next to where it shows it may be hidden.
-    asked = ndimage.maximum_filter(np.maximum(asked - _NOISE * noise, 0.0), _AROUND_CELLS + 2)
+    asked = ndimage.maximum_filter(np.maximum(asked - _NOISE * noise, 0.0), _AROUND_CELLS)
     cells = Raster(raster.low_mm, raster.step_mm * per_cell, shape)
     return PlaceErrors(cells, np.sqrt(fitted.reshape(shape) ** 2 + asked))

@@ -94,9 +94,9 @@ class Displacement:
         """Return the standard error (M,) float64 px of the displacement's length at places (M, 2) mm.
 
         From draws of the coefficients' posterior distribution, whose covariance is the inverse of the fit's matrix:
-        each is the fit to data and roughness that scatter as they are taken to (G. Papandreou and A. L. Yuille, "Gaussian
-        sampling by local perturbations", NIPS 2010). Where nothing is measured, the sheet is taken to be as rough as
-        it is found elsewhere.
+        each is the fit to data and roughness that scatter as they are taken to (G. Papandreou and A. L. Yuille,
+        "Gaussian sampling by local perturbations", NIPS 2010). Where nothing is measured, the sheet is taken to be as
+        rough as it is found elsewhere.
 
         Parameters
         ----------

@@ -93,6 +93,13 @@ class Registration:
         """Return which points (N,) bool are known too badly to be sampled: three standard errors exceed the limit."""
         return np.asarray(3 * self.uncertainty_px(points_mm) > MAX_PLACE_ERROR_PX * self.clearance)
 
+    @property
+    def places_known_px(self) -> tuple[float, float]:
+        """Standard error of places, px: the median over the field, and the largest of the outermost cells but 1 %."""
+        error = self.place_errors.error_px
+        rim = np.concatenate([error[1], error[-2], error[:, 1], error[:, -2]])
+        return float(np.median(error)), float(np.percentile(rim, 99))
+
     def shifted(self, dx: float, dy: float) -> Registration:
         """Return this registration for a frame in which the chart lies (dx, dy) px further."""
         return replace(self, shift_px=(self.shift_px[0] + dx, self.shift_px[1] + dy))
