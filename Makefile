@@ -22,7 +22,7 @@ demo: $(READY)
 	mkdir -p $(DEMO)
 	$(BIN)/acquire chart $(DEMO)/chart --no-tiff
 	$(BIN)/acquire illuminations $(DEMO)/illuminations.csv --grid 2 --blackbodies 2500:10000:1500
-	cp examples/demo.toml $(DEMO)/LAB.toml
+	$(BIN)/acquire init $(DEMO)/. --rig simulated
 	$(BIN)/acquire check $(DEMO)/LAB.toml --picture $(DEMO)/check.png
 	$(BIN)/acquire run $(DEMO)/LAB.toml $(DEMO)/session
 	$(BIN)/build-lut $(DEMO)/session $(DEMO)/lut

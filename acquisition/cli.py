@@ -31,6 +31,13 @@ class Arrangement(Enum):
     PAPER = "paper"
 
 
+class Rig(Enum):
+    """What a lab that is begun consists of."""
+
+    LAB = "lab"
+    SIMULATED = "simulated"
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """Run `acquire` with these arguments, or those of the process, and return the exit code (`EXIT_CODES`)."""
     return console.run(lambda: app(args=common_first(argv), prog_name="acquire"))
@@ -39,6 +46,35 @@ def main(argv: Sequence[str] | None = None) -> int:
 @app.callback()
 def acquire(verbose: Verbose = 0, quiet: Quiet = False, version: Version = False) -> None:
     """Take what all commands take."""
+
+
+@app.command(epilog=EXIT_CODES)
+def init(
+    lab: Annotated[Path, typer.Argument(metavar="LAB", help="Folder of the lab; made if it is not there.")],
+    rig: Annotated[
+        Rig, typer.Option(help="lab: camera and projector, to be named in LAB.toml; simulated: no hardware.")
+    ] = Rig.LAB,
+) -> None:
+    """Begin a lab: a commented LAB.toml, the chart to print and the 707 lights.
+
+    Reads no file. Writes LAB/LAB.toml, chart/ (as acquire chart does, without the TIFF) and illuminations.csv (as
+    acquire illuminations does). A chart or lights that are there already stay as they are; a LAB.toml that is there
+    is an error.
+    """
+    from importlib.resources import files
+
+    from foundation.files import make_folder, require_free, write_whole
+
+    settings, print_folder, lights = lab / "LAB.toml", lab / "chart", lab / "illuminations.csv"
+    require_free(settings, "the settings")
+    make_folder(lab, lab)
+    if not (print_folder / "chart.json").exists():
+        chart(print_folder, tiff=False)
+    if not lights.exists():
+        illuminations(lights)
+    write_whole(settings, files("acquisition").joinpath("data", f"{rig.value}.toml").read_text("utf-8"))
+    then = "name your devices in it" if rig is Rig.LAB else "change it as you like"
+    print(f"{settings}: {then}, then: acquire check {settings}")
 
 
 @app.command(epilog=EXIT_CODES)

@@ -291,10 +291,10 @@ CASES: Final[tuple[NamedCase, ...]] = (
     ),
     NamedCase(
         "short-waves",
-        "waves of 150 mm, 6 mm high, and a curl of 10 mm",
+        "waves of 150 mm, 6 mm high, and a curl of 25 mm before a wide-angle lens",
         r"\brim\b|edges? of|uncertain|wav|curl|flat",
         rf"{_STAINED}|{_BRILLIANT}|{_HAND}|{_GLARE}",
-        room={"waviness_mm": 6.0, "wave_mm": 150.0, "curl_mm": 10.0},
+        room={"waviness_mm": 6.0, "wave_mm": 150.0, "curl_mm": 25.0, "focal_diagonals": 0.8},
     ),
     NamedCase(
         "lateral-colour",

@@ -113,7 +113,7 @@ def _with_lens(seed: int, room: Room) -> Room:
     return replace(
         room,
         wave_mm=float(random.uniform(130, 400)) if short else 0.0,
-        curl_mm=float(random.uniform(-10, 10)) if curled else 0.0,
+        curl_mm=float(random.uniform(-20, 20)) if curled else 0.0,
         shoulder_share=float(random.uniform(0, 0.045)) if spread else 0.0,
         shoulder_px=float(random.uniform(1.5, 4)),
         veil=float(random.uniform(0, 0.015)),

@@ -7,18 +7,42 @@ functions hold no state and no lock and release the interpreter's.
 from __future__ import annotations
 
 import hashlib
+import logging
 import re
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from types import CellType, FunctionType
 from typing import Any, Final, TypeVar, cast
 
 import numba
+from numba.core import event
 
 _ROOT: Final = Path(__file__).parents[1]
 _IMPORT: Final = re.compile(r"^from ([a-z_][.\w]*) import (\([^)]*\)|.*)", re.MULTILINE)
 
+_COMPILING: Final = "compiling for this processor, which is done once and takes half a minute at most …"
+
 _Function = TypeVar("_Function", bound=Callable[..., Any])
+
+
+class _Announcement(event.Listener):
+    """Says on a terminal, once, why the first start takes long; numba tells of what it did not find on the disk."""
+
+    def __init__(self) -> None:
+        self._said = False
+
+    def on_start(self, event: event.Event) -> None:
+        if self._said or not sys.stderr.isatty() or not logging.getLogger().isEnabledFor(logging.WARNING):
+            return
+        self._said = True
+        print(_COMPILING, file=sys.stderr)
+
+    def on_end(self, event: event.Event) -> None:
+        pass
+
+
+event.register("numba:compile", _Announcement())
 
 
 def compiled(function: _Function) -> _Function:

@@ -87,6 +87,11 @@ def _outcome(command: Callable[[], object], keeps: bool) -> int:
             doing = "write" if error.errno in _WRITING_FAULTS else "use"
             say_error(f"cannot {doing} {about}: {error.strerror}; {remedy}")
             return StorageError.exit_code
+        if _has_lost_its_folder():
+            say_error(
+                "the folder in which this was started is gone; change to one that is there (cd), then run it again"
+            )
+            return InputError.exit_code
         remedy = remedy_of(error)
         if remedy is None or not named:
             raise
@@ -100,6 +105,15 @@ def _outcome(command: Callable[[], object], keeps: bool) -> int:
             return _interrupted(keeps)
         return error.code if isinstance(error.code, int) else int(error.code is not None)
     return 0
+
+
+def _has_lost_its_folder() -> bool:
+    """Return whether the working folder was removed, which every path of a user depends on."""
+    try:
+        os.getcwd()  # noqa: PTH109  the same, without an object
+    except OSError:
+        return True
+    return False
 
 
 def _abandon_stdout() -> None:

@@ -63,6 +63,11 @@ _NAMELESS = (_DISK_FAULTS.keys() | {errno.EACCES, errno.EPERM}) - {errno.ENOENT,
 file's that somebody reads meanwhile."""
 
 
+ATTEMPTS = 1000
+"""How often a folder is made anew that another program takes away meanwhile: programs do so once or twice, special file
+systems (/proc) for ever."""
+
+
 def partial_path(path: Path) -> Path:
     """Return the hidden name under which `path` is written before it is complete."""
     return path.with_name(f".{path.name}{_PARTIAL}")
@@ -142,7 +147,7 @@ def make_folder(folder: Path, of: Path | None = None) -> None:
         The disk is full, read-only or gone.
     """
     path = folder if of is None else of
-    while True:
+    for _ in range(ATTEMPTS):
         try:
             folder.mkdir(parents=True, exist_ok=True)
         except FileExistsError as error:
@@ -155,6 +160,7 @@ def make_folder(folder: Path, of: Path | None = None) -> None:
             raise storage_error(path, error) from error
         else:
             return
+    raise StorageError(f"cannot write {path}: its folder is there and not there; name a place on an ordinary disk")
 
 
 def sync_folder(folder: Path) -> None:

@@ -18,8 +18,8 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Final
 
-from foundation.errors import InputError
-from foundation.files import make_folder, storage_error
+from foundation.errors import InputError, StorageError
+from foundation.files import ATTEMPTS, make_folder, storage_error
 
 LOCK_FILE: Final = ".lock"
 """Name of the file that is locked where a folder cannot be."""
@@ -74,7 +74,7 @@ def held_folder(
     StorageError
         The folder cannot be made or opened.
     """
-    while True:
+    for _ in range(ATTEMPTS):
         make_folder(folder, of)
         with ExitStack() as opened:
             try:
@@ -91,6 +91,8 @@ def held_folder(
                 continue
             yield FolderLock(handle)
             return
+    place = folder if of is None else of
+    raise StorageError(f"cannot write {place}: its folder is made and not there; name a place on an ordinary disk")
 
 
 def _opened(folder: Path, opened: ExitStack) -> int:

@@ -13,6 +13,7 @@ from foundation.console import EXIT_CODES, new_app, run
 from foundation.errors import InputError
 from foundation.processors import processor_count
 from foundation.trust.secret_texts import masked, printable
+from generator.command.demo_table import table_folder
 from generator.command.grouping import grouped
 from generator.command.likeness_options import LikenessOptions, choose
 from generator.command.options import (
@@ -83,7 +84,10 @@ def generate(
         _draw_sheet(dataset, work.finish, sheet)
     else:
         if places.lut is None or places.out is None:
-            raise InputError("the table and the place of the dataset are missing; write generate LUT OUT --sources DIR")
+            raise InputError(
+                "the table and the place of the dataset are missing; write generate LUT OUT --sources DIR, with demo: "
+                "for LUT where you have no table yet"
+            )
         workers = work.makers()
         plan = _plan(places.lut, places.out, pictures, light, likeness, rendering, variation, images, work)
         if work.shard is not None:
@@ -120,7 +124,7 @@ def _plan(
     from generator.dataset.production.workplace import require_free_place
 
     require_free_place(out)
-    table = open_lut(lut)
+    table = open_lut(table_folder(lut))
     rendered = rendering.of(DatasetOptions(), table)
     chosen = choose(table, likeness, pictures, light, variation, rendered, images.seed, processor_count())
     for line in (*chosen.told, *_tint_caution(table, rendering.rendering)):

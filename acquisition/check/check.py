@@ -46,7 +46,7 @@ from acquisition.run.lamp import make_ready
 from acquisition.run.patience import Patience
 from acquisition.run.planning.work import planned_steps
 from acquisition.run.rig.opening import open_rig
-from acquisition.run.shutter import light_period_s
+from acquisition.run.shutter import period_s
 from drivers.camera import keep_awake
 from drivers.presenter import ReportsWarnings
 from drivers.projector import Power, Projector, Severity
@@ -139,12 +139,6 @@ def check_lab(
 
         write_whole(options.picture, check_png(seen, figures, chart, report))
     return report
-
-
-def period_s(settings: LabSettings) -> float:
-    """Return the seconds after which the light repeats: that of the simulated room's wheel where it has one."""
-    wheel_hz = float(settings.simulated.room.get("wheel_hz", 0)) if settings.rig == "simulated" else 0.0
-    return 1 / wheel_hz if wheel_hz else light_period_s(settings.lab.projector)
 
 
 def _exposure_findings(seen: CheckFrames, settings: LabSettings, recorded: bool) -> list[Finding]:

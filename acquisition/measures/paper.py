@@ -44,6 +44,9 @@ JUDGING_A_TERM = 12
 """References for each term of the fit that tells which are covered or dirty: with three, the terms describe a stain of
 a tenth of the references."""
 
+_PLAIN = 6
+"""Terms of a slope and a bend."""
+
 TERM_PRICE = 1.0
 """By how much a term must lower N log(mean squared error of the N references held out), chosen: 0 takes a shape for one
 in four frames that have none, and at 60 counts adds .2 % of noise to the field; 4 misses shapes of .3 % at 300."""
@@ -198,7 +201,9 @@ class PaperReader:
                 known = known * shared[0][:, None]
                 shape *= shared[1][:, None]
                 factors = [(shared[2],), (shared[2],), (shared[2],)]
-        fits = [_best_fit(basis, known[:, channel], values[:, channel], self._counts) for channel in range(3)]
+        # On a base that is known, what is left of the light is plain: the frame's references are judged by a bend.
+        judging = self._counts[-1] if not any(self.base.coefficients) else _PLAIN
+        fits = [_best_fit(basis, known[:, channel], values[:, channel], self._counts, judging) for channel in range(3)]
         solutions = np.zeros((3, basis.shape[1]))
         for channel, (solution, _) in enumerate(fits):
             solutions[channel, : len(solution)] = solution
@@ -230,11 +235,11 @@ class PaperReader:
         The channels are added as they are, so that each counts by its light, as photon noise asks for.
         """
         total, even = values.sum(axis=1), np.ones(len(values))
-        first = self._shape(basis, _best_fit(basis, even, total, self._counts)[0])
+        first = self._shape(basis, _best_fit(basis, even, total, self._counts, self._counts[-1])[0])
         if first is None:
             return None
         # Once more, with the references weighted by the light that the first fit shows.
-        return self._shape(basis, _best_fit(basis, even, total, self._counts, first[0])[0])
+        return self._shape(basis, _best_fit(basis, even, total, self._counts, self._counts[-1], first[0])[0])
 
     def _shape(self, basis: _Array, solution: _Array) -> tuple[_Array, _Array, _Array] | None:
         """Return a solution's shape at references and at centres, mean 1 there, and its factor; None if it is even."""
@@ -258,7 +263,12 @@ class PaperReader:
 
 
 def _best_fit(
-    basis: _Array, known: _Array, values: _Array, counts: tuple[int, ...], light: _Array | None = None
+    basis: _Array,
+    known: _Array,
+    values: _Array,
+    counts: tuple[int, ...],
+    judging: int,
+    light: _Array | None = None,
 ) -> tuple[_Array, _Array]:
     """Return solution (terms,) and weights (N,), 0 … 1, of the fit that foretells references best.
 
@@ -272,6 +282,8 @@ def _best_fit(
         (N,) float64 counts above black.
     counts
         Number of terms of each fit.
+    judging
+        Most terms of the fit that tells which references are covered or dirty.
     light
         (N,) float64, relative light by which the references' noise is known; the base's shape if not given.
     """
@@ -282,13 +294,15 @@ def _best_fit(
     design, trusted = basis * (known * trust)[:, None], values * trust
     allowed = tuple(count for count in counts if REFERENCES_A_TERM * count <= len(values)) or counts[:1]
     # Judged by a large fit dim corners are no outliers; one larger than references allow would follow a stain.
-    judging = max((count for count in allowed if JUDGING_A_TERM * count <= len(values)), default=allowed[0])
-    weights = robust_least_squares(design[:, :judging], trusted, _ROUNDS)[1]
+    enough = [count for count in allowed if count <= judging and JUDGING_A_TERM * count <= len(values)]
+    weights = robust_least_squares(design[:, : max(enough, default=allowed[0])], trusted, _ROUNDS)[1]
     held_out = held_out_squares(design[:, : allowed[-1]], trusted, weights, allowed)
     used = int((weights > 0).sum())
     best = allowed[int(np.argmin(used * np.log(np.maximum(held_out, 1e-12)) + TERM_PRICE * np.array(allowed)))]
-    solution, weights, _ = robust_least_squares(design[:, :best], trusted, _ROUNDS)
-    return solution, weights
+    # Begun with these weights, so that terms which a hand in a corner seems to ask for do not take it in again.
+    root = np.sqrt(weights)
+    solution, again, _ = robust_least_squares(design[:, :best] * root[:, None], trusted * root, _ROUNDS)
+    return solution, weights * again
 
 
 def _residual(left: _Array, places_mm: _Array, page_mm: tuple[float, float], channel: int) -> FieldResidual:

@@ -6,7 +6,7 @@ A DLP projector shows its primaries one after another; a frame that catches part
 
 from __future__ import annotations
 
-from acquisition.config import CameraSettings, ProjectorCable
+from acquisition.config import CameraSettings, LabSettings, ProjectorCable
 from foundation.errors import ConfigurationError
 
 MAX_TURN_ERROR = 0.005
@@ -22,6 +22,19 @@ ENGRAVED_S = (
 def light_period_s(projector: ProjectorCable) -> float:
     """Return the seconds after which the projector's light repeats: a turn of its wheel, else a picture."""
     return 1 / (projector.colour_wheel_hz or projector.refresh_hz)
+
+
+def wheel_of(settings: LabSettings) -> float:
+    """Return the turns a second of the colour wheel before the camera; 0 where there is none, or it is not known."""
+    if settings.rig == "simulated":
+        return float(settings.simulated.room.get("wheel_hz", 0))
+    return settings.lab.projector.colour_wheel_hz or 0.0 if settings.rig == "lab" else 0.0
+
+
+def period_s(settings: LabSettings) -> float:
+    """Return the seconds after which the light before the camera repeats: a turn of its wheel, or a picture."""
+    wheel_hz = wheel_of(settings)
+    return 1 / wheel_hz if wheel_hz else light_period_s(settings.lab.projector)
 
 
 def holds_whole_turns(shutter_s: float, period_s: float) -> bool:

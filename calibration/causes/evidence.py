@@ -25,6 +25,8 @@ class Evidence:
         Share of the white frames, but the one compared with, that show it; 0 where there is no other.
     white_residual
         Share of the white frames whose references are off there by half as much or more.
+    some_whites
+        1 where the references of some white frames are off there and those of others not; else 0.
     spot
         Share of the cells there that are not of their codes' colours in the mean of the white frames.
     in_first
@@ -79,6 +81,7 @@ class Evidence:
     showing: float = NAN
     even_showing: float = NAN
     white_residual: float = NAN
+    some_whites: float = NAN
     spot: float = NAN
     in_first: float = NAN
     share: float = NAN

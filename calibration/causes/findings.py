@@ -14,7 +14,7 @@ import numpy as np
 from acquisition.session.records import FrameRecord
 from calibration.causes.cause import UNKNOWN
 from calibration.causes.evidence import Evidence
-from calibration.causes.light_evidence import dark_evidence, light_evidence
+from calibration.causes.light_evidence import camera_evidence, dark_evidence, light_evidence, name_evidence
 from calibration.causes.place_evidence import (
     MOST_PLACES,
     Gathered,
@@ -154,6 +154,11 @@ def _noisy(figures: TableFigures, limit: float) -> Gathered | None:
     return Gathered(Evidence(**known | {"hot": hot}), frames, places)
 
 
+def _additivity(figures: TableFigures, limit: float) -> Gathered | None:
+    light = light_evidence(figures, limit)
+    return light if light.frames else name_evidence(figures, _OFF_CODES_DEG)
+
+
 def _drift(figures: TableFigures, limit: float) -> Gathered | None:
     light = light_evidence(figures, limit)
     worst = max(figures.white_frames, key=lambda frame: frame.consistency.block, default=None)
@@ -190,6 +195,9 @@ _MOSTLY = 0.5
 _DISTURBED = 0.03
 """Deviation of a block from which on what lies there moves the mean of the paper, too (judgement)."""
 
+_OFF_CODES_DEG = 2.0
+"""Angle from its codes from which a light may be what a sum of primaries is spoilt by: that of the limit on names."""
+
 _GATHERERS: dict[str, Callable[[TableFigures, float], Gathered | None]] = {
     "unlike_block": _place_in_frame,
     "unlike_scatter": _all_cells,
@@ -202,7 +210,16 @@ _GATHERERS: dict[str, Callable[[TableFigures, float], Gathered | None]] = {
     "doubtful_share": lambda figures, limit: print_evidence(figures, "doubtful_share"),
     "unfit_share": lambda figures, limit: print_evidence(figures, "unfit_share"),
     "reference_spread": lambda figures, limit: print_evidence(figures, "reference_spread"),
-    "additivity": light_evidence,
+    "additivity": _additivity,
+    "white_short": light_evidence,
+    "other_exposure": light_evidence,
+    "off_brightness": light_evidence,
+    "white_frame_brightness": light_evidence,
+    "off_codes_deg": name_evidence,
+    "exchanged_lights": name_evidence,
+    "white_frame_deg": name_evidence,
+    "other_camera": camera_evidence,
+    "other_lens": camera_evidence,
     "white_drift": _drift,
     "white_drift_deg": _drift,
     "leak_share": dark_evidence,

@@ -41,6 +41,33 @@ def light_evidence(figures: TableFigures, limit: float) -> Gathered:
     return Gathered(evidence, tuple(frame.record for frame in beyond) if differs else (), ())
 
 
+def name_evidence(figures: TableFigures, limit: float) -> Gathered:
+    """Return what is known of lights whose whites are not what their codes give; `limit` as in `light_evidence`."""
+    gathered, codes = light_evidence(figures, np.inf), figures.lights.codes
+    if codes is None:
+        return gathered
+    exchanged = {light for pair in codes.exchanges for light in (pair.one, pair.other)}
+    off = figures.lights.off_codes_deg
+    far: set[int] = set() if off is None else set(np.flatnonzero(off > limit).tolist())
+    as_another = exchanged | {light for light in far if codes.seen_as[light] >= 0}
+    lights = figures.session.lights
+    whites = [frame.record for number, frame in enumerate(figures.white_frames) if lights + number in exchanged]
+    named = [frame.record for frame in figures.frames if frame.record.illumination in far | exchanged]
+    known = gathered.evidence.known() | {"off_codes_deg": float(codes.off_deg.max())}
+    if as_another:
+        known["named_right"] = 0.0
+    return Gathered(Evidence(**known), (*named, *whites), ())
+
+
+def camera_evidence(figures: TableFigures, limit: float) -> Gathered:
+    """Return what is known of frames of another camera or lens; `limit` as in `light_evidence`."""
+    origins = figures.origins
+    foreign = origins.other_camera or origins.other_lens
+    cameras = 1 + len({frame.found for frame in foreign})
+    evidence = Evidence(frames=float(len(figures.frames)), cameras=float(cameras))
+    return Gathered(evidence, tuple(frame.record for frame in foreign), ())
+
+
 def dark_evidence(figures: TableFigures, limit: float) -> Gathered:
     """Return what is known of the light while the projector shows black; `limit` as in `light_evidence`."""
     dark, whites = figures.dark_frames, [frame.paper.white for frame in figures.white_frames]

@@ -181,8 +181,12 @@ def _of_spot(figures: TableFigures, stains: Stains, spot: npt.NDArray[np.int64])
     added, kept = _light_of(stains, spot, int(np.argmax(np.abs(colour))))
     size_mm, least = max(place.size_mm, 1e-9), _HALF * abs(deviation)
     hottest = figures.dark_frames.hottest
+    white_residual = _white_residual(figures, at_mm, place.size_mm, least)
     evidence = Evidence(
         **_across_frames(figures, at_mm, size_mm, least),
+        white_residual=white_residual,
+        some_whites=float(0 < white_residual < 1),
+        rim_frames=float(np.mean([frame.paper.left.rim < RIM_OFF for frame in figures.white_frames] or [0])),
         spot=1.0,
         share=len(spot) / len(stains.places_mm),
         deviation=deviation,
@@ -196,11 +200,30 @@ def _of_spot(figures: TableFigures, stains: Stains, spot: npt.NDArray[np.int64])
     frames: list[FrameFigures] = []
     if evidence.in_first == 1:
         frames = [figures.registered_frame]
+    elif 0 < white_residual <= _HALF:
+        frames = _white_off(figures, at_mm, place.size_mm, least)
     elif evidence.even_showing > 0:
         frames = [frame for frame in _showing(figures, at_mm, size_mm, least) if frame.record.kind == "white"]
     if frames:
         place = replace(place, file=frames[0].record.file)
     return Gathered(evidence, tuple(frame.record for frame in frames), (place,))
+
+
+def _white_off(figures: TableFigures, at_mm: _Array, size_mm: float, least: float) -> list[FrameFigures]:
+    """Return the white frames whose references are off at a place by `least` or more."""
+    reach = max(size_mm, 3 * _cell_mm(figures.cells.stains))
+    return [
+        frame
+        for frame in figures.white_frames
+        if abs(_colour(np.array(frame.paper.left.deviation))[0]) >= max(least, _LEAST_RESIDUAL)
+        and float(np.linalg.norm(np.array(frame.paper.left.at_mm) - at_mm)) < reach
+    ]
+
+
+def _white_residual(figures: TableFigures, at_mm: _Array, size_mm: float, least: float) -> float:
+    """Return the share of the white frames whose references are off at a place by `least` or more."""
+    whites = figures.white_frames
+    return len(_white_off(figures, at_mm, size_mm, least)) / len(whites) if whites else 0.0
 
 
 def reference_evidence(figures: TableFigures, frame: FrameFigures) -> tuple[dict[str, float], tuple[PrintPlace, ...]]:

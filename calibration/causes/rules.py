@@ -84,31 +84,33 @@ PRINT = frozenset({"doubtful_share", "unfit_share", "reference_spread"})
 FOUND = frozenset({"agreement", "blocks_good", "tags_found"})
 SHEET = PRINT | {"noisy_share"}
 DRIFT = frozenset({"white_drift", "white_drift_deg"})
-LIGHT = frozenset({"additivity", "off_codes_deg", "white_drift", "white_drift_deg", "brightness_off"})
+NAMES = frozenset({"off_codes_deg", "white_frame_deg", "exchanged_lights"})
+BRIGHTNESS = frozenset({"off_brightness", "white_frame_brightness", "white_short", "other_exposure"})
+LIGHT = NAMES | BRIGHTNESS | {"additivity", "white_drift", "white_drift_deg"}
 DARK = frozenset({"leak_share", "dark_drift"})
 
 RULES: tuple[Rule, ...] = (
     Rule(
         OTHER_CAMERA,
-        PLACE | ALL_CELLS | PRINT | LIGHT | DARK | frozenset({"cameras"}),
+        PLACE | ALL_CELLS | PRINT | LIGHT | DARK | frozenset({"other_camera", "other_lens"}),
         (Condition("cameras", 2, _FAR),),
         "the files name more than one camera or lens",
     ),
     Rule(
         OTHER_EXPOSURE,
-        LIGHT | frozenset({"exposures_differ"}),
+        LIGHT,
         (Condition("exposure", 0, 0.97),),
         "the file states less exposure than the others'",
     ),
     Rule(
         OTHER_EXPOSURE,
-        LIGHT | frozenset({"exposures_differ"}),
+        LIGHT,
         (Condition("exposure", 1.03, _FAR),),
         "the file states more exposure than the others'",
     ),
     Rule(
         WRONG_NAME,
-        LIGHT | frozenset({"exchanged"}),
+        LIGHT,
         (Condition("named_right", 0, 0), Condition("exposure", 0.97, 1.03)),
         "its white is not what its own codes give, and is what another light's codes give",
     ),
@@ -210,6 +212,7 @@ RULES: tuple[Rule, ...] = (
         (
             Condition("in_first", 0, 0),
             Condition("even_showing", 0, 0),
+            Condition("some_whites", 0, 0),
             Condition("frames", 2, _FAR),
             Condition("added", 0.004, _FAR),
             Condition("deviation", 0, _FAR),
@@ -229,9 +232,10 @@ RULES: tuple[Rule, ...] = (
         (
             Condition("in_first", 0, 0),
             Condition("even_showing", 0, 0),
+            Condition("some_whites", 0, 0),
             Condition("frames", 2, _FAR),
             Condition("deviation", -1, -0.01),
-            Condition("added", -0.004, 0.004),
+            Condition("added", -0.05, 0.05),
             Condition("kept", 0, 0.99),
             Condition("tint", 0.35, _FAR),
             Condition("share", 0, 0.2),
@@ -239,14 +243,26 @@ RULES: tuple[Rule, ...] = (
         "a place is darker in all frames, in proportion to its light, and more so in one colour",
     ),
     Rule(
+        STAIN,
+        SHEET,
+        (
+            Condition("white_residual", 0.9, 1),
+            Condition("deviation", -1, -0.03),
+            Condition("tint", 0.35, _FAR),
+            Condition("share", 0, 0.2),
+        ),
+        "white references are dark at one place in all white frames, and more so in one colour",
+    ),
+    Rule(
         SHADOW,
         SHEET,
         (
             Condition("in_first", 0, 0),
             Condition("even_showing", 0, 0),
+            Condition("some_whites", 0, 0),
             Condition("frames", 2, _FAR),
             Condition("deviation", -1, -0.005),
-            Condition("added", -0.004, 0.004),
+            Condition("added", -0.02, 0.004),
             Condition("kept", 0, 0.995),
             Condition("tint", 0, 0.25),
             Condition("share", 0, 0.5),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import astuple, dataclass
+from dataclasses import asdict, astuple, dataclass
 from typing import Any
 
 import numpy as np
@@ -14,6 +14,7 @@ from acquisition.measures.flat_field import FlatField
 from acquisition.measures.paper import FieldResidual, Paper
 from acquisition.session.records import FrameRecord
 from calibration.checks.frame_consistency import FrameConsistency
+from drivers.raw.origin import FrameOrigin
 
 _Array = npt.NDArray[np.float64]
 
@@ -48,6 +49,8 @@ class FrameFigures:
         σ of the frame's blur, half-size px: that of the frame registered last, plus the change since.
     exposure
         Shutter time × ISO speed / f-number² by the raw file, s; 0 where it does not state them.
+    origin
+        Camera, lens and exposure as the raw file states them.
     """
 
     record: FrameRecord
@@ -63,6 +66,7 @@ class FrameFigures:
     share_at_zero: float
     blur_px: float
     exposure: float
+    origin: FrameOrigin
 
     def to_json(self) -> dict[str, Any]:
         """Return the figures, but for the record, as JSON can hold them; `from_json` restores them to the last bit."""
@@ -84,6 +88,7 @@ class FrameFigures:
             "share_at_zero": self.share_at_zero,
             "blur_px": self.blur_px,
             "exposure": self.exposure,
+            "origin": asdict(self.origin),
         }
 
     @staticmethod
@@ -112,4 +117,5 @@ class FrameFigures:
             share_at_zero=stored["share_at_zero"],
             blur_px=stored["blur_px"],
             exposure=stored["exposure"],
+            origin=FrameOrigin(**stored["origin"]),
         )

@@ -14,6 +14,8 @@ import numpy.typing as npt
 
 from acquisition.measures.sensor_range import black_drift
 from acquisition.measures.stains import Stains
+from calibration.checks.frame_origins import OriginFigures
+from calibration.checks.light_codes import CodeAgreement
 from calibration.figures.frame_figures import FrameFigures
 from calibration.figures.linearity_figures import LinearityFigures
 from calibration.radiometry.dark_frames import DarkSummary
@@ -43,6 +45,8 @@ class SessionFigures:
         The frame that was registered first, relative to the session.
     white_references
         White references that the chart has.
+    codes
+        Codes of each light of the plan, 0 … 255.
     """
 
     folder: Path
@@ -50,6 +54,7 @@ class SessionFigures:
     lights: int
     registered_file: str
     white_references: int
+    codes: tuple[tuple[int, int, int], ...]
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,9 +74,12 @@ class LightFigures:
     additivity
         (3,) float64, by how much the primaries together differ from white, relative to white; None where a frame
         that is needed is missing.
-    off_codes_deg
-        (L,) float64 degrees, how far each white is from what its codes predict (`calibration.checks.light_codes`); None
-        where the lights are too few or were not exposed alike.
+    codes
+        How the whites agree with their codes, by all other lights (`calibration.checks.light_codes`); lights from index
+        L on in `exchanges` and `seen_as` are white frames. None after a check.
+    white_frames
+        The same of the white frames: of the first alone where the others differ from it as a lamp drifts, or of all.
+        None without.
     drift
         How the lights are brought to one lamp in the table; None where that was not asked for. All else is as measured.
     """
@@ -82,7 +90,8 @@ class LightFigures:
     subtracted: _Array | None
     share_at_zero: _Array
     additivity: _Array | None
-    off_codes_deg: _Array | None
+    codes: CodeAgreement | None
+    white_frames: CodeAgreement | None
     drift: DriftCorrection | None = None
 
     @cached_property
@@ -90,11 +99,24 @@ class LightFigures:
         """(L,) float64 degrees, standard error of each ground truth's direction."""
         return direction_error_deg(self.white, self.white_error)
 
+    @property
+    def off_codes_deg(self) -> _Array | None:
+        """(L,) float64 degrees, how far each white is off its codes for certain; None after a check.
+
+        Of lights whose names are exchanged, the angle between the two.
+        """
+        if self.codes is None:
+            return None
+        off = self.codes.off_deg.copy()
+        for pair in self.codes.exchanges:
+            both = [light for light in (pair.one, pair.other) if light < len(off)]
+            off[both] = np.maximum(off[both], pair.angle_deg)
+        return off
+
     def lights_off_codes(self, accepted_deg: float) -> list[int]:
         """Return the lights further than `accepted_deg` from what their codes predict, the furthest first."""
-        if self.off_codes_deg is None:
-            return []
-        return [int(light) for light in np.argsort(-self.off_codes_deg) if self.off_codes_deg[light] > accepted_deg]
+        off = self.off_codes_deg
+        return [] if off is None else [int(light) for light in np.argsort(-off) if off[light] > accepted_deg]
 
 
 @dataclass(frozen=True, eq=False)
@@ -186,6 +208,8 @@ class TableFigures:
         Figures of every light and white frame read, in the order taken.
     dark_frames
         What the dark frames show; of a check, the first of them.
+    origins
+        Which frames' files state another camera, lens or exposure than most.
     primaries
         The primaries each alone, by which the field of coloured cells is known apart from that of paper; None where
         the plan has no light of each alone, or one is too dim.
@@ -199,6 +223,7 @@ class TableFigures:
     sensor: SensorFigures
     dark_frames: DarkSummary
     cells: CellFigures
+    origins: OriginFigures
     primaries: Primaries | None
 
     @property

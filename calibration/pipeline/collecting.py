@@ -7,8 +7,10 @@ from collections.abc import Sequence
 import numpy as np
 import numpy.typing as npt
 
+from acquisition.lights.illuminations import Illumination
 from acquisition.session.folder import Session
-from calibration.checks.light_codes import angles_off_codes_deg
+from calibration.checks.frame_origins import origin_figures
+from calibration.checks.light_codes import CodeAgreement, code_agreement
 from calibration.figures.frame_figures import FrameFigures
 from calibration.figures.linearity_figures import LinearityFigures
 from calibration.figures.table_figures import (
@@ -18,18 +20,18 @@ from calibration.figures.table_figures import (
     SensorFigures,
     SessionFigures,
     TableFigures,
-    direction_error_deg,
 )
 from calibration.pipeline.baseline import Baseline
 from calibration.pipeline.intake import Intake, IntakeState
 from calibration.radiometry.drift import drift_correction
 from calibration.radiometry.projector import additivity, drift_gains
-
-_SAME_EXPOSURE = 1.01
-"""Ratio below which two exposures count as one: shutter speeds differ by 1.26 at least, and are written rounded."""
+from foundation.angles import angles_deg
 
 _LEAST_WHITE = 1e-3
 """Counts that a channel's ground truth has at least, so that it is a direction even where no light is measured."""
+
+_MOST_DRIFT, _MOST_DRIFT_DEG = 0.15, 2.0
+"""Drift of white, as a share and in degrees, up to which white frames are believed: a table is refused beyond."""
 
 _Array = npt.NDArray[np.float64]
 
@@ -78,7 +80,8 @@ def check_figures(intake: Intake, taken: IntakeState, camera: str, linearity: Li
         subtracted=None,
         share_at_zero=np.zeros(0),
         additivity=None,
-        off_codes_deg=None,
+        codes=None,
+        white_frames=None,
     )
     return _figures(
         session=_session_figures(intake.session, intake, camera, with_frame),
@@ -98,6 +101,7 @@ def _session_figures(session: Session, intake: Intake, camera: str, lights: int)
         lights=lights,
         registered_file=intake.selected.registered.file,
         white_references=len(session.chart.white_references),
+        codes=tuple(light.codes for light in session.illuminations),
     )
 
 
@@ -128,6 +132,7 @@ def _figures(
         ),
         dark_frames=statistics.dark_summary(),
         cells=CellFigures(baseline.options.window, statistics.unfit(saturation, stains), stains),
+        origins=origin_figures([(figures.record, figures.origin) for figures in taken.figures]),
         primaries=baseline.primaries,
     )
 
@@ -142,6 +147,8 @@ def _light_figures(intake: Intake, taken: IntakeState, by_light: Sequence[FrameF
     gains = _gains(by_light, whites)
     dark = np.zeros(3) if subtract_dark else taken.statistics.dark_summary().light
     full_white = whites[0].paper.white if whites else None
+    told = whites[:1] if _drift_is_one(whites) else whites
+    agreement = _code_agreement(illuminations, by_light, told, dark, gains if len(told) < 2 else np.ones_like(gains))
     return LightFigures(
         white=white,
         white_error=error,
@@ -149,12 +156,47 @@ def _light_figures(intake: Intake, taken: IntakeState, by_light: Sequence[FrameF
         subtracted=np.array([frame.dark for frame in by_light]) if subtract_dark else None,
         share_at_zero=np.array([frame.share_at_zero for frame in by_light]),
         additivity=additivity(illuminations, white, full_white, dark, gains),
-        off_codes_deg=angles_off_codes_deg(illuminations, white / gains, direction_error_deg(white, error))
-        if _exposed_alike(by_light)
-        else None,
+        codes=agreement.rows(slice(len(by_light))),
+        white_frames=agreement.rows(slice(len(by_light), None)) if whites else None,
         drift=drift_correction(*_times_s(by_light, whites), np.array([frame.paper.white for frame in whites]))
         if intake.baseline.options.correct_drift
         else None,
+    )
+
+
+def _drift_is_one(whites: Sequence[FrameFigures]) -> bool:
+    """Return whether white frames differ as a lamp drifts, and not as frames of other lights or exposures do."""
+    levels = np.array([frame.paper.white for frame in whites]).reshape(-1, 3)
+    if len(levels) < 2:
+        return True
+    middle = np.median(levels, axis=0)
+    turned = angles_deg(levels, np.broadcast_to(middle, levels.shape)).max()
+    return bool(np.abs(levels / np.maximum(middle, _LEAST_WHITE) - 1).max() < _MOST_DRIFT and turned < _MOST_DRIFT_DEG)
+
+
+def _code_agreement(
+    illuminations: Sequence[Illumination],
+    by_light: Sequence[FrameFigures],
+    whites: Sequence[FrameFigures],
+    dark: _Array,
+    gains: _Array,
+) -> CodeAgreement:
+    """Return how the lights, and white frames behind them, agree with their codes; stated exposures aside."""
+    frames = [*by_light, *whites]
+    codes = np.array([*(light.codes for light in illuminations), *((255, 255, 255) for _ in whites)])
+    exposures = np.array([frame.origin.exposure for frame in frames])
+    usual = float(np.median(exposures[exposures > 0])) if (exposures > 0).any() else 1.0
+    factor = np.where(exposures > 0, usual / np.maximum(exposures, 1e-12), 1.0)[:, None]
+    drift = np.concatenate([gains, np.ones((len(whites), 3))])
+    error = np.array([frame.paper.error for frame in frames])
+    there = np.isfinite(dark)
+    white = np.array([frame.paper.white for frame in frames]) - np.where(there, dark, 0)
+    return code_agreement(
+        codes,
+        white * factor / drift,
+        error * factor / drift,
+        dark_known=bool(there.all()),
+        drift_known=len(whites) == 1,
     )
 
 
@@ -172,9 +214,3 @@ def _times_s(by_light: Sequence[FrameFigures], whites: Sequence[FrameFigures]) -
         np.array([(frame.record.taken_at - start).total_seconds() for frame in frames]) for frames in (by_light, whites)
     )
     return at_s, white_at_s
-
-
-def _exposed_alike(by_light: Sequence[FrameFigures]) -> bool:
-    """Return whether all lights are known to have been exposed alike, which a prediction from their codes assumes."""
-    exposures = [frame.exposure for frame in by_light]
-    return min(exposures) > 0 and max(exposures) < _SAME_EXPOSURE * min(exposures)

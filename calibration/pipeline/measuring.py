@@ -11,7 +11,7 @@ Rules that hold inside:
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -27,7 +27,6 @@ from calibration.radiometry.dark_subtraction import DarkLight, winsorised_means
 from calibration.radiometry.primaries import Primaries
 from calibration.sampling.patch_statistics import patch_means, sample_noise
 from calibration.sampling.samples import Sites, gather, gather_values, table_values
-from drivers.raw.rawfile import Mosaic
 from foundation.errors import RegistrationError
 
 _Array = npt.NDArray[np.float64]
@@ -173,7 +172,7 @@ def sample_dark_frame(baseline: Baseline, decoded: DecodedFrame, registered: Reg
     shape = baseline.paper.base.at(whites_mm)[whites]
     figures, excess = measure_dark_frame(decoded.record, decoded.black, cells, references[whites], shape)
     means = np.concatenate([winsorised_means(patches, figures.noise) for patches in (cells, references)])
-    return MeasuredDarkFrame(figures, registered, excess, means)
+    return MeasuredDarkFrame(replace(figures, origin=decoded.mosaic.origin), registered, excess, means)
 
 
 def measure_primaries(baseline: Baseline, frames: Iterable[DecodedFrame]) -> Primaries | None:
@@ -254,7 +253,8 @@ def _measured(
         dark=np.zeros(3) if dark is None else dark.paper,
         share_at_zero=1 - int(np.count_nonzero(values)) / values.size,
         blur_px=_blur_px(registered, grid),
-        exposure=_exposure(decoded.mosaic),
+        exposure=decoded.mosaic.origin.exposure,
+        origin=decoded.mosaic.origin,
     )
     return MeasuredFrame(figures, registered, dark, decoded.saturation, values, highest, grid.cells.inside, kept, noise)
 
@@ -263,11 +263,3 @@ def _blur_px(registered: RegisteredFrame, grid: _Grid) -> float:
     """Return σ of the blur, half-size px: that of the registered frame, and what the gauges are softer than in it."""
     softer = 0.0 if grid.reregistered else grid.shift.softer_px2
     return float(np.sqrt(max(registered.registration.blur_px**2 + softer, 0.0)))
-
-
-def _exposure(mosaic: Mosaic) -> float:
-    """Return how much light a frame gathered, as its file states it; 0 where it does not."""
-    if mosaic.shutter_s is None or mosaic.iso is None:
-        return 0.0
-    # A lens without contacts has no f-number, and keeps the one that it has.
-    return mosaic.shutter_s * mosaic.iso / (mosaic.aperture or 1.0) ** 2

@@ -11,13 +11,14 @@ Rules that hold inside:
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from acquisition.session.records import FrameRecord
+from drivers.raw.origin import FrameOrigin
 from foundation.robust import MAD_TO_SIGMA, MEDIAN_ERROR
 
 HOT_COUNTS = 32.0
@@ -76,6 +77,8 @@ class DarkFrameFigures:
         (3,) float64 counts above black on bare paper, field divided out, and their standard error.
     noise
         (3,) float64 counts, standard deviation of a sample.
+    origin
+        Camera, lens and exposure as the raw file states them.
     """
 
     record: FrameRecord
@@ -83,15 +86,18 @@ class DarkFrameFigures:
     light: _Array
     error: _Array
     noise: _Array
+    origin: FrameOrigin = field(default_factory=FrameOrigin)
 
     def to_json(self) -> dict[str, Any]:
         """Return the figures as JSON can hold them; `from_json` restores them to the last bit."""
-        return {name: getattr(self, name).tolist() for name in ("black", "light", "error", "noise")}
+        figures = {name: getattr(self, name).tolist() for name in ("black", "light", "error", "noise")}
+        return figures | {"origin": asdict(self.origin)}
 
     @staticmethod
     def from_json(record: FrameRecord, data: dict[str, Any]) -> DarkFrameFigures:
         """Return the figures of a frame from what `to_json` returned."""
-        return DarkFrameFigures(record, *(np.array(data[name]) for name in ("black", "light", "error", "noise")))
+        figures = (np.array(data[name]) for name in ("black", "light", "error", "noise"))
+        return DarkFrameFigures(record, *figures, origin=FrameOrigin(**data["origin"]))
 
 
 def measure_dark_frame(

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from calibration.checks.light_codes import CodeAgreement
 from calibration.figures.table_figures import TableFigures
 from calibration.sampling.windows import largest_window
 from calibration.table.file_names import REPORT_FORMAT, REPORT_VERSION
@@ -35,7 +36,9 @@ def report_json(result: BuildResult) -> dict[str, Any]:
         "channels": _channels(figures),
         "chart_places": _chart_places(figures),
         "geometry": _geometry(figures),
-        "off_codes_deg": None if off_codes_deg is None else [float(f"{angle:.3g}") for angle in off_codes_deg.tolist()],
+        "off_codes_deg": None if off_codes_deg is None else _short(off_codes_deg),
+        "codes": None if figures.lights.codes is None else _codes(figures.lights.codes),
+        "origins": _origins(figures),
         "primaries_differ": None if primaries is None else float(f"{primaries.difference:.3g}"),
         "figures": {name: _rounded(value) for name, value in judged_values(figures).items()},
         "causes": _causes(result),
@@ -103,6 +106,39 @@ def _geometry(figures: TableFigures) -> dict[str, Any]:
         "lateral_corner_px": {channel: _rounded(lateral.corner_px(channel)) for channel in ("R", "B")},
         "lateral_error_px": {channel: _rounded(lateral.corner_error_px(channel)) for channel in ("R", "B")},
     }
+
+
+def _codes(codes: CodeAgreement) -> dict[str, Any]:
+    """Return how the lights agree with their codes, light by light."""
+    return {
+        "angle_deg": _short(codes.angle_deg),
+        "error_deg": _short(codes.error_deg),
+        "brightness": _short(codes.brightness),
+        "off_brightness": _short(codes.off_brightness),
+        "seen_as": {str(light): int(codes.seen_as[light]) for light in np.flatnonzero(codes.seen_as >= 0).tolist()},
+        "exchanges": [asdict(pair) for pair in codes.exchanges],
+        "held": int(codes.held.sum()),
+        "exchange_deg": _rounded(codes.exchange_deg),
+        "misfit": _rounded(codes.misfit),
+    }
+
+
+def _origins(figures: TableFigures) -> dict[str, Any]:
+    """Return which frames' files state another camera, lens or exposure than most."""
+    origins = figures.origins
+    named = {
+        "other_camera": origins.other_camera,
+        "other_lens": origins.other_lens,
+        "other_exposure": origins.other_exposure,
+    }
+    return {
+        name: [{"file": frame.record.file, "found": frame.found, "expected": frame.expected} for frame in frames]
+        for name, frames in named.items()
+    }
+
+
+def _short(values: _Array) -> list[float]:
+    return [float(f"{value:.3g}") for value in values.tolist()]
 
 
 def _channels(figures: TableFigures) -> dict[str, Any]:

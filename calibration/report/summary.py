@@ -182,8 +182,24 @@ def _light_rows(figures: TableFigures) -> list[SummaryRow]:
             SummaryRow(
                 "Lights against their codes",
                 f"{lights.off_codes_deg[worst]:.2f}° at most, light {worst}",
-                "angle between a white and what a smooth model of all lights predicts from its codes, beyond four "
-                "standard errors",
+                "angle between a white and what all other lights predict from its codes, beyond four standard errors",
+            )
+        )
+    if lights.codes is not None:
+        held, down_to = int(lights.codes.held.sum()), lights.codes.exchange_deg
+        rows.append(
+            SummaryRow(
+                "Lights held against their codes",
+                f"{held} of {len(lights.codes.held)}; exchanged names excluded down to {down_to:.2g}°",
+                "the others are too few, or too dim, for a wrong name to be noticed",
+            )
+        )
+    if figures.primaries is None and lights.codes is not None:
+        rows.append(
+            SummaryRow(
+                "Fields of the primaries",
+                "not measured",
+                "no frames of red, green and blue, each alone and bright enough; coloured cells are evened by paper's",
             )
         )
     if lights.additivity is not None:

@@ -7,6 +7,7 @@ the frame (`calibration.causes`). `report.json` names the frames in the form tha
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -39,7 +40,10 @@ def retaken_frames(verdict: Verdict, figures: TableFigures) -> tuple[FrameRecord
     for finding in findings(verdict, figures).values():
         if finding.is_of_frames:
             named |= {frame.sha256 for frame in finding.frames}
-    return tuple(frame.record for frame in figures.frames if frame.record.sha256 in named)
+    # Dark frames have no figures among the others; only where they come from can be refused.
+    foreign = [frame.record for frame in (*figures.origins.other_camera, *figures.origins.other_exposure)]
+    records = [*(frame.record for frame in figures.frames), *(record for record in foreign if record.kind == "dark")]
+    return tuple(sorted((record for record in records if record.sha256 in named), key=lambda record: record.taken_at))
 
 
 def is_mended_by_retaking(verdict: Verdict, figures: TableFigures) -> bool:
@@ -83,12 +87,36 @@ def _frames_of(row: JudgedValue, figures: TableFigures) -> list[FrameRecord] | N
     if row.threshold.name == "off_codes_deg":
         lights = set(figures.lights.lights_off_codes(limit))
         return [frame.record for frame in figures.frames if frame.record.illumination in lights]
+    if row.threshold.name == "off_brightness" and figures.lights.codes is not None:
+        off = figures.lights.codes.off_brightness
+        return [frame.record for frame in figures.frames if _index(frame) < len(off) and off[_index(frame)] > limit]
+    if row.threshold.name in ("white_frame_deg", "white_frame_brightness"):
+        return white_frames_beyond(limit, row, figures)
+    if row.threshold.name == "other_camera":
+        return [frame.record for frame in figures.origins.other_camera]
+    if row.threshold.name == "other_exposure":
+        others = figures.origins.other_exposure
+        return [frame.record for frame in others if max(frame.ratio, 1 / frame.ratio) - 1 > limit]
     value = _VALUES.get(row.threshold.name)
     if value is None:
         return None
     beyond = [frame.record for frame in figures.frames if value(frame, figures) > limit]
     # Where every frame is beyond, the fault is not one of single frames.
     return beyond if len(beyond) < len(figures.frames) else None
+
+
+def white_frames_beyond(limit: float, row: JudgedValue, figures: TableFigures) -> list[FrameRecord]:
+    """Return the white frames that are further than a limit from what the lights predict, by the row's value."""
+    white = figures.lights.white_frames
+    if white is None:
+        return []
+    off = white.off_deg if row.threshold.name == "white_frame_deg" else white.off_brightness
+    return [frame.record for frame, value in zip(figures.white_frames, off, strict=False) if value > limit]
+
+
+def _index(frame: FrameFigures) -> int:
+    """Return a frame's light; beyond any light for a white frame."""
+    return sys.maxsize if frame.record.illumination is None else frame.record.illumination
 
 
 def added_bleed(registration: Registration, blur_px: float, window: int) -> float:

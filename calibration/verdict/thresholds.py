@@ -147,6 +147,23 @@ THRESHOLDS: tuple[Threshold, ...] = (
         "the chart or the camera moved between frames; the sampling grid followed", JUDGEMENT, _FIX,
     ),
     Threshold(
+        "other_camera", "Frames of another camera", "", "at most", 0, 0.5,
+        "a table is of one camera: another body sees other colours, and another model others yet", "by definition",
+        "take these frames again with the session's camera",
+    ),
+    Threshold(
+        "other_lens", "Frames through another lens", "", "at most", 0, None,
+        "lenses tint, blur and shade each in its own way", "by definition",
+        "take these frames again through the session's lens",
+    ),
+    Threshold(
+        "other_exposure", "Exposure of a frame against that of most, as the files state it", "share", "at most",
+        0.01, 0.1,
+        "brightness would differ between lights that should be alike, and the noise with the ISO speed",
+        "shutter times are steps of 26 % apart, and are written rounded",
+        "keep one exposure and ISO speed for the session, and take these frames again",
+    ),
+    Threshold(
         "black_drift_counts", "Drift of the black level", "counts", "at most", MAX_BLACK_DRIFT, 16.0,
         "the sensor warmed up; each frame's own black is subtracted, but an error of it shows in dark cells of about "
         "30 counts",
@@ -196,13 +213,71 @@ THRESHOLDS: tuple[Threshold, ...] = (
         "switch off brilliant colour, white boost and dynamic contrast in the projector's menu",
     ),
     Threshold(
+        "white_short", "White short of the sum of the primaries", "share", "at most", 0.05, 0.3,
+        "no wheel takes light away: a frame of white or of a primary was exposed otherwise, or the projector holds "
+        "full white back",
+        JUDGEMENT + "; a lamp that flickers by 1 % gives 2 %",
+        "look at the exposures of these frames, and switch dynamic contrast and power saving off",
+    ),
+    Threshold(
         "off_codes_deg", "White of a light against what its codes predict", *TABLE_LIMITS["off_codes_deg"].numbers,
         "a frame bears another light's name, or was taken before the picture changed: codes in the table are not those "
         "of its whites",
-        SIMULATED + ": .2 and less, with wheels of six segments, any gamma and 10 % of drift to .5; a list of frames "
-        "shifted by a row gives 28 and more, an exchange of two lights the angle between them",
+        SIMULATED + ": 0 in random healthy rooms; a list of frames shifted by a row gives 28 and more, an exchange of "
+        "two lights the angle between them",
         "correct the list of frames that was imported, let the picture settle for longer (sequence.settle_s), or "
         "expose whole turns of the colour wheel",
+    ),
+    Threshold(
+        "off_brightness", "Brightness of a light against what its codes predict", "share", "at most", 0.1, 0.3,
+        "a frame was exposed otherwise than its file states, or another light; brightness differs between lights that "
+        "should be alike",
+        JUDGEMENT + ": lamps flicker by some per cent, the next shutter time is 26 % off",
+        "keep one exposure for the session, and take the frames again",
+    ),
+    Threshold(
+        "exchanged_lights", "Pairs of lights that bear each other's names", "", "at most", 0, None,
+        "their whites fit their codes when exchanged and not as they are; each ground truth is measured and right, "
+        "but its codes and temperature are the other's",
+        SIMULATED + ": none in random healthy rooms, all pairs further apart than the figure below in the others",
+        "correct the list of frames that was imported, or take both again",
+    ),
+    Threshold(
+        "code_misfit", "Disagreement of few lights with their codes, all together", "", "at most", 1.0, None,
+        "no projector makes these whites of these codes, whichever light it is that is wrong",
+        SIMULATED + ": 1 is what random healthy rooms stay below; of more than 24 lights each is judged by itself",
+        "look whether frames and lights belong together, and whether the lamp was steady",
+    ),
+    Threshold(
+        "exchange_deg", "Angle down to which exchanged names are excluded", "°", "at most", 8.0, None,
+        "two lights less far apart than this could bear each other's names unnoticed",
+        SIMULATED + ": 0.3 with 707 lights, 0 with eight that lie far apart",
+        "take white and the primaries along with the lights, and expose longer",
+    ),
+    Threshold(
+        "held_share", "Lights that could be held against their codes", "share", "at least", 0.9, None,
+        "of the others nothing says that they bear their own names",
+        "the angle from which a wrong name is refused, beyond what codes predict of so few lights",
+        "take white, red, green and blue along with the lights, and expose longer",
+    ),
+    Threshold(
+        "white_frame_deg", "White frame against what the lights predict", "°", "at most", 2.0, 8.0,
+        "the frame shows another light than white, or the lights bear wrong names",
+        SIMULATED + ": 0 in random healthy rooms",
+        "correct the list of frames that was imported, or take the white frame again",
+    ),
+    Threshold(
+        "white_frame_brightness", "Brightness of the white frame against what the lights predict", "share", "at most",
+        0.1, 0.3,
+        "the white frame was exposed otherwise than the lights, so that drift and stray light are read wrongly",
+        JUDGEMENT + ": lamps flicker by some per cent, the next shutter time is 26 % off",
+        "keep one exposure for the session, and take the white frame again",
+    ),
+    Threshold(
+        "primaries_lacking", "Primaries without a frame of their own", "", "at most", 0, None,
+        "the fields of the primaries were not measured, so that coloured cells are evened by the field of paper",
+        "where the primaries' fields differ by 10 %, coloured cells at corners are off by some tenths of a per cent",
+        "take red, green and blue, each alone, along with the lights",
     ),
     Threshold(
         "grey_tint_deg", "Tint of the print's greys against paper", *TABLE_LIMITS["grey_tint_deg"].numbers,

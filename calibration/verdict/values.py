@@ -63,6 +63,9 @@ def _frame_values(figures: TableFigures) -> dict[str, float]:
             (added_bleed(registration, frame.blur_px, figures.cells.window) for frame in frames), default=0.0
         ),
         "black_drift_counts": figures.black_drift,
+        "other_camera": float(len(figures.origins.other_camera)),
+        "other_lens": float(len(figures.origins.other_lens)),
+        "other_exposure": figures.origins.exposure_difference,
         "references_used": used / max(figures.session.white_references, 1),
     }
     if len(frames) > 1:
@@ -93,13 +96,34 @@ def _light_values(figures: TableFigures) -> dict[str, float]:
         "brightest_share": float(paper.max()) / figures.sensor.white_level,
         "darkest_counts": float(paper.min()),
     }
-    if lights.additivity is not None:
-        values["additivity"] = float(np.abs(lights.additivity).max())
-    if lights.off_codes_deg is not None:
-        values["off_codes_deg"] = float(lights.off_codes_deg.max())
+    if lights.additivity is not None and _white_is_white(figures):
+        more, less = -lights.additivity.min(), lights.additivity.max()
+        values["additivity"] = max(float(more), 0.0)
+        values["white_short"] = max(float(less), 0.0)
+    off, codes = lights.off_codes_deg, lights.codes
+    if off is not None and codes is not None:
+        values["off_codes_deg"] = float(off.max())
+        values["off_brightness"] = float(codes.off_brightness.max())
+        values["exchanged_lights"] = float(len(codes.exchanges))
+        values["code_misfit"] = codes.misfit
+        values["held_share"] = float(codes.held.mean())
+        values["exchange_deg"] = codes.exchange_deg
+        alone = {light.index(max(light)) for light in figures.session.codes if max(light) == sum(light) > 0}
+        values["primaries_lacking"] = float(3 - len(alone)) if alone else 0.0
+    if lights.white_frames is not None:
+        values["white_frame_deg"] = float(lights.white_frames.off_deg.max())
+        values["white_frame_brightness"] = float(lights.white_frames.off_brightness.max())
     if (tint := figures.greys.tints_deg(lights.white)).size and np.isfinite(tint).any():
         values["grey_tint_deg"] = float(np.nanmax(tint))
     return values
+
+
+def _white_is_white(figures: TableFigures) -> bool:
+    """Return whether white and the primaries are what they are called, so that they may be added up."""
+    off, white = figures.lights.off_codes_deg, figures.lights.white_frames
+    exchanged = figures.lights.codes is not None and len(figures.lights.codes.exchanges) > 0
+    named = (off is None or not (off > 0).any()) and (white is None or not (white.off_deg > 0).any())
+    return named and not exchanged and not figures.origins.other_camera and not figures.origins.other_exposure
 
 
 def _dark_values(figures: TableFigures) -> dict[str, float]:

@@ -5,12 +5,26 @@ from __future__ import annotations
 from collections import Counter
 
 from calibration.causes.findings import ProbableCause, explain
+from calibration.checks.frame_origins import ForeignFrame
 from calibration.figures.table_figures import TableFigures
-from calibration.verdict.retaking import COMMAND, findings, is_mended_by_retaking, retake_command, retaken_frames
+from calibration.verdict.retaking import (
+    COMMAND,
+    findings,
+    is_mended_by_retaking,
+    retake_command,
+    retaken_frames,
+    white_frames_beyond,
+)
 from calibration.verdict.verdict import JudgedValue, Verdict
 from foundation.errors import counted, first_of
 
 _THEN = "what else is refused may follow from these, else take the session anew"
+
+_PAIRS = 4
+"""Pairs of exchanged lights that a remark names; the report has all."""
+
+_FIRST = ("other_camera", "other_exposure", "off_codes_deg", "white_frame_deg")
+"""Refusals that others follow from: a frame of something else has no drift, focus or brightness of its own."""
 
 _REMEDIES = {
     "outside": "bring all of the chart into the picture",
@@ -37,7 +51,8 @@ def refusal(verdict: Verdict, figures: TableFigures, *, reported: bool = False) 
     found = findings(verdict, figures)
     # What is explained explains more than what comes first.
     known = [row for row in verdict.refused if row.threshold.name in found and found[row.threshold.name].is_known]
-    worst = (*known, *verdict.refused)[0]
+    first = [row for row in verdict.refused if row.threshold.name in _FIRST]
+    worst = (*first, *known, *verdict.refused)[0]
     remedy = worst.threshold.remedy
     more = f" (and {len(verdict.refused) - 1} more)" if len(verdict.refused) > 1 else ""
     detail = ""
@@ -48,11 +63,11 @@ def refusal(verdict: Verdict, figures: TableFigures, *, reported: bool = False) 
     if finding is not None and finding.is_known:
         remedy = finding.decision.cause.remedy
     what, frames = "take the session anew", retaken_frames(verdict, figures)
-    if reported and frames:
+    command = COMMAND if reported else retake_command(frames)
+    if frames and (reported or command != COMMAND):
         again = f"take {counted(len(frames), 'frame')} again"
-        what = (
-            f"{again}: {COMMAND}" if is_mended_by_retaking(verdict, figures) else f"{again} first ({COMMAND}); {_THEN}"
-        )
+        mended = is_mended_by_retaking(verdict, figures)
+        what = f"{again}: {command}" if mended else f"{again} first ({command}); {_THEN}"
     probably = cause_text(finding)
     return f"{_with_place(worst, figures)}{detail}{more}; {probably}{remedy}, and {what}"
 
@@ -96,9 +111,58 @@ def _place(row: JudgedValue, figures: TableFigures) -> str:
             return f"in {max(figures.frames, key=lambda frame: frame.consistency.scatter).record.file}"
         case "off_codes_deg":
             lights = figures.lights.lights_off_codes(row.threshold.accept)
-            return f"{len(lights)} lights: {first_of(lights)}"
+            return f"{len(lights)} lights: {first_of(lights)}{_exchanges(figures)}"
+        case "exchanged_lights":
+            return _exchanges(figures).removeprefix("; ")
+        case "off_brightness":
+            return _brightness(row.threshold.accept, figures)
+        case "white_frame_brightness" | "white_frame_deg":
+            return first_of([record.file for record in white_frames_beyond(row.threshold.accept, row, figures)])
+        case "held_share":
+            codes = figures.lights.codes
+            return "" if codes is None else f"{int(codes.held.sum())} of {len(codes.held)}"
+        case "other_camera":
+            return _foreign(figures.origins.other_camera)
+        case "other_lens":
+            return _foreign(figures.origins.other_lens)
+        case "other_exposure":
+            return _foreign(figures.origins.other_exposure)
         case _:
             return places_text(explain(row.threshold.name, row.threshold.accept, figures))
+
+
+def _exchanges(figures: TableFigures) -> str:
+    """Return which lights bear each other's names, behind a semicolon; "" where none do."""
+    codes = figures.lights.codes
+    if codes is None or not codes.exchanges:
+        return ""
+    count = figures.session.lights
+    pairs = [f"{_light(pair.one, count)} and {_light(pair.other, count)}" for pair in codes.exchanges]
+    apart = f"{codes.exchanges[0].angle_deg:.2g}° apart"
+    more = f" (and {len(pairs) - _PAIRS} pairs more)" if len(pairs) > _PAIRS else ""
+    return f"; exchanged names: {', '.join(pairs[:_PAIRS])}{more}, {apart} in the first pair"
+
+
+def _light(index: int, count: int) -> str:
+    return f"light {index}" if index < count else f"white frame {index - count}"
+
+
+def _brightness(accepted: float, figures: TableFigures) -> str:
+    """Return which lights are brighter or darker than their codes predict, the furthest off first."""
+    codes = figures.lights.codes
+    if codes is None:
+        return ""
+    order = sorted(range(len(codes.off_brightness)), key=lambda light: -codes.off_brightness[light])
+    found = [f"light {k} by {100 * codes.brightness[k]:+.0f} %" for k in order if codes.off_brightness[k] > accepted]
+    return first_of(found)
+
+
+def _foreign(frames: tuple[ForeignFrame, ...]) -> str:
+    """Return which frames state otherwise than most, and what."""
+    if not frames:
+        return ""
+    names = first_of([frame.record.file for frame in frames])
+    return f"{counted(len(frames), 'frame')}: {names}, with {frames[0].found} instead of {frames[0].expected}"
 
 
 def places_text(finding: ProbableCause | None) -> str:

@@ -21,7 +21,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 from drivers.raw.plain_dng import Area
-from drivers.tiff.reading import TiffDamaged, read_directories
+from drivers.tiff.reading import Directory, TiffDamaged, read_directories
 from drivers.tiff.tags import TiffTag
 
 MAX_BOXES = 4096
@@ -58,11 +58,14 @@ class Cr3:
     black
         Optically black areas that it states for its largest picture, on the whole sensor: left, upper; those that it
         leaves empty are left out.
+    exif
+        Directories of its Exif box, with serial number and lens; none where it has no such box.
     """
 
     maker: str = ""
     model: str = ""
     black: tuple[Area, ...] = ()
+    exif: tuple[Directory, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -89,6 +92,7 @@ def read_cr3(data: bytes | memoryview) -> Cr3:
         raise Cr3Damaged("it does not begin as a CR3 does")
     maker = model = ""
     black: tuple[Area, ...] = ()
+    exif: tuple[Directory, ...] = ()
     left = [MAX_BOXES]
     found: set[bytes] = set()
     for box in _boxes(data, 0, len(data), left, whole=True):
@@ -100,12 +104,14 @@ def read_cr3(data: bytes | memoryview) -> Cr3:
                 for entry in _boxes(data, part.start + _UUID_LENGTH, part.end, left):
                     if entry.kind == b"CMT1":
                         maker, model = _camera(data[entry.start : entry.end])
+                    elif entry.kind == b"CMT2":
+                        exif = _directories(data[entry.start : entry.end])
             elif part.kind == b"trak":
                 black = _black_of_track(data, part, left) or black
     for kind, what in ((b"moov", "description of its pictures"), (b"mdat", "pictures")):
         if kind not in found:
             raise Cr3Damaged(f"it holds no {what} ({kind.decode('ascii')})")
-    return Cr3(maker, model, black)
+    return Cr3(maker, model, black, exif)
 
 
 def _boxes(data: bytes | memoryview, start: int, end: int, left: list[int], *, whole: bool = False) -> Iterator[_Box]:
@@ -134,14 +140,18 @@ def _boxes(data: bytes | memoryview, start: int, end: int, left: list[int], *, w
 
 def _camera(content: bytes | memoryview) -> tuple[str, str]:
     """Return maker and model of the TIFF in a box CMT1."""
-    try:
-        directories = read_directories(bytes(content))
-    except TiffDamaged:
-        return "", ""
-    for directory in directories:
+    for directory in _directories(content):
         if directory.text(TiffTag.MODEL):
             return directory.text(TiffTag.MAKE), directory.text(TiffTag.MODEL)
     return "", ""
+
+
+def _directories(content: bytes | memoryview) -> tuple[Directory, ...]:
+    """Return the directories of the TIFF in a box; none where it is damaged."""
+    try:
+        return tuple(read_directories(bytes(content)))
+    except TiffDamaged:
+        return ()
 
 
 def _black_of_track(data: bytes | memoryview, track: _Box, left: list[int]) -> tuple[Area, ...]:

@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import ctypes
 import io
-import struct
 import threading
 from collections.abc import Generator
 from contextlib import contextmanager
@@ -27,6 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.raw.cr3 import Cr3, Cr3Damaged, is_cr3, read_cr3
+from drivers.raw.origin import FrameOrigin, body_and_lens, ciff_camera
 from drivers.raw.plain_dng import (
     BAYER_PATTERNS,
     Area,
@@ -79,8 +79,8 @@ class Mosaic:
         Optically black areas in sensor coordinates; empty if none is known.
     iso, aperture, shutter_s
         The exposure as the file states it: ISO speed, f-number, seconds; None where it does not.
-    serial
-        Serial number of the body as Exif 2.3 or DNG state it; empty where the file does not.
+    serial, lens
+        Serial number of the body and model of the lens; empty where the file does not state them.
     """
 
     counts: NDArray[np.uint16]
@@ -95,6 +95,12 @@ class Mosaic:
     aperture: float | None = None
     shutter_s: float | None = None
     serial: str = ""
+    lens: str = ""
+
+    @property
+    def origin(self) -> FrameOrigin:
+        """Camera, lens and exposure as the file states them."""
+        return FrameOrigin(self.camera, self.serial, self.lens, self.iso, self.aperture, self.shutter_s)
 
     def masked_black(self) -> NDArray[np.float64] | None:
         """Return the black level measured in the masked areas.
@@ -230,6 +236,7 @@ def decode_raw(data: bytes | memoryview, path: Path) -> Mosaic:
 
 def _plain_mosaic(data: bytes | memoryview, directories: list[Directory], plain: PlainDng) -> Mosaic:
     visible, camera = plain.active, _camera_name(data, directories)
+    serial, lens = body_and_lens(data, directories)
     return Mosaic(
         counts=_part(plain.sensor, visible),
         pattern=plain.pattern,
@@ -242,7 +249,8 @@ def _plain_mosaic(data: bytes | memoryview, directories: list[Directory], plain:
         iso=plain.iso,
         aperture=plain.aperture,
         shutter_s=plain.shutter_s,
-        serial=_camera_serial(directories),
+        serial=serial,
+        lens=lens,
     )
 
 
@@ -280,6 +288,7 @@ def _mosaic(path: Path, raw: RawPy, data: bytes | memoryview, directories: list[
     if stated is not None:
         black = stated
     black.setflags(write=False)
+    serial, lens = body_and_lens(data, directories if cr3 is None else cr3.exif)
     exposure = raw.other
     # LibRaw makes up 1 s at f/1 for a file that states nothing; such a file has no ISO speed either.
     stated_exposure = exposure.iso_speed > 0
@@ -295,7 +304,8 @@ def _mosaic(path: Path, raw: RawPy, data: bytes | memoryview, directories: list[
         iso=round(exposure.iso_speed) if stated_exposure else None,
         aperture=(round(exposure.aperture, 4) or None) if stated_exposure else None,
         shutter_s=(exposure.shutter_speed or None) if stated_exposure else None,
-        serial=_camera_serial(directories),
+        serial=serial,
+        lens=lens,
     )
 
 
@@ -341,15 +351,7 @@ def _camera_name(data: bytes | memoryview, directories: list[Directory]) -> str:
     for directory in directories:
         if directory.text(TiffTag.UNIQUE_CAMERA_MODEL):
             return directory.text(TiffTag.UNIQUE_CAMERA_MODEL)
-    return _joined(*_ciff_camera(data))
-
-
-def _camera_serial(directories: list[Directory]) -> str:
-    for tag in (TiffTag.BODY_SERIAL_NUMBER, TiffTag.CAMERA_SERIAL_NUMBER):
-        for directory in directories:
-            if directory.text(tag):
-                return directory.text(tag)
-    return ""
+    return _joined(*ciff_camera(data))
 
 
 def _joined(maker: str, model: str) -> str:
@@ -357,32 +359,6 @@ def _joined(maker: str, model: str) -> str:
     if not maker or model.split(" ")[0].casefold() == maker.split(" ")[0].casefold():
         return model
     return f"{maker} {model}"
-
-
-def _ciff_camera(data: bytes | memoryview) -> tuple[str, str]:
-    """Return maker and model from Canon's CRW heap; two empty strings for any other file.
-
-    Source: Canon, CIFF 1.0 revision 4: a heap ends with the offset of its table; 0x300A is the heap of the
-    picture's properties, 0x2807 in it that of the camera, 0x080A in that the text of maker and model.
-    """
-    if data[6:14] != b"HEAPCCDR":
-        return "", ""
-    try:
-        start, end = struct.unpack_from("<I", data, 2)[0], len(data)
-        for wanted in (0x300A, 0x2807, 0x080A):
-            table = start + struct.unpack_from("<I", data, end - 4)[0]
-            (count,) = struct.unpack_from("<H", data, table)
-            for number in range(count):
-                kind, size, offset = struct.unpack_from("<HII", data, table + 2 + 10 * number)
-                if kind == wanted:
-                    start, end = start + offset, start + offset + size
-                    break
-            else:
-                return "", ""
-        maker, model, *_ = bytes(data[start:end]).split(b"\0")
-    except (struct.error, ValueError):
-        return "", ""
-    return maker.decode("ascii", "replace"), model.decode("ascii", "replace")
 
 
 def _dcraw_frame(sensor: tuple[int, int], framed: Area) -> Area:

@@ -71,6 +71,7 @@ _DECODED: Final = frozenset(
         TiffTag.EXIF_IFD_POINTER,
         TiffTag.PHOTOGRAPHIC_SENSITIVITY,
         TiffTag.BODY_SERIAL_NUMBER,
+        TiffTag.LENS_MODEL,
         TiffTag.CAMERA_SERIAL_NUMBER,
         TiffTag.DNG_VERSION,
         TiffTag.UNIQUE_CAMERA_MODEL,

@@ -23,8 +23,8 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, BinaryIO, Final, cast
 
-from foundation.errors import FormatError, StorageError
-from foundation.files import disk_remedy_of
+from foundation.errors import FormatError
+from foundation.files import reading_error
 
 MOST_JSON_BYTES: Final = 256 << 20
 """JSON is read as far as this: the description of a data set of a million pictures, all skipped, is a third of it."""
@@ -123,23 +123,26 @@ def require_plain_folder(
     StorageError
         The disk fails.
     """
-    for inner in ("", *below):
-        try:
-            with os.scandir(folder / inner) as entries:
+    try:
+        for inner in ("", *below):
+            with suppress(FileNotFoundError, NotADirectoryError), os.scandir(folder / inner) as entries:
                 for entry in entries:
                     _require_plain(folder, f"{inner}/{entry.name}" if inner else entry.name, entry)
-        except (FileNotFoundError, NotADirectoryError):
-            continue
-        except OSError as error:
-            kind = StorageError if disk_remedy_of(error) else FormatError
-            remedy = disk_remedy_of(error) or "see that it may be read"
-            raise kind(f"cannot look into {folder / inner}: {error.strerror}; {remedy}") from error
-    for name, most in (most_bytes or {}).items():
-        path = folder / name
-        if path.is_file() and (size := path.stat().st_size) > most:
-            raise FormatError(
-                f"{path} has {size} bytes, at most {most} expected; it is not what it is called, or damaged"
-            )
+        for name, most in (most_bytes or {}).items():
+            _require_size(folder / name, most)
+    except OSError as error:
+        raise reading_error(folder, error, "see that it may be read") from error
+
+
+def _require_size(path: Path, most: int) -> None:
+    try:
+        found = path.stat()
+    except (FileNotFoundError, NotADirectoryError):
+        return
+    if stat.S_ISREG(found.st_mode) and found.st_size > most:
+        raise FormatError(
+            f"{path} has {found.st_size} bytes, at most {most} expected; it is not what it is called, or damaged"
+        )
 
 
 def require_plain_tree(folder: Path) -> None:

@@ -39,7 +39,12 @@ _WORK = "Work"
 class Places:
     """The arguments: the table, and the place of the dataset; None where an option needs neither."""
 
-    lut: Annotated[Path | None, typer.Argument(metavar="LUT", help="Folder of the table.", show_default=False)] = None
+    lut: Annotated[
+        Path | None,
+        typer.Argument(
+            metavar="LUT", help="Folder of the table; demo: for a small one to begin with.", show_default=False
+        ),
+    ] = None
     out: Annotated[
         str | None, typer.Argument(metavar="OUT", help="Folder or URL to make; must not exist.", show_default=False)
     ] = None

@@ -62,7 +62,8 @@ def filesystem(url: str) -> tuple[AbstractFileSystem, str]:
 
     try:
         return url_to_fs(url)
-    except (ImportError, ValueError, OSError) as error:
+    except Exception as error:
+        # A store may connect here, and has errors of its own (ftplib's are no OSError).
         reason = " ".join(str(error).split()).rstrip(".")
         raise InputError(
             f"cannot reach {url}: {reason}; name a store that fsspec knows, and install its library (s3://: s3fs, "

@@ -17,7 +17,7 @@ import os
 import secrets
 import shutil
 import tempfile
-from collections.abc import Generator, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -36,6 +36,10 @@ Pieces = Iterable[bytes | memoryview]
 _SYNC_THREADS: Final = 16
 """Files synchronised at a time: a file system commits its journal once for all that wait, so that sixteen waits cost
 little more than one."""
+
+_WITH_FOLDERS: Final = frozenset({"ftp", "sftp", "ssh", "smb", "webdav", "webdavs", "hdfs", "arrow_hdfs"})
+"""Stores by fsspec's names in which a file lies in a folder that has to be there; an object store might make a bucket
+of it."""
 
 if TYPE_CHECKING:
     from fsspec.spec import AbstractFileSystem
@@ -218,7 +222,7 @@ class RemoteStore:
         """Write an object."""
         whole = data if isinstance(data, bytes) else joined(data)
         with self._translated_errors(name):
-            self._files.pipe_file(self._path(name), whole)
+            self._write(name, lambda files, path: files.pipe_file(path, whole))
 
     @contextmanager
     def create(self, name: str) -> Generator[BinaryIO]:
@@ -228,7 +232,7 @@ class RemoteStore:
             yield cast("BinaryIO", stream)
             stream.flush()
             with self._translated_errors(name):
-                self._files.put_file(stream.name, self._path(name))
+                self._write(name, lambda files, path: files.put_file(stream.name, path))
 
     def sync(self, names: Iterable[str]) -> None:
         """Return at once: a store that accepted an object keeps it."""
@@ -265,6 +269,18 @@ class RemoteStore:
         with self._translated_errors(folder):
             if self._files.exists(self._path(folder)):
                 self._files.rm(self._path(folder), recursive=True)
+
+    def _write(self, name: str, write: Callable[[AbstractFileSystem, str], object]) -> None:
+        """Write an object; where a store has folders, those above it are made when they are missing."""
+        files, path = self._files, self._path(name)
+        try:
+            write(files, path)
+        except Exception:
+            protocols = {files.protocol} if isinstance(files.protocol, str) else set(files.protocol)
+            if not protocols & _WITH_FOLDERS:
+                raise
+            files.makedirs(path.rpartition("/")[0], exist_ok=True)
+            write(files, path)
 
     def _path(self, name: str) -> str:
         return f"{self._root}/{name}" if name else self._root

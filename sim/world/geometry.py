@@ -21,6 +21,9 @@ from numpy.typing import NDArray
 from sim.world.room import Room
 from sim.world.wear import Fold
 
+_RIPPLE: Final = 0.1
+"""Height of each of the weaker short waves over that of the first; chosen."""
+
 _A0_DIAGONAL_MM: Final = math.hypot(1189, 841)
 """Of a sheet of A0 (ISO 216)."""
 
@@ -69,7 +72,7 @@ class Waviness:
         modes
             Number of waves; up to 3 cycles along the longer side of the page, weaker the shorter they are.
         wave_mm
-            The waves' length, within 15 %, in any direction; 0 for those long ones.
+            The waves' length, within 15 %; 0 for those long ones. One wave in any direction, and weak ones across it.
         """
         random = np.random.default_rng([seed, 0x77617679])
         longer = max(page_mm)
@@ -78,7 +81,8 @@ class Waviness:
         if wave_mm:
             length, direction = wave_mm * random.uniform(0.85, 1.15, modes), random.uniform(0, np.pi, modes)
             cycles = np.column_stack([np.cos(direction), np.sin(direction)]) * np.array(page_mm) / length[:, None]
-            amplitudes = random.uniform(0.5, 1, modes)
+            # Damp paper cockles: ridges beside each other, not quite regular.
+            amplitudes = np.where(np.arange(modes) == 0, 1.0, _RIPPLE)
         shape = cls(cycles, random.uniform(0, 2 * np.pi, modes), amplitudes, page_mm)
         x, y = np.meshgrid(np.linspace(0, page_mm[0], 201), np.linspace(0, page_mm[1], 201))
         extent = float(np.ptp(shape.height(np.stack([x, y], axis=-1))))

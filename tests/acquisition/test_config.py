@@ -174,9 +174,9 @@ def test_a_missing_file_is_named(tmp_path: Path) -> None:
         load_lab(tmp_path / "nowhere.toml")
 
 
-@pytest.mark.parametrize("name", ["demo.toml", "lab.toml"])
-def test_the_examples_are_read(name: str) -> None:
-    settings = load_lab(Path(__file__).parents[2] / "examples" / name)
+@pytest.mark.parametrize("name", ["simulated.toml", "lab.toml"])
+def test_the_settings_that_a_lab_begins_with_are_read(name: str) -> None:
+    settings = load_lab(Path(__file__).parents[2] / "acquisition" / "data" / name)
     require_whole_turns(settings.camera, settings.lab.projector)
 
 

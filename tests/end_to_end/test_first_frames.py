@@ -17,7 +17,7 @@ from acquisition.lights.illuminations import plan_illuminations, save_illuminati
 from acquisition.run.run import run_session
 from acquisition.session.folder import Session
 from acquisition.session.records import ACCEPTED, Attempt
-from foundation.errors import QualityError
+from foundation.errors import InputError, QualityError
 
 pytestmark = pytest.mark.slow
 
@@ -148,3 +148,13 @@ def test_the_lamps_level_of_a_run_that_is_taken_up_is_said(tmp_path: Path) -> No
     resumed = again(tmp_path)
     assert resumed.end == "complete", resumed.said
     assert "8.0 % weaker" in of(resumed.said, "level")[0] or "8.1 % weaker" in of(resumed.said, "level")[0]
+
+
+def test_a_light_that_is_none_is_said_before_anything_moves(tmp_path: Path) -> None:
+    run(tmp_path, lights=1)
+    (tmp_path / "illuminations.csv").write_text(
+        (tmp_path / "illuminations.csv").read_text().splitlines()[0] + "\n0,uniform,,0,0,0\n"
+    )
+    with pytest.raises(InputError, match=r"light 0 has the codes 0, 0, 0: no frame .* take it out"):
+        run_session(load_lab(tmp_path / "LAB.toml"), tmp_path / "another", lambda done, total: None)
+    assert not (tmp_path / "another").exists()

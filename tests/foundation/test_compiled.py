@@ -103,3 +103,48 @@ def test_only_the_decorator_keeps_machine_code() -> None:
         if "cache=True" in path.read_text()
     ]
     assert caching == []
+
+
+ANNOUNCED = """
+import pty, os, sys
+pid, terminal = pty.fork()
+if pid == 0:
+    from kernels.square import square
+    square(5), square(2.5)
+    os._exit(0)
+said = b""
+while True:
+    try:
+        said += os.read(terminal, 1000)
+    except OSError:
+        break
+os.waitpid(pid, 0)
+print(said.count(b"compiling for this processor"))
+"""
+
+
+def test_the_first_start_says_on_a_terminal_why_it_takes_long(tmp_path: Path) -> None:
+    root = Path(__file__).parents[2]
+    for folder in (tmp_path / "foundation", tmp_path / "kernels"):
+        folder.mkdir()
+        (folder / "__init__.py").touch()
+    (tmp_path / "foundation" / "compiled.py").write_bytes((root / "foundation" / "compiled.py").read_bytes())
+    (tmp_path / "kernels" / "square.py").write_text(SQUARE.format(module="kernels.power"))
+    (tmp_path / "kernels" / "power.py").write_text(POWER.format(exponent=2))
+
+    def said(program: str) -> tuple[str, str]:
+        done = subprocess.run(
+            [sys.executable, "-c", program],
+            cwd=tmp_path,
+            env={"PYTHONPATH": str(tmp_path), "NUMBA_CACHE_DIR": str(tmp_path / "cache")},
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+        return done.stdout, done.stderr
+
+    assert said(ANNOUNCED) == ("1\n", "")
+    assert said(ANNOUNCED) == ("0\n", ""), "nothing is compiled the second time"
+    (tmp_path / "kernels" / "power.py").write_text(POWER.format(exponent=3))
+    # Compiled anew, but into a file that nobody watches.
+    assert said("from kernels.square import square; print(square(5))") == ("125\n", "")

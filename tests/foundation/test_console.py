@@ -322,3 +322,15 @@ class TestEnding:
         assert "ending soon" in capfd.readouterr().err
         assert signal.getsignal(signal.SIGINT) == before
         signal.signal(signal.SIGINT, inherited)
+
+
+def test_a_working_folder_that_is_gone_is_said(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    gone = tmp_path / "gone"
+    gone.mkdir()
+    monkeypatch.chdir(gone)
+    gone.rmdir()
+    assert run(lambda: Path("x").resolve()) == 2
+    assert "the folder in which this was started is gone; change to one that is there" in capsys.readouterr().err
+    monkeypatch.chdir(tmp_path)

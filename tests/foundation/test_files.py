@@ -341,3 +341,14 @@ def test_a_file_of_another_size_than_the_system_told_is_read_to_its_end(
 
     monkeypatch.setattr(storage.os, "fstat", fstat)
     assert read_whole(tmp_path / "frame") == b"ten bytes."
+
+
+def test_a_folder_that_is_there_and_not_there_is_not_waited_for(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def mkdir(*arguments: object, **options: object) -> None:
+        raise FileExistsError(errno.EEXIST, "File exists")
+
+    monkeypatch.setattr(Path, "mkdir", mkdir)
+    with pytest.raises(StorageError, match="its folder is there and not there; name a place on an ordinary disk"):
+        storage.make_folder(tmp_path / "x")

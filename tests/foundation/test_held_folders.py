@@ -226,3 +226,17 @@ def test_messages_name_what_is_made_there_rather_than_the_hidden_folder(tmp_path
         held_folder(table.with_name(".table.partial"), BUSY, of=table),
     ):
         pytest.fail("held")
+
+
+def test_a_folder_that_is_made_and_never_there_is_not_waited_for(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def make_nothing(folder: Path, of: Path | None = None) -> None:
+        del folder, of
+
+    monkeypatch.setattr("foundation.held_folders.make_folder", make_nothing)
+    with (
+        pytest.raises(StorageError, match="its folder is made and not there; name a place on an ordinary disk"),
+        held_folder(tmp_path / "x", "busy"),
+    ):
+        pass

@@ -14,7 +14,7 @@ from acquisition.config import LabSettings
 from acquisition.run.planning.answers import Answers
 from acquisition.run.planning.sizes import RETAKEN_SHARE, Estimate, bytes_text, frame_bytes, needed_bytes
 from acquisition.run.planning.work import Work
-from foundation.errors import CropError, DeviceFault, DeviceRefused, StorageError, counted
+from foundation.errors import CropError, DeviceFault, DeviceRefused, InputError, StorageError, counted
 
 DOWNLOAD_BYTES_PER_S: Final = 25e6
 """What a cable is assumed to carry before a frame was taken: USB 2.0 carries 30 to 40 million bytes a second."""
@@ -112,6 +112,7 @@ def make_plan(
         _battery_fault(work, answers),
         _card_fault(work, answers, size.value),
         _disk_fault(work, size, free_bytes),
+        _black_fault(settings, work),
     )
     return RunPlan(
         settings,
@@ -155,6 +156,16 @@ def _disk_fault(work: Work, size: Estimate, free_bytes: int) -> StorageError | s
         f"{bytes_text(missing, up=True)} are missing; free them, or name a session folder on another disk"
     )
     return StorageError(sentence) if size.sure else f"{sentence} (the size of a frame is {size.basis})"
+
+
+def _black_fault(settings: LabSettings, work: Work) -> CropError | None:
+    """Return why a new session with a light that is none could never be complete; one that is begun goes on."""
+    black = [step.illumination for step in work.steps if step.kind == "light" and not any(step.colour.codes)]
+    if work.done or not black:
+        return None
+    return InputError(
+        f"{settings.illuminations}: light {black[0]} has the codes 0, 0, 0: no frame under it can be used; take it out"
+    )
 
 
 def _exposure_fault(settings: LabSettings, work: Work, answers: Answers) -> CropError | None:

@@ -9,7 +9,7 @@ from acquisition.run.planning.answers import Answers
 from acquisition.run.planning.plan import RunPlan, is_offered
 from acquisition.run.planning.sizes import RETAKEN_SHARE, bytes_text
 from acquisition.run.planning.work import Work
-from acquisition.run.shutter import holds_whole_turns, light_period_s
+from acquisition.run.shutter import holds_whole_turns, period_s, wheel_of
 from acquisition.session.plan import KINDS
 from acquisition.session.progress import duration_text
 from foundation.errors import counted
@@ -96,14 +96,10 @@ def _kinds(work: Work) -> str:
 
 def _turns(settings: LabSettings) -> str:
     """Return how many turns of the colour wheel, or pictures, an exposure holds; empty where the light is steady."""
-    if settings.rig == "lab":
-        period, unit = light_period_s(settings.lab.projector), "turn of the colour wheel"
-        if not settings.lab.projector.colour_wheel_hz:
-            unit = "picture"
-    elif settings.rig == "simulated" and settings.simulated.room.get("wheel_hz"):
-        period, unit = 1 / float(settings.simulated.room["wheel_hz"]), "turn of the colour wheel"
-    else:
+    wheel = wheel_of(settings)
+    if settings.rig != "lab" and not wheel:
         return ""
+    period, unit = period_s(settings), "turn of the colour wheel" if wheel else "picture"
     turns = settings.camera.shutter_s / period
     plural = unit.replace("turn ", "turns ").replace("picture", "pictures")
     if holds_whole_turns(settings.camera.shutter_s, period):

@@ -30,7 +30,9 @@ from calibration.causes.evidence import Evidence, evidence_names
 from calibration.causes.findings import explained_figures
 from calibration.causes.rules import RULES, Condition, Rule, decide
 
-PRINT = Evidence(frames=8, showing=0, even_showing=0, in_first=0, spot=1, scatter=0.002, softer=0, share=0.03, hot=0)
+PRINT = Evidence(
+    frames=8, showing=0, even_showing=0, some_whites=0, in_first=0, spot=1, scatter=0.002, softer=0, share=0.03, hot=0
+)
 """A place of the print that is the same in all frames."""
 LIGHT = Evidence(frames=8, showing=0.125, even_showing=0, in_first=0, spot=0, scatter=0.006, softer=0, share=0.07)
 """A place that is off in one light's frame."""
@@ -51,6 +53,10 @@ CASES: list[tuple[str, Evidence, Cause]] = [
     ("unlike_block", replace(LIGHT, share=0.8, deviation=-0.05), UNKNOWN),
     ("doubtful_share", replace(PRINT, deviation=-0.1, tint=0.7, added=0, kept=0.9), STAIN),
     ("doubtful_share", replace(PRINT, deviation=-0.03, tint=0.1, added=0, kept=0.97), SHADOW),
+    # Cells at its rim are half under it, and most under it do not look like the chart's.
+    ("doubtful_share", replace(PRINT, deviation=-0.2, tint=0.63, added=0.025, kept=0.64), STAIN),
+    ("unfit_share", Evidence(white_residual=1, deviation=-0.2, tint=0.7, share=0.03, rim_frames=0, hot=0), STAIN),
+    ("unfit_share", Evidence(white_residual=1, deviation=-0.2, tint=0.1, share=0.03, rim_frames=0, hot=0), UNKNOWN),
     # Between a stain and a shadow: both are possible.
     ("doubtful_share", replace(PRINT, deviation=-0.05, tint=0.3, added=0, kept=0.95), UNKNOWN),
     ("doubtful_share", replace(PRINT, deviation=0.1, tint=0.2, added=0.03, kept=0.97), REFLECTION),
@@ -62,6 +68,13 @@ CASES: list[tuple[str, Evidence, Cause]] = [
         "doubtful_share",
         replace(PRINT, showing=0.125, deviation=-0.1, tint=0.7, added=0, kept=0.9),
         STAIN,
+    ),
+    # References of one white frame are off there, as a hand in a corner has it that the field follows.
+    ("doubtful_share", replace(PRINT, some_whites=1, deviation=-0.2, tint=0, added=0.003, kept=0.79), UNKNOWN),
+    (
+        "doubtful_share",
+        replace(PRINT, some_whites=1, white_residual=0.25, rim_frames=0.25, deviation=-0.2, tint=0, kept=0.79),
+        OBJECT_IN_FRAME,
     ),
     # From one frame nothing can be said of all.
     ("doubtful_share", Evidence(frames=0, deviation=-0.1, tint=0.7, added=0, kept=0.9, share=0.03), UNKNOWN),

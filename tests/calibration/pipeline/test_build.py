@@ -229,7 +229,7 @@ def test_a_lamp_that_fades_is_reported_and_not_corrected(lab: Lab, tmp_path: Pat
 def test_the_report_stands_alone(built: BuildResult) -> None:
     assert built.lut is not None
     page = (built.lut / "report.html").read_text()
-    assert page.count("data:image/png;base64,") == 7
+    assert page.count("data:image/png;base64,") == 8
     assert re.search(r"(src|href)='?http", page) is None
     for row in summary(built.figures):
         assert html.escape(row.name) in page

@@ -163,6 +163,21 @@ def test_dim_light_has_no_more_noise_than_a_few_terms_bring(level: float) -> Non
     assert float(np.mean(off)) < (1.5 * relative) ** 2 * (12 / 3 + 1) / 467
 
 
+def test_a_hand_in_a_corner_is_no_fall_off() -> None:
+    """A twelfth of the references is dark in one frame; the field of the others is its base, and stays."""
+    random = np.random.default_rng(21)
+    even = 6000 * falloff(PLACES)
+    base = read_paper(even + random.normal(0, 12, even.shape)).field
+    seen = even + random.normal(0, 12, even.shape)
+    seen[np.linalg.norm(PLACES - PAGE, axis=1) < 115] *= 0.2
+    found = read_paper(seen, base)
+    expected = falloff(CENTRES) / falloff(CENTRES).mean(axis=0)
+    assert np.abs(found.field.at(CENTRES) / expected - 1).max() < 0.01
+    assert np.linalg.norm(np.array(found.left.at_mm) - PAGE) < 115
+    assert found.left.deviation == pytest.approx((-0.8, -0.8, -0.8), abs=0.02)
+    assert 0.03 < found.left.share < 0.15
+
+
 def test_references_in_the_margin_give_no_shape_that_vanishes_there() -> None:
     """The light bends by 4 % in the middle, which the base knows; noise in the margin must not undo it."""
     side = RANDOM.random((300, 2)) * PAGE

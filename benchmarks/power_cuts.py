@@ -1,0 +1,342 @@
+"""Power cuts during a run: what was flushed stays, and the session ends in the frames of an undisturbed one.
+
+`python -m benchmarks.power_cuts [CUTS [SEED]]` prints one JSON object a line. Needs Linux, root, `mkfs.ext4`, libfuse 2
+and `pip install fusepy`; it says what is missing, and is skipped then.
+
+A session is taken on an ext4 file system whose disk is a loop device over a file that this program serves by FUSE. That
+file knows which sectors were written since the disk was last told to flush. A cut comes at an operation of chance (of
+those of `benchmarks.session_kills`): the run is killed, and of the sectors that were not flushed the disk keeps each
+with a chance of a half, as a drive with a cache does. That disk is mounted, which recovers its journal, and the session
+is taken to its end on it and compared: bytes, hashes, times, rows. Then a tenth as many cuts of runs whose raw files
+are never flushed: where those end alike, the disk forgets nothing, and the figures before say nothing.
+
+What is flattered: files are small, sectors are whole (no drive of today tears 512 bytes), a flush is believed.
+"""
+
+from __future__ import annotations
+
+import errno
+import importlib
+import json
+import os
+import random
+import shutil
+import signal
+import stat
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Callable
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+from acquisition.chart.layout import design_chart
+from acquisition.session.folder import Session
+from acquisition.session.journal import Journal
+from benchmarks.session_kills import LIGHTS, SETTINGS, STEPS, contents, in_child, killed_at_operation, take
+
+CUTS = 200
+"""Cuts that are made unless more are asked for: a few minutes on a quiet machine."""
+LEAST_CONTROL = 10
+"""Cuts of the control at least: about every second one of them takes a file that was not flushed."""
+
+DISK_BYTES = 24 << 20
+SECTOR = 512
+NAME = "/disk"
+"""Of the one file that is served."""
+
+
+class CachedDisk:
+    """A disk with a cache: reads see everything, and a cut keeps what was flushed and some of the rest.
+
+    Parameters
+    ----------
+    content
+        What is on the disk at first.
+    """
+
+    def __init__(self, content: bytes) -> None:
+        self._flushed = bytearray(content)
+        self._cached: dict[int, bytes] = {}
+        self._guard = threading.Lock()
+        self.flushes = 0
+
+    def read(self, size: int, offset: int) -> bytes:
+        """Return bytes as they were written last."""
+        with self._guard:
+            first, last = offset // SECTOR, -(-(offset + size) // SECTOR)
+            parts = [self._cached.get(number) or self._sector(number) for number in range(first, last)]
+        return b"".join(parts)[offset - first * SECTOR :][:size]
+
+    def write(self, data: bytes, offset: int) -> int:
+        """Take whole sectors into the cache."""
+        assert offset % SECTOR == 0, offset
+        assert len(data) % SECTOR == 0, len(data)
+        with self._guard:
+            for start in range(0, len(data), SECTOR):
+                self._cached[(offset + start) // SECTOR] = bytes(data[start : start + SECTOR])
+        return len(data)
+
+    def flush(self) -> None:
+        """Put the cache on the disk."""
+        with self._guard:
+            self._keep(self._cached)
+            self._cached = {}
+            self.flushes += 1
+
+    def cut(self, chance: random.Random) -> bytes:
+        """Return the disk after a power cut."""
+        with self._guard:
+            kept = {number: data for number, data in sorted(self._cached.items()) if chance.random() < 0.5}
+            self._keep(kept)
+            return bytes(self._flushed)
+
+    def _sector(self, number: int) -> bytes:
+        return bytes(self._flushed[number * SECTOR : (number + 1) * SECTOR])
+
+    def _keep(self, sectors: dict[int, bytes]) -> None:
+        for number, data in sectors.items():
+            self._flushed[number * SECTOR : (number + 1) * SECTOR] = data
+
+
+def serve(disk: CachedDisk, folder: Path, at_cut: Callable[[], object]) -> None:
+    """Serve the disk as the file `NAME` in `folder` until it is unmounted; SIGUSR1 calls `at_cut`."""
+    fuse: Any = importlib.import_module("fuse")
+
+    class Served(fuse.Operations):
+        def getattr(self, path: str, fh: int | None = None) -> dict[str, Any]:
+            if path == "/":
+                return {"st_mode": stat.S_IFDIR | 0o755, "st_nlink": 2}
+            if path != NAME:
+                raise fuse.FuseOSError(errno.ENOENT)
+            return {"st_mode": stat.S_IFREG | 0o600, "st_nlink": 1, "st_size": DISK_BYTES}
+
+        def read(self, path: str, size: int, offset: int, fh: int) -> bytes:
+            return disk.read(size, offset)
+
+        def write(self, path: str, data: bytes, offset: int, fh: int) -> int:
+            return disk.write(data, offset)
+
+        def fsync(self, path: str, datasync: int, fh: int) -> int:
+            disk.flush()
+            return 0
+
+    def wait() -> None:
+        while True:
+            signal.sigwait({signal.SIGUSR1})
+            at_cut()
+
+    signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGUSR1})
+    threading.Thread(target=wait, daemon=True).start()
+    fuse.FUSE(Served(), str(folder), foreground=True, nothreads=True, big_writes=True)
+
+
+class CutSessions:
+    """Sessions whose power is cut by chance and which are then taken to their end.
+
+    Attributes
+    ----------
+    cuts, differing
+        How many there were, and how many sessions ended otherwise than the undisturbed one.
+    lost
+        Of the frames whose row was in the journal before the cut, those that were not afterwards.
+    """
+
+    def __init__(self, scratch: Path, seed: int, flushing: bool = True) -> None:
+        scratch.mkdir()
+        self.flushing = flushing
+        self.scratch, self.chance = scratch, random.Random(seed)
+        self.cuts = self.differing = self.lost = self.flushes = 0
+        self.served, self.mounted = scratch / "served", scratch / "mounted"
+        for folder in (self.served, self.mounted):
+            folder.mkdir()
+        undisturbed = scratch / "undisturbed"
+        Session.create(undisturbed, SETTINGS.to_toml(), design_chart(bits=1), LIGHTS, STEPS).close()
+        self.blank = self._blank_disk(undisturbed)
+        told = scratch / "told"
+
+        def work() -> None:
+            from benchmarks.session_kills import counting
+
+            most = [0]
+            counting(lambda number: most.__setitem__(0, number))
+            take(undisturbed)
+            told.write_text(str(most[0]))
+
+        assert in_child(work) == 0
+        self.operations = int(told.read_text())
+        self.expected = contents(undisturbed)
+
+    def _blank_disk(self, session: Path) -> bytes:
+        image = self.scratch / "blank.img"
+        image.write_bytes(b"")
+        os.truncate(image, DISK_BYTES)
+        _run("mkfs.ext4", "-q", str(image))
+        _run("mount", "-o", "loop", str(image), str(self.mounted))
+        shutil.copytree(session, self.mounted / "session")
+        _run("umount", str(self.mounted))
+        return image.read_bytes()
+
+    def session(self) -> None:
+        """Cut the power of a run, take the session to its end on what the disk kept, and compare."""
+        image, ready = self.scratch / "after.img", self.scratch / "ready"
+        content = self.blank
+        for _ in range(self.chance.randint(1, 3)):
+            content, committed = self._cut(content, image, ready)
+            self.cuts += 1
+            _run("mount", "-o", "loop", str(image), str(self.mounted))
+            try:
+                with Session.open(self.mounted / "session") as opened:
+                    kept = {frame.sha256 for frame in opened.journal.accepted_files()}
+                self.lost += len(committed - kept)
+            finally:
+                _run("umount", str(self.mounted))
+            content = image.read_bytes()
+        _run("mount", "-o", "loop", str(image), str(self.mounted))
+        try:
+            folder = self.mounted / "session"
+            assert in_child(lambda: take(folder)) == 0
+            self.differing += contents(folder) != self.expected
+        finally:
+            _run("umount", str(self.mounted))
+
+    def _cut(self, content: bytes, image: Path, ready: Path) -> tuple[bytes, set[str]]:
+        """Run until the power fails; leave the disk in `image`, return the journal's frames before, by hash."""
+        disk, chance = CachedDisk(content), random.Random(self.chance.random())
+        operation = self.chance.randrange(1, self.operations)
+        ready.unlink(missing_ok=True)
+
+        def at_cut() -> None:
+            image.write_bytes(disk.cut(chance))
+            # Whoever waits for it must not find it empty.
+            partial = ready.with_suffix(".partial")
+            partial.write_text(str(disk.flushes))
+            partial.replace(ready)
+
+        image.unlink(missing_ok=True)
+        server = os.fork()
+        if server == 0:
+            serve(disk, self.served, at_cut)
+            os._exit(0)
+        file = self.served / NAME[1:]
+        log = self.scratch / "committed"
+        log.unlink(missing_ok=True)
+        # Whatever fails, no file system stays mounted over a disk that is gone.
+        with ExitStack() as at_last:
+            at_last.callback(os.waitpid, server, 0)
+            at_last.callback(_until, lambda: _succeeds("umount", str(self.served)))
+            _until(file.exists)
+            device = _run("losetup", "--find", "--show", str(file)).strip()
+            at_last.callback(_run, "losetup", "--detach", device)
+            _run("mount", device, str(self.mounted))
+            at_last.callback(_run, "umount", str(self.mounted))
+            with _LoggedCommits(log), _Flushing(self.flushing):
+                ended = killed_at_operation(self.mounted / "session", operation)
+            assert ended in (0, -signal.SIGKILL), ended
+            os.kill(server, signal.SIGUSR1)
+            _until(ready.exists)
+            self.flushes += int(ready.read_text())
+        committed = set(log.read_text().split()) if log.exists() else set[str]()
+        return image.read_bytes(), committed
+
+
+class _Flushing:
+    """Let files be flushed, or, for the control, only seem to be; the journal is flushed by SQLite all the same."""
+
+    def __init__(self, flushing: bool) -> None:
+        self._flushing, self._real = flushing, os.fsync
+
+    def __enter__(self) -> None:
+        if not self._flushing:
+            os.fsync = lambda fd: None
+
+    def __exit__(self, *_: object) -> None:
+        os.fsync = self._real
+
+
+class _LoggedCommits:
+    """Note the hash of every frame whose row is committed, outside the disk that fails."""
+
+    def __init__(self, log: Path) -> None:
+        self._log, self._real = log, Journal.commit
+
+    def __enter__(self) -> None:
+        real, log = self._real, self._log
+
+        def commit(journal: Journal, attempt: int, **named: Any) -> None:
+            real(journal, attempt, **named)
+            if named["judgement"].accepted:
+                with log.open("a") as stream:
+                    stream.write(f"{named['sha256']}\n")
+
+        setattr(Journal, "commit", commit)  # noqa: B010  # another signature, for this process alone
+
+    def __exit__(self, *_: object) -> None:
+        setattr(Journal, "commit", self._real)  # noqa: B010
+
+
+def _run(*words: str) -> str:
+    return subprocess.run(words, check=True, capture_output=True, text=True).stdout
+
+
+def _succeeds(*words: str) -> bool:
+    return subprocess.run(words, check=False, capture_output=True).returncode == 0
+
+
+def _until(holds: Callable[[], bool]) -> None:
+    until = time.monotonic() + 30
+    while not holds():
+        if time.monotonic() > until:
+            raise TimeoutError("the served disk does not answer")
+        time.sleep(0.01)
+
+
+def _missing() -> str:
+    """Return what this machine lacks; empty if nothing."""
+    if sys.platform != "linux" or os.geteuid() != 0:
+        return "Linux and root are needed, to mount file systems"
+    if shutil.which("mkfs.ext4") is None:
+        return "mkfs.ext4 is needed (package e2fsprogs)"
+    try:
+        importlib.import_module("fuse")
+    except (ImportError, OSError) as error:
+        return f"libfuse 2 and fusepy are needed (apt install libfuse2; pip install fusepy): {error}"
+    return ""
+
+
+def main(argv: list[str]) -> int:
+    """Cut the power and print what came of it."""
+    if missing := _missing():
+        print(f"power cuts: not tried: {missing}", file=sys.stderr)
+        return 0
+    wanted, seed = int(argv[0]) if argv else CUTS, int(argv[1]) if argv[1:] else 20190601
+    begun = time.perf_counter()
+    with tempfile.TemporaryDirectory() as scratch:
+        sessions = CutSessions(Path(scratch) / "flushed", seed)
+        count = 0
+        while sessions.cuts < wanted:
+            sessions.session()
+            count += 1
+        control = CutSessions(Path(scratch) / "control", seed, flushing=False)
+        while control.cuts < max(wanted // 10, LEAST_CONTROL):
+            control.session()
+    for name, value, unit in (
+        ("power cuts: cuts", sessions.cuts, "cuts"),
+        ("power cuts: sessions", count, "sessions"),
+        ("power cuts: flushes of the disk before them", sessions.flushes, "flushes"),
+        ("power cuts: frames that the journal had and lost", sessions.lost, "frames"),
+        ("power cuts: sessions that differ from an undisturbed one", sessions.differing, "sessions"),
+        ("power cuts: control without flushing: cuts", control.cuts, "cuts"),
+        ("power cuts: control without flushing: frames lost", control.lost, "frames"),
+        ("power cuts: control without flushing: sessions that differ", control.differing, "sessions"),
+        ("power cuts: time", round(time.perf_counter() - begun, 1), "s"),
+    ):
+        print(json.dumps({"name": name, "value": value, "unit": unit, "against": ""}), flush=True)
+    return int(sessions.differing > 0 or sessions.lost > 0 or control.differing == 0)
+
+
+if __name__ == "__main__":
+    raise SystemExit(main(sys.argv[1:]))

@@ -1,0 +1,79 @@
+"""A table to begin with, for whoever has none: ``generate demo: OUT --sources cat.jpg``.
+
+A computed table of 4096 colours under eight published lights, as `sim table` makes it, in some ten seconds; it is kept
+in the user's folder for such things and used from there the next time. The camera's sensitivities are measured ones,
+print and noise are the simulated lab's; a print shop's profile makes greys grey.
+"""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Final
+
+from foundation.errors import InputError, StorageError
+from foundation.hashing import sha256_of
+from foundation.version import software
+
+DEMO: Final = "demo:"
+"""What stands in place of a table's folder."""
+
+CAMERA: Final = "Canon_EOS_600D"
+LIGHTS: Final = "2856K,4000K,D55,D65,FL2,LED-B3,7500K,10000K"
+"""Incandescent lamp to blue sky, a fluorescent lamp and an LED between."""
+
+BITS: Final = 4
+"""Bits kept of each channel: 4096 colours, 5 MB."""
+
+
+def table_folder(given: Path, cache: Path | None = None) -> Path:
+    """Return the folder of a table: the one given, or that of the table to begin with, made if it is not there.
+
+    Parameters
+    ----------
+    given
+        What stands in place of LUT.
+    cache
+        Where the table is kept; None for `generator.rendering.kept_mixtures.cache_folder`.
+
+    Raises
+    ------
+    InputError
+        There is no place where it could be kept.
+    StorageError
+        It cannot be written there.
+    """
+    if str(given) != DEMO:
+        return given
+    from generator.rendering.kept_mixtures import cache_folder
+
+    cache = cache or cache_folder()
+    if cache is None:
+        raise InputError(
+            f"{DEMO} needs a place to keep its table, and there is no home folder; set XDG_CACHE_HOME, or make one "
+            "with sim table"
+        )
+    key = sha256_of(repr((software(), CAMERA, LIGHTS, BITS)).encode())[:12]
+    folder = cache / f"demo-{key}"
+    if not (folder / "lut.json").is_file():
+        _make(folder)
+    print(f"{DEMO} {folder}: a computed table of {CAMERA}, {8**BITS} colours under {LIGHTS}; see sim table --help")
+    return folder
+
+
+def _make(folder: Path) -> None:
+    """Have ``sim table`` make it, as a user would: this package knows tables and nothing that makes them."""
+    options = ["--camera", CAMERA, "--lights", LIGHTS, "--print", "managed", "--paper", "matt"]
+    with TemporaryDirectory() as place:
+        settings = Path(place) / "settings.toml"
+        settings.write_text(f"[chart]\nbits = {BITS}\n", encoding="utf-8")
+        words = [sys.executable, "-m", "synthesis.cli", "table", str(folder), *options, "--settings", str(settings)]
+        done = subprocess.run(words, stdout=subprocess.DEVNULL, check=False)
+    # Another program may have made it meanwhile, of the same bytes.
+    if done.returncode and not (folder / "lut.json").is_file():
+        raise StorageError(
+            f"the table for {DEMO} could not be made in {folder}: sim table ended with exit code {done.returncode}, "
+            "and says above why; mend that, or make a table elsewhere with sim table"
+        )

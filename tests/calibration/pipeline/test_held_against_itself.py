@@ -1,0 +1,230 @@
+"""Sessions of eight lights in which something is wrong that each frame alone does not show: each has its own cause."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from io import BytesIO
+from pathlib import Path
+
+import pytest
+
+from acquisition.lights.illuminations import Illumination
+from acquisition.session.folder import Session
+from acquisition.session.mending.retaking import lights_text
+from acquisition.session.plan import SessionStep
+from calibration.pipeline.build import build
+from calibration.report.report_json import report_json
+from calibration.report.summary import summary
+from calibration.verdict.result import BuildResult
+from drivers.presenter import WHITE, Colour
+from foundation.errors import QualityError
+from sim.camera.dng import write_dng
+from sim.world.room import Room
+from sim.world.sensors import BODIES
+from sim.world.world import World
+from tests.calibration.lab import SETTINGS, TAKEN_AT, Lab, hang, renumbered, take
+
+CODES = (
+    Colour(255, 255, 255),
+    Colour(255, 0, 0),
+    Colour(0, 255, 0),
+    Colour(0, 0, 255),
+    Colour(255, 190, 100),
+    Colour(170, 200, 255),
+    Colour(255, 255, 0),
+    Colour(110, 110, 110),
+)
+WHITE_LIGHT, RED, BLUE, WARM, COOL = 0, 1, 3, 4, 5
+EIGHT = tuple(Illumination(index, "uniform", None, colour) for index, colour in enumerate(CODES))
+ABOUT_NAMES = {
+    "off_codes_deg", "off_brightness", "exchanged_lights", "exchange_deg", "held_share", "white_frame_deg",
+    "white_frame_brightness", "white_short", "additivity", "other_camera", "other_lens", "other_exposure",
+    "primaries_lacking",
+}  # fmt: skip
+HALF = replace(SETTINGS, shutter_s=SETTINGS.shutter_s / 2)
+
+Frame = Callable[[SessionStep], bytes]
+
+
+def write_json(result: BuildResult, session: Session, folder: Path) -> None:
+    """Write the report for programs alone: drawing the other takes longer than the build."""
+    (folder / "report.json").write_text(json.dumps(report_json(result)))
+
+
+def built(
+    lab: Lab, tmp_path: Path, frame: Frame | None = None, lights: tuple[Illumination, ...] = EIGHT
+) -> BuildResult:
+    with take(lab, tmp_path / "session", lights, frame=frame) as session:
+        return build(session, tmp_path / "lut", report=write_json)
+
+
+def refused(lab: Lab, tmp_path: Path, frame: Frame) -> tuple[str, dict[str, object]]:
+    """Return why a session makes no table, and what its report says for programs."""
+    with take(lab, tmp_path / "session", EIGHT, frame=frame) as session, pytest.raises(QualityError) as error:
+        build(session, tmp_path / "lut", report=write_json)
+    return str(error.value), json.loads((tmp_path / "lut.refused" / "report.json").read_text())
+
+
+def remarks(result: BuildResult) -> set[str]:
+    return {row.threshold.name for row in result.verdict.remarks} & ABOUT_NAMES
+
+
+def showing(lab: Lab, colours: Mapping[int, Colour]) -> Frame:
+    """Return frames of a session in which some lights show other colours than their names say."""
+
+    def frame(step: SessionStep) -> bytes:
+        colour = step.colour if step.illumination is None else colours.get(step.illumination, step.colour)
+        return lab.dng(colour, step.number)
+
+    return frame
+
+
+def as_stated(lab: Lab, step: SessionStep, exposed: object, stated: object, world: World | None = None) -> bytes:
+    """Return a frame exposed in one way whose file states another."""
+    counts = (world or lab.world).expose(step.colour, exposed, key=(step.number,))  # pyright: ignore[reportArgumentType]
+    stream = BytesIO()
+    body = (world or lab.world).body
+    write_dng(stream, counts, body, settings=stated, taken_at=TAKEN_AT)  # pyright: ignore[reportArgumentType]
+    return stream.getvalue()
+
+
+def test_a_session_with_nothing_wrong_has_no_remark(lab: Lab, tmp_path: Path) -> None:
+    result = built(lab, tmp_path)
+    assert remarks(result) == set()
+    codes = result.figures.lights.codes
+    assert codes is not None
+    assert codes.held.all()
+    assert codes.exchange_deg < 1
+    assert codes.off_deg.max() == 0
+
+
+@pytest.mark.parametrize(("one", "other"), [(RED, BLUE), (WARM, COOL), (WHITE_LIGHT, RED)])
+def test_exchanged_lights_are_refused_and_both_named(lab: Lab, tmp_path: Path, one: int, other: int) -> None:
+    said, report = refused(lab, tmp_path, showing(lab, {one: CODES[other], other: CODES[one]}))
+    assert f"exchanged names: light {one} and light {other}" in said
+    assert "brilliant colour" not in said
+    assert report["retake"] == lights_text([one, other])
+
+
+def test_a_white_frame_that_is_red_is_refused_as_such(lab: Lab, tmp_path: Path) -> None:
+    def frame(step: SessionStep) -> bytes:
+        shown = CODES[RED] if step.kind == "white" and step.number == 0 else step.colour
+        return lab.dng(WHITE if step.illumination == RED else shown, step.number)
+
+    said, _ = refused(lab, tmp_path, frame)
+    assert "White frame against what the lights predict" in said or "exchanged names: light 1 and white frame 0" in said
+    assert "warm up" not in said
+
+
+def test_two_lights_of_another_camera_are_refused(lab: Lab, tmp_path: Path) -> None:
+    body = replace(BODIES["Test"], model="Other", sensitivities="Canon_EOS_200D")
+    other = World(lab.world.sheet, body, lab.world.room)
+
+    def frame(step: SessionStep) -> bytes:
+        if step.illumination in (WARM, COOL):
+            return as_stated(lab, step, SETTINGS, SETTINGS, other)
+        return lab.dng(step.colour, step.number)
+
+    said, report = refused(lab, tmp_path, frame)
+    assert "Frames of another camera: 2" in said
+    assert "Other" in said
+    assert report["retake"] == "4-5"
+
+
+def test_another_body_of_the_same_model_is_refused(lab: Lab, tmp_path: Path) -> None:
+    def frame(step: SessionStep) -> bytes:
+        if step.illumination != COOL:
+            return lab.dng(step.colour, step.number)
+        counts, stream = lab.world.expose(step.colour, SETTINGS, key=(1,)), BytesIO()
+        write_dng(stream, counts, lab.world.body, settings=SETTINGS, taken_at=TAKEN_AT, serial="42")
+        return stream.getvalue()
+
+    said, _ = refused(lab, tmp_path, frame)
+    assert "no. 42" in said
+
+
+@pytest.mark.parametrize("stated", [HALF, replace(SETTINGS, iso=200)], ids=["shutter", "iso"])
+def test_lights_whose_files_state_another_exposure_are_refused(lab: Lab, tmp_path: Path, stated: object) -> None:
+    exposed = HALF if stated is HALF else SETTINGS
+
+    def frame(step: SessionStep) -> bytes:
+        off = step.illumination in (WARM, COOL)
+        return as_stated(lab, step, exposed if off else SETTINGS, stated if off else SETTINGS)
+
+    said, report = refused(lab, tmp_path, frame)
+    assert "Exposure of a frame against that of most" in said
+    assert "instead of 0.5 s, ISO 100, f/8" in said
+    assert report["retake"] == "4-5"
+
+
+def test_white_frames_at_half_exposure_are_no_brilliant_colour(lab: Lab, tmp_path: Path) -> None:
+    said, report = refused(
+        lab,
+        tmp_path,
+        lambda step: as_stated(lab, step, *((HALF, HALF) if step.kind == "white" else (SETTINGS, SETTINGS))),
+    )
+    assert "Exposure of a frame against that of most" in said
+    assert "additivity" not in report["figures"]  # pyright: ignore[reportOperatorIssue]
+
+
+def test_a_white_frame_at_half_exposure_that_does_not_say_so(lab: Lab, tmp_path: Path) -> None:
+    said, report = refused(
+        lab, tmp_path, lambda step: as_stated(lab, step, HALF if step.kind == "white" else SETTINGS, SETTINGS)
+    )
+    assert "white" in said
+    rows = {limit["name"] for limit in report["limits"] if limit["outcome"] != "accept"}  # pyright: ignore
+    assert "additivity" not in rows
+    assert rows & {"white_frame_brightness", "white_short"}
+
+
+def test_a_light_at_half_exposure_that_does_not_say_so(lab: Lab, tmp_path: Path) -> None:
+    def frame(step: SessionStep) -> bytes:
+        return as_stated(lab, step, HALF if step.illumination == WHITE_LIGHT else SETTINGS, SETTINGS)
+
+    said, report = refused(lab, tmp_path, frame)
+    assert "light 0 by -50 %" in said
+    assert report["retake"] == "0"
+
+
+def test_a_session_without_red_says_what_was_not_measured(lab: Lab, tmp_path: Path) -> None:
+    result = built(lab, tmp_path, lights=renumbered([light for light in EIGHT if light.index != RED]))
+    assert remarks(result) == {"primaries_lacking"}
+    assert ("Fields of the primaries", "not measured") in [(row.name, row.value) for row in summary(result.figures)]
+
+
+def test_brilliant_colour_is_called_that(lab: Lab, tmp_path: Path) -> None:
+    """A white segment adds three tenths of the least primary: frames of a projector that shows white brighter."""
+    world = lab.world
+
+    def frame(step: SessionStep) -> bytes:
+        colour, least = step.colour, min(step.colour.red, step.colour.green, step.colour.blue)
+        counts = world.expose(colour, SETTINGS, key=(step.number,)).astype("float64")
+        if least:
+            grey = world.expose(Colour(least, least, least), SETTINGS, key=(step.number, 1)).astype("float64")
+            counts = counts + 0.3 * (grey - world.body.black)
+        stream = BytesIO()
+        counts = counts.clip(0, world.body.saturation).round().astype("uint16")
+        write_dng(stream, counts, world.body, settings=SETTINGS, taken_at=TAKEN_AT)
+        return stream.getvalue()
+
+    dim = hang(room=Room(waviness_mm=0.5, white_level_share=0.5))
+    world = dim.world
+    assert remarks(built(dim, tmp_path, frame)) == {"additivity"}
+
+
+def test_two_lights_are_held_against_each_other(lab: Lab, tmp_path: Path) -> None:
+    pair = renumbered([EIGHT[WARM], EIGHT[COOL]])
+    assert remarks(built(lab, tmp_path / "right", lights=pair)) <= {"held_share"}
+
+    def frame(step: SessionStep) -> bytes:
+        shown = {0: CODES[COOL], 1: CODES[WARM]}.get(step.illumination if step.illumination is not None else -1)
+        return lab.dng(shown or step.colour, step.number)
+
+    (tmp_path / "wrong").mkdir()
+    with (
+        take(lab, tmp_path / "wrong" / "session", pair, frame=frame) as session,
+        pytest.raises(QualityError, match="exchanged names: light 0 and light 1"),
+    ):
+        build(session, tmp_path / "wrong" / "lut")

@@ -1,0 +1,50 @@
+"""The table to begin with: made once, kept, used."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from calibration.table.lut import open_lut
+from foundation.errors import InputError
+from generator.cli import main
+from generator.command import demo_table
+from generator.command.demo_table import table_folder
+
+
+@pytest.fixture(autouse=True)
+def small(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """Make it small, and keep it elsewhere than in the user's folder."""
+    monkeypatch.setattr(demo_table, "BITS", 1)
+    monkeypatch.setattr(demo_table, "LIGHTS", "D65,A")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+
+
+def test_it_is_made_once_and_says_what_it_is(capsys: pytest.CaptureFixture[str]) -> None:
+    first = table_folder(Path("demo:"))
+    assert "computed table" in capsys.readouterr().out
+    made = (first / "lut.json").stat().st_mtime_ns
+    assert table_folder(Path("demo:")) == first
+    assert (first / "lut.json").stat().st_mtime_ns == made
+    assert [light.name for light in open_lut(first).illuminations] == ["D65", "A"]
+
+
+def test_any_other_folder_is_itself(tmp_path: Path) -> None:
+    assert table_folder(tmp_path) == tmp_path
+
+
+def test_without_a_place_the_remedy_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("generator.rendering.kept_mixtures.cache_folder", lambda: None)
+    with pytest.raises(InputError, match="XDG_CACHE_HOME"):
+        table_folder(Path("demo:"))
+
+
+def test_one_command_makes_images_of_a_picture(tmp_path: Path) -> None:
+    picture = tmp_path / "cat.png"
+    cv2.imwrite(str(picture), np.random.default_rng(1).integers(0, 255, (20, 30, 3), dtype=np.uint8))
+    assert main(["demo:", str(tmp_path / "out"), "--sources", str(picture), "--illuminations", "0-1"]) == 0
+    assert json.loads((tmp_path / "out" / "dataset.json").read_text("utf-8"))["images"]
