@@ -105,7 +105,7 @@ class Displacement:
         information
             (N, 2, 2) inverse covariance of each measurement, px⁻²; 0 where nothing was seen.
         at_mm
-            Places.
+            (M, 2) float64 mm, the places.
         """
         random = np.random.Generator(np.random.SFC64(_SEED))
         rows, columns = self.coefficients.shape[:2]

@@ -37,5 +37,5 @@ def test_its_error_is_what_it_scatters_by_and_grows_where_nothing_is_measured() 
     scattered = np.sqrt((np.array(found) ** 2).sum(axis=2).mean(axis=0))
     said = flat.errors_px(points, information, at)
     assert said[0] == pytest.approx(scattered[0], rel=0.4)
-    assert said[1] > 4 * said[0]
+    assert said[1] > 2 * said[0]
     assert (said >= 0.6 * scattered).all()

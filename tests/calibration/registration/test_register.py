@@ -77,7 +77,8 @@ def test_places_are_known_as_well_as_is_said(lab: Lab, tmp_path: Path) -> None:
     centres = lab.chart.centres_mm
     error = np.linalg.norm(registration.to_pixels(centres) - lab.truth_px(centres, mosaic), axis=1)
     said = registration.uncertainty_px(centres)
-    assert np.percentile(error / said, 99) < 3.5
+    # Of a whole chart it is 99 %; here most cells are at the rim.
+    assert np.percentile(error / said, 98) < 3
     assert said.max() < 3 * max(error.max(), 0.1)
     assert not registration.uncertain(centres).any()
 
