@@ -36,6 +36,7 @@ def report_json(result: BuildResult) -> dict[str, Any]:
         "channels": _channels(figures),
         "chart_places": _chart_places(figures),
         "geometry": _geometry(figures),
+        "lens": figures.lens.to_json() | ({} if figures.point_spread is None else figures.point_spread.to_json()),
         "off_codes_deg": None if off_codes_deg is None else _short(off_codes_deg),
         "codes": None if figures.lights.codes is None else _codes(figures.lights.codes),
         "origins": _origins(figures),
