@@ -135,8 +135,8 @@ def place_errors(
 
     The first is the error of the smooth displacement's fit, its measurements taken to scatter as they are found to; it
     grows where nothing was compared. The second is what a displacement cannot follow, or has not: folds, a curled edge.
-    In simulated rooms with waves, curl and dog-ears 99 % of a whole chart's cells lie within three standard errors, 98 %
-    of a chart of 512 cells. Too large where a smooth order of colours leaves places open that folds of it fix.
+    In simulated rooms with waves, curl and dog-ears 99 % of a whole chart's cells lie within three standard errors,
+    98 % of a chart of 512 cells. Too large where a smooth order of colours leaves places open that folds of it fix.
 
     Parameters
     ----------
