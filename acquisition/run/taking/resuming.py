@@ -126,9 +126,29 @@ def tie(session: Session) -> tuple[int, ...]:
         return ()
     ties = tie_steps(session.steps[-1].number + 1)
     unfinished = _unfinished(session.steps[-len(ties) :], ties, taken)
-    if not unfinished:
-        session.add_steps(ties)
-    return tuple(step.number for step in unfinished or ties)
+    return tuple(step.number for step in unfinished) if unfinished else _added(session, ties)
+
+
+def white_first(session: Session) -> tuple[int, ...]:
+    """Put a white and a dark frame into the plan where no white frame was measured; return the numbers of their steps.
+
+    The frames of journals of version 1 were not measured: the judge would have nothing to hold the first lights
+    against. Nothing is added where nothing was taken yet.
+
+    Raises
+    ------
+    StorageError
+        The journal cannot be written.
+    """
+    measured = any(step.kind == "white" and accepted for step, _, _, accepted in session.journal.measurements())
+    if measured or not session.journal.accepted_files():
+        return ()
+    return _added(session, tie_steps(session.steps[-1].number + 1, response=False))
+
+
+def _added(session: Session, ties: Sequence[SessionStep]) -> tuple[int, ...]:
+    session.add_steps(ties)
+    return tuple(step.number for step in ties)
 
 
 def _unfinished(
