@@ -25,6 +25,7 @@ COPIED = (
     "generator",
     "evaluation",
     "tests",
+    "benchmarks",
     "examples",
 )
 
