@@ -99,6 +99,14 @@ def build_lut(
             "of one lamp; recorded, and undone by its numbers. Refused where white frames leave it open.",
         ),
     ] = False,
+    no_lens_correction: Annotated[
+        bool,
+        typer.Option(
+            "--no-lens-correction",
+            help="Leave in the samples what the lens spreads from cell to cell and over the frame, where the print "
+            "proves that it does; measured it is all the same.",
+        ),
+    ] = False,
     corners: Annotated[
         tuple[str, str, str, str] | None,
         typer.Option(
@@ -216,6 +224,7 @@ def build_lut(
         "--window": window is not None,
         "--subtract-dark": subtract_dark,
         "--correct-drift": correct_drift,
+        "--no-lens-correction": no_lens_correction,
         "--corners": corners is not None,
         "--linearity": linearity is not None,
     }
@@ -249,7 +258,8 @@ def build_lut(
         if picture is not None and not check:
             raise InputError("--picture goes with --check; a table that is built has its report")
         places = None if corners is None else parse_corners(corners)
-        options = BuildOptions(WINDOW if window is None else window, subtract_dark, places, correct_drift)
+        samples = WINDOW if window is None else window
+        options = BuildOptions(samples, subtract_dark, places, correct_drift, not no_lens_correction)
         if compare is not None:
             if linearity is not None:
                 raise InputError("--linearity is for the report of one table; leave it out of --compare")

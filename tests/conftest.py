@@ -59,6 +59,7 @@ SLOW = (
     "calibration/registration/test_register_without_tags.py",
     "calibration/report/test_places.py",
     "calibration/sampling/test_windows.py",
+    "calibration/spread/test_spread.py",
     "drivers/display/test_fullscreen.py",
     "drivers/ptp/test_malformed.py",
     "drivers/raw/test_rawfile.py",

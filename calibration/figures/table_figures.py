@@ -25,6 +25,8 @@ from calibration.radiometry.greys import tint_deg
 from calibration.radiometry.photon_transfer import PhotonTransfer
 from calibration.radiometry.primaries import Primaries
 from calibration.registration.registration import Registration
+from calibration.spread.correction import LensFigures
+from calibration.spread.point_spread import PointSpread
 from calibration.table.provenance import Unfit
 
 _Array = npt.NDArray[np.float64]
@@ -217,6 +219,8 @@ class TableFigures:
     primaries
         The primaries each alone, by which the field of coloured cells is known apart from that of paper; None where
         the plan has no light of each alone, or one is too dim.
+    lens, point_spread
+        What the lens spreads beside its sharp core, and what of it was subtracted; None where it was not measured.
     """
 
     session: SessionFigures
@@ -229,6 +233,8 @@ class TableFigures:
     cells: CellFigures
     origins: OriginFigures
     primaries: Primaries | None
+    lens: LensFigures
+    point_spread: PointSpread | None
 
     @property
     def white_frames(self) -> tuple[FrameFigures, ...]:

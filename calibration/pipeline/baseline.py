@@ -7,13 +7,14 @@ threads share it.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
 
 from acquisition.chart.model import Chart
-from acquisition.framing.movement import Shift, gauges_of, shift_between
+from acquisition.framing.movement import STILL_PX, Shift, gauges_of, shift_between
 from acquisition.framing.planes import CLIPPING_SHARE, Channel
 from acquisition.measures.paper import MAX_ORDER, MAX_ORDER_AROUND, PaperReader
 from calibration.checks.frame_consistency import ConsistencyCheck
@@ -24,7 +25,19 @@ from calibration.radiometry.cell_field import field_of_cells
 from calibration.radiometry.dark_subtraction import DarkLightEstimator, reflectances
 from calibration.radiometry.photon_transfer import PhotonTransfer, photon_transfer
 from calibration.radiometry.primaries import Primaries
-from calibration.sampling.samples import Sites, gather
+from calibration.registration.registration import Registration
+from calibration.sampling.samples import Sites, gather, gather_means
+from calibration.spread.correction import (
+    FrameCorrection,
+    LensCorrection,
+    LensFigures,
+    PrintView,
+    SpreadFrame,
+    measure_spread,
+)
+from calibration.spread.fitting import LEAST_COUNTS, LOOSE_UNEVENNESS, USUAL_UNEVENNESS
+from calibration.spread.printed_grid import printed_grid, unsuitable
+from calibration.spread.surroundings import FrameLevels, Surroundings, photosite_offsets_px
 from drivers.raw.rawfile import Area, Mosaic
 from foundation.errors import FormatError
 
@@ -74,6 +87,8 @@ class Baseline:
         Compares other frames' cells with those of this one.
     primaries
         The primaries each alone; None where they were not given or cannot be used.
+    lens
+        What the lens spreads beside its sharp core, measured; None where it was not, or could not be.
     """
 
     chart: Chart
@@ -87,6 +102,7 @@ class Baseline:
     transfer: PhotonTransfer
     consistency_check: ConsistencyCheck
     primaries: Primaries | None = None
+    lens: LensCorrection | None = None
 
     def require_layout(self, mosaic: Mosaic, what: str) -> None:
         """Refuse a frame, called `what`, whose sensor or setting is not that of the first.
@@ -106,7 +122,15 @@ class Baseline:
     def register(self, decoded: DecodedFrame) -> RegisteredFrame:
         """Return a later frame with the chart registered in it; errors are those of `register_frame`."""
         # A chart without tags hangs as in the first frame, so that a build that goes on has it the same way up.
-        return register_frame(decoded, self.chart, self.points, self.options, self.first.registration)
+        registered = register_frame(decoded, self.chart, self.points, self.options, self.first.registration)
+        lens = self.correction(registered.registration, registered.cells, registered.references)
+        return replace(registered, lens=lens)
+
+    def correction(self, registration: Registration, cells: Sites, references: Sites) -> FrameCorrection | None:
+        """Return what corrects the lens in frames that are sampled at these places; None where nothing is corrected."""
+        if self.lens is None or not (self.options.lens_correction and self.lens.spread.proven):
+            return None
+        return self.lens.of(registration, cells, references)
 
     def movement(self, mosaic: Mosaic, black: _Array, channel: Channel, what: str) -> Shift:
         """Return how far the chart has moved in a frame since the first one.
@@ -165,7 +189,7 @@ class Baseline:
 
 
 def baseline_of(chart: Chart, first: DecodedFrame, options: BuildOptions = PAPER_OPTIONS) -> Baseline:
-    """Return what holds for all frames, from the one that is registered first; still without the primaries.
+    """Return what holds for all frames, from the one that is registered first; still without primaries and lens.
 
     Parameters
     ----------
@@ -184,9 +208,114 @@ def baseline_of(chart: Chart, first: DecodedFrame, options: BuildOptions = PAPER
         The white references cannot be used.
     """
     points = ChartPoints.of(chart)
-    registered = register_frame(first, chart, points, options)
+    return _baseline(chart, points, options, first, register_frame(first, chart, points, options))
+
+
+def with_lens(baseline: Baseline, first: DecodedFrame, primaries: Sequence[DecodedFrame] = ()) -> Baseline:
+    """Return the baseline with the lens measured, and corrected where the print proves that it spreads light.
+
+    Parameters
+    ----------
+    baseline
+        Of the frame that is registered first.
+    first
+        That frame.
+    primaries
+        The frames of red, green and blue alone, whose field is the same for all cells: the lens is measured on them
+        where there are any in which the chart lies as in the first, and on the first frame else.
+
+    Raises
+    ------
+    QualityError
+        The white references cannot be used.
+    """
+    chart, points = baseline.chart, baseline.points
+    if unsuitable(chart):
+        return baseline
+    cells = len(points.cells_mm)
+    registered = baseline.first
+    view = PrintView.of(
+        printed_grid(chart),
+        slice(cells, cells + len(points.whites_mm)),
+        photosite_offsets_px(first.mosaic),
+        baseline.paper.base,
+        registered.registration,
+        first.mosaic.block_planes().shape[2:],
+        baseline.options.window,
+    )
+    around = view.around(registered.registration, registered.cells, registered.references)
+    frames = [frame for decoded in primaries if (frame := _spread_frame(baseline, decoded, view, around, False))]
+    if not frames:
+        frames = [frame for frame in (_spread_frame(baseline, first, view, around, True),) if frame]
+    found = measure_spread(frames, chart.page_mm, chart.bits, LEAST_COUNTS)
+    if found is None:
+        return baseline
+    lens = LensCorrection(view, *found)
+    measured = replace(baseline, lens=lens)
+    correction = measured.correction(registered.registration, registered.cells, registered.references)
+    if correction is None:
+        return measured
+    corrected = _baseline(chart, points, baseline.options, first, replace(registered, lens=correction))
+    return replace(corrected, lens=lens)
+
+
+def lens_figures(baseline: Baseline) -> LensFigures:
+    """Return what is said of the lens of a session, measured or not, corrected or not."""
+    if baseline.lens is None:
+        why = unsuitable(baseline.chart) or f"no channel of paper has {LEAST_COUNTS:g} counts in a frame to measure on"
+        return LensFigures.unknown(why)
+    figures = baseline.lens.figures
+    if not baseline.options.lens_correction and baseline.lens.spread.proven:
+        return replace(figures, corrected=False, why_not="left out by --no-lens-correction")
+    return figures
+
+
+def beyond_print(decoded: DecodedFrame, beyond: Sites) -> _Array:
+    """Return the mean (3,) float64 counts above black of what lies behind the print; 0 where it is not seen."""
+    if not len(beyond.rows):
+        return np.zeros(3)
+    return gather_means(decoded.mosaic, decoded.black, beyond).mean(axis=0)
+
+
+def _spread_frame(
+    baseline: Baseline, decoded: DecodedFrame, view: PrintView, around: Surroundings, mixed: bool
+) -> SpreadFrame | None:
+    """Return a frame as the lens is measured on it; None where the chart has moved in it.
+
+    `mixed` is whether several primaries light it.
+    """
+    shift = baseline.movement(decoded.mosaic, decoded.black, decoded.strongest, decoded.record.file)
+    if shift.gauges == 0 or shift.length_px > STILL_PX or shift.largest_px > 2 * STILL_PX:
+        return None
+    means, highest = baseline.patches(decoded.mosaic, decoded.black)
+    inside = np.isfinite(means).all(axis=1)
+    usable = inside & (highest < CLIPPING_SHARE * decoded.saturation)
+    chart, points = baseline.chart, baseline.points
+    usable[: chart.colour_count] &= ~baseline.first.registration.mismatched_cells[chart.cell_of_colour]
+    whites = slice(len(points.cells_mm), len(points.cells_mm) + len(points.whites_mm))
+    paper, _ = baseline.paper.read(np.where(usable[whites, None], means[whites], np.nan), decoded.record.file)
+    return SpreadFrame(
+        levels=FrameLevels(np.nan_to_num(means), beyond_print(decoded, view.beyond)),
+        around=around,
+        field=paper.field.at(view.grid.points_mm),
+        white=paper.white,
+        usable=usable,
+        unevenness=LOOSE_UNEVENNESS if mixed else USUAL_UNEVENNESS,
+    )
+
+
+def _baseline(
+    chart: Chart, points: ChartPoints, options: BuildOptions, first: DecodedFrame, registered: RegisteredFrame
+) -> Baseline:
+    """Return the baseline of a frame in which the chart is registered, its lens corrected where that is said there."""
     cells = gather(first.mosaic, first.black, registered.cells)[0].astype(np.float64)
     references, highest = gather(first.mosaic, first.black, registered.references)
+    spread = cells.var(axis=1, ddof=1)
+    if registered.lens is not None:
+        means = np.concatenate([cells.mean(axis=1), references.mean(axis=1, dtype=np.float64)])
+        added = registered.lens.added(FrameLevels(means, beyond_print(first, registered.lens.beyond)))
+        cells -= added[: len(cells), None]
+        references = references - added[len(cells) :, None].astype(np.float32)
     level = cells.mean(axis=1)
     whites = usable_means(references, highest, registered.references, first.saturation)[: len(points.whites_mm)]
     there = registered.cells.inside & ~registered.registration.mismatched_cells[chart.cell_of_colour]
@@ -205,7 +334,7 @@ def baseline_of(chart: Chart, first: DecodedFrame, options: BuildOptions = PAPER
         whites=whites,
         means=np.concatenate([level, references.mean(axis=1, dtype=np.float64)]),
         paper=PaperReader(points.whites_mm, points.cells_mm, chart.page_mm, base, order),
-        transfer=photon_transfer(level, cells.var(axis=1, ddof=1), options.samples),
+        transfer=photon_transfer(level, spread, options.samples),
         consistency_check=ConsistencyCheck(codes, points.cells_mm, level / base.at(points.cells_mm), there),
     )
 

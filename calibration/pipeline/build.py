@@ -28,7 +28,7 @@ from acquisition.session.folder import Session
 from acquisition.session.records import FrameRecord
 from calibration.figures.linearity_figures import LinearityFigures
 from calibration.figures.table_figures import TableFigures
-from calibration.pipeline.baseline import baseline_of
+from calibration.pipeline.baseline import baseline_of, with_lens
 from calibration.pipeline.checkpoint import Checkpoint, UnfinishedTable, unfinished_table
 from calibration.pipeline.collecting import check_figures, table_figures
 from calibration.pipeline.frames import (
@@ -222,7 +222,7 @@ def check(
     selected = select_frames(session)
     first = decode_frame(session, selected.registered)
     try:
-        baseline = baseline_of(session.chart, first, replace(options, subtract_dark=False))
+        baseline = with_lens(baseline_of(session.chart, first, replace(options, subtract_dark=False)), first)
     except RegistrationError as error:
         if picture is None:
             raise RegistrationError(f"{error}; see what is there with --picture PNG") from error
@@ -349,8 +349,9 @@ def _begin(job: _Job, checkpoint: Checkpoint | None, writer: LutWriter) -> _Buil
     """Register the chart, and return the state that an earlier program left, or the one before any frame."""
     session, selected = job.session, job.selected
     first = decode_frame(session, selected.registered)
-    baseline = baseline_of(session.chart, first, job.options)
-    primaries = measure_primaries(baseline, (decode_frame(session, record) for record in selected.primaries))
+    pure = [decode_frame(session, record) for record in selected.primaries]
+    baseline = with_lens(baseline_of(session.chart, first, job.options), first, pure)
+    primaries = measure_primaries(baseline, pure)
     intake = Intake(session, selected, replace(baseline, primaries=primaries))
     linearity = None if job.linearity is None else read_linearity(job.linearity, baseline)
     taken = intake.before_all_frames(first.saturation)
@@ -407,6 +408,9 @@ def _write_table(work: _BuildState, figures: TableFigures) -> None:
     )
     if figures.primaries is not None:
         done.append(figures.primaries.correction(lights.white))
+    lens = work.intake.baseline.lens
+    if lens is not None and figures.lens.corrected:
+        done.append(lens.correction())
     gain = np.ones(lights.white.shape)
     if lights.drift is not None:
         gain = lights.drift.gains

@@ -26,6 +26,7 @@ from acquisition.measures.stains import Stains, find_stains
 from calibration.pipeline.measuring import MeasuredDarkFrame, MeasuredFrame
 from calibration.pipeline.registered_frame import RegisteredFrame
 from calibration.radiometry.dark_frames import DarkFrameFigures, DarkSummary, HotPixels, dark_summary, median_noise
+from calibration.registration.registration import MAX_PLACE_ERROR_PX
 from calibration.sampling.patch_statistics import has_dead_photosite, unevenness
 from calibration.table.provenance import Unfit
 
@@ -52,6 +53,9 @@ class CellStatistics:
         (C,) bool, whether a cell was cut off in a frame.
     covered
         (C,) bool, whether a cell did not look like the chart's in a frame in which the chart was registered.
+    place_error
+        (C,) float64 half-size px, three standard errors of a cell's place, the worst of the frames in which the chart
+        was registered; over the clearance of its samples (`Registration.clearance`).
     even_sum
         (C, S, 3) float32, sum of the frames of even light, counts above black.
     even_noise2
@@ -69,6 +73,7 @@ class CellStatistics:
     highest_at: npt.NDArray[np.int64]
     outside: _Mask
     covered: _Mask
+    place_error: _Array
     even_sum: npt.NDArray[np.float32]
     even_noise2: _Array
     even_frames: int
@@ -95,6 +100,7 @@ class CellStatistics:
             highest_at=np.zeros(count, dtype=np.int64),
             outside=np.zeros(count, dtype=np.bool_),
             covered=_covered_cells(chart, first),
+            place_error=_place_errors(chart, first),
             even_sum=np.zeros((count, samples, 3), dtype=np.float32),
             even_noise2=np.zeros((count, 3)),
             even_frames=0,
@@ -115,7 +121,9 @@ class CellStatistics:
         if measured.figures.reregistered:
             hot = deepcopy(self.hot)
             hot.restart(median_noise(self.darks))
-            after = replace(after, covered=self.covered | _covered_cells(self.chart, measured.registered), hot=hot)
+            covered = self.covered | _covered_cells(self.chart, measured.registered)
+            place_error = np.maximum(self.place_error, _place_errors(self.chart, measured.registered))
+            after = replace(after, covered=covered, place_error=place_error, hot=hot)
         if measured.samples is not None and measured.noise is not None:
             after = replace(
                 after,
@@ -142,6 +150,7 @@ class CellStatistics:
             "highest_at": self.highest_at,
             "outside": self.outside,
             "covered": self.covered,
+            "place_error": self.place_error,
             "even_sum": self.even_sum,
             "even_noise2": self.even_noise2,
             "even_frames": np.array(self.even_frames),
@@ -161,6 +170,7 @@ class CellStatistics:
             highest_at=stored["highest_at"],
             outside=stored["outside"],
             covered=stored["covered"],
+            place_error=stored["place_error"],
             even_sum=stored["even_sum"],
             even_noise2=stored["even_noise2"],
             even_frames=int(stored["even_frames"]),
@@ -214,6 +224,11 @@ class CellStatistics:
                 cause = f"clipped: {int(self.highest[colour])} counts under {under}, below {allowed:.0f} allowed"
             elif self.covered[colour]:
                 cause = "covered: it does not look like the chart's (covered, damaged, or printed otherwise)"
+            elif self.place_error[colour] > MAX_PLACE_ERROR_PX:
+                cause = (
+                    f"misplaced: its place is known to {self.place_error[colour]:.2f} px, {MAX_PLACE_ERROR_PX:g} px "
+                    "allowed (three standard errors); the print is curled or folded there"
+                )
             elif stains.stained[colour]:
                 deviation = stains.deviation_of(colour)
                 how = f"{abs(deviation):.1%} {'darker' if deviation < 0 else 'brighter'}"
@@ -227,6 +242,18 @@ class CellStatistics:
             if cause:
                 found.append(Unfit(colour=colour, cause=cause))
         return tuple(found)
+
+
+def _place_errors(chart: Chart, registered: RegisteredFrame) -> _Array:
+    """Return three standard errors (C,) of the cells' places, in the order of colours, over their clearance.
+
+    0 for a chart without tags: in a smooth order of colours the error is not that of the cells one by one, and whether
+    they are the right ones is tested part by part (`calibration.registration.colour_checks.slipped_parts`).
+    """
+    if not chart.tags:
+        return np.zeros(chart.colour_count)
+    registration = registered.registration
+    return 3 * registration.uncertainty_px(chart.centres_mm[chart.cell_of_colour]) / registration.clearance
 
 
 def _covered_cells(chart: Chart, registered: RegisteredFrame) -> _Mask:

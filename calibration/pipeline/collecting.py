@@ -22,7 +22,7 @@ from calibration.figures.table_figures import (
     SessionFigures,
     TableFigures,
 )
-from calibration.pipeline.baseline import Baseline
+from calibration.pipeline.baseline import Baseline, lens_figures
 from calibration.pipeline.intake import Intake, IntakeState
 from calibration.radiometry.drift import drift_correction
 from calibration.radiometry.primaries import pure_lights
@@ -139,6 +139,8 @@ def _figures(
         cells=CellFigures(baseline.options.window, statistics.unfit(saturation, stains), stains),
         origins=origin_figures([(figures.record, figures.origin) for figures in taken.figures]),
         primaries=baseline.primaries,
+        lens=lens_figures(baseline),
+        point_spread=None if baseline.lens is None else baseline.lens.spread,
     )
 
 

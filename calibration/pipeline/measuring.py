@@ -19,14 +19,16 @@ import numpy.typing as npt
 from acquisition.framing.movement import REREGISTER_PX, STILL_PX, Shift, gauges_of, shift_between
 from acquisition.measures.paper import Paper
 from calibration.figures.frame_figures import FrameFigures
-from calibration.pipeline.baseline import Baseline, usable_means
+from calibration.pipeline.baseline import Baseline, beyond_print, usable_means
 from calibration.pipeline.frames import DecodedFrame
 from calibration.pipeline.registered_frame import RegisteredFrame, sites_of
 from calibration.radiometry.dark_frames import DarkFrameFigures, measure_dark_frame
 from calibration.radiometry.dark_subtraction import DarkLight, winsorised_means
 from calibration.radiometry.primaries import Primaries
 from calibration.sampling.patch_statistics import patch_means, sample_noise
-from calibration.sampling.samples import Sites, gather, gather_values, table_values
+from calibration.sampling.samples import Sites, gather, gather_means, gather_values, table_values
+from calibration.spread.correction import FrameCorrection
+from calibration.spread.surroundings import FrameLevels
 from foundation.errors import RegistrationError
 
 _Array = npt.NDArray[np.float64]
@@ -38,6 +40,7 @@ class _Grid:
 
     cells: Sites
     references: Sites
+    lens: FrameCorrection | None
     shift: Shift
     reregistered: bool
 
@@ -130,12 +133,13 @@ def measure_frame(
     turned = shift.largest_px > shift.length_px + STILL_PX
     if shift.gauges == 0 or shift.length_px > REREGISTER_PX or turned:
         return shift
-    cells, references = registered.cells, registered.references
+    cells, references, lens = registered.cells, registered.references, registered.lens
     if shift.length_px > STILL_PX:
         moved = registered.registration.shifted(shift.dx, shift.dy)
         shape = decoded.mosaic.block_planes().shape[2:]
         cells, references = sites_of(moved, baseline.points, shape, baseline.options.window)
-    grid = _Grid(cells, references, shift, reregistered=False)
+        lens = baseline.correction(moved, cells, references)
+    grid = _Grid(cells, references, lens, shift, reregistered=False)
     return _measured(baseline, decoded, registered, grid, keep_samples, dark)
 
 
@@ -152,7 +156,7 @@ def measure_registered_frame(
     Parameters and errors are otherwise those of `measure_frame`.
     """
     reregistered = registered is not baseline.first
-    grid = _Grid(registered.cells, registered.references, shift, reregistered)
+    grid = _Grid(registered.cells, registered.references, registered.lens, shift, reregistered)
     return _measured(baseline, decoded, registered, grid, keep_samples, dark)
 
 
@@ -223,10 +227,11 @@ def _measured(
     points = baseline.points
     samples, highest = gather(decoded.mosaic, decoded.black, grid.references)
     seen = usable_means(samples, highest, grid.references, decoded.saturation)
-    dark_cells = None
-    if dark is not None:
-        dark_cells, dark_references = np.split(dark.patches, [len(points.cells_mm)])
-        seen -= dark_references
+    to_subtract = _to_subtract(decoded, grid, samples, dark)
+    of_cells = None
+    if to_subtract is not None:
+        of_cells, of_references = np.split(to_subtract, [len(points.cells_mm)])
+        seen -= of_references
     whites, greys = np.split(seen, [len(points.whites_mm)])
     paper, shape = baseline.paper.read(whites, decoded.record.file)
     if baseline.primaries is not None:
@@ -234,9 +239,13 @@ def _measured(
     grey_values, grey_errors = points.levels.read(greys, paper.field.at(points.greys_mm))
     if keep_samples:
         kept, highest = gather(decoded.mosaic, decoded.black, grid.cells)
-        values, noise = table_values(kept, shape, dark_cells), sample_noise(kept)
+        values, noise = table_values(kept, shape, of_cells), sample_noise(kept)
+        if of_cells is not None and dark is None:
+            kept -= of_cells[:, None]
+        elif of_cells is not None and dark is not None:
+            kept -= (of_cells - dark.patches[: len(of_cells)])[:, None]
     else:
-        values, highest = gather_values(decoded.mosaic, decoded.black, grid.cells, shape, dark_cells)
+        values, highest = gather_values(decoded.mosaic, decoded.black, grid.cells, shape, of_cells)
         kept = noise = None
     mean = patch_means(values[baseline.consistency_check.cells])
     variance = baseline.transfer.variance(mean) / baseline.options.samples
@@ -257,6 +266,23 @@ def _measured(
         origin=decoded.mosaic.origin,
     )
     return MeasuredFrame(figures, registered, dark, decoded.saturation, values, highest, grid.cells.inside, kept, noise)
+
+
+def _to_subtract(
+    decoded: DecodedFrame, grid: _Grid, references: npt.NDArray[np.float32], dark: DarkLight | None
+) -> npt.NDArray[np.float32] | None:
+    """Return what is subtracted from each patch, (P, 3) float32 counts: dark light, and what the lens added.
+
+    `references` are the references' samples. None where nothing is subtracted.
+    """
+    if grid.lens is None:
+        return None if dark is None else dark.patches
+    cells = gather_means(decoded.mosaic, decoded.black, grid.cells)
+    means = np.concatenate([cells, references.mean(axis=1, dtype=np.float64)])
+    if dark is not None:
+        means -= dark.patches
+    added = grid.lens.added(FrameLevels(means, beyond_print(decoded, grid.lens.beyond))).astype(np.float32)
+    return added if dark is None else added + dark.patches
 
 
 def _blur_px(registered: RegisteredFrame, grid: _Grid) -> float:

@@ -13,7 +13,7 @@ from foundation.errors import InputError
 
 @dataclass(frozen=True)
 class BuildOptions:
-    """How a table is built; the defaults are the paper's: 25 samples, nothing subtracted but black.
+    """How a table is built; by default 25 samples, the paper's, from which black and the lens's spread are subtracted.
 
     Attributes
     ----------
@@ -26,6 +26,9 @@ class BuildOptions:
         the printed top-left, for a chart without tags; None to have it found.
     correct_drift
         Whether the lamp's drift between white frames is taken out of samples and ground truth at the end.
+    lens_correction
+        Whether what the lens spreads beside its sharp core is subtracted from samples and ground truth, where the print
+        proves that it does.
 
     Raises
     ------
@@ -37,6 +40,7 @@ class BuildOptions:
     subtract_dark: bool = False
     corners: Corners | None = None
     correct_drift: bool = False
+    lens_correction: bool = True
 
     def __post_init__(self) -> None:
         if self.window not in WINDOWS:

@@ -24,6 +24,7 @@ from calibration.radiometry.greys import GreyLevels
 from calibration.registration.register import register
 from calibration.registration.registration import Registration
 from calibration.sampling.samples import Sites, sites_at
+from calibration.spread.correction import FrameCorrection
 
 _Array = npt.NDArray[np.float64]
 
@@ -79,6 +80,8 @@ class RegisteredFrame:
         Where the W + N references are sampled.
     gauges
         The frame around its tags, or the outline of its field, to measure movements against.
+    lens
+        Corrects frames sampled at these places for what the lens spreads; None where nothing is corrected.
     """
 
     file: str
@@ -86,6 +89,7 @@ class RegisteredFrame:
     cells: Sites
     references: Sites
     gauges: dict[Channel, Plane]
+    lens: FrameCorrection | None = None
 
 
 def register_frame(

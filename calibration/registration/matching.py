@@ -25,7 +25,7 @@ from acquisition.chart.model import PAPER_WHITE, Chart
 from acquisition.framing.homography import rms
 from acquisition.framing.planes import CHANNELS, Channel, Plane
 from calibration.registration.block_search import find_blocks
-from calibration.registration.blocks import Blocks, fit_blocks
+from calibration.registration.blocks import Blocks, PlaceErrors, fit_blocks, place_errors
 from calibration.registration.colour_checks import slipped_parts
 from calibration.registration.colour_model import ColourModel, fit_colours
 from calibration.registration.displacement import Displacement
@@ -343,6 +343,12 @@ class Matcher:
         return fit_blocks(
             comparison, self._raster, self._per_cell, self._chart, self._block_cells, all_known=self._smooth_order
         )
+
+    def place_errors(self) -> PlaceErrors:
+        """Return how well places are known after the last step; a step must have been made."""
+        assert self._left is not None
+        anchors = self._anchors.points_mm, self._anchors.information
+        return place_errors(self._left, self._raster, self._per_cell, self.displacement, anchors)
 
     def slipped(self, mismatched_cells: _Mask) -> tuple[_Array, int]:
         """Return the middles (B, 2) mm of parts of the field with their neighbours' colours, and of how many parts.

@@ -240,6 +240,7 @@ def _registered(chart: Chart, framing: Framing, matcher: Matcher, marks: Anchors
         marks_residual_px=residual,
         lens_residual_px=lens_rms,
         blocks=blocks,
+        place_errors=matcher.place_errors(),
         colours=matcher.colours,
         mismatched_cells=mismatched_cells,
         agreement=agreement(seen[there], expected[there]),

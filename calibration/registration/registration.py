@@ -11,11 +11,15 @@ from acquisition.framing.finding import Framing
 from acquisition.framing.homography import rms
 from acquisition.framing.planes import Channel
 from acquisition.limits.bleed import SAMPLE_REACH_PX
-from calibration.registration.blocks import Blocks
+from calibration.registration.blocks import Blocks, PlaceErrors
 from calibration.registration.colour_model import ColourModel
 from calibration.registration.displacement import Displacement
 from calibration.registration.lateral_colour import LateralColour
 from calibration.registration.lens import Lens
+
+MAX_PLACE_ERROR_PX = 0.5
+"""Three standard errors of the place of a cell of 10 px, at most: at 0.5 px the outermost of its 25 pixels, rounding
+included, has 0.1 % of its light from the next cell at a blur of 0.7 px (`calibration.sampling.windows`)."""
 
 CLEARANCE_PX = 1.75
 """From there to the edge of a cell of 10 px, for which the limits of places were found."""
@@ -42,6 +46,8 @@ class Registration:
         RMS of the same against the lens alone: what the paper's waviness leaves.
     blocks
         Fit of the cells.
+    place_errors
+        How well places are known.
     colours
         The colour model of the frame.
     mismatched_cells
@@ -63,6 +69,7 @@ class Registration:
     marks_residual_px: _Array
     lens_residual_px: float
     blocks: Blocks
+    place_errors: PlaceErrors
     colours: ColourModel
     mismatched_cells: _Mask
     agreement: float
@@ -77,6 +84,21 @@ class Registration:
         """
         places = self.lens.to_pixels(points_mm) + self.displacement.at(points_mm) + self.shift_px
         return places + self.lateral.shift_px(places, channel)
+
+    def uncertainty_px(self, points_mm: npt.ArrayLike) -> _Array:
+        """Return the standard error (N,) float64 px of the places of points (N, 2) on the print, in green."""
+        return self.place_errors.at(points_mm)
+
+    def uncertain(self, points_mm: npt.ArrayLike) -> _Mask:
+        """Return which points (N,) bool are known too badly to be sampled: three standard errors exceed the limit."""
+        return np.asarray(3 * self.uncertainty_px(points_mm) > MAX_PLACE_ERROR_PX * self.clearance)
+
+    @property
+    def places_known_px(self) -> tuple[float, float]:
+        """Standard error of places, px: the median over the field, and the largest of the outermost cells but 1 %."""
+        error = self.place_errors.error_px
+        rim = np.concatenate([error[1], error[-2], error[:, 1], error[:, -2]])
+        return float(np.median(error)), float(np.percentile(rim, 99))
 
     def shifted(self, dx: float, dy: float) -> Registration:
         """Return this registration for a frame in which the chart lies (dx, dy) px further."""

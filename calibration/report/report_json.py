@@ -35,6 +35,8 @@ def report_json(result: BuildResult) -> dict[str, Any]:
         "lights": figures.session.lights,
         "channels": _channels(figures),
         "chart_places": _chart_places(figures),
+        "geometry": _geometry(figures),
+        "lens": figures.lens.to_json() | ({} if figures.point_spread is None else figures.point_spread.to_json()),
         "off_codes_deg": None if off_codes_deg is None else _short(off_codes_deg),
         "codes": None if figures.lights.codes is None else _codes(figures.lights.codes),
         "origins": _origins(figures),
@@ -91,6 +93,19 @@ def _chart_places(figures: TableFigures) -> dict[str, Any]:
         "frame": figures.session.registered_file,
         "mm": np.round(points, 3).tolist(),
         "px": np.round(registration.to_pixels(points), 3).tolist(),
+    }
+
+
+def _geometry(figures: TableFigures) -> dict[str, Any]:
+    """Return how well cells' places are known, and where red and blue lie against green, half-size px."""
+    registration = figures.registration
+    inner, outer = registration.places_known_px
+    lateral = registration.lateral
+    return {
+        "uncertainty_px": _rounded(inner),
+        "rim_uncertainty_px": _rounded(outer),
+        "lateral_corner_px": {channel: _rounded(lateral.corner_px(channel)) for channel in ("R", "B")},
+        "lateral_error_px": {channel: _rounded(lateral.corner_error_px(channel)) for channel in ("R", "B")},
     }
 
 

@@ -68,6 +68,7 @@ def _registration_rows(figures: TableFigures) -> list[SummaryRow]:
         ),
         SummaryRow("Window", f"{window}×{window} samples", _window_note(figures)),
         SummaryRow("Blur", f"σ {registration.blur_px:.2f} px", "about 0.6 is sharp"),
+        SummaryRow("Spread of the lens", *_lens(figures)),
         SummaryRow(
             "Residual of the outline" if plain else "Residual of tags",
             f"{registration.marks_rms_px:.3f} px RMS",
@@ -91,6 +92,19 @@ def _registration_rows(figures: TableFigures) -> list[SummaryRow]:
             brief=True,
         ),
     ]
+
+
+def _lens(figures: TableFigures) -> tuple[str, str]:
+    """Return what the lens spreads beside its sharp core, and what is done about it."""
+    lens = figures.lens
+    if not lens.measured:
+        return "not measured", lens.why_not
+    veil = f"a veil of {100 * lens.veil:.2f} ± {100 * lens.veil_error:.2f} % of the mean light"
+    if not lens.corrected and not lens.beyond_cell:
+        return "none", f"{lens.why_not}; {veil}, and {100 * lens.left:.2g} % RMS is what it may do to cells' means"
+    done = f"subtracted, {100 * lens.residual:.2g} % are left" if lens.corrected else f"not subtracted: {lens.why_not}"
+    size = f"{100 * lens.rms:.2g} % RMS, {100 * lens.worst:.2g} % at most"
+    return size, f"of cells' means above 300 counts, relative to paper, {veil} in it; {done}"
 
 
 def _course_rows(figures: TableFigures) -> list[SummaryRow]:

@@ -145,6 +145,38 @@ def sample_to_table(
 
 
 @compiled
+def count_means(
+    sensor: _Count,
+    corner: _Place,
+    order: _Place,
+    inside: _Mask,
+    step: int,
+    places: _Place,
+    window: int,
+    black: _Float,
+    means: _Array,
+) -> None:
+    """Fill means (N, 3) float64, counts above black; patches that are not inside get 0. Parameters as for `sample`."""
+    red, green, other, blue = uint64(places[0]), uint64(places[1]), uint64(places[2]), uint64(places[3])
+    samples = window * window
+    for patch in order:
+        if not inside[patch]:
+            means[patch] = 0
+            continue
+        r, g, b = np.int64(0), np.int64(0), np.int64(0)
+        for row in range(window):
+            at = uint64(corner[patch] + row * step)
+            for _ in range(window):
+                r += sensor[at + red]
+                g += np.int64(sensor[at + green]) + np.int64(sensor[at + other])
+                b += sensor[at + blue]
+                at += uint64(2)
+        means[patch, 0] = r / samples - black[0]
+        means[patch, 1] = g / (2 * samples) - black[1]
+        means[patch, 2] = b / samples - black[2]
+
+
+@compiled
 def patch_means(values: _Count, means: _Array) -> None:
     """Fill means (N, 3) float64 of values (N, S, 3) uint16."""
     samples = values.shape[1]

@@ -93,6 +93,18 @@ def gather(
     return samples, highest
 
 
+def gather_means(mosaic: Mosaic, black: npt.NDArray[np.float64], sites: Sites) -> _Array:
+    """Return the means (N, 3) float64 of what `gather` returns, counts above black, without holding the samples.
+
+    Parameters are those of `gather`: `black` (2, 2) float64 counts.
+    """
+    from calibration.sampling import kernels
+
+    means = np.empty((len(sites.rows), 3))
+    kernels.count_means(*_photosites(mosaic, black, sites), means)
+    return means
+
+
 def _photosites(
     mosaic: Mosaic, black: npt.NDArray[np.float64], sites: Sites
 ) -> tuple[

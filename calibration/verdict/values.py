@@ -10,6 +10,9 @@ from calibration.sampling.windows import bleed
 from calibration.verdict.retaking import added_bleed
 from foundation.angles import angles_deg
 
+_LEAST_CELLS = 8**4
+"""Cells from which on a spread that is not there is known well enough not to be feared."""
+
 
 def judged_values(figures: TableFigures) -> dict[str, float]:
     """Return the values that are judged, by name; in the units of `calibration.verdict.thresholds`.
@@ -32,13 +35,16 @@ def _registration_values(figures: TableFigures) -> dict[str, float]:
     registration = figures.registration
     values = {
         "cell_px": registration.cell_px,
-        "bleed": bleed(registration.cell_px, registration.blur_px, figures.cells.window),
+        "bleed": bleed(registration.cell_px, registration.blur_px, figures.cells.window)
+        + figures.lens.uncorrected_in_worst,
         "tag_residual_px": registration.lens_residual_px,
         "tag_final_px": registration.marks_rms_px / registration.clearance,
         "block_residual_px": registration.block_rms_px / registration.clearance,
         "blocks_good": float(registration.blocks.good.mean()),
         "agreement": registration.agreement,
     }
+    if figures.lens.measured and _cell_count(figures) >= _LEAST_CELLS:
+        values["correction_residual"] = figures.lens.left
     if registration.framing.field is None:
         found = len(registration.framing.tags)
         values["tags_found"] = found / max(found + len(registration.framing.missing), 1)

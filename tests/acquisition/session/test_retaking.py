@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import json
 import os
@@ -17,6 +18,7 @@ from acquisition.lights.illuminations import Illumination
 from acquisition.session.folder import Session
 from acquisition.session.judgement import Judgement
 from acquisition.session.mending.retaking import lights_text, parse_lights
+from acquisition.session.mending.verification import MOST_UNREADABLE
 from acquisition.session.plan import plan_steps
 from drivers.camera import CapturedFrame
 from drivers.presenter import Colour
@@ -108,19 +110,37 @@ def test_the_newest_sound_frame_stays_where_a_newer_one_is_gone(session: Session
     assert verdicts(session, 3) == ["accepted", "voided"]
 
 
-def test_a_frame_that_cannot_be_read_is_not_given_up(session: Session, monkeypatch: pytest.MonkeyPatch) -> None:
+def unreadable(names: Sequence[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let the disk fail at files of these names."""
     real = Path.open
 
     def fail(path: Path, mode: str = "r") -> object:
-        if path.name == "0003_light_001.cr2":
-            raise OSError(5, "Input/output error", str(path))
+        if path.name in names:
+            raise OSError(errno.EIO, "Input/output error", str(path))
         return real(path, mode)
 
+    monkeypatch.setattr(Path, "open", fail)
+
+
+def test_a_frame_in_bad_sectors_is_taken_again_and_its_file_stays(
+    session: Session, monkeypatch: pytest.MonkeyPatch
+) -> None:
     with monkeypatch.context() as patched:
-        patched.setattr(Path, "open", fail)
-        with pytest.raises(StorageError, match=r"0003_light_001\.cr2: Input/output error; check the disk"):
+        unreadable(["0003_light_001.cr2"], patched)
+        assert session.verify() == ("frames/0003_light_001.cr2 cannot be read: Input/output error; it is taken again",)
+    assert verdicts(session, 3) == ["voided"]
+    assert take_what_is_left(session) == [3]
+    assert (session.frames_folder / "0003_light_001.cr2").read_bytes() == b"frame 0003_light_001"
+
+
+def test_frames_that_cannot_be_read_are_not_given_up(session: Session, monkeypatch: pytest.MonkeyPatch) -> None:
+    """So many are not bad sectors: the disk fails, and what is on it may be sound."""
+    names = [Path(frame.file).name for frame in session.journal.accepted_files()][: MOST_UNREADABLE + 1]
+    with monkeypatch.context() as patched:
+        unreadable(names, patched)
+        with pytest.raises(StorageError, match=rf"{names[0]} and 3 more: Input/output error; check the disk"):
             session.verify()
-    assert verdicts(session, 3) == ["accepted"]
+    assert session.done_steps() == set(range(9))
 
 
 def test_a_session_whose_frames_are_elsewhere_loses_none(session: Session) -> None:

@@ -19,3 +19,23 @@ def test_a_displacement_without_bend_is_followed_exactly(level: float, slope_x: 
     information = np.broadcast_to(np.eye(2) * 1e4, (300, 2, 2))
     found = Displacement.over(low, high, 12.0).fitted(points, information, 1e4 * moved)
     assert found.at(points) == pytest.approx(moved, abs=1e-3)
+
+
+def test_its_error_is_what_it_scatters_by_and_grows_where_nothing_is_measured() -> None:
+    random = np.random.default_rng(4)
+    low, high = np.array([0.0, 0.0]), np.array([200.0, 150.0])
+    points = low + random.random((4000, 2)) * (high - low)
+    points = points[(points[:, 0] < 80) | (points[:, 0] > 130)]
+    sigma = 0.2
+    information = np.broadcast_to(np.eye(2) / sigma**2, (len(points), 2, 2))
+    flat = Displacement.over(low, high, 15.0)
+    at = np.array([[40.0, 75.0], [105.0, 75.0]])
+    found = [
+        flat.fitted(points, information, information[0, 0, 0] * sigma * random.standard_normal(points.shape)).at(at)
+        for _ in range(60)
+    ]
+    scattered = np.sqrt((np.array(found) ** 2).sum(axis=2).mean(axis=0))
+    said = flat.errors_px(points, information, at)
+    assert said[0] == pytest.approx(scattered[0], rel=0.4)
+    assert said[1] > 2 * said[0]
+    assert (said >= 0.6 * scattered).all()

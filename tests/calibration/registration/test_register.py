@@ -71,6 +71,18 @@ def test_the_estimate_of_its_own_error_is_honest(lab: Lab, tmp_path: Path) -> No
     assert registration.cell_px == pytest.approx(9, abs=1)
 
 
+def test_places_are_known_as_well_as_is_said(lab: Lab, tmp_path: Path) -> None:
+    mosaic = lab.mosaic(tmp_path)
+    registration = register(mosaic, lab.chart)
+    centres = lab.chart.centres_mm
+    error = np.linalg.norm(registration.to_pixels(centres) - lab.truth_px(centres, mosaic), axis=1)
+    said = registration.uncertainty_px(centres)
+    # Of a whole chart it is 99 %; here most cells are at the rim.
+    assert np.percentile(error / said, 98) < 3
+    assert said.max() < 3 * max(error.max(), 0.1)
+    assert not registration.uncertain(centres).any()
+
+
 def test_shifted_moves_every_point(lab: Lab, tmp_path: Path) -> None:
     registration = register(lab.mosaic(tmp_path), lab.chart)
     moved = registration.shifted(0.25, -0.5).to_pixels(lab.chart.centres_mm)

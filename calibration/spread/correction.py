@@ -1,0 +1,437 @@
+"""The correction: what surroundings add to each patch of a frame, and what is said of it.
+
+What is subtracted from a patch's samples is one number for each channel: the light that the lens brought in, less what
+it took away. The samples' noise is not touched. Levels of a frame are taken from the frame itself, as it is: the shares
+were fitted on such levels, so that light which was spread twice is in them.
+
+P patches as in `PrintedGrid`; counts above black; half-size pixels.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from acquisition.measures.flat_field import FlatField
+from acquisition.measures.least_squares import least_squares
+from acquisition.measures.polynomials import page_polynomial, page_powers
+from calibration.registration.registration import Registration
+from calibration.sampling.samples import Sites, sites_at
+from calibration.spread.fitting import SpreadData, fit_spread, predicted_levels
+from calibration.spread.point_spread import FAR_PX, NEAR_PX, PLACES, PointSpread, kernel_of_terms, terms_of
+from calibration.spread.printed_grid import PrintedGrid
+from calibration.spread.surroundings import FrameLevels, NearLight, Surroundings, light_at, surroundings
+
+_MARGIN_PX = 12.0
+"""How far from the sheet's edge what lies behind it is looked at."""
+
+_LATTICE_PX = 24
+"""Distance of the places at which what lies behind the sheet is looked at."""
+
+_FIELD_ORDER = 6
+"""Highest order of the smooth change of white references by which a frame's field would change."""
+
+_Array = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class PrintView:
+    """What holds for all frames of a session: the print's grid, its usual light, and where it is looked past.
+
+    Attributes
+    ----------
+    grid, neighbours
+        The print.
+    whites
+        Places of the white references among the patches.
+    photosites_px
+        (3, 2) float64, where each channel's photosites lie from a block's centre.
+    frame_px
+        Rows and columns of the half-size frame.
+    light, slot_light
+        The usual field at patches (P, 3) and slots (R K, 3).
+    beyond
+        Places that show what lies behind the print; none where the print fills the frame.
+    """
+
+    grid: PrintedGrid
+    neighbours: npt.NDArray[np.int32]
+    whites: slice
+    photosites_px: _Array
+    frame_px: tuple[int, int]
+    light: _Array
+    slot_light: _Array
+    beyond: Sites
+
+    @staticmethod
+    def of(
+        grid: PrintedGrid,
+        whites: slice,
+        photosites_px: _Array,
+        field: FlatField,
+        registration: Registration,
+        shape: tuple[int, int],
+        window: int,
+    ) -> PrintView:
+        """Return the view of a session.
+
+        Parameters
+        ----------
+        grid, whites
+            As the attributes.
+        photosites_px
+            (3, 2) float64, where each channel's photosites lie from a block's centre.
+        field
+            Of the frame that is registered first.
+        registration
+            The chart's place in it.
+        shape
+            Rows and columns of the half-size frame.
+        window
+            Pixels along a patch's window.
+        """
+        beyond = _places_beyond(grid, registration, shape, window)
+        return PrintView(grid, grid.neighbours, whites, photosites_px, shape, *light_at(grid, field), beyond)
+
+    def around(self, registration: Registration, cells: Sites, references: Sites) -> Surroundings:
+        """Return the surroundings of the patches of a frame, given where they are sampled."""
+        return surroundings(
+            self.grid, self.neighbours, self.photosites_px, self.frame_px, registration, cells, references, self.whites,
+            (self.light, self.slot_light),
+        )  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class FrameCorrection:
+    """The correction of frames that are sampled at the same places.
+
+    Attributes
+    ----------
+    around
+        The patches' surroundings.
+    near
+        Weights of the near kernels.
+    far, veil
+        Shares of the far kernels (F,), and of the veil.
+    beyond
+        Places that show what lies behind the print.
+    """
+
+    around: Surroundings
+    near: NearLight
+    far: _Array
+    veil: float
+    beyond: Sites
+
+    @staticmethod
+    def of(spread: PointSpread, view: PrintView, around: Surroundings) -> FrameCorrection:
+        """Return the correction for a point spread and the surroundings of a frame's patches."""
+        amounts, near = spread.amounts(), len(NEAR_PX)
+        far, veil = amounts[0, 0, near:-1], float(amounts[0, 0, -1])
+        return FrameCorrection(around, around.near(amounts[:, :, :near]), far, veil, view.beyond)
+
+    def added(self, levels: FrameLevels) -> _Array:
+        """Return what the lens added to each patch, (P, 3) float64 counts; negative where it took more away."""
+        around = self.around
+        added = self.near.at(levels, around.local(levels)) - self.near.total * levels.patches
+        if self.far.any() or self.veil:
+            image = around.image(levels)
+            for share, scale in zip(self.far.tolist(), FAR_PX, strict=True):
+                if share:
+                    added += share * (around.far(image, scale) - levels.patches)
+            if self.veil:
+                added += self.veil * (image.mean(axis=(0, 1), dtype=np.float64) - levels.patches)
+        return added
+
+
+@dataclass(frozen=True, eq=False)
+class SpreadFrame:
+    """A frame that the point spread is measured on.
+
+    Attributes
+    ----------
+    levels, around
+        What it shows, and the patches' surroundings.
+    field
+        (P, 3) float64, its flat field at the patches.
+    white
+        (3,) float64 counts, its bare paper.
+    usable
+        (P,) bool, patches that are in the frame, not clipped and not covered.
+    unevenness
+        As in `SpreadData`.
+    """
+
+    levels: FrameLevels
+    around: Surroundings
+    field: _Array
+    white: _Array
+    usable: npt.NDArray[np.bool_]
+    unevenness: float
+
+
+@dataclass(frozen=True)
+class LensFigures:
+    """What the correction comes to under the light of the frames that it was measured on; cells above 300 counts.
+
+    Attributes
+    ----------
+    rms, worst
+        Change of the cells' means relative to paper, RMS and the largest; 0 where nothing is corrected.
+    residual
+        RMS error that the means have after it, by the shares' standard errors, proven or not.
+    veil, veil_error
+        Share of the frame's mean light that lies on all of it, and its standard error.
+    beyond_cell
+        Share of the light of a window's worst sample that the kernels bring from beyond its cell, channel by channel
+        the largest.
+    left_in_worst
+        The same beyond that of the window's mean, which is what is corrected.
+    measured, corrected
+        Whether the lens could be measured on the print, and whether samples and ground truth are corrected by it.
+    why_not
+        Why nothing was measured or nothing is corrected; "" where it is.
+    """
+
+    rms: float
+    worst: float
+    residual: float
+    veil: float
+    veil_error: float
+    beyond_cell: float
+    left_in_worst: float
+    measured: bool = True
+    corrected: bool = True
+    why_not: str = ""
+
+    @staticmethod
+    def unknown(why_not: str) -> LensFigures:
+        """Return the figures of a lens that could not be measured, and why."""
+        return LensFigures(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, measured=False, corrected=False, why_not=why_not)
+
+    @property
+    def uncorrected_in_worst(self) -> float:
+        """Share of the worst sample's light from beyond its cell, but for the sharp core's, that is not corrected."""
+        return max(self.left_in_worst, 0.0) if self.corrected else self.beyond_cell
+
+    @property
+    def left(self) -> float:
+        """RMS error that the lens leaves in the means of cells, relative to paper."""
+        return self.residual if self.corrected or not self.beyond_cell else float(np.hypot(self.rms, self.residual))
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the figures as `lut.json` and `report.json` state them."""
+        shares = ("rms", "worst", "residual", "veil", "veil_error", "beyond_cell", "left_in_worst")
+        found: dict[str, Any] = {name: float(f"{getattr(self, name):.4g}") for name in shares}
+        return {"measured": self.measured, "corrected": self.corrected, "why_not": self.why_not, **found}
+
+
+@dataclass(frozen=True, eq=False)
+class LensCorrection:
+    """The lens of a session: its point spread, what is said of it, and the view by which frames are corrected.
+
+    Attributes
+    ----------
+    view, spread, figures
+        As said.
+    """
+
+    view: PrintView
+    spread: PointSpread
+    figures: LensFigures
+
+    def correction(self) -> dict[str, Any]:
+        """Return what was done, for `lut.json`."""
+        return {
+            "name": "lens",
+            "how": "subtracted from samples, ground truth and references before the field is divided out, one number "
+            "for each patch and channel: sum over kernels k of share[k] (B_k - m) + share[veil] (M - m); m the patch's "
+            "mean in the frame, B_k the print as the frame shows it, blurred by a Gaussian of sigma_px[k] half-size px "
+            "and averaged over the patch's window, M the frame's mean light; share[term][channel][kernel], terms "
+            "P_i(x) P_j(y) over the frame, Legendre, j rising slowest, i, j 0 ... 2, x, y -1 ... 1; the last kernel is "
+            "the veil; samples' noise is not touched; build-lut --no-lens-correction leaves it out",
+            **self.figures.to_json(),
+            **self.spread.to_json(),
+        }
+
+    def of(self, registration: Registration, cells: Sites, references: Sites) -> FrameCorrection:
+        """Return the correction of frames that are sampled at these places."""
+        return FrameCorrection.of(self.spread, self.view, self.view.around(registration, cells, references))
+
+
+def measure_spread(
+    frames: list[SpreadFrame], page_mm: tuple[float, float], bits: int, least_counts: float
+) -> tuple[PointSpread, LensFigures] | None:
+    """Return the point spread that frames show, and its figures; None where no frame is bright enough.
+
+    Parameters
+    ----------
+    frames
+        Best of one primary each, whose field is the same for all cells.
+    page_mm
+        Width and height of the page.
+    bits
+        Bits of each channel of a code.
+    least_counts
+        Counts of bare paper from which on a channel is used, and of a cell from which on figures count it.
+    """
+    count = 8**bits
+    data: list[SpreadData] = []
+    scales: list[_Array] = []
+    # Of each channel the frame in which it has most light.
+    best: list[int] = np.argmax([frame.white for frame in frames], axis=0).tolist() if frames else []
+    for number, frame in enumerate(frames):
+        if number not in best:
+            continue
+        changes, gains = _changes(frame, page_mm, bits)
+        for channel in range(3):
+            if best[channel] == number and frame.white[channel] >= least_counts:
+                relative = frame.field[:count, channel] * frame.white[channel]
+                level = frame.levels.patches[:count, channel] / relative
+                even = _even(frame, channel) / relative
+                usable = frame.usable[:count]
+                data.append(SpreadData(channel, level, changes[:, :, channel].T, even, usable, frame.unevenness))
+                scales.append(np.append(gains[:, channel], frame.white[channel]))
+    if not data:
+        return None
+    cells_mm = frames[0].around.grid.points_mm[:count]
+    spread = fit_spread(data, cells_mm, page_mm, bits)
+    return None if spread is None else (spread, _figures(spread, data, scales, frames[0].around, bits, least_counts))
+
+
+def _even(frame: SpreadFrame, channel: int) -> float:
+    """Return the mean light of a frame in a channel, counts."""
+    return float(frame.around.image(frame.levels)[..., channel].mean(dtype=np.float64))
+
+
+def _changes(frame: SpreadFrame, page_mm: tuple[float, float], bits: int) -> tuple[_Array, _Array]:
+    """Return the change (T, C, 3) of levels for a whole share of each unknown, and the mean change of white (T, 3).
+
+    What comes in, less what the white references get, since the field is fitted through them; their mean, by which
+    all levels change alike, is returned apart.
+    """
+    around, levels, count = frame.around, frame.levels, 8**bits
+    relative = np.maximum(frame.field * frame.white, 1e-6)
+    expected = predicted_levels((levels.patches / relative)[:count], bits)
+    points = around.grid.points_mm
+    whites = np.arange(len(points))[around.whites]
+    whites = whites[frame.usable[whites]]
+    order = next((n for n in range(_FIELD_ORDER, 0, -1) if 3 * len(page_powers(n)) <= len(whites)), 0)
+    at_whites, at_cells = (
+        np.ascontiguousarray(page_polynomial(where, page_mm, order)) for where in (points[whites], points[:count])
+    )
+    terms = kernel_of_terms()
+    changes, gains = np.empty((len(terms), count, 3)), np.empty((len(terms), 3))
+    seen, own = _seen(frame)
+    for term, (kernel, place) in enumerate(terms):
+        share = np.ones((len(points), 1)) if place is None else around.places[:, [place]]
+        coming = share * (seen[kernel] - own[kernel] * levels.patches) / relative
+        differs = share * (own[kernel] - own[kernel][:count].mean(axis=0))
+        for channel in range(3):
+            of_white = coming[whites, channel] + differs[whites, channel]
+            smooth = at_cells @ least_squares(at_whites, of_white, np.ones(len(whites)))
+            gains[term, channel] = smooth.mean()
+            kept = differs[:count, channel] - (smooth - gains[term, channel])
+            changes[term, :, channel] = coming[:count, channel] + kept * expected[:, channel]
+    return changes, gains
+
+
+def _seen(frame: SpreadFrame) -> tuple[list[_Array], list[_Array]]:
+    """Return for each kernel the light (P, 3) that it brings, counts, and the share (P, 3) of a patch's own in it."""
+    around, levels = frame.around, frame.levels
+    local, image = around.local(levels), around.image(levels)
+    seen: list[_Array] = []
+    own: list[_Array] = []
+    for kernel in range(len(NEAR_PX)):
+        whole = np.zeros((PLACES, 3, len(NEAR_PX)))
+        whole[0, :, kernel] = 1
+        near = around.near(whole)
+        seen.append(near.at(levels, local))
+        own.append(near.own)
+    for scale in FAR_PX:
+        seen.append(around.far(image, scale))
+        own.append(np.full_like(levels.patches, around.own_share(scale)))
+    seen.append(np.broadcast_to(image.mean(axis=(0, 1), dtype=np.float64), levels.patches.shape))
+    return seen, [*own, np.zeros_like(levels.patches)]
+
+
+def _figures(
+    spread: PointSpread,
+    data: list[SpreadData],
+    scales: list[_Array],
+    around: Surroundings,
+    bits: int,
+    least_counts: float,
+) -> LensFigures:
+    amounts = spread.amounts()
+    corrected: list[_Array] = []
+    unknown: list[_Array] = []
+    for one, scale in zip(data, scales, strict=True):
+        expected = predicted_levels(one.level[:, None], bits)[:, 0]
+        lit = one.usable & (one.level * scale[-1] > least_counts)
+        # All of the change: with white's mean, by which a level over paper's changes too.
+        change = (one.changes[lit] - np.outer(expected[lit], scale[:-1])) / one.level[lit, None]
+        terms = terms_of(one.channel)
+        corrected.append(change @ spread.shares[terms])
+        unknown.append(np.einsum("nk,kl,nl->n", change, spread.covariance[np.ix_(terms, terms)], change))
+    size, left = np.concatenate(corrected), np.concatenate(unknown)
+    worst, mean = _beyond_cell(around)
+    near = amounts[:, :, : len(NEAR_PX)]
+    wide = amounts[:, :, len(NEAR_PX) :].sum(axis=2)
+    nothing = len(size) == 0
+    return LensFigures(
+        rms=0.0 if nothing else float(np.sqrt((size**2).mean())),
+        worst=0.0 if nothing else float(np.abs(size).max()),
+        residual=0.0 if nothing else float(np.sqrt(left.mean())),
+        veil=float(amounts[0, 0, -1]),
+        veil_error=float(spread.errors()[0, 0, -1]),
+        beyond_cell=float((near @ worst + wide).max()),
+        left_in_worst=float((near @ (worst - mean)).max()),
+        corrected=spread.proven,
+        why_not="" if spread.proven else "no spread beside the sharp core is proven",
+    )
+
+
+def _beyond_cell(around: Surroundings) -> tuple[_Array, _Array]:
+    """Return the share (N,) of each near kernel from beyond a cell, in the worst sample and in the mean of a window."""
+    from scipy.special import ndtr
+
+    cell, reach = float(around.pitch_px.min()), around.window // 2
+    worst, mean = np.empty(len(NEAR_PX)), np.empty(len(NEAR_PX))
+    # A corner's pixel, half a pixel of rounding towards the corner.
+    for kernel, scale in enumerate(NEAR_PX):
+        at = np.arange(-reach, reach + 1) + 0.5
+        inside = ndtr((cell / 2 - at) / scale) - ndtr((-cell / 2 - at) / scale)
+        worst[kernel] = 1 - inside[-1] ** 2
+        mean[kernel] = 1 - inside.mean() ** 2
+    return worst, mean
+
+
+def _places_beyond(grid: PrintedGrid, registration: Registration, shape: tuple[int, int], window: int) -> Sites:
+    """Return places that show what lies behind the print, all over the frame beside it."""
+    import cv2
+
+    rows, columns = shape
+    width, height = grid.pitch_mm
+    # The outermost patches, and from them straight on to the sheet's edge and a margin.
+    low, high = grid.points_mm.min(axis=0), grid.points_mm.max(axis=0)
+    sheet = grid.slots_mm[grid.others[..., 2].ravel() < 0.5]
+    low, high = np.minimum(low, sheet.min(axis=0)), np.maximum(high, sheet.max(axis=0))
+    half = np.array([width, height]) / 2
+    low, high = low - half, high + half
+    along = np.linspace(0, 1, 40)[:, None]
+    corners = np.array([low, [high[0], low[1]], high, [low[0], high[1]], low])
+    outline = np.concatenate([a + (b - a) * along for a, b in pairwise(corners)])
+    edge = registration.to_pixels(outline)
+    covered = np.zeros((rows, columns), dtype=np.uint8)
+    cv2.fillPoly(covered, [np.rint(edge).astype(np.int32).reshape(-1, 1, 2)], 1)
+    reach = 2 * int(_MARGIN_PX) + 1
+    covered = cv2.dilate(covered, np.ones((reach, reach), dtype=np.uint8))
+    y, x = np.mgrid[_LATTICE_PX // 2 : rows : _LATTICE_PX, _LATTICE_PX // 2 : columns : _LATTICE_PX]
+    free = covered[y, x] == 0
+    found = sites_at(np.stack([x[free], y[free]], axis=1).astype(np.float64).reshape(-1, 2), shape, window)
+    return Sites(found.rows[found.inside], found.columns[found.inside], found.inside[found.inside], window)

@@ -1,0 +1,374 @@
+"""How much of each kernel there is: regression of what cells of known colour differ by on the light around them.
+
+The colours of a chart lie in random order, so that what a cell's neighbours have is unrelated to its own code. A cell's
+own level is predicted from the six codes next to its own, which lie elsewhere on the print, less the curvature that the
+codes beside show; what it differs by from that is regressed on what each kernel would bring to it.
+
+Rules that hold inside:
+
+- Nothing that carries a cell's own noise is among the regressors: own levels are predicted ones there.
+- What the field's fit and the print's unevenness can be wrong by, smooth factors of a cell's level, is fitted along,
+  and held near 0 by what is usual of them. Veil is told from it since it adds the same to dark and bright cells.
+- A far kernel's share is not below 0, and a kernel whose omission costs less than `LEAST_GAIN` is left out.
+
+C cells in the order of colour indices; T unknowns of a channel.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from acquisition.measures.polynomials import page_polynomial, page_powers
+from calibration.spread.point_spread import LEAST_GAIN, TERMS, PointSpread, free_terms, groups_of_terms, terms_of
+from foundation.robust import MAD_TO_SIGMA
+
+MOST_MISFIT = 5.0
+"""Misfit from which on a veil is not told from other light; 1.5 to 3.3 in simulated rooms whose lens has a veil."""
+
+LEAST_COUNTS = 300.0
+"""Counts above black of bare paper from which on a channel of a frame is used."""
+
+USUAL_UNEVENNESS = 0.003
+"""Standard deviation of the coefficients of a smooth factor of cells' levels: errors of the fitted field and of an even
+print (chosen)."""
+
+LOOSE_UNEVENNESS = 0.03
+"""The same where several primaries light the print, each with a field of its own (chosen)."""
+
+FOLDS = 4
+"""Parts of the print, each of which is predicted from the others."""
+
+_PATCHWORK = 10
+"""Parts of the page's width that belong to one fold each, so that every fold has cells all over the print."""
+
+_FACTOR_ORDER, _INK_ORDER = 4, 2
+"""Orders over the page of smooth factors of a level, and of a density of ink (its level times its logarithm)."""
+
+_PRIOR_SHARE = 0.1
+"""Standard deviation that a share is expected to have at most: keeps kernels solvable that the windows hardly see."""
+
+USUAL_VEIL = 0.01
+"""Standard deviation of the veil that lenses have before it is measured: 0.3 to 1.5 % by ISO 9358 and ISO 18844. Where
+a print is lit so evenly that it shows no veil, this is what is known of it."""
+
+_LEVELS = 40
+"""Groups of like levels, in each of which the scatter is measured."""
+
+_HUBER = 3.0
+"""Standard deviations beyond which a cell weighs less."""
+
+_ROUNDS = 2
+"""Solutions in a row, each weighted by what the one before left."""
+
+_ROUNDING = 1e-7
+"""Step of a stored share: far below its error, far above what another order of sums changes, so that a table's bytes
+do not depend on the machine's linear algebra."""
+
+VARYING_BITS = 4
+"""Bits of a channel from which on cells are enough for shares that change over the frame."""
+
+_EVEN_TERMS = 3
+"""Unknowns of a kernel that is the same all over the frame, at most: one for each channel."""
+
+FULL_BITS = 5
+"""Bits of a full chart, whose codes stand so near each other that their curvature is less than the noise of a cell."""
+
+_BESIDE = 5
+"""Codes along each side of the square in which the usual curvature across an axis is taken."""
+
+_Array = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class SpreadData:
+    """A channel of a frame: what cells show, and what kernels would change of it.
+
+    Attributes
+    ----------
+    channel
+        0, 1 or 2.
+    level
+        (C,) float64, bare paper 1, the field divided out.
+    changes
+        (C, T) float64, change of `level` for a whole share of each unknown of the channel, by the light that comes in.
+    even
+        (C,) float64, change of `level` for light that lies evenly over all of the frame.
+    usable
+        (C,) bool.
+    unevenness
+        Standard deviation of the coefficients of smooth factors.
+    """
+
+    channel: int
+    level: _Array
+    changes: _Array
+    even: _Array
+    usable: npt.NDArray[np.bool_]
+    unevenness: float
+
+
+@dataclass(frozen=True, eq=False)
+class _Rows:
+    """Rows of the regression: (N,) values, (N, T + M) design, (N,) levels, (N,) fold, and the columns' unknowns."""
+
+    value: _Array
+    design: _Array
+    level: _Array
+    fold: npt.NDArray[np.int64]
+    unknowns: npt.NDArray[np.int64]
+
+
+def colour_residual(columns: npt.NDArray[np.floating], bits: int) -> tuple[_Array, npt.NDArray[np.bool_]]:
+    """Return how values of cells differ from what their neighbours in colour predict.
+
+    Linear in the values. The mean of both neighbours along each axis of the code predicts a cell's. Where codes stand
+    further apart than the 32 levels of a full chart, it is corrected for the curvature: the mean over the codes beside
+    it across that axis.
+
+    Parameters
+    ----------
+    columns
+        (C, M) float, values of C = 8**bits cells in the order of colour indices.
+    bits
+        Bits of each channel of a code, 2 or more.
+
+    Returns
+    -------
+    residual, known
+        (C, M) float64, and (C,) bool, whether a cell has two neighbours along any axis.
+    """
+    from calibration.spread import kernels
+
+    side = 1 << bits
+    codes = np.arange(side**3)
+    inner = [(codes // side**axis % side > 0) & (codes // side**axis % side < side - 1) for axis in range(3)]
+    known = np.any(inner, axis=0)
+    if bits < FULL_BITS:
+        return _less_curvature(columns, side), known
+    residual = np.empty(columns.shape)
+    kernels.colour_differences(np.ascontiguousarray(columns, dtype=np.float64), side, residual)
+    return residual, known
+
+
+def _less_curvature(columns: npt.NDArray[np.floating], side: int) -> _Array:
+    """Return the residuals (C, M) of a chart of fewer codes."""
+    from scipy.ndimage import uniform_filter
+
+    cube = np.asarray(columns, dtype=np.float64).reshape(side, side, side, -1)
+    total, count = np.zeros_like(cube), np.zeros((side, side, side, 1))
+    for axis in range(3):
+        inner, before, after = (
+            (*(slice(None),) * axis, part) for part in (slice(1, side - 1), slice(0, side - 2), slice(2, side))
+        )
+        second = cube[inner] - 0.5 * (cube[before] + cube[after])
+        size = [1 if other == axis else _BESIDE for other in range(3)]
+        # The mean is that of the codes beside, without the cell's own.
+        total[inner] += (second - uniform_filter(second, [*size, 1], mode="nearest")) / (1 - 1 / _BESIDE**2)
+        count[inner] += 1
+    return (total / np.maximum(count, 1)).reshape(columns.shape)
+
+
+def predicted_levels(level: _Array, bits: int) -> _Array:
+    """Return levels (C, M) float64 as the neighbours in colour have them; a cell's own where it has none."""
+    return level - colour_residual(level, bits)[0]
+
+
+def fit_spread(
+    data: Sequence[SpreadData], cells_mm: _Array, page_mm: tuple[float, float], bits: int
+) -> PointSpread | None:
+    """Return the point spread that explains best what cells differ by; None where nothing can be fitted.
+
+    Parameters
+    ----------
+    data
+        Channels of frames.
+    cells_mm
+        (C, 2) float64 mm, the cells' centres.
+    page_mm
+        Width and height of the page.
+    bits
+        Bits of each channel of a code.
+    """
+    if not data:
+        return None
+    rows = [_rows(one, number, cells_mm, page_mm, bits) for number, one in enumerate(data)]
+    shapes = len(page_powers(_FACTOR_ORDER)) - 1
+    size = max(int(one.unknowns.max()) for one in rows) + 1
+    prior = np.full(size, 1 / _PRIOR_SHARE**2)
+    prior[TERMS - 1] = 1 / USUAL_VEIL**2
+    for one, row in zip(data, rows, strict=True):
+        prior[row.unknowns[len(terms_of(0)) + shapes :]] = 1 / one.unevenness**2
+    shape = np.arange(TERMS, TERMS + shapes)
+    everything = np.delete(np.arange(size), shape)
+    solution = np.zeros(size)
+    normal, right = np.zeros((FOLDS, size, size)), np.zeros((FOLDS, size))
+    for _ in range(_ROUNDS):
+        normal, right = _normal_equations(rows, solution)
+        solution[everything] = _solved(*_of(normal.sum(axis=0), right.sum(axis=0), prior, everything), np.arange(TERMS))
+    misfit = _misfit(normal.sum(axis=0), right.sum(axis=0), prior, shapes)
+    normal, right = normal[:, everything][:, :, everything], right[:, everything]
+    prior = prior[everything]
+    matrix, vector = _without_factors(normal.sum(axis=0), right.sum(axis=0), prior)
+    covariance: _Array = np.asarray(misfit * np.linalg.inv(matrix), dtype=np.float64)
+    candidates = groups_of_terms()
+    if bits < VARYING_BITS:
+        candidates = [group for group in candidates if len(group) <= _EVEN_TERMS]
+    if misfit > MOST_MISFIT:
+        # Other light lies smoothly over the frame, and what an even veil would have been taken for is not known.
+        covariance[-1, -1] += _positive(matrix, vector, np.arange(TERMS))[0][-1] ** 2
+        candidates.pop()
+    kept = _selected(matrix, vector, misfit, candidates)
+    shares, gain = _positive(matrix, vector, kept)
+    held_out = 0.0
+    for fold in range(FOLDS):
+        others = normal.sum(axis=0) - normal[fold], right.sum(axis=0) - right[fold]
+        with_kernels, without = (_solved(*others, prior, chosen) for chosen in (kept, kept[:0]))
+        held_out += _explained(normal[fold], right[fold], with_kernels) - _explained(normal[fold], right[fold], without)
+    found = PointSpread(np.round(shares / _ROUNDING) * _ROUNDING, covariance, gain, held_out, misfit)
+    return found if found.proven else replace(found, shares=np.zeros(TERMS))
+
+
+def _of(normal: _Array, right: _Array, prior: _Array, chosen: npt.NDArray[np.int64]) -> tuple[_Array, _Array, _Array]:
+    """Return equations of some unknowns alone."""
+    return normal[np.ix_(chosen, chosen)], right[chosen], prior[chosen]
+
+
+def _misfit(normal: _Array, right: _Array, prior: _Array, shapes: int) -> float:
+    """Return what smooth light beyond the kernels' explains for each of its unknowns, over chance, at least 1.
+
+    The unknowns behind the shares are light that changes smoothly over the frame and adds to dark and bright cells
+    alike. Where the kernels and an even veil are all that there is, each of them lowers the sum of squares by about 1.
+    """
+    with_shape = _without_factors(normal, right, prior, TERMS + shapes)
+    without = np.delete(np.arange(len(prior)), np.arange(TERMS, TERMS + shapes))
+    plain = _without_factors(*_of(normal, right, prior, without))
+    gains = [_explained(*found, np.asarray(np.linalg.solve(*found), dtype=np.float64)) for found in (with_shape, plain)]
+    return max(1.0, (gains[0] - gains[1]) / shapes)
+
+
+def _rows(one: SpreadData, number: int, cells_mm: _Array, page_mm: tuple[float, float], bits: int) -> _Rows:
+    """Return the rows of a channel of a frame, whose smooth factors are the `number`-th."""
+    level = np.where(one.usable, one.level, np.nan)
+    # A cell that cannot be used gets its neighbour's value, so that it does no more harm than one outlier.
+    there = np.flatnonzero(one.usable)
+    nearest = there[np.clip(np.searchsorted(there, np.arange(len(level))), 0, len(there) - 1)]
+    level = np.where(one.usable, level, one.level[nearest])
+    expected = predicted_levels(level[:, None], bits)[:, 0]
+    factor = page_polynomial(cells_mm, page_mm, _FACTOR_ORDER)[:, 1:]
+    ink = factor[:, : len(page_powers(_INK_ORDER)) - 1]
+    dense = expected * np.log(np.clip(expected, 0.01, None))
+    even = factor * one.even[:, None]
+    columns = np.column_stack([level, one.changes, even, factor * expected[:, None], ink * dense[:, None]])
+    residual, known = colour_residual(columns, bits)
+    chosen = known & one.usable
+    places = np.floor(cells_mm / (max(page_mm) / _PATCHWORK)).astype(np.int64)
+    common = TERMS + even.shape[1]
+    own = factor.shape[1] + ink.shape[1]
+    smooth: npt.NDArray[np.int64] = np.arange(own, dtype=np.int64) + common + number * own
+    shape: npt.NDArray[np.int64] = np.arange(TERMS, common, dtype=np.int64)
+    return _Rows(
+        value=residual[chosen, 0],
+        design=np.ascontiguousarray(residual[chosen, 1:]),
+        level=expected[chosen],
+        fold=((places[:, 0] + 2 * places[:, 1]) % FOLDS)[chosen],
+        unknowns=np.concatenate([terms_of(one.channel), shape, smooth]),
+    )
+
+
+def _weights(left: _Array, level: _Array) -> _Array:
+    """Return the weight (N,) of each row from what is left of it: over the usual variance of its level, Huber's."""
+    variance = np.empty(len(left), dtype=np.float64)
+    parts: list[npt.NDArray[np.int64]] = np.array_split(np.argsort(level, kind="stable"), min(_LEVELS, len(left) // 8))
+    for part in parts:
+        variance[part] = (MAD_TO_SIGMA * float(np.median(np.abs(left[part])))) ** 2 + 1e-12
+    far = np.abs(left) / np.sqrt(variance)
+    weights: _Array = np.minimum(1.0, _HUBER / np.maximum(far, 1e-9)) / variance
+    return weights
+
+
+def _normal_equations(rows: Sequence[_Rows], solution: _Array) -> tuple[_Array, _Array]:
+    """Return matrix (FOLDS, T, T) and right side (FOLDS, T), weighted by what a solution (T,) leaves."""
+    size = len(solution)
+    normal, right = np.zeros((FOLDS, size, size)), np.zeros((FOLDS, size))
+    for one in rows:
+        weights = _weights(one.value - one.design @ solution[one.unknowns], one.level)
+        weighted = one.design * weights[:, None]
+        for fold in range(FOLDS):
+            there = one.fold == fold
+            normal[fold][np.ix_(one.unknowns, one.unknowns)] += weighted[there].T @ one.design[there]
+            right[fold][one.unknowns] += weighted[there].T @ one.value[there]
+    return normal, right
+
+
+def _without_factors(normal: _Array, right: _Array, prior: _Array, kept: int = TERMS) -> tuple[_Array, _Array]:
+    """Return the equations (kept, kept), (kept,) of the first unknowns alone: smooth factors eliminated (Schur)."""
+    full = normal + np.diag(prior)
+    share = np.linalg.solve(full[kept:, kept:], full[kept:, :kept]).T
+    matrix = full[:kept, :kept] - share @ full[kept:, :kept]
+    return 0.5 * (matrix + matrix.T), right[:kept] - share @ right[kept:]
+
+
+def _solved(normal: _Array, right: _Array, prior: _Array, kept: npt.NDArray[np.int64]) -> _Array:
+    """Return all unknowns (T,), shares other than the kept ones 0."""
+    shares, _ = _positive(*_without_factors(normal, right, prior), kept)
+    full = normal + np.diag(prior)
+    solution = np.empty(len(right))
+    solution[:TERMS] = shares
+    solution[TERMS:] = np.linalg.solve(full[TERMS:, TERMS:], right[TERMS:] - full[TERMS:, :TERMS] @ shares)
+    return solution
+
+
+def _explained(matrix: _Array, vector: _Array, solution: _Array) -> float:
+    """Return by how much a solution lowers the sum of squares."""
+    return float(2 * vector @ solution - solution @ matrix @ solution)
+
+
+def _positive(matrix: _Array, vector: _Array, kept: npt.NDArray[np.int64]) -> tuple[_Array, float]:
+    """Return the shares (TERMS,) that lower the sum of squares most, others than the kept ones 0, and by how much.
+
+    Far kernels' and the veil's are 0 or more: non-negative least squares of the equations' Cholesky factor (C. Lawson
+    and R. Hanson, Solving Least Squares Problems, 1974), the free ones eliminated.
+    """
+    from scipy.optimize import nnls
+
+    shares = np.zeros(TERMS)
+    free, bound = (kept[free_terms()[kept] == wanted] for wanted in (True, False))
+    inner, across = matrix[np.ix_(free, free)], matrix[np.ix_(free, bound)]
+    if len(bound):
+        reduced = matrix[np.ix_(bound, bound)] - across.T @ np.linalg.solve(inner, across)
+        right = vector[bound] - across.T @ np.linalg.solve(inner, vector[free])
+        factor = np.linalg.cholesky(0.5 * (reduced + reduced.T))
+        shares[bound] = nnls(factor.T, np.linalg.solve(factor, right))[0]
+    if len(free):
+        shares[free] = np.linalg.solve(inner, vector[free] - across @ shares[bound])
+    return shares, _explained(matrix, vector, shares)
+
+
+def _selected(
+    matrix: _Array, vector: _Array, misfit: float, candidates: list[npt.NDArray[np.int64]]
+) -> npt.NDArray[np.int64]:
+    """Return the unknowns that are worth their place: the weakest kernel is left out until each one gains enough."""
+    kernels = list(candidates)
+    _, gain = _positive(matrix, vector, _terms(kernels))
+    while kernels:
+        without = [
+            np.concatenate([*kernels[:k], *kernels[k + 1 :], np.zeros(0, dtype=np.int64)]) for k in range(len(kernels))
+        ]
+        gains = [_positive(matrix, vector, np.sort(rest))[1] for rest in without]
+        # Chance gains one for each unknown.
+        worth = [gain - less - misfit * (LEAST_GAIN + len(own) - 1) for less, own in zip(gains, kernels, strict=True)]
+        weakest = int(np.argmin(worth))
+        if worth[weakest] > 0:
+            break
+        gain = gains[weakest]
+        kernels.pop(weakest)
+    return _terms(kernels)
+
+
+def _terms(kernels: Sequence[npt.NDArray[np.int64]]) -> npt.NDArray[np.int64]:
+    """Return the unknowns of kernels, ascending."""
+    return np.sort(np.concatenate([*kernels, np.zeros(0, dtype=np.int64)]))

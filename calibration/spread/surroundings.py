@@ -1,0 +1,248 @@
+"""The light that kernels of a point spread bring to every patch of a frame from its surroundings.
+
+- Near kernels are integrated over each slot and each of a window's pixels, where they lie in the frame, each channel's
+  photosites in their own place; tags and margins in fifths of a slot.
+- Far kernels blur the print slot by slot, in which a patch's place within its slot does not matter.
+- Levels are what the frame itself shows: of cells and references their means, of bare paper and black ink the usual
+  ones in the light of the place, of what lies behind the print the mean of places beside it.
+
+Half-size pixels; P patches as in `PrintedGrid`; counts above black.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from acquisition.framing.planes import CHANNELS, channel_offset_px, phases
+from acquisition.measures.flat_field import FlatField
+from calibration.registration.registration import Registration
+from calibration.sampling.samples import Sites
+from calibration.spread import kernels
+from calibration.spread.point_spread import NEAR_PX, place_terms
+from calibration.spread.printed_grid import PARTS, PrintedGrid
+from drivers.raw.rawfile import Mosaic
+
+_OFFSETS_PX = (-2.0, 1 / 16, 65)
+"""First, step and number of the offsets of windows that shares are tabulated at: rounding, a quarter pixel of the
+colour filters, registration and lateral colour stay within 2 px, and cubic terms of a step below 10⁻⁴ of a share."""
+
+_PITCHES = 9
+"""Sizes of slots that shares are tabulated at, over those that occur."""
+
+_FAR_REACH = 3.0
+"""Standard deviations after which a far kernel's tail, 0.3 %, is dropped; it is scaled to keep its sum."""
+
+_Array = npt.NDArray[np.float64]
+_Float = npt.NDArray[np.float32]
+
+
+@dataclass(frozen=True, eq=False)
+class FrameLevels:
+    """What a frame shows, before the lens is corrected.
+
+    Attributes
+    ----------
+    patches
+        (P, 3) float64 counts, mean of each patch.
+    beyond
+        (3,) float64 counts, what lies behind the print.
+    """
+
+    patches: _Array
+    beyond: _Array
+
+
+@dataclass(frozen=True, eq=False)
+class Surroundings:
+    """A frame's patches and what lies around them; made by `surroundings`.
+
+    Attributes
+    ----------
+    grid, window
+        The print, and pixels along a patch's window.
+    neighbours
+        (P, 25) int32, as in `PrintedGrid`.
+    offset_px
+        (P, 3, 2) float64, from each patch's centre to the middle of its window, along the print's axes, by channel.
+    pitch_px
+        (P, 2) float64, a slot's width and height.
+    places
+        (P, 9) float64, the terms of a share over the frame at each patch (`place_terms`).
+    whites
+        Places of the white references among the patches.
+    light, slot_light
+        (P, 3) and (R K, 3) float64, the usual field of the session at patches and slots.
+    """
+
+    grid: PrintedGrid
+    window: int
+    neighbours: npt.NDArray[np.int32]
+    offset_px: _Array
+    pitch_px: _Array
+    places: _Array
+    whites: slice
+    light: _Array
+    slot_light: _Array
+
+    def near(self, amounts: _Array) -> NearLight:
+        """Return the light that near kernels bring, `amounts` (9, 3, N) of each: terms over the frame, by channel."""
+        count = len(self.grid.row)
+        first, step, number = _OFFSETS_PX
+        low, high = float(self.pitch_px.min()), float(self.pitch_px.max())
+        pitches = np.linspace(low, max(high, low * 1.001), _PITCHES)
+        offsets = np.linspace(first, first + step * (number - 1), number)
+        shares = np.empty((len(NEAR_PX), _PITCHES, number, kernels.ACROSS * PARTS))
+        for k, scale in enumerate(NEAR_PX):
+            kernels.window_shares(scale, pitches, offsets, self.window, shares[k])
+        weights = np.empty((count, 3, kernels.ACROSS**2), dtype=np.float32)
+        others = np.empty((count, 3, 3), dtype=np.float32)
+        table = np.array([pitches[0], pitches[1] - pitches[0], first, step])
+        grid, local = self.grid, np.ascontiguousarray(np.einsum("np,pck->nck", self.places, amounts))
+        kernels.weights_around(
+            grid.row, grid.column, self.neighbours, grid.parts, self.offset_px, self.pitch_px, shares, table, local,
+            weights, others,
+        )  # fmt: skip
+        return NearLight(self.neighbours, weights, others, local.sum(axis=2))
+
+    def inks(self, levels: FrameLevels) -> tuple[_Array, _Array]:
+        """Return bare paper and black ink (3,) float64, counts where the field is 1."""
+        whites = levels.patches[self.whites] / self.light[self.whites]
+        # The first colour is the code (0, 0, 0), which tags are printed with.
+        return np.median(whites, axis=0), levels.patches[0] / self.light[0]
+
+    def local(self, levels: FrameLevels) -> _Array:
+        """Return (P, 3 kinds, 3) float64 counts of bare paper, black ink, and what lies behind, at each patch."""
+        paper, black = self.inks(levels)
+        behind = np.broadcast_to(levels.beyond, self.light.shape)
+        return np.stack([self.light * paper, self.light * black, behind], axis=1)
+
+    def image(self, levels: FrameLevels) -> _Float:
+        """Return the print slot by slot, (R, K, 3) float32 counts."""
+        paper, black = self.inks(levels)
+        shares = self.grid.others.reshape(-1, 3)
+        seen = shares[:, :1] * (self.slot_light * paper) + shares[:, 1:2] * (self.slot_light * black)
+        seen += shares[:, 2:] * levels.beyond
+        image = seen.reshape(*self.grid.source.shape, 3).astype(np.float32)
+        image[self.grid.row, self.grid.column] = levels.patches
+        return image
+
+    def far(self, image: _Float, scale_px: float) -> _Array:
+        """Return what a far kernel brings to the patches, (P, 3) float64 counts, their own slots' light included."""
+        width, height = self.pitch_px.mean(axis=0)
+        down, across = np.empty_like(image), np.empty_like(image)
+        kernels.blur_rows(image, far_taps(scale_px / height), down)
+        turned = np.ascontiguousarray(down.transpose(1, 0, 2))
+        across = np.empty_like(turned)
+        kernels.blur_rows(turned, far_taps(scale_px / width), across)
+        return across[self.grid.column, self.grid.row].astype(np.float64)
+
+    def own_share(self, scale_px: float) -> float:
+        """Return the share of a far kernel's light at a patch that comes from its own slot."""
+        width, height = self.pitch_px.mean(axis=0)
+        taps = far_taps(scale_px / width), far_taps(scale_px / height)
+        return float(taps[0][len(taps[0]) // 2] * taps[1][len(taps[1]) // 2])
+
+
+@dataclass(frozen=True, eq=False)
+class NearLight:
+    """The weights by which near kernels bring light to patches.
+
+    Attributes
+    ----------
+    neighbours
+        (P, 25) int32, the patches around each.
+    weights, others
+        (P, 3, 25) and (P, 3, 3) float32, of each of them, and of bare paper, black ink and what lies behind.
+    total
+        (P, 3) float64, sum of a patch's weights.
+    """
+
+    neighbours: npt.NDArray[np.int32]
+    weights: _Float
+    others: _Float
+    total: _Array
+
+    @property
+    def own(self) -> _Array:
+        """(P, 3) float64, the weight of each patch's own slot."""
+        return self.weights[:, :, self.weights.shape[2] // 2].astype(np.float64)
+
+    def at(self, levels: FrameLevels, local: _Array) -> _Array:
+        """Return the light (P, 3) float64 counts; `local` is what `Surroundings.local` returns."""
+        out = np.empty_like(levels.patches)
+        kernels.light_around(self.neighbours, self.weights, self.others, levels.patches, local, out)
+        return out
+
+
+def far_taps(scale: float) -> _Float:
+    """Return the shares (n,) float32, n odd, of slots on a line in a Gaussian's light, σ `scale` slots, of sum 1."""
+    from scipy.special import ndtr
+
+    reach = max(1, math.ceil(_FAR_REACH * scale))
+    edges = np.arange(-reach, reach + 2) - 0.5
+    taps = np.diff(ndtr(edges / scale))
+    return (taps / taps.sum()).astype(np.float32)
+
+
+def surroundings(
+    grid: PrintedGrid,
+    neighbours: npt.NDArray[np.int32],
+    mosaic_offsets_px: _Array,
+    frame_px: tuple[int, int],
+    registration: Registration,
+    cells: Sites,
+    references: Sites,
+    whites: slice,
+    light: tuple[_Array, _Array],
+) -> Surroundings:
+    """Return the surroundings of the patches of a frame.
+
+    Parameters
+    ----------
+    grid
+        The print.
+    neighbours
+        (P, 25) int32, as in `PrintedGrid`.
+    mosaic_offsets_px
+        (3, 2) float64, where each channel's photosites lie from a block's centre, `photosite_offsets_px`.
+    frame_px
+        Rows and columns of the half-size frame.
+    registration, cells, references
+        The chart's place, and where the patches are sampled.
+    whites
+        Places of the white references among the patches.
+    light
+        The usual field at the patches (P, 3) and at the slots (R K, 3).
+    """
+    half = np.array(grid.pitch_mm) / 2
+    points = grid.points_mm
+    across, down = (
+        registration.to_pixels(points + half * axis) - registration.to_pixels(points - half * axis)
+        for axis in (np.array([1.0, 0.0]), np.array([0.0, 1.0]))
+    )
+    pitch = np.stack([np.linalg.norm(across, axis=1), np.linalg.norm(down, axis=1)], axis=1)
+    to_slots = np.linalg.inv(np.stack([across, down], axis=-1))
+    middle = np.stack(
+        [np.concatenate([cells.columns, references.columns]), np.concatenate([cells.rows, references.rows])], axis=1
+    )
+    seen = np.stack([registration.to_pixels(points, channel) for channel in CHANNELS], axis=1)
+    from_centre = middle[:, None] + mosaic_offsets_px - seen
+    offset = np.einsum("nij,ncj->nci", to_slots, from_centre) * pitch[:, None]
+    places = place_terms(middle.astype(np.float64), frame_px)
+    return Surroundings(grid, cells.window, neighbours, np.ascontiguousarray(offset), pitch, places, whites, *light)
+
+
+def photosite_offsets_px(mosaic: Mosaic) -> _Array:
+    """Return (3, 2) float64 half-size px: where photosites of red, green and blue lie from their block's centre."""
+    found = phases(mosaic)
+    return np.array([channel_offset_px(found[channel]) for channel in CHANNELS])
+
+
+def light_at(grid: PrintedGrid, field: FlatField) -> tuple[_Array, _Array]:
+    """Return a field at the patches (P, 3) and at the slots (R K, 3); beyond the outermost patches as at those."""
+    low, high = grid.points_mm.min(axis=0), grid.points_mm.max(axis=0)
+    return field.at(grid.points_mm), field.at(np.clip(grid.slots_mm, low, high))

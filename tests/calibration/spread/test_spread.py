@@ -1,0 +1,245 @@
+"""The lens measured on prints that another renderer has blurred, with spreads that are none of the fitted kernels."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import cast
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+from scipy import ndimage
+
+from acquisition.chart.layout import design_chart, paper_chart
+from acquisition.measures.flat_field import FlatField
+from calibration.registration.registration import Registration
+from calibration.sampling.samples import sites_at
+from calibration.spread.correction import (
+    FrameCorrection,
+    LensFigures,
+    PrintView,
+    SpreadFrame,
+    measure_spread,
+)
+from calibration.spread.fitting import LEAST_COUNTS, USUAL_UNEVENNESS, colour_residual
+from calibration.spread.point_spread import PointSpread
+from calibration.spread.printed_grid import PAD, PARTS, printed_grid, unsuitable
+from calibration.spread.surroundings import FrameLevels, Surroundings, far_taps
+
+_Array = npt.NDArray[np.float64]
+PX_MM = 0.5
+"""Half-size pixels are half a millimetre: cells of 10.6."""
+
+PAPER = np.array([5000.0, 9000.0, 6000.0])
+CHART = design_chart(4, seed=3)
+
+
+@dataclass(frozen=True)
+class Place:
+    """A registration of a print that hangs flat, upright and undistorted."""
+
+    at_px: tuple[float, float]
+
+    def to_pixels(self, points_mm: npt.ArrayLike, channel: str = "G") -> _Array:
+        """Return the pixels of points of the print."""
+        return np.asarray(points_mm, dtype=np.float64) / PX_MM + self.at_px
+
+
+def reflectance(rgb: npt.NDArray[np.integer]) -> _Array:
+    """Return smooth colours of codes, 0.03 … 0.9, each channel with a little of the others."""
+    share = (np.asarray(rgb, dtype=np.float64) / 255) ** 2.2
+    mixed = share @ np.array([[0.86, 0.1, 0.04], [0.08, 0.84, 0.08], [0.03, 0.12, 0.85]])
+    return 0.03 + 0.87 * mixed
+
+
+@dataclass(frozen=True)
+class Photograph:
+    """What a lens makes of a print: the levels as seen, and as they would be without it."""
+
+    view: PrintView
+    around: Surroundings
+    seen: FrameLevels
+    clean: _Array
+    true: _Array
+    field: _Array
+
+    def measured(self) -> tuple[PointSpread, LensFigures]:
+        """Return the spread that the photograph shows."""
+        usable = np.ones(len(self.true), dtype=np.bool_)
+        # Paper as it is seen, and its field: a veil lifts it too.
+        white = np.median(self.seen.patches[self.view.whites] / self.field[self.view.whites], axis=0)
+        frame = SpreadFrame(self.seen, self.around, self.field, white, usable, USUAL_UNEVENNESS)
+        found = measure_spread([frame], CHART.page_mm, CHART.bits, LEAST_COUNTS)
+        assert found is not None
+        return found
+
+    def error(self, levels: _Array) -> float:
+        """Return the RMS relative error of cells above 300 counts, relative to paper."""
+        whites, cells = self.view.whites, slice(0, CHART.colour_count)
+        scale = (levels[whites] / self.true[whites]).mean(axis=0)
+        off = (levels / scale / self.true)[cells] - 1
+        return float(np.sqrt((off[self.true[cells] > LEAST_COUNTS] ** 2).mean()))
+
+
+def photograph(
+    shoulder: float = 0.0, veil: float = 0.0, growing: bool = False, falloff: float = 0.35, seed: int = 0
+) -> Photograph:
+    """Return a photograph: exponential shoulders of 2.5 px, growing threefold to the corner if asked, and a veil."""
+    grid = printed_grid(CHART)
+    margin = 30
+    low = grid.slots_mm.min(axis=0) - np.array(grid.pitch_mm) / 2
+    place = Place((float(-low[0] / PX_MM) + margin, float(-low[1] / PX_MM) + margin))
+    rows, columns = (
+        int(np.ceil(n / PARTS * side / PX_MM)) + 2 * margin
+        for n, side in zip(grid.parts.shape, grid.pitch_mm[::-1], strict=True)
+    )
+    shape = rows, columns
+    where = place.to_pixels(grid.points_mm)
+    whites = [reference for reference in CHART.references if reference.is_white]
+    greys = [reference for reference in CHART.references if not reference.is_white]
+    codes = np.concatenate([CHART.rgb[CHART.cell_of_colour], *([reference.rgb] for reference in [*whites, *greys])])
+    of_patches = np.where((codes == 255).all(axis=1)[:, None], 1.0, reflectance(codes))
+    colours = np.concatenate([of_patches, np.ones((1, 3)), reflectance(np.zeros((1, 3), dtype=int)), [[0.04] * 3]])
+    # The scene pixel by pixel, by the part of the print that lies in its middle.
+    y, x = np.mgrid[:rows, :columns].astype(np.float64)
+    points = (np.stack([x, y], axis=-1) - place.at_px) * PX_MM
+    part = np.floor((points - low) / np.array(grid.pitch_mm) * PARTS).astype(int)
+    part = np.clip(part, 0, np.array(grid.parts.shape[::-1]) - 1)
+    radius2 = ((x - columns / 2) ** 2 + (y - rows / 2) ** 2) / ((columns / 2) ** 2 + (rows / 2) ** 2)
+    light = 1.1 * (1 - falloff * radius2)
+    scene = (colours[grid.parts[part[..., 1], part[..., 0]]] * light[..., None] * PAPER).astype(np.float64)
+    image = scene
+    if shoulder:
+        away = np.hypot(
+            *(
+                np.minimum(np.arange(n), n - np.arange(n))[s]
+                for n, s in ((rows, np.s_[:, None]), (columns, np.s_[None, :]))
+            )
+        )
+        kernel = np.exp(-away / 2.5)
+        answer = np.fft.rfft2(kernel / kernel.sum())[..., None]
+        spread = np.fft.irfft2(np.fft.rfft2(scene, axes=(0, 1)) * answer, shape, axes=(0, 1))
+        share = shoulder * (0.5 + radius2 if growing else np.ones(shape))
+        image = scene + share[..., None] * (spread - scene)
+    image = (1 - veil) * image + veil * image.mean(axis=(0, 1))
+    sites = sites_at(where, shape)
+    steps = np.arange(-2, 3)
+    near_y, near_x = sites.rows[:, None, None] + steps[:, None], sites.columns[:, None, None] + steps
+    random = np.random.default_rng([seed, 5])
+    clean = image[near_y, near_x].mean(axis=(1, 2))
+    noisy = clean + np.asarray(random.normal(size=clean.shape), dtype=np.float64) * np.sqrt(clean / 1.8 / 25 + 0.5)
+    field_at = light[sites.rows, sites.columns][:, None].repeat(3, axis=1)
+    cells, references = CHART.colour_count, len(where)
+    uniform = FlatField.uniform(CHART.page_mm)
+    # The window's pixels are whole, so that its places need no filter's offset here.
+    view = PrintView.of(
+        grid, slice(cells, cells + len(whites)), np.zeros((3, 2)), uniform, cast(Registration, place), shape, 5
+    )
+    around = view.around(
+        cast(Registration, place), sites_at(where[:cells], shape), sites_at(where[cells:references], shape)
+    )
+    around = Surroundings(
+        grid, 5, around.neighbours, around.offset_px, around.pitch_px, around.places, view.whites, field_at,
+        ndimage.map_coordinates(
+            light, (grid.slots_mm / PX_MM + place.at_px).T[::-1], order=1, mode="nearest"
+        )[:, None].repeat(3, axis=1),
+    )  # fmt: skip
+    beyond = image[:margin, :margin].mean(axis=(0, 1))
+    return Photograph(view, around, FrameLevels(noisy, beyond), clean, of_patches * field_at * PAPER, field_at)
+
+
+@pytest.fixture(scope="module")
+def sharp() -> Photograph:
+    return photograph()
+
+
+def test_a_sharp_lens_is_left_alone(sharp: Photograph) -> None:
+    spread, figures = sharp.measured()
+    assert not spread.shares.any()
+    assert not spread.proven
+    assert not figures.corrected
+    assert (figures.rms, figures.worst, figures.beyond_cell) == (0, 0, 0)
+    assert 0 < figures.residual < 0.009
+    added = FrameCorrection.of(spread, sharp.view, sharp.around).added(sharp.seen)
+    assert not added.any()
+
+
+@pytest.mark.parametrize(
+    ("lens", "least", "most"),
+    [
+        ({"shoulder": 0.03, "veil": 0.015}, 0.015, 0.005),
+        ({"shoulder": 0.08}, 0.05, 0.01),
+        ({"veil": 0.01}, 0.008, 0.005),
+        ({"shoulder": 0.06, "veil": 0.003, "growing": True}, 0.02, 0.01),
+    ],
+)
+def test_what_a_lens_spreads_is_found_and_taken_out(lens: dict[str, float], least: float, most: float) -> None:
+    shot = photograph(**lens)  # pyright: ignore[reportArgumentType]
+    spread, figures = shot.measured()
+    assert figures.corrected
+    assert spread.held_out > 0
+    added = FrameCorrection.of(spread, shot.view, shot.around).added(shot.seen)
+    # Without the noise of 25 samples, which the correction does not touch.
+    before, after = shot.error(shot.clean), shot.error(shot.clean - added)
+    assert before > least
+    assert after < most
+    assert figures.rms == pytest.approx(before, rel=0.35)
+    # What is said to be left is what is left.
+    assert after < 2 * figures.residual + 0.001
+
+
+def test_a_veil_in_even_light_is_not_known_and_that_is_said(sharp: Photograph) -> None:
+    even, falling = photograph(veil=0.01, falloff=0.0), photograph(veil=0.01)
+    _, unknown = even.measured()
+    _, known = falling.measured()
+    assert unknown.veil_error > 0.008
+    assert unknown.residual > 0.01
+    assert known.veil_error < 0.004
+    assert known.veil == pytest.approx(0.01, abs=3 * known.veil_error)
+
+
+def test_light_of_the_surroundings_is_that_of_an_even_print_where_all_is_even(sharp: Photograph) -> None:
+    around, count = sharp.around, len(sharp.true)
+    flat = Surroundings(
+        around.grid, 5, around.neighbours, around.offset_px, around.pitch_px, around.places, around.whites,
+        np.ones((count, 3)), np.ones((len(around.grid.slots_mm), 3)),
+    )  # fmt: skip
+    levels = FrameLevels(np.full((count, 3), 700.0), np.full(3, 700.0))
+    whole = np.zeros((9, 3, 3))
+    whole[0] = 0.2
+    near = flat.near(whole)
+    assert near.total == pytest.approx(0.6)
+    assert near.at(levels, flat.local(levels)) == pytest.approx(0.6 * 700, rel=1e-5)
+    assert flat.far(flat.image(levels), 24.0) == pytest.approx(700, rel=1e-5)
+
+
+def test_taps_of_a_far_kernel_add_up() -> None:
+    for scale in (0.3, 1.2, 9.6):
+        assert far_taps(scale).sum() == pytest.approx(1, abs=1e-6)
+
+
+def test_residuals_of_colour_are_blind_to_smooth_colours_and_linear() -> None:
+    codes = np.stack(np.meshgrid(*[np.arange(8.0)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+    smooth = (3 + codes @ [1.0, 0.5, 0.25])[:, None] ** 2
+    residual, known = colour_residual(smooth, 3)
+    assert residual[known] == pytest.approx(0, abs=1e-9)
+    assert known.sum() == 8**3 - 8
+    random = np.random.default_rng(1).normal(size=(2, 512, 1))
+    both = colour_residual(random.sum(axis=0), 3)[0]
+    assert both == pytest.approx(sum(colour_residual(part, 3)[0] for part in random))
+
+
+def test_charts_that_show_no_lens_are_named() -> None:
+    assert "no tags" in unsuitable(paper_chart("A4", 2))
+    assert "64 cells" in unsuitable(design_chart(2))
+    assert not unsuitable(CHART)
+
+
+def test_the_grid_has_every_patch_once() -> None:
+    grid = printed_grid(CHART)
+    found = grid.source[grid.source >= 0]
+    assert sorted(found.tolist()) == list(range(len(grid.points_mm)))
+    assert (grid.source[:PAD] < 0).all()
+    # Tags: 64 modules of two parts by two in a rim of one module.
+    black = (grid.parts == len(grid.points_mm) + 1).sum()
+    assert black > 0
