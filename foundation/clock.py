@@ -6,7 +6,8 @@ Whoever waits or stamps a time takes a `Clock`. `SystemClock` is the real one; t
 from __future__ import annotations
 
 import time
-from datetime import UTC, datetime
+from collections.abc import Callable
+from datetime import UTC, datetime, timedelta
 from typing import Protocol
 
 
@@ -40,3 +41,49 @@ class SystemClock:
     def sleep(self, seconds: float) -> None:
         """Block the calling thread for `seconds`."""
         time.sleep(seconds)
+
+
+def elapsed_s() -> float:
+    """Return seconds since an arbitrary origin that nobody sets; those of a suspended machine count on Linux."""
+    # time.monotonic() stands still there while the machine is suspended.
+    return time.clock_gettime(time.CLOCK_BOOTTIME) if hasattr(time, "CLOCK_BOOTTIME") else time.monotonic()
+
+
+class SteadyClock:
+    """A clock whose date goes on as seconds pass, and never back, whatever the machine's clock is set to meanwhile.
+
+    White frames are interpolated in time: where the machine's clock is set back during a session, lights would lie
+    between the wrong ones.
+
+    Parameters
+    ----------
+    clock
+        Tells the date once, and measures and makes every pause.
+    not_before
+        The date at the start is this at least; timezone-aware. None: whatever `clock` says.
+    elapsed
+        Returns seconds since an arbitrary origin; never goes back.
+    """
+
+    def __init__(
+        self, clock: Clock, not_before: datetime | None = None, elapsed: Callable[[], float] = elapsed_s
+    ) -> None:
+        date = clock.now()
+        self._clock = clock
+        self._elapsed = elapsed
+        self._start = date if not_before is None else max(date, not_before)
+        self._origin = elapsed()
+        self.behind_s = (self._start - date).total_seconds()
+        """Seconds by which `clock` was behind `not_before` at the start; 0 where it was not."""
+
+    def now(self) -> datetime:
+        """Return the date at the start and what has passed since, timezone-aware, UTC."""
+        return self._start + timedelta(seconds=self._elapsed() - self._origin)
+
+    def monotonic(self) -> float:
+        """Return seconds of the clock that was handed in."""
+        return self._clock.monotonic()
+
+    def sleep(self, seconds: float) -> None:
+        """Let `seconds` (≥ 0) pass."""
+        self._clock.sleep(seconds)

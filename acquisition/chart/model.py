@@ -230,7 +230,9 @@ def load_chart(path: Path) -> Chart:
     except ValidationError as error:
         first = error.errors()[0]
         where = ".".join(str(part) for part in first["loc"]) or "the file"
-        raise FormatError(f"{path} is no chart that this version reads: {where}: {first['msg']}") from error
+        raise FormatError(
+            f"{path} is no chart that this version reads: {where}: {first['msg']}; restore it from a copy"
+        ) from error
     count = 8**document.bits
     colours = np.asarray(document.cells.colour, dtype=np.int64)
     if len(document.cells.centre_mm) != len(colours) or not np.array_equal(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from contextlib import ExitStack, suppress
+from contextlib import ExitStack
 from pathlib import Path
 
 from acquisition.chart.model import load_chart
@@ -17,8 +17,8 @@ from acquisition.run.planning.work import planned_steps, require_same
 from acquisition.run.rig.opening import open_rig
 from acquisition.run.sequencer import RunOutcome, take_session
 from acquisition.run.taking.pipeline import Taken
-from acquisition.run.taking.resuming import check_frames, require_same_devices, tie
-from acquisition.session.folder import Session, session_exists
+from acquisition.run.taking.resuming import check_frames, clock_note, require_same_devices, tie, white_first
+from acquisition.session.folder import Session, busy_sentence, session_exists
 from acquisition.session.heartbeat import signs_of_life
 from acquisition.session.mending.redaction import secrets_warning
 from foundation.console import Ending
@@ -86,11 +86,13 @@ def run_session(
             session = opened.enter_context(_begun(settings, folder))
             session.journal.be_patient(settings.sequence.patience_s, announce)
         require_same_devices(session, devices, settings)
-        first = tie(session)
+        if note := clock_note(session, devices.clock):
+            announce(note)
+        first = tie(session) or white_first(session)
         total = len(session.steps)
         observe(len(session.done_steps()), total)
         # When the screen is dark and the journal at rest.
-        at_last.callback(_report, session)
+        at_last.callback(_report, session, announce)
         alive = opened.enter_context(signs_of_life(session.journal.beat, session.journal.heartbeat, TRY_S))
 
         def count(frame: Taken) -> None:
@@ -104,10 +106,12 @@ def run_session(
         return take_session(session, devices, settings, judge, count, announce, state, ending, first)
 
 
-def _report(session: Session) -> None:
+def _report(session: Session, announce: Callable[[str], object]) -> None:
     """Write the session's report; it is derived, so that a disk that does not take it leaves the run as it ended."""
-    with suppress(CropError):
+    try:
         write_session_report(session.folder)
+    except CropError as error:
+        announce(f"report: {error}; when that is mended, acquire report {session.folder} makes it")
 
 
 def _taken_up(settings: LabSettings, folder: Path, announce: Callable[[str], object]) -> Session:
@@ -125,4 +129,10 @@ def _taken_up(settings: LabSettings, folder: Path, announce: Callable[[str], obj
 def _begun(settings: LabSettings, folder: Path) -> Session:
     chart = load_chart(settings.chart)
     lights = load_illuminations(settings.illuminations)
-    return Session.create(folder, settings.to_toml(), chart, lights, planned_steps(settings, lights))
+    try:
+        return Session.create(folder, settings.to_toml(), chart, lights, planned_steps(settings, lights))
+    except InputError:
+        # It was not there when this run began: another one has made it since, and frames come into it.
+        if session_exists(folder):
+            raise InputError(busy_sentence(folder)) from None
+        raise

@@ -157,9 +157,8 @@ class Session:
             The folder cannot be written.
         """
         path = journal_path(folder)
-        busy = f"{folder} is being taken by another program; wait for it, or look with acquire status"
         with ExitStack() as opened:
-            opened.enter_context(held_folder(folder, busy))
+            opened.enter_context(held_folder(folder, busy_sentence(folder)))
             journal = Journal.open_for_run(path, patience_s, announce)
             opened.callback(journal.close)
             session = cls(folder, journal, opened)
@@ -425,6 +424,11 @@ def session_exists(folder: Path) -> bool:
         return True
     require_free(folder, "the session")
     return False
+
+
+def busy_sentence(folder: Path) -> str:
+    """Return what is said where another program takes a session."""
+    return f"{folder} is being taken by another program; wait for it, or look with acquire status"
 
 
 def journal_path(folder: Path) -> Path:

@@ -106,7 +106,7 @@ def plan_steps(
     return tuple(steps)
 
 
-def tie_steps(first_number: int) -> tuple[SessionStep, ...]:
+def tie_steps(first_number: int, *, response: bool = True) -> tuple[SessionStep, ...]:
     """Return what a run that is taken up again shows first, to tie it to what was taken before.
 
     A grey and the primaries, by which the projector is known again, and a white and a dark frame, so that lights lie
@@ -116,8 +116,10 @@ def tie_steps(first_number: int) -> tuple[SessionStep, ...]:
     ----------
     first_number
         Number of the first step; the plan's last plus one.
+    response
+        Whether grey and primaries are among them; else the white and the dark frame alone.
     """
-    colours = (Colour(TOP, TOP, TOP), *PRIMARIES)
+    colours = (Colour(TOP, TOP, TOP), *PRIMARIES) if response else ()
     shown: list[tuple[FrameKind, Colour]] = [*(("response", colour) for colour in colours), ("white", WHITE)]
     shown.append(("dark", BLACK))
     return tuple(SessionStep(number, kind, None, colour) for number, (kind, colour) in enumerate(shown, first_number))

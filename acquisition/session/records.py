@@ -5,6 +5,7 @@ And where the preview is that belongs to a row.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
@@ -75,6 +76,12 @@ class Attempt:
     verdict: str | None
     reason: str
     has_frame: bool
+
+
+def last_moment(attempts: Iterable[Attempt]) -> datetime | None:
+    """Return when the last of those attempts was over that gave a frame; None where none did."""
+    ends = (attempt.ended_at for attempt in attempts if attempt.has_frame and attempt.ended_at is not None)
+    return max(ends, default=None)
 
 
 @dataclass(frozen=True)

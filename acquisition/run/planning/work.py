@@ -128,7 +128,10 @@ def require_same(session: Session, settings: LabSettings) -> None:
     ConfigurationError
         Settings, chart or lights differ.
     """
-    before = parse_lab(session.settings_text(), str(session.folder / "session.toml"))
+    try:
+        before = parse_lab(session.settings_text(), str(session.folder / "session.toml"))
+    except ConfigurationError as error:
+        raise ConfigurationError(f"{error}; restore it from a copy") from error
     for key in FIXED:
         old, new = _value(before, key), _value(settings, key)
         if old != new:

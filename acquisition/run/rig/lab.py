@@ -8,6 +8,8 @@ from contextlib import ExitStack
 from acquisition.config import CameraCable, LabSettings, LightSource, ProjectorCable
 from acquisition.run.devices import Devices
 from acquisition.run.shutter import require_whole_turns
+from acquisition.session.folder import Session
+from acquisition.session.records import last_moment
 from drivers.camera import Camera
 from drivers.canon.camera import CanonEos
 from drivers.display.fullscreen import FullScreen
@@ -27,20 +29,22 @@ from drivers.ptp.codes import VENDOR_CANON_USB
 from drivers.ptp.ip_transport import IpTransport
 from drivers.ptp.usb_transport import UsbTransport
 from drivers.serial_projectors import language
-from foundation.clock import Clock, SystemClock
+from foundation.clock import Clock, SteadyClock, SystemClock
 from foundation.errors import ConfigurationError
 
 CONNECT_S = 5.0
 """How long a projector may take to accept a connection; on a lab's network it takes milliseconds."""
 
 
-def open_lab(settings: LabSettings, opened: ExitStack) -> Devices:
+def open_lab(settings: LabSettings, session: Session | None, opened: ExitStack) -> Devices:
     """Open the camera, the projector and its light that LAB.toml names.
 
     Parameters
     ----------
     settings
         As `acquisition.config.load_lab` returns them.
+    session
+        The session that is taken up: time goes on behind its last frame; None for a new one, and for a check.
     opened
         Closes what was opened, in the opposite order.
 
@@ -51,7 +55,7 @@ def open_lab(settings: LabSettings, opened: ExitStack) -> Devices:
     DeviceError
         A device does not answer.
     """
-    clock = SystemClock()
+    clock = session_clock(session)
     require_whole_turns(settings.camera, settings.lab.projector)
     projector = _lab_projector(settings.lab.projector, clock, settings.file)
     if projector is not None:
@@ -61,6 +65,11 @@ def open_lab(settings: LabSettings, opened: ExitStack) -> Devices:
     camera = _lab_camera(settings.lab.camera, clock, settings.file)
     opened.callback(camera.close)
     return Devices(camera, presenter, projector, clock)
+
+
+def session_clock(session: Session | None) -> SteadyClock:
+    """Return this machine's time for a session, going on behind its last frame; None for one that has none."""
+    return SteadyClock(SystemClock(), None if session is None else last_moment(session.journal.attempts()))
 
 
 def _lab_camera(cable: CameraCable, clock: Clock, file: str) -> Camera:

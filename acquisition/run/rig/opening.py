@@ -49,7 +49,7 @@ def open_rig(
         if settings.rig == "lab":
             from acquisition.run.rig.lab import open_lab
 
-            yield open_lab(settings, opened)
+            yield open_lab(settings, session, opened)
         else:
             from acquisition.run.rig.simulated import open_simulated
 

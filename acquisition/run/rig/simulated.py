@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections import Counter
 from contextlib import ExitStack
 from dataclasses import replace
-from datetime import datetime
 from pathlib import Path
 
 from acquisition.chart.model import Chart
@@ -17,6 +16,7 @@ from acquisition.chart.printing import drawing
 from acquisition.config import LabSettings
 from acquisition.run.devices import Devices
 from acquisition.session.folder import Session
+from acquisition.session.records import last_moment
 from drivers.canon.camera import CanonEos
 from drivers.pjlink.projector import PjLinkProjector
 from drivers.presenter import Colour
@@ -65,7 +65,8 @@ def open_simulated(settings: LabSettings, chart: Chart, session: Session | None,
         The recorded session holds no frames.
     """
     exposed = _exposed(session)
-    clock = SimulatedClock(_last_moment(session) if session is not None else OPENING)
+    last = None if session is None else last_moment(session.journal.attempts())
+    clock = SimulatedClock(last or OPENING)
     screen = Screen()
     simulated = SimulatedProjector(clock, power=Power.ON if exposed else Power.STANDBY)
     sensor = simulated_body(settings)
@@ -159,13 +160,6 @@ def _taken_before(session: Session | None) -> list[tuple[float, Colour]]:
         for attempt in session.journal.attempts()
         if attempt.has_frame
     ]
-
-
-def _last_moment(session: Session) -> datetime:
-    ends = [
-        attempt.ended_at for attempt in session.journal.attempts() if attempt.has_frame and attempt.ended_at is not None
-    ]
-    return max(ends, default=OPENING)
 
 
 def _recording(folder: Path) -> list[RecordedFrame]:

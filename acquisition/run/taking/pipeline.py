@@ -148,6 +148,7 @@ class Pipeline:
         self._begun_after = max((attempt.id for attempt in session.journal.attempts()), default=0)
         self._health = HealthWatch(devices.projector, devices.clock)
         self._doubtful = False
+        self._lacks_previews = False
         self._lasting = ""
         self._lasts_for: SessionStep | None = None
         self._probing: tuple[Pause, float] | None = None
@@ -389,6 +390,9 @@ class Pipeline:
             ),
             _DISK,
         )
+        if saved.preview_fault and not self._lacks_previews:
+            self._lacks_previews = True
+            self._patience.report("preview", f"{saved.preview_fault}; frames count without, and more is not said of it")
         void = self._void_ahead.pop(attempt.number, "")
         if judgement.accepted and void:
             self._agenda.withdraw(step)

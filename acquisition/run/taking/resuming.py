@@ -17,9 +17,11 @@ from acquisition.config import LabSettings
 from acquisition.run.devices import Devices
 from acquisition.session.folder import Session
 from acquisition.session.plan import SessionStep, tie_steps
+from acquisition.session.progress import duration_text
 from acquisition.session.records import ACCEPTED, Attempt
 from drivers.camera import CameraIdentity
 from drivers.projector import ProjectorIdentity
+from foundation.clock import Clock, SteadyClock
 from foundation.errors import DeviceRefused, first_of
 from foundation.version import software
 
@@ -81,6 +83,23 @@ def require_same_devices(session: Session, devices: Devices, settings: LabSettin
             session.journal.record(what, name)
 
 
+def clock_note(session: Session, clock: Clock) -> str:
+    """Return what to say where the machine's clock is behind the session's last frame, with the remedy; else nothing.
+
+    Parameters
+    ----------
+    clock
+        The run's; it goes on behind that frame.
+    """
+    if not isinstance(clock, SteadyClock) or not clock.behind_s:
+        return ""
+    return (
+        f"clock: it is {duration_text(clock.behind_s)} behind the last frame of {session.folder}, or was ahead when "
+        "that was taken; the session's time goes on from there, so that its frames stay in their order; set the "
+        "machine's clock right"
+    )
+
+
 def _camera_name(body: CameraIdentity) -> str:
     """Return a camera's name; its firmware may be brought up to date between two runs."""
     return f"{body.maker} {body.model}, serial number {body.serial}"
@@ -107,9 +126,29 @@ def tie(session: Session) -> tuple[int, ...]:
         return ()
     ties = tie_steps(session.steps[-1].number + 1)
     unfinished = _unfinished(session.steps[-len(ties) :], ties, taken)
-    if not unfinished:
-        session.add_steps(ties)
-    return tuple(step.number for step in unfinished or ties)
+    return tuple(step.number for step in unfinished) if unfinished else _added(session, ties)
+
+
+def white_first(session: Session) -> tuple[int, ...]:
+    """Put a white and a dark frame into the plan where no white frame was measured; return the numbers of their steps.
+
+    The frames of journals of version 1 were not measured: the judge would have nothing to hold the first lights
+    against. Nothing is added where nothing was taken yet.
+
+    Raises
+    ------
+    StorageError
+        The journal cannot be written.
+    """
+    measured = any(step.kind == "white" and accepted for step, _, _, accepted in session.journal.measurements())
+    if measured or not session.journal.accepted_files():
+        return ()
+    return _added(session, tie_steps(session.steps[-1].number + 1, response=False))
+
+
+def _added(session: Session, ties: Sequence[SessionStep]) -> tuple[int, ...]:
+    session.add_steps(ties)
+    return tuple(step.number for step in ties)
 
 
 def _unfinished(

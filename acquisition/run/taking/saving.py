@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import time
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Self
 
@@ -19,7 +18,7 @@ from acquisition.session.judgement import Check, FrameJudge, Judgement, Outlasts
 from acquisition.session.plan import SessionStep
 from acquisition.session.records import preview_path
 from drivers.camera import Camera, CapturedFrame
-from foundation.errors import DeviceError, StorageError
+from foundation.errors import CropError, DeviceError
 from foundation.files import write_whole
 
 
@@ -39,12 +38,15 @@ class Saved:
     ----------
     save_s, judge_s
         Seconds of this machine's time that hashing, flushing and renaming took, and judging.
+    preview_fault
+        Why its preview could not be written; empty where it was, or there is none.
     """
 
     received: ReceivedFile
     judgement: Judgement
     save_s: float
     judge_s: float
+    preview_fault: str = ""
 
 
 def download(session: Session, stem: str, camera: Camera) -> FilledFile:
@@ -112,12 +114,14 @@ class Saver:
         begun = time.perf_counter()
         received = filled.incoming.complete(filled.captured)
         saved = time.perf_counter()
-        judgement = Judgement(device_checks)
+        judgement, preview_fault = Judgement(device_checks), ""
         if judgement.accepted:
             seen = self._judge.judge(received.path, step)
             judgement = replace(seen, checks=(*device_checks, *seen.checks), preview=b"")
             if seen.preview:
                 # It is derived and may be lost; flushing it would cost the devices' thread as much as a row.
-                with suppress(StorageError):
+                try:
                     write_whole(preview_path(self._session.folder, received.path.name), seen.preview)
-        return Saved(received, judgement, saved - begun, time.perf_counter() - saved)
+                except CropError as error:
+                    preview_fault = str(error)
+        return Saved(received, judgement, saved - begun, time.perf_counter() - saved, preview_fault)

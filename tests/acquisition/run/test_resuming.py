@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import pytest
 
 from acquisition.config import LabSettings
 from acquisition.lights.illuminations import Illumination
+from acquisition.run.rig.lab import session_clock
 from acquisition.run.sequencer import take_session
-from acquisition.run.taking.resuming import check_frames, require_same_devices, tie
+from acquisition.run.taking.resuming import check_frames, clock_note, require_same_devices, tie
 from acquisition.session.folder import Session
 from acquisition.session.journal import Journal
+from acquisition.session.judgement import Judgement
 from acquisition.session.plan import plan_steps, tie_steps
-from drivers.camera import CameraIdentity
+from drivers.camera import CameraIdentity, CapturedFrame
 from drivers.presenter import Colour
 from drivers.projector import ProjectorIdentity
 from foundation.console import Ending
@@ -152,3 +155,18 @@ def test_lights_taken_again_are_closed_by_a_pair_behind_the_plan(folder: Path) -
     assert [step for step, _ in lab.taken()][-3:] == ["l3", "w7", "d8"]
     assert take_session(lab.session, lab.devices, SETTINGS).complete
     assert len(lab.taken()) == 10, "and only once"
+
+
+def test_a_machine_whose_clock_was_set_back_between_two_runs_is_told(folder: Path) -> None:
+    lab = Lab(folder)
+    ahead = datetime.now(UTC) + timedelta(hours=5)
+    assert clock_note(lab.session, session_clock(lab.session)) == ""
+    attempt = lab.session.journal.begin(lab.session.steps[0], "frames/a", ahead)
+    received = lab.session.receive("a", lambda into: CapturedFrame("a.cr2", into.write(b"a"), ahead))
+    lab.session.commit(attempt, received, Judgement(()), exposure_s=0.5, ended_at=ahead)
+    clock = session_clock(lab.session)
+    assert clock.now() >= ahead, "what is taken now lies behind it"
+    said = clock_note(lab.session, clock)
+    assert f"behind the last frame of {folder}" in said
+    assert "set the machine's clock right" in said
+    assert session_clock(None).behind_s == 0

@@ -1,0 +1,63 @@
+"""A session's time goes on, whatever the machine's clock is set to."""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime, timedelta
+
+from foundation.clock import Clock, SteadyClock, SystemClock, elapsed_s
+
+NOON = datetime(2026, 1, 1, 12, tzinfo=UTC)
+
+
+class SetClock:
+    """A machine's clock that somebody sets; seconds pass when told so."""
+
+    def __init__(self) -> None:
+        self.date = NOON
+        self.seconds = 100.0
+
+    def now(self) -> datetime:
+        return self.date
+
+    def monotonic(self) -> float:
+        return self.seconds
+
+    def sleep(self, seconds: float) -> None:
+        self.seconds += seconds
+        self.date += timedelta(seconds=seconds)
+
+
+def steady(machine: SetClock, not_before: datetime | None = None) -> SteadyClock:
+    return SteadyClock(machine, not_before, machine.monotonic)
+
+
+def test_a_clock_that_is_set_back_or_forward_does_not_move_a_session_s_time() -> None:
+    machine = SetClock()
+    clock: Clock = steady(machine)
+    clock.sleep(5)
+    assert clock.now() == NOON + timedelta(seconds=5)
+    for jump in (timedelta(hours=-1), timedelta(days=150)):
+        before = clock.now()
+        machine.date += jump
+        clock.sleep(2)
+        assert clock.now() - before == timedelta(seconds=2)
+    assert clock.monotonic() == machine.seconds
+
+
+def test_a_clock_that_is_behind_the_last_frame_goes_on_from_there() -> None:
+    last = NOON + timedelta(hours=3)
+    clock = steady(SetClock(), last)
+    assert clock.behind_s == 3 * 3600
+    clock.sleep(1)
+    assert clock.now() == last + timedelta(seconds=1)
+    ahead = steady(SetClock(), NOON - timedelta(hours=3))
+    assert ahead.behind_s == 0
+    assert ahead.now() == NOON
+
+
+def test_the_machine_s_own_seconds_do_not_go_back() -> None:
+    clock = SteadyClock(SystemClock())
+    moments = [clock.now() for _ in range(100)]
+    assert moments == sorted(moments)
+    assert moments[0].tzinfo is UTC
+    assert elapsed_s() <= elapsed_s()
