@@ -42,6 +42,7 @@ SLOW = (
     "calibration/pipeline/test_checkpoint.py",
     "calibration/pipeline/test_drift_correction.py",
     "calibration/pipeline/test_held_against_itself.py",
+    "calibration/pipeline/test_stray_light.py",
     "calibration/pipeline/test_linearity.py",
     "calibration/pipeline/test_options.py",
     "calibration/pipeline/test_plain_session.py",

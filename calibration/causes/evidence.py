@@ -73,6 +73,10 @@ class Evidence:
         Light while the projector shows black, of white.
     room_change
         Change of it between dark frames, of white.
+    stray
+        Light of a primary under a code of 0 that no dark frame shows, of that primary, the worst light.
+    stray_primaries
+        Light of the primaries' frames together beyond white's, alike in each, of white.
     veil
         Light of the whole frame that the lens spreads over each place, of paper white.
     """
@@ -105,6 +109,8 @@ class Evidence:
     cameras: float = NAN
     room: float = NAN
     room_change: float = NAN
+    stray: float = NAN
+    stray_primaries: float = NAN
     veil: float = NAN
 
     def known(self) -> dict[str, float]:

@@ -14,7 +14,13 @@ import numpy as np
 from acquisition.session.records import FrameRecord
 from calibration.causes.cause import UNKNOWN
 from calibration.causes.evidence import Evidence
-from calibration.causes.light_evidence import camera_evidence, dark_evidence, light_evidence, name_evidence
+from calibration.causes.light_evidence import (
+    camera_evidence,
+    dark_evidence,
+    light_evidence,
+    name_evidence,
+    stray_evidence,
+)
 from calibration.causes.place_evidence import (
     MOST_PLACES,
     Gathered,
@@ -224,5 +230,6 @@ _GATHERERS: dict[str, Callable[[TableFigures, float], Gathered | None]] = {
     "white_drift_deg": _drift,
     "leak_share": dark_evidence,
     "dark_drift": dark_evidence,
+    "stray_share": stray_evidence,
 }
 """How evidence is gathered for each figure."""

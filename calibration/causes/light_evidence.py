@@ -78,5 +78,17 @@ def dark_evidence(figures: TableFigures, limit: float) -> Gathered:
     return Gathered(Evidence(frames=float(len(dark.files)), room=room, room_change=change), (), ())
 
 
+def stray_evidence(figures: TableFigures, limit: float) -> Gathered:
+    """Return what is known of light that no dark frame shows, and in which frames; `limit` as in `light_evidence`."""
+    stray = figures.lights.stray
+    if stray is None:
+        return Gathered(Evidence(), (), ())
+    by_light = {frame.record.illumination: frame.record for frame in figures.frames if frame.record.kind == "light"}
+    frames = tuple(by_light[light] for light in stray.lights_beyond(limit) if light in by_light)
+    certain = float(stray.certain.max(initial=0.0))
+    evidence = Evidence(frames=float(len(figures.frames)), stray=certain, stray_primaries=stray.of_primaries)
+    return Gathered(evidence, frames, ())
+
+
 _SAME = 0.03
 """Logarithm of two exposures' ratio up to which they are one: shutter speeds differ by a quarter, and are rounded."""

@@ -88,6 +88,7 @@ NAMES = frozenset({"off_codes_deg", "white_frame_deg", "exchanged_lights"})
 BRIGHTNESS = frozenset({"off_brightness", "white_frame_brightness", "white_short", "other_exposure"})
 LIGHT = NAMES | BRIGHTNESS | {"additivity", "white_drift", "white_drift_deg"}
 DARK = frozenset({"leak_share", "dark_drift"})
+STRAY = frozenset({"stray_share"})
 
 RULES: tuple[Rule, ...] = (
     Rule(
@@ -125,6 +126,19 @@ RULES: tuple[Rule, ...] = (
         DARK,
         (Condition("room", 0.02, _FAR), Condition("frames", 1, _FAR)),
         "no projector's black is a fiftieth of its white",
+    ),
+    Rule(
+        ROOM_LIGHT,
+        STRAY,
+        (Condition("stray", 0.004, 0.1),),
+        "lights have, or lack, of a primary whose code is 0, what the dark frames do not show",
+    ),
+    Rule(
+        ROOM_LIGHT,
+        STRAY,
+        (Condition("stray_primaries", 0.004, 0.1),),
+        "red, green and blue alone together give more than white, each by as much, under a steady lamp; a projector "
+        "that holds full white back would do so too",
     ),
     Rule(
         HOT_PHOTOSITES,

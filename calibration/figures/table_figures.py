@@ -16,6 +16,7 @@ from acquisition.measures.sensor_range import black_drift
 from acquisition.measures.stains import Stains
 from calibration.checks.frame_origins import OriginFigures
 from calibration.checks.light_codes import CodeAgreement
+from calibration.checks.stray_light import StrayLight
 from calibration.figures.frame_figures import FrameFigures
 from calibration.figures.linearity_figures import LinearityFigures
 from calibration.radiometry.dark_frames import DarkSummary
@@ -84,6 +85,8 @@ class LightFigures:
         None without.
     drift
         How the lights are brought to one lamp in the table; None where that was not asked for. All else is as measured.
+    stray
+        Light in frames that the dark ones do not show; None without the three primaries each alone or a dark frame.
     """
 
     white: _Array
@@ -95,6 +98,7 @@ class LightFigures:
     codes: CodeAgreement | None
     white_frames: CodeAgreement | None
     drift: DriftCorrection | None = None
+    stray: StrayLight | None = None
 
     @cached_property
     def white_error_deg(self) -> _Array:

@@ -11,6 +11,7 @@ from acquisition.lights.illuminations import Illumination
 from acquisition.session.folder import Session
 from calibration.checks.frame_origins import origin_figures
 from calibration.checks.light_codes import CodeAgreement, code_agreement
+from calibration.checks.stray_light import StrayLight, stray_light
 from calibration.figures.frame_figures import FrameFigures
 from calibration.figures.linearity_figures import LinearityFigures
 from calibration.figures.table_figures import (
@@ -24,6 +25,7 @@ from calibration.figures.table_figures import (
 from calibration.pipeline.baseline import Baseline, lens_figures
 from calibration.pipeline.intake import Intake, IntakeState
 from calibration.radiometry.drift import drift_correction
+from calibration.radiometry.primaries import pure_lights
 from calibration.radiometry.projector import additivity, drift_gains
 from foundation.angles import angles_deg
 
@@ -32,6 +34,9 @@ _LEAST_WHITE = 1e-3
 
 _MOST_DRIFT, _MOST_DRIFT_DEG = 0.15, 2.0
 """Drift of white, as a share and in degrees, up to which white frames are believed: a table is refused beyond."""
+
+_FULL_CODE = 255
+"""Code of a primary at its brightest."""
 
 _Array = npt.NDArray[np.float64]
 
@@ -160,6 +165,7 @@ def _light_figures(intake: Intake, taken: IntakeState, by_light: Sequence[FrameF
         additivity=additivity(illuminations, white, full_white, dark, gains),
         codes=agreement.rows(slice(len(by_light))),
         white_frames=agreement.rows(slice(len(by_light), None)) if whites else None,
+        stray=_stray_light(illuminations, by_light, whites, dark, gains),
         drift=drift_correction(*_times_s(by_light, whites), np.array([frame.paper.white for frame in whites]))
         if intake.baseline.options.correct_drift
         else None,
@@ -186,9 +192,7 @@ def _code_agreement(
     """Return how the lights, and white frames behind them, agree with their codes; stated exposures aside."""
     frames = [*by_light, *whites]
     codes = np.array([*(light.codes for light in illuminations), *((255, 255, 255) for _ in whites)])
-    exposures = np.array([frame.origin.exposure for frame in frames])
-    usual = float(np.median(exposures[exposures > 0])) if (exposures > 0).any() else 1.0
-    factor = np.where(exposures > 0, usual / np.maximum(exposures, 1e-12), 1.0)[:, None]
+    factor = _to_one_exposure(frames)
     drift = np.concatenate([gains, np.ones((len(whites), 3))])
     error = np.array([frame.paper.error for frame in frames])
     there = np.isfinite(dark)
@@ -200,6 +204,31 @@ def _code_agreement(
         dark_known=bool(there.all()),
         drift_known=len(whites) == 1,
     )
+
+
+def _to_one_exposure(frames: Sequence[FrameFigures]) -> _Array:
+    """Return the usual exposure over that of each frame, (N, 1) float64, as files state them; 1 where they do not."""
+    exposures = np.array([frame.origin.exposure for frame in frames])
+    usual = float(np.median(exposures[exposures > 0])) if (exposures > 0).any() else 1.0
+    return np.where(exposures > 0, usual / np.maximum(exposures, 1e-12), 1.0)[:, None]
+
+
+def _stray_light(
+    illuminations: Sequence[Illumination],
+    by_light: Sequence[FrameFigures],
+    whites: Sequence[FrameFigures],
+    dark: _Array,
+    gains: _Array,
+) -> StrayLight | None:
+    """Return what light is in frames that the dark ones do not show; None where it cannot be known."""
+    frames, lights = [*by_light, *whites], len(by_light)
+    factor = _to_one_exposure(frames) / np.concatenate([gains, np.ones((len(whites), 3))])
+    white = (np.array([frame.paper.white for frame in frames]) - dark) * factor
+    error = np.array([frame.paper.error for frame in frames]) * factor
+    codes = np.array([light.codes for light in illuminations], dtype=np.int64)
+    # Lights of full white are white frames, too: the more there are, the better the lamp's flicker is known.
+    full = np.concatenate([white[lights:], white[:lights][(codes == _FULL_CODE).all(axis=1)]])
+    return stray_light(codes, white[:lights], error[:lights], full, pure_lights(illuminations))
 
 
 def _gains(by_light: Sequence[FrameFigures], whites: Sequence[FrameFigures]) -> _Array:

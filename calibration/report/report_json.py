@@ -156,6 +156,7 @@ def _channels(figures: TableFigures) -> dict[str, Any]:
         "dark_error": _numbers(dark.error),
         "dark_noise": _numbers(dark.noise),
         "additivity": None if lights.additivity is None else _numbers(lights.additivity),
+        "stray": None if lights.stray is None else lights.stray.to_json(),
         "gain_e_per_count": _numbers(transfer.gain_e),
         "read_noise_counts": _numbers(transfer.read_noise),
         "response_spread": _numbers(transfer.response),

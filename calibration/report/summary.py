@@ -9,7 +9,8 @@ import numpy.typing as npt
 
 from acquisition.framing.visibility import MIN_CELL_PX
 from acquisition.measures.sensor_range import MAX_BLACK_DRIFT
-from calibration.figures.table_figures import TableFigures
+from calibration.checks.stray_light import CERTAIN
+from calibration.figures.table_figures import LightFigures, TableFigures
 from calibration.sampling.windows import SAFE_BLEED, bleed, largest_window
 
 
@@ -216,6 +217,8 @@ def _light_rows(figures: TableFigures) -> list[SummaryRow]:
                 "no frames of red, green and blue, each alone and bright enough; coloured cells are evened by paper's",
             )
         )
+    if lights.codes is not None:
+        rows.append(_stray_row(lights))
     if lights.additivity is not None:
         rows.append(
             SummaryRow("Red + green + blue − white", _percents(lights.additivity), "R, G, B, of white; 0 is additive")
@@ -231,6 +234,23 @@ def _light_rows(figures: TableFigures) -> list[SummaryRow]:
             )
         )
     return rows
+
+
+def _stray_row(lights: LightFigures) -> SummaryRow:
+    """Return what light single frames have beyond the dark ones, and how many lights could be asked."""
+    stray = lights.stray
+    if stray is None:
+        return SummaryRow(
+            "Light that no dark frame shows",
+            "not measured",
+            "red, green and blue alone and a dark frame show it",
+        )
+    return SummaryRow(
+        "Light that no dark frame shows",
+        f"{_percent(stray.share)} of white",
+        f"beyond {CERTAIN:g} standard errors; {int(stray.checked.sum())} of {len(stray.certain)} lights are checked by "
+        "a code of 0, the primaries against white; of the others it is not known",
+    )
 
 
 def _dark_rows(figures: TableFigures) -> list[SummaryRow]:

@@ -207,6 +207,13 @@ THRESHOLDS: tuple[Threshold, ...] = (
         JUDGEMENT + ": a hundredth of a cell of a fifth of white", "darken the room, and keep daylight out",
     ),
     Threshold(
+        "stray_share", "Light in some frames that no dark frame shows, of white", "share", "at most", 0.004, 0.1,
+        "a light contains it, or a primary that others are made of, so that deep colours are paler under some lights "
+        "than under others; subtracting dark frames does not help",
+        SIMULATED + ": below 0.1 % in healthy rooms; 1 % of white makes the darkest cells 10 % brighter",
+        "darken the room, see that no door, lamp or display changes during the session, and take the frames again",
+    ),
+    Threshold(
         "linearity", "Deviation from linearity, 5 to 95 % of saturation", *TABLE_LIMITS["linearity"].numbers,
         "counts are not proportional to light, so that chromaticities change with brightness",
         "EMVA 1288 asks for the range; 1 % is " + JUDGEMENT,

@@ -106,6 +106,8 @@ def _light_values(figures: TableFigures) -> dict[str, float]:
         more, less = -lights.additivity.min(), lights.additivity.max()
         values["additivity"] = max(float(more), 0.0)
         values["white_short"] = max(float(less), 0.0)
+    if lights.stray is not None and _frames_are_alike(figures):
+        values["stray_share"] = lights.stray.share
     off, codes = lights.off_codes_deg, lights.codes
     if off is not None and codes is not None:
         values["off_codes_deg"] = float(off.max())
@@ -127,9 +129,14 @@ def _light_values(figures: TableFigures) -> dict[str, float]:
 def _white_is_white(figures: TableFigures) -> bool:
     """Return whether white and the primaries are what they are called, so that they may be added up."""
     off, white = figures.lights.off_codes_deg, figures.lights.white_frames
-    exchanged = figures.lights.codes is not None and len(figures.lights.codes.exchanges) > 0
     named = (off is None or not (off > 0).any()) and (white is None or not (white.off_deg > 0).any())
-    return named and not exchanged and not figures.origins.other_camera and not figures.origins.other_exposure
+    return named and _frames_are_alike(figures)
+
+
+def _frames_are_alike(figures: TableFigures) -> bool:
+    """Return whether no names are exchanged and files tell of one camera and exposure, so that frames may be added."""
+    exchanged = figures.lights.codes is not None and len(figures.lights.codes.exchanges) > 0
+    return not exchanged and not figures.origins.other_camera and not figures.origins.other_exposure
 
 
 def _dark_values(figures: TableFigures) -> dict[str, float]:

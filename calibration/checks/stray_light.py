@@ -1,0 +1,193 @@
+"""Light in single frames that no dark frame shows: a door that opened, a lamp, daylight, whose share is in some frames.
+
+What the dark frames show is known, and may be subtracted. What was there in other frames alone makes deep colours pale,
+and hardly moves a white; its amount is not found by what codes predict of a light, which is known to some per cent at
+best (`calibration.checks.light_codes`). Two sums are known far better, whatever the projector's response to codes:
+
+- *Codes of 0.* A light is a sum of the three primaries, each of which has a frame of its own. Of a primary whose code
+  is 0 it has nothing beyond the dark light. What it seems to have is room light in its own frame; what it seems to lack
+  was in the frame of a primary that it is made of, as much of it as the light takes of that primary.
+- *White.* Red, green and blue alone together give white. Where they give more, by as much in each primary and under a
+  lamp that is steady, light that is no projector's was in their frames, and is counted as often as it was there. A
+  projector that holds full white back looks the same, and this has to be said. One that brightens white hides it.
+
+Lights without a code of 0 that are no primaries are not checked, and how many are is a figure. The amounts are solved
+for in the whites of bare paper, which are means over hundreds of patches: three equations for three amounts.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+CERTAIN = 4.0
+"""Standard errors that are taken off each amount, so that noise is not taken for light."""
+
+BOOSTED = 0.02
+"""Share by which white may exceed the primaries' sum for lights of several primaries to be judged: from there on the
+projector adds light of its own making where primaries overlap, which need not be a sum of theirs."""
+
+_LARGEST = 0.1
+"""Amount beyond which it is no light of a room, but another light's frame or another exposure, which other figures
+find (judgement)."""
+
+_LEAST_SHARE = 0.02
+"""Least singular value of the primaries' whites over the largest for amounts to be known (judgement): cameras have
+0.1 and more."""
+
+_Array = npt.NDArray[np.float64]
+_Mask = npt.NDArray[np.bool_]
+
+
+@dataclass(frozen=True, eq=False)
+class StrayLight:
+    """Light that is in some frames and not in the dark ones; L lights.
+
+    Attributes
+    ----------
+    at_zero
+        (L,) float64, what a light has of a primary whose code is 0, in parts of that primary alone, with its sign, the
+        primary that is off most; NaN of lights that are not checked.
+    certain
+        (L,) float64, the size of that beyond four standard errors; 0 where not checked.
+    of_primaries
+        By how much the primaries together exceed white for certain, of white, in the primary that does least.
+    primaries
+        Lights that are the primaries, red, green and blue.
+    lights_of
+        (L, 3) bool, the primaries that a light has a code above 0 of.
+    """
+
+    at_zero: _Array
+    certain: _Array
+    of_primaries: float
+    primaries: tuple[int, int, int]
+    lights_of: _Mask
+
+    @property
+    def share(self) -> float:
+        """The largest of all, 0 … 1 of white."""
+        return max(float(self.certain.max(initial=0.0)), self.of_primaries)
+
+    @property
+    def checked(self) -> _Mask:
+        """(L,) bool, lights that have a code of 0 and could be held against it."""
+        return np.isfinite(self.at_zero)
+
+    def lights_beyond(self, accepted: float) -> list[int]:
+        """Return the lights whose frames are concerned, the worst first; primaries where they are what has the light.
+
+        Parameters
+        ----------
+        accepted
+            Share up to which a light is accepted.
+        """
+        worst = [int(light) for light in np.argsort(-self.certain, kind="stable") if self.certain[light] > accepted]
+        own = [light for light in worst if self.at_zero[light] > 0]
+        lacking = [light for light in worst if self.at_zero[light] < 0]
+        told = self.of_primaries > accepted
+        of = [
+            light
+            for primary, light in enumerate(self.primaries)
+            if told or any(self.lights_of[one, primary] for one in lacking)
+        ]
+        return own + [light for light in of if light not in own]
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the figures for `report.json`; null for lights that are not checked."""
+        at_zero = [None if value != value else round(value, 6) for value in self.at_zero.tolist()]
+        return {
+            "at_zero_codes": at_zero,
+            "certain": np.round(self.certain, 6).tolist(),
+            "of_primaries": round(self.of_primaries, 6),
+            "primaries": list(self.primaries),
+            "lights_checked": int(self.checked.sum()),
+        }
+
+
+def stray_light(
+    codes: npt.NDArray[np.int64],
+    white: _Array,
+    error: _Array,
+    full_white: _Array,
+    primaries: tuple[int, int, int] | None,
+) -> StrayLight | None:
+    """Return what light is in frames that the dark frames do not show; None where it cannot be known.
+
+    Parameters
+    ----------
+    codes
+        (L, 3) int64, 0 … 255.
+    white, error
+        (L, 3) float64 counts of bare paper and their standard errors; dark light, drift and stated exposures taken out.
+    full_white
+        (W, 3) float64 counts, likewise, of white frames; of all, not of one, as their scatter is the lamp's.
+    primaries
+        The lights of red, green and blue alone; None where one is missing.
+
+    Returns
+    -------
+    StrayLight or None
+        None without the three primaries, or where the camera cannot tell them apart, or where a white is not known.
+    """
+    if primaries is None or not (np.isfinite(white).all() and np.isfinite(error).all()):
+        return None
+    alone = white[list(primaries)]
+    size = np.linalg.svd(alone, compute_uv=False)
+    if not size[-1] > _LEAST_SHARE * size[0]:
+        return None
+    inverse = np.linalg.inv(alone)
+    amounts = white @ inverse
+    # An error of a primary's white counts as often as the light has that primary.
+    variance = error**2 + amounts**2 @ error[list(primaries)] ** 2
+    spread = np.sqrt(variance @ inverse**2)
+    lights_of = codes > 0
+    full = full_white @ inverse
+    checked = np.ones(len(codes), dtype=np.bool_)
+    checked[list(primaries)] = False
+    if len(full) and float(full.max()) > 1 + BOOSTED:
+        checked &= lights_of.sum(axis=1) <= 1
+    beyond = np.where(~lights_of & checked[:, None], np.maximum(np.abs(amounts) - CERTAIN * spread, 0), 0.0)
+    # All amounts of a light of another name or exposure are off, by far more.
+    beyond[(beyond > _LARGEST).any(axis=1)] = 0
+    zero = np.where(~lights_of & checked[:, None], np.abs(amounts), -1.0)
+    worst = np.argmax(np.where(beyond.any(axis=1, keepdims=True), beyond, zero), axis=1)
+    at_zero = amounts[np.arange(len(codes)), worst]
+    has = checked & ~lights_of.all(axis=1)
+    return StrayLight(
+        at_zero=np.where(has, at_zero, np.nan),
+        certain=beyond.max(axis=1, initial=0.0),
+        of_primaries=_of_primaries(codes[list(primaries)], full, spread[list(primaries)]),
+        primaries=primaries,
+        lights_of=lights_of,
+    )
+
+
+def _of_primaries(codes: npt.NDArray[np.int64], full: _Array, spread: _Array) -> float:
+    """Return by how much primaries exceed white for certain, given the amounts (W, 3) of them that white frames have.
+
+    Nothing where they are not at full code, as white is, or fewer than two white frames say how steady the lamp is.
+    """
+    if len(full) < 2 or int(codes.max(axis=1).min()) < _FULL:
+        return 0.0
+    lacking = 1 - full.mean(axis=0)
+    flicker = float(np.ptp(full.mean(axis=1)))
+    # Each primary's frame may have been taken in such a flicker, too, and in a lasting change between two white frames.
+    error = float(np.sqrt((spread**2).max() + (_FLICKERS * flicker) ** 2))
+    share = float(lacking.min()) - CERTAIN * error
+    alike = float(np.ptp(lacking)) <= _ALIKE * float(lacking.mean())
+    return share if alike and 0 < share <= _LARGEST else 0.0
+
+
+_FULL = 255
+"""Code of a primary at its brightest."""
+
+_FLICKERS = 0.5
+"""Standard deviation of a frame's brightness over the range of that of two or three white frames: 0.6 of three."""
+
+_ALIKE = 0.6
+"""Range of what the primaries exceed white by, over its mean, up to which they do alike: daylight against a lamp's
+white differs by less, frames of the primaries in a flicker by more (judgement)."""

@@ -1,0 +1,63 @@
+"""Room light that came and went between dark frames, and rooms in which it is there all the time."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from acquisition.session.plan import SessionStep
+from benchmarks.cases import chart_of
+from benchmarks.sessions import AS_PLANNED, FrameChange, light_named, short_plan, short_session, world_of
+from calibration.pipeline.build import build
+from calibration.pipeline.options import BuildOptions
+from calibration.report.summary import summary
+from calibration.verdict.result import BuildResult
+from calibration.verdict.wording import remark
+from drivers.presenter import Colour
+from sim.world.room import Room
+from sim.world.sensors import BODIES
+from sim.world.situation import Situation
+
+LIGHTS = {
+    "red": Colour(255, 0, 0), "green": Colour(0, 255, 0), "blue": Colour(0, 0, 255), "white": Colour(255, 255, 255),
+    "yellow": Colour(255, 180, 0), "warm": Colour(255, 164, 73),
+}  # fmt: skip
+DAYLIGHT = Situation(ambient=(0.008, 0.01, 0.012))
+
+
+def built(folder: Path, room: Room, leaking: frozenset[str] = frozenset(), subtract_dark: bool = False) -> BuildResult:
+    chart, lights = chart_of(small=True), short_plan(LIGHTS)
+    leak = FrameChange(situation=DAYLIGHT)
+
+    def changes(step: SessionStep) -> FrameChange:
+        return leak if light_named(lights, step) in leaking else AS_PLANNED
+
+    world = world_of(chart, BODIES["Test"], room)
+    with short_session(folder / "session", chart, world, changes, lights) as session:
+        return build(session, folder / "lut", options=BuildOptions(subtract_dark=subtract_dark))
+
+
+@pytest.mark.parametrize("leaking", [{"yellow"}, {"red", "blue", "warm"}], ids=["light", "primaries"])
+def test_light_that_no_dark_frame_shows_is_the_rooms(tmp_path: Path, leaking: set[str]) -> None:
+    result = built(tmp_path, Room(seed=3), frozenset(leaking))
+    rows = {row.threshold.name: row for row in result.verdict.remarks}
+    assert "stray_share" in rows
+    said = remark(rows["stray_share"], result.figures)
+    assert "light of the room" in said
+    stray = result.figures.lights.stray
+    assert stray is not None
+    assert ("yellow" in leaking) == (stray.lights_beyond(0.004) == [4])
+
+
+@pytest.mark.parametrize(("seed", "ambient", "subtract"), [(5, 0.0007, False), (6, 0.01, False), (7, 0.01, True)])
+def test_light_that_is_always_there_is_not_remarked_on_here(
+    tmp_path: Path, seed: int, ambient: float, subtract: bool
+) -> None:
+    result = built(tmp_path, Room(seed=seed, ambient=ambient, veil=0.003), subtract_dark=subtract)
+    assert "stray_share" not in {row.threshold.name for row in result.verdict.remarks}
+    stray = result.figures.lights.stray
+    assert stray is not None
+    assert stray.share < 0.002
+    (row,) = [row for row in summary(result.figures) if row.name == "Light that no dark frame shows"]
+    assert "1 of 6 lights" in row.note
