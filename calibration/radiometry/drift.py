@@ -3,7 +3,7 @@
 Every light is brought to the lamp at its brightest, never to a dimmer one: samples are multiplied by one or more, so
 that integers that differed still differ afterwards, and the counts as measured come back exactly
 (`as_measured`). Samples and ground truth are divided by the same numbers, channel by channel, so that the truth of
-every image stays what it was relative to it (docs/decisions/0031-drift-is-taken-out-on-request.md).
+every image stays what it was relative to it (docs/decisions/0030-drift-is-taken-out-on-request.md).
 """
 
 from __future__ import annotations
