@@ -96,7 +96,9 @@ ONLY_OF_A_SESSION: tuple[str, ...] = (
     "other_camera", "other_lens", "other_exposure",
     # Of the lights.
     "truth_median_deg", "truth_worst_deg", "off_brightness", "white_short", "exchanged_lights", "exchange_deg",
-    "held_share", "white_frame_deg", "white_frame_brightness", "primaries_lacking", "stray_share",
+    "held_share", "white_frame_deg", "white_frame_brightness", "primaries_lacking", "stray_share", "code_misfit",
+    # Of the lens, which is measured on the frames of the primaries.
+    "correction_residual",
     # Of the noise of the cells.
     "noise_misfit", "noisy_share",
 )  # fmt: skip

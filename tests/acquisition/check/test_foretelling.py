@@ -95,7 +95,7 @@ ROOMS = {
     "glare spot": Case({}, "not accept", paint=spot(0.2, 0.12)),
     "sharp glare spot": Case({}, "not accept", paint=spot(0.2, 0.1, 8)),
     "dark corner": Case({"vignetting": 0.6, "projector_falloff": 0.5}, "any"),
-    "stained": Case({"stain_mm": 60.0}, "accept with remarks"),
+    "stained": Case({"stain_mm": 60.0}, "not accept"),
     "a thumb": Case({"stain_mm": 20.0, "stain_depth": 0.3}, "not accept"),
     "cut off": Case({"fill": 1.04}, "any"),
     "far": Case({"fill": 0.8}, "refuse"),

@@ -45,7 +45,8 @@ def test_two_days_differ_in_brightness_alone(
 def test_one_room_and_other_noise_are_the_same(folders: tuple[Path, Path], lab: Lab, tmp_path: Path) -> None:
     with take(lab, tmp_path / "again", LIGHTS, every=6, frame=lambda step: lab.dng(step.colour, 900 + step.number)):
         pass
-    options = BuildOptions()
+    # A chart this small shows the lens with an error of its own, which is no noise of the samples.
+    options = BuildOptions(lens_correction=False)
     with table_of(folders[0], options) as one, table_of(tmp_path / "again", options) as other:
         found = compare(one, other)
     assert found.same is True
