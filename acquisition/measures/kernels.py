@@ -45,20 +45,7 @@ def linear_combinations(basis: _Array, factors: _Array, out: _Array) -> None:
 @compiled
 def weighted_fit(design: _Array, values: _Array, weights: _Array) -> _Array:
     """Return the x (K,) that minimises Σ w (values − design x)²; design (N, K), values and weights (N,), float64."""
-    count, unknowns = design.shape
-    gram, solution = np.zeros((unknowns, unknowns)), np.zeros(unknowns)
-    for point in range(count):
-        line = design[point]
-        for i in range(unknowns):
-            weighted = weights[point] * line[i]
-            solution[i] += weighted * values[point]
-            for j in range(i + 1):
-                gram[i, j] += weighted * line[j]
-    trace = 0.0
-    for i in range(unknowns):
-        trace += gram[i, i]
-    for i in range(unknowns):
-        gram[i, i] += _RIDGE * max(trace / unknowns, 1e-30)
+    gram, solution = _normal_equations(design, values, weights)
     _solve_positive_definite(gram, solution)
     return solution
 
@@ -111,28 +98,13 @@ def held_out_squares(design: _Array, values: _Array, weights: _Array, counts: np
         (M,) int64, rising, K at most.
     """
     points, unknowns = design.shape
-    gram, right = np.zeros((unknowns, unknowns)), np.zeros(unknowns)
+    gram, right = _normal_equations(design, values, weights)
+    _factorise(gram)
+    _solve_lower(gram, right)
+    squares, row = np.zeros(len(counts)), np.zeros(unknowns)
     total = 0.0
     for point in range(points):
-        line, weight = design[point], weights[point]
-        total += weight
-        for i in range(unknowns):
-            weighted = weight * line[i]
-            right[i] += weighted * values[point]
-            for j in range(i + 1):
-                gram[i, j] += weighted * line[j]
-    trace = 0.0
-    for i in range(unknowns):
-        trace += gram[i, i]
-    for i in range(unknowns):
-        gram[i, i] += _RIDGE * max(trace / unknowns, 1e-30)
-    _factorise(gram)
-    for i in range(unknowns):
-        for k in range(i):
-            right[i] -= gram[i, k] * right[k]
-        right[i] /= gram[i, i]
-    squares, row = np.zeros(len(counts)), np.zeros(unknowns)
-    for point in range(points):
+        total += weights[point]
         if weights[point] == 0:
             continue
         leverage, predicted, column = 0.0, 0.0, 0
@@ -152,6 +124,26 @@ def held_out_squares(design: _Array, values: _Array, weights: _Array, counts: np
 
 
 @compiled
+def _normal_equations(design: _Array, values: _Array, weights: _Array) -> tuple[_Array, _Array]:
+    """Return the lower half of the normal matrix (K, K), its ridge added, and the right side (K,)."""
+    count, unknowns = design.shape
+    gram, right = np.zeros((unknowns, unknowns)), np.zeros(unknowns)
+    for point in range(count):
+        line = design[point]
+        for i in range(unknowns):
+            weighted = weights[point] * line[i]
+            right[i] += weighted * values[point]
+            for j in range(i + 1):
+                gram[i, j] += weighted * line[j]
+    trace = 0.0
+    for i in range(unknowns):
+        trace += gram[i, i]
+    for i in range(unknowns):
+        gram[i, i] += _RIDGE * max(trace / unknowns, 1e-30)
+    return gram, right
+
+
+@compiled
 def _factorise(gram: _Array) -> None:
     """Replace the lower half of a positive definite matrix by its Cholesky factor."""
     unknowns = len(gram)
@@ -165,14 +157,20 @@ def _factorise(gram: _Array) -> None:
 
 
 @compiled
+def _solve_lower(factor: _Array, solution: _Array) -> None:
+    """Replace a right side by the solution, given a lower triangle."""
+    for i in range(len(solution)):
+        for k in range(i):
+            solution[i] -= factor[i, k] * solution[k]
+        solution[i] /= factor[i, i]
+
+
+@compiled
 def _solve_positive_definite(gram: _Array, solution: _Array) -> None:
     """Replace a right side by the solution, given the lower half of a positive definite matrix (Cholesky)."""
     unknowns = len(solution)
     _factorise(gram)
-    for i in range(unknowns):
-        for k in range(i):
-            solution[i] -= gram[i, k] * solution[k]
-        solution[i] /= gram[i, i]
+    _solve_lower(gram, solution)
     for i in range(unknowns - 1, -1, -1):
         for k in range(i + 1, unknowns):
             solution[i] -= gram[k, i] * solution[k]

@@ -9,6 +9,12 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
+_LINE_ROUNDS = 8
+"""Reweighted solutions in a row of a line."""
+
+_LEAST_RESIDUAL = 0.1
+"""Of the median residual: what a point's residual counts for at least, so that none on the line has all the weight."""
+
 _Array = npt.NDArray[np.float64]
 
 
@@ -99,6 +105,25 @@ def robust_least_squares(design: _Array, values: _Array, rounds: int) -> tuple[_
     from acquisition.measures import kernels
 
     return kernels.robust_fit(_plain(design), _plain(values), rounds)
+
+
+def least_absolute_line(x: _Array, y: _Array) -> tuple[float, float]:
+    """Return intercept and slope of the line that minimises Σ |y − line|, so that a few points do not decide.
+
+    Reweighted least squares (E. J. Schlossmacher, J. Am. Stat. Assoc. 68 (1973) 857).
+
+    Parameters
+    ----------
+    x, y
+        (N,) float64.
+    """
+    design, weights = np.column_stack([np.ones(len(x)), x]), np.ones(len(x))
+    solution = np.array([0.0, 1.0])
+    for _ in range(_LINE_ROUNDS):
+        solution = least_squares(design, y, weights)
+        residual = np.abs(y - design @ solution)
+        weights = 1 / np.maximum(residual, _LEAST_RESIDUAL * float(np.median(residual)) + 1e-9)
+    return float(solution[0]), float(solution[1])
 
 
 def held_out_squares(design: _Array, values: _Array, weights: _Array, counts: tuple[int, ...]) -> _Array:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from acquisition.measures.least_squares import least_squares
+from acquisition.measures.least_squares import least_absolute_line
 from acquisition.measures.stains import Stains
 from acquisition.session.records import FrameRecord
 from calibration.causes.evidence import Evidence
@@ -35,9 +35,6 @@ _LEAST_RESIDUAL = 0.02
 
 RIM_OFF = -0.005
 """Mean residual of the outermost references below which a frame's corners are darker than its field."""
-
-_LIGHT_ROUNDS = 8
-"""Reweighted solutions in a row of the line through a place's cells."""
 
 _LEAST_CELLS = 6
 """Cells of a place for a line through them to mean anything."""
@@ -334,13 +331,7 @@ def _light_of(stains: Stains, spot: npt.NDArray[np.int64], channel: int) -> tupl
     top = float(np.nanpercentile(seen, _BRIGHT_PERCENTILE))
     y = seen[there] / top
     x = y / (1 + alone[there])
-    design, weights = np.column_stack([np.ones(len(x)), x]), np.ones(len(x))
-    solution = np.array([0.0, 1.0])
-    for _ in range(_LIGHT_ROUNDS):
-        solution = least_squares(design, y, weights)
-        residual = np.abs(y - design @ solution)
-        weights = 1 / np.maximum(residual, 0.1 * float(np.median(residual)) + 1e-9)
-    return float(solution[0]), float(solution[1])
+    return least_absolute_line(x, y)
 
 
 def _place_of(stains: Stains, spot: npt.NDArray[np.int64], file: str) -> PrintPlace:

@@ -90,6 +90,15 @@ LIGHT = NAMES | BRIGHTNESS | {"additivity", "white_drift", "white_drift_deg"}
 DARK = frozenset({"leak_share", "dark_drift"})
 STRAY = frozenset({"stray_share"})
 
+_IN_ALL_FRAMES = (
+    Condition("in_first", 0, 0), Condition("even_showing", 0, 0), Condition("some_whites", 0, 0),
+    Condition("frames", 2, _FAR),
+)  # fmt: skip
+"""A place of the print looks in every frame as in the one registered first."""
+
+_SHARP_PLACE = (Condition("share", 0, 0.5), Condition("scatter", 0, 0.1), Condition("softer", -_FAR, 0.003))
+"""What is off lies at one place, and the rest of the frame is as sharp as before."""
+
 RULES: tuple[Rule, ...] = (
     Rule(
         OTHER_CAMERA,
@@ -200,9 +209,7 @@ RULES: tuple[Rule, ...] = (
             Condition("frames", 3, _FAR),
             Condition("showing", 1e-9, 0.34),
             Condition("even_showing", 1e-9, 1),
-            Condition("share", 0, 0.5),
-            Condition("scatter", 0, 0.1),
-            Condition("softer", -_FAR, 0.003),
+            *_SHARP_PLACE,
         ),
         "one place is off in few frames, a white one among them, and as it should be in the others",
     ),
@@ -214,9 +221,7 @@ RULES: tuple[Rule, ...] = (
             Condition("frames", 3, _FAR),
             Condition("showing", 1e-9, 0.34),
             Condition("spot", 0, 0.1),
-            Condition("share", 0, 0.5),
-            Condition("scatter", 0, 0.1),
-            Condition("softer", -_FAR, 0.003),
+            *_SHARP_PLACE,
         ),
         "one place is off in few frames, and as it should be in the others and under white",
     ),
@@ -224,10 +229,7 @@ RULES: tuple[Rule, ...] = (
         REFLECTION,
         SHEET,
         (
-            Condition("in_first", 0, 0),
-            Condition("even_showing", 0, 0),
-            Condition("some_whites", 0, 0),
-            Condition("frames", 2, _FAR),
+            *_IN_ALL_FRAMES,
             Condition("added", 0.004, _FAR),
             Condition("deviation", 0, _FAR),
             Condition("share", 0, 0.7),
@@ -244,10 +246,7 @@ RULES: tuple[Rule, ...] = (
         STAIN,
         SHEET,
         (
-            Condition("in_first", 0, 0),
-            Condition("even_showing", 0, 0),
-            Condition("some_whites", 0, 0),
-            Condition("frames", 2, _FAR),
+            *_IN_ALL_FRAMES,
             Condition("deviation", -1, -0.01),
             Condition("added", -0.05, 0.05),
             Condition("kept", 0, 0.99),
@@ -271,10 +270,7 @@ RULES: tuple[Rule, ...] = (
         SHADOW,
         SHEET,
         (
-            Condition("in_first", 0, 0),
-            Condition("even_showing", 0, 0),
-            Condition("some_whites", 0, 0),
-            Condition("frames", 2, _FAR),
+            *_IN_ALL_FRAMES,
             Condition("deviation", -1, -0.005),
             Condition("added", -0.02, 0.004),
             Condition("kept", 0, 0.995),

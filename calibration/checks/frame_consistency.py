@@ -8,8 +8,8 @@ What is left is noise, the polynomial's own error, which is spread over the shee
 is wrong with the frame:
 
 - `scatter`, over all cells: blur mixes neighbours, and another order of cells fits nothing;
-- `block`, the mean over neighbouring cells: a hand, a shadow or a reflection lies in one place. A cell that is far from
-  its block, as a hot photosite makes it, counts for four standard deviations of a cell and no more.
+- `block`, the mean over neighbouring cells: a hand, a shadow or a reflection lies in one place. A cell that none of
+  its neighbours is like, as a hot photosite makes it, counts as the one next to it in value.
 
 What else is known of that place, so that its cause can be told (`calibration.causes`): its colour, how large it is, and
 whether light was added there, as a reflection adds it, or taken in proportion, as a shadow does.
@@ -24,8 +24,9 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from scipy.spatial import cKDTree
 
-from acquisition.measures.least_squares import least_squares, product
+from acquisition.measures.least_squares import least_absolute_line, least_squares, product
 from acquisition.measures.polynomials import code_polynomial, code_powers
 from foundation.robust import huber_weights, sigma_of
 
@@ -57,18 +58,16 @@ _CERTAIN = 4.0
 """Standard errors that are taken off a block's mean before it counts: among a full chart's 256 blocks noise alone
 exceeds them in one of sixty frames."""
 
-_FAR = 4.0
-"""Standard deviations of a cell beyond its block's median that it counts for at most: among 32 cells one that is
-further off then moves the mean by an eighth of a standard deviation, a fifth of what is taken off it."""
+_AROUND = 8
+"""Neighbours of a cell of which one at least must be as far off for it to count as it is: those of a square grid. What
+covers the print, however small, covers two cells or harms one alone; a bound by the block's own spread would leave what
+covers less than half of each block it lies in."""
 
 _AS_MUCH = 0.3
 """Share of the worst block's deviation from which on a block is part of the same thing."""
 
 _BRIGHT_PERCENTILE = 99.0
 """Of the cells' expected levels, what is taken for the brightest: bare paper is not among them."""
-
-_LIGHT_ROUNDS = 8
-"""Reweighted solutions in a row of the line through a place's cells."""
 
 _MODEL_ERROR, _LEAST_ERROR = 0.02, 3.0
 """Standard error of a cell's prediction: a share of its level, and counts."""
@@ -187,8 +186,10 @@ class ConsistencyCheck:
         terms = code_polynomial(np.asarray(rgb)[self.cells], DEGREE)
         self._usable = usable[self.cells]
         self._channels = [_Channel.of(terms, level[self.cells, channel], self._usable) for channel in range(3)]
-        block, self._middles, self._block_mm2 = _blocks(cells_mm[self.cells])
+        places_mm = cells_mm[self.cells]
+        block, self._middles, self._block_mm2 = _blocks(places_mm)
         self._members = _members(block, len(self._middles))
+        self._around = np.atleast_2d(cKDTree(places_mm).query(places_mm, k=min(_AROUND + 1, len(places_mm)))[1])
 
     def compare(self, mean: _Array, variance: _Array) -> FrameConsistency:
         """Return how far a frame is consistent with the reference.
@@ -250,7 +251,8 @@ class ConsistencyCheck:
         deviation[there] = np.clip(mean[there] / expected[there] - 1, -1, 1)
         spread2 = sigma_of(deviation[there] - np.median(deviation[there])) ** 2
         noise2 = float(np.median(variance[there] / expected[there] ** 2))
-        average, count = _bounded_means(deviation[self._members], _FAR * float(np.sqrt(spread2)))
+        deviation[:-1] = _like_a_neighbour(deviation[:-1], self._around)
+        average, count = _known_means(deviation[self._members])
         off = np.abs(average) - _CERTAIN * np.sqrt(spread2 / np.maximum(count, 1))
         compared = np.isfinite(deviation[:-1])
         return _Deviations(
@@ -262,18 +264,25 @@ class ConsistencyCheck:
         )
 
 
-def _bounded_means(values: _Array, far: float) -> tuple[_Array, npt.NDArray[np.int64]]:
-    """Return the means (B,) of the rows of values (B, M), NaN left out, and of how many.
+def _like_a_neighbour(values: _Array, around: npt.NDArray[np.int64]) -> _Array:
+    """Return values (N,) brought between the second lowest and second highest of themselves and their neighbours.
 
-    No value counts for more than `far` beyond the row's median.
+    `around` (N, K) are each one's places in `values`, its own among them; NaN is no value and stays.
     """
-    ordered = np.sort(values, axis=1)
+    ordered = np.sort(values[around], axis=1)
     count = np.isfinite(ordered).sum(axis=1)
-    # NaN sorts last, so the middle of what is known stands at half their number.
-    low, high = (np.maximum(count - 1, 0) // 2)[:, None], np.minimum(count // 2, values.shape[1] - 1)[:, None]
-    middle = 0.5 * (np.take_along_axis(ordered, low, axis=1) + np.take_along_axis(ordered, high, axis=1))
-    bounded = np.nan_to_num(np.clip(values, middle - far, middle + far))
-    return bounded.sum(axis=1) / np.maximum(count, 1), count
+    rows, alone = np.arange(len(values)), count < 3
+    # NaN sorts last, so that the second highest stands two before what is known ends.
+    low = np.where(alone, -np.inf, ordered[:, min(1, ordered.shape[1] - 1)])
+    high = np.where(alone, np.inf, ordered[rows, np.maximum(count - 2, 0)])
+    return np.clip(values, low, high)
+
+
+def _known_means(values: _Array) -> tuple[_Array, npt.NDArray[np.int64]]:
+    """Return the means (B,) of the rows of values (B, M), NaN left out, and of how many; 0 of none."""
+    known = np.isfinite(values)
+    count = known.sum(axis=1)
+    return np.where(known, values, 0).sum(axis=1) / np.maximum(count, 1), count
 
 
 def _light_of(channels: list[_Deviations], members: npt.NDArray[np.int64]) -> tuple[float, float]:
@@ -292,13 +301,7 @@ def _light_of(channels: list[_Deviations], members: npt.NDArray[np.int64]) -> tu
     x, y = np.concatenate(own), np.concatenate(seen)
     if len(x) < LEAST_CELLS:
         return 0.0, 1.0
-    design, weights = np.column_stack([np.ones(len(x)), x]), np.ones(len(x))
-    solution = np.array([0.0, 1.0])
-    for _ in range(_LIGHT_ROUNDS):
-        solution = least_squares(design, y, weights)
-        residual = np.abs(y - design @ solution)
-        weights = 1 / np.maximum(residual, 0.1 * float(np.median(residual)) + 1e-9)
-    return float(solution[0]), float(solution[1])
+    return least_absolute_line(x, y)
 
 
 def _members(block: npt.NDArray[np.int64], blocks: int) -> npt.NDArray[np.int64]:

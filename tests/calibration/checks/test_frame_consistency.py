@@ -75,6 +75,20 @@ def test_a_shadow_is_found_where_it_lies(sheet: Sheet, left: float) -> None:
     assert np.abs(np.array(like.at_mm) - middle).max() < 45
 
 
+@pytest.mark.parametrize("left", [0.05, 0.7, 0.85])
+@pytest.mark.parametrize("cells", [4, 6])
+@pytest.mark.parametrize("place", [(0, 0), (17, 11), (33, 29), (52, 8), (70, 48)])
+def test_a_shadow_that_covers_a_part_of_each_block_is_found(
+    sheet: Sheet, place: tuple[int, int], cells: int, left: float
+) -> None:
+    """A third or a sixth of what a block holds, wherever the blocks' borders run."""
+    column, row = (sheet.places / 5.0).T
+    under = (np.abs(column - place[0] - 1) < cells / 2) & (np.abs(row - place[1] - 1) < cells / 2)
+    like = sheet.compared(sheet.other * np.where(under, left, 1.0)[:, None])
+    limit = LIMITS["unlike_block"]
+    assert like.block > ((limit.refuse or np.inf) if left == 0.05 else 0.5 * limit.accept)
+
+
 @pytest.mark.parametrize(
     ("added", "kept"), [(0.0, 0.7), (0.25, 0.0), (0.03, 1.0)], ids=["shadow", "hand", "reflection"]
 )
@@ -97,8 +111,9 @@ def test_a_stain_s_colour_is_told(sheet: Sheet) -> None:
 
 
 @pytest.mark.parametrize("excess", [120.0, 3000.0])
-def test_one_hot_photosite_is_no_hand(sheet: Sheet, excess: float) -> None:
+def test_one_hot_photosite_is_no_hand(excess: float) -> None:
     """3000 counts in one of 25 samples of a dark cell, and in all of them."""
+    sheet = Sheet(2)
     seen = sheet.other.copy()
     dark = np.argsort(seen[:, 0])[sheet.random.integers(300, 600, 3)]
     seen[dark, 0] += excess
