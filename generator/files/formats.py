@@ -232,7 +232,8 @@ def require_plausible(data: bytes, what: str) -> None:
     while place + 12 <= len(data):
         (size,) = struct.unpack(">I", data[place : place + 4])
         if size > len(data) - place - 12:
-            raise FormatError(f"{what} claims {size} bytes where {len(data) - place - 12} are left; make it again")
+            left = len(data) - place - 12
+            raise FormatError(f"{what}: a part of the PNG claims {size} bytes where {left} are left; make it again")
         place += size + 12
 
 

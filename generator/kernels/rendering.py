@@ -378,7 +378,8 @@ def render(
     --------
     >>> from types import SimpleNamespace
     >>> samples = np.arange(8 * 2 * 3, dtype=np.uint16).reshape(1, 8, 2, 3)
-    >>> lut = SimpleNamespace(samples=samples, provenance=SimpleNamespace(bits=1, white_level=100, unfit=()))
+    >>> known = SimpleNamespace(bits=1, white_level=100, unfit=())
+    >>> lut = SimpleNamespace(samples=samples, light_samples=samples.__getitem__, provenance=known)
     >>> render(lut, np.full((1, 2, 3), 255, np.uint8), light=0)
     array([[[45, 46, 47],
             [45, 46, 47]]], dtype=uint16)

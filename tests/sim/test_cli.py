@@ -162,7 +162,7 @@ def test_lends_a_camera_over_usb_ip_until_interrupted() -> None:
         (["--watch-projector", "127.0.0.1:4352"], "--watch-projector needs --watch-screen"),
         (["--watch-screen", "HDMI-1"], "'HDMI-1' is no screen"),
         (["--event", "{ what = 'bump'"], "is not TOML"),
-        (["--event", "{ what = 'flood' }"], "known are frozen screen"),
+        (["--event", "{ what = 'flood' }"], "there is no such event; what is one of frozen screen"),
         (
             ["--watch-screen", ":1", "--event", "{ what = 'frozen screen' }"],
             "frozen screen is for the simulated screen",

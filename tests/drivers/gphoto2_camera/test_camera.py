@@ -117,7 +117,7 @@ def test_no_camera_at_all_says_what_was_found() -> None:
         Gphoto2Camera("usb:777,777").identity()
 
 
-def test_a_missing_library_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_missing_library_names_the_package(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "gphoto2", None)
-    with pytest.raises(ConfigurationError, match=r"croplab\[gphoto2\]"):
+    with pytest.raises(ConfigurationError, match="install it: pip install gphoto2"):
         Gphoto2Camera()
