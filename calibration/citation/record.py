@@ -127,7 +127,7 @@ def origin_lines(origin: OriginRecord | None) -> list[tuple[str, str]]:
         ("Address", known.url),
         ("Note", known.note),
     ]
-    return [(name, value or NOT_RECORDED) for name, value in rows]
+    return [(name, " ".join((value or NOT_RECORDED).split())) for name, value in rows]
 
 
 def _rig_text(rig: Rig | None) -> str | None:
