@@ -317,7 +317,7 @@ def build_lut(
         if compare is not None:
             told = [name for name in ("--linearity", "--note", "--licence", "--author", "--serial") if made[name]]
             if told:
-                raise InputError(f"{told[0]} is for one table that is kept; leave it out of --compare")
+                raise InputError(f"{told[0]} is for the report of one table; leave it out of --compare")
             _compare(*compare, options, as_json, out, chart)
             return
         _make(session, lut, check, append, options, linearity, picture, changes)
