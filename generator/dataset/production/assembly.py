@@ -25,8 +25,10 @@ from generator.dataset.production.records import (
     SOURCE_COLUMNS,
     SOURCES,
     SPLITS,
+    STRETCHED_VERSION,
     SUMS,
     TRUTHS,
+    VERSION,
     Description,
     Details,
     ImageRecord,
@@ -39,7 +41,7 @@ from generator.dataset.production.records import (
     image_key,
 )
 from generator.dataset.production.workplace import Workplace
-from generator.files.formats import suffix_of
+from generator.files.formats import FULL, suffix_of
 from generator.stores.places import DESCRIPTION
 from generator.stores.store import Store
 
@@ -163,6 +165,7 @@ def assemble(place: Workplace, identity: Mapping[str, Any]) -> None:
                 "left out, each with its reason; name others, or ask for a smaller crop if they are too small"
             )
         description = Description(
+            version=STRETCHED_VERSION if options.get("scale") == "full" else VERSION,
             software=software(),
             libraries=identity["libraries"],
             table=TableRecord.model_validate(identity["table"]),
@@ -256,6 +259,30 @@ def _card(description: Description) -> str:
     return (
         f"---\nconfigs:\n- config_name: default\n  data_files:\n{files}---\n\n"
         f"{description.images} raw linear images of the {description.table.camera} with the ground truth of their "
-        f"light, made by {description.software}. Black is 0, saturation {description.table.white_level}; nothing is "
-        f"white balanced.{origin}\n"
+        f"light, made by {description.software}. Black is 0, saturation {_stored_white(description)}; nothing is "
+        f"white balanced.{origin}\n\n{_brightness_note(description)}\n"
+    )
+
+
+def _stored_white(description: Description) -> int:
+    """Return the number that saturation has in the files."""
+    return FULL if description.options.get("scale") == "full" else description.table.white_level
+
+
+def _brightness_note(description: Description) -> str:
+    """Return why a reader that knows nothing of raw images shows them as it does."""
+    white = _stored_white(description)
+    if description.options["format"] == "dng":
+        return "Images are raw files: open them with a raw developer."
+    if white == FULL:
+        counts = description.table.white_level
+        return (
+            f"Counts of 0 to {counts} are stretched over 16 bits: the camera's count is round(v * {counts} / {FULL}). "
+            "Images are linear, so that they still look darker than photographs: for display divide by the ground "
+            "truth and apply the sRGB curve."
+        )
+    return (
+        f"A reader that takes {FULL} for white, as WebDataset's decoders, imageio and image viewers do, shows them "
+        f"nearly black: {white} is white here. Divide by {white} after decoding all 16 bits (Pillow keeps 8), or make "
+        "the dataset with generate --scale full. Previews beside the images show what they look like."
     )
