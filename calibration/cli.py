@@ -11,7 +11,8 @@ import typer
 
 from foundation import console
 from foundation.console import EXIT_CODES, Quiet, Verbose, Version, new_app, shows_progress
-from foundation.errors import FormatError, InputError
+from foundation.errors import FormatError, InputError, QualityError
+from foundation.json_output import AsJson, JsonOutput, json_output
 from foundation.trust.secret_texts import masked, printable
 
 if TYPE_CHECKING:
@@ -55,8 +56,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     "--info, --verify and --match, reads a table and writes nothing. With --publish and --fetch, copies a table to a "
     "store for others and back.\n\n"
     "With --compare A B, says how far two sessions or tables of one chart differ in the lights' colour and brightness "
-    "and in every cell, what noise alone predicts of it, and whether they are the same within noise; --json prints it "
-    "for programs, --out writes a page. The exit code is 0 whatever is found, 2 where the charts differ or no light "
+    "and in every cell, what noise alone predicts of it, and whether they are the same within noise; --out "
+    "writes a page. The exit code is 0 whatever is found, 2 where the charts differ or no light "
     "is in both, 4 where a session makes no table.\n\n" + EXIT_CODES,
 )
 def build_lut(
@@ -161,7 +162,7 @@ def build_lut(
             show_default=False,
         ),
     ] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="With --compare, print the comparison as JSON.")] = False,
+    as_json: AsJson = False,
     out: Annotated[
         Path | None,
         typer.Option(
@@ -235,37 +236,38 @@ def build_lut(
         )
     if expect is not None and fetch is None:
         raise InputError("--expect goes with --fetch; leave it out")
-    told = {"--json": as_json, "--out": out, "--chart": chart}
-    if compare is None and any(told.values()):
-        raise InputError(f"{next(name for name, value in told.items() if value)} goes with --compare; leave it out")
+    beside = {"--out": out, "--chart": chart}
+    if compare is None and any(beside.values()):
+        raise InputError(f"{next(name for name, value in beside.items() if value)} goes with --compare; leave it out")
     if (lut if verify else session if compare or any(reading.values()) else None) is not None:
         raise InputError(f"{given[0]} does not expect {lut or session}; leave it out")
-    if info is not None:
-        _print_table(info)
-    elif verify is not None:
-        _verify(verify, session)
-    elif match is not None:
-        _match(*match)
-    elif publish is not None:
-        _publish(*publish)
-    elif fetch is not None:
-        _fetch(*fetch, expect)
-    else:
-        from acquisition.framing.corners import parse_corners
-        from calibration.pipeline.options import BuildOptions
-        from calibration.sampling.samples import WINDOW
+    with json_output("build-lut", as_json) as told:
+        if info is not None:
+            _print_table(info, told)
+        elif verify is not None:
+            _verify(verify, session, told)
+        elif match is not None:
+            _match(*match, told)
+        elif publish is not None:
+            _publish(*publish, told)
+        elif fetch is not None:
+            _fetch(*fetch, expect, told)
+        else:
+            from acquisition.framing.corners import parse_corners
+            from calibration.pipeline.options import BuildOptions
+            from calibration.sampling.samples import WINDOW
 
-        if picture is not None and not check:
-            raise InputError("--picture goes with --check; a table that is built has its report")
-        places = None if corners is None else parse_corners(corners)
-        samples = WINDOW if window is None else window
-        options = BuildOptions(samples, subtract_dark, places, correct_drift, not no_lens_correction)
-        if compare is not None:
-            if linearity is not None:
-                raise InputError("--linearity is for the report of one table; leave it out of --compare")
-            _compare(*compare, options, as_json, out, chart)
-            return
-        _make(session, lut, check, append, options, linearity, picture)
+            if picture is not None and not check:
+                raise InputError("--picture goes with --check; a table that is built has its report")
+            places = None if corners is None else parse_corners(corners)
+            samples = WINDOW if window is None else window
+            options = BuildOptions(samples, subtract_dark, places, correct_drift, not no_lens_correction)
+            if compare is not None:
+                if linearity is not None:
+                    raise InputError("--linearity is for the report of one table; leave it out of --compare")
+                _compare(*compare, options, told, out, chart)
+                return
+            _make(session, lut, check, append, options, linearity, picture, told)
 
 
 def _make(
@@ -276,6 +278,7 @@ def _make(
     options: BuildOptions,
     linearity: Path | None,
     picture: Path | None,
+    told: JsonOutput,
 ) -> None:
     if check and lut is not None:
         raise InputError(f"--check writes nothing, so a table's folder ({lut}) is not expected; leave one of them out")
@@ -285,33 +288,46 @@ def _make(
 
     if check:
         with Session.open(session) as opened:
-            _check(opened, options, linearity, picture)
+            _check(opened, options, linearity, picture, told)
         return
     if lut is None:
         raise InputError("a folder for the table is expected: build-lut SESSION LUT, or --check to judge only")
-    from calibration.pipeline.build import TableProgress
-    from calibration.table.file_names import REPORT_PAGE
+    import json
 
+    from calibration.pipeline.build import TableProgress, refused_folder
+    from calibration.table.file_names import REPORT_JSON, REPORT_PAGE
+
+    kept = refused_folder(lut) / REPORT_JSON
+    before = kept.stat().st_mtime_ns if kept.is_file() else None
     with Session.open(session) as opened:
-        result = _build(opened, lut, append, options, linearity)
+        try:
+            result = _build(opened, lut, append, options, linearity)
+        except QualityError:
+            # A report of an earlier build says nothing of this one.
+            if told.asked and kept.is_file() and kept.stat().st_mtime_ns != before:
+                told.add(**json.loads(kept.read_text(encoding="utf-8")))
+            raise
     if isinstance(result, TableProgress):
+        told.add(table=lut, progress=result)
         print(
             f"{lut}: {result.lights} of {result.lights_planned} lights, {result.new_frames} frames taken in now, "
             f"{result.frames} in all; run the same command again when more have come"
         )
         return
-    _print_result(result)
+    told.add(table=lut)
+    _print_result(result, told)
     print(f"{lut}: {result.figures.session.lights} lights, {result.figures.session.camera}; see {lut / REPORT_PAGE}")
 
 
-def _check(session: Session, options: BuildOptions, linearity: Path | None, picture: Path | None) -> None:
+def _check(
+    session: Session, options: BuildOptions, linearity: Path | None, picture: Path | None, told: JsonOutput
+) -> None:
     from calibration.pipeline.build import check
 
     result = check(session, options, linearity, picture)
-    _print_result(result)
+    _print_result(result, told)
     if result.verdict.refused:
         from calibration.verdict.wording import refusal
-        from foundation.errors import QualityError
 
         raise QualityError(f"{session.folder}: {refusal(result.verdict, result.figures)}")
     print(f"{session.folder}: the chart is found and is the one expected; a table can be built")
@@ -327,15 +343,24 @@ def _build(
         return (append if so_far else build)(session, lut, progress, write_report, options, linearity)
 
 
-def _print_table(folder: Path) -> None:
+def _print_table(folder: Path, told: JsonOutput) -> None:
     from calibration.table.description import describe
     from calibration.table.lut import open_lut
 
-    for name, value in describe(open_lut(folder)):
+    lut = open_lut(folder)
+    told.add(
+        table=folder,
+        sha256=lut.sha256,
+        lights=len(lut.white),
+        colours=8**lut.provenance.bits,
+        samples=int(lut.samples.shape[2]),
+        provenance=lut.provenance.model_dump(mode="json"),
+    )
+    for name, value in describe(lut):
         print(f"{name + ':':17}{printable(value)}")
 
 
-def _verify(folder: Path, session: Path | None) -> None:
+def _verify(folder: Path, session: Path | None, told: JsonOutput) -> None:
     from calibration.table.lut import open_lut
     from calibration.table.verification import find_faults
 
@@ -348,6 +373,7 @@ def _verify(folder: Path, session: Path | None) -> None:
 
         with Session.open(session) as opened, _bar("reading the frames") as progress:
             faults += frame_faults(lut, opened, progress)
+    told.add(table=folder, sha256=lut.sha256, frames=None if session is None else len(lut.frames), faults=faults)
     for fault in faults:
         print(fault)
     if faults:
@@ -358,18 +384,19 @@ def _verify(folder: Path, session: Path | None) -> None:
     print(f"{folder}: every byte is as it was built{frames}")
 
 
-def _match(one: Path, other: Path) -> None:
+def _match(one: Path, other: Path, told: JsonOutput) -> None:
     from calibration.table.lut import open_lut
     from calibration.table.verification import require_match
 
     tables = open_lut(one), open_lut(other)
     require_match(*tables)
+    told.add(tables=[one, other], cameras=[table.provenance.camera for table in tables], match=True)
     cameras = " and ".join(table.provenance.camera for table in tables)
     print(f"{one} and {other} ({cameras}): colours and lights correspond number by number")
 
 
 def _compare(
-    one: Path, other: Path, options: BuildOptions, as_json: bool, out: Path | None, chart: Path | None
+    one: Path, other: Path, options: BuildOptions, told: JsonOutput, out: Path | None, chart: Path | None
 ) -> None:
     from acquisition.chart.model import load_chart
     from calibration.comparison.comparing import compare
@@ -384,10 +411,8 @@ def _compare(
         drawn = chart_of((one, other)) if chart is None else load_chart(chart)
         if drawn is not None and drawn.sha256 != a.provenance.chart_sha256:
             raise FormatError(f"{chart} is not the chart of {one}; name the chart.json that was printed")
-    if as_json:
-        import json
-
-        print(json.dumps(comparison_json(found), indent=2))
+    if told.asked:
+        told.add(**comparison_json(found))
     else:
         print("\n".join(lines(found)))
     if out is not None:
@@ -396,22 +421,24 @@ def _compare(
         write_comparison(found, out, drawn)
 
 
-def _publish(folder: Path, url: str) -> None:
+def _publish(folder: Path, url: str, told: JsonOutput) -> None:
     from calibration.table.lut import open_lut
     from calibration.table.zarr_store import publish
 
     lut = open_lut(folder)
     with _bar("writing lights") as progress:
         publish(lut, url, lambda done, total: progress(done, total, "writing lights"))
+    told.add(table=folder, url=masked(url), lights=len(lut.samples), sha256=lut.sha256)
     print(f"{masked(url)}: {len(lut.samples)} lights of {folder}; others get them by")
     print(f"build-lut --fetch {masked(url)} LUT --expect {lut.sha256}")
 
 
-def _fetch(url: str, folder: Path, expect: str | None) -> None:
+def _fetch(url: str, folder: Path, expect: str | None, told: JsonOutput) -> None:
     from calibration.table.zarr_store import fetch
 
     with _bar("reading lights") as progress:
         lut = fetch(url, folder, lambda done, total: progress(done, total, "reading lights"), expect)
+    told.add(table=folder, url=masked(url), lights=len(lut.samples), sha256=lut.sha256, expected=expect is not None)
     print(f"{folder}: {len(lut.samples)} lights, {printable(lut.provenance.camera)}; {_vouched(lut, expect)}")
 
 
@@ -445,8 +472,13 @@ def _bar(beginning: str) -> Generator[Callable[[int, int, str], None]]:
         yield lambda done, total, what: bar.update(task, completed=done, total=total, description=what)
 
 
-def _print_result(result: BuildResult) -> None:
-    """Print the figures that matter most, the remarks, and the verdict."""
+def _print_result(result: BuildResult, told: JsonOutput) -> None:
+    """Print the figures that matter most, the remarks, and the verdict; or add all that `report.json` holds."""
+    if told.asked:
+        from calibration.report.report_json import report_json
+
+        told.add(**report_json(result))
+        return
     from calibration.report.summary import summary
     from calibration.verdict.wording import remark
 
