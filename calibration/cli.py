@@ -2,24 +2,31 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from calibration.table_jobs import (
+    fetch_table,
+    match_tables,
+    print_citation,
+    print_table,
+    progress_bar,
+    publish_table,
+    verify_table,
+)
 from foundation import console
-from foundation.console import EXIT_CODES, Quiet, Verbose, Version, new_app, shows_progress
+from foundation.console import EXIT_CODES, Quiet, Verbose, Version, new_app
 from foundation.errors import FormatError, InputError, QualityError
 from foundation.json_output import AsJson, JsonOutput, json_output
-from foundation.trust.secret_texts import masked, printable
 
 if TYPE_CHECKING:
     from acquisition.session.folder import Session
     from calibration.pipeline.build import TableProgress
     from calibration.pipeline.options import BuildOptions
-    from calibration.table.lut import Lut
     from calibration.verdict.result import BuildResult
 
 app = new_app()
@@ -53,8 +60,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     "its report is then in LUT.refused/, and the exit code is 4.\n\n"
     "With --check, finds the chart in the session's best frame, judges it, and writes nothing. With --append, takes in "
     "the frames that have come so far of a session that is being taken; LUT appears with the last of them. With "
-    "--info, --verify and --match, reads a table and writes nothing. With --publish and --fetch, copies a table to a "
-    "store for others and back.\n\n"
+    "--info, --cite, --verify and --match, reads a table and writes nothing. With --publish and --fetch, copies a "
+    "table to a store for others and back.\n\n"
     "With --compare A B, says how far two sessions or tables of one chart differ in the lights' colour and brightness "
     "and in every cell, what noise alone predicts of it, and whether they are the same within noise; --out "
     "writes a page. The exit code is 0 whatever is found, 2 where the charts differ or no light "
@@ -128,11 +135,43 @@ def build_lut(
             show_default=False,
         ),
     ] = None,
+    note: Annotated[
+        str | None, typer.Option("--note", help="What readers of the table should know.", show_default=False)
+    ] = None,
+    licence: Annotated[
+        str | None,
+        typer.Option(
+            "--licence", "--license", metavar="SPDX", help="Licence of the table, as CC-BY-4.0.", show_default=False
+        ),
+    ] = None,
+    author: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--author",
+            metavar='"FAMILY, GIVEN"',
+            help="Who made the table; several times for several. As --note, --licence and --serial in place of "
+            "\\[citation] in the session's LAB.toml.",
+            show_default=False,
+        ),
+    ] = None,
+    serial: Annotated[
+        str | None,
+        typer.Option(
+            "--serial",
+            metavar="hash|plain|withheld",
+            help="How the camera's serial number is told in the table. \\[default: hash]",
+            show_default=False,
+        ),
+    ] = None,
     info: Annotated[
         Path | None,
         typer.Option(
             "--info", metavar="LUT", help="Print what a table is and what it was made of.", show_default=False
         ),
+    ] = None,
+    cite: Annotated[
+        Path | None,
+        typer.Option("--cite", metavar="LUT", help="Print a BibTeX entry of a table.", show_default=False),
     ] = None,
     verify: Annotated[
         Path | None,
@@ -216,7 +255,14 @@ def build_lut(
     version: Version = False,
 ) -> None:
     """Build, check or read a table; the help text says what the command does."""
-    reading = {"--info": info, "--verify": verify, "--match": match, "--publish": publish, "--fetch": fetch}
+    reading = {
+        "--info": info,
+        "--cite": cite,
+        "--verify": verify,
+        "--match": match,
+        "--publish": publish,
+        "--fetch": fetch,
+    }
     asked = {"--check": check, "--append": append, "--compare": compare, **reading}
     given = [name for name, value in asked.items() if value]
     if len(given) > 1:
@@ -228,6 +274,10 @@ def build_lut(
         "--no-lens-correction": no_lens_correction,
         "--corners": corners is not None,
         "--linearity": linearity is not None,
+        "--note": note is not None,
+        "--licence": licence is not None,
+        "--author": bool(author),
+        "--serial": serial is not None,
     }
     if any(reading.values()) and any(made.values()):
         raise InputError(
@@ -243,15 +293,17 @@ def build_lut(
         raise InputError(f"{given[0]} does not expect {lut or session}; leave it out")
     with json_output("build-lut", as_json) as told:
         if info is not None:
-            _print_table(info, told)
+            print_table(info, told)
+        elif cite is not None:
+            print_citation(cite, told)
         elif verify is not None:
-            _verify(verify, session, told)
+            verify_table(verify, session, told)
         elif match is not None:
-            _match(*match, told)
+            match_tables(*match, told)
         elif publish is not None:
-            _publish(*publish, told)
+            publish_table(*publish, told)
         elif fetch is not None:
-            _fetch(*fetch, expect, told)
+            fetch_table(*fetch, expect, told)
         else:
             from acquisition.framing.corners import parse_corners
             from calibration.pipeline.options import BuildOptions
@@ -262,12 +314,15 @@ def build_lut(
             places = None if corners is None else parse_corners(corners)
             samples = WINDOW if window is None else window
             options = BuildOptions(samples, subtract_dark, places, correct_drift, not no_lens_correction)
+            stated = {"note": note, "licence": licence, "authors": author or None, "camera_serial": serial}
+            changes = {name: value for name, value in stated.items() if value is not None}
             if compare is not None:
-                if linearity is not None:
-                    raise InputError("--linearity is for the report of one table; leave it out of --compare")
+                unfit = [name for name in ("--linearity", "--note", "--licence", "--author", "--serial") if made[name]]
+                if unfit:
+                    raise InputError(f"{unfit[0]} is for one table that is kept; leave it out of --compare")
                 _compare(*compare, options, told, out, chart)
                 return
-            _make(session, lut, check, append, options, linearity, picture, told)
+            _make(session, lut, check, append, options, linearity, picture, changes, told)
 
 
 def _make(
@@ -278,6 +333,7 @@ def _make(
     options: BuildOptions,
     linearity: Path | None,
     picture: Path | None,
+    changes: dict[str, Any],
     told: JsonOutput,
 ) -> None:
     if check and lut is not None:
@@ -288,7 +344,7 @@ def _make(
 
     if check:
         with Session.open(session) as opened:
-            _check(opened, options, linearity, picture, told)
+            _check(opened, _with_citation(options, opened, changes), linearity, picture, told)
         return
     if lut is None:
         raise InputError("a folder for the table is expected: build-lut SESSION LUT, or --check to judge only")
@@ -301,7 +357,7 @@ def _make(
     before = kept.stat().st_mtime_ns if kept.is_file() else None
     with Session.open(session) as opened:
         try:
-            result = _build(opened, lut, append, options, linearity)
+            result = _build(opened, lut, append, _with_citation(options, opened, changes), linearity)
         except QualityError:
             # A report of an earlier build says nothing of this one.
             if told.asked and kept.is_file() and kept.stat().st_mtime_ns != before:
@@ -317,6 +373,13 @@ def _make(
     told.add(table=lut)
     _print_result(result, told)
     print(f"{lut}: {result.figures.session.lights} lights, {result.figures.session.camera}; see {lut / REPORT_PAGE}")
+
+
+def _with_citation(options: BuildOptions, session: Session, changes: dict[str, Any]) -> BuildOptions:
+    """Return the options with what was given of the table's origin in place of what the session's settings state."""
+    from calibration.citation.stated import stated_origin, with_changes
+
+    return replace(options, citation=with_changes(stated_origin(session).citation, changes)) if changes else options
 
 
 def _check(
@@ -339,60 +402,8 @@ def _build(
     from calibration.pipeline.build import append, build
     from calibration.report.report import write_report
 
-    with _bar("finding the chart") as progress:
+    with progress_bar("finding the chart") as progress:
         return (append if so_far else build)(session, lut, progress, write_report, options, linearity)
-
-
-def _print_table(folder: Path, told: JsonOutput) -> None:
-    from calibration.table.description import describe
-    from calibration.table.lut import open_lut
-
-    lut = open_lut(folder)
-    told.add(
-        table=folder,
-        sha256=lut.sha256,
-        lights=len(lut.white),
-        colours=8**lut.provenance.bits,
-        samples=int(lut.samples.shape[2]),
-        provenance=lut.provenance.model_dump(mode="json"),
-    )
-    for name, value in describe(lut):
-        print(f"{name + ':':17}{printable(value)}")
-
-
-def _verify(folder: Path, session: Path | None, told: JsonOutput) -> None:
-    from calibration.table.lut import open_lut
-    from calibration.table.verification import find_faults
-
-    lut = open_lut(folder, check=False)
-    with _bar("reading the samples") as progress:
-        faults = find_faults(lut, lambda done, total: progress(done, total, "reading the samples"))
-    if session is not None:
-        from acquisition.session.folder import Session
-        from calibration.pipeline.frames import frame_faults
-
-        with Session.open(session) as opened, _bar("reading the frames") as progress:
-            faults += frame_faults(lut, opened, progress)
-    told.add(table=folder, sha256=lut.sha256, frames=None if session is None else len(lut.frames), faults=faults)
-    for fault in faults:
-        print(fault)
-    if faults:
-        raise FormatError(
-            f"{folder} is not as it was built: {len(faults)} faults; restore it from a copy, or build it again"
-        )
-    frames = "" if session is None else f", and so are its {len(lut.frames)} frames in {session}"
-    print(f"{folder}: every byte is as it was built{frames}")
-
-
-def _match(one: Path, other: Path, told: JsonOutput) -> None:
-    from calibration.table.lut import open_lut
-    from calibration.table.verification import require_match
-
-    tables = open_lut(one), open_lut(other)
-    require_match(*tables)
-    told.add(tables=[one, other], cameras=[table.provenance.camera for table in tables], match=True)
-    cameras = " and ".join(table.provenance.camera for table in tables)
-    print(f"{one} and {other} ({cameras}): colours and lights correspond number by number")
 
 
 def _compare(
@@ -406,7 +417,11 @@ def _compare(
 
     if out is not None:
         require_free(out, "the comparison")
-    with _bar("reading") as progress, table_of(one, options, progress) as a, table_of(other, options, progress) as b:
+    with (
+        progress_bar("reading") as progress,
+        table_of(one, options, progress) as a,
+        table_of(other, options, progress) as b,
+    ):
         found = compare(a, b, lambda done, total: progress(done, total, "comparing lights"), (one, other))
         drawn = chart_of((one, other)) if chart is None else load_chart(chart)
         if drawn is not None and drawn.sha256 != a.provenance.chart_sha256:
@@ -419,57 +434,6 @@ def _compare(
         from calibration.comparison.report import write_comparison
 
         write_comparison(found, out, drawn)
-
-
-def _publish(folder: Path, url: str, told: JsonOutput) -> None:
-    from calibration.table.lut import open_lut
-    from calibration.table.zarr_store import publish
-
-    lut = open_lut(folder)
-    with _bar("writing lights") as progress:
-        publish(lut, url, lambda done, total: progress(done, total, "writing lights"))
-    told.add(table=folder, url=masked(url), lights=len(lut.samples), sha256=lut.sha256)
-    print(f"{masked(url)}: {len(lut.samples)} lights of {folder}; others get them by")
-    print(f"build-lut --fetch {masked(url)} LUT --expect {lut.sha256}")
-
-
-def _fetch(url: str, folder: Path, expect: str | None, told: JsonOutput) -> None:
-    from calibration.table.zarr_store import fetch
-
-    with _bar("reading lights") as progress:
-        lut = fetch(url, folder, lambda done, total: progress(done, total, "reading lights"), expect)
-    told.add(table=folder, url=masked(url), lights=len(lut.samples), sha256=lut.sha256, expected=expect is not None)
-    print(f"{folder}: {len(lut.samples)} lights, {printable(lut.provenance.camera)}; {_vouched(lut, expect)}")
-
-
-def _vouched(lut: Lut, expect: str | None) -> str:
-    """Return in words what is known of a table that was fetched."""
-    if not lut.provenance.lights_sha256:
-        return "it has no hashes, so that nobody can say whether it is as it was built"
-    covered = "every file is" if lut.provenance.has_sums else "ground truth and samples are (it is an older table)"
-    if expect is not None:
-        return f"it is the table expected, and {covered} as it was built"
-    return (
-        f"{covered} as its own hashes say; that it is the table you mean shows its hash, {lut.sha256}: compare it with "
-        "the one you were told, or give that with --expect"
-    )
-
-
-@contextmanager
-def _bar(beginning: str) -> Generator[Callable[[int, int, str], None]]:
-    """Show a bar of progress on stderr; yield what is to be called with done, total, and the present work."""
-    from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-
-    columns = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeRemainingColumn(),
-    )
-    with Progress(*columns, console=Console(stderr=True), transient=True, disable=not shows_progress()) as bar:
-        task = bar.add_task(beginning, total=None)
-        yield lambda done, total, what: bar.update(task, completed=done, total=total, description=what)
 
 
 def _print_result(result: BuildResult, told: JsonOutput) -> None:
