@@ -188,10 +188,10 @@ def _coded(row: Mapping[str, str]) -> CodedImage:
     for file in filter(None, (row["codes"], row["mask"])):
         if not is_inside_name(file) or not file.startswith(("codes/", "masks/")):
             raise ValueError(f"{file!r} is no name below codes/ or masks/")
-    k, scale, gamma, largest, *light = (float(row[name]) for name in COLUMNS[3:])
+    k, scale, gamma, largest, red, green, blue = (float(row[name]) for name in COLUMNS[3:])
     if not all(0 < number < np.inf for number in (k, scale, gamma)) or not 0 <= largest < np.inf:
         raise ValueError("k, scale and gamma are to be above 0, largest from 0")
-    return CodedImage(row["image"], row["codes"], row["mask"], Flash(k, scale, gamma), largest, tuple(light))
+    return CodedImage(row["image"], row["codes"], row["mask"], Flash(k, scale, gamma), largest, (red, green, blue))
 
 
 def _read_codes(folder: Path, name: str) -> npt.NDArray[np.uint8]:
