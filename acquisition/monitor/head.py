@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from datetime import datetime, timedelta
 
 from acquisition.monitor.rows import AttemptView
-from acquisition.session.heartbeat import AGAIN, Heartbeat
+from acquisition.session.heartbeat import AGAIN, Heartbeat, Place
 from acquisition.session.plan import SessionStep
 from acquisition.session.progress import time_left
 from acquisition.session.records import ACCEPTED, FAILED, REFUSED, VOIDED
@@ -31,8 +31,9 @@ class Head:
     ----------
     state
         ``running``, ``waiting`` or ``paused`` as the run says it; ``complete``; ``incomplete``: it has ended and frames
-        are left; ``stopped``: killed or power lost; ``unknown``: the journal has no sign of life; ``absent``, ``gone``,
-        ``unreadable``: there is no journal to read, yet, or any more.
+        are left; ``stopped``: killed or power lost; ``copy``: the run's signs of life are those of another folder;
+        ``unknown``: the journal has no sign of life; ``absent``, ``gone``, ``unreadable``: there is no journal to read,
+        yet, or any more.
     sentence
         The same in words, with the remedy behind a semicolon where there is one; empty while there is nothing to say.
     alive
@@ -79,6 +80,7 @@ def head_of(
     *,
     process_alive: bool | None,
     name: str,
+    here: Place | None = None,
 ) -> Head:
     """Return how a session stands.
 
@@ -96,10 +98,12 @@ def head_of(
         Whether the process that gave it is there; None if that cannot be told.
     name
         The session's folder, for the sentence that says what comes next.
+    here
+        Where it lies; None if that is not known.
     """
     done = {view.step for view in attempts if view.verdict == ACCEPTED} & {step.number for step in steps}
     verdicts = [view.verdict for view in attempts]
-    state, sentence = _state_of(heartbeat, now, process_alive, len(steps) - len(done), len(steps), name)
+    state, sentence = _state_of(heartbeat, now, process_alive, len(steps) - len(done), len(steps), name, here)
     alive = state in ("running", "waiting", "paused")
     pace = _pace(attempts)
     left = len(steps) - len(done)
@@ -134,13 +138,22 @@ def head_of(
 
 
 def _state_of(
-    heartbeat: Heartbeat | None, now: datetime, process_alive: bool | None, left: int, total: int, name: str
+    heartbeat: Heartbeat | None,
+    now: datetime,
+    process_alive: bool | None,
+    left: int,
+    total: int,
+    name: str,
+    here: Place | None,
 ) -> tuple[str, str]:
-    over = heartbeat is None or heartbeat.state == "ended" or heartbeat.is_dead(now, process_alive)
+    copied = heartbeat is not None and heartbeat.state != "ended" and heartbeat.is_of(here) is False
+    over = heartbeat is None or heartbeat.state == "ended" or copied or heartbeat.is_dead(now, process_alive)
     if over and total and not left:
         return "complete", f"complete, {total} frames; next: build-lut {shlex.quote(name)} LUT/"
     if heartbeat is None:
         return "unknown", f"{left} of {total} frames are left, and the journal has no sign of life of a run"
+    if copied and here is not None:
+        return "copy", heartbeat.sentence_of_copy(here, process_alive)
     if heartbeat.is_dead(now, process_alive):
         return "stopped", heartbeat.sentence_for(now, process_alive)
     if heartbeat.state == "ended":

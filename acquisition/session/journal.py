@@ -21,7 +21,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from acquisition.session.heartbeat import Heartbeat, Process, RunState
+from acquisition.session.heartbeat import Heartbeat, Place, Process, RunState
 from acquisition.session.journal_file import (
     JOURNAL_VERSION,
     LockPatience,
@@ -49,6 +49,9 @@ from foundation.errors import FormatError, counted
 
 JOURNAL_FILE = "journal.sqlite"
 """Name of the journal in a session's folder."""
+
+PLACE = "place"
+"""Key of the record that says which folder the signs of life are given for."""
 
 PATIENCE_S = 600.0
 """How long a write waits for another program's unless the caller says otherwise: as long as a run waits for a device by
@@ -277,8 +280,10 @@ class Journal:
         until
             When the next sign is given at the latest, by the machine's wall clock (not by a simulated lab's time).
         """
-        own, at = Process.own(), datetime.now(UTC)
+        own, at, place = Process.own(), datetime.now(UTC), Place.of(self._path)
         with self._writing():
+            if place is not None:
+                self._connection.execute("INSERT OR REPLACE INTO records VALUES (?, ?)", (PLACE, place.to_text()))
             self._connection.execute(
                 "INSERT OR REPLACE INTO heartbeat VALUES (1, ?, ?, ?, ?, ?, ?, ?, ?)",
                 (time_text(at), own.pid, own.started, own.host, own.boot, state, sentence, time_text(until)),
@@ -291,7 +296,7 @@ class Journal:
 
     def records(self) -> dict[str, str]:
         """Return what the session was taken with, by key."""
-        return dict(self._newer_rows("SELECT key, text FROM records ORDER BY key"))
+        return dict(self._newer_rows(f"SELECT key, text FROM records WHERE key <> '{PLACE}' ORDER BY key"))
 
     def heartbeat(self) -> Heartbeat | None:
         """Return the newest sign of life; None if none was ever given."""
@@ -299,7 +304,10 @@ class Journal:
         if not rows:
             return None
         at, *process, state, sentence, until = rows[0]
-        return Heartbeat(datetime.fromisoformat(at), Process(*process), state, sentence, datetime.fromisoformat(until))
+        said = self._newer_rows(f"SELECT text FROM records WHERE key = '{PLACE}'")
+        place = Place.from_text(said[0][0]) if said else None
+        begun, due = datetime.fromisoformat(at), datetime.fromisoformat(until)
+        return Heartbeat(begun, Process(*process), state, sentence, due, place)
 
     def attempts(self) -> list[Attempt]:
         """Return every attempt, oldest first."""

@@ -5,13 +5,14 @@ from __future__ import annotations
 import subprocess
 import sys
 from collections.abc import Sequence
+from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 
 import pytest
 
 from acquisition.monitor.head import Head, head_of
 from acquisition.monitor.rows import AttemptView, with_seconds
-from acquisition.session.heartbeat import Heartbeat, Process, RunState
+from acquisition.session.heartbeat import Heartbeat, Place, Process, RunState
 from acquisition.session.plan import plan_steps
 from tests.acquisition.monitor.made_up import LIGHTS
 
@@ -72,6 +73,21 @@ def test_a_killed_run_is_told_at_once_where_it_ran() -> None:
     assert not stands.alive
     assert "killed or power lost: run the same command again" in stands.sentence
     assert stands.eta is None
+
+
+@pytest.mark.parametrize("alive", [True, False, None])
+def test_a_copy_of_a_session_is_no_run(alive: bool | None) -> None:
+    there, here = Place("/data/night", 5, 10, 11, 0), Place("/backup/night", 5, 20, 21, 0)
+    beat = replace(heartbeat("running"), place=there)
+    stands = head_of(STEPS, attempts(3), beat, NOW, process_alive=alive, name="night", here=here)
+    assert (stands.state, stands.alive, stands.eta) == ("copy", False, None)
+    assert "/data/night" in stands.sentence
+    stands = head_of(STEPS, attempts(8), beat, NOW, process_alive=alive, name="night", here=here)
+    assert stands.state == "complete", "all frames are in the copy, too"
+    ended = replace(beat, state="ended")
+    assert head_of(STEPS, attempts(3), ended, NOW, process_alive=alive, name="night", here=here).state == "incomplete"
+    where_it_is = head_of(STEPS, attempts(3), beat, NOW, process_alive=True, name="night", here=there)
+    assert where_it_is.state == "running"
 
 
 @pytest.mark.parametrize(("late_s", "state"), [(29.0, "paused"), (31.0, "stopped")])
