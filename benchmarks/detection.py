@@ -33,7 +33,7 @@ from acquisition.chart.model import Chart
 from acquisition.config import LabSettings, parse_lab
 from acquisition.judge import limits
 from acquisition.judge.judge import LiveJudge
-from acquisition.judge.response import ProjectorModel
+from acquisition.judge.known.response import ProjectorModel
 from acquisition.lights.illuminations import Illumination, plan_illuminations
 from acquisition.run.rig.simulated import sheet
 from acquisition.session.judgement import Judgement
@@ -145,7 +145,7 @@ def lab_of(
 
 # Detection
 
-LIGHT, ANY, LIT = "lights", "any", "lit"
+LIGHT, ANY, LIT, TWO_COLOURED = "lights", "any", "lit", "lights with more of red than of blue, or less"
 
 
 @dataclass(frozen=True)
@@ -205,12 +205,12 @@ TRIALS = (
     Trial("another camera", "serial number", special="serial", at=ANY),
     Trial("another camera", "model", special="model", at=ANY),
     Trial("another ISO speed", "200", special="iso", at=ANY),
-    Trial("colours exchanged", "red for blue", special="exchanged"),
+    Trial("colours exchanged", "red for blue", at=TWO_COLOURED, special="exchanged"),
 )
 
 
 _ANOTHER_LIGHT = "still seen|another light is seen|not the one ordered"
-_ELSEWHERE = "light from elsewhere|other light fall on the chart"
+_ELSEWHERE = "light from elsewhere|other light fall on the chart|was a lamp or a display switched"
 
 NAMED = {
     "frozen screen, from a frame on": _ANOTHER_LIGHT,
@@ -223,7 +223,8 @@ NAMED = {
     "defocus": "focus",
     "person": "does somebody or something stand before",
     "hand": "does somebody or something stand before",
-    "half-changed picture": "did only a part of the picture change|did the picture change during",
+    "half-changed picture": "only a part of the picture had changed|did only a part of the picture change|"
+    "did only a part of it change|did the picture change during",
     "late picture": "light of the frame before|is the picture late|did the picture change during",
     "repeated file": "a frame that it had given before",
     "zeroed strip": "part of the file was lost",
@@ -255,7 +256,9 @@ def steps_of(lab: Lab, at: str, random: np.random.Generator) -> Iterator[Session
     """Yield steps at which a disturbance is tried: lights of the plan, deep blue and red ones, white, black."""
     fixed = [Colour(0, 0, 255), Colour(255, 0, 0), Colour(255, 255, 255), Colour(0, 48, 255)]
     lights = [*fixed, *(lab.plan[int(k)].colour for k in random.permutation(len(lab.plan)))]
-    if at != LIGHT:
+    if at == TWO_COLOURED:
+        lights = [colour for colour in lights if abs(colour.red - colour.blue) > 16]
+    if at in (ANY, LIT):
         yield SessionStep(9000, "white", None, WHITE)
     if at == ANY:
         yield SessionStep(9001, "dark", None, BLACK)

@@ -14,9 +14,9 @@ import numpy as np
 import numpy.typing as npt
 
 from acquisition.judge import limits
-from acquisition.judge.basis import FrameLight
-from acquisition.judge.knowledge import Knowledge, Leaning, Seen, combined
-from acquisition.judge.response import Codes, Fit, ProjectorModel
+from acquisition.judge.known.basis import FrameLight
+from acquisition.judge.known.knowledge import Knowledge, Leaning, Seen, combined
+from acquisition.judge.known.response import Codes, Fit, ProjectorModel
 from acquisition.session.judgement import Check
 from acquisition.session.plan import SessionStep
 from foundation.angles import angles_deg
@@ -141,9 +141,10 @@ def _cause(
     remains = _added_of(model, light, codes, before)
     ambient = _added_of(model, light, codes, None)
     if wrong and remains is not None and (ambient is None or remains[1] + 9 < ambient[1]):
+        elsewhere = ", or does light from elsewhere fall on the chart?" if _coloured(model, light, codes) else ""
         return (
             f"{100 * remains[0]:.1f} % of the light of the frame before remain in this one; let the picture settle for "
-            "longer (sequence.settle_s), and switch dynamic contrast and frame interpolation off",
+            f"longer (sequence.settle_s), and switch dynamic contrast and frame interpolation off{elsewhere}",
             0.0,
         )
     if wrong:
