@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shlex
 import statistics
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import datetime, timedelta
 
@@ -74,7 +74,7 @@ class Head:
 
 def head_of(
     steps: Sequence[SessionStep],
-    attempts: Collection[AttemptView],
+    attempts: Sequence[AttemptView],
     heartbeat: Heartbeat | None,
     now: datetime,
     *,
@@ -107,10 +107,10 @@ def head_of(
     alive = state in ("running", "waiting", "paused")
     pace = _pace(attempts)
     left = len(steps) - len(done)
-    recent = [view for view in list(attempts)[-RECENT:] if view.verdict is not None]
+    recent = [view for view in attempts[-RECENT:] if view.verdict is not None]
     gained = sum(view.verdict in (ACCEPTED, VOIDED) for view in recent)
     remaining = time_left([view.seconds for view in recent if view.seconds is not None], len(recent), gained, left)
-    newest = max((view.started_at for view in attempts), default=None)
+    newest = next((view.started_at for view in reversed(attempts)), None)
     near = (
         heartbeat is not None
         and newest is not None
@@ -133,7 +133,7 @@ def head_of(
         seconds_per_frame=pace,
         remaining_s=remaining,
         eta=now + timedelta(seconds=remaining) if near and remaining is not None else None,
-        last=max((view.taken_at for view in attempts if view.taken_at is not None), default=None),
+        last=next((view.taken_at for view in reversed(attempts) if view.taken_at is not None), None),
     )
 
 
@@ -161,7 +161,7 @@ def _state_of(
     return heartbeat.state, heartbeat.sentence
 
 
-def _pace(attempts: Collection[AttemptView]) -> float | None:
+def _pace(attempts: Sequence[AttemptView]) -> float | None:
     """Return the median interval of the newest attempts, seconds."""
-    intervals = [view.seconds for view in list(attempts)[-RECENT:] if view.seconds is not None]
+    intervals = [view.seconds for view in attempts[-RECENT:] if view.seconds is not None]
     return statistics.median(intervals) if intervals else None

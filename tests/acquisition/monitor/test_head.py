@@ -140,6 +140,15 @@ def test_a_frame_of_a_step_that_the_plan_does_not_have_does_not_count() -> None:
     assert head([stray], heartbeat("running")).done == 0
 
 
+def test_a_clock_that_was_set_back_makes_no_time() -> None:
+    views = [*attempts(4), replace(attempts(1)[0], id=5, step=4, started_at=NOW - timedelta(hours=1))]
+    timed = with_seconds([replace(view, seconds=None) for view in views], [])
+    assert [one.seconds for one in timed] == [None, 5.0, 5.0, 5.0, None]
+    stands = head(timed, heartbeat("running"))
+    assert stands.remaining_s == 15.0
+    assert stands.eta is None, "the lab's clock is not the wall's"
+
+
 def test_the_time_between_two_runs_is_no_frames() -> None:
     first, second, third = attempts(3)
     timed = with_seconds([first, second, third], [second.started_at])
