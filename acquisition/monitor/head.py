@@ -11,12 +11,8 @@ from datetime import datetime, timedelta
 from acquisition.monitor.rows import AttemptView
 from acquisition.session.heartbeat import AGAIN, Heartbeat, Place
 from acquisition.session.plan import SessionStep
-from acquisition.session.progress import time_left
+from acquisition.session.progress import RECENT, TimedAttempt, time_left
 from acquisition.session.records import ACCEPTED, FAILED, REFUSED, VOIDED
-
-RECENT = 50
-"""Attempts whose median interval stands for the time that a frame takes now: enough that retakes and references do not
-sway it, few enough to follow a change of the settings."""
 
 LAB_CLOCK_S = 600.0
 """How far the lab's clock may be from that of the wall for the end to be told as a time of day; a simulated lab's time
@@ -107,9 +103,8 @@ def head_of(
     alive = state in ("running", "waiting", "paused")
     pace = _pace(attempts)
     left = len(steps) - len(done)
-    recent = [view for view in attempts[-RECENT:] if view.verdict is not None]
-    gained = sum(view.verdict in (ACCEPTED, VOIDED) for view in recent)
-    remaining = time_left([view.seconds for view in recent if view.seconds is not None], len(recent), gained, left)
+    judged = (view for view in attempts if view.verdict is not None)
+    remaining = time_left((TimedAttempt(view.seconds, view.verdict in (ACCEPTED, VOIDED)) for view in judged), left)
     newest = next((view.started_at for view in reversed(attempts)), None)
     near = (
         heartbeat is not None

@@ -162,9 +162,9 @@ def _judge_rows(basis: Basis, light: FrameLight, frame: Measured, moved_px: _Arr
 
 def _is_ragged(rest: Residuals, wrong: npt.NDArray[np.bool_]) -> bool:
     """Return whether strips (S,) bool that deviate do so row by row otherwise; a shadow goes on from row to row."""
-    deviation, of = (values.reshape(-1, SEGMENTS) for values in (np.nan_to_num(rest.signed), wrong))
+    deviation, of = np.nan_to_num(rest.signed).reshape(-1, SEGMENTS), wrong.reshape(-1, SEGMENTS)
     both = of[1:] & of[:-1]
-    if both.sum() < limits.ROWS:
+    if np.count_nonzero(both) < limits.ROWS:
         return False
     steps = np.abs(np.diff(deviation, axis=0))[both]
     return bool(np.median(steps) > _RAGGED * np.median(np.abs(rest.signed[wrong])))
