@@ -54,7 +54,21 @@ def look(
     chart: Chart | None,
     plan: Sequence[tuple[int, int, int]],
 ) -> Looked:
-    """Return what is found of a frame of a step."""
+    """Return what is found of a frame of a step.
+
+    Parameters
+    ----------
+    known
+        What is known before it.
+    mosaic, black
+        The frame and its black level, (2, 2) float64 counts.
+    step, settings
+        What was to be taken, and how.
+    chart
+        The print before the camera; None where none is looked for.
+    plan
+        Codes of the lights among which another one than the one ordered is looked for.
+    """
     measured = measure(mosaic, black)
     frame = Frame(measured, np.full(3, np.nan), UNTOLD_PX)
     checks = [*judge_file(known, mosaic, measured, step, settings)]

@@ -32,7 +32,7 @@ def best_channel(measured: Measured) -> tuple[Channel, float]:
 
 
 def has_moved_far(known: Knowledge, mosaic: Mosaic, black: npt.NDArray[np.float64], measured: Measured) -> bool:
-    """Return whether the chart lies elsewhere than in the earlier run."""
+    """Return whether the chart lies elsewhere than in the earlier run; `black` (2, 2) float64 counts of the frame."""
     assert known.anchor is not None
     channel, level = best_channel(measured)
     if level < limits.DIM_DN / 2:
@@ -49,7 +49,24 @@ def judge_movement(
     frame: Frame,
     judge: JudgeSettings,
 ) -> tuple[list[Check], npt.NDArray[np.float64]]:
-    """Return whether the chart has moved or is softer than in the anchor's frame, and where it lies from there."""
+    """Return whether the chart has moved or is softer than in the anchor's frame, and where it lies from there.
+
+    Parameters
+    ----------
+    known, anchor
+        What it is held against.
+    mosaic, black, frame
+        The frame, its black level (2, 2) float64 counts, and what was measured of it.
+    judge
+        The limits.
+
+    Returns
+    -------
+    list of Check
+        Movement and blur.
+    numpy.ndarray
+        (2,) float64 px right and down from the anchor's frame; NaN where that is not told.
+    """
     channel, _ = best_channel(frame.measured)
     paper = _paper_in(frame, channel)
     if paper < limits.DIM_DN:
