@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from datetime import datetime, timedelta
 
 from acquisition.monitor.rows import AttemptView
-from acquisition.session.heartbeat import AGAIN, Heartbeat, Place
+from acquisition.session.heartbeat import AGAIN, Heartbeat, SessionPlace
 from acquisition.session.plan import SessionStep
 from acquisition.session.progress import RECENT, TimedAttempt, time_left
 from acquisition.session.records import ACCEPTED, FAILED, REFUSED, VOIDED
@@ -76,7 +76,7 @@ def head_of(
     *,
     process_alive: bool | None,
     name: str,
-    here: Place | None = None,
+    here: SessionPlace | None = None,
 ) -> Head:
     """Return how a session stands.
 
@@ -139,7 +139,7 @@ def _state_of(
     left: int,
     total: int,
     name: str,
-    here: Place | None,
+    here: SessionPlace | None,
 ) -> tuple[str, str]:
     copied = heartbeat is not None and heartbeat.state != "ended" and heartbeat.is_of(here) is False
     over = heartbeat is None or heartbeat.state == "ended" or copied or heartbeat.is_dead(now, process_alive)

@@ -12,7 +12,7 @@ from pathlib import Path
 from acquisition.lights.illuminations import Illumination, load_illuminations
 from acquisition.monitor.head import Head, head_of
 from acquisition.monitor.rows import AttemptView, EventView, changed_attempts, events_after, with_seconds
-from acquisition.session.heartbeat import Heartbeat, Place
+from acquisition.session.heartbeat import Heartbeat, SessionPlace
 from acquisition.session.journal import JOURNAL_FILE, Journal
 from acquisition.session.journal_file import open_to_read, reading_error
 from acquisition.session.plan import SessionStep
@@ -53,7 +53,7 @@ class SessionView:
     events: tuple[EventView, ...]
     heartbeat: Heartbeat | None
     given: str = ""
-    place: Place | None = None
+    place: SessionPlace | None = None
 
     def head(self, now: datetime) -> Head:
         """Return how it stands at the wall clock's `now`; the process that takes it is looked for."""
@@ -124,7 +124,7 @@ def read_session(folder: Path, before: SessionView | None = None) -> SessionView
     starts = [event.at for event in events if event.what == RUN_STARTS]
     attempts = with_seconds([known[number] for number in sorted(known)], starts)
     lights = before.lights if before else _lights_of(folder)
-    name, place = folder.resolve().name, Place.of(path)
+    name, place = folder.resolve().name, SessionPlace.of(path)
     return SessionView(name, steps, lights, records, attempts, events, heartbeat, str(folder), place)
 
 

@@ -87,7 +87,7 @@ _GETVERSION = 0x80007601 | struct.calcsize("l") << 16
 
 
 @dataclass(frozen=True)
-class Place:
+class SessionPlace:
     """Where a session lies: its name, and the numbers of its files, which a copy does not have.
 
     A folder that is renamed keeps its numbers, and one that is looked at over NFS has those of the server. A journal
@@ -112,7 +112,7 @@ class Place:
     generation: int
 
     @classmethod
-    def of(cls, journal: Path) -> Place | None:
+    def of(cls, journal: Path) -> SessionPlace | None:
         """Return the place of a journal; None where it is not there any more."""
         try:
             folder, file = journal.parent.stat(), journal.stat()
@@ -124,7 +124,7 @@ class Place:
         return cls(path, folder.st_dev, folder.st_ino, file.st_ino, _generation(journal.parent))
 
     @classmethod
-    def from_text(cls, text: str) -> Place | None:
+    def from_text(cls, text: str) -> SessionPlace | None:
         """Return the place that `to_text` wrote; None for anything else."""
         try:
             folder, *numbers = json.loads(text)
@@ -163,9 +163,9 @@ class Heartbeat:
     state: RunState
     sentence: str
     until: datetime
-    place: Place | None = None
+    place: SessionPlace | None = None
 
-    def is_of(self, here: Place | None) -> bool | None:
+    def is_of(self, here: SessionPlace | None) -> bool | None:
         """Return whether it was given for the session that lies `here`, and not for one that this is a copy of.
 
         None where that cannot be told.
@@ -201,7 +201,7 @@ class Heartbeat:
             return self.sentence
         return f"stopped at {_moment(self.at)}, killed or power lost: {AGAIN}"
 
-    def sentence_of_copy(self, here: Place, alive: bool | None) -> str:
+    def sentence_of_copy(self, here: SessionPlace, alive: bool | None) -> str:
         """Return what to tell a reader of a copy, which lies `here`; see `is_of` and `is_dead`."""
         assert self.place is not None
         there, moment = self.place.folder, _moment(self.at)

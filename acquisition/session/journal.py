@@ -22,7 +22,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from acquisition.session.heartbeat import Heartbeat, Place, Process, RunState
+from acquisition.session.heartbeat import Heartbeat, Process, RunState, SessionPlace
 from acquisition.session.journal_file import (
     JOURNAL_VERSION,
     LockPatience,
@@ -284,7 +284,7 @@ class Journal:
         until
             When the next sign is given at the latest, by the machine's wall clock (not by a simulated lab's time).
         """
-        own, at, place = Process.own(), datetime.now(UTC), Place.of(self._path)
+        own, at, place = Process.own(), datetime.now(UTC), SessionPlace.of(self._path)
         with self._writing():
             if place is not None:
                 self._connection.execute("INSERT OR REPLACE INTO records VALUES (?, ?)", (PLACE, place.to_text()))
@@ -309,7 +309,7 @@ class Journal:
             return None
         at, *process, state, sentence, until = rows[0]
         said = self._newer_rows(f"SELECT text FROM records WHERE key = '{PLACE}'")
-        place = Place.from_text(said[0][0]) if said else None
+        place = SessionPlace.from_text(said[0][0]) if said else None
         begun, due = datetime.fromisoformat(at), datetime.fromisoformat(until)
         return Heartbeat(begun, Process(*process), state, sentence, due, place)
 

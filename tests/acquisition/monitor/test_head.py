@@ -12,7 +12,7 @@ import pytest
 
 from acquisition.monitor.head import Head, head_of
 from acquisition.monitor.rows import AttemptView, with_seconds
-from acquisition.session.heartbeat import Heartbeat, Place, Process, RunState
+from acquisition.session.heartbeat import Heartbeat, Process, RunState, SessionPlace
 from acquisition.session.plan import plan_steps
 from tests.acquisition.monitor.made_up import LIGHTS
 
@@ -77,7 +77,7 @@ def test_a_killed_run_is_told_at_once_where_it_ran() -> None:
 
 @pytest.mark.parametrize("alive", [True, False, None])
 def test_a_copy_of_a_session_is_no_run(alive: bool | None) -> None:
-    there, here = Place("/data/night", 5, 10, 11, 0), Place("/backup/night", 5, 20, 21, 0)
+    there, here = SessionPlace("/data/night", 5, 10, 11, 0), SessionPlace("/backup/night", 5, 20, 21, 0)
     beat = replace(heartbeat("running"), place=there)
     stands = head_of(STEPS, attempts(3), beat, NOW, process_alive=alive, name="night", here=here)
     assert (stands.state, stands.alive, stands.eta) == ("copy", False, None)

@@ -20,7 +20,7 @@ from types import SimpleNamespace
 import pytest
 
 from acquisition.session import heartbeat
-from acquisition.session.heartbeat import Heartbeat, Place, Process, signs_of_life
+from acquisition.session.heartbeat import Heartbeat, Process, SessionPlace, signs_of_life
 from acquisition.session.journal import Journal
 from foundation.errors import DeviceError, StorageError
 
@@ -136,8 +136,8 @@ class TestPlace:
         return folder
 
     @staticmethod
-    def of(folder: Path) -> tuple[Heartbeat, Place]:
-        here = Place.of(folder / "journal.sqlite")
+    def of(folder: Path) -> tuple[Heartbeat, SessionPlace]:
+        here = SessionPlace.of(folder / "journal.sqlite")
         with closing(Journal.open(folder / "journal.sqlite")) as journal:
             told = journal.heartbeat()
             assert journal.records() == {}, "the place is no device"
@@ -189,7 +189,7 @@ class TestPlace:
     ) -> None:
         told, here = self.of(run)
         monkeypatch.setattr(heartbeat, "file_system_of", lambda path: kind)  # pyright: ignore[reportUnknownLambdaType, reportUnknownArgumentType]
-        mounted = Place.of(run / "journal.sqlite")
+        mounted = SessionPlace.of(run / "journal.sqlite")
         assert mounted is not None
         assert mounted.folder == here.folder
         assert told.is_of(mounted) is None
@@ -207,8 +207,8 @@ class TestPlace:
             '["/night", 1, 2, "x"]',
             '["/night", 1, 2, null]',
         ):
-            assert Place.from_text(text) is None
-        assert Place.from_text(here.to_text()) == here
+            assert SessionPlace.from_text(text) is None
+        assert SessionPlace.from_text(here.to_text()) == here
 
     def test_what_a_reader_of_a_copy_is_told(self, run: Path) -> None:
         told, here = self.of(run)
