@@ -136,7 +136,7 @@ def _figures(
             linearity=linearity,
         ),
         dark_frames=statistics.dark_summary(),
-        cells=CellFigures(baseline.options.window, statistics.unfit(saturation, stains), stains),
+        cells=CellFigures(baseline.options.window, statistics.unfit(saturation, stains, taken.frames), stains),
         origins=origin_figures([(figures.record, figures.origin) for figures in taken.figures]),
         primaries=baseline.primaries,
         lens=lens_figures(baseline),
