@@ -424,6 +424,7 @@ def _write_table(work: _BuildState, figures: TableFigures) -> None:
         chart_sha256=session.chart.sha256,
         software=software(),
         unfit=list(figures.cells.unfit),
+        origin=figures.origin,
     )
     per_light = gain[:, None]
     references = references_csv(

@@ -39,6 +39,7 @@ def report_json(result: BuildResult) -> dict[str, Any]:
         "lens": figures.lens.to_json() | ({} if figures.point_spread is None else figures.point_spread.to_json()),
         "off_codes_deg": None if off_codes_deg is None else _short(off_codes_deg),
         "codes": None if figures.lights.codes is None else _codes(figures.lights.codes),
+        "origin": figures.origin.model_dump(mode="json"),
         "origins": _origins(figures),
         "primaries_differ": None if primaries is None else float(f"{primaries.difference:.3g}"),
         "figures": {name: _rounded(value) for name, value in judged_values(figures).items()},
