@@ -55,6 +55,7 @@ def _causes(result: BuildResult) -> list[dict[str, Any]]:
         {
             "figure": name,
             "cause": found.decision.cause.name,
+            "follows": found.decision.follows,
             "why": "" if found.decision.rule is None else found.decision.rule.why,
             "remedy": found.decision.cause.remedy,
             "mends": found.decision.cause.mends,
