@@ -149,7 +149,7 @@ def _figures(
             linearity=linearity,
         ),
         dark_frames=statistics.dark_summary(),
-        cells=CellFigures(baseline.options.window, statistics.unfit(saturation, stains), stains),
+        cells=CellFigures(baseline.options.window, statistics.unfit(saturation, stains, taken.frames), stains),
         origins=origin_figures([(one.record, origin) for one, origin in zip(taken.figures, told, strict=True)]),
         origin=origin_record(stated, taken.records, [one.origin for one in taken.figures]),
         primaries=baseline.primaries,
