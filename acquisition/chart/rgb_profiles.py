@@ -36,8 +36,10 @@ _GAMUT_GRID = 17
 """Points along each side of the gamut's table: a warning needs no more."""
 
 _FULL = 65535
+"""Encoding of 1 of a device value, 16 bits (ICC.1:2001-04, 6.5.8)."""
+
 _ONE_XYZ = 32768
-"""Encodings of 1: of a device value, and of X, Y or Z as u1Fixed15 (ICC.1:2001-04, 5.3.4.2 and 6.5.8)."""
+"""Encoding of 1 of X, Y or Z as u1Fixed15 (ICC.1:2001-04, 5.3.4.2)."""
 
 _Array = npt.NDArray[np.float64]
 

@@ -91,7 +91,7 @@ def draw_noise(figure: Any, noise: tuple[_Array, _Array], transfer: PhotonTransf
     figure
         To draw on.
     noise
-        Mean and variance of each cell, as `cell_noise` returns them.
+        Mean and variance of each cell, both (N, 3) float64, as `cell_noise` returns them.
     transfer
         The fitted curve.
     samples

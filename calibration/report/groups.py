@@ -27,7 +27,9 @@ OF_THRESHOLDS: Final[dict[str, Group]] = {
     **dict.fromkeys(("additivity", "white_short", "off_codes_deg", "off_brightness", "exchanged_lights"), "light"),
     **dict.fromkeys(("code_misfit", "exchange_deg", "held_share", "white_frame_deg"), "light"),
     **dict.fromkeys(("white_frame_brightness", "primaries_lacking", "stray_share"), "light"),
-    **dict.fromkeys(("correction_residual", "unfit_share", "doubtful_share", "unlike_scatter"), "radiometry"),
+    **dict.fromkeys(
+        ("correction_residual", "unfit_share", "doubtful_share", "disturbed_cells", "unlike_scatter"), "radiometry"
+    ),
     **dict.fromkeys(
         ("unlike_block", "other_camera", "other_lens", "other_exposure", "black_drift_counts"), "radiometry"
     ),
