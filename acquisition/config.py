@@ -58,6 +58,29 @@ def _target_checked(target: str) -> str:
     return target
 
 
+def spdx_expression(licence: str) -> str:
+    """Return an SPDX licence expression in its canonical spelling, ``CC-BY-4.0``; empty stays empty.
+
+    SPDX specification 2.3, annex D, so that programs and lawyers read the same.
+
+    Raises
+    ------
+    ValueError
+        It is none; the message says what is expected.
+    """
+    from packaging.licenses import InvalidLicenseExpression, canonicalize_license_expression
+
+    if not licence.strip():
+        return ""
+    try:
+        return str(canonicalize_license_expression(licence))
+    except InvalidLicenseExpression as error:
+        raise ValueError(
+            "no SPDX licence expression; expected an identifier of spdx.org/licenses, such as CC-BY-4.0 or CC0-1.0, or "
+            "LicenseRef-NAME for a licence of your own"
+        ) from error
+
+
 def _endless(value: object) -> object:
     """Return infinity for the word ``forever``, and anything else as it is."""
     return math.inf if isinstance(value, str) and value.strip().lower() == "forever" else value
@@ -156,6 +179,28 @@ class JudgeSettings(_Settings):
     """Angle between the light seen and the one ordered, as predicted from the response frames, that is always allowed,
     degrees; where the prediction is uncertain, more is. A quarter of the 2 degrees within which a fifth of the 707 have
     their neighbour."""
+
+
+class CitationSettings(_Settings):
+    """What a table says of itself that no device tells; `build-lut` writes it into the table and its data sets."""
+
+    title: Annotated[str, Field(max_length=500)] = ""
+    """What the table is called where it is cited; empty: its camera and lights."""
+    authors: tuple[Annotated[str, Field(min_length=1, max_length=200)], ...] = ()
+    """Who made it, each as "Family, Given" or the name of an institution."""
+    licence: Annotated[str, Field(max_length=500), AfterValidator(spdx_expression)] = ""
+    """Under which licence the table may be used, an SPDX expression such as "CC-BY-4.0"; empty: not recorded."""
+    note: Annotated[str, Field(max_length=20_000)] = ""
+    """What whoever took the session wants readers to know: what was ordered at the print shop, what went wrong."""
+    url: Annotated[str, Field(max_length=500)] = ""
+    """Where the table is found, its DOI for example."""
+    lens: Annotated[str, Field(max_length=500)] = ""
+    """The lens, where it has no contacts, so that raw files do not name it."""
+    projector: Annotated[str, Field(max_length=500)] = ""
+    """The projector, where it has no control port that names it."""
+    camera_serial: Literal["hash", "plain", "withheld"] = "hash"
+    """How the body's serial number is told in the table: its hash tells bodies apart and no more, "plain" is the number
+    itself, "withheld" nothing."""
 
 
 class SimulatedSettings(_Settings):
@@ -258,6 +303,7 @@ class LabSettings(_Settings):
     limits: LimitSettings = LimitSettings()
     judge: JudgeSettings = JudgeSettings()
     simulated: SimulatedSettings = SimulatedSettings()
+    citation: CitationSettings = CitationSettings()
     replay: ReplaySettings | None = None
     lab: LabRig = LabRig()
     _file: str = PrivateAttr(default="LAB.toml")

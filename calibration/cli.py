@@ -2,23 +2,30 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from calibration.table_jobs import (
+    fetch_table,
+    match_tables,
+    print_citation,
+    print_table,
+    progress_bar,
+    publish_table,
+    verify_table,
+)
 from foundation import console
-from foundation.console import EXIT_CODES, Quiet, Verbose, Version, new_app, shows_progress
+from foundation.console import EXIT_CODES, Quiet, Verbose, Version, new_app
 from foundation.errors import FormatError, InputError
-from foundation.trust.secret_texts import masked, printable
 
 if TYPE_CHECKING:
     from acquisition.session.folder import Session
     from calibration.pipeline.build import TableProgress
     from calibration.pipeline.options import BuildOptions
-    from calibration.table.lut import Lut
     from calibration.verdict.result import BuildResult
 
 app = new_app()
@@ -52,8 +59,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     "its report is then in LUT.refused/, and the exit code is 4.\n\n"
     "With --check, finds the chart in the session's best frame, judges it, and writes nothing. With --append, takes in "
     "the frames that have come so far of a session that is being taken; LUT appears with the last of them. With "
-    "--info, --verify and --match, reads a table and writes nothing. With --publish and --fetch, copies a table to a "
-    "store for others and back.\n\n"
+    "--info, --cite, --verify and --match, reads a table and writes nothing. With --publish and --fetch, copies a "
+    "table to a store for others and back.\n\n"
     "With --compare A B, says how far two sessions or tables of one chart differ in the lights' colour and brightness "
     "and in every cell, what noise alone predicts of it, and whether they are the same within noise; --json prints it "
     "for programs, --out writes a page. The exit code is 0 whatever is found, 2 where the charts differ or no light "
@@ -127,11 +134,43 @@ def build_lut(
             show_default=False,
         ),
     ] = None,
+    note: Annotated[
+        str | None, typer.Option("--note", help="What readers of the table should know.", show_default=False)
+    ] = None,
+    licence: Annotated[
+        str | None,
+        typer.Option(
+            "--licence", "--license", metavar="SPDX", help="Licence of the table, as CC-BY-4.0.", show_default=False
+        ),
+    ] = None,
+    author: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--author",
+            metavar='"FAMILY, GIVEN"',
+            help="Who made the table; several times for several. As --note, --licence and --serial in place of "
+            "\\[citation] in the session's LAB.toml.",
+            show_default=False,
+        ),
+    ] = None,
+    serial: Annotated[
+        str | None,
+        typer.Option(
+            "--serial",
+            metavar="hash|plain|withheld",
+            help="How the camera's serial number is told in the table. \\[default: hash]",
+            show_default=False,
+        ),
+    ] = None,
     info: Annotated[
         Path | None,
         typer.Option(
             "--info", metavar="LUT", help="Print what a table is and what it was made of.", show_default=False
         ),
+    ] = None,
+    cite: Annotated[
+        Path | None,
+        typer.Option("--cite", metavar="LUT", help="Print a BibTeX entry of a table.", show_default=False),
     ] = None,
     verify: Annotated[
         Path | None,
@@ -215,7 +254,14 @@ def build_lut(
     version: Version = False,
 ) -> None:
     """Build, check or read a table; the help text says what the command does."""
-    reading = {"--info": info, "--verify": verify, "--match": match, "--publish": publish, "--fetch": fetch}
+    reading = {
+        "--info": info,
+        "--cite": cite,
+        "--verify": verify,
+        "--match": match,
+        "--publish": publish,
+        "--fetch": fetch,
+    }
     asked = {"--check": check, "--append": append, "--compare": compare, **reading}
     given = [name for name, value in asked.items() if value]
     if len(given) > 1:
@@ -227,6 +273,10 @@ def build_lut(
         "--no-lens-correction": no_lens_correction,
         "--corners": corners is not None,
         "--linearity": linearity is not None,
+        "--note": note is not None,
+        "--licence": licence is not None,
+        "--author": bool(author),
+        "--serial": serial is not None,
     }
     if any(reading.values()) and any(made.values()):
         raise InputError(
@@ -241,15 +291,17 @@ def build_lut(
     if (lut if verify else session if compare or any(reading.values()) else None) is not None:
         raise InputError(f"{given[0]} does not expect {lut or session}; leave it out")
     if info is not None:
-        _print_table(info)
+        print_table(info)
+    elif cite is not None:
+        print_citation(cite)
     elif verify is not None:
-        _verify(verify, session)
+        verify_table(verify, session)
     elif match is not None:
-        _match(*match)
+        match_tables(*match)
     elif publish is not None:
-        _publish(*publish)
+        publish_table(*publish)
     elif fetch is not None:
-        _fetch(*fetch, expect)
+        fetch_table(*fetch, expect)
     else:
         from acquisition.framing.corners import parse_corners
         from calibration.pipeline.options import BuildOptions
@@ -260,12 +312,15 @@ def build_lut(
         places = None if corners is None else parse_corners(corners)
         samples = WINDOW if window is None else window
         options = BuildOptions(samples, subtract_dark, places, correct_drift, not no_lens_correction)
+        stated = {"note": note, "licence": licence, "authors": author or None, "camera_serial": serial}
+        changes = {name: value for name, value in stated.items() if value is not None}
         if compare is not None:
-            if linearity is not None:
-                raise InputError("--linearity is for the report of one table; leave it out of --compare")
+            told = [name for name in ("--linearity", "--note", "--licence", "--author", "--serial") if made[name]]
+            if told:
+                raise InputError(f"{told[0]} is for one table that is kept; leave it out of --compare")
             _compare(*compare, options, as_json, out, chart)
             return
-        _make(session, lut, check, append, options, linearity, picture)
+        _make(session, lut, check, append, options, linearity, picture, changes)
 
 
 def _make(
@@ -276,6 +331,7 @@ def _make(
     options: BuildOptions,
     linearity: Path | None,
     picture: Path | None,
+    changes: dict[str, Any],
 ) -> None:
     if check and lut is not None:
         raise InputError(f"--check writes nothing, so a table's folder ({lut}) is not expected; leave one of them out")
@@ -285,7 +341,7 @@ def _make(
 
     if check:
         with Session.open(session) as opened:
-            _check(opened, options, linearity, picture)
+            _check(opened, _with_citation(options, opened, changes), linearity, picture)
         return
     if lut is None:
         raise InputError("a folder for the table is expected: build-lut SESSION LUT, or --check to judge only")
@@ -293,7 +349,7 @@ def _make(
     from calibration.table.file_names import REPORT_PAGE
 
     with Session.open(session) as opened:
-        result = _build(opened, lut, append, options, linearity)
+        result = _build(opened, lut, append, _with_citation(options, opened, changes), linearity)
     if isinstance(result, TableProgress):
         print(
             f"{lut}: {result.lights} of {result.lights_planned} lights, {result.new_frames} frames taken in now, "
@@ -302,6 +358,13 @@ def _make(
         return
     _print_result(result)
     print(f"{lut}: {result.figures.session.lights} lights, {result.figures.session.camera}; see {lut / REPORT_PAGE}")
+
+
+def _with_citation(options: BuildOptions, session: Session, changes: dict[str, Any]) -> BuildOptions:
+    """Return the options with what was given of the table's origin in place of what the session's settings state."""
+    from calibration.citation.stated import stated_origin, with_changes
+
+    return replace(options, citation=with_changes(stated_origin(session).citation, changes)) if changes else options
 
 
 def _check(session: Session, options: BuildOptions, linearity: Path | None, picture: Path | None) -> None:
@@ -323,49 +386,8 @@ def _build(
     from calibration.pipeline.build import append, build
     from calibration.report.report import write_report
 
-    with _bar("finding the chart") as progress:
+    with progress_bar("finding the chart") as progress:
         return (append if so_far else build)(session, lut, progress, write_report, options, linearity)
-
-
-def _print_table(folder: Path) -> None:
-    from calibration.table.description import describe
-    from calibration.table.lut import open_lut
-
-    for name, value in describe(open_lut(folder)):
-        print(f"{name + ':':17}{printable(value)}")
-
-
-def _verify(folder: Path, session: Path | None) -> None:
-    from calibration.table.lut import open_lut
-    from calibration.table.verification import find_faults
-
-    lut = open_lut(folder, check=False)
-    with _bar("reading the samples") as progress:
-        faults = find_faults(lut, lambda done, total: progress(done, total, "reading the samples"))
-    if session is not None:
-        from acquisition.session.folder import Session
-        from calibration.pipeline.frames import frame_faults
-
-        with Session.open(session) as opened, _bar("reading the frames") as progress:
-            faults += frame_faults(lut, opened, progress)
-    for fault in faults:
-        print(fault)
-    if faults:
-        raise FormatError(
-            f"{folder} is not as it was built: {len(faults)} faults; restore it from a copy, or build it again"
-        )
-    frames = "" if session is None else f", and so are its {len(lut.frames)} frames in {session}"
-    print(f"{folder}: every byte is as it was built{frames}")
-
-
-def _match(one: Path, other: Path) -> None:
-    from calibration.table.lut import open_lut
-    from calibration.table.verification import require_match
-
-    tables = open_lut(one), open_lut(other)
-    require_match(*tables)
-    cameras = " and ".join(table.provenance.camera for table in tables)
-    print(f"{one} and {other} ({cameras}): colours and lights correspond number by number")
 
 
 def _compare(
@@ -379,7 +401,11 @@ def _compare(
 
     if out is not None:
         require_free(out, "the comparison")
-    with _bar("reading") as progress, table_of(one, options, progress) as a, table_of(other, options, progress) as b:
+    with (
+        progress_bar("reading") as progress,
+        table_of(one, options, progress) as a,
+        table_of(other, options, progress) as b,
+    ):
         found = compare(a, b, lambda done, total: progress(done, total, "comparing lights"), (one, other))
         drawn = chart_of((one, other)) if chart is None else load_chart(chart)
         if drawn is not None and drawn.sha256 != a.provenance.chart_sha256:
@@ -394,55 +420,6 @@ def _compare(
         from calibration.comparison.report import write_comparison
 
         write_comparison(found, out, drawn)
-
-
-def _publish(folder: Path, url: str) -> None:
-    from calibration.table.lut import open_lut
-    from calibration.table.zarr_store import publish
-
-    lut = open_lut(folder)
-    with _bar("writing lights") as progress:
-        publish(lut, url, lambda done, total: progress(done, total, "writing lights"))
-    print(f"{masked(url)}: {len(lut.samples)} lights of {folder}; others get them by")
-    print(f"build-lut --fetch {masked(url)} LUT --expect {lut.sha256}")
-
-
-def _fetch(url: str, folder: Path, expect: str | None) -> None:
-    from calibration.table.zarr_store import fetch
-
-    with _bar("reading lights") as progress:
-        lut = fetch(url, folder, lambda done, total: progress(done, total, "reading lights"), expect)
-    print(f"{folder}: {len(lut.samples)} lights, {printable(lut.provenance.camera)}; {_vouched(lut, expect)}")
-
-
-def _vouched(lut: Lut, expect: str | None) -> str:
-    """Return in words what is known of a table that was fetched."""
-    if not lut.provenance.lights_sha256:
-        return "it has no hashes, so that nobody can say whether it is as it was built"
-    covered = "every file is" if lut.provenance.has_sums else "ground truth and samples are (it is an older table)"
-    if expect is not None:
-        return f"it is the table expected, and {covered} as it was built"
-    return (
-        f"{covered} as its own hashes say; that it is the table you mean shows its hash, {lut.sha256}: compare it with "
-        "the one you were told, or give that with --expect"
-    )
-
-
-@contextmanager
-def _bar(beginning: str) -> Generator[Callable[[int, int, str], None]]:
-    """Show a bar of progress on stderr; yield what is to be called with done, total, and the present work."""
-    from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-
-    columns = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeRemainingColumn(),
-    )
-    with Progress(*columns, console=Console(stderr=True), transient=True, disable=not shows_progress()) as bar:
-        task = bar.add_task(beginning, total=None)
-        yield lambda done, total, what: bar.update(task, completed=done, total=total, description=what)
 
 
 def _print_result(result: BuildResult) -> None:

@@ -92,7 +92,8 @@ ONLY_OF_A_SESSION: tuple[str, ...] = (
     # Of the registration, which is finer than what a check takes the time for.
     "tag_residual_px", "tag_final_px", "block_residual_px", "blocks_good", "agreement",
     # Of frames against each other.
-    "softer_bleed", "unlike_scatter", "unlike_block", "moved_anew", "black_drift_counts", "drift_left",
+    "softer_bleed", "unlike_scatter", "unlike_block", "disturbed_cells", "moved_anew", "black_drift_counts",
+    "drift_left",
     "other_camera", "other_lens", "other_exposure",
     # Of the lights.
     "truth_median_deg", "truth_worst_deg", "off_brightness", "white_short", "exchanged_lights", "exchange_deg",

@@ -327,7 +327,7 @@ class Session:
         accepted = self.journal.accepted_files()
         known = range(len(self.illuminations))
         if selection.strip() == BAD:
-            refused = newest_report(self.folder, {frame.sha256 for frame in self.frames()})
+            refused = newest_report(self.folder, {frame.sha256: frame.attempt for frame in self.frames()})
             if not refused.sha256:
                 raise InputError(
                     f"--retake bad: {refused.report}, the newest report on {self.folder}, names no frame to be taken "

@@ -49,6 +49,12 @@ REFLECTION = Cause(
     "turn print or projector until no lamp, window or bright wall is mirrored on it, or print on matt paper",
     "session",
 )
+REFLECTION_IN_FRAME = Cause(
+    "reflection in one frame",
+    "a reflection on the print in single frames: a lamp, a display or daylight that is not always there",
+    "cover displays and windows, and see that nobody moves in front of what the print mirrors",
+    "frames",
+)
 STAIN = Cause(
     "stain",
     "a stain on the print: it takes some colours more than others, in all frames",
@@ -65,6 +71,19 @@ FALL_OFF = Cause(
     "fall-off",
     "fall-off towards the corners that the field does not follow",
     "stop the lens down, take a longer lens or step back, and zoom the projector's picture out",
+    "session",
+)
+CURL = Cause(
+    "curled print",
+    "a print that is curled or folded: its shape there is not known from what was measured",
+    "hang the print flatter, on a board or held at all corners",
+    "session",
+)
+SPREAD = Cause(
+    "soft lens",
+    "a lens that spreads light over several cells, so that their rims have the neighbours' colours",
+    "focus on the print, stop down to f/8, clean the lens, bring the camera nearer, or take a smaller window "
+    "(build-lut --window)",
     "session",
 )
 BUMP = Cause(
@@ -119,7 +138,8 @@ UNKNOWN = Cause("unknown", "", "", "nothing")
 """What was measured does not decide; the remedy is then that of the limit."""
 
 CAUSES = (
-    HOT_PHOTOSITES, OBJECT_IN_FRAME, REFLECTION, STAIN, SHADOW, FALL_OFF, BUMP, DEFOCUS, ANOTHER_PRINT, WRONG_NAME,
+    HOT_PHOTOSITES, OBJECT_IN_FRAME, REFLECTION, REFLECTION_IN_FRAME, STAIN, SHADOW, CURL, FALL_OFF, SPREAD, BUMP,
+    DEFOCUS, ANOTHER_PRINT, WRONG_NAME,
     OTHER_CAMERA, OTHER_EXPOSURE, ROOM_LIGHT, VEIL, UNKNOWN,
 )  # fmt: skip
 """All of them."""

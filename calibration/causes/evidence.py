@@ -77,6 +77,14 @@ class Evidence:
         Light of a primary under a code of 0 that no dark frame shows, of that primary, the worst light.
     stray_primaries
         Light of the primaries' frames together beyond white's, alike in each, of white.
+    misplaced
+        Share of the unfit cells whose place is not known well enough.
+    uneven
+        Share of the unfit cells whose rim and middle differ.
+    waves_px
+        How far tags lie from where a flat sheet would have them, RMS, half-size px of cells of 10 px.
+    beyond_cell
+        Share of the light of a window's worst sample that the lens brings from beyond its cell.
     veil
         Light of the whole frame that the lens spreads over each place, of paper white.
     """
@@ -111,6 +119,10 @@ class Evidence:
     room_change: float = NAN
     stray: float = NAN
     stray_primaries: float = NAN
+    misplaced: float = NAN
+    uneven: float = NAN
+    waves_px: float = NAN
+    beyond_cell: float = NAN
     veil: float = NAN
 
     def known(self) -> dict[str, float]:

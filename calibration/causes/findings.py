@@ -7,7 +7,7 @@ has no cause.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -15,6 +15,7 @@ from acquisition.session.records import FrameRecord
 from calibration.causes.cause import UNKNOWN
 from calibration.causes.evidence import Evidence
 from calibration.causes.light_evidence import (
+    brightness_evidence,
     camera_evidence,
     dark_evidence,
     light_evidence,
@@ -26,6 +27,8 @@ from calibration.causes.place_evidence import (
     Gathered,
     PrintPlace,
     block_evidence,
+    disturbed_evidence,
+    lens_evidence,
     print_evidence,
     reference_evidence,
 )
@@ -88,9 +91,26 @@ def explain(figure: str, limit: float, figures: TableFigures) -> ProbableCause |
     gathered = gather(figures, limit)
     if gathered is None:
         return None
-    return ProbableCause(
+    found = ProbableCause(
         figure, decide(figure, gathered.evidence, RULES), gathered.evidence, gathered.frames, gathered.places
     )
+    return found if found.is_known else _as_another(found, figures)
+
+
+def _as_another(unknown: ProbableCause, figures: TableFigures) -> ProbableCause:
+    """Return a finding with the cause of a figure that it goes with, in the same frames; as it is where there is none.
+
+    What lies on the print in a frame spreads its cells; a light that bears another's name has another's brightness.
+    """
+    for name, limit in _GOES_WITH.get(unknown.figure, ()):
+        main = explain(name, limit, figures)
+        if main is None or not main.is_known or not main.frames:
+            continue
+        own, others = ({frame.sha256 for frame in finding.frames} for finding in (unknown, main))
+        if own and own <= others:
+            decision = replace(main.decision, follows=name)
+            return replace(unknown, decision=decision, evidence=main.evidence, places=unknown.places or main.places)
+    return unknown
 
 
 def explained_figures() -> tuple[str, ...]:
@@ -111,6 +131,11 @@ def _place_in_frame(figures: TableFigures, limit: float) -> Gathered | None:
     if worst is None:
         return None
     return block_evidence(figures, worst, limit, added_bleed(figures, worst))
+
+
+def _small_place(figures: TableFigures, limit: float) -> Gathered | None:
+    worst = max(figures.frames, key=lambda frame: len(frame.consistency.disturbed))
+    return disturbed_evidence(figures, added_bleed(figures, worst))
 
 
 def _all_cells(figures: TableFigures, limit: float) -> Gathered | None:
@@ -157,7 +182,7 @@ def _noisy(figures: TableFigures, limit: float) -> Gathered | None:
     places = tuple(PrintPlace(file, x, y, 0.0) for x, y in stains.places_mm[concerned[:MOST_PLACES]].tolist())
     known = gathered.evidence.known()
     frames = gathered.frames if "white_residual" in known else ()
-    return Gathered(Evidence(**known | {"hot": hot}), frames, places)
+    return Gathered(Evidence(**known | lens_evidence(figures) | {"hot": hot}), frames, places)
 
 
 def _additivity(figures: TableFigures, limit: float) -> Gathered | None:
@@ -204,8 +229,16 @@ _DISTURBED = 0.03
 _OFF_CODES_DEG = 2.0
 """Angle from its codes from which a light may be what a sum of primaries is spoilt by: that of the limit on names."""
 
+_GOES_WITH: dict[str, tuple[tuple[str, float], ...]] = {
+    "unlike_scatter": (("unlike_block", 0.01), ("disturbed_cells", 0.0)),
+    "off_brightness": (("off_codes_deg", _OFF_CODES_DEG), ("exchanged_lights", 0.0)),
+}
+"""Figures that others move along: each with those whose cause it shares where it has none of its own, and from which on
+these are looked at."""
+
 _GATHERERS: dict[str, Callable[[TableFigures, float], Gathered | None]] = {
     "unlike_block": _place_in_frame,
+    "disturbed_cells": _small_place,
     "unlike_scatter": _all_cells,
     "softer_bleed": _softer,
     "moved_anew": _moved,
@@ -219,7 +252,7 @@ _GATHERERS: dict[str, Callable[[TableFigures, float], Gathered | None]] = {
     "additivity": _additivity,
     "white_short": light_evidence,
     "other_exposure": light_evidence,
-    "off_brightness": light_evidence,
+    "off_brightness": brightness_evidence,
     "white_frame_brightness": light_evidence,
     "off_codes_deg": name_evidence,
     "exchanged_lights": name_evidence,

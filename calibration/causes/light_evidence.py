@@ -59,6 +59,16 @@ def name_evidence(figures: TableFigures, limit: float) -> Gathered:
     return Gathered(Evidence(**known), (*named, *whites), ())
 
 
+def brightness_evidence(figures: TableFigures, limit: float) -> Gathered:
+    """Return what is known of lights that are brighter or darker than their codes give; `limit` in `light_evidence`."""
+    gathered, codes = light_evidence(figures, limit), figures.lights.codes
+    if gathered.frames or codes is None:
+        return gathered
+    off = set(np.flatnonzero(codes.off_brightness > limit).tolist())
+    frames = tuple(frame.record for frame in figures.frames if frame.record.illumination in off)
+    return Gathered(gathered.evidence, frames, ())
+
+
 def camera_evidence(figures: TableFigures, limit: float) -> Gathered:
     """Return what is known of frames of another camera or lens; `limit` as in `light_evidence`."""
     origins = figures.origins

@@ -13,6 +13,7 @@ from acquisition.session.records import FrameRecord
 from calibration.causes.evidence import Evidence
 from calibration.figures.frame_figures import FrameFigures
 from calibration.figures.table_figures import TableFigures
+from calibration.sampling.windows import bleed
 
 LEAST_BLOCK = 0.004
 """Deviation of a block beyond noise from which on a frame shows something there: clean frames in the simulated room
@@ -38,6 +39,9 @@ RIM_OFF = -0.005
 
 _LEAST_CELLS = 6
 """Cells of a place for a line through them to mean anything."""
+
+_LEAST_BRIGHT = 4
+"""Cells of a small place from which on light was added if all of them are brighter."""
 
 _BRIGHT_PERCENTILE = 99.0
 """Of the cells' levels, what is taken for paper white."""
@@ -115,6 +119,52 @@ def block_evidence(figures: TableFigures, worst: FrameFigures, limit: float, sof
     return Gathered(evidence, tuple(frame.record for frame in frames), (place,))
 
 
+def disturbed_evidence(figures: TableFigures, softer: float) -> Gathered | None:
+    """Return what is known of the cells that something small covers in lights' frames; None where there are none.
+
+    Parameters
+    ----------
+    figures
+        What was measured.
+    softer
+        Light of neighbouring cells added by the worst frame's blur, a share.
+    """
+    lights = [frame for frame in figures.frames if frame.record.kind == "light" and frame.consistency.disturbed]
+    if not lights:
+        return None
+    lights.sort(key=lambda frame: -len(frame.consistency.disturbed))
+    worst, stains, first = lights[0], figures.cells.stains, figures.registered_frame
+    cells = np.array([cell for cell, _ in worst.consistency.disturbed], dtype=np.int64)
+    off = np.array([off for _, off in worst.consistency.disturbed])
+    others = [frame for frame in figures.frames if frame is not first]
+    whites = [frame for frame in others if frame.record.kind == "white"]
+
+    def showing(among: list[FrameFigures]) -> float:
+        same = [any(cell in cells for cell, _ in frame.consistency.disturbed) for frame in among]
+        return sum(same) / max(len(among), 1)
+
+    seen = off[off != 0]
+    darker = seen[seen < 0]
+    # Few cells that are brighter may be dark ones that a hand covers.
+    deviation = float(darker.min()) if len(darker) else float(np.median(seen)) if len(seen) >= _LEAST_BRIGHT else np.nan
+    evidence = Evidence(
+        frames=float(len(others)),
+        showing=showing(others),
+        even_showing=showing(whites),
+        in_first=float(showing(others) >= IN_FIRST),
+        spot=float((stains.stained | stains.doubtful)[cells].mean()) if stains.known else np.nan,
+        share=len(cells) / len(stains.places_mm),
+        deviation=deviation,
+        scatter=worst.consistency.scatter,
+        softer=softer,
+    )
+    places: list[PrintPlace] = []
+    for frame in lights[:MOST_PLACES]:
+        own = np.array([cell for cell, _ in frame.consistency.disturbed], dtype=np.int64)
+        places += [_place_of(stains, spot, frame.record.file) for spot in _joined(stains, own)]
+    return Gathered(evidence, tuple(frame.record for frame in lights), tuple(places[:MOST_PLACES]))
+
+
 def print_evidence(figures: TableFigures, figure: str) -> Gathered | None:
     """Return what is known of the print's largest spot, of unfit cells, or of what the field leaves.
 
@@ -137,8 +187,11 @@ def print_evidence(figures: TableFigures, figure: str) -> Gathered | None:
             file = figures.registered_frame.record.file
             points = stains.places_mm[colours[[kind == common for kind in kinds]]][:MOST_PLACES].tolist()
             places = tuple(PrintPlace(file, x, y, 0.0) for x, y in points)
+            if common == "disturbed" and (covered := disturbed_evidence(figures, 0.0)) is not None:
+                return covered
             if common != "covered":
-                return Gathered(Evidence(hot=hot), (), places)
+                known = lens_evidence(figures) | {"misplaced": kinds.count("misplaced") / len(kinds), "hot": hot}
+                return Gathered(Evidence(**known), (), places)
             known, lying = reference_evidence(figures, figures.registered_frame)
             frames = (figures.registered_frame.record,) if known else ()
             return Gathered(Evidence(**known | {"hot": hot}), frames, lying or places)
@@ -151,13 +204,31 @@ def print_evidence(figures: TableFigures, figure: str) -> Gathered | None:
     return replace(gathered, places=(*gathered.places, *more))
 
 
+def lens_evidence(figures: TableFigures) -> dict[str, float]:
+    """Return what is known of what the lens brings into cells, and of the sheet's flatness, by `Evidence`'s names."""
+    registration, unfit = figures.registration, figures.cells.unfit
+    # Of sharp cores alone it is what the blur gives.
+    core = bleed(registration.cell_px, registration.blur_px, figures.cells.window)
+    known = {
+        "waves_px": registration.lens_residual_px / registration.clearance,
+        "beyond_cell": core + figures.lens.beyond_cell,
+    }
+    if unfit:
+        known["uneven"] = sum(cell.cause.startswith("uneven") for cell in unfit) / len(unfit)
+    return known
+
+
 def spots_of(stains: Stains) -> list[npt.NDArray[np.int64]]:
     """Return the cells (N,) int64 of each spot of deviating cells, the largest first."""
+    return _joined(stains, np.flatnonzero(stains.stained | stains.doubtful))
+
+
+def _joined(stains: Stains, cells: npt.NDArray[np.int64]) -> list[npt.NDArray[np.int64]]:
+    """Return cells (N,) in groups of those that lie next to each other, the largest first."""
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
     from scipy.spatial import cKDTree
 
-    cells = np.flatnonzero(stains.stained | stains.doubtful)
     if not len(cells):
         return []
     places = stains.places_mm[cells]

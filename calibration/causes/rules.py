@@ -19,6 +19,7 @@ from dataclasses import dataclass
 from calibration.causes.cause import (
     ANOTHER_PRINT,
     BUMP,
+    CURL,
     DEFOCUS,
     FALL_OFF,
     HOT_PHOTOSITES,
@@ -26,8 +27,10 @@ from calibration.causes.cause import (
     OTHER_CAMERA,
     OTHER_EXPOSURE,
     REFLECTION,
+    REFLECTION_IN_FRAME,
     ROOM_LIGHT,
     SHADOW,
+    SPREAD,
     STAIN,
     UNKNOWN,
     VEIL,
@@ -78,7 +81,8 @@ class Rule:
         return figure in self.figures and all(condition.holds(evidence) for condition in self.conditions)
 
 
-PLACE = frozenset({"unlike_block"})
+PLACE = frozenset({"unlike_block", "disturbed_cells"})
+COVERED = frozenset({"disturbed_cells", "unfit_share"})
 ALL_CELLS = frozenset({"unlike_scatter", "softer_bleed", "moved_anew", "noisy_share"})
 PRINT = frozenset({"doubtful_share", "unfit_share", "reference_spread"})
 FOUND = frozenset({"agreement", "blocks_good", "tags_found"})
@@ -98,6 +102,11 @@ _IN_ALL_FRAMES = (
 
 _SHARP_PLACE = (Condition("share", 0, 0.5), Condition("scatter", 0, 0.1), Condition("softer", -_FAR, 0.003))
 """What is off lies at one place, and the rest of the frame is as sharp as before."""
+
+_IN_FEW_FRAMES = (
+    Condition("in_first", 0, 0), Condition("frames", 3, _FAR), Condition("showing", 1e-9, 0.34),
+)  # fmt: skip
+"""A place is off in few of the frames, and not in the one that they are compared with."""
 
 RULES: tuple[Rule, ...] = (
     Rule(
@@ -205,24 +214,41 @@ RULES: tuple[Rule, ...] = (
         OBJECT_IN_FRAME,
         PLACE | SHEET | DRIFT,
         (
-            Condition("in_first", 0, 0),
-            Condition("frames", 3, _FAR),
-            Condition("showing", 1e-9, 0.34),
+            *_IN_FEW_FRAMES,
             Condition("even_showing", 1e-9, 1),
             *_SHARP_PLACE,
         ),
         "one place is off in few frames, a white one among them, and as it should be in the others",
     ),
     Rule(
-        OBJECT_IN_FRAME,
+        REFLECTION_IN_FRAME,
         PLACE,
         (
-            Condition("in_first", 0, 0),
-            Condition("frames", 3, _FAR),
-            Condition("showing", 1e-9, 0.34),
+            *_IN_FEW_FRAMES,
             Condition("spot", 0, 0.1),
+            Condition("deviation", 0, _FAR),
+            Condition("added", 0.004, _FAR),
+            Condition("kept", 0.9, 1.1),
             *_SHARP_PLACE,
         ),
+        "in few frames light is added at one place, and the cells keep their own",
+    ),
+    Rule(
+        REFLECTION_IN_FRAME,
+        COVERED,
+        (*_IN_FEW_FRAMES, Condition("spot", 0, 0.1), Condition("deviation", 1e-9, _FAR), *_SHARP_PLACE),
+        "in few frames some cells next to each other are brighter, and none darker",
+    ),
+    Rule(
+        OBJECT_IN_FRAME,
+        frozenset({"unlike_block"}),
+        (*_IN_FEW_FRAMES, Condition("spot", 0, 0.1), Condition("kept", -_FAR, 0.85), *_SHARP_PLACE),
+        "in few frames cells of one place have light of their own colours less, and all alike",
+    ),
+    Rule(
+        OBJECT_IN_FRAME,
+        PLACE | COVERED,
+        (*_IN_FEW_FRAMES, Condition("spot", 0, 0.1), Condition("deviation", -1, 0), *_SHARP_PLACE),
         "one place is off in few frames, and as it should be in the others and under white",
     ),
     Rule(
@@ -280,6 +306,18 @@ RULES: tuple[Rule, ...] = (
         "a place is darker in all frames, in proportion to its light, in all colours alike",
     ),
     Rule(
+        CURL,
+        frozenset({"unfit_share"}),
+        (Condition("misplaced", 0.5, 1), Condition("waves_px", 0.3, _FAR)),
+        "most of the cells concerned lie where their places are not known well enough, and tags lie beside a plane",
+    ),
+    Rule(
+        SPREAD,
+        frozenset({"unfit_share", "noisy_share", "bleed"}),
+        (Condition("beyond_cell", 0.01, _FAR), Condition("uneven", 0.5, 1)),
+        "rim and middle of cells differ, and the print shows that the lens brings light from beyond them",
+    ),
+    Rule(
         VEIL,
         frozenset({"bleed", "correction_residual", "veil"}),
         (Condition("veil", 0.005, _FAR),),
@@ -291,10 +329,19 @@ RULES: tuple[Rule, ...] = (
 
 @dataclass(frozen=True)
 class Decision:
-    """The probable cause of a figure beyond its limit, and the rule that says so; None where it is unknown."""
+    """The probable cause of a figure beyond its limit, and the rule that says so; None where it is unknown.
+
+    Attributes
+    ----------
+    cause, rule
+        As said.
+    follows
+        The figure that the rule explains where it is another one, which this one goes with; "" else.
+    """
 
     cause: Cause
     rule: Rule | None
+    follows: str = ""
 
 
 def decide(figure: str, evidence: Evidence, rules: Collection[Rule] = RULES) -> Decision:

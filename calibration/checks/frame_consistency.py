@@ -9,7 +9,9 @@ is wrong with the frame:
 
 - `scatter`, over all cells: blur mixes neighbours, and another order of cells fits nothing;
 - `block`, the mean over neighbouring cells: a hand, a shadow or a reflection lies in one place. A cell that none of
-  its neighbours is like, as a hot photosite makes it, counts as the one next to it in value.
+  its neighbours is like, as a hot photosite makes it, counts as the one next to it in value;
+- `disturbed`, cells next to each other that are far off: what covers too few of them to move a block's mean
+  (`calibration.checks.small_places`).
 
 What else is known of that place, so that its cause can be told (`calibration.causes`): its colour, how large it is, and
 whether light was added there, as a reflection adds it, or taken in proportion, as a shadow does.
@@ -26,8 +28,9 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial import cKDTree
 
-from acquisition.measures.least_squares import least_absolute_line, least_squares, product
+from acquisition.measures.least_squares import least_absolute_line, least_squares, linear_combinations, product
 from acquisition.measures.polynomials import code_polynomial, code_powers
+from calibration.checks.small_places import LEAST_MODEL_ERROR, SmallPlaces
 from foundation.robust import huber_weights, sigma_of
 
 DEGREE = 4
@@ -37,7 +40,7 @@ LEAST_COUNTS = 60.0
 """Mean of 25 samples that a cell is expected to have for it to be compared: good to 3 %."""
 
 CELLS = 8192
-"""Cells that are compared, at most: a quarter of a full chart, for every frame is compared."""
+"""Cells whose scatter and blocks are compared, at most: a quarter of a full chart, for every frame is compared."""
 
 FIT_CELLS = 1500
 """Cells that the polynomial is fitted on, about: forty for each of its terms."""
@@ -98,6 +101,11 @@ class FrameConsistency:
         Light that these blocks' cells have besides their own, as a share of the brightest cells'.
     kept
         Share of their own light that they have.
+    disturbed
+        Cells that something covers, however few they are, and how far each is off, a share with its sign: of the
+        channel that is off most, 0 where it is too dark to be compared.
+    alone
+        Cells that are far off, and none of their neighbours is.
     """
 
     scatter: float = 0.0
@@ -108,6 +116,8 @@ class FrameConsistency:
     extent_mm: float = 0.0
     added: float = 0.0
     kept: float = 1.0
+    disturbed: tuple[tuple[int, float], ...] = ()
+    alone: tuple[int, ...] = ()
 
     def to_json(self) -> list[Any]:
         """Return the values as JSON can hold them; `from_json` restores them to the last bit."""
@@ -116,18 +126,22 @@ class FrameConsistency:
     @staticmethod
     def from_json(stored: list[Any]) -> FrameConsistency:
         """Return the values of what `to_json` returned."""
-        scatter, block, (x_mm, y_mm), (red, green, blue), share, extent_mm, added, kept = stored
-        return FrameConsistency(scatter, block, (x_mm, y_mm), (red, green, blue), share, extent_mm, added, kept)
+        scatter, block, (x_mm, y_mm), (red, green, blue), share, extent_mm, added, kept, disturbed, alone = stored
+        cells = tuple((int(cell), float(off)) for cell, off in disturbed)
+        place, colour = (x_mm, y_mm), (red, green, blue)
+        return FrameConsistency(scatter, block, place, colour, share, extent_mm, added, kept, cells, tuple(alone))
 
 
 @dataclass(frozen=True, eq=False)
 class _Deviations:
     """What is left of one channel.
 
-    `seen` and `expected` (N,) counts, NaN of cells that are not compared, `scatter` of all cells, and of each block
-    (B,) its `mean` deviation, a share, and how far that is `off` beyond noise.
+    `solution` (K,) of the polynomial. Of the cells compared for blocks `seen` and `expected` (N,) counts, NaN of those
+    that cannot be, `scatter` of all, and of each block (B,) its `mean` deviation, a share, and how far that is `off`
+    beyond noise.
     """
 
+    solution: _Array
     seen: _Array
     expected: _Array
     scatter: float
@@ -170,23 +184,24 @@ class ConsistencyCheck:
         (C, 3) printed codes.
     cells_mm
         (C, 2) places.
-    level
-        (C, 3) float64 mean counts above black in that frame, field divided out.
+    level, variance
+        (C, 3) float64 mean counts above black in that frame, field divided out, and their variance.
     usable
         (C,) bool, cells that are inside the frame and not covered.
-
-    Attributes
-    ----------
-    cells
-        Which cells are compared, every so many of them.
     """
 
-    def __init__(self, rgb: npt.ArrayLike, cells_mm: _Array, level: _Array, usable: _Mask) -> None:
-        self.cells = slice(None, None, max(1, len(cells_mm) // CELLS))
-        terms = code_polynomial(np.asarray(rgb)[self.cells], DEGREE)
-        self._usable = usable[self.cells]
-        self._channels = [_Channel.of(terms, level[self.cells, channel], self._usable) for channel in range(3)]
-        places_mm = cells_mm[self.cells]
+    def __init__(self, rgb: npt.ArrayLike, cells_mm: _Array, level: _Array, variance: _Array, usable: _Mask) -> None:
+        # Blocks are means over many cells: of a full chart every fourth is enough.
+        self._some = slice(None, None, max(1, len(cells_mm) // CELLS))
+        every = code_polynomial(np.asarray(rgb), DEGREE)
+        terms = np.ascontiguousarray(every[self._some])
+        self._usable = usable[self._some]
+        self._channels = [_Channel.of(terms, level[self._some, channel], self._usable) for channel in range(3)]
+        self._basis = np.ascontiguousarray(every.T)
+        self._level = np.where(usable[:, None] & (level > LEAST_COUNTS), level, np.nan).T
+        self._noise2 = (variance / np.maximum(level, 1.0) ** 2).T
+        self._places = SmallPlaces(rgb, cells_mm, usable)
+        places_mm = cells_mm[self._some]
         block, self._middles, self._block_mm2 = _blocks(places_mm)
         self._members = _members(block, len(self._middles))
         self._around = np.atleast_2d(cKDTree(places_mm).query(places_mm, k=min(_AROUND + 1, len(places_mm)))[1])
@@ -197,23 +212,25 @@ class ConsistencyCheck:
         Parameters
         ----------
         mean
-            (N, 3) float64 mean counts above black of `cells`, field divided out.
+            (C, 3) float64 mean counts above black of all cells, field divided out.
         variance
-            (N, 3) float64, of these means.
+            (C, 3) float64, of these means.
         """
-        light = np.median(mean[self._usable], axis=0)
+        some, some_variance = mean[self._some], variance[self._some]
+        light = np.median(some[self._usable], axis=0)
         found = {
-            int(channel): self._of_channel(self._channels[channel], mean[:, channel], variance[:, channel])
+            int(channel): self._of_channel(self._channels[channel], some[:, channel], some_variance[:, channel])
             for channel in np.flatnonzero(light >= 0.2 * light.max())
         }
         known = {channel: one for channel, one in found.items() if one is not None}
         if not known:
             return FrameConsistency()
+        disturbed, alone = self._disturbed(known, mean, variance)
         scatter = max(one.scatter for one in known.values())
         off = np.max([one.off for one in known.values()], axis=0)
         worst = int(np.argmax(off))
         if not off[worst] > 0:
-            return FrameConsistency(scatter)
+            return FrameConsistency(scatter, disturbed=disturbed, alone=alone)
         there = np.flatnonzero(off >= _AS_MUCH * off[worst])
         red, green, blue = (float(known[c].mean[worst]) if c in known else 0.0 for c in range(3))
         x, y = self._middles[worst].tolist()
@@ -227,7 +244,26 @@ class ConsistencyCheck:
             extent_mm=float(np.sqrt(len(there) * self._block_mm2)),
             added=added,
             kept=kept,
+            disturbed=disturbed,
+            alone=alone,
         )
+
+    def _disturbed(
+        self, known: dict[int, _Deviations], mean: _Array, variance: _Array
+    ) -> tuple[tuple[tuple[int, float], ...], tuple[int, ...]]:
+        """Return the cells that something covers, how far each is off, and those that are far off alone."""
+        channels = sorted(known)
+        factors = np.zeros((3, len(self._basis)))
+        for channel in channels:
+            factors[channel] = known[channel].solution
+        with np.errstate(invalid="ignore"):
+            expected = (linear_combinations(self._basis, factors) * self._level)[channels]
+            expected = np.where(expected > LEAST_COUNTS, expected, np.nan)
+        scatter = np.array([[max(known[channel].scatter, LEAST_MODEL_ERROR)] for channel in channels])
+        deviation = mean.T[channels] / expected - 1
+        sigma = np.sqrt(variance.T[channels] / expected**2 + self._noise2[channels] + scatter**2)
+        cells, off, alone = self._places.disturbed(deviation, sigma)
+        return tuple(zip(cells.tolist(), off.round(6).tolist(), strict=True)), tuple(alone.tolist())
 
     def _of_channel(self, known: _Channel, mean: _Array, variance: _Array) -> _Deviations | None:
         if len(known.there) < CELLS_A_TERM * known.terms.shape[1]:
@@ -256,6 +292,7 @@ class ConsistencyCheck:
         off = np.abs(average) - _CERTAIN * np.sqrt(spread2 / np.maximum(count, 1))
         compared = np.isfinite(deviation[:-1])
         return _Deviations(
+            solution=solution,
             seen=np.where(compared, mean, np.nan),
             expected=np.where(compared, expected, np.nan),
             scatter=float(np.sqrt(max(spread2 - noise2, 0))),

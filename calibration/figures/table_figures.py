@@ -17,6 +17,7 @@ from acquisition.measures.stains import Stains
 from calibration.checks.frame_origins import OriginFigures
 from calibration.checks.light_codes import CodeAgreement
 from calibration.checks.stray_light import StrayLight
+from calibration.citation.record import OriginRecord
 from calibration.figures.frame_figures import FrameFigures
 from calibration.figures.linearity_figures import LinearityFigures
 from calibration.radiometry.dark_frames import DarkSummary
@@ -221,6 +222,8 @@ class TableFigures:
         the plan has no light of each alone, or one is too dim.
     lens, point_spread
         What the lens spreads beside its sharp core, and what of it was subtracted; None where it was not measured.
+    origin
+        With what, when and by whom the frames were taken.
     """
 
     session: SessionFigures
@@ -235,6 +238,7 @@ class TableFigures:
     primaries: Primaries | None
     lens: LensFigures
     point_spread: PointSpread | None
+    origin: OriginRecord
 
     @property
     def white_frames(self) -> tuple[FrameFigures, ...]:

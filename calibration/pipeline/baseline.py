@@ -325,6 +325,9 @@ def _baseline(
         # Its references are in the margin, and do not show what light there is in the middle.
         base = field_of_cells(codes, points.cells_mm, level, there, points.whites_mm, whites, chart.page_mm)
     order = MAX_ORDER if chart.tags else MAX_ORDER_AROUND
+    transfer = photon_transfer(level, spread, options.samples)
+    evened = level / base.at(points.cells_mm)
+    variance = transfer.variance(evened) / options.samples
     return Baseline(
         chart=chart,
         points=points,
@@ -334,8 +337,8 @@ def _baseline(
         whites=whites,
         means=np.concatenate([level, references.mean(axis=1, dtype=np.float64)]),
         paper=PaperReader(points.whites_mm, points.cells_mm, chart.page_mm, base, order),
-        transfer=photon_transfer(level, spread, options.samples),
-        consistency_check=ConsistencyCheck(codes, points.cells_mm, level / base.at(points.cells_mm), there),
+        transfer=transfer,
+        consistency_check=ConsistencyCheck(codes, points.cells_mm, evened, variance, there),
     )
 
 

@@ -72,7 +72,7 @@ REPORT_FILES = (REPORT_PAGE, REPORT_JSON)
 CHECKPOINT_EVERY = 16
 """Frames from one checkpoint to the next: what a build that is killed has to do again."""
 
-METHOD = 6
+METHOD = 7
 """Raised when samples or ground truth come out otherwise than before, so that no table is made by two methods."""
 
 _IN_PLACE = Shift(0.0, 0.0, 0.0, 0)
@@ -340,7 +340,7 @@ def _take_in_all(job: _Job, checkpoint: Checkpoint | None) -> _BuildState:
 def _stopped_by(error: FormatError | QualityError, record: FrameRecord, job: _Job) -> FormatError | QualityError:
     """Return why the build ends at a frame, after naming it in a report that `acquire run --retake bad` reads."""
     says = {"format": REPORT_FORMAT, "version": REPORT_VERSION, "verdict": "refuse", "reason": str(error)}
-    says |= {"session": job.session.folder.name, **retake_json((record,), record.sha256)}
+    says |= {"session": job.session.folder.name, **retake_json((record,), record.sha256, job.selected.newest.sha256)}
     write_whole(refused_folder(job.out) / REPORT_JSON, json.dumps(says, indent=2) + "\n")
     return type(error)(f"{error}; or take {record.file} again: {COMMAND}")
 
@@ -424,6 +424,7 @@ def _write_table(work: _BuildState, figures: TableFigures) -> None:
         chart_sha256=session.chart.sha256,
         software=software(),
         unfit=list(figures.cells.unfit),
+        origin=figures.origin,
     )
     per_light = gain[:, None]
     references = references_csv(

@@ -11,6 +11,7 @@ C cells of S samples.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from copy import deepcopy
 from dataclasses import dataclass, replace
 from typing import Any
@@ -23,6 +24,7 @@ from acquisition.chart.model import Chart
 from acquisition.framing.planes import CLIPPING_SHARE
 from acquisition.measures.flat_field import FlatField
 from acquisition.measures.stains import Stains, find_stains
+from calibration.figures.frame_figures import FrameFigures
 from calibration.pipeline.measuring import MeasuredDarkFrame, MeasuredFrame
 from calibration.pipeline.registered_frame import RegisteredFrame
 from calibration.radiometry.dark_frames import DarkFrameFigures, DarkSummary, HotPixels, dark_summary, median_noise
@@ -198,7 +200,7 @@ class CellStatistics:
         level = self.even_sum.mean(axis=1, dtype=np.float64) / max(self.even_frames, 1) / field.at(cells_mm)
         return find_stains(level, cells_mm, self.chart.bits, ~(self.outside | self.covered))
 
-    def unfit(self, saturation_counts: int, stains: Stains) -> tuple[Unfit, ...]:
+    def unfit(self, saturation_counts: int, stains: Stains, frames: Sequence[FrameFigures]) -> tuple[Unfit, ...]:
         """Return the cells not to be used, each with the first cause that applies.
 
         Parameters
@@ -207,11 +209,16 @@ class CellStatistics:
             Raw count of saturation.
         stains
             What `stains` returned.
+        frames
+            Figures of all frames taken in.
         """
-        frames, dark = max(self.even_frames, 1), self.dark_summary()
+        disturbed = disturbed_cells(frames)
+        lit = [(frame.consistency.alone, frame.record.illumination) for frame in frames]
+        alone = {colour: light for cells, light in lit if light is not None for colour in cells}
+        even, dark = max(self.even_frames, 1), self.dark_summary()
         hottest = dark.hottest if len(dark.hottest) else np.zeros(self.chart.colour_count)
-        dead = has_dead_photosite(self.even_sum / frames)
-        uneven = unevenness(self.even_sum / frames, np.sqrt(self.even_noise2) / frames)
+        dead = has_dead_photosite(self.even_sum / even)
+        uneven = unevenness(self.even_sum / even, np.sqrt(self.even_noise2) / even)
         allowed, samples = CLIPPING_SHARE * saturation_counts, self.even_sum.shape[1]
         found: list[Unfit] = []
         for colour in range(self.chart.colour_count):
@@ -227,7 +234,7 @@ class CellStatistics:
             elif self.place_error[colour] > MAX_PLACE_ERROR_PX:
                 cause = (
                     f"misplaced: its place is known to {self.place_error[colour]:.2f} px, {MAX_PLACE_ERROR_PX:g} px "
-                    "allowed (three standard errors); the print is curled or folded there"
+                    "allowed (three standard errors); the print waves there, or little of it is seen"
                 )
             elif stains.stained[colour]:
                 deviation = stains.deviation_of(colour)
@@ -239,9 +246,33 @@ class CellStatistics:
                 cause = "dead: a photosite sees less than half of the light of its cell"
             elif uneven[colour] > 0:
                 cause = f"uneven: rim and middle differ by {uneven[colour]:.1%} under white"
+            elif colour in disturbed:
+                cause = f"disturbed: {_disturbance(disturbed[colour])}"
+            elif colour in alone:
+                cause = f"unlike: under light {alone[colour]} it is far from its code, and its neighbours are not"
             if cause:
                 found.append(Unfit(colour=colour, cause=cause))
         return tuple(found)
+
+
+def disturbed_cells(frames: Sequence[FrameFigures]) -> dict[int, list[tuple[int, float]]]:
+    """Return the lights under which something covered cells, and how far these are off; by the cells' colours.
+
+    White frames' do not count: a table has no samples of them.
+    """
+    found: dict[int, list[tuple[int, float]]] = {}
+    for frame in frames:
+        if frame.record.illumination is not None:
+            for colour, off in frame.consistency.disturbed:
+                found.setdefault(colour, []).append((frame.record.illumination, off))
+    return found
+
+
+def _disturbance(under: list[tuple[int, float]]) -> str:
+    light, off = max(under, key=lambda one: abs(one[1]))
+    more = f" and {len(under) - 1} more" if len(under) > 1 else ""
+    how = f"{abs(off):.1%} {'darker' if off < 0 else 'brighter'} than its code gives" if off else "next to such a cell"
+    return f"under light {light}{more} something covers it and its neighbours; it is {how}"
 
 
 def _place_errors(chart: Chart, registered: RegisteredFrame) -> _Array:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import numpy.typing as npt
@@ -12,6 +13,8 @@ from acquisition.session.folder import Session
 from calibration.checks.frame_origins import origin_figures
 from calibration.checks.light_codes import CodeAgreement, code_agreement
 from calibration.checks.stray_light import StrayLight, stray_light
+from calibration.citation.serial_numbers import with_told_serials
+from calibration.citation.stated import StatedOrigin, origin_record, stated_origin
 from calibration.figures.frame_figures import FrameFigures
 from calibration.figures.linearity_figures import LinearityFigures
 from calibration.figures.table_figures import (
@@ -65,6 +68,7 @@ def table_figures(intake: Intake, taken: IntakeState, camera: str, linearity: Li
         lights=_light_figures(intake, taken, by_light),
         greys=(np.array([frame.greys for frame in by_light]), np.array([frame.grey_errors for frame in by_light])),
         linearity=linearity,
+        stated=_stated(intake),
     )
 
 
@@ -96,7 +100,14 @@ def check_figures(intake: Intake, taken: IntakeState, camera: str, linearity: Li
         lights=lights,
         greys=(frame.greys[None], frame.grey_errors[None]),
         linearity=linearity,
+        stated=_stated(intake),
     )
+
+
+def _stated(intake: Intake) -> StatedOrigin:
+    """Return what session and lab state; what was given for the build stands in place of the session's settings."""
+    stated, given = stated_origin(intake.session), intake.baseline.options.citation
+    return stated if given is None else replace(stated, citation=given)
 
 
 def _session_figures(session: Session, intake: Intake, camera: str, lights: int) -> SessionFigures:
@@ -118,8 +129,10 @@ def _figures(
     lights: LightFigures,
     greys: tuple[_Array, _Array],
     linearity: LinearityFigures | None,
+    stated: StatedOrigin,
 ) -> TableFigures:
     statistics, saturation = taken.statistics, taken.saturation
+    told = with_told_serials([one.origin for one in taken.figures], stated.citation.camera_serial)
     stains = statistics.stains(even.paper.field)
     return TableFigures(
         session=session,
@@ -136,8 +149,9 @@ def _figures(
             linearity=linearity,
         ),
         dark_frames=statistics.dark_summary(),
-        cells=CellFigures(baseline.options.window, statistics.unfit(saturation, stains), stains),
-        origins=origin_figures([(figures.record, figures.origin) for figures in taken.figures]),
+        cells=CellFigures(baseline.options.window, statistics.unfit(saturation, stains, taken.frames), stains),
+        origins=origin_figures([(one.record, origin) for one, origin in zip(taken.figures, told, strict=True)]),
+        origin=origin_record(stated, taken.records, [one.origin for one in taken.figures]),
         primaries=baseline.primaries,
         lens=lens_figures(baseline),
         point_spread=None if baseline.lens is None else baseline.lens.spread,

@@ -247,7 +247,7 @@ def _measured(
     else:
         values, highest = gather_values(decoded.mosaic, decoded.black, grid.cells, shape, of_cells)
         kept = noise = None
-    mean = patch_means(values[baseline.consistency_check.cells])
+    mean = patch_means(values)
     variance = baseline.transfer.variance(mean) / baseline.options.samples
     figures = FrameFigures(
         record=decoded.record,

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
+from acquisition.config import CitationSettings
 from acquisition.framing.corners import Corners
 from calibration.sampling.samples import WINDOW
 from calibration.sampling.windows import WINDOWS
@@ -29,6 +30,8 @@ class BuildOptions:
     lens_correction
         Whether what the lens spreads beside its sharp core is subtracted from samples and ground truth, where the print
         proves that it does.
+    citation
+        What the lab states of the table's origin; None for what the session's settings state. No sample depends on it.
 
     Raises
     ------
@@ -41,6 +44,7 @@ class BuildOptions:
     corners: Corners | None = None
     correct_drift: bool = False
     lens_correction: bool = True
+    citation: CitationSettings | None = None
 
     def __post_init__(self) -> None:
         if self.window not in WINDOWS:
@@ -55,8 +59,10 @@ class BuildOptions:
         return self.window**2
 
     def to_json(self) -> dict[str, Any]:
-        """Return the options as JSON can hold them."""
-        return asdict(self) | {"corners": None if self.corners is None else [list(corner) for corner in self.corners]}
+        """Return the options as JSON can hold them, but for the citation: they are part of what samples depend on."""
+        values = asdict(replace(self, citation=None))
+        del values["citation"]
+        return values | {"corners": None if self.corners is None else [list(corner) for corner in self.corners]}
 
 
 PAPER_OPTIONS = BuildOptions()

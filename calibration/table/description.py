@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from calibration.citation.citing import bibtex
+from calibration.citation.record import origin_lines
 from calibration.table.file_names import FRAMES, SUMS
 from calibration.table.lut import Lut
 from calibration.table.provenance import Provenance
@@ -63,7 +65,8 @@ def describe(lut: Lut) -> list[tuple[str, str]]:
             + "".join(f", {count} {cause}" for cause, count in sorted(causes.items())),
         ),
         ("Corrections", ", ".join(_name(correction) for correction in known.corrections)),
-        ("Software", known.software),
+        *origin_lines(known.origin),
+        ("Built by", known.software),
         ("Frames", frames),
         ("Session", session),
         ("Chart", known.chart_sha256),
@@ -71,6 +74,13 @@ def describe(lut: Lut) -> list[tuple[str, str]]:
         ("Hashes", _hashes(known)),
         ("Table", lut.sha256),
     ]
+
+
+def citation_of(lut: Lut) -> str:
+    """Return a BibTeX entry of a table, with its hash."""
+    known = lut.provenance
+    computed = known.computed is not None
+    return bibtex(known.camera, len(lut.illuminations), known.software, lut.sha256, known.origin, computed)
 
 
 def _name(correction: Mapping[str, Any]) -> str:

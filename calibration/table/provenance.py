@@ -7,6 +7,7 @@ from typing import Annotated, Any, Final, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
+from calibration.citation.record import OriginRecord
 from foundation.errors import FormatError
 
 FORMAT: Final = "crop.lut"
@@ -63,6 +64,9 @@ class Provenance(BaseModel):
     computed
         Where the table was computed from spectra and a model of the sensor and nothing was photographed: by what,
         and with which settings. None where it was made from frames.
+    origin
+        With what, when and by whom the frames were taken, and under which licence the table may be used; None in tables
+        made before it was kept, and in computed ones of which nothing is stated.
     """
 
     model_config = ConfigDict(frozen=True, extra="ignore")
@@ -83,6 +87,7 @@ class Provenance(BaseModel):
     files_sha256: dict[FileName, Sha256] = {}
     has_sums: bool = False
     computed: dict[str, Any] | None = None
+    origin: OriginRecord | None = None
 
     @model_validator(mode="after")
     def _require_colours(self) -> Self:
@@ -93,8 +98,8 @@ class Provenance(BaseModel):
         return self
 
     def to_json(self) -> str:
-        """Return the text of `lut.json`; `computed` stands in it where the table was computed."""
-        left_out = {"computed"} if self.computed is None else set[str]()
+        """Return the text of `lut.json`; `computed` and `origin` stand in it where they are known."""
+        left_out = {name for name in ("computed", "origin") if getattr(self, name) is None}
         return self.model_dump_json(indent=2, exclude=left_out) + "\n"
 
 

@@ -150,6 +150,13 @@ THRESHOLDS: tuple[Threshold, ...] = (
         "see that nobody comes between lamp, print and camera",
     ),
     Threshold(
+        "disturbed_cells", "Cells that something small covers in a light's frame", "", "at most", 0, None,
+        "a fly, a finger or a scrap lay on them, or a glint; they are listed as unfit, and the other cells are not "
+        "touched",
+        SIMULATED + ": none in healthy rooms; two cells next to each other, five standard deviations off, are one",
+        "see that nothing comes between lamp, print and camera",
+    ),
+    Threshold(
         "moved_anew", "Frames registered again", "", "at most", 0, None,
         "the chart or the camera moved between frames; the sampling grid followed", JUDGEMENT, _FIX,
     ),

@@ -79,6 +79,8 @@ def _frame_values(figures: TableFigures) -> dict[str, float]:
     if has_enough_cells(_cell_count(figures)):
         values["unlike_scatter"] = max((frame.consistency.scatter for frame in frames), default=0.0)
         values["unlike_block"] = max((frame.consistency.block for frame in frames), default=0.0)
+        lights = [frame for frame in frames if frame.record.kind == "light"]
+        values["disturbed_cells"] = float(len({cell for one in lights for cell, _ in one.consistency.disturbed}))
     whites = [frame.paper for frame in figures.white_frames]
     if whites:
         values["reference_spread"] = max(float(paper.spread[int(np.argmax(paper.white))]) for paper in whites)

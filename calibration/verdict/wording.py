@@ -33,6 +33,9 @@ _REMEDIES = {
     "hot": "let the camera cool",
     "dead": "have the camera's pixels remapped",
     "stained": "clean the print or print it anew, and light it evenly",
+    "disturbed": "see that nothing comes between lamp, print and camera",
+    "unlike": "look at the cell in the frame of that light",
+    "misplaced": "hang the print flatter",
     "uneven": "focus on the print and keep the camera still",
 }
 """What helps against each cause of unfit cells (`calibration.pipeline.cell_statistics`)."""
@@ -92,7 +95,10 @@ def cause_text(finding: ProbableCause | None) -> str:
         return ""
     if finding.decision.rule is None:
         return "the cause is not known from what was measured; it may help to "
-    return f"probably {finding.decision.cause.says} ({finding.decision.rule.why}); "
+    decision = finding.decision
+    # What it goes with says why.
+    why = "" if decision.follows else f" ({finding.decision.rule.why})"
+    return f"probably {decision.cause.says}{why}; "
 
 
 def _with_place(row: JudgedValue, figures: TableFigures) -> str:

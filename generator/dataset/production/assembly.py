@@ -17,8 +17,11 @@ from typing import Any
 from foundation.errors import FormatError
 from foundation.hashing import HashingWriter
 from foundation.version import software
+from generator.dataset.production.cards.croissant import croissant
+from generator.dataset.production.cards.datasheet import datasheet
+from generator.dataset.production.cards.facts import CARD, COMPLETED_BY_HAND, CROISSANT, DATASHEET
+from generator.dataset.production.cards.hugging_face import card
 from generator.dataset.production.records import (
-    CARD,
     GROUND_TRUTH,
     GROUND_TRUTH_COLUMNS,
     IMAGES,
@@ -86,9 +89,14 @@ class _ListedFile:
         self._writer.write(text.encode())
 
     @property
+    def sha256(self) -> str:
+        """Of what was written so far."""
+        return self._writer.sha256
+
+    @property
     def sum(self) -> str:
         """The file's line in SHA256SUMS."""
-        return f"{self._writer.sha256}  {self.name}\n"
+        return f"{self.sha256}  {self.name}\n"
 
 
 def assemble(place: Workplace, identity: Mapping[str, Any]) -> None:
@@ -111,7 +119,6 @@ def assemble(place: Workplace, identity: Mapping[str, Any]) -> None:
         The disk is full, read-only or gone.
     """
     options = identity["options"]
-    folder = options["layout"] == "folder"
     suffix = suffix_of(options["format"])
     counts: Counter[str] = Counter()
     splits: Counter[str] = Counter()
@@ -182,19 +189,24 @@ def assemble(place: Workplace, identity: Mapping[str, Any]) -> None:
         written = [table, truths, listed, *parts.values()]
         if details is not None:
             written.append(details)
-        if not folder:
-            card = _ListedFile(stack, place.files, CARD)
-            card.write(_card(description))
-            written.append(card)
         for file in written:
             sums.write(file.sum.encode())
         sums.write(f"{hashlib.sha256(text).hexdigest()}  {DESCRIPTION}\n".encode())
+        known = {file.name: file.sha256 for file in written}
+        _write_cards(place, description, known)
     names = [file.name for file in written]
-    place.files.sync([*names, SUMS])
+    place.files.sync([*names, SUMS, *COMPLETED_BY_HAND])
     # In an object store this makes it a dataset, so everything else is there.
     place.files.put(DESCRIPTION, text)
     place.files.sync([DESCRIPTION])
     place.publish()
+
+
+def _write_cards(place: Workplace, description: Description, sums: Mapping[str, str]) -> None:
+    """Write what people and catalogues read of the dataset; its makers complete it, so that no hash is recorded."""
+    texts = {CARD: card(description), DATASHEET: datasheet(description), CROISSANT: croissant(description, sums)}
+    for name, text in texts.items():
+        place.files.put(name, text.encode())
 
 
 def _records(place: Workplace, shards: int) -> Iterator[tuple[ShardRecord, list[SourceRecord], list[Skipped]]]:
@@ -240,22 +252,4 @@ def _source_row(source: SourceRecord) -> str:
 def _image_rows(name: str, source: str, image: ImageRecord) -> str:
     return "".join(
         _row((name, source, light.illumination, *(f"{part:.9f}" for part in light.truth))) for light in image.lights
-    )
-
-
-def _card(description: Description) -> str:
-    """Return what Hugging Face `datasets` reads to find the files of each part, and a person to know what they are."""
-    ending = {"webdataset": "tar", "parquet": "parquet"}[description.options["layout"]]
-    parts = [part for part, images in description.splits.items() if images] or ["data"]
-    files = "".join(
-        f"  - split: {'train' if part == 'data' else part}\n    path: {part}/*.{ending}\n" for part in parts
-    )
-    origin = ""
-    if description.table.computed is not None:
-        origin = " The table behind them was computed from spectra and a model of the sensor, not photographed."
-    return (
-        f"---\nconfigs:\n- config_name: default\n  data_files:\n{files}---\n\n"
-        f"{description.images} raw linear images of the {description.table.camera} with the ground truth of their "
-        f"light, made by {description.software}. Black is 0, saturation {description.table.white_level}; nothing is "
-        f"white balanced.{origin}\n"
     )

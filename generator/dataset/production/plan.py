@@ -242,6 +242,8 @@ def table_of(lut: Lut) -> TableRecord:
         white_level=provenance.white_level,
         software=provenance.software,
         computed=provenance.computed,
+        lights=len(lut.illuminations),
+        origin=provenance.origin,
     )
 
 

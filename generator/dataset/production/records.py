@@ -11,6 +11,7 @@ from typing import Any, Final, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, SerializerFunctionWrapHandler, model_serializer
 
+from calibration.citation.record import OriginRecord
 from generator.files.formats import Format
 
 FORMAT: Final = "crop.dataset"
@@ -24,7 +25,6 @@ SOURCES: Final = "sources.csv"
 SOURCE_COLUMNS: Final = ("position", "name", "sha256", "width", "height", "replaced_pixels", "split", "profile")
 TRUTHS: Final = "gt.txt"
 SUMS: Final = "SHA256SUMS"
-CARD: Final = "README.md"
 
 Triple = tuple[float, float, float]
 Details = dict[str, int | float | str]
@@ -63,7 +63,8 @@ class TableRecord(_RecordWithOptional):
     """The table a dataset was made from; `sha256` as `calibration.table.lut.Lut.sha256`.
 
     `computed` is what the table says of itself where nothing was photographed for it
-    (`calibration.table.provenance.Provenance.computed`).
+    (`calibration.table.provenance.Provenance.computed`), `lights` how many
+    it has, `origin` with what, when and by whom its frames were taken; None where that was not kept.
     """
 
     sha256: str
@@ -73,6 +74,8 @@ class TableRecord(_RecordWithOptional):
     white_level: int = Field(ge=1, le=65535)
     software: str
     computed: dict[str, Any] | None = None
+    lights: int | None = Field(default=None, ge=1)
+    origin: OriginRecord | None = None
 
 
 class Light(_RecordWithOptional):

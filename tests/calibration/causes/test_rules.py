@@ -11,6 +11,7 @@ from calibration.causes.cause import (
     ANOTHER_PRINT,
     BUMP,
     CAUSES,
+    CURL,
     DEFOCUS,
     FALL_OFF,
     HOT_PHOTOSITES,
@@ -18,8 +19,10 @@ from calibration.causes.cause import (
     OTHER_CAMERA,
     OTHER_EXPOSURE,
     REFLECTION,
+    REFLECTION_IN_FRAME,
     ROOM_LIGHT,
     SHADOW,
+    SPREAD,
     STAIN,
     UNKNOWN,
     VEIL,
@@ -40,6 +43,14 @@ LIGHT = Evidence(frames=8, showing=0.125, even_showing=0, in_first=0, spot=0, sc
 CASES: list[tuple[str, Evidence, Cause]] = [
     ("unlike_block", replace(LIGHT, deviation=-0.9, tint=0, added=0, kept=0.1), OBJECT_IN_FRAME),
     ("unlike_block", replace(LIGHT, deviation=0.3, tint=0.1, added=0.3, kept=0), OBJECT_IN_FRAME),
+    # Light beside what the cells have of their own, in one frame.
+    ("unlike_block", replace(LIGHT, deviation=0.08, tint=0.2, added=0.02, kept=1.0), REFLECTION_IN_FRAME),
+    # Between a reflection and a pale hand: both are possible.
+    ("unlike_block", replace(LIGHT, deviation=0.08, tint=0.2, added=0.02, kept=0.87), UNKNOWN),
+    ("disturbed_cells", replace(LIGHT, deviation=-0.3), OBJECT_IN_FRAME),
+    ("disturbed_cells", replace(LIGHT, deviation=0.3), REFLECTION_IN_FRAME),
+    # Two dark cells that are brighter: a glint, or a finger.
+    ("disturbed_cells", replace(LIGHT, deviation=math.nan), UNKNOWN),
     # Half of the frames: something came and stayed, and nobody knows what.
     ("unlike_block", replace(LIGHT, showing=0.5, deviation=-0.2), UNKNOWN),
     ("unlike_block", replace(LIGHT, showing=1, in_first=1, deviation=0.2), OBJECT_IN_FRAME),
@@ -78,6 +89,14 @@ CASES: list[tuple[str, Evidence, Cause]] = [
     ),
     # From one frame nothing can be said of all.
     ("doubtful_share", Evidence(frames=0, deviation=-0.1, tint=0.7, added=0, kept=0.9, share=0.03), UNKNOWN),
+    ("unfit_share", replace(LIGHT, deviation=-0.3), OBJECT_IN_FRAME),
+    ("unfit_share", Evidence(misplaced=0.8, waves_px=0.8, hot=0, uneven=0, beyond_cell=0), CURL),
+    # A flat print: few cells, or dark corners, and no curl.
+    ("unfit_share", Evidence(misplaced=1, waves_px=0.05, hot=0, uneven=0, beyond_cell=0), UNKNOWN),
+    ("unfit_share", Evidence(misplaced=0, waves_px=0.05, hot=0, uneven=0.9, beyond_cell=0.08), SPREAD),
+    ("noisy_share", Evidence(hot=0, uneven=0.9, beyond_cell=0.08), SPREAD),
+    # Uneven cells before a sharp lens are dirt, or a print of dots.
+    ("unfit_share", Evidence(misplaced=0, waves_px=0.05, hot=0, uneven=0.9, beyond_cell=0.001), UNKNOWN),
     ("unfit_share", Evidence(hot=0.9), HOT_PHOTOSITES),
     ("unfit_share", Evidence(hot=0.2), UNKNOWN),
     ("reference_spread", Evidence(frames=4, radial=0.8, rim=-0.02, rim_frames=1, white_residual=1), FALL_OFF),

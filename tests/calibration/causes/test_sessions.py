@@ -18,6 +18,7 @@ from calibration.causes.cause import (
     OBJECT_IN_FRAME,
     OTHER_EXPOSURE,
     REFLECTION,
+    REFLECTION_IN_FRAME,
     ROOM_LIGHT,
     STAIN,
     UNKNOWN,
@@ -31,8 +32,8 @@ from calibration.verdict.thresholds import THRESHOLDS
 from calibration.verdict.wording import remark
 from drivers.presenter import Colour
 from sim.world.room import Room
-from sim.world.situation import Situation
-from tests.calibration.causes.rooms import HAND, Counts, glare, half, nth_white, taken
+from sim.world.situation import Blob, Situation
+from tests.calibration.causes.rooms import BRIGHT, HAND, Counts, glare, half, nth_white, taken
 from tests.calibration.lab import Lab, hang
 
 REMARKING = tuple(replace(limit, refuse=None) for limit in THRESHOLDS)
@@ -78,6 +79,37 @@ def test_a_hand_in_one_frame_is_that_frame_s(which: str, file: str, lab: Lab, tm
     assert told.endswith(
         "take 1 frame again: acquire run LAB.toml SESSION --retake " + ("bad" if "w" in which else "1")
     )
+
+
+def test_what_covers_few_cells_costs_these_cells_and_not_the_table(lab: Lab, tmp_path: Path) -> None:
+    """A fly of two cells' size in one light: with the limits as they are."""
+    fly = Situation(blobs=(Blob((0.5, 0.5, 0.54, 0.56), left=0.4),))
+    light = next(light.index for light in BRIGHT if min(light.codes) > 80)
+    with taken(lab, tmp_path / "session", lambda step: step.illumination == light, situation=fly) as session:
+        result = build(session, tmp_path / "lut")
+    (row,) = (row for row in result.verdict.remarks if row.threshold.name == "disturbed_cells")
+    assert 2 <= row.value <= 12
+    unfit = {cell.colour for cell in result.figures.cells.unfit if cell.cause.startswith("disturbed")}
+    assert len(unfit) == row.value
+    page = np.array(lab.chart.page_mm)
+    places = lab.chart.centres_mm[lab.chart.cell_of_colour]
+    half = np.array(lab.chart.cell_mm) / 2
+    low, high = np.array([0.5, 0.5]) * page, np.array([0.54, 0.56]) * page
+    covered = np.flatnonzero(((places + half > low) & (places - half < high)).all(axis=1))
+    middle = np.flatnonzero(((places > low) & (places < high)).all(axis=1))
+    assert set(middle.tolist()) <= unfit <= set(covered.tolist())
+    finding = findings(result.verdict, result.figures)["disturbed_cells"]
+    assert finding.decision.cause is OBJECT_IN_FRAME
+    assert remark(row, result.figures).endswith(f"acquire run LAB.toml SESSION --retake {light}")
+
+
+def test_a_reflection_in_one_frame_is_no_hand(lab: Lab, tmp_path: Path) -> None:
+    light = next(light.index for light in BRIGHT if min(light.codes) > 80)
+    session = taken(lab, tmp_path / "session", lambda step: step.illumination == light, paint=glare(lab, 0.05, 0.2))
+    result, found = measured(session, tmp_path)
+    assert causes(found) == {REFLECTION_IN_FRAME}
+    assert all(finding.is_known for finding in found.values())
+    assert [frame.illumination for frame in retaken_frames(result.verdict, result.figures)] == [light]
 
 
 @pytest.mark.parametrize("radius", [0.3, 0.12])

@@ -6,6 +6,7 @@ A healthy frame passes half of either limit; noise alone would need five standar
 from __future__ import annotations
 
 import json
+from functools import cache
 
 import numpy as np
 import numpy.typing as npt
@@ -19,13 +20,14 @@ _Array = npt.NDArray[np.float64]
 
 
 class Sheet:
-    """4096 colours at random over a sheet, and what two lights give of them."""
+    """4096 colours at random over a sheet, or another cube of them, and what two lights give of them."""
 
-    def __init__(self, seed: int = 1) -> None:
+    def __init__(self, seed: int = 1, step: int = 16) -> None:
         self.random = np.random.default_rng(seed)
-        self.rgb = np.stack(np.meshgrid(*[np.arange(0, 256, 16)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+        self.rgb = np.stack(np.meshgrid(*[np.arange(0, 256, step)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
         place = self.random.permutation(len(self.rgb))
-        self.places: _Array = 5.0 * np.stack([place % 76, place // 76], axis=-1).astype(np.float64)
+        self.columns = round(1.19 * len(self.rgb) ** 0.5)
+        self.places: _Array = 5.0 * np.stack([place % self.columns, place // self.columns], axis=-1).astype(np.float64)
         inks = (self.rgb / 255) @ np.array([[0.85, 0.1, 0.02], [0.1, 0.8, 0.15], [0.05, 0.1, 0.83]])
         self.paint = 0.04 + 0.9 * inks**2.2
         self.white = 8000 * self.paint
@@ -39,8 +41,16 @@ class Sheet:
 
     def compared(self, true: _Array, usable: npt.NDArray[np.bool_] | None = None) -> FrameConsistency:
         there = np.ones(len(true), dtype=np.bool_) if usable is None else usable
-        expected = ConsistencyCheck(self.rgb, self.places, self.seen(self.white)[0], there)
+        expected = ConsistencyCheck(self.rgb, self.places, *self.seen(self.white), there)
         return expected.compare(*self.seen(true))
+
+
+@cache
+def checked_sheet(step: int) -> tuple[Sheet, ConsistencyCheck]:
+    """Return a sheet, and the check that its first frame makes."""
+    sheet = Sheet(3, step)
+    there = np.ones(len(sheet.rgb), dtype=np.bool_)
+    return sheet, ConsistencyCheck(sheet.rgb, sheet.places, *sheet.seen(sheet.white), there)
 
 
 @pytest.fixture(scope="module")
@@ -121,6 +131,61 @@ def test_one_hot_photosite_is_no_hand(excess: float) -> None:
     assert like.block < 0.5 * LIMITS["unlike_block"].accept
 
 
+@pytest.mark.parametrize("left", [0.05, 0.8])
+@pytest.mark.parametrize("size", [(2, 1), (2, 2), (3, 2)])
+@pytest.mark.parametrize("step", [32, 16, 8])
+def test_what_covers_few_cells_is_listed(step: int, size: tuple[int, int], left: float) -> None:
+    """Of a chart of 512, of 4096 and of 32768 colours; the block's mean says hardly anything of the last."""
+    sheet, check = checked_sheet(step)
+    column, row = (sheet.places / 5.0).T
+    for at in [(3, 4), (9, 2), (11, 12)]:
+        under = (column >= at[0]) & (column < at[0] + size[0]) & (row >= at[1]) & (row < at[1] + size[1])
+        found = check.compare(*sheet.seen(sheet.other * np.where(under, left, 1.0)[:, None])).disturbed
+        assert set(np.flatnonzero(under).tolist()) <= {cell for cell, _ in found}
+        # Cells beside it that are three standard deviations off are not told from those that it touches.
+        assert len(found) <= under.sum() + 6
+        assert all(off < -0.5 * (1 - left) for cell, off in found if under[cell])
+
+
+def test_cells_too_dark_to_compare_are_listed_with_those_that_cover_them() -> None:
+    sheet = Sheet(4)
+    column, row = (sheet.places / 5.0).T
+    under = (column >= 20) & (column < 22) & (row >= 30) & (row < 32)
+    darkest = np.flatnonzero(under)[0]
+    sheet.white[darkest] = sheet.other[darkest] = 5.0
+    assert (int(darkest), 0.0) in sheet.compared(sheet.other * np.where(under, 0.3, 1.0)[:, None]).disturbed
+
+
+@pytest.mark.parametrize("step", [32, 16, 8])
+def test_a_frame_without_anything_has_no_disturbed_cells(step: int) -> None:
+    sheet, check = checked_sheet(step)
+    for level in (1.0, 0.5, 0.2):
+        found = check.compare(*sheet.seen(level * sheet.other))
+        assert not found.disturbed
+        assert not found.alone
+
+
+def test_colours_that_the_polynomial_misses_are_no_place() -> None:
+    """A fold in what the inks give: hundreds of cells are 6 % off, and so are those of codes next to theirs."""
+    sheet = Sheet(7)
+    missed = (sheet.rgb[:, 0] > 176) & (sheet.rgb[:, 2] < 64)
+    like = sheet.compared(sheet.other * np.where(missed, 0.9, 1.0)[:, None])
+    assert missed.sum() > 200
+    assert not like.disturbed
+    assert not like.alone
+
+
+def test_cells_that_stand_alone_are_no_place() -> None:
+    sheet = Sheet(8)
+    seen = sheet.other.copy()
+    column, row = (sheet.places / 5.0).T
+    strewn = (column % 9 == 4) & (row % 13 == 6)
+    seen[strewn] *= 0.7
+    found = sheet.compared(seen)
+    assert not found.disturbed
+    assert set(found.alone) == set(np.flatnonzero(strewn).tolist())
+
+
 def test_what_is_found_is_restored_from_a_checkpoint(sheet: Sheet) -> None:
     like = sheet.compared(sheet.other * np.where(sheet.places[:, :1] < 60, 0.9, 1.0))
     assert FrameConsistency.from_json(json.loads(json.dumps(like.to_json()))) == like
@@ -136,7 +201,9 @@ def test_too_few_cells_say_nothing() -> None:
     """64 cells of two inks that a plane through their codes cannot describe."""
     sheet = Sheet()
     few = np.flatnonzero((sheet.rgb % 80 == 0).all(axis=1))
-    expected = ConsistencyCheck(sheet.rgb[few], sheet.places[few], sheet.white[few], np.ones(len(few), dtype=np.bool_))
+    expected = ConsistencyCheck(
+        sheet.rgb[few], sheet.places[few], *sheet.seen(sheet.white[few]), np.ones(len(few), dtype=np.bool_)
+    )
     assert len(few) == 64
     assert not has_enough_cells(64)
     assert expected.compare(*sheet.seen(sheet.other[few])) == FrameConsistency()

@@ -18,11 +18,11 @@ import numpy as np
 import numpy.typing as npt
 
 from acquisition.judge import limits
-from acquisition.judge.anchor import Anchor
-from acquisition.judge.basis import Basis, FrameLight
-from acquisition.judge.frame import Frame
-from acquisition.judge.measuring import Measured
-from acquisition.judge.response import Codes, ProjectorModel
+from acquisition.judge.known.basis import Basis, FrameLight
+from acquisition.judge.known.response import Codes, ProjectorModel
+from acquisition.judge.measured.anchor import Anchor
+from acquisition.judge.measured.frame import Frame
+from acquisition.judge.measured.measuring import Measured
 from acquisition.session.plan import PRIMARIES, REFERENCES, TOP, SessionStep
 
 RECENT = 6

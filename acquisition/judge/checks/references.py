@@ -10,10 +10,10 @@ import numpy.typing as npt
 
 from acquisition.config import JudgeSettings
 from acquisition.judge import limits
-from acquisition.judge.frame import Frame
-from acquisition.judge.knowledge import Knowledge
-from acquisition.judge.lights import same_light
-from acquisition.judge.measuring import TILE_COLUMNS, TILE_ROWS, Measured
+from acquisition.judge.checks.lights import same_light
+from acquisition.judge.known.knowledge import Knowledge
+from acquisition.judge.measured.frame import Frame
+from acquisition.judge.measured.measuring import TILE_COLUMNS, TILE_ROWS, Measured
 from acquisition.session.judgement import Check
 from acquisition.session.plan import SessionStep
 

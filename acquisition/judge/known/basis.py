@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from acquisition.judge.measuring import SEGMENTS, Measured, Noise, strip_blocks
+from acquisition.judge.measured.measuring import SEGMENTS, Measured, Noise, strip_blocks
 from foundation.robust import huber_weights, sigma_of
 
 _LIT = 0.01

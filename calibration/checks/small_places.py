@@ -1,0 +1,156 @@
+"""What covers a few cells in one frame: a finger's tip, a fly, a scrap of paper.
+
+The mean over a block of cells (`calibration.checks.frame_consistency`) hides what lies on four of them. Here every
+cell of the chart is looked at by itself. A place is disturbed where cells that lie next to each other are far off in
+one frame, since what a polynomial in the code cannot follow is spread over the print as the codes are, at random, and
+a hot photosite stands alone. A cell counts as far off that is
+
+- beyond noise and the model's usual error, and
+- beyond those whose codes are next to its own, so that it is no part of a colour that the model misses.
+
+A cell that stands alone is no hand, but it is not its colour either: where it is off by far more, it is told apart.
+
+How many neighbours are enough follows from how many cells of the frame are far off at all. What touches such a place
+and is off by less, or is too dark to be compared, belongs to it.
+
+A chart whose colours lie in order has its neighbours in code next to each other on the print: there nothing is found.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+
+FAR = 5.0
+"""Standard deviations from which on a cell is far off: noise alone has one in a million comparisons there."""
+
+ALONE = 8.0
+"""Standard deviations from which on a cell that stands alone is not what the print shows elsewhere (chosen: 707 frames
+of a full chart are 70 million comparisons, and no polynomial is exact at the cube's corners)."""
+
+LEAST_ALONE = 0.05
+"""Deviation of such a cell, at least, as a share (chosen)."""
+
+ALSO = 3.0
+"""Standard deviations from which on a cell is part of a place that it touches."""
+
+LEAST_MODEL_ERROR = 0.004
+"""Standard deviation of what a cell's code predicts, at least, as a share: photosites answer to some 0.4 % alike."""
+
+BY_CHANCE = 0.1
+"""Number of places of a size that a frame has by chance, from which on one of that size says nothing (chosen; in frames
+of healthy rooms hardly a cell is far off, and two next to each other need two)."""
+
+_NEXT = 1.6
+"""Distance, in distances of the nearest cell, up to which cells touch: diagonal ones do, 1.41."""
+
+_AROUND = 8
+"""Cells that touch one, at most."""
+
+_ALIKE = 6
+"""Nearest codes that a cell is held against: one step along each axis of a cube of colours, either way."""
+
+_Array = npt.NDArray[np.float64]
+_Index = npt.NDArray[np.int64]
+_Mask = npt.NDArray[np.bool_]
+
+
+class SmallPlaces:
+    """Finds cells that something covers in a frame, from how far each is off.
+
+    Parameters
+    ----------
+    rgb
+        (C, 3) printed codes.
+    cells_mm
+        (C, 2) places.
+    usable
+        (C,) bool, cells that are inside the frame and were not covered from the start.
+    """
+
+    def __init__(self, rgb: npt.ArrayLike, cells_mm: _Array, usable: _Mask) -> None:
+        count = len(cells_mm)
+        found = cKDTree(cells_mm).query(cells_mm, k=min(_AROUND + 1, count))
+        far, near = np.asarray(found[0], dtype=np.float64), np.asarray(found[1], dtype=np.int64)
+        touching = far <= _NEXT * float(np.median(far[:, 1]))
+        touching[:, 0] = False
+        self._one: _Index = np.repeat(np.arange(count, dtype=np.int64), near.shape[1])[touching.ravel()]
+        self._other: _Index = np.asarray(near[touching], dtype=np.int64)
+        codes = np.asarray(rgb, dtype=np.float64)
+        self._alike: _Index = np.asarray(cKDTree(codes).query(codes, k=min(_ALIKE + 1, count))[1])[:, 1:]
+        self._usable = usable
+
+    def disturbed(self, deviation: _Array, sigma: _Array) -> tuple[_Index, _Array, _Index]:
+        """Return the cells (N,) int64 that something covers, ascending, how far each is off (N,), a share, and others.
+
+        The others (M,) int64 are cells that stand alone.
+
+        Parameters
+        ----------
+        deviation
+            (K, C) float64 of each channel that is lit, a share of what the code gives; NaN of cells not compared.
+        sigma
+            (K, C) float64, its standard deviation: noise of both frames, and the model's usual error.
+        """
+        no_cells = np.zeros(0, dtype=np.int64)
+        far = np.abs(deviation) / sigma
+        compared = np.isfinite(far)
+        far = np.where(compared, far, 0.0)
+        candidates = np.flatnonzero((far > FAR).any(axis=0))
+        if not len(candidates):
+            return no_cells, np.zeros(0), no_cells
+        own = deviation[:, candidates]
+        like = np.where(compared, deviation, np.nan)[:, self._alike[candidates]]
+        known = np.asarray(np.isfinite(like).any(axis=2))
+        usual = np.where(known, np.nanmedian(np.where(known[..., None], like, 0.0), axis=2), 0.0)
+        apart = np.abs(own - usual) / sigma[:, candidates]
+        # As far off from its code as from those next to it.
+        certain = np.minimum(np.nan_to_num(apart), far[:, candidates])
+        seeds, alone = np.zeros((2, deviation.shape[1]), dtype=np.bool_)
+        seeds[candidates] = (certain > FAR).any(axis=0)
+        large = np.nan_to_num(np.minimum(np.abs(own), np.abs(own - usual))) > LEAST_ALONE
+        alone[candidates] = ((certain > ALONE) & large).any(axis=0)
+        seeds &= self._usable
+        places = self._places(seeds)
+        found = self._grown(places, self._usable & (far.max(axis=0) > ALSO))
+        # Nothing is known of those that are too dark, so that a place does not grow through them.
+        found |= self._touched(found) & self._usable & ~compared.any(axis=0)
+        cells = np.flatnonzero(found)
+        worst = np.argmax(far[:, cells], axis=0)
+        return cells, np.nan_to_num(deviation[worst, cells]), np.flatnonzero(alone & self._usable & ~found)
+
+    def _places(self, seeds: _Mask) -> _Mask:
+        """Return which of the cells far off (C,) lie at places that chance does not make."""
+        cells = np.flatnonzero(seeds)
+        both = seeds[self._one] & seeds[self._other]
+        count = len(seeds)
+        pairs = (np.ones(int(both.sum())), (self._one[both], self._other[both]))
+        if not len(cells):
+            return seeds
+        label = connected_components(coo_matrix(pairs, shape=(count, count)), directed=False)[1]
+        size = np.bincount(label[cells], minlength=int(label.max()) + 1)[label[cells]]
+        # Of n cells strewn at random, n/2 (8 n / C)^(k - 1) places of k or more are to be expected.
+        by_chance = 0.5 * len(cells) * (_AROUND * len(cells) / count) ** (size - 1.0)
+        kept = np.zeros(count, dtype=np.bool_)
+        kept[cells[(size > 1) & (by_chance < BY_CHANCE)]] = True
+        # Where most of a print is far off, places are as large as it is.
+        largest = cells[size > max(1, len(cells) // 2)]
+        kept[largest] = True
+        return kept
+
+    def _grown(self, places: _Mask, joins: _Mask) -> _Mask:
+        """Return the places with all cells that touch them, directly or by way of others, and may join."""
+        while True:
+            more = self._touched(places) & joins & ~places
+            if not more.any():
+                return places
+            places = places | more
+
+    def _touched(self, places: _Mask) -> _Mask:
+        """Return which cells (C,) touch one of the places."""
+        touched = np.zeros_like(places)
+        touched[self._other[places[self._one]]] = True
+        return touched
