@@ -295,7 +295,9 @@ def _photograph(
     from generator.dataset.production.photographing import photograph
     from generator.kernels.palette import replace_unfit_colours
     from generator.lights.lighting import Lighting, plain
+    from generator.pictures.bits import keep_bits
 
+    picture = keep_bits(picture, rendered.bits)
     if rendered.rendering == "codes":
         picture, _ = replace_unfit_colours(picture, lut.provenance)
     white_level = lut.provenance.white_level
@@ -333,7 +335,7 @@ def _prepared_as(pictures: PictureOptions, made: Mapping[str, Any], place: str) 
         "max_side": made.get("max_side"),
         "crop": None if crop is None else "{}x{}".format(*crop),
         "cover": bool(made.get("cover", False)),
-        "crop_at": made.get("crop_at", "centre"),
+        "crop_at": made.get("crop_at"),
         "profiles": made.get("profiles", "honour"),
         "crops": int(made.get("crops", 1)),
     }
