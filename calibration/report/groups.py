@@ -35,6 +35,7 @@ OF_THRESHOLDS: Final[dict[str, Group]] = {
     ),
     **dict.fromkeys(("linearity", "grey_tint_deg", "brightest_share", "darkest_counts"), "radiometry"),
     **dict.fromkeys(("noise_misfit", "noisy_share"), "noise"),
+    "disturbed_cells": "radiometry",
     **dict.fromkeys(("references_used", "reference_spread", "truth_median_deg", "truth_worst_deg"), "truth"),
 }
 """Group of each limit of `calibration.verdict.thresholds`, by name."""
