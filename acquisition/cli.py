@@ -14,6 +14,7 @@ import typer
 from foundation import console
 from foundation.console import EXIT_CODES, Quiet, Verbose, Version, common_first, new_app, orderly_end
 from foundation.errors import InputError, QualityError, first_of
+from foundation.json_output import JsonOutput, with_json
 
 if TYPE_CHECKING:
     from acquisition.config import LabSettings
@@ -78,6 +79,7 @@ def init(
 
 
 @app.command(epilog=EXIT_CODES)
+@with_json("acquire chart")
 def chart(
     out: Annotated[
         Path, typer.Argument(help="New folder for chart.json, chart.tif, chart.pdf and what goes with them.")
@@ -97,6 +99,8 @@ def chart(
     ] = Arrangement.TAGGED,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the order of the colours.")] = 1,
     tiff: Annotated[bool, typer.Option(help="Write the 600-dpi TIFF.")] = True,
+    *,
+    told: JsonOutput,
 ) -> None:
     """Make the print: every colour once, AprilTags and achromatic references, at true size.
 
@@ -132,6 +136,16 @@ def chart(
         f"on {width:g} × {height:g} mm, cells of {cell} mm"
     )
     small = small_parts_warning(design)
+    told.add(
+        folder=out,
+        colours=design.colour_count,
+        tags=len(design.tags),
+        references=len(design.references),
+        page_mm=design.page_mm,
+        cell_mm=design.cell_mm,
+        chart_sha256=design.sha256,
+        warning=small,
+    )
     if small is not None:
         print(f"warning: {small}", file=sys.stderr)
 
@@ -146,17 +160,22 @@ def _page(text: str | None) -> str | tuple[float, float] | None:
 
 
 @app.command(epilog=EXIT_CODES)
+@with_json("acquire illuminations")
 def illuminations(
     out: Annotated[Path, typer.Argument(help="New CSV file; a plot of the lights is written beside it as .png.")],
     grid: Annotated[int, typer.Option(min=0, max=200, help="Steps along an edge of the chromaticity triangle.")] = 35,
     blackbodies: Annotated[
         str, typer.Option(help="Black bodies as FIRST:LAST:STEP in kelvin, or a list K,K,…; empty for none.")
     ] = "2000:10000:200",
+    *,
+    told: JsonOutput,
 ) -> None:
     """Make the lights: uniformly spread chromaticities and black bodies; 707 by default.
 
     Reads no file. Writes OUT (index, kind, cct_k, red, green, blue) and a plot of the rb-chromaticities beside it.
     """
+    from collections import Counter
+
     from acquisition.lights.illuminations import parse_ccts, plan_illuminations, save_illuminations
     from acquisition.lights.plots import plot_illuminations
     from foundation.files import require_free
@@ -171,15 +190,19 @@ def illuminations(
         raise InputError("no light is left: grid is 0 and there are no black bodies; name some")
     plot_illuminations(lights, plot)
     save_illuminations(lights, out)
+    told.add(file=out, plot=plot, lights=len(lights), kinds=Counter(light.kind for light in lights))
     print(f"{out}: {len(lights)} lights; plot in {plot}")
 
 
 @app.command(epilog=EXIT_CODES)
+@with_json("acquire devices")
 def devices(
     search: Annotated[
         float, typer.Option(min=0, help="Seconds to wait for PJLink projectors to answer; 0 does not ask.")
     ] = 10.0,
     identify: Annotated[bool, typer.Option(help="Show on every display its number for ten seconds.")] = False,
+    *,
+    told: JsonOutput,
 ) -> None:
     """List what is attached and reachable: cameras, serial ports, displays, projectors on the network.
 
@@ -188,6 +211,7 @@ def devices(
     from acquisition.run.rig.attached import attached_devices, identify_displays
 
     for attached in attached_devices(search):
+        told.append("devices", attached)
         print(f"{attached.kind}:")
         for name in attached.found:
             print(f"  {name}")
@@ -198,6 +222,7 @@ def devices(
 
 
 @app.command(epilog=EXIT_CODES)
+@with_json("acquire check")
 def check(
     lab: Annotated[Path, typer.Argument(help="LAB.toml: the settings.")],
     picture: Annotated[
@@ -219,7 +244,8 @@ def check(
     session: Annotated[
         Path | None, typer.Option(help="Where the session will be, for the disk's space; else beside LAB.toml.")
     ] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print the verdicts as JSON.")] = False,
+    *,
+    told: JsonOutput,
 ) -> None:
     """Say whether the lab is ready: a verdict on exposure, light, sharpness, print, sensor, supplies; record nothing.
 
@@ -227,6 +253,8 @@ def check(
     one suits. Each verdict is good, a remark, a fault, or not checked, with its number, limit, reason and remedy.
     Writes nothing unless asked with --picture. Ends with 4 when there is a fault.
     """
+    import json
+
     from acquisition.check.check import CheckOptions, check_lab
     from acquisition.config import load_lab
 
@@ -243,8 +271,8 @@ def check(
     options = CheckOptions(picture, given, linearity, session)
     with orderly_end():
         report = check_lab(settings, options, lambda sentence: print(sentence, file=sys.stderr))
-    if as_json:
-        print(report.to_json())
+    if told.asked:
+        told.add(**json.loads(report.to_json()))
     else:
         for line in report.lines():
             print(line)
@@ -255,6 +283,7 @@ def check(
 
 
 @app.command(epilog=EXIT_CODES)
+@with_json("acquire run")
 def run(
     lab: Annotated[Path, typer.Argument(help="LAB.toml: the settings.")],
     session: Annotated[Path, typer.Argument(help="Session folder: new, or one that was interrupted.")],
@@ -274,6 +303,8 @@ def run(
             "nothing is lit, released, shown or written.",
         ),
     ] = False,
+    *,
+    told: JsonOutput,
 ) -> None:
     """Take the session, or take up one that was interrupted.
 
@@ -287,12 +318,13 @@ def run(
 
     settings = load_lab(lab)
     if dry_run:
-        _print_plan(settings, session, retake)
+        _print_plan(settings, session, retake, told)
         return
     with orderly_end() as ending, Terminal() as shown:
         outcome = run_session(
             settings, session, shown.progress, shown.announce, retake, ending, shown.taken, shown.state
         )
+    told.add(session=session, frames=outcome.total, left=outcome.left, refused=outcome.refused)
     if not outcome.complete:
         raise QualityError(
             f"{outcome.left} of {outcome.total} frames are without an accepted frame; " + "; ".join(outcome.refused)
@@ -300,7 +332,7 @@ def run(
     print(f"{session}: complete, {outcome.total} frames; next: build-lut {session} LUT/")
 
 
-def _print_plan(settings: LabSettings, session: Path, retake: str | None) -> None:
+def _print_plan(settings: LabSettings, session: Path, retake: str | None, told: JsonOutput) -> None:
     from acquisition.run.planning.dry_run import dry_run
     from acquisition.run.planning.text import plan_lines
 
@@ -308,21 +340,33 @@ def _print_plan(settings: LabSettings, session: Path, retake: str | None) -> Non
         raise InputError("a dry run voids nothing; leave --retake out")
     with orderly_end():
         plan = dry_run(settings, session)
+    told.add(
+        session=session,
+        frames=plan.work.left,
+        frame_s=plan.frame_s.value,
+        warm_up_s=plan.warm_up_s,
+        time_s=plan.time_s,
+        needed_bytes=plan.needed_bytes,
+        free_bytes=plan.free_bytes,
+        doubts=plan.doubts,
+        faults=[str(fault) for fault in plan.faults],
+    )
     for line in plan_lines(plan):
         print(line)
     plan.require()
 
 
 @app.command(epilog=EXIT_CODES)
+@with_json("acquire status")
 def status(
     session: Annotated[Path, typer.Argument(help="Session folder.")],
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object, for programs.")] = False,
+    *,
+    told: JsonOutput,
 ) -> None:
     """Show how far a session is, how long it will take, what was measured last, and what was refused.
 
     Reads SESSION, also while it is being taken; writes nothing. Says so when the run was killed.
     """
-    import json
     from datetime import UTC, datetime
 
     from acquisition.monitor.reading import read_session
@@ -332,8 +376,8 @@ def status(
 
     journal_path(session)
     view, now = read_session(session), datetime.now(UTC)
-    if as_json:
-        print(json.dumps(status_json(view, now), indent=2))
+    if told.asked:
+        told.add(**status_json(view, now))
     else:
         print("\n".join(status_lines(view, now)))
     if warning := secrets_warning(session):
@@ -410,12 +454,15 @@ def report(
 
 
 @app.command("import", epilog=EXIT_CODES)
+@with_json("acquire import")
 def import_(
     frames: Annotated[
         Path, typer.Argument(help="CSV of raw files, columns as frames.csv; with illuminations.csv beside.")
     ],
     chart: Annotated[Path, typer.Argument(help="chart.json of the print.")],
     session: Annotated[Path, typer.Argument(help="New session folder.")],
+    *,
+    told: JsonOutput,
 ) -> None:
     """Make a session from raw files taken by other means; every file is copied and judged.
 
@@ -427,6 +474,7 @@ def import_(
 
     with progress("files") as advance:
         imported = import_session(frames, chart, session, advance)
+    told.add(session=session, refused=imported.refused, left=imported.left)
     print(f"{session}: imported; {len(imported.refused)} frames refused")
     for line in imported.refused:
         print(f"  {line}")

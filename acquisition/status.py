@@ -17,6 +17,7 @@ from acquisition.monitor.rows import AttemptView
 from acquisition.session.judgement import Check
 from acquisition.session.progress import duration_text
 from acquisition.session.records import ACCEPTED
+from foundation.errors import counted
 
 LAST = 5
 """Verdicts, and events, that are shown: chosen, a screen has room for them beside the rest."""
@@ -72,6 +73,8 @@ def status_json(view: SessionView, now: datetime) -> dict[str, Any]:
 
 def _state(head: Head) -> str:
     """Return what the run does, without saying it twice."""
+    if head.state == "copy":
+        return head.sentence
     if not head.sentence or head.sentence.startswith(head.state):
         return head.sentence or head.state
     return f"{head.state}: {head.sentence}"
@@ -82,7 +85,8 @@ def _left(head: Head) -> str:
     if head.done == head.total:
         return "nothing"
     if not head.alive:
-        return f"{head.total - head.done} frames; no run is at work"
+        at_work = "this copy gets none" if head.state == "copy" else "no run is at work"
+        return f"{counted(head.total - head.done, 'frame')}; {at_work}"
     ready = f", ready at {head.eta.astimezone():%H:%M}" if head.eta is not None else ""
     return f"{duration_text(head.remaining_s)}{ready}"
 

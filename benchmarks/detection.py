@@ -14,6 +14,7 @@ from __future__ import annotations
 import argparse
 import copy
 import itertools
+import re
 import sys
 import tempfile
 import time
@@ -32,7 +33,7 @@ from acquisition.chart.model import Chart
 from acquisition.config import LabSettings, parse_lab
 from acquisition.judge import limits
 from acquisition.judge.judge import LiveJudge
-from acquisition.judge.response import ProjectorModel
+from acquisition.judge.known.response import ProjectorModel
 from acquisition.lights.illuminations import Illumination, plan_illuminations
 from acquisition.run.rig.simulated import sheet
 from acquisition.session.judgement import Judgement
@@ -144,12 +145,15 @@ def lab_of(
 
 # Detection
 
-LIGHT, ANY, LIT = "lights", "any", "lit"
+LIGHT, ANY, LIT, TWO_COLOURED = "lights", "any", "lit", "lights with more of red than of blue, or less"
 
 
 @dataclass(frozen=True)
 class Trial:
-    """A disturbance: its size, how it is made, whether it stays, and at which frames it is tried."""
+    """A disturbance: its size, how it is made, whether it stays, and at which frames it is tried.
+
+    `NAMED` has what a sentence must say to have named its cause.
+    """
 
     name: str
     size: str
@@ -157,6 +161,10 @@ class Trial:
     stays: bool = True
     at: str = LIGHT
     special: str = ""
+
+    def is_named_in(self, reason: str) -> bool:
+        """Return whether the reason of a refusal says what was done."""
+        return re.search(NAMED[self.name], reason) is not None
 
 
 TRIALS = (
@@ -197,17 +205,45 @@ TRIALS = (
     Trial("another camera", "serial number", special="serial", at=ANY),
     Trial("another camera", "model", special="model", at=ANY),
     Trial("another ISO speed", "200", special="iso", at=ANY),
-    Trial("colours exchanged", "red for blue", special="exchanged"),
+    Trial("colours exchanged", "red for blue", at=TWO_COLOURED, special="exchanged"),
 )
+
+
+_ANOTHER_LIGHT = "still seen|another light is seen|not the one ordered"
+_ELSEWHERE = "light from elsewhere|other light fall on the chart|was a lamp or a display switched"
+
+NAMED = {
+    "frozen screen, from a frame on": _ANOTHER_LIGHT,
+    "stale frame": _ANOTHER_LIGHT,
+    "pop-up during the exposure": f"a window cover|{_ANOTHER_LIGHT}",
+    "bump": "the chart has moved|not recognised where it was",
+    "lamp": "the lamp",
+    "light in the room": _ELSEWHERE,
+    "light in the room, warm": _ELSEWHERE,
+    "defocus": "focus",
+    "person": "does somebody or something stand before",
+    "hand": "does somebody or something stand before",
+    "half-changed picture": "only a part of the picture had changed|did only a part of the picture change|"
+    "did only a part of it change|did the picture change during",
+    "late picture": "light of the frame before|is the picture late|did the picture change during",
+    "repeated file": "a frame that it had given before",
+    "zeroed strip": "part of the file was lost",
+    "scrambled rows": "the file was damaged",
+    "another camera": "connect the camera",
+    "another ISO speed": "ISO speed 200",
+    "colours exchanged": _ANOTHER_LIGHT,
+}
+"""What of each disturbance a sentence names; what cannot be told apart by one frame is named with its alternatives."""
 
 
 @dataclass
 class Tally:
-    """How often something was refused at its frame, at the next one, not at all, and by which causes."""
+    """How often something was refused at its frame, at the next one, not at all, with another cause, and by which."""
 
     at_once: int = 0
     next: int = 0
     missed: int = 0
+    misnamed: int = 0
     causes: Counter[str] = field(default_factory=Counter)
 
 
@@ -220,7 +256,9 @@ def steps_of(lab: Lab, at: str, random: np.random.Generator) -> Iterator[Session
     """Yield steps at which a disturbance is tried: lights of the plan, deep blue and red ones, white, black."""
     fixed = [Colour(0, 0, 255), Colour(255, 0, 0), Colour(255, 255, 255), Colour(0, 48, 255)]
     lights = [*fixed, *(lab.plan[int(k)].colour for k in random.permutation(len(lab.plan)))]
-    if at != LIGHT:
+    if at == TWO_COLOURED:
+        lights = [colour for colour in lights if abs(colour.red - colour.blue) > 16]
+    if at in (ANY, LIT):
         yield SessionStep(9000, "white", None, WHITE)
     if at == ANY:
         yield SessionStep(9001, "dark", None, BLACK)
@@ -281,6 +319,10 @@ def detection(labs: Sequence[Lab], tries: int) -> dict[tuple[str, str], Tally]:
                 tally.causes[cause(said) or "(missed)"] += 1
                 if said.accepted:
                     print(f"missed: {trial.name} {trial.size} at {step.kind} {step.colour}", file=sys.stderr)
+                elif not trial.is_named_in(said.reason):
+                    tally.misnamed += 1
+                    where = f"{trial.name} {trial.size} in room {number} at {step.kind} {step.colour}"
+                    print(f"misnamed: {where} after {before}: {said.reason}", file=sys.stderr)
     return table
 
 
@@ -372,11 +414,12 @@ def odd_worlds(folder: Path, lights: int) -> list[tuple[str, int, int, Counter[s
         ("white segment, +60 %", {"projector": with_white_segment(room, 0.6)}),
         ("primaries weaker by up to 2 % after bright ones", {"projector": with_memory(room, 0.02)}),
         ("other light of 1 % that flickers by 3 %", {"flicker": 0.03}),
+        ("white of 650 counts", {"room": replace(room, white_level_share=0.05)}),
         ("lamp −10 % in the session, blue −13 %", {"events": Disturbances((fading,))}),
     ]  # fmt: skip
     found: list[tuple[str, int, int, Counter[str], str]] = []
     for name, more in cases:
-        lab = lab_of(folder, room, **more)
+        lab = lab_of(folder, more.pop("room", room), **more)
         said = lab.session(lights, 12, 3)
         causes = Counter(cause(one) for _, one in said if not one.accepted)
         limit = [c.high for _, one in said[-20:] for c in one.checks if c.name == "light" and c.high is not None]
@@ -437,12 +480,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
             for step, said in lab.session(options.lights, 12, number):
                 if not said.accepted:
                     print(f"room {number}: {step.stem} refused: {said.reason}", file=sys.stderr)
-        print("| disturbance | size | tried | at the frame | at the next | missed | cause named |")
-        print("|---|---|---|---|---|---|---|")
+        print("| disturbance | size | tried | at the frame | at the next | missed | misnamed | causes |")
+        print("|---|---|---|---|---|---|---|---|")
         for (what, size), tally in detection(labs, options.tries).items():
             causes = ", ".join(f"{one} {count}" for one, count in tally.causes.most_common())
             tried = tally.at_once + tally.next + tally.missed
-            print(f"| {what} | {size} | {tried} | {tally.at_once} | {tally.next} | {tally.missed} | {causes} |")
+            counts = f"{tried} | {tally.at_once} | {tally.next} | {tally.missed} | {tally.misnamed}"
+            print(f"| {what} | {size} | {counts} | {causes} |")
         if labs:
             lights, following, which = neighbours(labs[0].judge.knowledge.model, labs[0].plan)
             scatter = labs[0].judge.knowledge.model

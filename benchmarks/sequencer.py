@@ -321,7 +321,7 @@ def measure(
             judge = PassingJudge() if live else ExposureJudge(settings)
             assert take_session(session, devices, settings, judge, tidy).complete
             taken_s, machine_s = clock.monotonic() - begun, time.perf_counter() - machine
-            parts = list(session.journal.timings().values())
+            parts = [details.timings for details in session.journal.details().values()]
     medians = {name: statistics.median(part[name] for part in parts) for name in parts[0]}
     # The first light settles with nothing to hide it; behind the last frame there is no light to settle.
     waits = [max(settle_s, downloading_s) for downloading_s in camera.downloading_s]

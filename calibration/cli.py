@@ -20,7 +20,8 @@ from calibration.table_jobs import (
 )
 from foundation import console
 from foundation.console import EXIT_CODES, Quiet, Verbose, Version, new_app
-from foundation.errors import FormatError, InputError
+from foundation.errors import FormatError, InputError, QualityError
+from foundation.json_output import AsJson, JsonOutput, json_output
 
 if TYPE_CHECKING:
     from acquisition.session.folder import Session
@@ -62,8 +63,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     "--info, --cite, --verify and --match, reads a table and writes nothing. With --publish and --fetch, copies a "
     "table to a store for others and back.\n\n"
     "With --compare A B, says how far two sessions or tables of one chart differ in the lights' colour and brightness "
-    "and in every cell, what noise alone predicts of it, and whether they are the same within noise; --json prints it "
-    "for programs, --out writes a page. The exit code is 0 whatever is found, 2 where the charts differ or no light "
+    "and in every cell, what noise alone predicts of it, and whether they are the same within noise; --out "
+    "writes a page. The exit code is 0 whatever is found, 2 where the charts differ or no light "
     "is in both, 4 where a session makes no table.\n\n" + EXIT_CODES,
 )
 def build_lut(
@@ -200,7 +201,7 @@ def build_lut(
             show_default=False,
         ),
     ] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="With --compare, print the comparison as JSON.")] = False,
+    as_json: AsJson = False,
     out: Annotated[
         Path | None,
         typer.Option(
@@ -285,42 +286,43 @@ def build_lut(
         )
     if expect is not None and fetch is None:
         raise InputError("--expect goes with --fetch; leave it out")
-    told = {"--json": as_json, "--out": out, "--chart": chart}
-    if compare is None and any(told.values()):
-        raise InputError(f"{next(name for name, value in told.items() if value)} goes with --compare; leave it out")
+    beside = {"--out": out, "--chart": chart}
+    if compare is None and any(beside.values()):
+        raise InputError(f"{next(name for name, value in beside.items() if value)} goes with --compare; leave it out")
     if (lut if verify else session if compare or any(reading.values()) else None) is not None:
         raise InputError(f"{given[0]} does not expect {lut or session}; leave it out")
-    if info is not None:
-        print_table(info)
-    elif cite is not None:
-        print_citation(cite)
-    elif verify is not None:
-        verify_table(verify, session)
-    elif match is not None:
-        match_tables(*match)
-    elif publish is not None:
-        publish_table(*publish)
-    elif fetch is not None:
-        fetch_table(*fetch, expect)
-    else:
-        from acquisition.framing.corners import parse_corners
-        from calibration.pipeline.options import BuildOptions
-        from calibration.sampling.samples import WINDOW
+    with json_output("build-lut", as_json) as told:
+        if info is not None:
+            print_table(info, told)
+        elif cite is not None:
+            print_citation(cite, told)
+        elif verify is not None:
+            verify_table(verify, session, told)
+        elif match is not None:
+            match_tables(*match, told)
+        elif publish is not None:
+            publish_table(*publish, told)
+        elif fetch is not None:
+            fetch_table(*fetch, expect, told)
+        else:
+            from acquisition.framing.corners import parse_corners
+            from calibration.pipeline.options import BuildOptions
+            from calibration.sampling.samples import WINDOW
 
-        if picture is not None and not check:
-            raise InputError("--picture goes with --check; a table that is built has its report")
-        places = None if corners is None else parse_corners(corners)
-        samples = WINDOW if window is None else window
-        options = BuildOptions(samples, subtract_dark, places, correct_drift, not no_lens_correction)
-        stated = {"note": note, "licence": licence, "authors": author or None, "camera_serial": serial}
-        changes = {name: value for name, value in stated.items() if value is not None}
-        if compare is not None:
-            told = [name for name in ("--linearity", "--note", "--licence", "--author", "--serial") if made[name]]
-            if told:
-                raise InputError(f"{told[0]} is for one table that is kept; leave it out of --compare")
-            _compare(*compare, options, as_json, out, chart)
-            return
-        _make(session, lut, check, append, options, linearity, picture, changes)
+            if picture is not None and not check:
+                raise InputError("--picture goes with --check; a table that is built has its report")
+            places = None if corners is None else parse_corners(corners)
+            samples = WINDOW if window is None else window
+            options = BuildOptions(samples, subtract_dark, places, correct_drift, not no_lens_correction)
+            stated = {"note": note, "licence": licence, "authors": author or None, "camera_serial": serial}
+            changes = {name: value for name, value in stated.items() if value is not None}
+            if compare is not None:
+                unfit = [name for name in ("--linearity", "--note", "--licence", "--author", "--serial") if made[name]]
+                if unfit:
+                    raise InputError(f"{unfit[0]} is for one table that is kept; leave it out of --compare")
+                _compare(*compare, options, told, out, chart)
+                return
+            _make(session, lut, check, append, options, linearity, picture, changes, told)
 
 
 def _make(
@@ -332,6 +334,7 @@ def _make(
     linearity: Path | None,
     picture: Path | None,
     changes: dict[str, Any],
+    told: JsonOutput,
 ) -> None:
     if check and lut is not None:
         raise InputError(f"--check writes nothing, so a table's folder ({lut}) is not expected; leave one of them out")
@@ -341,22 +344,34 @@ def _make(
 
     if check:
         with Session.open(session) as opened:
-            _check(opened, _with_citation(options, opened, changes), linearity, picture)
+            _check(opened, _with_citation(options, opened, changes), linearity, picture, told)
         return
     if lut is None:
         raise InputError("a folder for the table is expected: build-lut SESSION LUT, or --check to judge only")
-    from calibration.pipeline.build import TableProgress
-    from calibration.table.file_names import REPORT_PAGE
+    import json
 
+    from calibration.pipeline.build import TableProgress, refused_folder
+    from calibration.table.file_names import REPORT_JSON, REPORT_PAGE
+
+    kept = refused_folder(lut) / REPORT_JSON
+    before = kept.stat().st_mtime_ns if kept.is_file() else None
     with Session.open(session) as opened:
-        result = _build(opened, lut, append, _with_citation(options, opened, changes), linearity)
+        try:
+            result = _build(opened, lut, append, _with_citation(options, opened, changes), linearity)
+        except QualityError:
+            # A report of an earlier build says nothing of this one.
+            if told.asked and kept.is_file() and kept.stat().st_mtime_ns != before:
+                told.add(**json.loads(kept.read_text(encoding="utf-8")))
+            raise
     if isinstance(result, TableProgress):
+        told.add(table=lut, progress=result)
         print(
             f"{lut}: {result.lights} of {result.lights_planned} lights, {result.new_frames} frames taken in now, "
             f"{result.frames} in all; run the same command again when more have come"
         )
         return
-    _print_result(result)
+    told.add(table=lut)
+    _print_result(result, told)
     print(f"{lut}: {result.figures.session.lights} lights, {result.figures.session.camera}; see {lut / REPORT_PAGE}")
 
 
@@ -367,14 +382,15 @@ def _with_citation(options: BuildOptions, session: Session, changes: dict[str, A
     return replace(options, citation=with_changes(stated_origin(session).citation, changes)) if changes else options
 
 
-def _check(session: Session, options: BuildOptions, linearity: Path | None, picture: Path | None) -> None:
+def _check(
+    session: Session, options: BuildOptions, linearity: Path | None, picture: Path | None, told: JsonOutput
+) -> None:
     from calibration.pipeline.build import check
 
     result = check(session, options, linearity, picture)
-    _print_result(result)
+    _print_result(result, told)
     if result.verdict.refused:
         from calibration.verdict.wording import refusal
-        from foundation.errors import QualityError
 
         raise QualityError(f"{session.folder}: {refusal(result.verdict, result.figures)}")
     print(f"{session.folder}: the chart is found and is the one expected; a table can be built")
@@ -391,7 +407,7 @@ def _build(
 
 
 def _compare(
-    one: Path, other: Path, options: BuildOptions, as_json: bool, out: Path | None, chart: Path | None
+    one: Path, other: Path, options: BuildOptions, told: JsonOutput, out: Path | None, chart: Path | None
 ) -> None:
     from acquisition.chart.model import load_chart
     from calibration.comparison.comparing import compare
@@ -410,10 +426,8 @@ def _compare(
         drawn = chart_of((one, other)) if chart is None else load_chart(chart)
         if drawn is not None and drawn.sha256 != a.provenance.chart_sha256:
             raise FormatError(f"{chart} is not the chart of {one}; name the chart.json that was printed")
-    if as_json:
-        import json
-
-        print(json.dumps(comparison_json(found), indent=2))
+    if told.asked:
+        told.add(**comparison_json(found))
     else:
         print("\n".join(lines(found)))
     if out is not None:
@@ -422,8 +436,13 @@ def _compare(
         write_comparison(found, out, drawn)
 
 
-def _print_result(result: BuildResult) -> None:
-    """Print the figures that matter most, the remarks, and the verdict."""
+def _print_result(result: BuildResult, told: JsonOutput) -> None:
+    """Print the figures that matter most, the remarks, and the verdict; or add all that `report.json` holds."""
+    if told.asked:
+        from calibration.report.report_json import report_json
+
+        told.add(**report_json(result))
+        return
     from calibration.report.summary import summary
     from calibration.verdict.wording import remark
 

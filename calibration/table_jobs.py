@@ -13,26 +13,38 @@ from foundation.trust.secret_texts import masked, printable
 
 if TYPE_CHECKING:
     from calibration.table.lut import Lut
+    from foundation.json_output import JsonOutput
 
 
-def print_table(folder: Path) -> None:
+def print_table(folder: Path, told: JsonOutput) -> None:
     """Print what a table is and what it was made of, a line each."""
     from calibration.table.description import describe
     from calibration.table.lut import open_lut
 
-    for name, value in describe(open_lut(folder)):
+    lut = open_lut(folder)
+    told.add(
+        table=folder,
+        sha256=lut.sha256,
+        lights=len(lut.white),
+        colours=8**lut.provenance.bits,
+        samples=int(lut.samples.shape[2]),
+        provenance=lut.provenance.model_dump(mode="json"),
+    )
+    for name, value in describe(lut):
         print(f"{name + ':':17}{printable(value)}")
 
 
-def print_citation(folder: Path) -> None:
+def print_citation(folder: Path, told: JsonOutput) -> None:
     """Print a BibTeX entry of a table."""
     from calibration.table.description import citation_of
     from calibration.table.lut import open_lut
 
-    print(printable(citation_of(open_lut(folder))), end="")
+    entry = printable(citation_of(open_lut(folder)))
+    told.add(table=folder, bibtex=entry)
+    print(entry, end="")
 
 
-def verify_table(folder: Path, session: Path | None) -> None:
+def verify_table(folder: Path, session: Path | None, told: JsonOutput) -> None:
     """Hash every byte of a table again, with a session its frames too; a FormatError where anything changed."""
     from calibration.table.lut import open_lut
     from calibration.table.verification import find_faults
@@ -46,6 +58,7 @@ def verify_table(folder: Path, session: Path | None) -> None:
 
         with Session.open(session) as opened, progress_bar("reading the frames") as progress:
             faults += frame_faults(lut, opened, progress)
+    told.add(table=folder, sha256=lut.sha256, frames=None if session is None else len(lut.frames), faults=faults)
     for fault in faults:
         print(fault)
     if faults:
@@ -56,18 +69,19 @@ def verify_table(folder: Path, session: Path | None) -> None:
     print(f"{folder}: every byte is as it was built{frames}")
 
 
-def match_tables(one: Path, other: Path) -> None:
+def match_tables(one: Path, other: Path, told: JsonOutput) -> None:
     """Print that two tables correspond number by number; a FormatError says where they do not."""
     from calibration.table.lut import open_lut
     from calibration.table.verification import require_match
 
     tables = open_lut(one), open_lut(other)
     require_match(*tables)
+    told.add(tables=[one, other], cameras=[table.provenance.camera for table in tables], match=True)
     cameras = " and ".join(table.provenance.camera for table in tables)
     print(f"{one} and {other} ({cameras}): colours and lights correspond number by number")
 
 
-def publish_table(folder: Path, url: str) -> None:
+def publish_table(folder: Path, url: str, told: JsonOutput) -> None:
     """Copy a table to a store, and print how others get it."""
     from calibration.table.lut import open_lut
     from calibration.table.zarr_store import publish
@@ -75,16 +89,18 @@ def publish_table(folder: Path, url: str) -> None:
     lut = open_lut(folder)
     with progress_bar("writing lights") as progress:
         publish(lut, url, lambda done, total: progress(done, total, "writing lights"))
+    told.add(table=folder, url=masked(url), lights=len(lut.samples), sha256=lut.sha256)
     print(f"{masked(url)}: {len(lut.samples)} lights of {folder}; others get them by")
     print(f"build-lut --fetch {masked(url)} LUT --expect {lut.sha256}")
 
 
-def fetch_table(url: str, folder: Path, expect: str | None) -> None:
+def fetch_table(url: str, folder: Path, expect: str | None, told: JsonOutput) -> None:
     """Copy a published table from a store, and print what is known of it."""
     from calibration.table.zarr_store import fetch
 
     with progress_bar("reading lights") as progress:
         lut = fetch(url, folder, lambda done, total: progress(done, total, "reading lights"), expect)
+    told.add(table=folder, url=masked(url), lights=len(lut.samples), sha256=lut.sha256, expected=expect is not None)
     print(f"{folder}: {len(lut.samples)} lights, {printable(lut.provenance.camera)}; {_vouched(lut, expect)}")
 
 

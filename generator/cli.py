@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Final
 
 from foundation.console import EXIT_CODES, new_app, run
 from foundation.errors import InputError
+from foundation.json_output import JsonOutput, json_output
 from foundation.processors import processor_count
 from foundation.trust.secret_texts import masked, printable
 from generator.command.demo_table import table_folder
@@ -73,28 +74,37 @@ def generate(
     _require_alone({"--verify": work.verify, "--finish": work.finish}, places.lut)
     sheet = images.contact_sheet
     if sheet is not None:
-        _check_sheet(sheet, work.verify or work.finish or places.out, work.shard)
-    if work.verify is not None:
-        _draw_sheet(_verify(work.verify, work.workers), work.verify, sheet)
-    elif work.finish is not None:
-        from generator.dataset.making import finish_dataset
+        _check_sheet(sheet, work.verify or work.finish or places.out, work.shard, again=work.verify is None)
+    with json_output("generate", common.as_json) as told:
+        if work.verify is not None:
+            _draw_sheet(_verify(work.verify, work.workers, told), work.verify, sheet)
+        elif work.finish is not None:
+            from generator.dataset.making import finish_dataset
+            from generator.dataset.production.workplace import holds_dataset
 
-        dataset = finish_dataset(work.finish)
-        _print_summary(dataset, work.finish)
-        _draw_sheet(dataset, work.finish, sheet)
-    else:
-        if places.lut is None or places.out is None:
-            raise InputError(
-                "the table and the place of the dataset are missing; write generate LUT OUT --sources DIR, with demo: "
-                "for LUT where you have no table yet"
-            )
-        workers = work.makers()
-        plan = _plan(places.lut, places.out, pictures, light, likeness, rendering, variation, images, work)
-        if work.shard is not None:
-            _make_share(plan, places.out, work.shard, workers)
+            was_there = holds_dataset(work.finish)
+            dataset = finish_dataset(work.finish)
+            _print_summary(dataset, work.finish, told, was_there)
+            _draw_sheet(dataset, work.finish, sheet)
         else:
-            dataset = _make_whole(plan, places.out, workers)
-            _draw_sheet(dataset, places.out, sheet)
+            if places.lut is None or places.out is None:
+                raise InputError(
+                    "the table and the place of the dataset are missing; write generate LUT OUT --sources DIR, with "
+                    "demo: for LUT where you have no table yet"
+                )
+            from generator.dataset.making import made_before
+
+            workers = work.makers()
+            plan = _plan(places.lut, places.out, pictures, light, likeness, rendering, variation, images, work)
+            there = made_before(plan, places.out)
+            if there is not None:
+                _print_summary(there, places.out, told, was_there=True)
+                _draw_sheet(there, places.out, sheet)
+            elif work.shard is not None:
+                _make_share(plan, places.out, work.shard, workers, told)
+            else:
+                dataset = _make_whole(plan, places.out, workers, told)
+                _draw_sheet(dataset, places.out, sheet)
 
 
 def _require_alone(commands: dict[str, str | None], more: Path | None) -> None:
@@ -117,15 +127,16 @@ def _plan(
     images: ImageOptions,
     work: WorkOptions,
 ) -> Plan:
-    """Return the plan of a dataset whose place is free."""
+    """Return the plan of a dataset whose place is free, or holds a dataset, which may be the one planned."""
     from calibration.table.lut import open_lut
     from generator.dataset.production.options import DatasetOptions
     from generator.dataset.production.plan import Plan
-    from generator.dataset.production.workplace import require_free_place
+    from generator.dataset.production.workplace import holds_dataset, require_free_place
 
-    require_free_place(out)
+    if not holds_dataset(out):
+        require_free_place(out)
     table = open_lut(table_folder(lut))
-    rendered = rendering.of(DatasetOptions(), table)
+    rendered = rendering.of(DatasetOptions(bits=images.bits), table)
     chosen = choose(table, likeness, pictures, light, variation, rendered, images.seed, processor_count())
     for line in (*chosen.told, *_tint_caution(table, rendering.rendering)):
         print(line)
@@ -150,18 +161,18 @@ def _tint_caution(table: Lut, rendering: str | None) -> tuple[str, ...]:
     )
 
 
-def _make_whole(plan: Plan, out: str, workers: Workers) -> Dataset:
+def _make_whole(plan: Plan, out: str, workers: Workers, told: JsonOutput) -> Dataset:
     from generator.command.progress import shown_progress
     from generator.dataset.making import make_dataset
 
     _print_cells(plan, range(plan.shards))
     with shown_progress(plan.total) as callbacks:
         dataset = make_dataset(plan, out, workers, callbacks)
-    _print_summary(dataset, out)
+    _print_summary(dataset, out, told)
     return dataset
 
 
-def _make_share(plan: Plan, out: str, shard: str, workers: Workers) -> None:
+def _make_share(plan: Plan, out: str, shard: str, workers: Workers, told: JsonOutput) -> None:
     from generator.command.progress import shown_progress
     from generator.dataset.making import make_share
     from generator.dataset.production.workers import parse_share
@@ -171,6 +182,7 @@ def _make_share(plan: Plan, out: str, shard: str, workers: Workers) -> None:
     _print_cells(plan, shards)
     with shown_progress(sum(map(plan.images_of, shards))) as callbacks:
         done, every = make_share(plan, out, share, workers, callbacks)
+    told.add(dataset=masked(out), shard=shard, shards_done=done, shards=every)
     finish = f"make a dataset of them with generate --finish {out}"
     left = finish if done == every else "others are still to be made"
     print(masked(f"{done} of {every} shards of {out} are done; {left}"))
@@ -182,7 +194,7 @@ def _print_cells(plan: Plan, shards: range) -> None:
         print(line, flush=True)
 
 
-def _print_summary(dataset: Dataset, out: str) -> None:
+def _print_summary(dataset: Dataset, out: str, told: JsonOutput, was_there: bool = False) -> None:
     made = dataset.description
     lights = len({light for entry in dataset.entries for light in entry.lights})
     # A picture that was drawn several times is a source each time; one that was made and not read has no hash.
@@ -190,7 +202,22 @@ def _print_summary(dataset: Dataset, out: str) -> None:
     pictures = _counted(made.sources, "picture")
     if different < made.sources:
         pictures += f", {different} of them different,"
-    print(f"{masked(out)}: {_counted(made.images, 'image')} of {pictures} under {_counted(lights, 'light')}")
+    told.add(
+        dataset=masked(out),
+        made=not was_there,
+        images=made.images,
+        planned=made.planned,
+        pictures=made.sources,
+        different_pictures=different,
+        lights=lights,
+        splits=made.splits,
+        skipped=[skipped.name for skipped in made.skipped],
+        pixels=made.pixels,
+        replaced_pixels=made.replaced_pixels,
+        rendering=None if made.rendering is None else made.rendering.model_dump(mode="json"),
+    )
+    there = ", complete already; nothing was made" if was_there else ""
+    print(f"{masked(out)}: {_counted(made.images, 'image')} of {pictures} under {_counted(lights, 'light')}{there}")
     if made.splits:
         print(", ".join(f"{images} for {part}" for part, images in made.splits.items()))
     if made.skipped:
@@ -213,7 +240,7 @@ def _counted(number: int, thing: str) -> str:
     return f"{number} {thing}{'' if number == 1 else 's'}"
 
 
-def _verify(out: str, workers: int | None) -> Dataset:
+def _verify(out: str, workers: int | None, told: JsonOutput) -> Dataset:
     """Print every fault of a dataset and return it; a QualityError if there is one."""
     from foundation.console import progress
     from foundation.errors import QualityError
@@ -224,22 +251,29 @@ def _verify(out: str, workers: int | None) -> Dataset:
 
     by_default = max(processor_count(), _STORE_READERS if is_remote(out) else 1)
     at_once = Workers(count=by_default if workers is None else workers).count
-    faults = 0
+    faults: list[str] = []
     with progress("files") as shown:
         for fault in file_faults(out, shown, workers=at_once):
             print(printable(fault))
-            faults += 1
+            faults.append(printable(fault))
+    told.add(dataset=masked(out), faults=faults)
     if faults:
         raise QualityError(
-            f"{out} is not as it was made: {_counted(faults, 'fault')}, listed above; make it again, or copy it again"
+            f"{out} is not as it was made: {_counted(len(faults), 'fault')}, listed above; make it again, or copy it "
+            "again"
         )
     dataset = open_dataset(out)
+    told.add(images=dataset.description.images)
     print(f"{masked(out)}: {_counted(dataset.description.images, 'image')}, every file as it was made")
     return dataset
 
 
-def _check_sheet(contact_sheet: Path, out: str | None, shard: str | None) -> None:
-    """Refuse a contact sheet that could not be written when the dataset is made."""
+def _check_sheet(contact_sheet: Path, out: str | None, shard: str | None, again: bool) -> None:
+    """Refuse a contact sheet that could not be written when the dataset is made.
+
+    One that is there is refused unless a dataset is, too, where the command may have made both before.
+    """
+    from generator.dataset.production.workplace import holds_dataset
     from generator.stores.places import is_remote, local_path
 
     if shard is not None:
@@ -252,13 +286,16 @@ def _check_sheet(contact_sheet: Path, out: str | None, shard: str | None) -> Non
         )
     if contact_sheet.suffix.lower() != ".png":
         raise InputError(f"the contact sheet {contact_sheet} is to be a PNG file; let its name end in .png")
-    if contact_sheet.exists():
+    if contact_sheet.exists() and not (again and out and holds_dataset(out)):
         raise InputError(f"{contact_sheet} already exists; name a new file for the contact sheet, or remove it first")
 
 
 def _draw_sheet(dataset: Dataset, out: str, contact_sheet: Path | None) -> None:
     """Write the contact sheet if one is wanted; a StorageError says how to make it from the finished dataset."""
     if contact_sheet is None:
+        return
+    if contact_sheet.exists():
+        print(f"{contact_sheet}: a contact sheet is there already, and stays as it is")
         return
     from foundation.errors import StorageError
     from generator.dataset.contact_sheet import save_contact_sheet

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from foundation.console import EXIT_CODES, orderly_end, progress
+from foundation.json_output import JsonOutput, with_json
 from sim import cli as devices
 from sim.cli import app
 
@@ -42,6 +43,7 @@ def read_print(chart: Path) -> Print:
 
 
 @app.command(epilog=EXIT_CODES)
+@with_json("sim table")
 def table(
     out: Annotated[Path, typer.Argument(metavar="OUT", help="New folder for the table.")],
     camera: Annotated[
@@ -73,6 +75,8 @@ def table(
     threads: Annotated[
         int | None, typer.Option(min=1, help="Lights computed at a time; by default one a processor.")
     ] = None,
+    *,
+    told: JsonOutput,
 ) -> None:
     """Compute a whole table from spectra and the sensor's noise model, without a frame.
 
@@ -90,8 +94,9 @@ def table(
     given = load_settings(settings).changed(seed, {name: value for name, value in changes.items() if value is not None})
     spectra = None if lights is None else read_lights(lights)
     task = table_task(camera, given, str(settings or "the command line"), spectra)
-    with orderly_end(), progress("lights") as told:
-        done = compute_table(task, out, threads or processor_count(), told)
+    with orderly_end(), progress("lights") as shown:
+        done = compute_table(task, out, threads or processor_count(), shown)
+    told.add(table=out, lights=done.lights, colours=done.cells, samples=task.window**2, unfit=done.unfit)
     print(
         f"{out}: computed, {done.lights} lights, {done.cells} colours, {task.window**2} samples each; "
         f"{done.unfit} cells unfit for use"

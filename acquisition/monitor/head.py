@@ -4,19 +4,15 @@ from __future__ import annotations
 
 import shlex
 import statistics
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import datetime, timedelta
 
 from acquisition.monitor.rows import AttemptView
-from acquisition.session.heartbeat import AGAIN, Heartbeat
+from acquisition.session.heartbeat import AGAIN, Heartbeat, SessionPlace
 from acquisition.session.plan import SessionStep
-from acquisition.session.progress import time_left
+from acquisition.session.progress import RECENT, TimedAttempt, time_left
 from acquisition.session.records import ACCEPTED, FAILED, REFUSED, VOIDED
-
-RECENT = 50
-"""Attempts whose median interval stands for the time that a frame takes now: enough that retakes and references do not
-sway it, few enough to follow a change of the settings."""
 
 LAB_CLOCK_S = 600.0
 """How far the lab's clock may be from that of the wall for the end to be told as a time of day; a simulated lab's time
@@ -31,8 +27,9 @@ class Head:
     ----------
     state
         ``running``, ``waiting`` or ``paused`` as the run says it; ``complete``; ``incomplete``: it has ended and frames
-        are left; ``stopped``: killed or power lost; ``unknown``: the journal has no sign of life; ``absent``, ``gone``,
-        ``unreadable``: there is no journal to read, yet, or any more.
+        are left; ``stopped``: killed or power lost; ``copy``: the run's signs of life are those of another folder;
+        ``unknown``: the journal has no sign of life; ``absent``, ``gone``, ``unreadable``: there is no journal to read,
+        yet, or any more.
     sentence
         The same in words, with the remedy behind a semicolon where there is one; empty while there is nothing to say.
     alive
@@ -73,12 +70,13 @@ class Head:
 
 def head_of(
     steps: Sequence[SessionStep],
-    attempts: Collection[AttemptView],
+    attempts: Sequence[AttemptView],
     heartbeat: Heartbeat | None,
     now: datetime,
     *,
     process_alive: bool | None,
     name: str,
+    here: SessionPlace | None = None,
 ) -> Head:
     """Return how a session stands.
 
@@ -96,17 +94,18 @@ def head_of(
         Whether the process that gave it is there; None if that cannot be told.
     name
         The session's folder, for the sentence that says what comes next.
+    here
+        Where it lies; None if that is not known.
     """
     done = {view.step for view in attempts if view.verdict == ACCEPTED} & {step.number for step in steps}
     verdicts = [view.verdict for view in attempts]
-    state, sentence = _state_of(heartbeat, now, process_alive, len(steps) - len(done), len(steps), name)
+    state, sentence = _state_of(heartbeat, now, process_alive, len(steps) - len(done), len(steps), name, here)
     alive = state in ("running", "waiting", "paused")
     pace = _pace(attempts)
     left = len(steps) - len(done)
-    recent = [view for view in list(attempts)[-RECENT:] if view.verdict is not None]
-    gained = sum(view.verdict in (ACCEPTED, VOIDED) for view in recent)
-    remaining = time_left([view.seconds for view in recent if view.seconds is not None], len(recent), gained, left)
-    newest = max((view.started_at for view in attempts), default=None)
+    judged = (view for view in attempts if view.verdict is not None)
+    remaining = time_left((TimedAttempt(view.seconds, view.verdict in (ACCEPTED, VOIDED)) for view in judged), left)
+    newest = next((view.started_at for view in reversed(attempts)), None)
     near = (
         heartbeat is not None
         and newest is not None
@@ -129,18 +128,27 @@ def head_of(
         seconds_per_frame=pace,
         remaining_s=remaining,
         eta=now + timedelta(seconds=remaining) if near and remaining is not None else None,
-        last=max((view.taken_at for view in attempts if view.taken_at is not None), default=None),
+        last=next((view.taken_at for view in reversed(attempts) if view.taken_at is not None), None),
     )
 
 
 def _state_of(
-    heartbeat: Heartbeat | None, now: datetime, process_alive: bool | None, left: int, total: int, name: str
+    heartbeat: Heartbeat | None,
+    now: datetime,
+    process_alive: bool | None,
+    left: int,
+    total: int,
+    name: str,
+    here: SessionPlace | None,
 ) -> tuple[str, str]:
-    over = heartbeat is None or heartbeat.state == "ended" or heartbeat.is_dead(now, process_alive)
+    copied = heartbeat is not None and heartbeat.state != "ended" and heartbeat.is_of(here) is False
+    over = heartbeat is None or heartbeat.state == "ended" or copied or heartbeat.is_dead(now, process_alive)
     if over and total and not left:
         return "complete", f"complete, {total} frames; next: build-lut {shlex.quote(name)} LUT/"
     if heartbeat is None:
         return "unknown", f"{left} of {total} frames are left, and the journal has no sign of life of a run"
+    if copied and here is not None:
+        return "copy", heartbeat.sentence_of_copy(here, process_alive)
     if heartbeat.is_dead(now, process_alive):
         return "stopped", heartbeat.sentence_for(now, process_alive)
     if heartbeat.state == "ended":
@@ -148,7 +156,7 @@ def _state_of(
     return heartbeat.state, heartbeat.sentence
 
 
-def _pace(attempts: Collection[AttemptView]) -> float | None:
+def _pace(attempts: Sequence[AttemptView]) -> float | None:
     """Return the median interval of the newest attempts, seconds."""
-    intervals = [view.seconds for view in list(attempts)[-RECENT:] if view.seconds is not None]
+    intervals = [view.seconds for view in attempts[-RECENT:] if view.seconds is not None]
     return statistics.median(intervals) if intervals else None

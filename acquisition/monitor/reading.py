@@ -12,7 +12,7 @@ from pathlib import Path
 from acquisition.lights.illuminations import Illumination, load_illuminations
 from acquisition.monitor.head import Head, head_of
 from acquisition.monitor.rows import AttemptView, EventView, changed_attempts, events_after, with_seconds
-from acquisition.session.heartbeat import Heartbeat
+from acquisition.session.heartbeat import Heartbeat, SessionPlace
 from acquisition.session.journal import JOURNAL_FILE, Journal
 from acquisition.session.journal_file import open_to_read, reading_error
 from acquisition.session.plan import SessionStep
@@ -41,6 +41,8 @@ class SessionView:
         All of them, oldest first.
     heartbeat
         The newest sign of life; None where there is none.
+    place
+        Where it lies; None if that is not known.
     """
 
     name: str
@@ -51,12 +53,19 @@ class SessionView:
     events: tuple[EventView, ...]
     heartbeat: Heartbeat | None
     given: str = ""
+    place: SessionPlace | None = None
 
     def head(self, now: datetime) -> Head:
         """Return how it stands at the wall clock's `now`; the process that takes it is looked for."""
         alive = self.heartbeat.process.is_alive() if self.heartbeat else None
         return head_of(
-            self.steps, self.attempts, self.heartbeat, now, process_alive=alive, name=self.given or self.name
+            self.steps,
+            self.attempts,
+            self.heartbeat,
+            now,
+            process_alive=alive,
+            name=self.given or self.name,
+            here=self.place,
         )
 
     def whites(self) -> dict[int, tuple[float, float, float] | None]:
@@ -105,7 +114,7 @@ def read_session(folder: Path, before: SessionView | None = None) -> SessionView
             if before is not None and (planned != len(before.steps) or any(one.id > newest for one in before.attempts)):
                 before = None
             known = {view.id: view for view in before.attempts} if before else {}
-            known |= {view.id: view for view in changed_attempts(connection, version > 1, known)}
+            known |= {view.id: view for view in changed_attempts(connection, journal, known)}
             events = before.events if before else ()
             events += events_after(connection, events[-1].id if events else 0)
             steps = before.steps if before else journal.steps()
@@ -115,7 +124,8 @@ def read_session(folder: Path, before: SessionView | None = None) -> SessionView
     starts = [event.at for event in events if event.what == RUN_STARTS]
     attempts = with_seconds([known[number] for number in sorted(known)], starts)
     lights = before.lights if before else _lights_of(folder)
-    return SessionView(folder.resolve().name, steps, lights, records, attempts, events, heartbeat, str(folder))
+    name, place = folder.resolve().name, SessionPlace.of(path)
+    return SessionView(name, steps, lights, records, attempts, events, heartbeat, str(folder), place)
 
 
 def _lights_of(folder: Path) -> tuple[Illumination, ...]:

@@ -6,17 +6,16 @@ that a look at a journal of 800 attempts reads a handful of rows.
 
 from __future__ import annotations
 
+import json
 import sqlite3
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import datetime
 from typing import Any
 
-from acquisition.session.judgement import Check
+from acquisition.session.journal import AMONG, Journal
+from acquisition.session.judgement import AttemptDetails, Check
 from acquisition.session.records import VOIDED
-
-_AT_ONCE = 500
-"""Rows asked for by number in one query; the oldest builds of SQLite take 999 parameters."""
 
 
 @dataclass(frozen=True)
@@ -79,7 +78,7 @@ def events_after(connection: sqlite3.Connection, last: int) -> tuple[EventView, 
 
 
 def changed_attempts(
-    connection: sqlite3.Connection, has_details: bool, known: Mapping[int, AttemptView]
+    connection: sqlite3.Connection, journal: Journal, known: Mapping[int, AttemptView]
 ) -> tuple[AttemptView, ...]:
     """Return the attempts that are new, or may have changed since they were read as `known`; oldest first.
 
@@ -87,8 +86,8 @@ def changed_attempts(
     ----------
     connection
         In a transaction, so that a verdict is never read without its checks.
-    has_details
-        Whether the journal has tables of checks, measurements and timings (version 2).
+    journal
+        The same journal, on this connection.
     known
         By their numbers.
     """
@@ -97,14 +96,13 @@ def changed_attempts(
     stale = {number for number, view in known.items() if view.verdict is None}
     stale |= {number for number in voided if number in known and known[number].verdict != VOIDED}
     numbers = sorted(stale.union(new))
-    views: list[AttemptView] = []
-    for begin in range(0, len(numbers), _AT_ONCE):
-        views += _attempts(connection, has_details, numbers[begin : begin + _AT_ONCE])
-    return tuple(views)
+    return tuple(_attempts(connection, journal, numbers))
 
 
 def with_seconds(views: Sequence[AttemptView], starts: Iterable[datetime]) -> tuple[AttemptView, ...]:
     """Return attempts, oldest first, with the seconds since the one before; none across the start of a run.
+
+    And none where time goes back, as in sessions of older software whose clock was set.
 
     Parameters
     ----------
@@ -116,42 +114,35 @@ def with_seconds(views: Sequence[AttemptView], starts: Iterable[datetime]) -> tu
     for before, view in zip([None, *views], views, strict=False):
         apart = before is None or any(before.started_at < start <= view.started_at for start in begun)
         seconds = None if before is None or apart else (view.started_at - before.started_at).total_seconds()
+        # A clock that was set back between the two says nothing of how long it took.
+        seconds = None if seconds is not None and seconds < 0 else seconds
         timed.append(view if seconds == view.seconds else replace(view, seconds=seconds))
     return tuple(timed)
 
 
-def _attempts(connection: sqlite3.Connection, has_details: bool, numbers: Sequence[int]) -> list[AttemptView]:
-    """Return the attempts of these numbers, with all that is known of them."""
-    among = f"IN ({','.join('?' * len(numbers))})"
-    seen: dict[int, tuple[float, float, float]] = {}
-    checks: dict[int, list[Check]] = {}
-    timings: dict[int, dict[str, float]] = {}
-    if has_details:
-        query = f"SELECT attempt, red, green, blue FROM measurements WHERE red IS NOT NULL AND attempt {among}"
-        seen = {attempt: (red, green, blue) for attempt, red, green, blue in connection.execute(query, numbers)}
-        query = f"SELECT attempt, name, value, low, high, unit, reason FROM checks WHERE attempt {among}"
-        for attempt, *check in connection.execute(f"{query} ORDER BY attempt, position", numbers):
-            checks.setdefault(attempt, []).append(Check(*check))
-        query = f"SELECT attempt, name, seconds FROM timings WHERE attempt {among} ORDER BY rowid"
-        for attempt, name, seconds in connection.execute(query, numbers):
-            timings.setdefault(attempt, {})[name] = seconds
+def _attempts(connection: sqlite3.Connection, journal: Journal, numbers: Sequence[int]) -> list[AttemptView]:
+    """Return the attempts of these numbers, rising, with all that is known of them."""
+    details, nothing = journal.details(numbers), AttemptDetails()
     query = "SELECT id, step, file, started_at, ended_at, taken_at, verdict, reason FROM attempts"
-    return [
-        AttemptView(
-            row[0],
-            row[1],
-            row[2],
-            datetime.fromisoformat(row[3]),
-            _time(row[4]),
-            _time(row[5]),
-            row[6],
-            row[7],
-            seen.get(row[0]),
-            tuple(checks.get(row[0], ())),
-            timings.get(row[0], {}),
+    views: list[AttemptView] = []
+    for row in connection.execute(f"{query} WHERE id {AMONG} ORDER BY id", (json.dumps(numbers),)):
+        known = details.get(row[0], nothing)
+        views.append(
+            AttemptView(
+                row[0],
+                row[1],
+                row[2],
+                datetime.fromisoformat(row[3]),
+                _time(row[4]),
+                _time(row[5]),
+                row[6],
+                row[7],
+                known.seen,
+                known.checks,
+                known.timings,
+            )
         )
-        for row in connection.execute(f"{query} WHERE id {among} ORDER BY id", numbers)
-    ]
+    return views
 
 
 def _time(text: Any) -> datetime | None:

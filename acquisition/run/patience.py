@@ -35,7 +35,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable
-from contextlib import suppress
+from contextlib import AbstractContextManager, nullcontext, suppress
 from typing import Final, Protocol, TypeVar
 
 from acquisition.session.journal_file import HeldJournalError
@@ -95,6 +95,8 @@ class Patience:
         Keeps the other devices awake; called every few seconds. Its `DeviceError` is left to the device's own next use.
     beat
         Told every few seconds of a wait, with the time left in the sentence.
+    breakable
+        Entered for each wait for what fails: nothing has begun then that an end could spoil.
     """
 
     def __init__(
@@ -104,9 +106,11 @@ class Patience:
         report: Report = lambda what, sentence: None,
         idle: Callable[[], None] = lambda: None,
         beat: Beat = lambda state, sentence, within_s: None,
+        breakable: Callable[[], AbstractContextManager[None]] = nullcontext,
     ) -> None:
         self.clock = clock
         self.limit_s = limit_s
+        self.breakable = breakable
         self._tell, self._idle, self._beat = report, idle, beat
         self._untold: list[tuple[str, str]] = []
 
@@ -218,6 +222,10 @@ class Pause:
         CropError
             Patience has ended: the first fault, with what holds now.
         """
+        with self._patience.breakable():
+            self._wait(fault)
+
+    def _wait(self, fault: CropError) -> None:
         patience = self._patience
         now = patience.clock.monotonic()
         again = self._first is not None
@@ -244,9 +252,9 @@ class Pause:
     def over(self) -> None:
         """Say that the run goes on, where it had said that it paused."""
         if self._told:
-            self._patience.report(
-                "resumed", f"{self._name} is ready again after a pause of {duration_text(self.lasted_s)}"
-            )
+            are = "are" if self._name.endswith("s") else "is"
+            lasted = duration_text(self.lasted_s)
+            self._patience.report("resumed", f"{self._name} {are} ready again after a pause of {lasted}")
 
     def _countdown(self, fault: CropError) -> str:
         left = self._patience.limit_s - self.lasted_s

@@ -176,7 +176,12 @@ def _taken(
     """Make the devices ready, and take what is open."""
     clock, journal = devices.clock, session.journal
     patience = Patience(
-        clock, settings.sequence.patience_s, telling.report, lambda: keep_awake(devices.camera), telling.beat
+        clock,
+        settings.sequence.patience_s,
+        telling.report,
+        lambda: keep_awake(devices.camera),
+        telling.beat,
+        ending.at_once,
     )
     for stray in session.set_aside_strays():
         telling.report("stray", f"{stray.name}: complete, but not in the journal; kept, not used")

@@ -16,17 +16,14 @@ from typing import Self
 from acquisition.run.taking.agenda import step_name
 from acquisition.run.taking.pipeline import Taken
 from acquisition.session.judgement import Check, Judgement
-from acquisition.session.progress import duration_text, time_left
-
-REMEMBERED = 25
-"""Frames whose time says how long the rest will take: enough for a median, few enough to follow a change."""
+from acquisition.session.progress import RECENT, TimedAttempt, duration_text, time_left
 
 SHOWN = ("light", "movement", "blur", "white drift", "dark", "ambient", "exposure")
 """Checks that the line about the last frame has, as far as they have a number."""
 
 
 class TimeLeft:
-    """Estimates the time left from the time of the last frames, pauses left out.
+    """Tells the time left by the machine's clock as the page and `acquire status` tell it by the journal's.
 
     Parameters
     ----------
@@ -37,15 +34,12 @@ class TimeLeft:
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock = clock
         self._since: float | None = None
-        self._seconds: deque[float] = deque(maxlen=REMEMBERED)
-        self._accepted: deque[bool] = deque(maxlen=REMEMBERED)
+        self._attempts: deque[TimedAttempt] = deque(maxlen=RECENT)
 
     def taken(self, accepted: bool = True) -> None:
         """Note that a frame was taken now, and whether it counts."""
         now = self._clock()
-        self._accepted.append(accepted)
-        if self._since is not None:
-            self._seconds.append(now - self._since)
+        self._attempts.append(TimedAttempt(None if self._since is None else now - self._since, accepted))
         self._since = now
 
     def paused(self) -> None:
@@ -54,7 +48,7 @@ class TimeLeft:
 
     def left_s(self, frames: int) -> float | None:
         """Return seconds that so many frames will take, retaken ones included; None before the second frame."""
-        return time_left(self._seconds, len(self._accepted), sum(self._accepted), frames)
+        return time_left(self._attempts, frames)
 
 
 def verdict_line(taken: Taken) -> str:

@@ -33,8 +33,8 @@ from drivers.camera import CapturedFrame
 from drivers.presenter import Colour
 from foundation.errors import FormatError, InputError
 from foundation.files import is_partial, reading_error, require_free, storage_error, whole_folder, write_whole
-from foundation.held_folders import held_folder
 from foundation.trust.foreign_folders import require_plain_folder
+from foundation.trust.held_folders import held_folder
 
 FRAME_COLUMNS = ("kind", "illumination", "file", "sha256", "taken_at", "exposure_s", "verdict")
 """Columns of `frames.csv` (docs/formats.md)."""
@@ -327,7 +327,7 @@ class Session:
         accepted = self.journal.accepted_files()
         known = range(len(self.illuminations))
         if selection.strip() == BAD:
-            refused = newest_report(self.folder, {frame.sha256 for frame in self.frames()})
+            refused = newest_report(self.folder, {frame.sha256: frame.attempt for frame in self.frames()})
             if not refused.sha256:
                 raise InputError(
                     f"--retake bad: {refused.report}, the newest report on {self.folder}, names no frame to be taken "

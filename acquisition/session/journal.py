@@ -14,6 +14,7 @@ files are really there.
 
 from __future__ import annotations
 
+import json
 import sqlite3
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager, suppress
@@ -21,7 +22,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from acquisition.session.heartbeat import Heartbeat, Process, RunState
+from acquisition.session.heartbeat import Heartbeat, Process, RunState, SessionPlace
 from acquisition.session.journal_file import (
     JOURNAL_VERSION,
     LockPatience,
@@ -32,7 +33,7 @@ from acquisition.session.journal_file import (
     reading_error,
     writing_error,
 )
-from acquisition.session.judgement import Check, Judgement
+from acquisition.session.judgement import AttemptDetails, Check, Judgement
 from acquisition.session.plan import KINDS, FrameKind, SessionStep
 from acquisition.session.records import (
     ACCEPTED,
@@ -49,6 +50,12 @@ from foundation.errors import FormatError, counted
 
 JOURNAL_FILE = "journal.sqlite"
 """Name of the journal in a session's folder."""
+
+AMONG = "IN (SELECT value FROM json_each(?))"
+"""Condition on numbers that are given as a JSON list, however many there are."""
+
+PLACE = "place"
+"""Key of the record that says which folder the signs of life are given for."""
 
 PATIENCE_S = 600.0
 """How long a write waits for another program's unless the caller says otherwise: as long as a run waits for a device by
@@ -277,8 +284,10 @@ class Journal:
         until
             When the next sign is given at the latest, by the machine's wall clock (not by a simulated lab's time).
         """
-        own, at = Process.own(), datetime.now(UTC)
+        own, at, place = Process.own(), datetime.now(UTC), SessionPlace.of(self._path)
         with self._writing():
+            if place is not None:
+                self._connection.execute("INSERT OR REPLACE INTO records VALUES (?, ?)", (PLACE, place.to_text()))
             self._connection.execute(
                 "INSERT OR REPLACE INTO heartbeat VALUES (1, ?, ?, ?, ?, ?, ?, ?, ?)",
                 (time_text(at), own.pid, own.started, own.host, own.boot, state, sentence, time_text(until)),
@@ -291,7 +300,7 @@ class Journal:
 
     def records(self) -> dict[str, str]:
         """Return what the session was taken with, by key."""
-        return dict(self._newer_rows("SELECT key, text FROM records ORDER BY key"))
+        return dict(self._newer_rows(f"SELECT key, text FROM records WHERE key <> '{PLACE}' ORDER BY key"))
 
     def heartbeat(self) -> Heartbeat | None:
         """Return the newest sign of life; None if none was ever given."""
@@ -299,7 +308,10 @@ class Journal:
         if not rows:
             return None
         at, *process, state, sentence, until = rows[0]
-        return Heartbeat(datetime.fromisoformat(at), Process(*process), state, sentence, datetime.fromisoformat(until))
+        said = self._newer_rows(f"SELECT text FROM records WHERE key = '{PLACE}'")
+        place = SessionPlace.from_text(said[0][0]) if said else None
+        begun, due = datetime.fromisoformat(at), datetime.fromisoformat(until)
+        return Heartbeat(begun, Process(*process), state, sentence, due, place)
 
     def attempts(self) -> list[Attempt]:
         """Return every attempt, oldest first."""
@@ -328,25 +340,36 @@ class Journal:
         rows = self._rows("SELECT at, what, detail FROM events ORDER BY id")
         return [SessionEvent(datetime.fromisoformat(row[0]), row[1], row[2]) for row in rows]
 
-    def checks(self, attempt: int) -> tuple[Check, ...]:
-        """Return what was looked at in an attempt's frame."""
-        return self.all_checks().get(attempt, ())
+    def details(self, attempts: Sequence[int] | None = None) -> dict[int, AttemptDetails]:
+        """Return what is kept of attempts, those of these numbers or all, by number, oldest first; see `begin`.
 
-    def all_checks(self) -> dict[int, tuple[Check, ...]]:
-        """Return what was looked at in each frame, by attempt, oldest first."""
-        found: dict[int, list[Check]] = {}
+        Those of which nothing is kept, as in journals of version 1, are not there.
+        """
+        among, numbers = "", tuple[str, ...]()
+        if attempts is not None:
+            among, numbers = f"AND attempt {AMONG}", (json.dumps(list(attempts)),)
+        seen: dict[int, tuple[float, float, float]] = {
+            attempt: (red, green, blue)
+            for attempt, red, green, blue in self._newer_rows(
+                f"SELECT attempt, red, green, blue FROM measurements WHERE red IS NOT NULL {among}", numbers
+            )
+        }
+        checks: dict[int, list[Check]] = {}
         for attempt, *check in self._newer_rows(
-            "SELECT attempt, name, value, low, high, unit, reason FROM checks ORDER BY attempt, position"
+            "SELECT attempt, name, value, low, high, unit, reason FROM checks"
+            f" WHERE TRUE {among} ORDER BY attempt, position",
+            numbers,
         ):
-            found.setdefault(attempt, []).append(Check(*check))
-        return {attempt: tuple(checks) for attempt, checks in found.items()}
-
-    def seen(self) -> dict[int, tuple[float, float, float]]:
-        """Return the camera RGB of the paper above black that was seen, counts, by attempt, oldest first."""
-        rows = self._newer_rows(
-            "SELECT attempt, red, green, blue FROM measurements WHERE red IS NOT NULL ORDER BY attempt"
-        )
-        return {attempt: (red, green, blue) for attempt, red, green, blue in rows}
+            checks.setdefault(attempt, []).append(Check(*check))
+        timings: dict[int, dict[str, float]] = {}
+        for attempt, name, seconds in self._newer_rows(
+            f"SELECT attempt, name, seconds FROM timings WHERE TRUE {among} ORDER BY rowid", numbers
+        ):
+            timings.setdefault(attempt, {})[name] = seconds
+        return {
+            number: AttemptDetails(seen.get(number), tuple(checks.get(number, ())), timings.get(number, {}))
+            for number in sorted(seen.keys() | checks.keys() | timings.keys())
+        }
 
     def measurements(self) -> Iterator[tuple[SessionStep, int, bytes, bool]]:
         """Return what the judge keeps of each frame, in taking order: step, attempt, bytes, and whether it counts."""
@@ -356,13 +379,6 @@ class Journal:
         ):
             if step in plan and data:
                 yield plan[step], attempt, data, verdict == ACCEPTED
-
-    def timings(self) -> dict[int, dict[str, float]]:
-        """Return the seconds that each part of an attempt took, by attempt, oldest first."""
-        found: dict[int, dict[str, float]] = {}
-        for attempt, name, seconds in self._newer_rows("SELECT attempt, name, seconds FROM timings ORDER BY attempt"):
-            found.setdefault(attempt, {})[name] = seconds
-        return found
 
     def accepted_files(self) -> list[AcceptedFile]:
         """Return every frame that was accepted, oldest first."""
@@ -382,7 +398,7 @@ class Journal:
         Of a step with several accepted frames, as older software could leave them, the newest counts.
         """
         rows = self._rows(
-            "SELECT step, kind, illumination, file, sha256, taken_at, exposure_s, verdict, reason FROM attempts"
+            "SELECT step, kind, illumination, file, sha256, taken_at, exposure_s, verdict, reason, id FROM attempts"
             " WHERE sha256 IS NOT NULL ORDER BY step, id"
         )
         newest = {row[0]: row[3] for row in rows if row[7] == ACCEPTED}
@@ -395,6 +411,7 @@ class Journal:
                 datetime.fromisoformat(row[5]),
                 row[6],
                 _verdict_text(row[7], row[8], newest.get(row[0], row[3]) == row[3]),
+                row[9],
             )
             for row in rows
         ]
@@ -407,9 +424,9 @@ class Journal:
             )
         return kind
 
-    def _newer_rows(self, query: str) -> list[Any]:
+    def _newer_rows(self, query: str, values: tuple[Any, ...] = ()) -> list[Any]:
         """Return rows of a table that journals of version 1 do not have."""
-        return [] if self._version < JOURNAL_VERSION else self._rows(query)
+        return [] if self._version < JOURNAL_VERSION else self._rows(query, values)
 
     def _rows(self, query: str, values: tuple[Any, ...] = ()) -> list[Any]:
         """Return all rows at once, so that nothing is held once they are read."""

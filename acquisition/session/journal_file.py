@@ -453,10 +453,15 @@ def _in_write_ahead(path: Path, connection: sqlite3.Connection, patience: LockPa
 
 def _on_network(path: Path) -> bool:
     """Return whether the file lies on a file system that several machines work on; False where that is not known."""
+    return file_system_of(path) in _NETWORK
+
+
+def file_system_of(path: Path) -> str:
+    """Return the kind of file system that a file lies on, as /proc/self/mounts names it; empty where nobody says."""
     try:
         mounts = [line.split() for line in Path("/proc/self/mounts").read_text().splitlines()]
     except OSError:
-        return False
+        return ""
     place = path.resolve()
     holding = [(len(at), kind) for _, at, kind, *_ in mounts if place.is_relative_to(at.replace("\\040", " "))]
-    return max(holding, default=(0, ""))[1] in _NETWORK
+    return max(holding, default=(0, ""))[1]

@@ -7,7 +7,8 @@ taken up again knows what the frames before looked like.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Protocol, runtime_checkable
 
@@ -94,6 +95,25 @@ class Judgement:
     def reason(self) -> str:
         """The first reason against the frame; empty if it is accepted."""
         return next((check.reason for check in self.checks if check.reason), "")
+
+
+@dataclass(frozen=True)
+class AttemptDetails:
+    """What a journal keeps of an attempt beside its row.
+
+    Attributes
+    ----------
+    seen
+        Camera RGB of the paper above black, counts; None if it was not measured.
+    checks
+        What was looked at, in the judge's order.
+    timings
+        Seconds of each part of it, by name.
+    """
+
+    seen: tuple[float, float, float] | None = None
+    checks: tuple[Check, ...] = ()
+    timings: Mapping[str, float] = field(default_factory=dict[str, float])
 
 
 class FrameJudge(Protocol):

@@ -3,10 +3,24 @@
 from __future__ import annotations
 
 import statistics
-from collections.abc import Collection
+from collections import deque
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+RECENT = 50
+"""Attempts by which the time left is told: enough that retakes and references do not sway their median, few enough to
+follow a change of the settings."""
 
 
-def time_left(intervals: Collection[float], attempts: int, gained: int, left: int) -> float | None:
+@dataclass(frozen=True)
+class TimedAttempt:
+    """How long after the one before an attempt came, seconds, None behind a pause; and whether it gave its frame."""
+
+    seconds: float | None
+    gained: bool
+
+
+def time_left(attempts: Iterable[TimedAttempt], left: int) -> float | None:
     """Return how long the frames that are left will take, seconds; None while that is unknown.
 
     Each frame costs as many attempts as frames have cost lately, retakes and references included; each attempt the
@@ -14,23 +28,25 @@ def time_left(intervals: Collection[float], attempts: int, gained: int, left: in
 
     Parameters
     ----------
-    intervals
-        Seconds from one attempt to the next, of the newest attempts.
-    attempts, gained
-        How many of the newest attempts there are, and how many of them gave a frame that was accepted.
+    attempts
+        Those that are judged, oldest first; the newest `RECENT` count.
     left
         Steps without an accepted frame.
 
     Examples
     --------
-    >>> time_left([5.0, 5.0, 300.0, 5.0], attempts=6, gained=4, left=10)
-    75.0
+    >>> night = [TimedAttempt(seconds, gained=seconds != 7) for seconds in (None, 5, 300, 5, 7, 7)]
+    >>> time_left(night, left=10)
+    105.0
     """
     if not left:
         return 0.0
+    recent = deque(attempts, RECENT)
+    intervals = [attempt.seconds for attempt in recent if attempt.seconds is not None]
+    gained = sum(attempt.gained for attempt in recent)
     if not intervals or not gained:
         return None
-    return statistics.median(intervals) * attempts / gained * left
+    return statistics.median(intervals) * len(recent) / gained * left
 
 
 def duration_text(seconds: float | None) -> str:

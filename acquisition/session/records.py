@@ -30,7 +30,8 @@ class FrameRecord:
     """A frame that counts as taken and judged; the row of `frames.csv`.
 
     `file` is relative to the session's folder; `illumination` is None but for lights; `verdict` is
-    ``accepted`` or ``refused: reason``, also of a frame that was accepted at first.
+    ``accepted`` or ``refused: reason``, also of a frame that was accepted at first; `attempt` is its number in the
+    journal, by which frames are in the order taken whatever a clock said.
     """
 
     kind: FrameKind
@@ -40,6 +41,7 @@ class FrameRecord:
     taken_at: datetime
     exposure_s: float
     verdict: str
+    attempt: int = 0
 
     @property
     def accepted(self) -> bool:

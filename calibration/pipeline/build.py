@@ -340,7 +340,7 @@ def _take_in_all(job: _Job, checkpoint: Checkpoint | None) -> _BuildState:
 def _stopped_by(error: FormatError | QualityError, record: FrameRecord, job: _Job) -> FormatError | QualityError:
     """Return why the build ends at a frame, after naming it in a report that `acquire run --retake bad` reads."""
     says = {"format": REPORT_FORMAT, "version": REPORT_VERSION, "verdict": "refuse", "reason": str(error)}
-    says |= {"session": job.session.folder.name, **retake_json((record,), record.sha256)}
+    says |= {"session": job.session.folder.name, **retake_json((record,), record.sha256, job.selected.newest.sha256)}
     write_whole(refused_folder(job.out) / REPORT_JSON, json.dumps(says, indent=2) + "\n")
     return type(error)(f"{error}; or take {record.file} again: {COMMAND}")
 

@@ -11,8 +11,11 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from datetime import timedelta
 from functools import cached_property
+from itertools import pairwise
+from statistics import median
 
 import numpy as np
 import numpy.typing as npt
@@ -91,6 +94,12 @@ class SelectedFrames:
         """The first frame that is not dark."""
         return next(record for record in self.records if record.kind != "dark")
 
+    @property
+    def newest(self) -> FrameRecord:
+        """The frame that was taken last, dark ones apart."""
+        lit = (record for record in self.records if record.kind != "dark")
+        return max(lit, key=lambda record: record.attempt)
+
     def is_even(self, record: FrameRecord) -> bool:
         """Return whether a frame's samples show how even cells are: the white ones, or the first with any light."""
         return record.kind == "white" or record is self.first_lit
@@ -113,11 +122,31 @@ def select_frames(session: Session) -> SelectedFrames:
     others = [record for record in accepted if record.kind in ("white", "dark")]
     pure = pure_lights(session.illuminations) or ()
     return SelectedFrames(
-        records=tuple(sorted([*last.values(), *others], key=lambda record: (record.taken_at, record.file))),
+        records=_in_order_taken(session, [*last.values(), *others]),
         lights_without=tuple(light.index for light in session.illuminations if light.index not in last),
         registered=_frame_to_register(session, accepted),
         primaries=tuple(last[light] for light in pure) if all(light in last for light in pure) else (),
     )
+
+
+def _in_order_taken(session: Session, records: Sequence[FrameRecord]) -> tuple[FrameRecord, ...]:
+    """Return frames in the order taken, by the journal, with times that go on.
+
+    White frames are interpolated in time: where a clock was set back between two frames (sessions of older software),
+    what follows counts as taken the usual interval later. Frames that were taken by other means have their times alone.
+    """
+    if any(event.what == "import" for event in session.journal.events()):
+        return tuple(sorted(records, key=lambda record: (record.taken_at, record.file)))
+    ordered = sorted(records, key=lambda record: record.attempt)
+    gaps = [after.taken_at - before.taken_at for before, after in pairwise(ordered)]
+    nothing = timedelta(0)
+    forward = [gap.total_seconds() for gap in gaps if gap > nothing]
+    usual = timedelta(seconds=median(forward)) if forward else nothing
+    moved, behind = ordered[:1], timedelta(0)
+    for record, gap in zip(ordered[1:], gaps, strict=True):
+        behind += usual - gap if gap < nothing else nothing
+        moved.append(replace(record, taken_at=record.taken_at + behind))
+    return tuple(moved)
 
 
 def _last_of_each_light(session: Session, accepted: Sequence[FrameRecord]) -> dict[int, FrameRecord]:

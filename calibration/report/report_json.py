@@ -44,7 +44,7 @@ def report_json(result: BuildResult) -> dict[str, Any]:
         "primaries_differ": None if primaries is None else float(f"{primaries.difference:.3g}"),
         "figures": {name: _rounded(value) for name, value in judged_values(figures).items()},
         "causes": _causes(result),
-        **retake_json(retaken_frames(verdict, figures), _registered_sha256(figures)),
+        **retake_json(retaken_frames(verdict, figures), _registered_sha256(figures), _newest_sha256(figures)),
         "limits": [asdict(row.threshold) | {"outcome": row.outcome} for row in verdict.rows],
     }
 
@@ -80,6 +80,11 @@ def _registered_sha256(figures: TableFigures) -> str:
     """Return the hash of the frame that was registered first; of another where that one is not among those measured."""
     named = [frame for frame in figures.frames if frame.record.file == figures.session.registered_file]
     return (named or figures.frames)[0].record.sha256
+
+
+def _newest_sha256(figures: TableFigures) -> str:
+    """Return the hash of the measured frame that was taken last."""
+    return max((frame.record for frame in figures.frames), key=lambda record: record.attempt).sha256
 
 
 def _chart_places(figures: TableFigures) -> dict[str, Any]:

@@ -43,7 +43,7 @@ def retaken_frames(verdict: Verdict, figures: TableFigures) -> tuple[FrameRecord
     # Dark frames have no figures among the others; only where they come from can be refused.
     foreign = [frame.record for frame in (*figures.origins.other_camera, *figures.origins.other_exposure)]
     records = [*(frame.record for frame in figures.frames), *(record for record in foreign if record.kind == "dark")]
-    return tuple(sorted((record for record in records if record.sha256 in named), key=lambda record: record.taken_at))
+    return tuple(sorted((record for record in records if record.sha256 in named), key=lambda record: record.attempt))
 
 
 def is_mended_by_retaking(verdict: Verdict, figures: TableFigures) -> bool:
@@ -62,7 +62,7 @@ def findings(verdict: Verdict, figures: TableFigures) -> dict[str, ProbableCause
     return {name: finding for name, finding in explained if finding is not None}
 
 
-def retake_json(records: tuple[FrameRecord, ...], registered_sha256: str) -> dict[str, Any]:
+def retake_json(records: tuple[FrameRecord, ...], registered_sha256: str, newest_sha256: str) -> dict[str, Any]:
     """Return what `acquire run --retake bad` reads of a report (docs/formats.md).
 
     Parameters
@@ -71,11 +71,14 @@ def retake_json(records: tuple[FrameRecord, ...], registered_sha256: str) -> dic
         The frames to be taken again.
     registered_sha256
         Hash of a frame of the session, by which the report is known to be on it.
+    newest_sha256
+        Hash of the frame that was taken last of those that the report is on.
     """
     return {
         "retake": lights_text([record.illumination for record in records if record.illumination is not None]),
         "retake_sha256": [record.sha256 for record in records],
         "registered_sha256": registered_sha256,
+        "newest_sha256": newest_sha256,
     }
 
 

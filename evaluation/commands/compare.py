@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from foundation.console import EXIT_CODES
+from foundation.json_output import JsonOutput, with_json
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -33,6 +34,7 @@ nothing unless asked with --out.
 """
 
 
+@with_json("evaluate compare")
 def compare(
     results: Annotated[
         list[str],
@@ -63,10 +65,12 @@ def compare(
     ] = False,
     level: Annotated[float, typer.Option(help="Confidence of the intervals.", min=0.5, max=0.999)] = 0.95,
     seed: Annotated[int, typer.Option(help="Of the bootstrap.", min=0)] = 0,
+    *,
+    told: JsonOutput,
 ) -> None:
     """Compare methods on the same images."""
     from evaluation.experiments import comparing, comparison_report
-    from evaluation.reports.terminal import print_table
+    from evaluation.reports.terminal import show_notes, show_tables
     from evaluation.results.errors_file import read_errors
     from foundation.errors import InputError
     from foundation.files import require_free
@@ -88,15 +92,16 @@ def compare(
         *_unlike(results),
         *_guessed(runs, results),
     )
-    for note in notes:
-        print(note)
-    print_table(comparison_report.tests_table(comparisons))
-    for made in comparisons:
-        print(comparing.verdict(made, level))
-    if images or len(comparisons) <= _FEW:
+    show_notes(told, notes)
+    verdicts = [comparing.verdict(made, level) for made in comparisons]
+    told.add(results=results, error=error, level=level, verdicts=verdicts)
+    show_tables(told, [comparison_report.tests_table(comparisons)])
+    for verdict in verdicts:
+        print(verdict)
+    if images or told.asked or len(comparisons) <= _FEW:
         for made in comparisons:
-            print_table(comparison_report.statistics_table(made, level))
-            print_table(comparison_report.images_table(made, 5))
+            show_tables(told, [comparison_report.statistics_table(made, level)])
+            show_tables(told, [comparison_report.images_table(made, 5)])
     elif out is None:
         print("Statistics and images of each comparison: --images prints them, --out writes them, --method chooses.")
     if out is not None:

@@ -11,6 +11,7 @@ from evaluation.commands.data_options import DataReading, with_data_options
 from evaluation.commands.result_options import PrintedError, PrintedStatistics
 from evaluation.commands.train import LEARNERS_HELP
 from foundation.console import EXIT_CODES
+from foundation.json_output import JsonOutput, with_json
 
 if TYPE_CHECKING:
     import numpy as np
@@ -35,6 +36,7 @@ the table of evaluate run; writes nothing unless asked: --out writes the results
 """
 
 
+@with_json("evaluate cv")
 @with_data_options
 def cv(
     method: Annotated[
@@ -78,13 +80,14 @@ def cv(
         ),
     ] = None,
     reading: DataReading,
+    told: JsonOutput,
 ) -> None:
     """Cross-validate methods on a data set."""
     from evaluation.commands.choosing import require_order
     from evaluation.experiments.cross_validation import cross_validate
     from evaluation.experiments.folds import choose_folds, folds_to_csv
     from evaluation.experiments.run_folder import describe_run, write_run
-    from evaluation.reports.terminal import print_table
+    from evaluation.reports.terminal import show_notes, show_tables
     from evaluation.results.method_records import describe_method
     from evaluation.results.summary_tables import summary_table
     from foundation.console import orderly_end, progress
@@ -115,11 +118,9 @@ def cv(
             write_run(made, found.scenes, out, error, threads)
         if save_folds is not None:
             write_whole(save_folds, folds_to_csv(made.subject.images, parts))
-    print_table(summary_table(made.subject, results, error, statistics == "all"))
-    for note in made.notes:
-        print(note)
-    for what, how in made.treatment.items():
-        print(f"{what}: {how}")
+    told.add(data_set=found.name, images=count, folds=len(set(parts.tolist())), seed=seed, error=error)
+    show_tables(told, [summary_table(made.subject, results, error, statistics == "all" or told.asked)])
+    show_notes(told, made.notes, made.treatment)
 
 
 def _parted_copies(data: SceneSet, folds: npt.NDArray[np.int64]) -> list[str]:

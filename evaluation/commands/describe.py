@@ -9,6 +9,7 @@ import typer
 
 from evaluation.commands.data_options import DataReading, with_data_options
 from foundation.console import EXIT_CODES, shows_progress
+from foundation.json_output import JsonOutput, with_json
 
 if TYPE_CHECKING:
     from evaluation.experiments.describing import DataDescription
@@ -28,6 +29,7 @@ Prints tables, and with --against one sentence for each figure: within 25 % or n
 """
 
 
+@with_json("evaluate describe")
 @with_data_options
 def describe(
     data: Annotated[
@@ -68,6 +70,7 @@ def describe(
     ] = None,
     *,
     reading: DataReading,
+    told: JsonOutput,
 ) -> None:
     """Describe a data set."""
     from dataclasses import replace
@@ -75,7 +78,7 @@ def describe(
     from evaluation.experiments.describing import report as reporting
     from evaluation.experiments.describing.against import compare_figures, sentence
     from evaluation.experiments.describing.statistics_json import statistics_to_json
-    from evaluation.reports.terminal import print_table
+    from evaluation.reports.terminal import show_notes, show_tables
     from foundation.errors import InputError
     from foundation.files import require_free_file, write_whole
     from foundation.processors import processor_count
@@ -93,15 +96,15 @@ def describe(
     other = None if against is None else _described(against, beside, cells, threads)
     if other is not None and one.name == other.name:
         one, other = (replace(made, name=f"{made.name} ({place})") for made, place in ((one, data), (other, against)))
+    told.add(data_sets=[one.name] if other is None else [one.name, other.name])
     if other is None:
-        print_table(reporting.figures_table(one))
-    print_table(reporting.lights_table([one] if other is None else [one, other]))
+        show_tables(told, [reporting.figures_table(one)])
+    show_tables(told, [reporting.lights_table([one] if other is None else [one, other])])
     if other is not None:
-        for note in reporting.seen_notes(one, other):
-            print(note)
+        show_notes(told, list(reporting.seen_notes(one, other)))
         compared = compare_figures(one, other, seed)
-        for table in reporting.compared_tables(compared, (one.name, other.name)):
-            print_table(table)
+        show_tables(told, list(reporting.compared_tables(compared, (one.name, other.name))))
+        told.add(sentences=[sentence(made, (one.name, other.name)) for made in compared])
         for made in compared:
             print(sentence(made, (one.name, other.name)))
     if out is not None:

@@ -11,6 +11,7 @@ import typer
 
 from evaluation.commands.data_options import DataReading, with_data_options
 from foundation.console import EXIT_CODES, new_app, shows_progress
+from foundation.json_output import JsonOutput, with_json
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Generator
@@ -60,6 +61,7 @@ Writes nothing unless asked with --out.
 
 
 @app.command("table1", help=_TABLE1)
+@with_json("evaluate paper table1")
 def table1(
     luts: Luts,
     pictures: Annotated[
@@ -104,6 +106,8 @@ def table1(
     seed: Seed = 0,
     out: Out = None,
     workers: Workers = None,
+    *,
+    told: JsonOutput,
 ) -> None:
     """Run plain methods on eight generated data sets."""
     from evaluation.experiments.paper.hot import hot_rows
@@ -131,7 +135,7 @@ def table1(
         f"Tables: {'; '.join(map(_says, opened))}.",
         *(() if names == ("C1", "C1") else (_NOT_C1,)),
     )
-    _finish(table1_report(blocks, opened, conditions, error, found, raised), conditions, out)
+    _finish(table1_report(blocks, opened, conditions, error, found, raised), conditions, out, told)
 
 
 def _says(lut: Lut) -> str:
@@ -151,6 +155,7 @@ the real one, and tests on the real one. The paper's numbers stand beside those 
 
 
 @app.command("table2", help=_TABLE2)
+@with_json("evaluate paper table2")
 @with_data_options
 def table2(
     data: Annotated[str, typer.Argument(metavar="DATA", help="Real data set; the paper's is Cube+.")],
@@ -177,6 +182,7 @@ def table2(
     workers: Workers = None,
     *,
     reading: DataReading,
+    told: JsonOutput,
 ) -> None:
     """Train learned methods on real and on generated images."""
     from evaluation.commands.choosing import choose_learners
@@ -195,13 +201,13 @@ def table2(
     learners = dict(zip(names, choose_learners(names), strict=True))
     real, made = reading.open(data), open_scenes(generated)
     count = len(real.scenes)
-    training, told = trainable_images(made, real, shared, real.name, copies=False)
+    training, shared_images = trainable_images(made, real, shared, real.name, copies=False)
     fate = (
         "left out"
         if shared == "leave-out"
         else "kept, as in the paper, whose generated images show the pictures that are tested"
     )
-    unseen = (f"{told}. They were {fate}.",) if told else ()
+    unseen = (f"{shared_images}. They were {fate}.",) if shared_images else ()
     drawn, _ = choose_folds(real, folds, seed)
     with _progress(2 * count) as step:
         found = run(real.scenes, training, learners, drawn, seed, workers or processor_count(), step)
@@ -213,7 +219,7 @@ def table2(
         *unseen,
         *(() if is_cube else ("The paper's table is of Cube+, so only its ratios stand beside these.",)),
     )
-    _finish(table2_report(table2_tables(found, error, real.name, is_cube), conditions), conditions, out)
+    _finish(table2_report(table2_tables(found, error, real.name, is_cube), conditions), conditions, out, told)
 
 
 _BITS = f"""Influence of colour reduction on methods (section 4.2).
@@ -227,6 +233,7 @@ nothing unless asked with --out.
 
 
 @app.command("bits", help=_BITS)
+@with_json("evaluate paper bits")
 @with_data_options
 def bits(
     data: Annotated[str, typer.Argument(metavar="DATA", help="Real data set of linear images; the paper's is NUS C1.")],
@@ -238,6 +245,7 @@ def bits(
     workers: Workers = None,
     *,
     reading: DataReading,
+    told: JsonOutput,
 ) -> None:
     """Run methods on images whose colours were reduced."""
     from evaluation.experiments.paper.bits import bits_methods, bits_removed
@@ -250,7 +258,72 @@ def bits(
         found = bits_removed(opened.scenes, bits_methods(sigma), workers=workers or processor_count(), on_scene=step)
     first = f"{opened.name}, {len(opened.scenes)} images. Gray-Edge at a scale of {sigma:g} px."
     conditions = (first, _treatment(opened))
-    _finish(bits_report(found, error, opened.name, conditions), conditions, out)
+    _finish(bits_report(found, error, opened.name, conditions), conditions, out, told)
+
+
+_FLASH = f"""Tone map linear images to codes of 8 bits by the Flash operator (section 4.2).
+
+Reads DATA. Writes the new folder FOLDER: codes/ (PNG of 8 bits, of which --clear sets the lowest bits to zero), masks/,
+and flash.csv with each image's operator and ground truth. evaluate paper flash-inverse takes codes back to linear
+images, also codes that another program has changed.
+
+{EXIT_CODES}
+"""
+
+
+@app.command("flash", help=_FLASH)
+@with_json("evaluate paper flash")
+@with_data_options
+def flash(
+    data: Annotated[str, typer.Argument(metavar="DATA", help="Real data set of linear images.")],
+    out: Annotated[Path, typer.Option(metavar="FOLDER", help="New folder of codes.", show_default=False)],
+    clear: Annotated[int, typer.Option(metavar="N", help="Bits of each code set to zero.", min=0, max=8)] = 0,
+    workers: Workers = None,
+    *,
+    reading: DataReading,
+    told: JsonOutput,
+) -> None:
+    """Write tone-mapped codes of linear images."""
+    from evaluation.experiments.paper.flash_files import write_codes
+    from foundation.processors import processor_count
+
+    _require_free(out)
+    opened = reading.open(data)
+    with _progress(len(opened.scenes)) as step:
+        write_codes(opened, out, clear, workers or processor_count(), step)
+    told.add(folder=out, data_set=opened.name, images=len(opened.scenes), cleared=clear)
+    print(f"{out}: codes of {len(opened.scenes)} images of {opened.name}, {clear} bits of each set to zero")
+
+
+_INVERSE = f"""Take codes back to linear images by the inverse of the Flash operator (section 4.2).
+
+Reads FOLDER, made by evaluate paper flash; a picture there may have been changed, or replaced by a JPEG of its name.
+Writes the new folder LINEAR: TIFF files of 32-bit floats in the units of the data set, masks, and gt.csv, as evaluate
+run reads them.
+
+{EXIT_CODES}
+"""
+
+
+@app.command("flash-inverse", help=_INVERSE)
+@with_json("evaluate paper flash-inverse")
+def flash_inverse(
+    folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="Folder of codes.", show_default=False)],
+    out: Annotated[Path, typer.Option(metavar="LINEAR", help="New folder of linear images.", show_default=False)],
+    workers: Workers = None,
+    *,
+    told: JsonOutput,
+) -> None:
+    """Write the linear images of codes."""
+    from evaluation.experiments.paper.flash_files import write_linear
+    from foundation.console import progress
+    from foundation.processors import processor_count
+
+    _require_free(out)
+    with progress("images") as shown:
+        count = write_linear(folder, out, workers or processor_count(), shown)
+    told.add(folder=out, images=count)
+    print(f"{out}: {count} linear images; evaluate run {out} estimates their lights")
 
 
 _REDUCTION = f"""One picture with 0 to 7 bits of each code set to zero (a figure of section 4.2).
@@ -263,16 +336,19 @@ the figure is there only.
 
 
 @app.command("reduction", help=_REDUCTION)
+@with_json("evaluate paper reduction")
 def reduction(
     picture: Annotated[Path, typer.Argument(metavar="PICTURE", help="Any picture file.", show_default=False)],
     out: Out = None,
+    *,
+    told: JsonOutput,
 ) -> None:
     """Show a picture with its colours reduced."""
     from evaluation.experiments.paper.reporting import reduction_report
     from generator import read_picture
 
     _require_free(out)
-    _finish(reduction_report(read_picture(picture), picture.name), (), out)
+    _finish(reduction_report(read_picture(picture), picture.name), (), out, told)
 
 
 _CHROMATICITIES = f"""Chromaticities of tables' lights as their cameras see them (figures of section 3.3).
@@ -285,6 +361,7 @@ with --out; the figure is there only.
 
 
 @app.command("chromaticities", help=_CHROMATICITIES)
+@with_json("evaluate paper chromaticities")
 def chromaticities(
     luts: Luts,
     truths: Annotated[
@@ -296,6 +373,8 @@ def chromaticities(
         ),
     ] = None,
     out: Out = None,
+    *,
+    told: JsonOutput,
 ) -> None:
     """Show the chromaticities of tables' lights."""
     from evaluation.experiments.paper.reporting import chromaticities_report
@@ -303,7 +382,7 @@ def chromaticities(
 
     _require_free(out)
     report = chromaticities_report(_open(luts), [read_truths(place) for place in truths or ()])
-    _finish(report, (), out)
+    _finish(report, (), out, told)
     if out is None:
         print("Name a folder with --out for the figure.")
 
@@ -313,16 +392,16 @@ def _treatment(data: SceneSet) -> str:
     return f"{'; '.join(f'{what}: {how}' for what, how in data.treatment.items())}."
 
 
-def _finish(report: PaperReport, conditions: Sequence[str], out: Path | None) -> None:
+def _finish(report: PaperReport, conditions: Sequence[str], out: Path | None, told: JsonOutput) -> None:
     """Print the tables and write the folder, if one was named."""
     from evaluation.experiments.paper.reporting import write_report
-    from evaluation.reports.terminal import print_table
+    from evaluation.reports.terminal import show_notes, show_tables
 
-    for line in conditions:
-        print(line)
+    show_notes(told, conditions)
     for table in report.tables:
-        print()
-        print_table(table)
+        if not told.asked:
+            print()
+        show_tables(told, [table])
     if out is not None:
         write_report(report, out)
         print(f"\n{out / 'report.html'}")

@@ -8,6 +8,7 @@ from typing import Annotated, Literal
 import typer
 
 from foundation.console import EXIT_CODES
+from foundation.json_output import JsonOutput, with_json
 
 HELP = f"""Pool the results of several transfers, such as one for each of several cameras.
 
@@ -22,6 +23,7 @@ tables.tex and run.json.
 """
 
 
+@with_json("evaluate pool")
 def pool(
     results: Annotated[
         list[str], typer.Argument(metavar="RESULTS", help="Results folders of transfers.", show_default=False)
@@ -33,12 +35,14 @@ def pool(
     out: Annotated[
         Path | None, typer.Option(metavar="FOLDER", help="Write the results to this new folder.", show_default=False)
     ] = None,
+    *,
+    told: JsonOutput,
 ) -> None:
     """Pool the results of several transfers."""
     from evaluation.experiments.pooling.pool import pool_transfers
     from evaluation.experiments.pooling.reading import read_transfer
     from evaluation.experiments.pooling.report import make_tables, save_pool
-    from evaluation.reports.terminal import print_table
+    from evaluation.reports.terminal import show_notes, show_tables
     from foundation.errors import InputError
     from foundation.files import require_free
 
@@ -51,10 +55,8 @@ def pool(
     chosen = error or parts[0].error
     made = pool_transfers(parts)
     tables = make_tables(made, chosen)
-    for table in tables.shown:
-        print_table(table)
-        print()
-    for note in made.notes:
-        print(note)
+    told.add(results=results, error=chosen)
+    show_tables(told, tables.shown, "")
+    show_notes(told, made.notes)
     if out is not None:
         save_pool(made, tables, [part.place for part in parts], chosen, out)

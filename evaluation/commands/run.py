@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import os
-import sys
-from contextlib import nullcontext, redirect_stdout
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -14,6 +12,7 @@ from evaluation.commands.choosing import METHOD_HELP
 from evaluation.commands.data_options import DataReading, with_data_options
 from evaluation.commands.result_options import PrintedError, PrintedStatistics
 from foundation.console import EXIT_CODES
+from foundation.json_output import JsonOutput, with_json
 
 if TYPE_CHECKING:
     from evaluation.metrics import ErrorKind
@@ -33,6 +32,7 @@ A run with --out that was stopped goes on when the same command is given again.
 """
 
 
+@with_json("evaluate run")
 @with_data_options
 def run(
     data: Annotated[
@@ -78,7 +78,6 @@ def run(
             metavar="OUT.csv", help="Write each image's estimates and errors to this new file.", show_default=False
         ),
     ] = None,
-    json: Annotated[bool, typer.Option("--json", help="Print every statistic as JSON in place of the tables.")] = False,
     workers: Annotated[
         int | None,
         typer.Option(
@@ -90,6 +89,7 @@ def run(
     ] = None,
     *,
     reading: DataReading,
+    told: JsonOutput,
 ) -> None:
     """Evaluate methods on a data set."""
     from evaluation.commands.choosing import choose_estimates, choose_methods
@@ -106,12 +106,10 @@ def run(
     _require_free(csv, images, out)
     found = reading.open(data)
     given = choose_estimates(estimates or [], [scene.name for scene in found.scenes])
-    # What a method prints must not stand in the JSON.
-    aside = redirect_stdout(sys.stderr) if json else nullcontext()
-    with orderly_end(), aside, progress("images") as advance:
+    with orderly_end(), progress("images") as advance:
         made = run_methods(found, [*chosen, *given], out, error, workers or processor_count(), advance)
-    if json:
-        _print_json(made)
+    if told.asked:
+        _tell(made, told)
     else:
         _print(made, error, statistics == "all")
     if csv is not None:
@@ -150,12 +148,11 @@ def _print(made: Run, error: ErrorKind, further: bool) -> None:
         print(f"{what}: {how}")
 
 
-def _print_json(made: Run) -> None:
-    import json
-
+def _tell(made: Run, told: JsonOutput) -> None:
+    """Add every statistic of every kind of error, and what was done to the images."""
     from evaluation.results.summary_tables import statistics_rows
 
     table = statistics_rows(made.subject, made.results)
     rows = [dict(zip(table.columns, row, strict=True)) for row in table.rows]
-    about = {"data_set": made.subject.name, "images": len(made.subject.images), "treatment": dict(made.treatment)}
-    print(json.dumps({**about, "notes": list(made.notes), "errors": rows}, indent=2, ensure_ascii=False))
+    told.add(data_set=made.subject.name, images=len(made.subject.images), treatment=dict(made.treatment))
+    told.add(notes=list(made.notes), errors=rows)

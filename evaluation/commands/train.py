@@ -9,6 +9,7 @@ import typer
 
 from evaluation.commands.data_options import DataReading, with_data_options
 from foundation.console import EXIT_CODES
+from foundation.json_output import JsonOutput, with_json
 
 LEARNERS_HELP = "regression-trees, smart-color-cat, color-beaver, log-chroma, kernel-ridge, convnet or constant-light"
 """The suite's own, for the help of commands."""
@@ -26,6 +27,7 @@ another; the tables say what it was trained on.
 """
 
 
+@with_json("evaluate train")
 @with_data_options
 def train(
     method: Annotated[str, typer.Argument(metavar="METHOD", help=f"One of {LEARNERS_HELP}.", show_default=False)],
@@ -47,6 +49,7 @@ def train(
         ),
     ] = None,
     reading: DataReading,
+    told: JsonOutput,
 ) -> None:
     """Train a method on a data set."""
     from evaluation.commands.choosing import choose_learners, require_order
@@ -58,6 +61,7 @@ def train(
         truths_of,
     )
     from evaluation.learning.model_files import provenance_of, save_model
+    from evaluation.reports.terminal import show_notes
     from foundation.clock import SystemClock
     from foundation.console import orderly_end, progress
     from foundation.errors import InputError
@@ -90,8 +94,7 @@ def train(
         record = provenance_of(found, seed, SystemClock())
         save_model(out, fitted, record)
     unused = sum(given is None for given in features)
+    notes = [f"{unused} of {count} images have no usable pixel and were left out of the training"] if unused else []
+    told.add(model=out, method=learner.name, data_set=found.name, images=count, unused=unused, seed=seed)
     print(f"{out}: {learner.name}, {record.sentence()}")
-    if unused:
-        print(f"{unused} of {count} images have no usable pixel and were left out of the training")
-    for what, how in found.treatment.items():
-        print(f"{what}: {how}")
+    show_notes(told, notes, found.treatment)

@@ -9,6 +9,7 @@ import typer
 
 from evaluation.commands.data_options import DataReading, with_data_options
 from foundation.console import EXIT_CODES
+from foundation.json_output import JsonOutput, with_json
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -39,6 +40,7 @@ report.html and run.json.
 """
 
 
+@with_json("evaluate transfer")
 @with_data_options
 def transfer(
     train: Annotated[
@@ -124,6 +126,7 @@ def transfer(
     ] = None,
     *,
     reading: DataReading,
+    told: JsonOutput,
 ) -> None:
     """Train on generated data, test on real data; options of reading are those of the test set."""
     from dataclasses import asdict, replace
@@ -135,7 +138,7 @@ def transfer(
     from evaluation.experiments.transfer.plan import is_generated, plan_transfer
     from evaluation.experiments.transfer.rows import count_images
     from evaluation.experiments.transfer.rows import transfer as run_transfer
-    from evaluation.reports.terminal import print_table
+    from evaluation.reports.terminal import show_notes, show_tables
     from evaluation.results.method_records import describe_method
     from foundation.console import orderly_end, progress
     from foundation.files import require_free
@@ -148,8 +151,8 @@ def transfer(
     references = _references(statistics)
     tested = reading.open(test)
     plan = plan_transfer(tested, [open_scenes(place) for place in train], naive, matrix, shared)
-    told = _sizes(tested, plan, side)
-    plan = replace(plan, notes=(*plan.notes, *([told] if told else []), *left_out))
+    unlike = _sizes(tested, plan, side)
+    plan = replace(plan, notes=(*plan.notes, *([unlike] if unlike else []), *left_out))
     counted, places, partly = _only(only, tested)
     plan = replace(plan, notes=(*plan.notes, *partly))
     drawn = tuple(choose_folds(tested, folds, seed)[0] for seed in range(seeds))
@@ -180,11 +183,9 @@ def transfer(
         "reading": asdict(reading),
     }
     outcome = TransferOutcome(counted, tested, plan, rows, figures, drawn, settings)
-    for table in outcome.tables():
-        print_table(table)
-        print()
-    for note in plan.notes:
-        print(note)
+    told.add(test=counted.name, error=error, settings=settings)
+    show_tables(told, list(outcome.tables()), "")
+    show_notes(told, plan.notes)
     if out is not None:
         save_outcome(outcome, out)
 

@@ -9,6 +9,7 @@ import typer
 
 from evaluation.commands.data_options import DataReading, with_data_options
 from foundation.console import EXIT_CODES
+from foundation.json_output import JsonOutput, with_json
 
 FAMILIES_HELP = "shades-of-gray, general-gray-world, gray-edge-1 or gray-edge-2"
 """The families, for the help."""
@@ -27,6 +28,7 @@ evaluate run DATA --method SETTING evaluates one. Writes nothing unless asked wi
 """
 
 
+@with_json("evaluate tune")
 @with_data_options
 def tune(
     family: Annotated[str, typer.Argument(metavar="FAMILY", help=f"{FAMILIES_HELP}, or one of these with @PIXELS.")],
@@ -52,10 +54,11 @@ def tune(
         ),
     ] = None,
     reading: DataReading,
+    told: JsonOutput,
 ) -> None:
     """Choose a method's parameters on a data set."""
     from evaluation.experiments.tuning import settings_of, tune_family, tuning_rows, tuning_table
-    from evaluation.reports.terminal import print_table
+    from evaluation.reports.terminal import show_notes, show_tables
     from evaluation.results.tables import table_to_csv
     from foundation.console import orderly_end, progress
     from foundation.files import require_free_file, write_whole
@@ -71,8 +74,9 @@ def tune(
         tuned = tune_family(family, found.name, found.scenes, errors, threads, lambda: advance(next(steps), count))
     if out is not None:
         write_whole(out, table_to_csv(tuning_rows(tuned)))
-    print_table(tuning_table(tuned))
+    show_tables(told, [tuning_table(tuned)])
     best = tuned.settings[0]
+    told.add(data_set=found.name, images=count, family=family, chosen=best.text, spread=best.spread)
     print(f"chosen: {best.text}, whose estimates spread least in green chromaticity ({best.spread:.5f})")
     print(
         "ground truths: not used for the choice"
@@ -80,5 +84,4 @@ def tune(
         + "; on other images the setting is evaluated as --method "
         + best.text
     )
-    for what, how in found.treatment.items():
-        print(f"{what}: {how}")
+    show_notes(told, [], found.treatment)

@@ -81,6 +81,11 @@ def open_generated(place: Path | str) -> SceneSet:
     white = table.white_level
     # Whoever reads results must see that no camera took a photograph of these colours.
     computed = {} if table.computed is None else {"table": "computed from spectra and a model of the sensor"}
+    made = dataset.description.options
+    if "bits" in made:
+        computed["bits"] = f"the pictures' codes were reduced to {made['bits']} bits a channel before they were printed"
+    if made.get("scale") == "full":
+        computed["scale"] = "counts were stretched over 16 bits in the files, which is undone"
     return SceneSet(
         name=_name_of(str(place)),
         layout="generated",

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from evaluation.results.tables import Table
+    from foundation.json_output import JsonOutput
 
 _WIDE = 10_000
 """Columns of a terminal that no table fills: the table is measured as wide as it likes to be."""
@@ -40,3 +42,39 @@ def print_table(table: Table) -> None:
     console.print(grid)
     for note in table.notes:
         print(note)
+
+
+def show_tables(told: JsonOutput, tables: Sequence[Table], between: str | None = None) -> None:
+    """Print tables, or add them to `tables` of the JSON object where one is asked for.
+
+    Parameters
+    ----------
+    told
+        The object.
+    tables
+        Tables with numbers as they are; in JSON each has title, columns, rows (an object each) and notes.
+    between
+        Line that is printed after each.
+    """
+    for table in tables:
+        if told.asked:
+            rows = [dict(zip(table.columns, row, strict=True)) for row in table.rows]
+            whole = {"title": table.title, "columns": table.columns, "rows": rows, "notes": table.notes}
+            told.append("tables", whole)
+            continue
+        print_table(table)
+        if between is not None:
+            print(between)
+
+
+def show_notes(told: JsonOutput, notes: Sequence[str], treatment: Mapping[str, str] | None = None) -> None:
+    """Print notes and what was done to the images, or add them to the JSON object where one is asked for."""
+    if told.asked:
+        told.add(notes=list(notes))
+        if treatment is not None:
+            told.add(treatment=dict(treatment))
+        return
+    for note in notes:
+        print(note)
+    for what, how in (treatment or {}).items():
+        print(f"{what}: {how}")

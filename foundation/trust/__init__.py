@@ -1,1 +1,1 @@
-"""What may be shown of a text with secrets, and what may be read of a folder that somebody else made."""
+"""What may be shown of a text with secrets, what may be read of a folder of others, and how programs share one."""

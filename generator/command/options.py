@@ -15,6 +15,7 @@ import typer
 
 from foundation.console import Quiet, Verbose, Version
 from foundation.errors import InputError
+from foundation.json_output import AsJson
 from foundation.processors import processor_count
 from generator.command.grouping import option
 from generator.dataset.production.workers import Workers
@@ -76,11 +77,23 @@ class PictureOptions:
         ),
     ] = False
     crop_at: Annotated[
-        Literal["centre", "random"], option(None, "Where to cut; random is chosen by the seed.", _SOURCES)
-    ] = "centre"
+        Literal["centre", "random"] | None,
+        option(
+            None,
+            "Where to cut; random is chosen by the seed. Of several crops the first. \\[default: centre; random with "
+            "--crops]",
+            _SOURCES,
+        ),
+    ] = None
     crops: Annotated[
         int,
-        option("N", "Cut N different crops of each picture, at random places far from each other.", _SOURCES, min=1),
+        option(
+            "N",
+            "Cut N different crops of each picture, the first where --crop-at says, the others at random places far "
+            "from it and from each other.",
+            _SOURCES,
+            min=1,
+        ),
     ] = 1
     profiles: Annotated[
         Literal["honour", "ignore"],
@@ -151,8 +164,8 @@ class LightOptions:
         str | None,
         option(
             "NAME",
-            "Draw chromaticities from uniform, gaussian:r=.3,b=.25,sd=.02 (or sd_r, sd_b and corr for sd), or the "
-            "normal distribution fitted to a file of ground truths as of --nearest.",
+            "Draw chromaticities from uniform, gaussian:r=.3,b=.25,sd=.02 (or sd_r, sd_b and corr for sd), or a "
+            "file of ground truths as of --nearest: the kernel density of its lights.",
             _LIGHT,
         ),
     ] = None
@@ -234,8 +247,42 @@ class ImageOptions:
     ] = "folder"
     split: Annotated[
         str | None,
-        option("SHARES", "Divide by source into train, validation and test, such as 0.8,0.1,0.1.", _IMAGES),
+        option(
+            "SHARES",
+            "Divide by source into train, validation and test, such as 0.8,0.1,0.1; by a hash of each picture, so that "
+            "parts have these sizes on average.",
+            _IMAGES,
+        ),
     ] = None
+    exact_split: Annotated[
+        bool,
+        typer.Option(
+            "--exact-split",
+            help="With --split, parts of exactly these sizes, such as 700,200,100 of 1000 pictures; copies of a "
+            "picture stay in one part.",
+            rich_help_panel=_IMAGES,
+        ),
+    ] = False
+    bits: Annotated[
+        int | None,
+        option(
+            "N",
+            "Keep N bits of each code of the pictures and set the others to zero before they are printed. "
+            "\\[default: those of the table]",
+            _IMAGES,
+            min=1,
+            max=8,
+        ),
+    ] = None
+    scale: Annotated[
+        Literal["table", "full"],
+        option(
+            None,
+            "Store the camera's counts, which most programs show nearly black; or stretch them over 16 bits, which our "
+            "readers undo (PNG, TIFF and JPEG XL).",
+            _IMAGES,
+        ),
+    ] = "table"
     preview: Annotated[bool, option(None, "Write tone-mapped previews.", _IMAGES)] = True
     contact_sheet: Annotated[
         Path | None,
@@ -253,6 +300,9 @@ class ImageOptions:
             layout=self.layout,
             previews=self.preview,
             split=None if self.split is None else parse_split(self.split),
+            split_exact=self.exact_split,
+            bits=self.bits,
+            scale=self.scale,
             shard_images=shard_images,
             variation=variation,
             crops=crops,
@@ -288,8 +338,9 @@ class RenderingOptions:
         str,
         option(
             "WHAT",
-            "The print's own black: keep it, compensate for it (take it out), or take out a random share of it of "
-            "each image, random or random:MAX. The ground truth stays.",
+            "The print's own black: keep it, compensate for it (take it out), take out a random share of it of each "
+            "image, random or random:MAX, or, with --like, of each picture the share that makes shadows like the real "
+            "ones, like. The ground truth stays.",
             _IMAGES,
         ),
     ] = "keep"
@@ -409,6 +460,7 @@ class WorkOptions:
 class CommonOptions:
     """What every command takes; acts by itself where it is given."""
 
+    as_json: AsJson = False
     verbose: Verbose = 0
     quiet: Quiet = False
     version: Version = False

@@ -12,10 +12,19 @@ from generator.dataset.production.engines import make_shards
 from generator.dataset.production.options import DatasetOptions
 from generator.dataset.production.plan import Plan
 from generator.dataset.production.workers import SILENT, Callbacks, Workers
-from generator.dataset.production.workplace import Workplace, finished, stored_identity, workplace
+from generator.dataset.production.workplace import (
+    Workplace,
+    differences,
+    finished,
+    holds_dataset,
+    stored_identity,
+    workplace,
+)
 from generator.dataset.reader import Dataset, open_dataset
 from generator.lights.choices import ListedLights
 from generator.lights.lighting import LightChoice
+from generator.pictures.sources import hash_since
+from generator.stores.places import DESCRIPTION, is_remote, local_path
 
 if TYPE_CHECKING:
     from calibration.table.lut import Lut
@@ -28,6 +37,7 @@ __all__ = [
     "Workers",
     "finish_dataset",
     "generate_dataset",
+    "made_before",
     "make_dataset",
     "make_share",
 ]
@@ -114,6 +124,56 @@ def make_dataset(plan: Plan, out: Path | str, workers: Workers | None = None, ca
     return open_dataset(out)
 
 
+def made_before(plan: Plan, out: Path | str) -> Dataset | None:
+    """Return the dataset at `out` if it is complete and of this very plan; None where there is no complete one.
+
+    Pictures on this machine that were written to since are hashed again and compared; those on a store are compared by
+    their names.
+
+    Raises
+    ------
+    InputError
+        The dataset is of another plan; the message says how the two differ.
+    FormatError
+        The dataset is damaged.
+    """
+    if not holds_dataset(out):
+        return None
+    dataset = open_dataset(out)
+    made, identity = dataset.description, plan.identity()
+    stored = {
+        "software": made.software,
+        "libraries": made.libraries,
+        "table": made.table.model_dump(mode="json"),
+        "seed": made.seed,
+        "options": made.options,
+        "images": made.planned,
+    }
+    differing = differences(stored, {key: identity[key] for key in stored}) or _other_pictures(dataset, plan, out)
+    if differing:
+        raise InputError(
+            f"{out} holds a dataset that this command would make otherwise ({'; '.join(differing)}); name another "
+            "place, or remove what is there"
+        )
+    return dataset
+
+
+def _other_pictures(dataset: Dataset, plan: Plan, out: Path | str) -> list[str]:
+    """Return in words a picture of the plan that the dataset was not made of."""
+    known = {source.position: (source.name, source.sha256) for source in dataset.sources}
+    known |= {skipped.position: (skipped.name, None) for skipped in dataset.description.skipped}
+    if len(known) != len(plan.sources):
+        return [f"sources {len(known)}, now {len(plan.sources)}"]
+    since = None if is_remote(str(out)) else (local_path(out) / DESCRIPTION).stat().st_mtime
+    for place, source in enumerate(plan.sources):
+        name, sha256 = known.get(place, ("", None))
+        if source.name != name:
+            return [f"source {place} {name}, now {source.name}"]
+        if sha256 is not None and since is not None and hash_since(source, since) not in (None, sha256):
+            return [f"the content of {name}"]
+    return []
+
+
 def make_share(
     plan: Plan,
     out: Path | str,
@@ -151,13 +211,15 @@ def make_share(
 
 
 def finish_dataset(out: Path | str) -> Dataset:
-    """Make a dataset of its shards when every share is done.
+    """Make a dataset of its shards when every share is done; a dataset that is complete stays as it is.
 
     Raises
     ------
     InputError
         No dataset is being made there, shards are missing, or another program is at it.
     """
+    if holds_dataset(out):
+        return open_dataset(out)
     identity = stored_identity(out)
     if not finished(out, identity):
         with workplace(out, identity) as place:

@@ -40,6 +40,7 @@ from generator.dataset.production.records import (
     FORMAT,
     IMAGES,
     SOURCES,
+    STRETCHED_VERSION,
     VERSION,
     Description,
     Entry,
@@ -47,7 +48,7 @@ from generator.dataset.production.records import (
     SourceRecord,
     shard_key,
 )
-from generator.files.formats import decode_image
+from generator.files.formats import decode_image, from_full_scale
 from generator.masks.maps import decode_ground_truth, decode_weights
 from generator.stores.places import DESCRIPTION
 from generator.stores.store import Store, open_store, read_bounded
@@ -79,13 +80,18 @@ class Dataset:
     def read_image(self, entry: Entry) -> npt.NDArray[np.uint16]:
         """Return the image (H, W, 3) uint16, linear camera RGB, `description.table.white_level` = saturation.
 
+        Counts that were stretched over 16 bits are as they were before.
+
         Raises
         ------
         FormatError
             The file is missing, damaged or no image of its format.
         """
         name = self._name(entry.image, entry.split, "images")
-        return decode_image(self._bytes(name), self._options.format, f"{self.store.place}/{name}")
+        image = decode_image(self._bytes(name), self._options.format, f"{self.store.place}/{name}")
+        if self._options.scale == "full":
+            return from_full_scale(image, self.description.table.white_level)
+        return image
 
     def read_preview(self, entry: Entry) -> bytes | None:
         """Return the JPEG file of an image's preview, or None if the dataset has none."""
@@ -244,7 +250,7 @@ def _load_description(store: Store) -> Description:
         first = error.errors()[0]
         raise FormatError(
             f"{name} is no dataset's description: {'.'.join(map(str, first['loc']))}: {first['msg']}; this software "
-            f"reads {FORMAT} of versions 1 to {VERSION}"
+            f"reads {FORMAT} of versions 1 to {STRETCHED_VERSION}"
         ) from error
     except (ValueError, KeyError, TypeError) as error:
         raise FormatError(f"{name} is damaged ({type(error).__name__}: {error}); make the dataset again") from error

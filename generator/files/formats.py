@@ -23,10 +23,12 @@ import numpy as np
 import numpy.typing as npt
 
 from foundation.errors import FormatError, InputError
+from generator.files.full_scale import FULL, from_full_scale, to_full_scale
 from generator.files.metadata import ImageMetadata
 
 __all__ = [
     "FORMATS",
+    "FULL",
     "Format",
     "ImageMetadata",
     "decode_array",
@@ -35,10 +37,12 @@ __all__ = [
     "encode_map",
     "encode_pieces",
     "encode_preview",
+    "from_full_scale",
     "libraries_of",
     "require_plausible",
     "smallest_side",
     "suffix_of",
+    "to_full_scale",
 ]
 
 Format = Literal["png", "tiff", "exr", "jxl", "dng"]

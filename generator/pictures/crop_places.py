@@ -14,15 +14,20 @@ _CANDIDATES: Final = 8
 
 
 def random_places(
-    free: tuple[int, int], size: tuple[int, int], count: int, seed: int, name: str
+    free: tuple[int, int],
+    size: tuple[int, int],
+    count: int,
+    seed: int,
+    name: str,
+    first: tuple[int, int] | None = None,
 ) -> list[tuple[int, int]]:
     """Return `count` different places of crops in a picture.
 
     Candidate n is made of the first two words of Philox with counter (a + n mod 2³², b, number, 6); a, b, number are
-    the first three words of the SHA-256 of the picture's name. The first crop is at candidate 0. Each further one is
-    at that of the next eight candidates which overlaps least with the crops before it, the first of equals, as in
-    best-candidate sampling (D. Mitchell, "Spectrally optimal sampling for distribution ray tracing", SIGGRAPH 1991),
-    where its eight are all taken, at the first free place after them, row by row.
+    the first three words of the SHA-256 of the picture's name. The first crop is at candidate 0, or at `first`. Each
+    further one is at that of the next eight candidates which overlaps least with the crops before it, the first of
+    equals, as in best-candidate sampling (D. Mitchell, "Spectrally optimal sampling for distribution ray tracing",
+    SIGGRAPH 1991), where its eight are all taken, at the first free place after them, row by row.
 
     Parameters
     ----------
@@ -36,6 +41,8 @@ def random_places(
         0 … 2⁶⁴ − 1.
     name
         Of the picture.
+    first
+        Column and row of the first crop, px; None for a random place.
 
     Returns
     -------
@@ -54,14 +61,14 @@ def random_places(
     candidates = [
         (int(column) * free[0] >> 32, int(row) * free[1] >> 32) for column, row in zip(across, down, strict=True)
     ]
-    places = candidates[:1]
+    places = candidates[:1] if first is None else [first]
     for crop in range(1, count):
-        first = 1 + _CANDIDATES * (crop - 1)
-        left = [place for place in candidates[first : first + _CANDIDATES] if place not in places]
+        begin = 1 + _CANDIDATES * (crop - 1)
+        left = [place for place in candidates[begin : begin + _CANDIDATES] if place not in places]
         if left:
             places.append(min(left, key=lambda place: max(_overlap(place, other, size) for other in places)))
             continue
-        last = candidates[first + _CANDIDATES - 1]
+        last = candidates[begin + _CANDIDATES - 1]
         start, total = last[1] * free[0] + last[0], free[0] * free[1]
         following = (((start + step) % total % free[0], (start + step) % total // free[0]) for step in range(total))
         places.append(next(place for place in following if place not in places))

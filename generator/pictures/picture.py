@@ -10,7 +10,7 @@ These steps turn a file's values into codes, in this order, so that one picture 
     profile       codes of another colour space become those of sRGB; see `generator.pictures.profiles`
     orientation   turned as the file's EXIF or TIFF orientation asks
     size          only ever made smaller, on request, by averaging areas of codes
-    crop          cut, on request, from the centre or at a place that the picture's name and a seed choose
+    crop          cut, on request, from the centre or at places that the picture's name and a seed choose
 """
 
 from __future__ import annotations
@@ -56,9 +56,11 @@ class Preparation:
     cover
         Whether a picture is first made as small as still covers the crop.
     crop_at
-        Where to cut: ``"centre"``, or ``"random"``, a place that the seed and the picture's name choose.
+        Where to cut: ``"centre"``, or ``"random"``, a place that the seed and the picture's name choose; None for the
+        centre of one crop, and random places of several.
     crops
-        How many different crops to cut; more than one are cut at random places, the first at that of one.
+        How many different crops to cut. The first is where `crop_at` says, at random that of one; the others are at
+        random places far from it and from each other.
     profiles
         ``"honour"`` converts pictures of other colour spaces to sRGB; ``"ignore"`` takes all codes as they stand.
     seed
@@ -73,7 +75,7 @@ class Preparation:
     max_side: int | None = None
     crop: tuple[int, int] | None = None
     cover: bool = False
-    crop_at: Literal["centre", "random"] = "centre"
+    crop_at: Literal["centre", "random"] | None = None
     profiles: Literal["honour", "ignore"] = "honour"
     seed: int = 0
     crops: int = 1
@@ -92,15 +94,20 @@ class Preparation:
         if self.crops > 1 and self.crop is None:
             raise InputError(f"{self.crops} crops of a picture have no size; give that of a crop, such as 512x512")
 
+    @property
+    def place(self) -> Literal["centre", "random"]:
+        """Where the first crop is cut."""
+        return self.crop_at or ("centre" if self.crops == 1 else "random")
+
     def describe(self) -> dict[str, Any]:
         """Return the options that are set, as a JSON object."""
         options: dict[str, Any] = {"profiles": self.profiles}
         if self.max_side is not None:
             options["max_side"] = self.max_side
         if self.crop is not None:
-            options |= {"crop": list(self.crop), "cover": self.cover, "crop_at": self.crop_at}
+            options |= {"crop": list(self.crop), "cover": self.cover, "crop_at": self.place}
         if self.crops > 1:
-            options |= {"crop_at": "random", "crops": self.crops}
+            options |= {"crops": self.crops}
         return options
 
 
@@ -142,7 +149,7 @@ def read_picture(path: Path | str, max_side: int | None = None) -> Picture:
     Parameters
     ----------
     path
-        Any file that OpenImageIO reads.
+        Any file that OpenImageIO reads, or AVIF.
     max_side
         Longest side allowed, px; a larger picture is made smaller. None allows any.
 
@@ -170,7 +177,7 @@ def open_picture(path: Path, preparation: Preparation = UNPREPARED, name: str | 
     Parameters
     ----------
     path
-        Any file that OpenImageIO reads.
+        Any file that OpenImageIO reads, or AVIF.
     preparation
         How the picture is prepared besides.
     name
@@ -240,6 +247,11 @@ class _Values:
 def _read(path: Path) -> _Values:
     if not path.is_file():
         raise FormatError(f"cannot read {path}: there is no such file; name a picture")
+    if path.suffix.lower() == ".avif":
+        from generator.pictures.avif import read_avif
+
+        picture = read_avif(path, LARGEST_PICTURE)
+        return _Values(picture.codes, picture.alpha, False, False, picture.orientation, picture.icc, False)
     with _named_in_text(path) as name:
         return _read_named(path, name)
 
@@ -384,15 +396,17 @@ def _fit(picture: Picture, preparation: Preparation, path: Path, name: str) -> t
         raise FormatError(
             f"cannot cut {path}: it is {width}x{height} px where the crop is {wide}x{high}; ask for a smaller crop"
         )
-    places = [((width - wide) // 2, (height - high) // 2)]
-    if preparation.crop_at == "random" or preparation.crops > 1:
+    centre = ((width - wide) // 2, (height - high) // 2)
+    places = [centre]
+    if preparation.place == "random" or preparation.crops > 1:
         free = (width - wide + 1, height - high + 1)
         if preparation.crops > free[0] * free[1]:
             raise FormatError(
                 f"cannot cut {path} in {preparation.crops} different crops of {wide}x{high} px: it is "
                 f"{width}x{height} px and has {free[0] * free[1]}; ask for fewer, or for smaller ones"
             )
-        places = random_places(free, (wide, high), preparation.crops, preparation.seed, name)
+        first = centre if preparation.place == "centre" else None
+        places = random_places(free, (wide, high), preparation.crops, preparation.seed, name, first)
     return tuple(
         Cut(left, top, np.ascontiguousarray(picture[top : top + high, left : left + wide])) for left, top in places
     )

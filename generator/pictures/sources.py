@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import errno
 import hashlib
+import logging
 import os
 import tempfile
-from collections.abc import Generator, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
@@ -15,6 +16,7 @@ from typing import TYPE_CHECKING, Any, Final, Protocol
 import numpy as np
 
 from foundation.errors import FormatError, InputError, StorageError
+from foundation.hashing import file_sha256
 from foundation.trust.secret_texts import masked
 from generator import philox
 from generator.pictures.picture import LARGEST_SIDE, UNPREPARED, Cut, Picture, Preparation, open_picture
@@ -24,10 +26,15 @@ if TYPE_CHECKING:
     from fsspec.spec import AbstractFileSystem
 
 SUFFIXES: Final = frozenset(
-    {".avif", ".bmp", ".dpx", ".exr", ".gif", ".hdr", ".heic", ".heif", ".j2k", ".jp2", ".jpe", ".jpeg", ".jpg"}
+    {".avif", ".bmp", ".dpx", ".exr", ".gif", ".hdr", ".j2k", ".jp2", ".jpe", ".jpeg", ".jpg"}
     | {".jxl", ".pbm", ".pgm", ".png", ".pnm", ".ppm", ".psd", ".rgbe", ".sgi", ".tga", ".tif", ".tiff", ".webp"}
 )
 """Ends of the names for which a folder is searched, in either case; a file that is named itself may have any end."""
+
+UNREADABLE: Final = frozenset({".heic", ".heif"})
+"""Ends of pictures' names that no library of a plain installation reads; those in a folder are told."""
+
+_log = logging.getLogger(__name__)
 
 _MACHINE_ERRORS: Final = frozenset(
     {errno.EMFILE, errno.ENFILE, errno.ENOMEM, errno.ENOSPC, errno.ESTALE, errno.ETIMEDOUT, errno.ENOTCONN}
@@ -51,6 +58,8 @@ class SourcePicture:
         The crops, where several were asked for.
     weight
         By which it was drawn; None where pictures were not drawn by weights.
+    black_taken
+        Share of the print's black, 0 … 1, that is taken out of its images; None where options say it.
     """
 
     picture: Picture
@@ -58,6 +67,7 @@ class SourcePicture:
     profile: str | None = None
     cuts: tuple[Cut, ...] = ()
     weight: float | None = None
+    black_taken: float | None = None
 
 
 class Source(Protocol):
@@ -141,6 +151,32 @@ class PictureFile:
                     f"there is not enough memory to read {self.location}; use fewer workers, or leave it out"
                 ) from error
         return SourcePicture(reading.picture, digest.hexdigest(), reading.profile, reading.cuts)
+
+
+def hash_since(source: Source, moment: float) -> str | None:
+    """Return the SHA-256 of a source's file if that is on this machine and was changed after a moment.
+
+    Parameters
+    ----------
+    source
+        Any; with a weight, or one that must be as it was, that which it is of.
+    moment
+        Seconds since 1970, as of `os.stat_result`.
+
+    Returns
+    -------
+    str or None
+        None where there is no such file, or it was not changed. A file that was removed has an empty hash.
+    """
+    file: object = getattr(source, "source", source)
+    if not isinstance(file, PictureFile) or is_remote(file.location):
+        return None
+    try:
+        status = Path(file.location).stat()
+        # The second changes with every change of the first, and no program sets it back.
+        return file_sha256(Path(file.location)) if max(status.st_mtime, status.st_ctime) > moment else None
+    except OSError:
+        return ""
 
 
 @contextmanager
@@ -263,9 +299,11 @@ def find_pictures(
 ) -> tuple[PictureFile, ...]:
     """Return the pictures of folders and files.
 
-    A folder is searched with all folders below it, except hidden ones, data sets and links to folders, for files whose
-    names end in one of `SUFFIXES`. They are sorted by their path below it, code point by code point; the order of
-    `places` is kept. No file is opened; a million of them take about 0.2 GB of memory.
+    A folder is searched with all folders below it, except hidden ones and data sets, for files whose names end in one
+    of `SUFFIXES`. A link to a folder is followed, unless that is searched already or holds what is searched, so that
+    no picture comes twice and no search goes round in a circle. Pictures are sorted by their path below the folder,
+    code point by code point; the order of `places` is kept. No file is opened; a million of them take about 0.2 GB of
+    memory. A warning is logged of pictures that cannot be read (`UNREADABLE`).
 
     Parameters
     ----------
@@ -301,10 +339,15 @@ def find_pictures(
             found.append(PictureFile(root, "", preparation))
             continue
         before = len(found)
-        below = _below_url(root) if remote else _below_folder(root)
+        search = _Search(root)
+        below = _below_url(root, search) if remote else _below_folder(root, search)
         found += [PictureFile(root, name, preparation) for name in below]
+        told = search.sentence(masked(root))
         if len(found) == before:
-            raise InputError(f"{root} holds no picture; expected files that end in one of {' '.join(sorted(SUFFIXES))}")
+            expected = f"expected files that end in one of {' '.join(sorted(SUFFIXES))}"
+            raise InputError(told or f"{root} holds no picture; {expected}")
+        if told:
+            _log.warning(told)
     if len(named) > 1:
         _refuse_names(found)
     return tuple(found)
@@ -321,25 +364,72 @@ def _refuse_names(found: Sequence[PictureFile]) -> None:
             )
 
 
+def _is_unreadable(name: str) -> bool:
+    return os.path.splitext(name)[1].lower() in UNREADABLE  # noqa: PTH122  as below
+
+
 def _is_picture(name: str) -> bool:
     return os.path.splitext(name)[1].lower() in SUFFIXES  # noqa: PTH122  a million Path objects take a minute
 
 
-def _below_folder(folder: str, prefix: str = "") -> Iterator[str]:
+class _Search:
+    """What a search for pictures has followed and passed over.
+
+    Parameters
+    ----------
+    root
+        Folder that is searched.
+    """
+
+    def __init__(self, root: str) -> None:
+        self._searched = [root if is_remote(root) else os.path.realpath(root)]
+        self._unreadable = 0
+        self._first = ""
+
+    def follows(self, link: str) -> bool:
+        """Return whether a link to a folder is followed: what is, or holds, what is searched already is not."""
+        target = os.path.realpath(link)
+        for folder in self._searched:
+            if os.path.commonpath([folder, target]) in (folder, target):
+                _log.info("%s is not followed: it leads to %s, which is searched already or holds it", link, target)
+                return False
+        self._searched.append(target)
+        return True
+
+    def pass_over(self, name: str) -> None:
+        """Count a picture that cannot be read."""
+        self._unreadable += 1
+        self._first = self._first or name
+
+    def sentence(self, place: str) -> str | None:
+        """Return what is to be told of pictures that cannot be read; None if there are none."""
+        if not self._unreadable:
+            return None
+        others = f" and {self._unreadable - 1} more" if self._unreadable > 1 else ""
+        return (
+            f"{place} holds {self._first}{others}, which {'are' if others else 'is'} left out: HEIC is not read; "
+            "convert to JPEG, PNG or AVIF"
+        )
+
+
+def _below_folder(folder: str, search: _Search, prefix: str = "") -> Iterator[str]:
     """Yield the pictures below a folder in the order of their paths, with one folder's list in memory at a time."""
+    links: set[str] = set()
     try:
         with os.scandir(folder) as entries:
-            # A folder is sorted with the slash that follows it in a path.
-            listed = sorted(
-                f"{entry.name}/" if entry.is_dir(follow_symlinks=False) else entry.name
-                for entry in entries
-                if not entry.name.startswith(".")
-                and (
-                    entry.is_dir(follow_symlinks=False)
-                    or (_is_picture(entry.name) and _is_file(entry))
-                    or entry.name == DESCRIPTION
-                )
-            )
+            listed: list[str] = []
+            for entry in entries:
+                name = entry.name
+                if name.startswith("."):
+                    continue
+                if _is(entry.is_dir):
+                    # A folder is sorted with the slash that follows it in a path.
+                    listed.append(f"{name}/")
+                    if entry.is_symlink():
+                        links.add(f"{name}/")
+                elif name == DESCRIPTION or (_is_picture(name) and _is(entry.is_file)) or _is_unreadable(name):
+                    listed.append(name)
+            listed.sort()
     except OSError as error:
         raise InputError(f"cannot look into {folder}: {error.strerror}; name a folder that may be read") from error
     if DESCRIPTION in listed:
@@ -349,22 +439,26 @@ def _below_folder(folder: str, prefix: str = "") -> Iterator[str]:
         listed.remove(DESCRIPTION)
     for name in listed:
         if name.endswith("/"):
-            yield from _below_folder(f"{folder.rstrip('/')}/{name[:-1]}", prefix + name)
+            path = f"{folder.rstrip('/')}/{name[:-1]}"
+            if name not in links or search.follows(path):
+                yield from _below_folder(path, search, prefix + name)
+        elif _is_unreadable(name):
+            search.pass_over(prefix + name)
         else:
             yield prefix + name
 
 
-def _is_file(entry: os.DirEntry[str]) -> bool:
-    """Return whether an entry is a file or a link to one; a link in a circle of links is none."""
+def _is(asked: Callable[[], bool]) -> bool:
+    """Return what an entry says of itself, a link of what it leads to; a link in a circle of links leads nowhere."""
     try:
-        return entry.is_file()
+        return asked()
     except OSError as error:
         if error.errno == errno.ELOOP:
             return False
         raise
 
 
-def _below_url(url: str) -> list[str]:
+def _below_url(url: str, search: _Search) -> list[str]:
     """Return the pictures below a URL, or ``""`` where it is a file itself."""
     store, root = filesystem(url)
     try:
@@ -376,10 +470,11 @@ def _below_url(url: str) -> list[str]:
         # Every store raises errors of its own.
         raise InputError(f"cannot look into {url}: {error}; check the address and that you may read there") from error
     datasets = {path.parent for path in listed if path.name == DESCRIPTION and len(path.parts) > 1}
-    return sorted(
+    seen = sorted(
         path.as_posix()
         for path in listed
-        if _is_picture(path.name)
-        and not any(part.startswith(".") for part in path.parts)
-        and datasets.isdisjoint(path.parents)
+        if not any(part.startswith(".") for part in path.parts) and datasets.isdisjoint(path.parents)
     )
+    for name in filter(_is_unreadable, seen):
+        search.pass_over(name)
+    return list(filter(_is_picture, seen))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -68,6 +69,21 @@ def test_a_killed_run_has_no_time_left(folder: Path, capsys: pytest.CaptureFixtu
     assert main(["status", "--json", str(folder)]) == 0
     values = json.loads(capsys.readouterr().out)
     assert (values["state"], values["alive"], values["remaining_s"]) == ("stopped", False, None)
+
+
+def test_a_copy_of_a_session_at_work_is_no_run(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    copy = tmp_path / "backup" / "night"
+    shutil.copytree(folder, copy)
+    told = say(copy, capsys)
+    assert f"state   copied from {folder.resolve()} at 20" in told
+    assert "or later, and the run there goes on; look there" in told
+    assert "left    4 frames; this copy gets none\n" in told
+    assert main(["status", "--json", str(copy)]) == 0
+    values = json.loads(capsys.readouterr().out)
+    assert (values["state"], values["alive"], values["remaining_s"]) == ("copy", False, None)
+    assert "state   running" in say(folder.rename(tmp_path / "renamed"), capsys)
 
 
 def test_values_for_programs(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:

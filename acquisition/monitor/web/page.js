@@ -16,6 +16,7 @@ const STATES = {
   complete: ["■", "complete"],
   incomplete: ["■", "ended, incomplete"],
   stopped: ["✕", "stopped"],
+  copy: ["⧉", "a copy"],
   gone: ["✕", "no session"],
   unreadable: ["✕", "cannot be read"],
   absent: ["…", "not begun"],

@@ -103,8 +103,8 @@ def work_left(session: Session, settings: LabSettings) -> Work:
         A file that the settings name is missing, or the session was begun otherwise.
     """
     require_same(session, settings)
-    taken = sorted(frame.taken_at for frame in session.frames())
-    gaps = [(after - before).total_seconds() for before, after in pairwise(taken)]
+    taken = [frame.taken_at for frame in sorted(session.frames(), key=lambda frame: frame.attempt)]
+    gaps = [(after - before).total_seconds() for before, after in pairwise(taken) if after >= before]
     sizes = [frame.size for frame in session.journal.accepted_files()]
     return Work(
         session.folder,

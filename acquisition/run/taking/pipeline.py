@@ -25,7 +25,6 @@ from collections.abc import Callable, Collection, Mapping
 from concurrent.futures import Future
 from dataclasses import dataclass, replace
 from datetime import datetime
-from typing import TypeVar
 
 from acquisition.config import LabSettings
 from acquisition.run.devices import Devices
@@ -61,8 +60,6 @@ PROMISE = "ending after this frame; press Ctrl-C again to end at once"
 """What somebody is told who asks a run to end."""
 
 _CAMERA, _SCREEN, _DISK = "the camera", "the screen", "the disk"
-
-_Result = TypeVar("_Result")
 
 
 @dataclass(frozen=True)
@@ -182,7 +179,7 @@ class Pipeline:
                 self._wait_for_cause()
             step = self._agenda.next()
             if step is not None:
-                return self._insist(lambda step=step: self._show(step), _SCREEN)
+                return self._patience.attempt(lambda step=step: self._show(step), _SCREEN)
             if not self._pending:
                 return None
             self._collect(0)
@@ -243,7 +240,9 @@ class Pipeline:
         clock, step = self._devices.clock, lit.step
         kept = self._session.journal.kept_files(step)
         stem = step.stem if kept == 0 else f"{step.stem}_try{kept + 1}"
-        number = self._insist(lambda: self._session.journal.begin(step, f"frames/{stem}", lit.shown_at), _DISK)
+        number = self._patience.attempt(
+            lambda: self._session.journal.begin(step, f"frames/{stem}", lit.shown_at), _DISK
+        )
         self._agenda.begin(step)
         begun = clock.monotonic()
         try:
@@ -296,23 +295,21 @@ class Pipeline:
 
         for _ in range(DOWNLOADS - 1):
             try:
-                return self._insist(fetch, _DISK, of_disk)
+                return self._patience.attempt(fetch, _DISK, curable=of_disk)
             except DeviceError as error:
                 self._patience.report("retry", f"{step_name(attempt.step)}: {error}")
-        return self._insist(fetch, _DISK, of_disk)
+        return self._patience.attempt(fetch, _DISK, curable=of_disk)
 
     def _give_up(self, step: SessionStep, number: int, error: CropError) -> None:
         """Note an attempt that gave no frame, by no fault of what was to be photographed."""
         self._agenda.withdraw(step)
         self._collect(0)
         now = self._devices.clock.now()
-        self._insist(lambda: self._session.journal.fail(number, now, str(error)), _DISK)
+        self._patience.attempt(lambda: self._session.journal.fail(number, now, str(error)), _DISK)
 
     def _wait_for(self, name: str, fault: CropError) -> None:
         """Wait for a camera or disk that lost a frame; the pause lasts until a frame came through."""
-        pause = self._pauses.setdefault(name, self._patience.pause(name, idle=name != _CAMERA))
-        with self._ending.at_once():
-            pause.wait(fault)
+        self._pauses.setdefault(name, self._patience.pause(name, idle=name != _CAMERA)).wait(fault)
 
     def _is_back(self, name: str) -> None:
         if (pause := self._pauses.pop(name, None)) is not None:
@@ -324,10 +321,9 @@ class Pipeline:
         pause, pause_s = self._probing or (self._patience.pause("the frames"), 0.0)
         clock = self._devices.clock
         until = clock.monotonic() + pause_s
-        with self._ending.at_once():
+        pause.wait(fault)
+        while clock.monotonic() < until:
             pause.wait(fault)
-            while clock.monotonic() < until:
-                pause.wait(fault)
         self._probing = pause, min(max(2 * pause_s, PROBE_S), LONGEST_PROBE_S)
         self._agenda.retry()
         if self._lasts_for is not None and self._lasts_for.kind != "dark":
@@ -336,29 +332,12 @@ class Pipeline:
     def _tie(self) -> None:
         """Take the frames first that tie what follows to what was taken: what lasted may have changed for good."""
         journal = self._session.journal
-        attempts = self._insist(journal.attempts, _DISK)
+        attempts = self._patience.attempt(journal.attempts, _DISK)
         if any(attempt.kind == "light" and attempt.verdict == ACCEPTED for attempt in attempts):
-            numbers = self._insist(lambda: tie(self._session), _DISK)
+            numbers = self._patience.attempt(lambda: tie(self._session), _DISK)
             self._agenda.begin_with(step for step in self._session.steps if step.number in numbers)
         self._begun_after = attempts[-1].id
         self._saver.after_pause()
-
-    def _insist(
-        self, action: Callable[[], _Result], name: str, curable: Callable[[CropError], bool] = is_curable
-    ) -> _Result:
-        """Return what `action` returns, tried until it succeeds or patience ends; a wait can be broken off."""
-        pause = self._patience.pause(name)
-        while True:
-            try:
-                result = action()
-            except CropError as fault:
-                if not curable(fault):
-                    raise
-                with self._ending.at_once():
-                    pause.wait(fault)
-            else:
-                pause.over()
-                return result
 
     def _collect(self, keep: int) -> None:
         """Journal the frames whose verdicts are due, oldest first, until `keep` are left to wait for."""
@@ -379,7 +358,7 @@ class Pipeline:
         """Let a frame count, or not, and draw what follows for those to come."""
         step, judgement = attempt.step, saved.judgement
         timings = {**attempt.timings, "save": saved.save_s, "judge": saved.judge_s, "waited": waited_s}
-        self._insist(
+        self._patience.attempt(
             lambda: self._session.commit(
                 attempt.number,
                 saved.received,
@@ -478,7 +457,7 @@ class Pipeline:
         if not attempts:
             return
         now = self._devices.clock.now()
-        self._insist(lambda: self._session.journal.void(tuple(attempts), now, reason), _DISK)
+        self._patience.attempt(lambda: self._session.journal.void(tuple(attempts), now, reason), _DISK)
         self._patience.report("voided", f"{counted(len(attempts), 'frame')}, to be taken again: {reason}")
 
     def _salvage(self, error: BaseException) -> None:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -98,15 +98,19 @@ def lights_text(lights: Collection[int]) -> str:
     return ",".join(str(first) if first == last else f"{first}-{last}" for first, last in ranges)
 
 
-def newest_report(session: Path, taken: Collection[str]) -> RefusedFrames:
+def newest_report(session: Path, taken: Mapping[str, int]) -> RefusedFrames:
     """Return what the newest report on a session's frames, beside the session or in it, says is to be taken again.
+
+    The newest is the one whose newest frame was taken last: what clocks said when reports were written counts only
+    between reports on the same frames.
 
     Parameters
     ----------
     session
         The session's folder.
     taken
-        Hashes of all its frames: a report on other frames is another session's.
+        Hashes of all its frames, and the number of the attempt that each came of: a report on other frames is another
+        session's, or a copy's that went on by itself.
 
     Raises
     ------
@@ -114,16 +118,18 @@ def newest_report(session: Path, taken: Collection[str]) -> RefusedFrames:
         There is no such report.
     """
     home = session.resolve()
-    found: list[tuple[int, RefusedFrames]] = []
+    found: list[tuple[int, int, RefusedFrames]] = []
     for path in [*home.parent.glob("*/report.json"), *home.glob("*/report.json")]:
         with suppress(OSError, ValueError, TypeError, KeyError):
             says: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
             refused = RefusedFrames(path, str(says["retake"]), frozenset(map(str, says["retake_sha256"])))
-            if says["registered_sha256"] in taken:
-                found.append((path.stat().st_mtime_ns, refused))
+            # Reports of older software do not say it, and are older.
+            newest = says.get("newest_sha256")
+            if says["registered_sha256"] in taken and newest in (None, *taken):
+                found.append((0 if newest is None else taken[newest], path.stat().st_mtime_ns, refused))
     if not found:
         raise FormatError(
             f"no report of build-lut on {session} lies beside it in {home.parent}; build the table there "
             f"(build-lut {session} {session}-lut), or name the lights, as in --retake 12,40-44"
         )
-    return max(found, key=lambda entry: entry[0])[1]
+    return max(found, key=lambda entry: entry[:2])[2]

@@ -25,33 +25,15 @@ from evaluation.results.answers import SceneAnswer, read_light, results_of
 from evaluation.results.result import Result
 from evaluation.results.tables import Table
 from evaluation.scene import Image, Scene
-from foundation.errors import InputError
 from foundation.processors import ordered_map
-from generator.pictures.tonemap import fit_flash
+from generator.pictures.bits import clear_bits
+from generator.pictures.tonemap import Flash, fit_flash
 
 BITS: Final = tuple(range(8))
 """Numbers of bits set to zero, as in the paper's figure."""
 
 GRAY_EDGE_SIGMA: Final = 6.0
 """Scale of Gray-Edge, px: that of its entry in the NUS tables, for images of full size."""
-
-
-def clear_bits(codes: npt.NDArray[np.uint8], bits: int) -> npt.NDArray[np.uint8]:
-    """Return codes (...) uint8 with their lowest `bits` bits, 0 … 8, set to zero.
-
-    Raises
-    ------
-    InputError
-        A code has no such number of bits.
-
-    Examples
-    --------
-    >>> clear_bits(np.array([7, 8, 200, 255], np.uint8), 3)
-    array([  0,   8, 200, 248], dtype=uint8)
-    """
-    if not 0 <= bits <= 8:
-        raise InputError(f"{bits} bits of a code of 8 were to be set to zero, expected 0 to 8")
-    return codes & np.uint8(0xFF << bits & 0xFF)
 
 
 def reduce_colours(
@@ -85,14 +67,47 @@ def reduce_colours(
             [0.   , 0.023, 0.   ]]], dtype=float32)
     """
     counts = (bits,) if isinstance(bits, int) else tuple(bits)
+    found = fitted_codes(image, mask)
+    return [found.operator.invert(clear_bits(found.codes, count)).astype(np.float32) for count in counts]
+
+
+@dataclass(frozen=True, eq=False)
+class FittedCodes:
+    """A linear image after Flash.
+
+    Attributes
+    ----------
+    codes
+        (H, W, 3) uint8.
+    operator
+        That made them, of values relative to `largest`.
+    largest
+        Largest value that is not masked, in the image's unit; 0 of a black image.
+    """
+
+    codes: npt.NDArray[np.uint8]
+    operator: Flash
+    largest: float
+
+
+def fitted_codes(image: Image, mask: npt.NDArray[np.bool_] | None = None) -> FittedCodes:
+    """Return the codes of 8 bits of a linear image, by the operator that is fitted to it.
+
+    Parameters
+    ----------
+    image
+        (H, W, 3) uint16, float32 or float64, linear camera RGB ≥ 0, any unit.
+    mask
+        (H, W) bool, True where a pixel has no say in the operator.
+    """
     values = np.asarray(image, dtype=np.float64)
     seen = values.reshape(-1, 3) if mask is None else values[~mask]
     largest = float(seen.max(initial=0.0))
     if not largest:
-        return [np.zeros(values.shape, np.float32) for _ in counts]
+        return FittedCodes(np.zeros(values.shape, np.uint8), Flash(1.0, 255.0, 1.0), 0.0)
     operator = fit_flash(seen / largest)
     codes = np.clip(np.rint(operator.apply(values / largest)), 0, 255).astype(np.uint8)
-    return [operator.invert(clear_bits(codes, count)).astype(np.float32) for count in counts]
+    return FittedCodes(codes, operator, largest)
 
 
 def bits_methods(sigma: float = GRAY_EDGE_SIGMA) -> tuple[Method, ...]:

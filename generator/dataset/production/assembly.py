@@ -28,8 +28,10 @@ from generator.dataset.production.records import (
     SOURCE_COLUMNS,
     SOURCES,
     SPLITS,
+    STRETCHED_VERSION,
     SUMS,
     TRUTHS,
+    VERSION,
     Description,
     Details,
     ImageRecord,
@@ -170,6 +172,7 @@ def assemble(place: Workplace, identity: Mapping[str, Any]) -> None:
                 "left out, each with its reason; name others, or ask for a smaller crop if they are too small"
             )
         description = Description(
+            version=STRETCHED_VERSION if options.get("scale") == "full" else VERSION,
             software=software(),
             libraries=identity["libraries"],
             table=TableRecord.model_validate(identity["table"]),

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Final, get_args
 
 from foundation.errors import InputError
-from generator.dataset.production.records import Layout
+from generator.dataset.production.records import Layout, Scale
 from generator.files.formats import FORMATS, Format
 from generator.rendering import Rendering
 from generator.rendering.black_points import KEEP, BlackPoint
@@ -22,6 +22,9 @@ SHARD_IMAGES: Final = 256
 
 RENDERING: Final[Rendering] = "codes"
 """Rendering unless said otherwise: the paper's."""
+STRETCHED: Final[tuple[Format, ...]] = ("png", "tiff", "jxl")
+"""Formats without a place for the white level that readers use, whose counts may be stretched over 16 bits."""
+
 RENDERING_VERSION: Final = 1
 """Of colorimetric rendering: rises when its rules change, so that other pixels come of the same options."""
 
@@ -57,6 +60,13 @@ class DatasetOptions:
         Linear sRGB to the camera's RGB, for colorimetric rendering; None for that of the table's camera.
     black_point
         What becomes of the print's black.
+    bits
+        Bits kept of each code of the pictures, the others set to zero before they are printed; None keeps those that
+        the table tells apart.
+    scale
+        ``"table"`` stores counts as they are; ``"full"`` stretches them over 16 bits, see `generator.files.full_scale`.
+    split_exact
+        Whether parts have exactly the sizes of `split`, and not on average.
 
     Raises
     ------
@@ -84,6 +94,9 @@ class DatasetOptions:
     rendering: Rendering = RENDERING
     matrix: ColourMatrix | None = None
     black_point: BlackPoint = KEEP
+    bits: int | None = None
+    scale: Scale = "table"
+    split_exact: bool = False
 
     @property
     def has_details(self) -> bool:
@@ -114,6 +127,7 @@ class DatasetOptions:
             ("format", self.form, FORMATS),
             ("layout", self.layout, get_args(Layout)),
             ("rendering", self.rendering, get_args(Rendering)),
+            ("scale", self.scale, get_args(Scale)),
         ):
             if value not in known:
                 raise InputError(f"{value!r} is no {what} of a dataset; use one of {', '.join(known)}")
@@ -121,6 +135,15 @@ class DatasetOptions:
             raise InputError("a colour matrix is for colorimetric rendering; choose that, or leave the matrix out")
         if self.shard_images < 1:
             raise InputError(f"shards of {self.shard_images} images were asked for, expected 1 or more")
+        if self.bits is not None and not 1 <= self.bits <= 8:
+            raise InputError(f"{self.bits} bits of each code were to be kept, expected 1 to 8")
+        if self.scale == "full" and self.form not in STRETCHED:
+            raise InputError(
+                f"counts of {self.form} are not stretched: the file says what white is; use one of "
+                f"{', '.join(STRETCHED)}, or leave the scale as it is"
+            )
+        if self.split_exact and self.split is None:
+            raise InputError("exact parts were asked for without their sizes; give a split such as 0.8,0.1,0.1")
         if self.crops < 1:
             raise InputError(f"{self.crops} crops of each picture were asked for, expected 1 or more")
         split = self.split

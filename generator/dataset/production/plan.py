@@ -14,7 +14,7 @@ import importlib.metadata
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -53,6 +53,8 @@ class ShardJob:
         Those of the plan.
     versions
         Versions of the libraries that the bytes depend on; a worker must have the same.
+    parts
+        The part of each of `sources`, where they were decided together; empty where each is by itself.
     """
 
     table: Path
@@ -66,6 +68,7 @@ class ShardJob:
     seed: int
     options: DatasetOptions
     versions: dict[str, str]
+    parts: tuple[Split, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,7 +102,22 @@ class Plan:
                 "a gradient with a colour and several lights an image were both asked for, but masks tell either; "
                 "leave out colour, or ask for one light"
             )
+        kept = self.options.bits
+        if self.options.rendering == "codes" and kept is not None and kept > self.lut.provenance.bits:
+            raise InputError(
+                f"{kept} bits of each code were to be kept, where the table has {self.lut.provenance.bits}; ask for "
+                "fewer"
+            )
         require_libraries(self.options.layout)
+
+    @cached_property
+    def parts(self) -> tuple[Split, ...]:
+        """The part of each source, where parts have exact sizes; empty otherwise."""
+        if not self.options.split_exact or self.options.split is None:
+            return ()
+        from generator.dataset.production.exact_split import exact_parts
+
+        return exact_parts(self.sources, self.options.split, self.seed)
 
     @property
     def total(self) -> int:
@@ -138,10 +156,13 @@ class Plan:
             seed=self.seed,
             options=self.options,
             versions=versions(self.options.form, self.options.layout),
+            parts=tuple(self.parts[place] for place in places) if self.parts else (),
         )
 
     def identity(self) -> dict[str, Any]:
         """Return plain values that two plans share exactly if they make the same bytes."""
+        # Copies of a file are told by its content, which is not in the list of sources.
+        parts = {"parts": hashlib.sha256(" ".join(self.parts).encode()).hexdigest()} if self.parts else {}
         return {
             "format": "crop.plan",
             "version": 1,
@@ -154,6 +175,7 @@ class Plan:
             "lights_each": self.choice.lights_each,
             "shards": self.shards,
             "sources": {"count": len(self.sources), "sha256": sources_sha256(self.sources)},
+            **parts,
         }
 
     def recorded_options(self) -> dict[str, Any]:
@@ -174,6 +196,12 @@ class Plan:
             recorded["variation"] = options.variation.describe()
         if options.crops > 1:
             recorded["crops"] = options.crops
+        if options.bits is not None:
+            recorded["bits"] = options.bits
+        if options.scale != "table":
+            recorded["scale"] = options.scale
+        if options.split_exact:
+            recorded["split_exact"] = True
         # A data set is published: addresses in it have no secrets.
         return json.loads(json.dumps(masked_values(recorded)))
 

@@ -17,6 +17,9 @@ from generator.files.formats import Format
 FORMAT: Final = "crop.dataset"
 VERSION: Final = 2
 """Version 1 listed the sources in `dataset.json`; they have a table of their own since."""
+STRETCHED_VERSION: Final = 3
+"""Of datasets whose counts are stretched over 16 bits: software that knows nothing of it refuses them, and does not
+take their images for more than six times as bright."""
 
 GROUND_TRUTH: Final = "ground_truth.csv"
 GROUND_TRUTH_COLUMNS: Final = ("image", "source", "illumination", "r", "g", "b")
@@ -31,6 +34,7 @@ Details = dict[str, int | float | str]
 """What options did to one image, by column of `images.csv`; all images of a dataset have the same columns."""
 
 Layout = Literal["folder", "webdataset", "parquet"]
+Scale = Literal["table", "full"]
 Split = Literal["train", "validation", "test"]
 SPLITS: Final[tuple[Split, ...]] = ("train", "validation", "test")
 
@@ -57,6 +61,7 @@ class ReadingOptions(_Record):
     layout: Layout = "folder"
     previews: bool
     shard_images: int = Field(default=256, ge=1, le=1 << 32)
+    scale: Scale = "table"
 
 
 class TableRecord(_RecordWithOptional):
@@ -215,7 +220,7 @@ class Description(_Record):
     """
 
     format: Literal["crop.dataset"] = FORMAT
-    version: Literal[2] = VERSION
+    version: Literal[2, 3] = VERSION
     software: str
     libraries: dict[str, str]
     table: TableRecord

@@ -36,6 +36,7 @@ from generator.dataset.production.records import (
 from generator.dataset.production.workers import SILENT, Callbacks
 from generator.dataset.production.workplace import Workplace
 from generator.lights.lighting import Lighting
+from generator.pictures.bits import keep_bits
 from generator.pictures.picture import Cut
 from generator.pictures.sources import Source
 from generator.stores.store import Pieces
@@ -56,6 +57,7 @@ class _ReadSource:
 
     cuts: tuple[Cut, ...]
     record: SourceRecord
+    black_taken: float | None
 
 
 class ShardCancelled(Exception):
@@ -236,6 +238,7 @@ def _read(job: ShardJob, lut: Lut, place: int) -> _ReadSource:
             f"{source.name} has {max(1, len(whole))} crops, expected {job.options.crops}; give the preparation of "
             "pictures and the options of the dataset the same number, and leave random scenes out"
         )
+    whole = tuple(replace(cut, picture=keep_bits(cut.picture, job.options.bits)) for cut in whole)
     if job.options.rendering == "codes":
         fit = [replace_unfit_colours(cut.picture, lut.provenance) for cut in whole]
     else:
@@ -256,17 +259,24 @@ def _read(job: ShardJob, lut: Lut, place: int) -> _ReadSource:
         width=width,
         height=height,
         replaced_pixels=sum(replaced for _, replaced in fit),
-        split=split_of(job.options.split, job.seed, scene.sha256, source.name),
+        split=job.parts[place] if job.parts else split_of(job.options.split, job.seed, scene.sha256, source.name),
         weight=scene.weight,
     )
     cuts = tuple(replace(cut, picture=picture) for cut, (picture, _) in zip(whole, fit, strict=True))
-    return _ReadSource(cuts, record)
+    return _ReadSource(cuts, record, scene.black_taken)
 
 
 def _make(
     job: ShardJob, lut: Lut, writer: ShardWriter, number: int, source: _ReadSource, crop: int, lighting: Lighting
 ) -> Sample:
-    from generator.files.formats import ImageMetadata, encode_pieces, encode_preview, suffix_of
+    from generator.files.formats import (
+        FULL,
+        ImageMetadata,
+        encode_pieces,
+        encode_preview,
+        suffix_of,
+        to_full_scale,
+    )
     from generator.pictures.preview import preview_of
 
     options, cut = job.options, source.cuts[crop]
@@ -274,12 +284,14 @@ def _make(
     white_level = lut.provenance.white_level
     # What exceeds saturation may be below it once it is exposed anew, and is cut then.
     most = LARGEST_COUNT if options.variation.is_on else white_level
-    image, weights, rendered = photograph(lut, cut.picture, lighting, options, job.seed, number, most)
+    taken = source.black_taken
+    image, weights, rendered = photograph(lut, cut.picture, lighting, options, job.seed, number, most, taken)
     varied = options.variation.apply(image, white_level, job.seed, number)
     light = image_light(lut, lighting, weights, varied, options.variation.tints)
-    metadata = ImageMetadata(white_level, light.truth, lut.provenance.camera)
+    stored, level = (image, white_level) if options.scale == "table" else (to_full_scale(image, white_level), FULL)
+    metadata = ImageMetadata(level, light.truth, lut.provenance.camera)
     files: list[tuple[str, str, Pieces]] = [
-        ("images", suffix_of(options.form), encode_pieces(image, options.form, metadata)),
+        ("images", suffix_of(options.form), encode_pieces(stored, options.form, metadata)),
         *((kind, ending, (data,)) for kind, ending, data in light.maps),
     ]
     if options.previews:

@@ -29,7 +29,7 @@ from pydantic import ValidationError
 
 from foundation.errors import FormatError, InputError
 from foundation.files import partial_path, publish_folder, require_free, storage_error
-from foundation.held_folders import LOCK_FILE, held_folder
+from foundation.trust.held_folders import LOCK_FILE, held_folder
 from generator.dataset.production.records import ShardRecord, shard_key
 from generator.stores.places import DESCRIPTION, is_remote, local_path
 from generator.stores.store import LocalStore, RemoteStore, Store, open_store
@@ -148,6 +148,16 @@ def require_free_place(out: str | Path) -> None:
             raise InputError(f"{out} already holds a dataset; name another place, or remove what is there")
     else:
         require_free(local_path(out), "the dataset")
+
+
+def holds_dataset(out: str | Path) -> bool:
+    """Return whether a dataset is complete at `out`, and no plan lies there that its making was ended by."""
+    return open_store(out).has(DESCRIPTION) and not _notes(out).has(PLAN)
+
+
+def differences(stored: Any, wanted: Any) -> list[str]:
+    """Return each difference of two plans, or of parts of them, in words."""
+    return list(_differences(stored, json.loads(json.dumps(wanted))))
 
 
 @contextmanager

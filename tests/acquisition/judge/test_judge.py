@@ -8,7 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from acquisition.judge.checks.lights import crept
 from acquisition.judge.judge import LiveJudge
+from acquisition.judge.known.knowledge import Leaning
 from acquisition.session.judgement import Check, Judgement
 from acquisition.session.plan import SessionStep, tie_steps
 from drivers.camera import ExposureSettings
@@ -378,6 +380,60 @@ def test_a_picture_that_comes_late_is_told(taught: Bench) -> None:
     late = lab.take(lab.light(*ORANGE), HalfChanged(place=(-9, -9, 9, 9), share=0.08), before=Colour(*SKY))
     assert cause(late) == "light"
     assert "of the frame before" in late.reason
+
+
+@pytest.mark.parametrize(("share", "said"), [(1.0, "for 100% of"), (0.3, "for 30% of")])
+def test_a_part_that_still_shows_the_light_before_is_named_as_that(taught: Bench, share: float, said: str) -> None:
+    lab = taught.fork()
+    assert lab.take(lab.light(*SKY)).accepted
+    part = HalfChanged(place=(-9, -9, 0.2, 0.2), share=share)
+    uneven = lab.take(lab.light(*ORANGE), part, before=Colour(*SKY))
+    assert cause(uneven) == "uniformity"
+    assert "still showed the light of the frame before, " in uneven.reason
+    assert said in uneven.reason
+
+
+def test_a_hand_is_named_as_one_also_where_the_light_before_was_darker(taught: Bench) -> None:
+    hand = Person(place=(0.3, 0.4, 0.5, 0.6), left=0.3)
+    for before in (SKY, (120, 77, 48), (0, 0, 255)):
+        lab = taught.fork()
+        assert lab.take(lab.light(*before)).accepted
+        uneven = lab.take(lab.light(*ORANGE), hand, before=Colour(*before))
+        assert "does somebody or something stand before the chart" in uneven.reason
+        assert "did only a part of the picture change?" in uneven.reason, "which a dark part may be, too"
+
+
+@pytest.mark.parametrize(("added", "told"), [(0.006, True), (0.003, False)])
+def test_light_in_the_room_that_no_frame_tells_alone_is_told_by_two(taught: Bench, added: float, told: bool) -> None:
+    known = taught.judge.knowledge
+    assert known.basis is not None
+    assert known.white is not None
+    light = known.basis.light(known.white)
+    # In neutral lights, each of which may as well be a brighter lamp.
+    leaning = Leaning(lamp=((0.003, 0.002),) * 2, added=((added, 0.0017),) * 2)
+    assert (crept(leaning, light, 0.01) == ("", pytest.approx(added))) is told
+    assert crept(replace(leaning, added=leaning.added[:1], lamp=leaning.lamp[:1]), light, 0.01) == ("", 0.0)
+
+
+def test_scrambled_rows_are_named_also_where_they_are_brighter(taught: Bench) -> None:
+    for top in np.linspace(0.2, 0.8, 13).tolist():
+        lab = taught.fork()
+        assert cause(lab.take(lab.light(*ORANGE), ScrambledRows(top=top, bottom=top + 0.05))) == "rows", top
+
+
+def test_where_white_has_some_hundred_counts_noise_and_black_level_are_no_light(tmp_path: Path) -> None:
+    lab = bench(tmp_path, Room(seed=14, wheel_hz=60, white_level_share=0.05), count=8, every=4)
+    assert [said.reason for said in map(lab.take, lab.steps) if said.reason] == []
+    assert lab.take(lab.light(*ORANGE)).accepted
+    assert cause(lab.show(lab.counts(lab.light(*ORANGE)), lab.light(*SKY))) == "light"
+
+
+def test_a_first_frame_that_is_clipped_is_not_taken_again_and_again(tmp_path: Path) -> None:
+    lab = bench(tmp_path, Room(seed=3, white_level_share=4.0))
+    judgement = lab.take(WHITE_STEP)
+    assert cause(judgement) == "clipping"
+    assert judgement.lasting
+    assert "dim the projector, or set a shorter exposure" in judgement.reason
 
 
 def test_a_light_too_dark_for_it_leaves_blur_to_the_next_reference(taught: Bench) -> None:

@@ -5,13 +5,14 @@ from __future__ import annotations
 import subprocess
 import sys
 from collections.abc import Sequence
+from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 
 import pytest
 
 from acquisition.monitor.head import Head, head_of
 from acquisition.monitor.rows import AttemptView, with_seconds
-from acquisition.session.heartbeat import Heartbeat, Process, RunState
+from acquisition.session.heartbeat import Heartbeat, Process, RunState, SessionPlace
 from acquisition.session.plan import plan_steps
 from tests.acquisition.monitor.made_up import LIGHTS
 
@@ -74,6 +75,21 @@ def test_a_killed_run_is_told_at_once_where_it_ran() -> None:
     assert stands.eta is None
 
 
+@pytest.mark.parametrize("alive", [True, False, None])
+def test_a_copy_of_a_session_is_no_run(alive: bool | None) -> None:
+    there, here = SessionPlace("/data/night", 5, 10, 11, 0), SessionPlace("/backup/night", 5, 20, 21, 0)
+    beat = replace(heartbeat("running"), place=there)
+    stands = head_of(STEPS, attempts(3), beat, NOW, process_alive=alive, name="night", here=here)
+    assert (stands.state, stands.alive, stands.eta) == ("copy", False, None)
+    assert "/data/night" in stands.sentence
+    stands = head_of(STEPS, attempts(8), beat, NOW, process_alive=alive, name="night", here=here)
+    assert stands.state == "complete", "all frames are in the copy, too"
+    ended = replace(beat, state="ended")
+    assert head_of(STEPS, attempts(3), ended, NOW, process_alive=alive, name="night", here=here).state == "incomplete"
+    where_it_is = head_of(STEPS, attempts(3), beat, NOW, process_alive=True, name="night", here=there)
+    assert where_it_is.state == "running"
+
+
 @pytest.mark.parametrize(("late_s", "state"), [(29.0, "paused"), (31.0, "stopped")])
 def test_elsewhere_a_missing_sign_of_life_is_waited_for(late_s: float, state: str) -> None:
     beat = heartbeat("paused", process=ELSEWHERE)
@@ -122,6 +138,15 @@ def test_refused_failed_and_voided_are_told_apart_and_none_of_them_counts() -> N
 def test_a_frame_of_a_step_that_the_plan_does_not_have_does_not_count() -> None:
     stray = AttemptView(1, 99, "frames/x.cr2", NOW, NOW, NOW, "accepted", "")
     assert head([stray], heartbeat("running")).done == 0
+
+
+def test_a_clock_that_was_set_back_makes_no_time() -> None:
+    views = [*attempts(4), replace(attempts(1)[0], id=5, step=4, started_at=NOW - timedelta(hours=1))]
+    timed = with_seconds([replace(view, seconds=None) for view in views], [])
+    assert [one.seconds for one in timed] == [None, 5.0, 5.0, 5.0, None]
+    stands = head(timed, heartbeat("running"))
+    assert stands.remaining_s == 15.0
+    assert stands.eta is None, "the lab's clock is not the wall's"
 
 
 def test_the_time_between_two_runs_is_no_frames() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import shutil
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -15,6 +16,7 @@ from acquisition.run.importing import Imported, import_session
 from acquisition.session.folder import FRAME_COLUMNS, Session
 from drivers.presenter import Colour
 from foundation.errors import FormatError
+from tests.json_of import json_of
 
 LIGHTS = tuple(Illumination(number, "uniform", None, Colour(255, number, 0)) for number in range(3))
 Row = Mapping[str, object]
@@ -91,5 +93,9 @@ def test_a_light_without_an_accepted_frame_is_told_by_the_exit_code(
     """Another frame of the light may be refused."""
     write(folder, [light(0), light(1, verdict="refused: a hand"), light(1, verdict=verdict)])
     arguments = ("import", folder / "list.csv", folder / "chart.json", folder / "session")
+    found = json_of(main, arguments, capsys, code)
+    assert len(found["refused"]) == (3 if code else 2) - 1
+    assert found["left"] == (["light 1"] if code else [])
+    shutil.rmtree(folder / "session")
     assert main(list(map(str, arguments))) == code
     assert ("1 are without an accepted frame: light 1; list other files" in capsys.readouterr().err) == (code == 4)

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 import signal
-from collections.abc import Callable
+from collections.abc import Callable, Generator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
@@ -314,3 +315,26 @@ def test_a_journal_that_another_program_held_for_the_whole_patience_is_not_waite
     with pytest.raises(StorageError, match="database is locked"):
         Patience(clock, 600).attempt(held, "the disk")
     assert clock.monotonic() == begun
+
+
+def test_a_wait_can_be_broken_off_and_a_try_cannot() -> None:
+    clock, inside, seen = SimulatedClock(), [0], list[tuple[str, int]]()
+
+    @contextmanager
+    def breakable() -> Generator[None]:
+        inside[0] += 1
+        yield
+        inside[0] -= 1
+
+    def idle() -> None:
+        seen.append(("waits", inside[0]))
+        if clock.monotonic() > 60:
+            raise KeyboardInterrupt
+
+    def action() -> None:
+        seen.append(("tries", inside[0]))
+        raise DeviceFault("it is off; switch it on")
+
+    with pytest.raises(KeyboardInterrupt):
+        Patience(clock, 600, idle=idle, breakable=breakable).attempt(action, "the screen")
+    assert set(seen) == {("tries", 0), ("waits", 1)}

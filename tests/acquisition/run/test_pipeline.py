@@ -106,7 +106,7 @@ class TestTime:
     def test_every_step_of_an_attempt_has_its_time_in_the_journal(self, folder: Path) -> None:
         lab = Lab(folder)
         run(lab)
-        timings = lab.session.journal.timings()
+        timings = {number: known.timings for number, known in lab.session.journal.details().items()}
         assert len(timings) == 6
         for attempt in timings.values():
             assert set(attempt) == {"show", "settle", "expose", "download", "save", "judge", "waited"}

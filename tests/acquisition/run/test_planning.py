@@ -32,6 +32,7 @@ from drivers.projector import Power, Severity
 from foundation.errors import ConfigurationError, CropError, DeviceError, DeviceFault, DeviceRefused, StorageError
 from sim.clock import SimulatedClock
 from sim.projectors.projector import SimulatedProjector
+from tests.json_of import json_of
 
 GB = 10**9
 LIGHTS = tuple(Illumination(index, "uniform", None, Colour(255, index, 0)) for index in range(100))
@@ -366,7 +367,8 @@ class TestDryRun:
 
     def test_a_session_is_looked_at_and_not_changed(self, lab: Path, capsys: pytest.CaptureFixture[str]) -> None:
         night = lab.parent / "night"
-        assert main(["run", str(lab), str(night)]) == 0
+        found = json_of(main, ["run", lab, night], capsys)
+        assert found == {"command": "acquire run", "session": str(night), "frames": 8, "left": 0, "refused": []}
         with Session.open_for_run(night) as session:
             session.retake("2")
         before = contents(lab.parent)
@@ -391,6 +393,11 @@ class TestDryRun:
         said = capsys.readouterr()
         assert "fault       the disk of" in said.out
         assert "are missing; free them" in said.err
+        found = json_of(main, ["run", lab, lab.parent / "night", "--dry-run"], capsys, code=5)
+        assert (found["command"], found["frames"]) == ("acquire run", 8)
+        assert found["needed_bytes"] > found["free_bytes"] == 10**8
+        (fault,) = found["faults"]
+        assert fault.startswith("the disk of")
 
     def test_a_session_that_was_begun_otherwise_is_refused(self, lab: Path) -> None:
         night = lab.parent / "night"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import itertools
 import os
+import shutil
 import signal
 import socket
 import subprocess
@@ -19,7 +20,7 @@ from types import SimpleNamespace
 import pytest
 
 from acquisition.session import heartbeat
-from acquisition.session.heartbeat import Heartbeat, Process, signs_of_life
+from acquisition.session.heartbeat import Heartbeat, Process, SessionPlace, signs_of_life
 from acquisition.session.journal import Journal
 from foundation.errors import DeviceError, StorageError
 
@@ -119,6 +120,109 @@ def test_a_journal_keeps_the_newest_sign_of_life(tmp_path: Path) -> None:
     assert found is not None
     assert (found.state, found.sentence, found.until, found.process) == ("paused", "it is paused", NOW, SELF)
     assert abs(found.at - datetime.now(UTC)) < timedelta(minutes=5)
+
+
+class TestPlace:
+    """Whose folder a sign of life was given for; a copy holds the same sign."""
+
+    @pytest.fixture
+    def run(self, tmp_path: Path) -> Path:
+        """Return a session's folder in which a run has said that it takes frames, and still says so."""
+        folder = tmp_path / "night"
+        folder.mkdir()
+        Journal.create(folder / "journal.sqlite", ())
+        with closing(Journal.open_for_run(folder / "journal.sqlite")) as journal:
+            journal.beat("running", "frames are taken", NOW)
+        return folder
+
+    @staticmethod
+    def of(folder: Path) -> tuple[Heartbeat, SessionPlace]:
+        here = SessionPlace.of(folder / "journal.sqlite")
+        with closing(Journal.open(folder / "journal.sqlite")) as journal:
+            told = journal.heartbeat()
+            assert journal.records() == {}, "the place is no device"
+        assert told is not None
+        assert here is not None
+        return told, here
+
+    def test_it_is_that_of_the_folder_also_when_it_was_renamed(self, run: Path) -> None:
+        told, here = self.of(run)
+        assert told.is_of(here) is True
+        told, here = self.of(run.rename(run.with_name("moved")))
+        assert told.is_of(here) is True
+
+    def test_a_copy_and_a_restored_backup_are_others(self, run: Path) -> None:
+        backup = run.with_name("backup")
+        shutil.copytree(run, backup)
+        told, here = self.of(backup)
+        assert told.is_of(here) is False
+        shutil.rmtree(run)
+        shutil.copytree(backup, run)
+        told, here = self.of(run)
+        if here.generation:  # Else numbers may be given anew, and nothing tells.
+            assert told.is_of(here) is False
+
+    def test_a_folder_that_bears_the_number_of_one_that_is_gone_is_another(self, run: Path) -> None:
+        told, here = self.of(run)
+        said = replace(told, place=replace(here, generation=7))
+        assert said.is_of(replace(here, generation=8)) is False
+        assert said.is_of(replace(here, generation=0)) is True, "over NFS it is not told"
+
+    def test_a_snapshot_of_a_file_system_has_the_same_numbers_and_another_device(self, run: Path) -> None:
+        told, here = self.of(run)
+        assert told.is_of(replace(here, device=here.device + 1)) is False
+
+    def test_over_nfs_the_device_is_another_and_the_numbers_are_the_servers(self, run: Path) -> None:
+        told, here = self.of(run)
+        elsewhere = replace(told, process=replace(SELF, host="another"))
+        assert elsewhere.is_of(replace(here, device=here.device + 1, folder="/mnt/night")) is True
+        assert elsewhere.is_of(replace(here, inode=here.inode + 1)) is False
+
+    def test_after_a_boot_the_device_may_have_another_number(self, run: Path) -> None:
+        told, here = self.of(run)
+        before = replace(told, process=replace(SELF, boot="the one before"))
+        assert before.is_of(replace(here, device=here.device + 1)) is True
+
+    @pytest.mark.parametrize("kind", ["fuse.sshfs", "cifs", "virtiofs"])
+    def test_where_numbers_are_made_up_they_say_nothing(
+        self, run: Path, kind: str, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        told, here = self.of(run)
+        monkeypatch.setattr(heartbeat, "file_system_of", lambda path: kind)  # pyright: ignore[reportUnknownLambdaType, reportUnknownArgumentType]
+        mounted = SessionPlace.of(run / "journal.sqlite")
+        assert mounted is not None
+        assert mounted.folder == here.folder
+        assert told.is_of(mounted) is None
+
+    def test_older_signs_and_damaged_ones_say_nothing(self, run: Path) -> None:
+        told, here = self.of(run)
+        assert replace(told, place=None).is_of(here) is None
+        assert told.is_of(None) is None
+        for text in (
+            "",
+            "null",
+            "{}",
+            '["/night"]',
+            '["/night", 1, 2]',
+            '["/night", 1, 2, "x"]',
+            '["/night", 1, 2, null]',
+        ):
+            assert SessionPlace.from_text(text) is None
+        assert SessionPlace.from_text(here.to_text()) == here
+
+    def test_what_a_reader_of_a_copy_is_told(self, run: Path) -> None:
+        told, here = self.of(run)
+        copy, at = replace(here, folder="/backup/night", inode=1), told.at.astimezone().strftime("%Y-%m-%d %H:%M:%S")
+        elsewhere = replace(told, process=replace(SELF, host="lab"))
+        assert elsewhere.sentence_of_copy(copy, None) == (
+            f"copied from lab:{run} at {at} or later, and it is not known from here whether the run there goes on; ask "
+            "acquire status there"
+        )
+        assert "and the run there goes on; look there" in told.sentence_of_copy(copy, alive=True)
+        assert "which is over now; acquire status" in told.sentence_of_copy(copy, alive=False)
+        assert told.sentence_of_copy(here, alive=False) == (
+            f"restored from a copy of {at} or later, made while a run was at work; run the same command again"
+        )
 
 
 class TestSignsOfLife:

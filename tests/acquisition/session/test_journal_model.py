@@ -19,7 +19,7 @@ from hypothesis import strategies as st
 
 from acquisition.lights.illuminations import Illumination
 from acquisition.session.journal import Journal
-from acquisition.session.judgement import Check, Judgement
+from acquisition.session.judgement import AttemptDetails, Check, Judgement
 from acquisition.session.plan import SessionStep, plan_steps, tie_steps
 from drivers.presenter import Colour
 
@@ -119,18 +119,19 @@ def check(journal: Journal, model: Model) -> None:
     attempts = journal.attempts()
     assert [(one.verdict, one.reason) for one in attempts] == [(row.verdict, row.reason) for row in model.rows]
     judged = {number: row for number, row in enumerate(model.rows, 1) if row.judgement is not None}
-    assert journal.all_checks() == {
-        number: row.judgement.checks for number, row in judged.items() if row.judgement and row.judgement.checks
+    assert journal.details() == {
+        number: AttemptDetails(row.judgement.seen, row.judgement.checks, {"settle": float(number)})
+        for number, row in judged.items()
+        if row.judgement
     }
-    assert journal.seen() == {
-        number: row.judgement.seen for number, row in judged.items() if row.judgement and row.judgement.seen
-    }
+    some = sorted(judged)[::2]
+    assert journal.details(some) == {number: journal.details()[number] for number in some}
+    assert journal.details([]) == {}
     assert list(journal.measurements()) == [
         (row.step, number, row.judgement.measurement, row.verdict == "accepted")
         for number, row in judged.items()
         if row.judgement and row.judgement.measurement
     ]
-    assert journal.timings() == {number: {"settle": float(number)} for number in judged}
     assert [one.attempt for one in journal.accepted_files()] == [
         number for number, row in judged.items() if row.verdict == "accepted"
     ]
@@ -226,7 +227,7 @@ def state_after(journal: Journal) -> tuple[object, ...]:
     """Return what a journal holds, without times."""
     attempts = [(one.id, one.verdict, one.has_frame) for one in journal.attempts()]
     events = [one.what for one in journal.events()]
-    return len(journal.steps()), attempts, journal.all_checks(), journal.timings(), events
+    return len(journal.steps()), attempts, journal.details(), events
 
 
 def test_a_kill_at_any_statement_leaves_the_last_transaction_or_the_one_before(tmp_path: Path) -> None:

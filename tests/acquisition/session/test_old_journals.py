@@ -86,8 +86,7 @@ def test_it_is_read_and_not_changed(folder: Path, capsys: pytest.CaptureFixture[
             "frames/0002_light_000_try2.cr2",
         ], "a light's newest frame counts once"
         assert session.done_steps() == {0, 1, 2}
-        assert session.journal.all_checks() == session.journal.timings() == session.journal.records() == {}
-        assert session.journal.checks(1) == ()
+        assert session.journal.details() == session.journal.details([1]) == session.journal.records() == {}
         assert list(session.journal.measurements()) == []
         assert session.journal.heartbeat() is None
     assert main(["status", str(folder)]) == 0
@@ -119,7 +118,8 @@ def test_it_is_taken_up(folder: Path) -> None:
             "frames/0002_light_000_try2.cr2",
             "frames/0003_light_001.cr2",
         ]
-        assert session.journal.timings() == {7: {"settle": 0.2}, 8: {"settle": 0.2}, 9: {"settle": 0.2}}
+        settled = {number: details.timings for number, details in session.journal.details().items()}
+        assert settled == {7: {"settle": 0.2}, 8: {"settle": 0.2}, 9: {"settle": 0.2}}
     rows = (folder / "frames.csv").read_text().splitlines()
     assert len([row for row in rows if row.endswith(",accepted")]) == 6
 

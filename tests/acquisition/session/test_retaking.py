@@ -195,13 +195,17 @@ def test_lights_as_text_are_read_again(text: str) -> None:
     assert lights_text(parse_lights(text, range(5))) == text
 
 
-def write_report(folder: Path, lights: str, frames: Sequence[bytes], registered: bytes, age: int) -> None:
+def write_report(
+    folder: Path, lights: str, frames: Sequence[bytes], registered: bytes, age: int, newest: bytes | None = None
+) -> None:
     folder.mkdir()
-    says = {
+    says: dict[str, object] = {
         "retake": lights,
         "retake_sha256": [hashlib.sha256(frame).hexdigest() for frame in frames],
         "registered_sha256": hashlib.sha256(registered).hexdigest(),
     }
+    if newest is not None:
+        says["newest_sha256"] = hashlib.sha256(newest).hexdigest()
     (folder / "report.json").write_text(json.dumps(says))
     os.utime(folder / "report.json", (age, age))
 
@@ -220,6 +224,26 @@ def test_what_the_newest_report_refused_is_taken_again_once(session: Session, tm
     assert "lut.refused/report.json" in session.journal.attempts()[4].reason
     session.retake("bad")
     assert take_what_is_left(session) == [], "the report is on the frames that were there before"
+
+
+def test_the_newest_report_is_the_one_on_the_newest_frames_whatever_clocks_said(
+    session: Session, tmp_path: Path
+) -> None:
+    white = b"frame 0000_white"
+    write_report(tmp_path / "lut", "0", [b"frame 0002_light_000"], white, 900, newest=b"frame 0004_light_002")
+    # The machine's clock was set back before this one was written, which knows a later frame.
+    write_report(tmp_path / "later", "1", [b"frame 0003_light_001"], white, 100, newest=b"frame 0006_light_004")
+    # A copy of the session went on by itself: of this one, the report says nothing.
+    write_report(tmp_path / "of a copy", "3", [b"frame 0005_light_003"], white, 999, newest=b"taken in the copy")
+    assert session.retake("bad") == (1,)
+    assert take_what_is_left(session) == [3]
+
+
+def test_between_reports_on_the_same_frames_the_one_written_last_counts(session: Session, tmp_path: Path) -> None:
+    white, last = b"frame 0000_white", b"frame 0006_light_004"
+    write_report(tmp_path / "lut", "0", [b"frame 0002_light_000"], white, 200, newest=last)
+    write_report(tmp_path / "lut.refused", "1", [b"frame 0003_light_001"], white, 100, newest=last)
+    assert session.retake("bad") == (0,)
 
 
 def test_without_a_report_on_this_session_nothing_is_bad(session: Session, tmp_path: Path) -> None:

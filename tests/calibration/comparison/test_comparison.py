@@ -259,10 +259,9 @@ def test_drift_that_is_not_of_these_lights_is_not_used(one: Lut) -> None:
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (["--json"], "--json goes with --compare"),
         (["session", "--out", "x"], "--out goes with --compare"),
         (["--compare", "a", "b", "--info", "a"], "are two commands"),
-        (["--compare", "a", "b", "--linearity", "x"], "--linearity is for the report of one table"),
+        (["--compare", "a", "b", "--linearity", "x"], "--linearity is for one table that is kept"),
         (["c", "--compare", "a", "b"], "--compare does not expect c"),
         (["--compare", "a", "b"], "a is no table"),
     ],

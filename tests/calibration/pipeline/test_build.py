@@ -30,6 +30,7 @@ from foundation.errors import FormatError, InputError, QualityError, Registratio
 from sim.camera.dng import write_dng
 from sim.world.room import Room
 from tests.calibration.lab import LIGHTS, SETTINGS, TAKEN_AT, Lab, hang, renumbered, take
+from tests.json_of import json_of
 
 
 def angle_deg(one: npt.NDArray[np.float64], other: npt.NDArray[np.float64]) -> float:
@@ -408,6 +409,9 @@ def test_the_command_builds_and_reports(session: Session, tmp_path: Path, capsys
 def test_the_command_checks(session: Session, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["--check", str(session.folder)]) == 0
     assert "a table can be built" in capsys.readouterr().out
+    found = json_of(main, ["--check", session.folder], capsys)
+    assert (found["command"], found["format"]) == ("build-lut", "crop.report")
+    assert found["figures"]
 
 
 @pytest.mark.parametrize(

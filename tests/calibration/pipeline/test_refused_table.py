@@ -18,6 +18,7 @@ from calibration.verdict.thresholds import THRESHOLDS
 from calibration.verdict.values import judged_values
 from foundation.errors import QualityError
 from tests.calibration.lab import LIGHTS, Lab, take
+from tests.json_of import json_of
 
 STRICT = (replace(next(limit for limit in THRESHOLDS if limit.name == "darkest_counts"), refuse=60_000.0),)
 
@@ -64,5 +65,7 @@ def test_the_command_ends_with_the_exit_code_of_a_refusal(
     """A window of nine pixels does not fit into these cells."""
     assert main(["--check", "--window", "9", str(short.folder)]) == 4
     assert "Light of neighbouring cells in the worst sample" in capsys.readouterr().err
-    assert main(["--window", "9", str(short.folder), str(tmp_path / "lut")]) == 4
+    found = json_of(main, ["--window", "9", short.folder, tmp_path / "lut"], capsys, code=4)
+    assert (found["command"], found["verdict"]) == ("build-lut", "refuse")
+    assert found["figures"]["bleed"] > 0
     assert not (tmp_path / "lut").exists()

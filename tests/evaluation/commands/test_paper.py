@@ -15,6 +15,7 @@ from generator import DatasetOptions, find_pictures, generate_dataset
 from generator.lights.choices import RandomLights
 from generator.pictures.sources import random_scenes
 from tests.evaluation.experiments.paper.conftest import LIGHTS, TableMaker, make_table
+from tests.json_of import json_of
 
 __all__ = ["make_table"]
 
@@ -77,6 +78,8 @@ def test_table1(
     assert page.index("Reproduction error") < page.index("Images of other sizes") < page.index("Recovery error")
     assert "Photos scenes, 6D sensor, A illuminations" in (out / "table1.tex").read_text()
     assert [row["Per million"] for row in rows_of(out / "hot.csv")] == ["500"] * 8
+    small = ["--pictures", thumbnails, "--lights-like", f"{truths}#A", "--side", "8"]
+    assert len(json_of(main, ["paper", "table1", tables[0], *small], capsys)["tables"]) >= 2
     assert main(["paper", "table1", *tables, *given, *wish]) == 2
     assert "already exists; name another place for the report" in capsys.readouterr().err
 
@@ -111,6 +114,8 @@ def test_table2(make_table: TableMaker, thumbnails: Path, tmp_path: Path, capsys
     (ratio,) = rows_of(out / "ratios.csv")
     assert float(ratio["Ratio"]) == pytest.approx(float(generated[0]["Med."]) / float(real[0]["Med."]))
     assert float(ratio["In the paper, on Cube+"]) == pytest.approx(1.66 / 0.89)
+    again = ["paper", "table2", thumbnails, "--generated", made, "--methods", "constant-light"]
+    assert json_of(main, again, capsys)["tables"][0]["rows"]
     assert main(["paper", "table2", str(thumbnails), "--generated", str(made), "--methods", "magic"]) == 2
     assert "'magic' is no method that learns" in capsys.readouterr().err
     copy = thumbnails.with_name("copy.npz")
@@ -186,6 +191,8 @@ def test_chromaticities(
     assert "black bodies (2)" in (out / "chromaticities.svg").read_text()
     assert main(["paper", "chromaticities", *tables]) == 0
     assert "--out" in capsys.readouterr().out
+    found = json_of(main, ["paper", "chromaticities", *tables], capsys)
+    assert found["command"] == "evaluate paper chromaticities"
 
 
 @pytest.mark.parametrize(

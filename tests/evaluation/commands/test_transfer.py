@@ -15,6 +15,7 @@ from evaluation.experiments.transfer import rows as transfer_rows
 from evaluation.metrics import summarise
 from evaluation.results.errors_file import read_errors
 from tests.evaluation.experiments.transfer.conftest import Maker, save_pictures, write_table
+from tests.json_of import json_of
 
 OWN = """
 import numpy as np
@@ -171,7 +172,9 @@ def test_only_some_images_are_tested(place: Path, capsys: pytest.CaptureFixture[
     lines = list(csv.DictReader(Path("part0/results.csv").read_text().splitlines()))
     assert {line["images"] for line in lines if line["training"] == "cross-validation"} == {"20"}
     assert Path("part0/folds_0.csv").read_text() == Path("whole/folds_0.csv").read_text()
-    assert main(["pool", "part0", "part1", "--error", "recovery", "--out", "pool"]) == 0
+    pooled_json = json_of(main, ["pool", "part0", "part1", "--error", "recovery", "--out", "pool"], capsys)
+    assert (pooled_json["command"], pooled_json["error"]) == ("evaluate pool", "recovery")
+    assert all(table["rows"] for table in pooled_json["tables"])
     together = csv.DictReader(Path("pool/results.csv").read_text().splitlines())
     pooled = {(line["method"], line["training"], line["statistic"]): float(line["degrees"]) for line in together}
     error = whole["Map of the mean, made: generated"].errors["recovery"]
@@ -189,6 +192,9 @@ def test_only_some_images_are_tested(place: Path, capsys: pytest.CaptureFixture[
 def test_images_made_small_are_alike(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main([*BASIC, "--side", "6"]) == 0
     printed = capsys.readouterr().out
+    found = json_of(main, [*BASIC, "--side", "6"], capsys)
+    assert (found["command"], found["test"], found["settings"]["side"]) == ("evaluate transfer", "real", 6)
+    assert all(table["rows"] for table in found["tables"])
     assert "All images were made small to at most 6 px" in printed
     assert "sides of up to" not in printed
 

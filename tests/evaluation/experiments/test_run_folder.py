@@ -23,7 +23,7 @@ from evaluation.scene import Scene, SceneSet
 from foundation.clock import SystemClock
 from foundation.errors import InputError
 from foundation.files import partial_path
-from foundation.held_folders import held_folder
+from foundation.trust.held_folders import held_folder
 from tests.evaluation.made_up import MixedWall, Wall, as_set, walls
 
 METHODS = [GrayEdge("Gray-world", 0, 1, 0, 0), GrayEdge("White-Patch", 0, np.inf, 0, 0)]

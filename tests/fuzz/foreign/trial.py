@@ -147,7 +147,7 @@ def read_session_folder(folder: Path, spare: Path) -> None:
             session.settings_text()
         list(session.journal.measurements())
         session.journal.heartbeat()
-        session.journal.timings()
+        session.journal.details()
         session.journal.records()
         unsound_files(folder, session.journal.accepted_files(), lambda done, total: None)
 

@@ -52,8 +52,8 @@ def test_a_damaged_dataset_is_named(small: Path, tmp_path: Path) -> None:
     with pytest.raises(FormatError, match=r"ground_truth\.csv, line 2: expected image,source"):
         open_dataset(small)
     path = small / "dataset.json"
-    path.write_text(path.read_text().replace('"version": 2', '"version": 3'))
-    with pytest.raises(FormatError, match=r"version: .*reads crop\.dataset of versions 1 to 2"):
+    path.write_text(path.read_text().replace('"version": 2', '"version": 4'))
+    with pytest.raises(FormatError, match=r"version: .*reads crop\.dataset of versions 1 to 3"):
         open_dataset(small)
     with pytest.raises(FormatError, match=r"is no dataset: it has no dataset\.json; make one with generate"):
         open_dataset(tmp_path / "nowhere")

@@ -36,6 +36,21 @@ def test_crops_are_parts_of_the_picture_and_the_first_is_the_single_one(path: Pa
     assert [(cut.left, cut.top) for cut in other.cuts] != [(cut.left, cut.top) for cut in fewer.cuts]
 
 
+def test_the_first_of_several_is_in_the_centre_where_that_is_said(path: Path) -> None:
+    whole = open_picture(path, Preparation(crop=(16, 12))).picture
+    wish = Preparation(crop=(16, 12), crops=4, crop_at="centre", seed=4)
+    cuts = open_picture(path, wish).cuts
+    assert (cuts[0].left, cuts[0].top) == (22, 19)
+    np.testing.assert_array_equal(cuts[0].picture, whole)
+    assert len({(cut.left, cut.top) for cut in cuts}) == 4
+    assert wish.describe()["crop_at"] == "centre"
+    assert Preparation(crop=(16, 12), crops=4).describe()["crop_at"] == "random"
+    assert Preparation(crop=(16, 12)).describe()["crop_at"] == "centre"
+    every = random_places((3, 2), (9, 9), 6, 1, "x", (1, 0))
+    assert every[0] == (1, 0)
+    assert len(set(every)) == 6
+
+
 def test_crops_keep_away_from_each_other() -> None:
     def shared(count: int, together: bool) -> float:
         """Return the mean share of a crop that the second has in common with the first."""

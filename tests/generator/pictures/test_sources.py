@@ -35,12 +35,40 @@ def test_folders_are_searched_in_order_of_names(tmp_path: Path) -> None:
     assert {source.preparation.max_side for source in found} == {99}
 
 
-def test_links_to_folders_are_not_followed_and_links_to_files_are(tmp_path: Path) -> None:
+def test_links_are_followed_unless_that_is_searched_already(tmp_path: Path) -> None:
+    """Neither circles nor pictures that come twice, whatever leads to what."""
     (tmp_path / "in/deep").mkdir(parents=True)
     (tmp_path / "in/deep/a.png").touch()
+    (tmp_path / "out/far").mkdir(parents=True)
+    (tmp_path / "out/far/c.png").touch()
     (tmp_path / "in/again").symlink_to(tmp_path / "in")
+    (tmp_path / "in/above").symlink_to(tmp_path)
     (tmp_path / "in/b.png").symlink_to(tmp_path / "in/deep/a.png")
-    assert [source.name for source in find_pictures([tmp_path / "in"])] == ["b.png", "deep/a.png"]
+    (tmp_path / "in/elsewhere").symlink_to(tmp_path / "out")
+    (tmp_path / "in/further").symlink_to(tmp_path / "out/far")
+    (tmp_path / "out/back").symlink_to(tmp_path / "in/deep")
+    (tmp_path / "in/nowhere").symlink_to(tmp_path / "gone")
+    (tmp_path / "in/round").symlink_to(tmp_path / "in/round")
+    found = find_pictures([tmp_path / "in"])
+    assert [source.name for source in found] == ["b.png", "deep/a.png", "elsewhere/far/c.png"]
+    (tmp_path / "whole").symlink_to(tmp_path / "in")
+    assert len(find_pictures([tmp_path / "whole"])) == 3, "a folder that is named may be a link itself"
+
+
+def test_what_is_not_read_is_told(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    for name in ("a.png", "IMG_1.HEIC", "deep/IMG_2.heif"):
+        (tmp_path / "in" / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / "in" / name).touch()
+    assert [source.name for source in find_pictures([tmp_path / "in"])] == ["a.png"]
+    (told,) = caplog.messages
+    assert told == (
+        f"{tmp_path}/in holds IMG_1.HEIC and 1 more, which are left out: HEIC is not read; convert to JPEG, PNG or AVIF"
+    )
+    assert [source.name for source in find_pictures(f"file://{tmp_path}/in")] == ["a.png"]
+    assert len(caplog.messages) == 2
+    (tmp_path / "in/a.png").unlink()
+    with pytest.raises(InputError, match=r"holds IMG_1\.HEIC and 1 more, which are left out: HEIC is not read"):
+        find_pictures([tmp_path / "in"])
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="names are bytes, whatever they mean, on Linux only")

@@ -18,6 +18,7 @@ from generator.dataset.production.cards.facts import (
     name_of,
     option,
     origin_table,
+    stored_white,
     summary_of,
     table_cell,
     table_name,
@@ -67,7 +68,7 @@ def datasheet(description: Description) -> str:
         "table_name": table_name(description),
         "table_software": table.software,
         "truth": truth_of(description),
-        "white_level": table.white_level,
+        "white_level": stored_white(description),
     }
     # The makers of the dataset are asked for whether or not those of the table are known.
     return template.substitute(answers, count=template.template.count("${open}") + 1)

@@ -10,6 +10,7 @@ from typing import Any, Final
 from calibration.citation.citing import bibtex, table_title
 from calibration.citation.record import origin_lines
 from generator.dataset.production.records import Description
+from generator.files.formats import FULL
 
 DATASHEET: Final = "DATASHEET.md"
 CROISSANT: Final = "croissant.json"
@@ -47,8 +48,32 @@ def summary_of(description: Description) -> str:
     table = description.table
     return (
         f"{counted_images(description)} of linear camera RGB as the raw sensor of the {_one_line(table.camera)} would "
-        f"give them, each with the exact colour of its light. Black is 0, saturation {table.white_level}; nothing is "
-        f"white balanced. {kind_of(description)}"
+        "give them, each with the exact colour of its light. Black is 0, saturation "
+        f"{stored_white(description)}; nothing is white balanced. {kind_of(description)}"
+    )
+
+
+def stored_white(description: Description) -> int:
+    """Return the number that saturation has in the files."""
+    return FULL if option(description, "scale") == "full" else description.table.white_level
+
+
+def brightness_note(description: Description) -> str:
+    """Return why a reader that knows nothing of raw images shows them as it does, and what to do about it."""
+    white = stored_white(description)
+    if option(description, "format") == "dng":
+        return "Images are raw files: open them with a raw developer."
+    if option(description, "scale") == "full":
+        counts = description.table.white_level
+        return (
+            f"Counts of 0 to {counts} are stretched over 16 bits: the camera's count is round(v * {counts} / {FULL}). "
+            "Images are linear, so that they still look darker than photographs: for display divide by the ground "
+            "truth and apply the sRGB curve."
+        )
+    return (
+        f"A reader that takes {FULL} for white, as WebDataset's decoders, imageio and image viewers do, shows them "
+        f"nearly black: {white} is white here. Divide by {white} after decoding all 16 bits, or make the dataset with "
+        "generate --scale full. Previews show what they look like."
     )
 
 

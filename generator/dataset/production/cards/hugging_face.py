@@ -12,6 +12,7 @@ import json
 from generator.dataset.production.cards.facts import (
     CROISSANT,
     DATASHEET,
+    brightness_note,
     citation_of,
     kind_of,
     name_of,
@@ -54,7 +55,7 @@ def card(description: Description) -> str:
         f"- **Made by** {description.software}, seed {description.seed}; `dataset.json` has enough to make every byte "
         f"again, `SHA256SUMS` the hash of every file but this one, `{DATASHEET}` and `{CROISSANT}`\n"
         f"- **More**: [{DATASHEET}]({DATASHEET}) (Datasheets for Datasets), [{CROISSANT}]({CROISSANT}) (MLCommons)\n\n"
-        f"## Reading\n\n{_reading(description)}\n\n"
+        f"## Reading\n\n{_reading(description)}\n\n{brightness_note(description)}\n\n"
         f"## Licence\n\n**To be stated by whoever publishes**: images are made of pictures, which have licences of "
         f"their own (`sources.csv` names them), and of the table, whose licence is in the list below. Put the result "
         f"into the front matter, in place of `unknown`.\n\n"

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from foundation.errors import FormatError, InputError
-from foundation.held_folders import FolderLock, held_folder
+from foundation.trust.held_folders import FolderLock, held_folder
 from generator.dataset.making import (
     DatasetOptions,
     Plan,
@@ -199,8 +199,11 @@ def test_shares_make_the_whole(make_lut: Callable[..., Lut], tmp_path: Path) -> 
     finish_dataset(out)
     assert contents(out) == contents(tmp_path / "whole")
     assert not list(tmp_path.glob(".out*"))
+    before = contents(out)
+    assert finish_dataset(out).description.images == plan_of(lut).total, "finished before: it is there"
+    assert contents(out) == before
     with pytest.raises(InputError, match="no dataset is being made at"):
-        finish_dataset(out)
+        finish_dataset(tmp_path / "elsewhere")
 
 
 def test_shares_are_made_beside_each_other(make_lut: Callable[..., Lut], tmp_path: Path) -> None:

@@ -14,9 +14,9 @@ import numpy as np
 import numpy.typing as npt
 
 from acquisition.judge import limits
-from acquisition.judge.basis import FrameLight
-from acquisition.judge.knowledge import Knowledge, Leaning, Seen, combined
-from acquisition.judge.response import Codes, Fit, ProjectorModel
+from acquisition.judge.known.basis import FrameLight
+from acquisition.judge.known.knowledge import Knowledge, Leaning, Seen, combined
+from acquisition.judge.known.response import Codes, Fit, ProjectorModel
 from acquisition.session.judgement import Check
 from acquisition.session.plan import SessionStep
 from foundation.angles import angles_deg
@@ -86,7 +86,7 @@ def judge_light(
     percent = 100 * float(np.expm1(fit.brightness))
     leaning = Leaning(((fit.brightness, fit.brightness_sd),), (_added(model, light, codes),))
     if not reason and not lamp and not stepped and not known.rested:
-        lamp, added = _crept(known.leaning.then(leaning), light, drift_percent / 100)
+        lamp, added = crept(known.leaning.then(leaning), light, drift_percent / 100)
         reason = _ambient_reason(added) if added else ""
     ambient = (Check("ambient", round(100 * added, 2), None, None, "%", reason),) if added else ()
     # Where another cause changes the light, its brightness is none of the lamp's.
@@ -98,11 +98,21 @@ def judge_light(
     return LightVerdict(checks, fit.brightness, stepped, leaning)
 
 
-def _crept(leaning: Leaning, light: FrameLight, drift: float) -> tuple[str, float]:
-    """Return the reason against the lamp, or how much light is added, that the last lights together show."""
+def crept(leaning: Leaning, light: FrameLight, drift: float) -> tuple[str, float]:
+    """Return the reason against the lamp, or how much light is added, of white, that the last lights together show.
+
+    Parameters
+    ----------
+    leaning
+        By how much the lights were off, the newest first; each alone is too little to be told.
+    light
+        Of the newest.
+    drift
+        Change of brightness that is always allowed, 0 … 1.
+    """
     for count in range(2, len(leaning.lamp) + 1):
         added, sd = combined(leaning.added[:count])
-        if added > max(limits.ADDED_LEAST, limits.BRIGHTNESS_SIGMAS * sd):
+        if added > max(limits.ADDED_LEAST, limits.ADDED_SIGMAS * sd):
             return "", added
         brightness, sd = combined(leaning.lamp[:count])
         if abs(brightness) > max(drift, limits.BRIGHTNESS_SIGMAS * sd):
@@ -141,9 +151,10 @@ def _cause(
     remains = _added_of(model, light, codes, before)
     ambient = _added_of(model, light, codes, None)
     if wrong and remains is not None and (ambient is None or remains[1] + 9 < ambient[1]):
+        elsewhere = ", or does light from elsewhere fall on the chart?" if _coloured(model, light, codes) else ""
         return (
             f"{100 * remains[0]:.1f} % of the light of the frame before remain in this one; let the picture settle for "
-            "longer (sequence.settle_s), and switch dynamic contrast and frame interpolation off",
+            f"longer (sequence.settle_s), and switch dynamic contrast and frame interpolation off{elsewhere}",
             0.0,
         )
     if wrong:
@@ -249,7 +260,7 @@ def _coloured(model: ProjectorModel, light: FrameLight, codes: Codes) -> float:
     """Return how much light of any colour, of white, is added to the one ordered; 0 where it is not just more light."""
     expected = model.predict(codes)
     off = light.amounts - expected.amounts
-    sd = np.sqrt(np.diag(expected.with_lamp) + (model.brightness_sd * expected.amounts) ** 2)
+    sd = np.sqrt(np.diag(expected.with_lamp + light.covariance) + (model.brightness_sd * expected.amounts) ** 2)
     more = float(np.mean(off))
     return more if (off > -3 * sd).all() and limits.ADDED_LEAST < more < limits.ADDED_MOST else 0.0
 

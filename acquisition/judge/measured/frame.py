@@ -21,8 +21,8 @@ from acquisition.framing.finding import Framing
 from acquisition.framing.planes import CHANNELS, Channel, Plane
 from acquisition.framing.tagless_field import FoundField
 from acquisition.framing.tags import FoundTag
-from acquisition.judge.anchor import Anchor
-from acquisition.judge.measuring import FramePlaces, Measured, Noise
+from acquisition.judge.measured.anchor import Anchor
+from acquisition.judge.measured.measuring import FramePlaces, Measured, Noise
 
 VERSION = 1
 """Of the format of the bytes."""

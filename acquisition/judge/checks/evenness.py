@@ -8,13 +8,17 @@ import numpy as np
 import numpy.typing as npt
 
 from acquisition.judge import limits
-from acquisition.judge.basis import Basis, FrameLight, Residuals
-from acquisition.judge.measuring import SEGMENTS, TILE_COLUMNS, TILE_ROWS, Measured
+from acquisition.judge.known.basis import Basis, FrameLight, Residuals
+from acquisition.judge.known.knowledge import Seen
+from acquisition.judge.measured.measuring import SEGMENTS, TILE_COLUMNS, TILE_ROWS, Measured
 from acquisition.session.judgement import Check
 from foundation.robust import sigma_of
 
 _DARKER = -0.1
 """Median relative deviation below which places that deviate are called covered or dark, and not differently lit."""
+
+_OF_BEFORE = 0.02
+"""Power of the deviation, relative, that the light of the frame before may leave where it is seen: 8° off."""
 
 _BOTH_PARTS = 0.5
 """Share of the tiles off from which on it is the frame that deviates and not a part of it."""
@@ -34,6 +38,10 @@ _CONTRAST = 2.0
 _BY_TURNS = 0.1
 """Share of deviating rows that are brighter, or darker, from which on they are rows of another place."""
 
+_RAGGED = 0.1
+"""Median step from row to row, over the median deviation, from which on rows are those of several places: of shadows,
+windows and parts of a picture it is 0.03 and less, of scrambled rows 0.2 and more (simulated)."""
+
 _UNSEEN_PX = 1.0
 """Movement or blur, px, that rows at the print's edges must stand: those are measured where they can be told."""
 
@@ -51,8 +59,20 @@ class Evenness:
     off: npt.NDArray[np.bool_]
 
 
-def judge_evenness(basis: Basis, light: FrameLight, frame: Measured, moved_px: _Array) -> Evenness:
-    """Return whether a lit frame shows one light everywhere; the chart lies `moved_px` (2,) from the basis."""
+def judge_evenness(
+    basis: Basis, light: FrameLight, frame: Measured, moved_px: _Array, before: Seen | None = None
+) -> Evenness:
+    """Return whether a lit frame shows one light everywhere.
+
+    Parameters
+    ----------
+    basis, light, frame
+        The frame, and its light as it is fitted to all of it.
+    moved_px
+        (2,) how far the chart lies from its place in the basis.
+    before
+        The frame before, whose light may still be seen in a part; None where there is none.
+    """
     rest = light.tiles
     systematic = limits.UNEVEN if basis.of_primaries else limits.UNEVEN_WHITE
     by = float(np.hypot(*moved_px)) / float(np.diff(frame.places.x_edges).mean())
@@ -64,12 +84,40 @@ def judge_evenness(basis: Basis, light: FrameLight, frame: Measured, moved_px: _
     worst = int(excess.argmax())
     # A tile of few cells is not what the camera's colours under white describe; many tiles are.
     least = 1 if basis.of_primaries else max(1, round(limits.UNEVEN_TILES * len(off)))
-    reason = _uneven_reason(rest, off) if off.sum() >= least else ""
+    late = _share_of_before(basis, light, frame, off, before)
+    reason = _uneven_reason(rest, off, late) if off.sum() >= least else ""
     value, limit = (100 * float(np.nan_to_num(number)) for number in (rest.relative[worst], allowed[worst]))
     checks = [Check("uniformity", round(value, 2), None, round(limit, 2), "%", reason)]
     if len(frame.strips):
         checks += _judge_rows(basis, light, frame, moved_px, bool(reason))
     return Evenness(tuple(checks), off if reason else np.zeros_like(off))
+
+
+def _share_of_before(
+    basis: Basis, light: FrameLight, frame: Measured, off: npt.NDArray[np.bool_], before: Seen | None
+) -> float:
+    """Return for how much of the exposure the tiles off (T,) bool showed the light of the frame before; 0 if another.
+
+    And 0 where that light was so much darker that a shadow explains what is seen as well.
+    """
+    if before is None or before.amounts is None or not off.any() or not basis.of_primaries:
+        return 0.0
+    maps = basis.maps[:, off]
+    expected, change = (np.einsum("p,ptc->tc", a, maps) for a in (light.amounts, before.amounts - light.amounts))
+    seen = frame.tiles[off] - basis.dark[off] - expected
+    share, left = _explained(seen, change)
+    _, left_by_shadow = _explained(seen, -expected)
+    return float(np.median(share)) if left < min(_OF_BEFORE, left_by_shadow / 4) else 0.0
+
+
+def _explained(seen: _Array, by: _Array) -> tuple[_Array, float]:
+    """Return shares (T,) 0 … 1 of what deviates (T, 3) that make up `seen` (T, 3), and the part of its power left.
+
+    Each tile has its own: some are cut by an edge.
+    """
+    share = np.clip((seen * by).sum(axis=1) / np.maximum((by**2).sum(axis=1), 1e-9), 0, 1)
+    left = ((seen - share[:, None] * by) ** 2).sum() / max(float((seen**2).sum()), 1e-9)
+    return share, float(left)
 
 
 def _beside(basis: Basis) -> _Array:
@@ -102,7 +150,7 @@ def _judge_rows(basis: Basis, light: FrameLight, frame: Measured, moved_px: _Arr
     # Rows of another place are brighter and darker by turns; a shadow or another light is one of both.
     signed = rest.signed[wrong]
     brighter = float((signed > 0).mean())
-    if uneven and min(brighter, 1 - brighter) < _BY_TURNS:
+    if uneven and min(brighter, 1 - brighter) < _BY_TURNS and not _is_ragged(rest, wrong):
         return checks
     rows = np.flatnonzero(wrong.reshape(-1, SEGMENTS).any(axis=1))
     reason = (
@@ -110,6 +158,16 @@ def _judge_rows(basis: Basis, light: FrameLight, frame: Measured, moved_px: _Arr
         "what belongs there; the file was damaged on its way: check the cable and the memory card"
     )
     return [Check("rows", float(count), None, float(limits.ROWS), "", reason)]
+
+
+def _is_ragged(rest: Residuals, wrong: npt.NDArray[np.bool_]) -> bool:
+    """Return whether strips (S,) bool that deviate do so row by row otherwise; a shadow goes on from row to row."""
+    deviation, of = np.nan_to_num(rest.signed).reshape(-1, SEGMENTS), wrong.reshape(-1, SEGMENTS)
+    both = of[1:] & of[:-1]
+    if np.count_nonzero(both) < limits.ROWS:
+        return False
+    steps = np.abs(np.diff(deviation, axis=0))[both]
+    return bool(np.median(steps) > _RAGGED * np.median(np.abs(rest.signed[wrong])))
 
 
 def _typical(rest: Residuals) -> float:
@@ -132,12 +190,18 @@ def _wrong_rows(basis: Basis, rest: Residuals, moved_px: _Array) -> npt.NDArray[
     return np.asarray(np.abs(np.where(seen, rest.signed, 0.0)) > room)
 
 
-def _uneven_reason(rest: Residuals, off: npt.NDArray[np.bool_]) -> str:
+def _uneven_reason(rest: Residuals, off: npt.NDArray[np.bool_], late: float) -> str:
     lit = np.isfinite(rest.relative)
     share = float(off.sum() / max(int(lit.sum()), 1))
     median = float(np.median(rest.signed[off]))
     where = _where(off)
     amount = f"{max(share, 0.01):.0%} of the frame, {where},"
+    if late:
+        return (
+            f"{amount} still showed the light of the frame before, for {max(late, 0.01):.0%} of the exposure: only a "
+            "part of the picture had changed; let it settle for longer (sequence.settle_s), and look for what else "
+            "draws on the screen"
+        )
     if share > _BOTH_PARTS:
         return (
             f"{share:.0%} of the frame are not what the primaries give together; did the picture change during the "
@@ -146,7 +210,7 @@ def _uneven_reason(rest: Residuals, off: npt.NDArray[np.bool_]) -> str:
     if median < _DARKER:
         return (
             f"{amount} are {-median:.0%} darker than the light of the rest; does somebody or something stand before "
-            "the chart or the projector, or does a window cover the picture?"
+            "the chart or the projector, does a window cover the picture, or did only a part of the picture change?"
         )
     return (
         f"{amount} show another light than the rest, {median:+.0%} bright; did only a part of the picture change, does "

@@ -1,0 +1,73 @@
+"""Frames come in the order of the journal, and their times go on, whatever a clock was set to."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Sequence
+from datetime import UTC, datetime, timedelta
+from itertools import pairwise
+from pathlib import Path
+
+import pytest
+
+from acquisition.chart.layout import design_chart
+from acquisition.lights.illuminations import Illumination
+from acquisition.session.folder import Session
+from acquisition.session.incoming import ReceivedFile
+from acquisition.session.judgement import Judgement
+from acquisition.session.plan import plan_steps
+from calibration.pipeline.frames import select_frames
+from drivers.camera import CapturedFrame
+from drivers.presenter import Colour
+
+AT = datetime(2024, 3, 1, 23, 0, tzinfo=UTC)
+LIGHTS = tuple(Illumination(n, "uniform", None, Colour(255, 20 * n, 255 - n)) for n in range(5))
+STEPS = plan_steps(LIGHTS, 2)
+
+
+@pytest.fixture
+def taken(tmp_path: Path) -> Callable[[Sequence[float]], Session]:
+    """Return what makes a session whose frames were taken so many seconds after `AT`, as its clock said."""
+
+    def make(seconds: Sequence[float]) -> Session:
+        with Session.create(tmp_path / "s", 'rig = "simulated"\n', design_chart(1), LIGHTS, STEPS) as session:
+            for step, after in zip(STEPS, seconds, strict=True):
+                at, data = AT + timedelta(seconds=after), step.stem.encode()
+                attempt = session.journal.begin(step, f"frames/{step.stem}.cr2", at)
+                path = session.frames_folder / f"{step.stem}.cr2"
+                path.write_bytes(data)
+                captured = CapturedFrame(path.name, len(data), at)
+                received = ReceivedFile(path, len(data), hashlib.sha256(data).hexdigest(), captured)
+                session.commit(attempt, received, Judgement(()), exposure_s=0.5, ended_at=at)
+        return Session.open_for_run(tmp_path / "s")
+
+    return make
+
+
+def test_a_clock_that_goes_on_is_left_as_it_is(taken: Callable[[Sequence[float]], Session]) -> None:
+    seconds = [4.0 * number for number in range(len(STEPS))]
+    with taken(seconds) as session:
+        records = select_frames(session).records
+    assert [(record.taken_at - AT).total_seconds() for record in records] == seconds
+    assert [record.file for record in records] == [f"frames/{step.stem}.cr2" for step in STEPS]
+
+
+def test_where_it_was_set_back_time_goes_on_by_the_usual_interval(taken: Callable[[Sequence[float]], Session]) -> None:
+    back = [4.0 * number - (3600 if number >= 5 else 0) - (90 if number >= 8 else 0) for number in range(len(STEPS))]
+    with taken(back) as session:
+        selected = select_frames(session)
+        assert [record.file for record in selected.records] == [f"frames/{step.stem}.cr2" for step in STEPS]
+        assert selected.newest.file == f"frames/{STEPS[-2].stem}.cr2", "the last one is dark"
+        raw = [frame.taken_at for frame in session.frames()]
+    gaps = [(after.taken_at - before.taken_at).total_seconds() for before, after in pairwise(selected.records)]
+    assert gaps == [4.0] * (len(STEPS) - 1)
+    assert raw == [AT + timedelta(seconds=one) for one in back], "the journal says what the clock said"
+
+
+def test_frames_taken_by_other_means_have_their_times_alone(taken: Callable[[Sequence[float]], Session]) -> None:
+    # A list may name the lights in the order of their numbers, whenever they were taken.
+    listed = [float(7 * number % len(STEPS)) for number in range(len(STEPS))]
+    with taken(listed) as session:
+        session.journal.note(AT, "import", "13 frames from frames.csv")
+        records = select_frames(session).records
+    assert [(record.taken_at - AT).total_seconds() for record in records] == sorted(listed)

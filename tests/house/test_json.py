@@ -1,0 +1,199 @@
+"""`--json`: of every command that has figures, one object, described in docs/reference/json.md, and nothing else."""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+import sys
+from collections.abc import Iterator
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from typer.main import get_command
+
+from foundation.errors import QualityError
+from foundation.json_output import JsonOutput, json_output, plain, with_json
+from tests.json_of import json_of
+
+COMMANDS = {
+    "acquire": "acquisition.cli",
+    "build-lut": "calibration.cli",
+    "generate": "generator.cli",
+    "evaluate": "evaluation.cli",
+    "sim": "synthesis.cli",
+}
+WITHOUT_FIGURES = {"acquire init", "acquire redact", "acquire monitor", "acquire report", "sim projector", "sim camera"}
+"""Commands that write or serve something and have no figure to tell."""
+
+REFERENCE = Path(__file__).parents[2] / "docs/reference/json.md"
+
+
+def leaves(words: tuple[str, ...], command: Any) -> Iterator[tuple[str, Any]]:
+    """Yield every command without others below it, with its words."""
+    below = getattr(command, "commands", {})
+    if not below:
+        yield " ".join(words), command
+    for name, found in below.items():
+        yield from leaves((*words, name), found)
+
+
+EVERY = dict(leaf for name, room in COMMANDS.items() for leaf in leaves((name,), get_command(import_module(room).app)))
+
+
+def described() -> dict[str, str]:
+    """Return the section of the reference on each command."""
+    parts = re.split(r"^## (.*)$", REFERENCE.read_text(encoding="utf-8"), flags=re.MULTILINE)
+    return {title.strip("`"): text for title, text in zip(parts[1::2], parts[2::2], strict=True)}
+
+
+@pytest.mark.parametrize("name", EVERY)
+def test_every_command_with_figures_has_it_and_is_described(name: str) -> None:
+    has = any("--json" in option.opts for option in EVERY[name].params)
+    assert has == (name not in WITHOUT_FIGURES)
+    assert (name in described()) == has
+
+
+def test_nothing_else_is_described() -> None:
+    assert set(described()) == set(EVERY) - WITHOUT_FIGURES
+
+
+class TestOutput:
+    def test_what_is_printed_goes_elsewhere(self, capsys: pytest.CaptureFixture[str]) -> None:
+        with json_output("generate", asked=True) as told:
+            print("for a reader")
+            told.add(
+                images=3, share=math.nan, most=math.inf, place=Path("a"), levels=np.arange(2), mean=np.float32(0.5)
+            )
+            told.append("notes", "é")
+        said = capsys.readouterr()
+        assert json.loads(said.out) == {
+            **{"command": "generate", "images": 3, "share": None, "most": None, "place": "a", "levels": [0, 1]},
+            **{"mean": 0.5, "notes": ["é"]},
+        }
+        assert said.err == "for a reader\n"
+
+    def test_nothing_changes_unless_asked(self, capsys: pytest.CaptureFixture[str]) -> None:
+        with json_output("generate", asked=False) as told:
+            print("for a reader")
+            told.add(images=3)
+        assert capsys.readouterr().out == "for a reader\n"
+
+    def test_figures_of_bad_data_are_told(self, capsys: pytest.CaptureFixture[str]) -> None:
+        with pytest.raises(QualityError):
+            _refuse(faults=["a"])
+        assert json.loads(capsys.readouterr().out) == {"command": "build-lut", "faults": ["a"]}
+        with pytest.raises(QualityError):
+            _refuse()
+        assert capsys.readouterr().out == ""
+
+    def test_a_command_without_a_place_for_it_is_our_mistake(self) -> None:
+        with pytest.raises(ValueError, match="no parameter 'told'"):
+            with_json("x")(lambda: None)
+
+    def test_standard_output_is_given_back(self) -> None:
+        before = sys.stdout
+        with json_output("x", asked=True):
+            pass
+        assert sys.stdout is before
+
+    def test_objects_are_plain(self) -> None:
+        assert plain(JsonOutput) == str(JsonOutput)
+        assert plain({1: {2.5}}) == {"1": [2.5]}
+
+
+def _refuse(**figures: Any) -> None:
+    with json_output("build-lut", asked=True) as told:
+        told.add(**figures)
+        raise QualityError("bad")
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a folder with a small computed table `lut`, pictures, and a dataset `set` of 12 images made of them."""
+    folder = tmp_path_factory.mktemp("json")
+    (folder / "pictures").mkdir()
+    for number in range(6):
+        coarse = np.random.default_rng(number).integers(0, 256, (4, 5, 3)).astype(np.uint8)
+        cv2.imwrite(str(folder / f"pictures/{number}.png"), cv2.resize(coarse, (60, 48), interpolation=cv2.INTER_CUBIC))
+    (folder / "table.toml").write_text("[chart]\nbits = 2\n")
+    table = ["table", str(folder / "lut"), "--settings", str(folder / "table.toml"), "--lights", "D65,A,FL2,7500K"]
+    assert main_of("sim")(table) == 0
+    wish = ["--sources", str(folder / "pictures"), "--random", "2"]
+    assert main_of("generate")([str(folder / "lut"), str(folder / "set"), *wish]) == 0
+    return folder
+
+
+def main_of(command: str) -> Any:
+    return import_module(COMMANDS[command]).main
+
+
+CALLS: dict[str, tuple[str, dict[str, Any]]] = {
+    "acquire chart": ("OUT/chart --bits 1 --no-tiff", {"colours": 8}),
+    "acquire illuminations": ("OUT/lights.csv --grid 2 --blackbodies 5000", {"lights": 7}),
+    "acquire devices": ("--search 0", {}),
+    "build-lut --info": ("MADE/lut", {"lights": 4, "colours": 64, "samples": 25}),
+    "build-lut --verify": ("MADE/lut", {"faults": []}),
+    "build-lut --match": ("MADE/lut MADE/lut", {"match": True}),
+    "build-lut --publish": ("MADE/lut OUT/published", {"lights": 4}),
+    "sim table": ("OUT/lut --settings MADE/table.toml --lights D65", {"lights": 1, "colours": 64}),
+    "generate": ("MADE/lut OUT/set --sources MADE/pictures", {"images": 6, "made": True, "skipped": []}),
+    "generate again": ("MADE/lut MADE/set --sources MADE/pictures --random 2", {"images": 12, "made": False}),
+    "generate --verify": ("MADE/set", {"faults": [], "images": 12}),
+    "generate --finish": ("MADE/set", {"made": False}),
+    "evaluate run": ("MADE/set --methods gray-world", {"data_set": "set", "images": 12}),
+    "evaluate cv": ("constant-light MADE/set --folds 2", {"folds": 2, "images": 12}),
+    "evaluate train": ("constant-light MADE/set --out OUT/model.npz", {"images": 12, "unused": 0}),
+    "evaluate tune": ("shades-of-gray MADE/set", {"images": 12, "family": "shades-of-gray"}),
+    "evaluate describe": ("MADE/set", {"data_sets": ["set"]}),
+    "evaluate paper bits": ("MADE/set --sigma 1", {}),
+    "evaluate paper flash": ("MADE/set --out OUT/codes --clear 2", {"images": 12, "cleared": 2}),
+    "evaluate paper reduction": ("MADE/pictures/0.png", {}),
+    "evaluate paper chromaticities": ("MADE/lut", {}),
+}
+
+
+@pytest.mark.parametrize("name", CALLS)
+def test_a_command_prints_one_object_with_the_keys_of_the_reference(
+    name: str, made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = name.removesuffix(" again").split()
+    text, expected = CALLS[name]
+    arguments = [word.replace("MADE", str(made)).replace("OUT", str(tmp_path)) for word in text.split()]
+    found = json_of(main_of(words[0]), [*words[1:], *arguments], capsys)
+    command = " ".join(word for word in words if not word.startswith("--"))
+    assert found["command"] == command
+    assert {key: found[key] for key in expected} == expected
+    section = described()[command]
+    assert {key for key in found if key != "command" and f"`{key}`" not in section} == set()
+
+
+def test_the_inverse_of_flash_and_comparisons(made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    evaluate = main_of("evaluate")
+    data, codes, results = str(made / "set"), tmp_path / "codes", tmp_path / "results"
+    json_of(evaluate, ["paper", "flash", data, "--out", codes], capsys)
+    found = json_of(evaluate, ["paper", "flash-inverse", codes, "--out", tmp_path / "linear"], capsys)
+    assert (found["images"], found["command"]) == (12, "evaluate paper flash-inverse")
+    assert evaluate(["run", data, "--methods", "gray-world,white-patch", "--out", str(results)]) == 0
+    compared = json_of(evaluate, ["compare", results], capsys)
+    assert len(compared["verdicts"]) == 1
+    assert [len(table["rows"]) > 0 for table in compared["tables"]] == [True] * 3
+    rows = compared["tables"][0]["rows"]
+    assert set(rows[0]) == set(compared["tables"][0]["columns"])
+    for key in ("images", "folder"):
+        assert f"`{key}`" in described()["evaluate paper flash-inverse"]
+    section = described()["evaluate compare"]
+    assert {key for key in compared if key != "command" and f"`{key}`" not in section} == set()
+
+
+def test_faults_are_figures_too(made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    wish = ["--random-scenes", "2", "--size", "20x20"]
+    found = json_of(main_of("generate"), [made / "lut", tmp_path / "set", *wish, "--shard-images", "1"], capsys)
+    assert found["splits"] == {}
+    (tmp_path / "set/images/000001.png").write_bytes(b"")
+    (fault,) = json_of(main_of("generate"), ["--verify", tmp_path / "set"], capsys, code=4)["faults"]
+    assert "000001.png" in fault
