@@ -257,7 +257,8 @@ def check(
 
     Reads LAB.toml, the chart and the lights it names. Takes 10 to 20 frames and keeps none; tries shutter times until
     one suits. Each verdict is good, a remark, a fault, or not checked, with its number, limit, reason and remedy.
-    Writes nothing unless asked with --picture. Ends with 4 when there is a fault.
+    Writes nothing unless asked with --picture. Ends with 4 when there is a fault. Devices that cannot be used are all
+    named at once, each with its remedy, and end it with 3, or with 2 where LAB.toml alone is at fault.
     """
     import json
 
