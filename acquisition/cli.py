@@ -99,15 +99,19 @@ def chart(
     ] = Arrangement.TAGGED,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the order of the colours.")] = 1,
     tiff: Annotated[bool, typer.Option(help="Write the 600-dpi TIFF.")] = True,
+    tagged_tiff: Annotated[
+        bool,
+        typer.Option("--tagged-tiff", help="Write chart-srgb.tif too, tagged as sRGB, to print through a profile."),
+    ] = False,
     *,
     told: JsonOutput,
 ) -> None:
     """Make the print: every colour once, AprilTags and achromatic references, at true size.
 
-    Reads no file. Writes OUT/chart.json (what calibration reads), chart.pdf (vector), chart.tif (600 dpi), preview.png,
-    proof.pdf (an A4 page to try the printer with) and PRINTING.txt. Print the PDF or the TIFF with the printer's colour
-    management off, at 100 %, on matte paper. A line on stderr warns when cells are too small for the paper's
-    cameras.
+    Reads no file. Writes OUT/chart.json (what calibration reads), chart.pdf (vector, PDF/X-4), chart.tif (600 dpi),
+    preview.png, proof.pdf (an A4 page to try the printer with) and PRINTING.txt. Print the PDF or the TIFF with the
+    printer's colour management off, at 100 %, on matte paper. A line on stderr warns when cells are too small for the
+    paper's cameras.
     """
     from acquisition.chart.layout import design_chart, paper_chart
     from acquisition.chart.printing import save_pdf, save_preview, save_tiff
@@ -126,6 +130,8 @@ def chart(
         save_pdf(design, folder / "chart.pdf")
         if tiff:
             save_tiff(design, folder / "chart.tif")
+        if tagged_tiff:
+            save_tiff(design, folder / "chart-srgb.tif", tagged=True)
         save_proof(design, folder / "proof.pdf")
         save_instructions(design, folder / "PRINTING.txt", tiff)
         design.save(folder / "chart.json")
@@ -251,7 +257,8 @@ def check(
 
     Reads LAB.toml, the chart and the lights it names. Takes 10 to 20 frames and keeps none; tries shutter times until
     one suits. Each verdict is good, a remark, a fault, or not checked, with its number, limit, reason and remedy.
-    Writes nothing unless asked with --picture. Ends with 4 when there is a fault.
+    Writes nothing unless asked with --picture. Ends with 4 when there is a fault. Devices that cannot be used are all
+    named at once, each with its remedy, and end it with 3, or with 2 where LAB.toml alone is at fault.
     """
     import json
 

@@ -17,6 +17,7 @@ from acquisition.monitor.rows import AttemptView
 from acquisition.session.judgement import Check
 from acquisition.session.progress import duration_text
 from acquisition.session.records import ACCEPTED
+from foundation.errors import counted
 
 LAST = 5
 """Verdicts, and events, that are shown: chosen, a screen has room for them beside the rest."""
@@ -85,7 +86,7 @@ def _left(head: Head) -> str:
         return "nothing"
     if not head.alive:
         at_work = "this copy gets none" if head.state == "copy" else "no run is at work"
-        return f"{head.total - head.done} frames; {at_work}"
+        return f"{counted(head.total - head.done, 'frame')}; {at_work}"
     ready = f", ready at {head.eta.astimezone():%H:%M}" if head.eta is not None else ""
     return f"{duration_text(head.remaining_s)}{ready}"
 

@@ -414,11 +414,12 @@ def odd_worlds(folder: Path, lights: int) -> list[tuple[str, int, int, Counter[s
         ("white segment, +60 %", {"projector": with_white_segment(room, 0.6)}),
         ("primaries weaker by up to 2 % after bright ones", {"projector": with_memory(room, 0.02)}),
         ("other light of 1 % that flickers by 3 %", {"flicker": 0.03}),
+        ("white of 650 counts", {"room": replace(room, white_level_share=0.05)}),
         ("lamp −10 % in the session, blue −13 %", {"events": Disturbances((fading,))}),
     ]  # fmt: skip
     found: list[tuple[str, int, int, Counter[str], str]] = []
     for name, more in cases:
-        lab = lab_of(folder, room, **more)
+        lab = lab_of(folder, more.pop("room", room), **more)
         said = lab.session(lights, 12, 3)
         causes = Counter(cause(one) for _, one in said if not one.accepted)
         limit = [c.high for _, one in said[-20:] for c in one.checks if c.name == "light" and c.high is not None]

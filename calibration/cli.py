@@ -319,7 +319,7 @@ def build_lut(
             if compare is not None:
                 unfit = [name for name in ("--linearity", "--note", "--licence", "--author", "--serial") if made[name]]
                 if unfit:
-                    raise InputError(f"{unfit[0]} is for one table that is kept; leave it out of --compare")
+                    raise InputError(f"{unfit[0]} is for the report of one table; leave it out of --compare")
                 _compare(*compare, options, told, out, chart)
                 return
             _make(session, lut, check, append, options, linearity, picture, changes, told)

@@ -10,7 +10,8 @@
 # SEEDS     of learners, training images and folds, by default 5.
 #
 # LEVERS (environment) chooses some of the renderings below, by default all. Naive rows are made for each of them, of the same
-# pictures under the same lights.
+# pictures under the same lights; NAIVE=no leaves them out, which are half of the work. DRAW=900 draws so many pictures
+# for the sets that are drawn to be like the real ones, by default as many as there are.
 set -euo pipefail
 pictures=$(realpath "$1") archives=$(realpath "$2") out=$3 seeds=${4:-5}
 here=$(realpath "$(dirname "$0")")
@@ -35,15 +36,16 @@ for camera in 600d 1ds 5dsr; do
         other=$((1 - test))
         once "$half/stats_$other.json" evaluate describe "$half/half_$other.npz" --out "$half/stats_$other.json"
         colorimetric=(--rendering colorimetric --matrix "${matrix[$camera]}")
-        like=(--like "$half/stats_$other.json" --like-in pictures)
+        like=(--like "$half/stats_$other.json" --like-in pictures ${DRAW:+--draw "$DRAW"})
         sets=()
-        for lever in ${LEVERS:-codes colorimetric compensate random random-like}; do
+        for lever in ${LEVERS:-codes colorimetric compensate random random-like like}; do
             case $lever in
                 codes) options=(--rendering codes) ;;
                 colorimetric) options=("${colorimetric[@]}") ;;
                 compensate) options=("${colorimetric[@]}" --black-point compensate) ;;
                 random) options=("${colorimetric[@]}" --black-point random) ;;
                 random-like) options=("${colorimetric[@]}" --black-point random "${like[@]}") ;;
+                like) options=("${colorimetric[@]}" --black-point like "${like[@]}") ;;
                 *) echo "no lever $lever" >&2; exit 2 ;;
             esac
             set=sets/$camera$test/$lever
@@ -51,9 +53,11 @@ for camera in 600d 1ds 5dsr; do
                 --match "$half/lights_$other.csv" --outside nearest --seed 1 "${options[@]}"
             sets+=(--train "$set")
         done
+        naive=(--naive "$pictures" --matrix "${matrix[$camera]}")
+        [ "${NAIVE:-yes}" = no ] && naive=()
         once "results/$camera$test" evaluate transfer "${sets[@]}" --test "$half/$camera.npz" \
             --only "$half/images_$test.csv" --side 64 --images 900 --seeds "$seeds" --error recovery --statistics none \
-            --methods "$learners" --naive "$pictures" --matrix "${matrix[$camera]}" --out "results/$camera$test"
+            --methods "$learners" "${naive[@]}" --out "results/$camera$test"
     done
 done
 once pool evaluate pool results/* --error recovery --out pool

@@ -4,8 +4,9 @@ Laws that hold here:
 
 - Everything is made of filled rectangles on bare paper; the three files show the same list.
 - A file is at true size: print it at 100 %, never "fit to page".
-- No colour profile is embedded, since the codes name inks rather than colours: what they look like is measured. The
-  printer's colour management must be off, so that the same code is the same ink everywhere, and the paper matte.
+- The codes name inks rather than colours: what they look like is measured. They stand untagged on the page of the PDF
+  and in the TIFF; the PDF's output intent, which PDF/X asks for, and the tagged TIFF say what they are taken for where
+  colours are managed all the same. The same code must be the same ink everywhere, and the paper matte.
 - In the TIFF every cell and every tag module is the same whole number of pixels; a resolution at which they are not
   is refused (300 dpi, for one), because modules of unequal size move the corners that detectors find.
 - Cells do not only touch in the PDF: each reaches a fifth of a pixel below its right and lower neighbours, because
@@ -18,23 +19,21 @@ from __future__ import annotations
 
 import math
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
 
 from acquisition.chart.margins import margin_marks
 from acquisition.chart.model import PAPER_WHITE, TAG_FAMILY, TAG_MODULES, Chart, Tag
+from acquisition.chart.pdf_x import filled, save_page
 from acquisition.chart.pixels import DESIGN_DPI, MM_PER_INCH, PX_MM, Boxes, whole_px
+from acquisition.chart.rgb_profiles import srgb_display_profile
 from foundation.errors import InputError
 from foundation.files import whole_file, write_whole
-
-if TYPE_CHECKING:
-    from reportlab.pdfgen.canvas import Canvas
 
 POINTS_PER_MM = 72 / MM_PER_INCH
 """Points of a PDF's user space, 72 to the inch (ISO 32000-1, 8.3.2.3)."""
@@ -260,8 +259,8 @@ def _even_resolutions(lengths: list[float]) -> str:
     return " or ".join(even) or "another number of"
 
 
-def save_tiff(chart: Chart, path: Path, dpi: int = DESIGN_DPI) -> None:
-    """Write the sheet as an RGB TIFF at true size: 8 bits, deflate, no colour profile.
+def save_tiff(chart: Chart, path: Path, dpi: int = DESIGN_DPI, tagged: bool = False) -> None:
+    """Write the sheet as an RGB TIFF at true size: 8 bits, deflate.
 
     An A0 sheet at 600 dpi is 28 087 × 19 866 pixels.
 
@@ -270,6 +269,8 @@ def save_tiff(chart: Chart, path: Path, dpi: int = DESIGN_DPI) -> None:
     dpi
         Dots per inch; one at which cells and tag modules are whole pixels: 600, 360, or another multiple of 24 for
         charts of `acquisition.chart.layout`.
+    tagged
+        Whether the codes are tagged as sRGB, for a shop that prints through its printer's profile.
 
     Raises
     ------
@@ -297,13 +298,14 @@ def save_tiff(chart: Chart, path: Path, dpi: int = DESIGN_DPI) -> None:
             description=label(chart),
             software="CroP",
             metadata=None,
+            iccprofile=srgb_display_profile() if tagged else None,
         )
 
 
 def save_pdf(chart: Chart, path: Path) -> None:
-    """Write the sheet as a PDF of one page of exactly its size: filled rectangles in device RGB, no colour profile.
+    """Write the sheet as a PDF/X-4 of one page of exactly its size: filled rectangles of plain codes in DeviceRGB.
 
-    The same chart and libraries give the same bytes.
+    The same chart gives the same bytes.
 
     Raises
     ------
@@ -315,47 +317,41 @@ def save_pdf(chart: Chart, path: Path) -> None:
     save_drawing(drawing(chart), path, label(chart), f"chart.json has SHA-256 {chart.sha256}")
 
 
-def save_drawing(
-    sheet: Drawing, path: Path, title: str, subject: str, finish: Callable[[Canvas], None] | None = None
-) -> None:
-    """Write any drawing as a PDF of one page of exactly its size: filled rectangles in device RGB, no colour profile.
+def save_drawing(sheet: Drawing, path: Path, title: str, subject: str, more: bytes = b"") -> None:
+    """Write any drawing as a PDF/X-4 of one page of exactly its size: filled rectangles of plain codes.
 
     Parameters
     ----------
-    finish
-        May draw more on the page, in points with y up, before it is closed.
+    sheet
+        The drawing.
+    path
+        The file.
+    title, subject
+        Of the document.
+    more
+        Operators that draw more on the page (`acquisition.chart.pdf_x`).
 
     Raises
     ------
     StorageError
         The disk is full, read-only or gone.
     """
-    from reportlab.pdfgen.canvas import FILL_NON_ZERO, Canvas
-
     width, height = (side * POINTS_PER_MM for side in sheet.page_mm)
     corners = sheet.rectangles_mm * POINTS_PER_MM
     # Renderers paint every pixel that a part touches: a hair less on each side keeps rounding out of the next pixel.
     hair, lap = _INSET_PX * PX_MM * POINTS_PER_MM, _LAP_PX * PX_MM * POINTS_PER_MM
     corners += np.array([hair, hair, -hair, -hair])
     corners[len(corners) - sheet.tiles :, 2:] += lap
+    left, top, right, bottom = corners.T
+    boxes = np.stack([left, height - bottom, right - left, bottom - top], axis=1)
     changes = np.flatnonzero((np.diff(sheet.rgb.astype(np.int64), axis=0) != 0).any(axis=1)) + 1
-    with whole_file(path) as stream:
-        canvas = Canvas(stream, pagesize=(width, height), pageCompression=1, invariant=1)
-        canvas.setTitle(title)
-        canvas.setAuthor("CroP")
-        canvas.setCreator("CroP")
-        canvas.setSubject(subject)
-        # Neighbours of one colour share a path: it keeps the painter's order and saves bytes.
-        for first, last in zip([0, *changes], [*changes, len(corners)], strict=True):
-            canvas.setFillColorRGB(*(int(code) / 255 for code in sheet.rgb[first]))
-            path_ = canvas.beginPath()
-            for left, top, right, bottom in corners[first:last].tolist():
-                path_.rect(left, height - bottom, right - left, bottom - top)
-            canvas.drawPath(path_, stroke=0, fill=1, fillMode=FILL_NON_ZERO)
-        if finish is not None:
-            finish(canvas)
-        canvas.showPage()
-        canvas.save()
+    # Neighbours of one colour share a path: it keeps the painter's order and saves bytes.
+    parts: list[bytes] = []
+    for first, last in zip([0, *changes.tolist()], [*changes.tolist(), len(corners)], strict=True):
+        red, green, blue = (int(code) for code in sheet.rgb[first])
+        rows = ((box[0], box[1], box[2], box[3]) for box in boxes[first:last].tolist())
+        parts.append(filled(rows, (red, green, blue)))
+    save_page(path, (width, height), b"".join([*parts, more]), title, subject)
 
 
 def preview(chart: Chart, width_px: int) -> npt.NDArray[np.uint8]:

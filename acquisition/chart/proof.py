@@ -10,13 +10,13 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
 
 from acquisition.chart.margins import margin_marks, text_boxes
 from acquisition.chart.model import Chart
+from acquisition.chart.pdf_x import row_of_pixels
 from acquisition.chart.pixels import DESIGN_DPI, MM_PER_INCH, PX_MM, Boxes, whole_px
 from acquisition.chart.printing import (
     POINTS_PER_MM,
@@ -27,9 +27,6 @@ from acquisition.chart.printing import (
     save_drawing,
 )
 from foundation.files import write_whole
-
-if TYPE_CHECKING:
-    from reportlab.pdfgen.canvas import Canvas
 
 PAGE_MM = (297.0, 210.0)
 """A4, landscape (ISO 216): every printer takes it."""
@@ -110,20 +107,17 @@ def _wedge_boxes() -> npt.NDArray[np.float64]:
     return boxes + left[:, None] * np.array([1.0, 0.0, 1.0, 0.0])
 
 
-def _draw_image_half(canvas: Canvas) -> None:
-    """Draw the lower half of the greys as an image, one pixel a step."""
-    from PIL import Image
-
-    row = np.repeat(np.array(WEDGE_CODES, dtype=np.uint8)[None, :, None], 3, axis=2)
+def _image_half() -> bytes:
+    """Return what draws the lower half of the greys as an image, one pixel a step."""
     boxes = _wedge_boxes() * POINTS_PER_MM
-    width, height = boxes[-1, 2] - boxes[0, 0], WEDGE_HEIGHT_MM / 2 * POINTS_PER_MM
-    canvas.drawInlineImage(
-        Image.fromarray(row), boxes[0, 0], PAGE_MM[1] * POINTS_PER_MM - boxes[0, 3], width=width, height=height
-    )
+    left, right = float(boxes[0, 0]), float(boxes[-1, 2])
+    bottom = PAGE_MM[1] * POINTS_PER_MM - float(boxes[0, 3])
+    height = WEDGE_HEIGHT_MM / 2 * POINTS_PER_MM
+    return row_of_pixels([(code, code, code) for code in WEDGE_CODES], (left, bottom, right - left, height))
 
 
 def save_proof(chart: Chart, path: Path) -> None:
-    """Write `proof_drawing` as a PDF of one A4 page, landscape; no colour profile.
+    """Write `proof_drawing` as a PDF/X-4 of one A4 page, landscape.
 
     Raises
     ------
@@ -133,7 +127,7 @@ def save_proof(chart: Chart, path: Path) -> None:
         The disk is full, read-only or gone.
     """
     title = f"Proof page of {label_lines(chart)[0]}"
-    save_drawing(proof_drawing(chart), path, title, f"chart.json has SHA-256 {chart.sha256}", _draw_image_half)
+    save_drawing(proof_drawing(chart), path, title, f"chart.json has SHA-256 {chart.sha256}", _image_half())
 
 
 def instructions(chart: Chart, tiff: bool = True) -> str:
@@ -142,7 +136,7 @@ def instructions(chart: Chart, tiff: bool = True) -> str:
     left, top, right, bottom = (field_px(chart) * PX_MM).tolist()
     across, down = (math.floor((end - start) / 100) * 100 for start, end in ((left, right), (top, bottom)))
     pixels = " × ".join(f"{round(side / MM_PER_INCH * DESIGN_DPI)}" for side in chart.page_mm)
-    raster = f" or chart.tif ({pixels} pixels, {DESIGN_DPI} dpi); both show the same" if tiff else ""
+    raster = f" or chart.tif ({pixels} pixels, {DESIGN_DPI} dpi, untagged); both show the same" if tiff else ""
     scale = (
         f"Marks 0 and {across} below the field are {across} mm apart, 0 and {down} on its left {down} mm."
         if min(across, down) > 0
@@ -160,8 +154,18 @@ For the print shop
 ------------------
 Page            {width:g} × {height:g} mm on one sheet, not tiled. Margins hold marks: print them too.
 Scale           100 %, "actual size"; never "fit to page". On a roll, cut along the corner marks.
-Colours         Colour management OFF: no profile, no conversion, no rendering intent, no "enhancement", no black
-                boost. The numbers in the file must reach the printer's driver as they are; RGB stays RGB.
+File            chart.pdf is PDF/X-4: vector, trim box = sheet, no fonts, no transparency, no bleed. Its page is
+                untagged RGB (DeviceRGB).
+Colours         NO COLOUR MANAGEMENT. Print as you print a profiling target: the RGB numbers in the file must reach the
+                printer's driver as they are. RGB stays RGB; the driver alone makes inks of it.
+In the RIP      Colour management: off / "none" / "as target (profiling chart)". Input profile for RGB: none. Embedded
+                profiles and the PDF's output intent: IGNORE. Rendering intent, black point compensation, grey balance,
+                "pure hues", spot colour replacement, "enhancement", ink saving: off. Calibration (linearisation) of the
+                printer: as always.
+In a driver     "No colour adjustment" / "application manages colours", from a program that converts nothing
+                (Adobe Color Printer Utility, ColorSync Utility "print as colour target").
+If asked for    "Which profile?": none. "CMYK?": no; do not convert. The output intent of the PDF says sRGB, for PDF/X
+a profile       demands one: it is no order to convert.
 Quality         The printer's best, at least 600 dpi; no smoothing, sharpening or interpolation of the image.
 Paper           Matte, white, heavy enough to hang flat (180 g/m² or more), if possible without optical brighteners.
 Finish          None: no varnish, no lamination, no mounting under film or glass.

@@ -41,14 +41,15 @@ from acquisition.config import LabSettings
 from acquisition.framing.corners import Corners
 from acquisition.judge.exposure import disagreement
 from acquisition.lights.illuminations import Illumination, load_illuminations
+from acquisition.run.asking import ask_all
 from acquisition.run.devices import Devices
-from acquisition.run.lamp import make_ready
+from acquisition.run.lamp import make_ready, reported_error
 from acquisition.run.patience import Patience
 from acquisition.run.planning.work import planned_steps
 from acquisition.run.rig.opening import open_rig
 from acquisition.run.shutter import period_s
 from drivers.camera import keep_awake
-from drivers.presenter import ReportsWarnings
+from drivers.presenter import Colour, ReportsWarnings
 from drivers.projector import Power, Projector, Severity
 from foundation.errors import DeviceError, counted
 from foundation.files import write_whole
@@ -283,28 +284,47 @@ def _sensor_findings(
 def _make_devices_ready(
     devices: Devices, settings: LabSettings, announce: Callable[[str], None]
 ) -> tuple[list[str], list[Finding]]:
-    """Make every device ready for a frame; return a line about each, and what screen and projector report."""
+    """Make every device ready for a frame; return a line about each, and what screen and projector report.
+
+    Raises
+    ------
+    DeviceError
+        A device cannot be used: of several all are named, since each was asked.
+    """
+    projector = devices.projector
+    questions: dict[str, Callable[[], object]] = {
+        "camera": lambda: (devices.camera.identity(), devices.camera.configure(settings.camera.exposure)),
+        "display": lambda: devices.presenter.show(Colour(0, 0, 0)),
+    }
+    if projector is not None:
+        questions["projector"] = lambda: (projector.identity(), projector.power(), _require_sound(projector))
+    ask_all(questions)
     body = devices.camera.identity()
     lines = [f"camera      {body.name}, serial {body.serial}"]
     warnings = devices.presenter.warnings() if isinstance(devices.presenter, ReportsWarnings) else ()
     findings = [Finding("screen", "remark", warning) for warning in warnings]
-    devices.camera.configure(settings.camera.exposure)
-    if devices.projector is None:
+    if projector is None:
         lines.append("projector   not under control: see to its lamp yourself")
         return lines, findings
-    before = _state(devices.projector)
+    before = _state(projector)
     patience = Patience(
         devices.clock, 0, lambda what, sentence: announce(f"{what}: {sentence}"), lambda: keep_awake(devices.camera)
     )
-    make_ready(devices.projector, settings.sequence, patience)
-    identity = devices.projector.identity()
-    hours = ", ".join(f"{lamp.hours} h" for lamp in devices.projector.lamps()) or "no lamp"
+    make_ready(projector, settings.sequence, patience)
+    identity = projector.identity()
+    hours = ", ".join(f"{lamp.hours} h" for lamp in projector.lamps()) or "no lamp"
     lines.append(f"projector   {identity.maker} {identity.model} {identity.name}, {hours}; {before}")
-    parts = [fault.part for fault in devices.projector.faults() if fault.severity is Severity.WARNING]
+    parts = [fault.part for fault in projector.faults() if fault.severity is Severity.WARNING]
     if parts:
         said = f"the projector warns of its {', '.join(parts)}"
         findings.append(Finding("projector", "remark", said, remedy="look at its display before the session"))
     return lines, findings
+
+
+def _require_sound(projector: Projector) -> None:
+    """Require that a projector reports no error of its parts; a DeviceFault names them."""
+    if (fault := reported_error(projector)) is not None:
+        raise fault
 
 
 def _state(projector: Projector) -> str:

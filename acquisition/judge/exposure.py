@@ -94,13 +94,14 @@ def refusal(exposure: Exposure, kind: FrameKind, limits: LimitSettings) -> str |
     if exposure.clipped * 100 > limits.clipped_percent:
         return (
             f"{exposure.clipped:.1%} of the photosites are clipped, {limits.clipped_percent:g} % allowed; "
-            "set a shorter exposure (acquire check recommends one) and begin a new session"
+            "dim the projector, or set a shorter exposure (acquire check recommends one) and begin a new session"
         )
     # Of the greys by which the projector's curve is known the darkest are meant to be dark.
     if kind != "response" and exposure.brightest_dn < limits.too_dark_dn:
         return (
             f"the brightest photosites are {exposure.brightest_dn:.0f} counts above black, "
-            f"at least {limits.too_dark_dn:g} expected; is the projector on, its picture not muted, the lens cap off?"
+            f"at least {limits.too_dark_dn:g} expected; is the projector on, its picture not muted, the lens cap off? "
+            "If so, expose longer, in a new session"
         )
     return None
 

@@ -29,6 +29,11 @@ OBEYS_S: Final = 5.0
 LOOK_S: Final = 0.5
 """Between two questions whether it has begun."""
 
+TRIES: Final = 3
+"""Tries at putting the lamp out: an answer that is lost once must not let it burn till the morning."""
+AGAIN_S: Final = 2.0
+"""Between two of them; a controller that was busy answers then."""
+
 _BY_HAND: Final = "switch it off by hand"
 
 
@@ -74,19 +79,27 @@ def lamp_fate(projector: Projector | None, end: RunEnd, sequence: SequenceSettin
         # Somebody waits for the end: a projector that does not answer would hold it up.
         return f"it is left as it is, so that the next run needs no warm-up; else {_BY_HAND}"
     goes_out = sequence.switch_off if end is RunEnd.COMPLETE else sequence.lamp_if_unfinished == "off"
+    for _ in range(TRIES - 1):
+        with suppress(DeviceError):
+            return _decided(projector, goes_out, clock)
+        clock.sleep(AGAIN_S)
     try:
-        power = projector.power()
-        if power is not Power.ON and power is not Power.WARMING:
-            return f"it is out already: the projector is in {power.value}"
-        if not goes_out:
-            return f"it burns on, so that the next run needs no warm-up; else {_BY_HAND}"
-        projector.switch_off()
-        until = clock.monotonic() + OBEYS_S
-        while (power := projector.power()) is Power.ON and clock.monotonic() < until:
-            clock.sleep(LOOK_S)
+        return _decided(projector, goes_out, clock)
     except DeviceError as error:
         undone = "whether it burns is not known" if not goes_out else "it could not be switched off"
         return f"{undone}: {error}; {_BY_HAND}"
+
+
+def _decided(projector: Projector, goes_out: bool, clock: Clock) -> str:
+    power = projector.power()
+    if power is not Power.ON and power is not Power.WARMING:
+        return f"it is out already: the projector is in {power.value}"
+    if not goes_out:
+        return f"it burns on, so that the next run needs no warm-up; else {_BY_HAND}"
+    projector.switch_off()
+    until = clock.monotonic() + OBEYS_S
+    while (power := projector.power()) is Power.ON and clock.monotonic() < until:
+        clock.sleep(LOOK_S)
     if power is Power.ON:
         return f"it burns on though the projector was told to switch it off; {_BY_HAND}"
     return "it was switched off"

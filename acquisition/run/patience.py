@@ -252,9 +252,9 @@ class Pause:
     def over(self) -> None:
         """Say that the run goes on, where it had said that it paused."""
         if self._told:
-            self._patience.report(
-                "resumed", f"{self._name} is ready again after a pause of {duration_text(self.lasted_s)}"
-            )
+            are = "are" if self._name.endswith("s") else "is"
+            lasted = duration_text(self.lasted_s)
+            self._patience.report("resumed", f"{self._name} {are} ready again after a pause of {lasted}")
 
     def _countdown(self, fault: CropError) -> str:
         left = self._patience.limit_s - self.lasted_s

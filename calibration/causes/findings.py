@@ -18,6 +18,7 @@ from calibration.causes.light_evidence import (
     brightness_evidence,
     camera_evidence,
     dark_evidence,
+    iso_evidence,
     light_evidence,
     name_evidence,
     stray_evidence,
@@ -264,5 +265,6 @@ _GATHERERS: dict[str, Callable[[TableFigures, float], Gathered | None]] = {
     "leak_share": dark_evidence,
     "dark_drift": dark_evidence,
     "stray_share": stray_evidence,
+    "other_iso": iso_evidence,
 }
 """How evidence is gathered for each figure."""

@@ -128,6 +128,12 @@ RULES: tuple[Rule, ...] = (
         "the file states more exposure than the others'",
     ),
     Rule(
+        OTHER_EXPOSURE,
+        frozenset({"other_iso"}),
+        (Condition("other_iso", 1, _FAR),),
+        "the file states another ISO speed than the others'",
+    ),
+    Rule(
         WRONG_NAME,
         LIGHT,
         (Condition("named_right", 0, 0), Condition("exposure", 0.97, 1.03)),

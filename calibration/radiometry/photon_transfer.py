@@ -61,6 +61,28 @@ class PhotonTransfer:
         return self.ratio > self.allowed
 
 
+def noise_levels(level: _Array, variance: _Array, samples: int) -> tuple[_Array, _Array]:
+    """Return the noise of one channel at levels: medians of cells of like levels.
+
+    Parameters
+    ----------
+    level, variance
+        (N,) float64 mean, counts above black, and variance of one sample, counts², of each cell.
+    samples
+        Samples of each cell.
+
+    Returns
+    -------
+    tuple of ndarray
+        Levels (B,), counts above black, and variances (B,), counts², both float64.
+    """
+    median = median_of_variance(samples - 1)
+    order = np.argsort(level)
+    bins: list[npt.NDArray[np.int64]] = np.array_split(order, max(4, min(_BINS, len(order) // 16)))
+    at = np.array([float(np.median(level[part])) for part in bins if len(part)])
+    return at, np.array([float(np.median(variance[part])) for part in bins if len(part)]) / median
+
+
 def photon_transfer(level: _Array, variance: _Array, samples: int = 25) -> PhotonTransfer:
     """Return the curve through cells: non-negative least squares on the medians of cells of like levels.
 
@@ -76,14 +98,10 @@ def photon_transfer(level: _Array, variance: _Array, samples: int = 25) -> Photo
     from scipy.optimize import nnls
     from scipy.stats import chi2
 
-    median = median_of_variance(samples - 1)
     terms, misfit = np.zeros((3, 3)), np.zeros(3)
     ratio = np.zeros(len(level))
     for channel in range(3):
-        order = np.argsort(level[:, channel])
-        bins: list[npt.NDArray[np.int64]] = np.array_split(order, max(4, min(_BINS, len(order) // 16)))
-        at = np.array([float(np.median(level[part, channel])) for part in bins if len(part)])
-        seen = np.array([float(np.median(variance[part, channel])) for part in bins if len(part)]) / median
+        at, seen = noise_levels(level[:, channel], variance[:, channel], samples)
         design = np.column_stack([np.ones_like(at), np.maximum(at, 0), np.maximum(at, 0) ** 2])
         weight = 1 / np.maximum(seen, 1e-9)
         scale = np.maximum(np.abs(design * weight[:, None]).max(axis=0), 1e-30)

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from io import BytesIO
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -29,7 +30,8 @@ INK, FAINT, MARK = "#22262b", "#8a929c", "#e8502a"
 WORST_CELLS = 20
 """Cells that are shown magnified: two rows of ten."""
 
-_CHANNEL_INK = ("#c8382e", "#2f8f46", "#2f62c8")
+CHANNEL_INK = ("#c8382e", "#2f8f46", "#2f62c8")
+"""Colours of lines of R, G and B."""
 _DPI = 110
 """Pictures 10 inches wide fill the page's 1100 pixels."""
 
@@ -248,7 +250,9 @@ def draw_print(figure: Any, chart: Chart, stains: Stains) -> None:
     figure.colorbar(image, ax=axes, label="deviation, %; brighter is positive", shrink=0.8, extend="both")
 
 
-def draw_chromaticities(figure: Any, codes: _Array, black_body: _Mask, white: _Array, seen: str) -> None:
+def draw_chromaticities(
+    figure: Any, codes: _Array, black_body: _Mask, white: _Array, seen: str, worst: int | None = None
+) -> None:
     """Draw the rb-chromaticities of the lights, as projected and as the camera sees them (the paper's figures).
 
     Parameters
@@ -263,6 +267,8 @@ def draw_chromaticities(figure: Any, codes: _Array, black_body: _Mask, white: _A
         (L, 3) float64 counts, the ground truth.
     seen
         Title of what the camera sees.
+    worst
+        Number of the light whose ground truth is known worst, which is ringed; None for no ring.
     """
     figure.set_size_inches(10, 3.7)
     planned = decode_srgb(codes / 255)
@@ -290,27 +296,57 @@ def draw_chromaticities(figure: Any, codes: _Array, black_body: _Mask, white: _A
             linewidths=1.1,
             zorder=3,
         )
+        if worst is not None and lit[worst]:
+            share = linear[worst] / linear[worst].sum()
+            _ring(axes, float(share[0]), float(share[2]), f"light {worst}")
         axes.set(title=title, xlabel="r", aspect="equal", xlim=(-0.03, 1.03), ylim=(-0.03, 1.03))
     panels[0].set_ylabel("b")
 
 
+def _ring(axes: Any, x: float, y: float, text: str) -> None:
+    """Ring a point of a plot and name it."""
+    axes.plot([x], [y], "o", markersize=11, markerfacecolor="none", markeredgecolor=MARK, markeredgewidth=1.4)
+    axes.annotate(text, (x, y), xytext=(8, 8), textcoords="offset points", color=MARK, fontsize=8)
+
+
+def _ring_largest(axes: Any, values: Any, figures: TableFigures, least: bool = False) -> None:
+    """Ring the frame of the largest value, or the least, unless all are alike; its name is that of its file."""
+    seen = np.asarray(values, dtype=np.float64)
+    if not len(seen) or np.ptp(seen) == 0:
+        return
+    at = int(np.argmin(seen) if least else np.argmax(seen))
+    _ring(axes, at, float(seen[at]), Path(figures.frames[at].record.file).stem)
+
+
 def draw_course(figure: Any, figures: TableFigures) -> None:
-    """Draw black level, movement, paper white and the cells' deviations, frame by frame."""
+    """Draw black, movement, blur, white, the cells' deviations and the references used, frame by frame.
+
+    The worst frame of each is ringed and named.
+    """
     frames = figures.frames
-    figure.set_size_inches(10, 5)
-    (black, shift), (white, consistency) = figure.subplots(2, 2)
+    figure.set_size_inches(10, 5.4)
+    (black, shift, blur), (white, consistency, used) = figure.subplots(2, 3)
     count = np.arange(len(frames))
     level = np.array([frame.black.mean() for frame in frames])
     black.plot(count, level, ".", color=INK, markersize=3)
     black.set(title="black level", ylabel="counts", xlabel="frame")
     middle = float(np.median(level)) if len(level) else 0.0
     black.set_ylim(middle - max(1.0, float(np.ptp(level))), middle + max(1.0, float(np.ptp(level))))
+    blurs = [frame.blur_px for frame in frames]
+    blur.plot(count, blurs, ".", color=INK, markersize=3)
+    blur.set(title="blur σ", ylabel="px", xlabel="frame")
+    _ring_largest(blur, blurs, figures)
+    counts = [frame.paper.references for frame in frames]
+    used.plot(count, counts, ".", color=INK, markersize=3)
+    used.set(title="white references used", xlabel="frame", ylim=(0, 1.15 * max(counts, default=1)))
+    _ring_largest(used, counts, figures, least=True)
     moved = [frame.shift.length_px for frame in frames]
     shift.plot(count, moved, ".", color=INK, markersize=3)
     shift.axhline(STILL_PX, color=MARK, linewidth=0.8, linestyle=(0, (4, 3)))
     shift.set(
         title="movement of the chart", ylabel="px", xlabel="frame", ylim=(0, max(0.12, 1.1 * max(moved, default=0)))
     )
+    _ring_largest(shift, moved, figures)
     at = [number for number, frame in enumerate(frames) if frame.record.kind == "white"]
     whites = np.array([frames[number].paper.white for number in at]).reshape(-1, 3)
     if len(whites):
@@ -319,7 +355,7 @@ def draw_course(figure: Any, figures: TableFigures) -> None:
                 at,
                 100 * (whites[:, channel] / whites[0, channel] - 1),
                 ".-",
-                color=_CHANNEL_INK[channel],
+                color=CHANNEL_INK[channel],
                 label="RGB"[channel],
                 linewidth=0.9,
             )
@@ -330,7 +366,7 @@ def draw_course(figure: Any, figures: TableFigures) -> None:
 
 
 def _draw_consistency(axes: Any, count: npt.NDArray[np.integer], figures: TableFigures) -> None:
-    axes.set(title="deviation of cells from their codes' colours", ylabel="%", xlabel="frame")
+    axes.set(title="cells off their codes' colours", ylabel="%", xlabel="frame")
     if not has_enough_cells(len(figures.registration.mismatched_cells)):
         axes.text(0.5, 0.5, "too few colours to compare", ha="center", va="center", transform=axes.transAxes)
         return
@@ -350,8 +386,11 @@ def _draw_consistency(axes: Any, count: npt.NDArray[np.integer], figures: TableF
         markersize=3,
         label="worst block of cells",
     )
-    axes.legend(frameon=False, fontsize=8)
-    axes.set_ylim(bottom=0, top=max(1.5, axes.get_ylim()[1]))
+    axes.legend(frameon=False, fontsize=7, loc="upper right")
+    axes.set_ylim(bottom=0, top=max(1.5, 1.3 * axes.get_ylim()[1]))
+    _ring_largest(axes, [100 * frame.consistency.scatter for frame in figures.frames], figures)
+    if any(frame.consistency.block for frame in figures.frames):
+        _ring_largest(axes, [100 * frame.consistency.block for frame in figures.frames], figures)
 
 
 def draw_worst_cells(figure: Any, picture: _Image, chart: Chart, registration: Registration, window: int) -> None:

@@ -1,13 +1,14 @@
 """The table's report: one page that shows by eye what the figures claim, and the same figures for programs.
 
-`report.json` holds figures, limits and verdict; `report.html` opens with the verdict and holds everything: the
-registered grid over the frame, the residuals of tags and cells, the shape of the light, the lights as planned and as
-the camera saw them (the paper's three figures of chromaticities), the course of the session, and the worst cells.
+`report.json` holds figures, limits and verdict; `report.html` opens with the verdict, what to do, and the pictures that
+are looked at first: the registered grid over the frame, the lights as planned and as the camera saw them (the paper's
+three figures of chromaticities), where cells err, and the noise. All figures follow in groups, each with its pictures.
 """
 
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +19,7 @@ from acquisition.measures.flat_field import FlatField
 from acquisition.measures.stains import Stains
 from acquisition.session.folder import Session
 from calibration.figures.table_figures import TableFigures
+from calibration.report.first_plots import cell_noise, draw_errors, draw_noise
 from calibration.report.half_size import half_size
 from calibration.report.page import Picture, page
 from calibration.report.places import (
@@ -38,6 +40,7 @@ from calibration.report.plots import (
     png_of,
 )
 from calibration.report.report_json import report_json
+from calibration.report.worsts import Worst, worst_of
 from calibration.table.file_names import REPORT_JSON, REPORT_PAGE
 from calibration.verdict.result import BuildResult
 from calibration.verdict.retaking import findings
@@ -60,17 +63,65 @@ def write_report(result: BuildResult, session: Session, folder: Path) -> None:
     folder
         Where the files are written.
     """
-    write_whole(folder / REPORT_PAGE, page(result, _pictures(result, session), _place_pictures(result, session)))
+    worsts = worst_of(result.figures, session.chart)
+    pictures = _pictures(result, session, worsts)
+    write_whole(folder / REPORT_PAGE, page(result, pictures, _place_pictures(result, session), worsts))
     write_whole(folder / REPORT_JSON, json.dumps(report_json(result), indent=2) + "\n")
 
 
-def _pictures(result: BuildResult, session: Session) -> list[Picture]:
+def _pictures(result: BuildResult, session: Session, worsts: Sequence[Worst]) -> list[Picture]:
+    """Return the pictures: first chart, lights, errors and noise, then those of the groups."""
     figures = result.figures
-    chart, registration, window = session.chart, figures.registration, figures.cells.window
+    chart, registration = session.chart, figures.registration
     frame = half_size(read_raw(session.folder / figures.session.registered_file))
+    return [
+        *_first_pictures(result, session, frame, worsts),
+        Picture(
+            "Residuals of the registration",
+            "Left: how far the cells moved the map from what the tags and the lens alone give, which is the paper's "
+            "waviness. Right: the residual of each block of cells, magnified; short arrows without order are noise.",
+            png_of(draw_residuals, chart, registration),
+            "geometry",
+        ),
+        *_worst_pictures(chart, figures, frame, worsts),
+        Picture(
+            "The light on the print",
+            "Shape of the light under the frame that was registered, from its white references; it is divided out of "
+            f"samples and ground truth. Contours are 2 % apart. {_primaries_caption(figures)}",
+            png_of(draw_field, chart, _registered_field(figures)),
+            "light",
+        ),
+        *_print_picture(chart, figures.cells.stains),
+        Picture(
+            "The course of the session",
+            "Black level, movement and blur of the chart, bare paper under white, how far cells are off their codes' "
+            "colours, and the white references used, frame by frame; the worst frame of each is ringed. All cells are "
+            "off where the focus is lost, a block of them where a hand or a shadow lies on the print.",
+            png_of(draw_course, figures),
+            "radiometry",
+        ),
+        Picture(
+            "The worst cells",
+            f"The {WORST_CELLS} cells whose rim and middle differ most under white, in standard deviations, each "
+            "between its neighbours; the frame is the samples.",
+            png_of(draw_worst_cells, frame, chart, registration, figures.cells.window),
+            "noise",
+        ),
+        *_residual_picture(chart, figures, frame),
+    ]
+
+
+def _first_pictures(
+    result: BuildResult, session: Session, frame: npt.NDArray[np.float32], worsts: Sequence[Worst]
+) -> list[Picture]:
+    """Return what a scientist looks at first: chart, lights, errors, noise."""
+    figures, chart = result.figures, session.chart
+    registration, window = figures.registration, figures.cells.window
     codes = np.array([light.codes for light in session.illuminations])
     black_body = np.array([light.kind == "blackbody" for light in session.illuminations], dtype=np.bool_)
     seen = f"seen by the {figures.session.camera}"
+    truth = next((worst.light for worst in worsts if worst.figure == "truth_worst_deg"), None)
+    ringed = "" if truth is None else f" Ringed is light {truth}, whose ground truth is known worst."
     return [
         Picture(
             "The chart as registered",
@@ -79,39 +130,39 @@ def _pictures(result: BuildResult, session: Session) -> list[Picture]:
             png_of(draw_registration, frame, chart, registration, window),
         ),
         Picture(
-            "Residuals of the registration",
-            "Left: how far the cells moved the map from what the tags and the lens alone give, which is the paper's "
-            "waviness. Right: the residual of each block of cells, magnified; short arrows without order are noise.",
-            png_of(draw_residuals, chart, registration),
-        ),
-        Picture(
-            "The light on the print",
-            "Shape of the light under the frame that was registered, from its white references; it is divided out of "
-            f"samples and ground truth. Contours are 2 % apart. {_primaries_caption(figures)}",
-            png_of(draw_field, chart, _registered_field(figures)),
-        ),
-        *_residual_picture(chart, figures, frame),
-        *_print_picture(chart, figures.cells.stains),
-        Picture(
             "The lights",
             "rb-chromaticities of the lights as projected, as the camera sees them on bare paper (the ground truth), "
-            "and the latter in their colours. Rings are black bodies.",
-            png_of(draw_chromaticities, codes, black_body, figures.lights.white, seen),
+            f"and the latter in their colours. Rings are black bodies.{ringed}",
+            png_of(draw_chromaticities, codes, black_body, figures.lights.white, seen, truth),
         ),
         Picture(
-            "The course of the session",
-            "Black level, movement of the chart, bare paper under white, and how far cells deviate from their codes' "
-            "colours under each light, frame by frame: all of them where the focus is lost, a block of them where a "
-            "hand or a shadow lies on the print.",
-            png_of(draw_course, figures),
+            "Where cells err",
+            "Left: how far cells and their neighbours are off their codes' colours elsewhere on the sheet. Right: how "
+            "well the place of each cell is known. The worst cell of each is ringed.",
+            png_of(draw_errors, figures, chart),
         ),
         Picture(
-            "The worst cells",
-            f"The {WORST_CELLS} cells whose rim and middle differ most under white, in standard deviations, each "
-            "between its neighbours; the frame is the samples.",
-            png_of(draw_worst_cells, frame, chart, registration, window),
+            "The noise",
+            "Left: variance of one sample over its level, medians of cells of like levels and the fitted curve (read "
+            "noise, photons, unequal photosites). Right: what that makes of signal over noise.",
+            png_of(draw_noise, cell_noise(frame, chart, registration, window), figures.sensor.transfer, window**2),
         ),
     ]
+
+
+def _worst_pictures(
+    chart: Chart, figures: TableFigures, frame: npt.NDArray[np.float32], worsts: Sequence[Worst]
+) -> list[Picture]:
+    """Return the picture of the places where figures are worst."""
+    places = [(worst.label, worst.place) for worst in worsts if worst.place is not None]
+    if not places:
+        return []
+    caption = (
+        "The place of the worst of each figure that has one, on the frame that was registered, whether or not it is "
+        "beyond a limit. Worst frames are ringed in the course of the session, the worst light among the lights."
+    )
+    drawn = png_of(draw_places, frame, chart, figures.registration, places)
+    return [Picture("Where the worst is", caption, drawn, "geometry")]
 
 
 def _place_pictures(result: BuildResult, session: Session) -> list[Picture]:
@@ -145,7 +196,9 @@ def _residual_picture(chart: Chart, figures: TableFigures, picture: npt.NDArray[
         "what lies or shines on the print is one place. Right, by the distance from the middle: a bend at its end is "
         "fall-off that the field does not follow."
     )
-    return [Picture("What the field leaves", caption, png_of(draw_reference_residuals, chart, places_mm, residual))]
+    return [
+        Picture("What the field leaves", caption, png_of(draw_reference_residuals, chart, places_mm, residual), "truth")
+    ]
 
 
 def _registered_field(figures: TableFigures) -> FlatField:
@@ -172,4 +225,4 @@ def _print_picture(chart: Chart, stains: Stains) -> list[Picture]:
         "that deviates most. Noise is a fine grain of some tenths of a per cent; stains, folds and shadows have a "
         "shape. Crosses are cells listed for it."
     )
-    return [Picture("The print", caption, png_of(draw_print, chart, stains))]
+    return [Picture("The print", caption, png_of(draw_print, chart, stains), "radiometry")]

@@ -10,9 +10,6 @@ from calibration.sampling.windows import bleed
 from calibration.verdict.retaking import added_bleed
 from foundation.angles import angles_deg
 
-_LEAST_CELLS = 8**4
-"""Cells from which on a spread that is not there is known well enough not to be feared."""
-
 
 def judged_values(figures: TableFigures) -> dict[str, float]:
     """Return the values that are judged, by name; in the units of `calibration.verdict.thresholds`.
@@ -43,7 +40,7 @@ def _registration_values(figures: TableFigures) -> dict[str, float]:
         "blocks_good": float(registration.blocks.good.mean()),
         "agreement": registration.agreement,
     }
-    if figures.lens.measured and _cell_count(figures) >= _LEAST_CELLS:
+    if figures.lens.measured:
         values["correction_residual"] = figures.lens.left
     if registration.framing.field is None:
         found = len(registration.framing.tags)
@@ -72,9 +69,11 @@ def _frame_values(figures: TableFigures) -> dict[str, float]:
         "other_camera": float(len(figures.origins.other_camera)),
         "other_lens": float(len(figures.origins.other_lens)),
         "other_exposure": figures.origins.exposure_difference,
+        "other_iso": float(len(figures.origins.other_iso)),
         "references_used": used / max(figures.session.white_references, 1),
     }
     if len(frames) > 1:
+        values["white_frames"] = float(len(figures.white_frames))
         values["moved_anew"] = float(sum(frame.reregistered for frame in frames))
     if has_enough_cells(_cell_count(figures)):
         values["unlike_scatter"] = max((frame.consistency.scatter for frame in frames), default=0.0)

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from generator.dataset.production.options import DatasetOptions
     from generator.lights.lighting import LightChoice
     from generator.likeness.drawing import DrawnPictures
+    from generator.likeness.pictures import BlackShares
     from generator.pictures.sources import Source
     from generator.statistics.statistics_file import RealStatistics
     from generator.variation.exposures import ExposureChoice
@@ -116,6 +117,12 @@ def choose(
     FormatError
         A file of statistics, or a dataset, cannot be read.
     """
+    parts = [] if likeness.like is None else _parts(likeness, pictures, light, variation)
+    if rendered.black_point.kind == "like" and "pictures" not in parts:
+        raise InputError(
+            "--black-point like draws pictures with the shadows of real images; give --like STATS.json, with pictures "
+            "in --like-in if that is given, or another black point"
+        )
     if likeness.lights_of is not None:
         if likeness.like is not None:
             raise InputError("--like and --lights-of were both given; the second takes pictures and lights as they are")
@@ -126,7 +133,6 @@ def choose(
         sources = pictures.find(seed)
         choice = light.request().choose(lut, seed, [source.name for source in sources], pictures.crops)
         return Chosen(sources, choice, pictures.preparation(seed).describe(), crops=pictures.crops)
-    parts = _parts(likeness, pictures, light, variation)
     return _like(lut, likeness, likeness.like, parts, pictures, light, rendered, seed, workers)
 
 
@@ -259,12 +265,27 @@ def _drawn(
     from foundation.console import progress
     from generator.likeness.drawing import draw_pictures
     from generator.likeness.pictures import measure_pictures, reference_light
+    from generator.rendering.black_points import KEEP
 
     reference = reference_light(lut, target.lights)
+    black = None
+    if rendered.black_point.kind == "like":
+        black = _black_under(lut, reference, grey=rendered.rendering == "colorimetric")
+        rendered = replace(rendered, black_point=KEEP)
     photograph = partial(_photograph, lut, reference, rendered, seed)
     with progress("pictures") as shown:
-        measured = measure_pictures(sources, photograph, lut.white[reference], target.cells, workers, shown)
+        measured = measure_pictures(sources, photograph, lut.white[reference], target.cells, workers, shown, black)
     return draw_pictures(measured, target, count, seed)
+
+
+def _black_under(lut: Lut, light: int, grey: bool) -> BlackShares:
+    """Return the print's black under a light of the table; a QualityError where it is as bright as half of white."""
+    from generator.lights.lighting import plain
+    from generator.likeness.pictures import BlackShares
+    from generator.rendering.black_points import veil_of
+
+    red, green, blue = veil_of(lut, plain(light), 1.0, grey).taken.tolist()
+    return BlackShares((red, green, blue))
 
 
 def _photograph(

@@ -338,8 +338,9 @@ class RenderingOptions:
         str,
         option(
             "WHAT",
-            "The print's own black: keep it, compensate for it (take it out), or take out a random share of it of "
-            "each image, random or random:MAX. The ground truth stays.",
+            "The print's own black: keep it, compensate for it (take it out), take out a random share of it of each "
+            "image, random or random:MAX, or, with --like, of each picture the share that makes shadows like the real "
+            "ones, like. The ground truth stays.",
             _IMAGES,
         ),
     ] = "keep"

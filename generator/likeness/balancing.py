@@ -63,7 +63,9 @@ def effective_size(weights: _Array) -> float:
     return float(weights.sum() ** 2 / np.square(weights).sum())
 
 
-def balance(moments: _Array, wanted: _Array, real: float, least_effective: float = LEAST_EFFECTIVE) -> Balance:
+def balance(
+    moments: _Array, wanted: _Array, real: float, least_effective: float = LEAST_EFFECTIVE, variants: int = 1
+) -> Balance:
     """Return the weights of N images by which the means of their moments come near to the wanted ones.
 
     Parameters
@@ -75,7 +77,9 @@ def balance(moments: _Array, wanted: _Array, real: float, least_effective: float
     real
         M, of how many real images those are means; infinite where they are exact.
     least_effective
-        Least effective sample size as a share of N, 0 … 1.
+        Least effective sample size as a share of the images, 0 … 1.
+    variants
+        Of each image, one after the other among the N: the effective size is that of their sums.
 
     Examples
     --------
@@ -84,16 +88,20 @@ def balance(moments: _Array, wanted: _Array, real: float, least_effective: float
     (0.6, 88)
     """
     aside = moments - wanted
-    penalty, least = 1 / real, least_effective * len(moments)
+    penalty, least = 1 / real, least_effective * len(moments) / variants
+
+    def is_enough(found: Balance) -> bool:
+        return effective_size(found.weights.reshape(-1, variants).sum(axis=1)) >= least
+
     free = _dual(aside, penalty, np.zeros(len(wanted)), None)
     found = Balance(_weights(aside, free), None)
-    if found.effective >= least:
+    if is_enough(found):
         return found
     best, low, high = Balance(np.full(len(moments), 1 / len(moments)), 0.0), 0, len(_BOUNDS) - 1
     while low <= high:
         middle = (low + high) // 2
         found = Balance(_weights(aside, _dual(aside, penalty, free, _BOUNDS[middle])), _BOUNDS[middle])
-        if found.effective >= least:
+        if is_enough(found):
             best, high = found, middle - 1
         else:
             low = middle + 1

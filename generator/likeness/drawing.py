@@ -103,11 +103,14 @@ class DrawnPictures:
         (M,) int64 ascending, the pictures drawn, those of more than one draw repeated.
     reached
         What became of each figure.
+    blacks
+        (M,) float64, the share of the print's black, 0 … 1, that is taken out of each draw; None where options say it.
     """
 
     weights: _Array
     places: npt.NDArray[np.int64]
     reached: tuple[Reached, ...]
+    blacks: npt.NDArray[np.float64] | None = None
 
     @property
     def effective(self) -> float:
@@ -121,7 +124,9 @@ class DrawnPictures:
 
     def describe(self) -> dict[str, Any]:
         """Return what `dataset.json` records."""
+        black = {} if self.blacks is None else {"black_taken": _short(float(self.blacks.mean()))}
         return {
+            **black,
             "measured": int((self.weights > 0).sum()),
             "drawn": len(self.places),
             "distinct": self.distinct,
@@ -138,15 +143,24 @@ class DrawnPictures:
             f"{len(self.places)} draws of {self.distinct} pictures, of {int((self.weights > 0).sum())} measured; their "
             f"weights are worth {self.effective:.0f} equal ones"
         )
-        return [head, *(made.sentence() for made in self.reached)]
+        black: list[str] = []
+        if self.blacks is not None:
+            low, middle, high = np.percentile(self.blacks, (10, 50, 90), method="hazen")
+            told = f"{middle:.2f} in the median, {low:.2f} to {high:.2f} of eight images of ten"
+            black.append(f"share of the print's black taken out: {told}")
+        return [head, *black, *(made.sentence() for made in self.reached)]
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class WeightedPicture:
-    """A source picture with its weight, 1 being that of a picture that is neither favoured nor disfavoured."""
+    """A source picture with its weight, 1 being that of a picture that is neither favoured nor disfavoured.
+
+    With it the share of the print's black, 0 … 1, that is taken out of its images, where it was drawn with one.
+    """
 
     source: Source
     weight: float
+    black_taken: float | None = None
 
     @property
     def name(self) -> str:
@@ -155,11 +169,12 @@ class WeightedPicture:
 
     def read(self) -> SourcePicture:
         """Return the picture with its weight; errors as of the source."""
-        return replace(self.source.read(), weight=self.weight)
+        return replace(self.source.read(), weight=self.weight, black_taken=self.black_taken)
 
     def to_json(self) -> dict[str, Any]:
         """Return as a JSON object how the picture is made or read, and its weight."""
-        return {**self.source.to_json(), "weight": self.weight}
+        black = {} if self.black_taken is None else {"black_taken": self.black_taken}
+        return {**self.source.to_json(), "weight": self.weight, **black}
 
 
 def draw_pictures(
@@ -204,21 +219,30 @@ def draw_pictures(
         raise InputError(f"none of the {len(usable)} pictures can be read or has a colour; name others with --sources")
     if count is not None and count < 1:
         raise InputError(f"{count} pictures are to be drawn, expected 1 or more")
+    variants = measured.variants
+    # A picture counts with all its shares of black, or not at all.
+    usable = np.repeat(usable.reshape(-1, variants).all(axis=1), variants)
     pictures = {name: measured.values[name][usable] for name in names}
     weights = np.zeros(len(usable))
-    weights[usable] = _weights(pictures, real, least_effective)
-    places = _systematic(weights, count or int(usable.sum()), seed)
+    weights[usable] = _weights(pictures, real, least_effective, variants)
+    places = _systematic(weights, count or int(usable.sum()) // variants, seed)
     reached: list[Reached] = []
     for name in names:
         reached += _reached(name, real[name], pictures[name], measured.values[name][places])
-    return DrawnPictures(weights, places, tuple(reached))
+    blacks = np.array(measured.shares)[places % variants] if measured.shares else None
+    of_pictures = weights.reshape(-1, variants).sum(axis=1)
+    return DrawnPictures(of_pictures, places // variants, tuple(reached), blacks)
 
 
 def drawn_sources(sources: Sequence[Source], drawn: DrawnPictures) -> tuple[WeightedPicture, ...]:
     """Return the sources that were drawn, with their weights; sources drawn more than once are repeated."""
     relative = drawn.weights * (drawn.weights > 0).sum()
     places: list[int] = drawn.places.tolist()
-    return tuple(WeightedPicture(sources[place], _short(float(relative[place]))) for place in places)
+    blacks: list[float | None] = [None] * len(places) if drawn.blacks is None else drawn.blacks.tolist()
+    return tuple(
+        WeightedPicture(sources[place], _short(float(relative[place])), black)
+        for place, black in zip(places, blacks, strict=True)
+    )
 
 
 def cautions(target: RealStatistics) -> list[str]:
@@ -235,12 +259,14 @@ def cautions(target: RealStatistics) -> list[str]:
     return told
 
 
-def _weights(pictures: Mapping[str, _Array], real: Mapping[str, _Array], least_effective: float) -> _Array:
+def _weights(
+    pictures: Mapping[str, _Array], real: Mapping[str, _Array], least_effective: float, variants: int
+) -> _Array:
     """Return the weights of pictures by their moments and those of real images."""
     columns = [_moments(name, pictures[name], real[name]) for name in pictures]
     moments = np.concatenate([column for column, _ in columns], axis=1)
     wanted = np.concatenate([column.mean(axis=0) for _, column in columns])
-    return balance(moments, wanted, min(map(len, real.values())), least_effective).weights
+    return balance(moments, wanted, min(map(len, real.values())), least_effective, variants).weights
 
 
 def _moments(name: str, pictures: _Array, real: _Array) -> tuple[_Array, _Array]:

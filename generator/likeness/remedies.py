@@ -33,10 +33,11 @@ def remedies(drawn: DrawnPictures, options: DatasetOptions) -> list[str]:
             "--rendering colorimetric: by codes a picture has the contrast and chroma of the print, mostly less than "
             "the scene's"
         )
-    if (bright or pale) and options.black_point.kind != "compensate":
-        told.append("--black-point compensate: the print's own black lifts shadows and makes colours pale")
-    if shadows is not None and not bright and options.black_point.kind != "keep":
-        told.append("--black-point keep: shadows are darker than the real ones, and the print's own black lifts them")
+    if (shadows is not None or pale) and options.black_point.kind != "like":
+        told.append(
+            "--black-point like: the print's own black lifts shadows and makes colours pale, and of each picture as "
+            "much of it is taken out as makes it like the real ones"
+        )
     told.append(
         "more pictures with --sources, or several crops of each (--crop WxH --crops N): there is more to choose from"
     )

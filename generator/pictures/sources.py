@@ -58,6 +58,8 @@ class SourcePicture:
         The crops, where several were asked for.
     weight
         By which it was drawn; None where pictures were not drawn by weights.
+    black_taken
+        Share of the print's black, 0 … 1, that is taken out of its images; None where options say it.
     """
 
     picture: Picture
@@ -65,6 +67,7 @@ class SourcePicture:
     profile: str | None = None
     cuts: tuple[Cut, ...] = ()
     weight: float | None = None
+    black_taken: float | None = None
 
 
 class Source(Protocol):

@@ -249,6 +249,7 @@ def _exchange_pairs(colours: Any, wanted: Any, scale: Any, near: Any, cost: floa
     held = np.empty((slots, 3))
     held_single = np.empty(slots)
     total = np.empty(3)
+    tried = np.empty((slots * slots, 2), np.int64)
     for k in range(len(wanted)):
         for j in range(candidates):
             single[j] = _place(colours[near[k, j]], wanted[k], scale, places[j]) * cost * slots
@@ -258,8 +259,18 @@ def _exchange_pairs(colours: Any, wanted: Any, scale: Any, near: Any, cost: floa
             total += held[i]
         while True:
             best, first, second, one, other = -1e-12, -1, -1, -1, -1
+            pairs = 0
             for i in range(slots):
                 for i2 in range(i):
+                    # Of 16 slots some six are distinct, and equal pairs are equally good.
+                    known = False
+                    for pair in range(pairs):
+                        if tried[pair, 0] == cells[k, i] and tried[pair, 1] == cells[k, i2]:
+                            known = True
+                    if known:
+                        continue
+                    tried[pairs, 0], tried[pairs, 1] = cells[k, i], cells[k, i2]
+                    pairs += 1
                     x = total[0] - held[i, 0] - held[i2, 0]
                     y = total[1] - held[i, 1] - held[i2, 1]
                     z = total[2] - held[i, 2] - held[i2, 2]

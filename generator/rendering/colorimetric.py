@@ -49,6 +49,11 @@ makes the contrast of a print less by a hundredth of white."""
 _MIXTURES_AT_HAND: Final = 16
 """Lights whose mixtures are kept in memory, 3 MB each: pictures that follow each other share some."""
 
+_asked_for: Final[set[str]] = set()
+"""Keys of mixtures of lights that were found in this process. One that is found a second time is kept: pictures go
+through a list of lights that is longer than what is in memory. Of lights drawn at random each has one image, and to
+keep them would push out those of the table's own lights."""
+
 _PROFILES_AT_HAND: Final = 64
 """Lights whose profiles are kept in memory, 1 MB each: mixtures of lights share their parts."""
 
@@ -186,11 +191,16 @@ def lights_to_find(
 def _mixtures(lut: Lut, light: Mixture, rows: tuple[float, ...], folder: Path | None) -> CellMixtures:
     matrix = ColourMatrix("", np.array(rows).reshape(3, 3), "")
     first, *others = light.lights
-    if others:
-        return _mixtures_near_grey(lut, light, matrix, folder)
     key = _key(lut, light, rows)
     found = load_mixtures(key, source_colours.NODES, folder)
-    if found is None:
+    if found is not None:
+        return found
+    if others:
+        found = _mixtures_near_grey(lut, light, matrix, folder)
+        if key in _asked_for:
+            keep_mixtures(key, found, folder)
+        _asked_for.add(key)
+    else:
         profile = _profile(lut, first)
         if 2 * profile.black >= profile.white:
             raise QualityError(

@@ -22,7 +22,7 @@ COMMANDS = {
 }
 ROOMS = ("drivers", "sim", "acquisition", "calibration", "synthesis", "generator", "evaluation")
 HEAVY = (
-    *("numba", "matplotlib", "colour", "rawpy", "cv2", "scipy", "tifffile", "OpenImageIO", "reportlab"),
+    *("numba", "matplotlib", "colour", "rawpy", "cv2", "scipy", "tifffile", "OpenImageIO"),
     *("distributed", "pyarrow", "torch", "zarr"),
 )
 

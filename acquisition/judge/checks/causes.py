@@ -75,4 +75,6 @@ def is_lasting(known: Knowledge, step: SessionStep, cause: str) -> bool:
     """Return whether taking the frame again will not help; `known` includes it."""
     # A lamp that is another one at the beginning of a run would cost every light up to the next white frame.
     another = cause == "white drift" and is_brightest_grey(step)
-    return another or cause in _AT_ONCE or known.refused[1] >= limits.LASTING_FRAMES
+    # Of a session's first frame the exposure is too long, and a second one is no shorter.
+    overexposed = cause == "clipping" and known.white is None
+    return another or overexposed or cause in _AT_ONCE or known.refused[1] >= limits.LASTING_FRAMES

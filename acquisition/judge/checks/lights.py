@@ -260,7 +260,7 @@ def _coloured(model: ProjectorModel, light: FrameLight, codes: Codes) -> float:
     """Return how much light of any colour, of white, is added to the one ordered; 0 where it is not just more light."""
     expected = model.predict(codes)
     off = light.amounts - expected.amounts
-    sd = np.sqrt(np.diag(expected.with_lamp) + (model.brightness_sd * expected.amounts) ** 2)
+    sd = np.sqrt(np.diag(expected.with_lamp + light.covariance) + (model.brightness_sd * expected.amounts) ** 2)
     more = float(np.mean(off))
     return more if (off > -3 * sd).all() and limits.ADDED_LEAST < more < limits.ADDED_MOST else 0.0
 

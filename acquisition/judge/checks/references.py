@@ -11,6 +11,7 @@ import numpy.typing as npt
 from acquisition.config import JudgeSettings
 from acquisition.judge import limits
 from acquisition.judge.checks.lights import same_light
+from acquisition.judge.known.basis import BLACK_DN
 from acquisition.judge.known.knowledge import Knowledge
 from acquisition.judge.measured.frame import Frame
 from acquisition.judge.measured.measuring import TILE_COLUMNS, TILE_ROWS, Measured
@@ -69,7 +70,8 @@ def judge_dark(known: Knowledge, frame: Measured, dark_percent: float, ambient_p
         noise = 100 * float(np.sqrt(frame.noise.variance(frame.level).max() / frame.places.tile_blocks.mean()))
         noise /= float(scale.min()) * _TILES**0.5
         drift = float(np.abs(changed).max())
-        limit = max(ambient_percent, _SIGMAS * noise)
+        black = 100 * BLACK_DN / float(scale.min())
+        limit = max(ambient_percent, _SIGMAS * 2**0.5 * float(np.hypot(noise, black)))
         # Without a masked border the black level is a constant of the file's, and its drift looks like light.
         if not frame.black_measured:
             limit = max(limit, 100 * 8.0 / float(scale.min()))

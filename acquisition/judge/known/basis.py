@@ -24,6 +24,10 @@ _LIT = 0.01
 _SYSTEMATIC = 0.003
 """Relative error of a tile's counts besides noise that the fit reckons with."""
 
+BLACK_DN = 0.3
+"""Standard deviation of a frame's black level, counts, each channel for itself: the mean of a masked border is good to
+0.1, and what lies under it differs from the picture by some tenths. It matters where white has some hundred counts."""
+
 _FAINT = 0.1
 """Share of the median tile's signal below which deviations are measured against that share: a glint on a dark backdrop
 is not a fault of the picture."""
@@ -79,6 +83,8 @@ class Basis:
         (S, 3) and (3, S, 3), likewise of the strips; None where they are not known.
     of_primaries
         Whether the maps are of the projector's primaries; else of the camera's colours under white.
+    spread, strip_spread
+        (4, T, 3) and (4, S, 3), variance of the darkness and of each map by noise: in dim light as much as the frame's.
     """
 
     dark: _Array
@@ -86,31 +92,35 @@ class Basis:
     dark_strips: _Array | None
     strip_maps: _Array | None
     of_primaries: bool
+    spread: _Array
+    strip_spread: _Array | None = None
 
     @classmethod
     def of_white(cls, white: Measured, dark: Measured) -> Basis:
         """Return the coarse one: what a camera's colour shows under white stands for the primary of that colour."""
         added = white.tiles - dark.tiles
-        maps = np.stack([np.where(np.arange(3) == channel, added, 0.0) for channel in range(3)])
-        return cls(dark.tiles, maps, None, None, of_primaries=False)
+        of = [np.arange(3) == channel for channel in range(3)]
+        maps = np.stack([np.where(channel, added, 0.0) for channel in of])
+        own, dark_own = _tile_variance(white), _tile_variance(dark)
+        spread = np.stack([dark_own, *(np.where(channel, own + dark_own, 0.0) for channel in of)])
+        return cls(dark.tiles, maps, None, None, of_primaries=False, spread=spread)
 
     @classmethod
     def between(cls, primaries: tuple[Measured, Measured, Measured], dark: Measured) -> Basis:
         """Return that of three frames, each of one primary."""
         maps = np.stack([frame.tiles - dark.tiles for frame in primaries])
         strips = np.stack([frame.strips - dark.strips for frame in primaries])
-        return cls(dark.tiles, maps, dark.strips, strips, of_primaries=True)
+        spread, strip_spread = (
+            np.stack([of(dark), *(of(frame) + of(dark) for frame in primaries)])
+            for of in (_tile_variance, _strip_variance)
+        )
+        return cls(dark.tiles, maps, dark.strips, strips, True, spread, strip_spread)
 
     def with_dark(self, dark: Measured) -> Basis:
         """Return the same with the darkness of a newer frame."""
         strips = None if self.strip_maps is None else dark.strips
-        return replace(self, dark=dark.tiles, dark_strips=strips)
-
-    def scaled(self, amounts: _Array) -> Basis:
-        """Return the same with the maps of amounts (3,) float64 as its units."""
-        by = amounts[:, None, None]
-        strips = None if self.strip_maps is None else self.strip_maps / by
-        return replace(self, maps=self.maps / by, strip_maps=strips)
+        spread = np.concatenate([_tile_variance(dark)[None], self.spread[1:]])
+        return replace(self, dark=dark.tiles, dark_strips=strips, spread=spread)
 
     def light(self, frame: Measured) -> FrameLight:
         """Return the light of a frame."""
@@ -133,8 +143,11 @@ class Basis:
             gram = np.einsum("ptc,tc,qtc->pq", design, weights, design)
             inverse = np.asarray(np.linalg.inv(gram + 1e-12 * np.trace(gram) * np.eye(3)), dtype=np.float64)
             amounts = inverse @ np.einsum("ptc,tc,tc->p", design, weights, seen)
-        tiles = _residuals(seen, amounts, design, self.dark, frame.noise, blocks, lit)
-        return FrameLight(amounts, inverse, tiles)
+        # What both frames' black levels are off by is in all tiles alike.
+        by_black = inverse @ np.einsum("ptc,tc->pc", design, trust[:, None] / variance)
+        covariance = inverse + 2 * BLACK_DN**2 * by_black @ by_black.T
+        tiles = _residuals(seen, amounts, design, self.dark, frame.noise, blocks, lit, self.spread)
+        return FrameLight(amounts, covariance, tiles)
 
     def strips(self, frame: Measured, amounts: _Array, down_px: float = 0.0, blur_px: float = 0.0) -> Residuals | None:
         """Return what amounts (3,) of light leave at the strips; None where these are not known.
@@ -155,7 +168,7 @@ class Basis:
         blocks = np.full((len(strength), 1), strip_blocks(frame.places))
         lit = strength > _LIT * np.median(strength)
         seen = frame.strips - self.dark_strips
-        return _residuals(seen, amounts, maps, self.dark_strips, frame.noise, blocks, lit)
+        return _residuals(seen, amounts, maps, self.dark_strips, frame.noise, blocks, lit, self.strip_spread)
 
 
 def _mean_variance(level: _Array, noise: Noise, blocks: _Array) -> _Array:
@@ -163,8 +176,25 @@ def _mean_variance(level: _Array, noise: Noise, blocks: _Array) -> _Array:
     return noise.variance(level) / (blocks * np.array([1.0, 2.0, 1.0]))
 
 
+def _tile_variance(frame: Measured) -> _Array:
+    """Return the variance (T, 3) of a frame's tiles by noise."""
+    return _mean_variance(frame.tiles, frame.noise, frame.places.tile_blocks)
+
+
+def _strip_variance(frame: Measured) -> _Array:
+    """Return the variance (S, 3) of a frame's strips by noise."""
+    return _mean_variance(frame.strips, frame.noise, np.full((len(frame.strips), 1), strip_blocks(frame.places)))
+
+
 def _residuals(
-    seen: _Array, amounts: _Array, maps: _Array, dark: _Array, noise: Noise, blocks: _Array, lit: npt.NDArray[np.bool_]
+    seen: _Array,
+    amounts: _Array,
+    maps: _Array,
+    dark: _Array,
+    noise: Noise,
+    blocks: _Array,
+    lit: npt.NDArray[np.bool_],
+    spread: _Array | None,
 ) -> Residuals:
     expected = np.einsum("p,ptc->tc", amounts, maps)
     signal = np.linalg.norm(expected + np.maximum(dark, 0), axis=1)
@@ -173,6 +203,8 @@ def _residuals(
     off = seen - expected
     relative = np.where(lit, np.linalg.norm(off, axis=1) / against, np.nan)
     variance = _mean_variance(expected + np.maximum(dark, 0), noise, blocks).sum(axis=1)
+    if spread is not None:
+        variance = variance + np.einsum("p,ptc->t", np.array([1.0, *amounts**2]), spread)
     total = (expected + np.maximum(dark, 0)).sum(axis=1)
     usual = float(np.median(total[lit])) if lit.any() else 0.0
     signed = off.sum(axis=1) / np.maximum(total, max(_FAINT * usual, 1e-6))

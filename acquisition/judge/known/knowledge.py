@@ -266,7 +266,7 @@ class Knowledge:
         # A frame that makes the basis has been learnt from with it.
         if found.light is not None and self.modelled and known.modelled and step.kind != "dark":
             model = known.model.stepped(found.brightness) if found.stepped else known.model
-            known = replace(known, model=model.learn(found.light.amounts, codes))
+            known = replace(known, model=model.learn(found.light.amounts, codes, found.light.covariance))
         return known
 
     def without_white(self) -> ProjectorModel | None:
@@ -276,7 +276,8 @@ class Knowledge:
             return None
         model = ProjectorModel.unknown()
         for one in others:
-            model = model.learn(self.basis.light(one.measured).amounts, one.codes)
+            light = self.basis.light(one.measured)
+            model = model.learn(light.amounts, one.codes, light.covariance)
         return model
 
     def _anchored(self, anchor: Anchor) -> Knowledge:
@@ -324,9 +325,11 @@ class Knowledge:
                 basis = Basis.between((red, green, blue), self.dark)
                 model = self.model
                 for number, frame in enumerate((red, green, blue)):
-                    model = model.learn(basis.light(frame).amounts, primary_codes(number))
+                    light = basis.light(frame)
+                    model = model.learn(light.amounts, primary_codes(number), light.covariance)
                 if self.white is not None and not self.moved_on:
-                    model = model.learn(basis.light(self.white).amounts, (255, 255, 255))
+                    light = basis.light(self.white)
+                    model = model.learn(light.amounts, (255, 255, 255), light.covariance)
                 return replace(self, basis=basis, model=model)
             if self.white is not None and step.kind in REFERENCES:
                 return replace(self, basis=Basis.of_white(self.white, self.dark))

@@ -225,7 +225,8 @@ class ProjectorModel:
     def compare(self, amounts: _Array, codes: Codes, added: _Array | None = None) -> Fit:
         """Return how well amounts (3,) float64 agree with codes; `added` (3, 3) is their own covariance."""
         expected = self.predict(codes)
-        weight = np.linalg.inv(expected.covariance + (0 if added is None else added))
+        own = np.zeros((3, 3)) if added is None else added
+        weight = np.linalg.inv(expected.covariance + own)
         h = expected.amounts
         power = max(float(h @ weight @ h), 1e-12)
         level = float(h @ weight @ amounts) / power
@@ -235,14 +236,15 @@ class ProjectorModel:
         angle = float(np.degrees(np.arctan2(sine, amounts @ h))) if h.any() else 180.0
         brightness = float(np.log(max(level, 1e-6)))
         share = weight @ h / power
-        sd = (float(share @ expected.with_lamp @ share) + self.brightness_sd**2 + LAMP_STEP**2) ** 0.5
+        sd = (float(share @ (expected.with_lamp + own) @ share) + self.brightness_sd**2 + LAMP_STEP**2) ** 0.5
         return Fit(distance, angle, brightness, sd)
 
-    def learn(self, amounts: _Array, codes: Codes) -> ProjectorModel:
-        """Return what is known after a frame of `codes` that showed `amounts` (3,) float64."""
+    def learn(self, amounts: _Array, codes: Codes, added: _Array | None = None) -> ProjectorModel:
+        """Return what is known after a frame of `codes` that showed `amounts` (3,) float64; see `compare`."""
         covariance = self.covariance.copy()
         covariance[_LAMP, _LAMP] += LAMP_STEP**2
-        used = (np.array(codes) > 0) & (amounts > 5 * _ABSOLUTE)
+        absolute = _ABSOLUTE**2 * np.eye(3) + (0 if added is None else added)
+        used = (np.array(codes) > 0) & (amounts > 5 * np.sqrt(np.diag(absolute)))
         if not used.any():
             return replace(self, covariance=covariance)
         seen, count = np.log(amounts[used]), int(used.sum())
@@ -254,8 +256,9 @@ class ProjectorModel:
             logs, slopes, extra = at._logs(codes)
             slopes, off = slopes[used], seen - logs[used]
             before = off if turn == 0 else before
-            own = np.diag(self.chroma_sd**2 + extra[used] ** 2 + (_ABSOLUTE / amounts[used]) ** 2)
-            noise = own + self.brightness_sd**2
+            own = np.diag(self.chroma_sd**2 + extra[used] ** 2)
+            faint = absolute[np.ix_(used, used)] / np.outer(amounts[used], amounts[used])
+            noise = own + faint + self.brightness_sd**2
             innovation = slopes @ covariance @ slopes.T + noise
             gain = covariance @ slopes.T @ np.asarray(np.linalg.inv(innovation), dtype=np.float64)
             state = self.state + gain @ (off - slopes @ (self.state - at.state))

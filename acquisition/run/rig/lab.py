@@ -6,6 +6,7 @@ import uuid
 from contextlib import ExitStack
 
 from acquisition.config import CameraCable, LabSettings, LightSource, ProjectorCable
+from acquisition.run.asking import ask_all
 from acquisition.run.devices import Devices
 from acquisition.run.shutter import require_whole_turns
 from acquisition.session.folder import Session
@@ -57,14 +58,27 @@ def open_lab(settings: LabSettings, session: Session | None, opened: ExitStack) 
     """
     clock = session_clock(session)
     require_whole_turns(settings.camera, settings.lab.projector)
-    projector = _lab_projector(settings.lab.projector, clock, settings.file)
-    if projector is not None:
-        opened.callback(projector.close)
-    presenter = _lab_presenter(settings.lab.light, clock, settings.file)
-    opened.callback(presenter.close)
-    camera = _lab_camera(settings.lab.camera, clock, settings.file)
-    opened.callback(camera.close)
-    return Devices(camera, presenter, projector, clock)
+    projectors: list[Projector] = []
+    presenters: list[Presenter] = []
+    cameras: list[Camera] = []
+
+    def open_projector() -> None:
+        projector = _lab_projector(settings.lab.projector, clock, settings.file)
+        if projector is not None:
+            opened.callback(projector.close)
+            projectors.append(projector)
+
+    def open_presenter() -> None:
+        presenters.append(_lab_presenter(settings.lab.light, clock, settings.file))
+        opened.callback(presenters[0].close)
+
+    def open_camera() -> None:
+        cameras.append(_lab_camera(settings.lab.camera, clock, settings.file))
+        opened.callback(cameras[0].close)
+
+    # One that cannot be opened does not keep the others' faults from being told.
+    ask_all({"projector": open_projector, "display": open_presenter, "camera": open_camera})
+    return Devices(cameras[0], presenters[0], projectors[0] if projectors else None, clock)
 
 
 def session_clock(session: Session | None) -> SteadyClock:

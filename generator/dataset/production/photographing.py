@@ -33,6 +33,7 @@ def photograph(
     seed: int,
     number: int,
     white_level: int,
+    black_taken: float | None = None,
 ) -> tuple[npt.NDArray[np.uint16], npt.NDArray[np.float32] | None, Details]:
     """Return the raw image of a picture's print.
 
@@ -50,6 +51,8 @@ def photograph(
         The dataset's seed, and the image's number in it.
     white_level
         What mixtures of several lights on a pixel are cut at.
+    black_taken
+        Share of the print's black that is taken out, 0 … 1; None for what the options say.
 
     Returns
     -------
@@ -73,7 +76,7 @@ def photograph(
     for mixture in lighting.mixtures:
         for light in mixture.lights:
             lut.require_unchanged(light)
-    share = options.black_point.share(seed, number)
+    share = options.black_point.share(seed, number) if black_taken is None else black_taken
     cells = None
     details: Details = {}
     if options.rendering == "colorimetric":

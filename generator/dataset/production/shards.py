@@ -57,6 +57,7 @@ class _ReadSource:
 
     cuts: tuple[Cut, ...]
     record: SourceRecord
+    black_taken: float | None
 
 
 class ShardCancelled(Exception):
@@ -262,7 +263,7 @@ def _read(job: ShardJob, lut: Lut, place: int) -> _ReadSource:
         weight=scene.weight,
     )
     cuts = tuple(replace(cut, picture=picture) for cut, (picture, _) in zip(whole, fit, strict=True))
-    return _ReadSource(cuts, record)
+    return _ReadSource(cuts, record, scene.black_taken)
 
 
 def _make(
@@ -283,7 +284,8 @@ def _make(
     white_level = lut.provenance.white_level
     # What exceeds saturation may be below it once it is exposed anew, and is cut then.
     most = LARGEST_COUNT if options.variation.is_on else white_level
-    image, weights, rendered = photograph(lut, cut.picture, lighting, options, job.seed, number, most)
+    taken = source.black_taken
+    image, weights, rendered = photograph(lut, cut.picture, lighting, options, job.seed, number, most, taken)
     varied = options.variation.apply(image, white_level, job.seed, number)
     light = image_light(lut, lighting, weights, varied, options.variation.tints)
     stored, level = (image, white_level) if options.scale == "table" else (to_full_scale(image, white_level), FULL)

@@ -190,12 +190,12 @@ def test_a_preview_is_the_mean_of_what_it_covers(a7: Chart, tmp_path: Path) -> N
 def test_the_pdf_has_the_page_s_size_and_no_profile(a7: Chart, tmp_path: Path) -> None:
     save_pdf(a7, tmp_path / "chart.pdf")
     content = (tmp_path / "chart.pdf").read_bytes()
-    box = re.search(rb"/MediaBox \[ ([\d. ]+) \]", content)
+    box = re.search(rb"/MediaBox \[([\d. ]+)\]", content)
     assert box is not None
     assert [float(value) for value in box[1].split()] == pytest.approx(
         [0, 0, 105 * 72 / 25.4, 74 * 72 / 25.4], abs=1e-3
     )
-    assert content.count(b"/Type /Page\n") == 1
+    assert len(re.findall(rb"/Type /Page\b", content)) == 1
     assert b"/FlateDecode" in content
     assert b"/ICCBased" not in content
     save_pdf(a7, tmp_path / "again.pdf")

@@ -421,6 +421,21 @@ def test_scrambled_rows_are_named_also_where_they_are_brighter(taught: Bench) ->
         assert cause(lab.take(lab.light(*ORANGE), ScrambledRows(top=top, bottom=top + 0.05))) == "rows", top
 
 
+def test_where_white_has_some_hundred_counts_noise_and_black_level_are_no_light(tmp_path: Path) -> None:
+    lab = bench(tmp_path, Room(seed=14, wheel_hz=60, white_level_share=0.05), count=8, every=4)
+    assert [said.reason for said in map(lab.take, lab.steps) if said.reason] == []
+    assert lab.take(lab.light(*ORANGE)).accepted
+    assert cause(lab.show(lab.counts(lab.light(*ORANGE)), lab.light(*SKY))) == "light"
+
+
+def test_a_first_frame_that_is_clipped_is_not_taken_again_and_again(tmp_path: Path) -> None:
+    lab = bench(tmp_path, Room(seed=3, white_level_share=4.0))
+    judgement = lab.take(WHITE_STEP)
+    assert cause(judgement) == "clipping"
+    assert judgement.lasting
+    assert "dim the projector, or set a shorter exposure" in judgement.reason
+
+
 def test_a_light_too_dark_for_it_leaves_blur_to_the_next_reference(taught: Bench) -> None:
     lab = taught.fork()
     dim = lab.take(lab.light(0, 0, 56), Defocus(px=1))

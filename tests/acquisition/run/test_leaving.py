@@ -51,6 +51,22 @@ def test_what_ended_a_run_is_known_by_what_it_raised() -> None:
     assert end_of(AssertionError()) is RunEnd.UNFINISHED
 
 
+@pytest.mark.parametrize(("lost", "said"), [(2, "it was switched off"), (3, "it could not be switched off: no answer")])
+def test_an_answer_that_is_lost_does_not_let_the_lamp_burn(lost: int, said: str) -> None:
+    class Deaf(SimulatedProjector):
+        asked = 0
+
+        def power(self) -> Power:
+            type(self).asked += 1
+            if type(self).asked <= lost:
+                raise DeviceError("no answer")
+            return super().power()
+
+    clock = SimulatedClock()
+    sentence = lamp_fate(Deaf(clock, power=ON), RunEnd.COMPLETE, SequenceSettings(), clock)
+    assert sentence.startswith(said)
+
+
 def test_a_lamp_that_is_out_is_left_alone() -> None:
     class Untouched(SimulatedProjector):
         def switch_off(self) -> None:

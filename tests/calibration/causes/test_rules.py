@@ -118,6 +118,7 @@ CASES: list[tuple[str, Evidence, Cause]] = [
     ("unlike_scatter", Evidence(softer=0, scatter=0.5), ANOTHER_PRINT),
     ("unlike_scatter", Evidence(softer=0, scatter=0.03), UNKNOWN),
     ("moved_anew", Evidence(anew=0.1, moved_px=2, softer=0), BUMP),
+    ("other_iso", Evidence(frames=8, other_iso=2), OTHER_EXPOSURE),
     ("additivity", Evidence(exposure=0.5), OTHER_EXPOSURE),
     ("white_drift", Evidence(exposure=2.0), OTHER_EXPOSURE),
     ("additivity", Evidence(exposure=1.0, named_right=0), WRONG_NAME),

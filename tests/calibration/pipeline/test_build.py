@@ -17,11 +17,14 @@ from acquisition.chart.model import Chart
 from acquisition.measures.polynomials import order_of, page_polynomial
 from acquisition.session.folder import Session
 from acquisition.session.plan import SessionStep, plan_steps
+from calibration.citation.record import exposure_text
 from calibration.cli import main
 from calibration.pipeline.build import build, check
 from calibration.pipeline.frames import session_sha256
+from calibration.report.groups import GROUPS, OF_THRESHOLDS
 from calibration.report.report import write_report
 from calibration.report.summary import summary
+from calibration.report.worsts import cell_sides_px, worst_of
 from calibration.table.lut import Lut, open_lut
 from calibration.verdict.result import BuildResult
 from drivers.camera import ExposureSettings
@@ -230,10 +233,38 @@ def test_a_lamp_that_fades_is_reported_and_not_corrected(lab: Lab, tmp_path: Pat
 def test_the_report_stands_alone(built: BuildResult) -> None:
     assert built.lut is not None
     page = (built.lut / "report.html").read_text()
-    assert page.count("data:image/png;base64,") == 8
+    assert page.count("data:image/png;base64,") == 11
+    # Verdict, what to do, and the four pictures to look at first stand before everything that is folded.
+    heads = re.findall(r"<h2>([^<]+)</h2>", page[: page.index("<details")])
+    assert [head for head in heads if head not in ("Probable causes",) and not head.startswith("Where it is")] == [
+        "What to do", "The chart as registered", "The lights", "Where cells err", "The noise", "All figures",
+    ]  # fmt: skip
+    assert page.index("class='verdict ") < page.index("What to do")
+    assert re.findall(r"<details id='(\w+)'", page) == [*GROUPS, "origin"]
     assert re.search(r"(src|href)='?http", page) is None
     for row in summary(built.figures):
         assert html.escape(row.name) in page
+    # A group with something beyond its limit is not folded, all others are.
+    beyond = {OF_THRESHOLDS[row.threshold.name] for row in built.verdict.rows if row.outcome != "accept"}
+    assert set(re.findall(r"<details id='(\w+)' open", page)) == beyond
+    assert f"<th>Exposure</th><td>{html.escape(exposure_text(built.figures.origin))}</td>" in page
+
+
+def test_the_worst_of_each_figure_is_somewhere(built: BuildResult, session: Session) -> None:
+    chart, found = session.chart, worst_of(built.figures, session.chart)
+    files = {record.file for record in session.frames()}
+    for worst in found:
+        assert worst.where
+        assert not worst.file or worst.file in files
+        if worst.place is not None:
+            assert 0 <= worst.place.x_mm <= chart.page_mm[0]
+            assert 0 <= worst.place.y_mm <= chart.page_mm[1]
+    errors = built.figures.lights.white_error_deg
+    assert next(worst.light for worst in found if worst.figure == "truth_worst_deg") == int(np.argmax(errors))
+    by_name = {worst.figure: worst for worst in found}
+    assert by_name["bleed"].place is not None
+    smallest = cell_sides_px(built.figures, chart).min()
+    assert smallest == pytest.approx(built.figures.registration.cell_px, rel=0.1)
 
 
 def test_the_same_session_gives_the_same_table(session: Session, built: BuildResult, tmp_path: Path) -> None:

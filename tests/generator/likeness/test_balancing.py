@@ -57,5 +57,16 @@ def test_equal_sets_leave_weights_equal() -> None:
     assert found.effective == pytest.approx(500)
 
 
+def test_variants_of_an_image_count_as_one() -> None:
+    """Of ten variants of each image one is wanted: a tenth of all, and yet every image is of the same use."""
+    values = np.tile(np.arange(10.0) == 3, 200)[:, None].astype(float)
+    together = balance(values, np.array([0.999]), np.inf, 0.5, variants=10)
+    assert together.bound is None
+    assert float(together.weights @ values[:, 0]) == pytest.approx(0.999, abs=1e-3)
+    alone = balance(values, np.array([0.999]), np.inf, 0.5)
+    assert alone.bound is not None
+    assert float(alone.weights @ values[:, 0]) < 0.5
+
+
 def test_effective_size_of_weights_that_are_not_normalised() -> None:
     assert effective_size(np.array([2.0, 2.0, 0.0, 0.0])) == 2

@@ -124,6 +124,28 @@ def test_real_images_that_are_all_alike() -> None:
     assert drawn.effective >= 60
 
 
+def test_each_draw_has_the_share_of_black_that_it_was_measured_with() -> None:
+    """A picture without black has shadows that the real images have; all else of it is the same with any share."""
+    pictures, shares = numbers(300, 1, 0.0, 0.1, 0.05), (0.0, 0.5, 1.0)
+    pictures = {name: np.repeat(given, 3) for name, given in pictures.items()}
+    pictures["luminance_1"] = pictures["luminance_1"] * np.tile([4.0, 2.0, 1.0], 300)
+    given = MeasuredPictures(pictures, np.repeat(np.arange(300) < 7, 3), shares)
+    drawn = draw_pictures(given, target(numbers(400, 2, 0.0, 0.1, 0.05)), 900, seed=5)
+    assert drawn.blacks is not None
+    assert len(drawn.weights) == 300
+    assert (drawn.weights[:7] == 0).all()
+    assert drawn.places.min() >= 7
+    assert drawn.places.max() < 300
+    assert drawn.effective > 60
+    assert np.mean(drawn.blacks == 1.0) > 0.8
+    reached = {made.name: made for made in drawn.reached}
+    assert reached["luminance_1"].is_alike
+    assert reached["luminance_1"].before > 1.6 * reached["luminance_1"].wanted
+    sources = drawn_sources(random_scenes(300, 8, 6, seed=3), drawn)
+    assert [source.black_taken for source in sources] == drawn.blacks.tolist()
+    assert sources[0].read().black_taken == sources[0].to_json()["black_taken"] == sources[0].black_taken
+
+
 def test_drawn_sources_keep_their_names_and_know_their_weights() -> None:
     scenes = random_scenes(300, 8, 6, seed=3)
     drawn = draw_pictures(measured(numbers(300, 1, 0.1, 0.2, 0.04)), target(numbers(300, 2, 0, 0.1, 0.05)), 900, seed=5)

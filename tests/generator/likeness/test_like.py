@@ -42,8 +42,11 @@ def table(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Lut:
     return lut
 
 
-def real_numbers(lut: Lut, reddish: float) -> dict[str, npt.ArrayLike]:
-    """Return numbers as of a real set of which that share is reddish, else like the pictures."""
+def real_numbers(lut: Lut, reddish: float, black_taken: float = 0.0) -> dict[str, npt.ArrayLike]:
+    """Return numbers as of a real set of which that share is reddish, else like the pictures.
+
+    Of the print's black, which is a tenth of white, that share is taken out of them.
+    """
     random = np.random.default_rng(1)
     values: dict[str, list[float]] = {}
     for number in range(100):
@@ -51,6 +54,7 @@ def real_numbers(lut: Lut, reddish: float) -> dict[str, npt.ArrayLike]:
         codes = np.clip(random.integers(0, 256, (20, 24, 3)) + tint, 0, 255)
         index = (codes >> 6) @ np.array([16, 4, 1])
         image = lut.samples[2].astype(float).mean(axis=1)[index]
+        image = (image - 0.1 * black_taken * lut.white[2]) / (1 - 0.1 * black_taken)
         for name, value in numbers_of_cells(cell_means(image, lut.white[2]))[0].items():
             values.setdefault(name, []).append(value)
     return dict(values)
@@ -179,6 +183,7 @@ def test_lights_outside_the_gamut_are_counted_and_others_drawn(table: Lut, capsy
         (("--like-in", "lights", "--match", "s.json"), "--match says the lights, and so does --like"),
         (("--like-in", "exposure"), "s.json knows no exposure"),
         (("--like-in", "lights", "--draw", "5"), "--draw 5 is for pictures"),
+        (("--like-in", "lights", "--black-point", "like"), "--black-point like draws pictures with the shadows of"),
     ],
 )
 def test_options_that_do_not_go_together(
@@ -187,6 +192,8 @@ def test_options_that_do_not_go_together(
     write_stats(Path("s.json"), lights_of(table), real_numbers(table, 0.5))
     assert main(("lut", "out", "--sources", "pictures", "--like", "s.json", *options)) == 2
     assert told in capsys.readouterr().err
+    assert main(("lut", "out", "--sources", "pictures", "--black-point", "like")) == 2
+    assert "give --like STATS.json" in capsys.readouterr().err
     assert main(("lut", "out", "--sources", "pictures", "--draw", "5")) == 2
     assert "give --like STATS.json" in capsys.readouterr().err
 
@@ -235,3 +242,26 @@ def test_pictures_are_measured_as_they_will_be_rendered(table: Lut) -> None:
         assert np.median(seen) == pytest.approx(figure["after"], rel=0.05)
         found[black] = figure["before"]
     assert found["compensate"] < 0.7 * found["keep"]
+
+
+def test_shadows_are_made_like_the_real_ones_by_the_black_of_each_picture(
+    table: Lut, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_stats(Path("s.json"), lights_of(table), real_numbers(table, 0.5, black_taken=0.5))
+    wish = ("--sources", "pictures", "--no-preview", "--like", "s.json", "--like-in", "pictures", "--draw", "150")
+    away: dict[str, float] = {}
+    for black in ("compensate", "keep", "like"):
+        assert main(("lut", black, *wish, "--black-point", black, "--random", "1")) == 0
+        dataset = open_dataset(black)
+        images = [(dataset.read_image(entry), entry.truth) for entry in dataset.entries]
+        seen = [numbers_of_cells(cell_means(image, truth))[0]["luminance_1"] for image, truth in images]
+        figure = recorded(black)["like"]["pictures"]["figures"]["luminance_1"]
+        # What was promised is what the images are.
+        assert np.median(seen) == pytest.approx(figure["after"], rel=0.1)
+        away[black] = abs(np.log(np.median(seen) / figure["wanted"]))
+    assert away["like"] < 0.05 < 0.15 < min(away["keep"], away["compensate"])
+    with Path("like/images.csv").open() as stream:
+        shares = np.array([float(row["black_taken"]) for row in csv.DictReader(stream)])
+    assert np.median(shares) == pytest.approx(0.5, abs=0.16)
+    assert recorded("like")["like"]["pictures"]["black_taken"] == pytest.approx(shares.mean(), rel=1e-4)
+    assert "share of the print's black taken out: " in capsys.readouterr().out

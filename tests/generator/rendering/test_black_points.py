@@ -190,6 +190,8 @@ def test_random_shares_are_even_and_a_function_of_seed_and_image() -> None:
 
 
 def test_faults_are_named(make_lut: MakeLut) -> None:
+    with pytest.raises(InputError, match="the black point like has a share for each picture"):
+        parse_black_point("like").share(0, 0)
     for text in ("none", "random:", "random:x", "Random"):
         with pytest.raises(InputError, match="expected keep, compensate, random, or random:MAX"):
             parse_black_point(text)

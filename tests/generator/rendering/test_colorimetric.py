@@ -98,6 +98,24 @@ def test_a_second_run_takes_what_the_first_kept(
     assert len(list(cache.iterdir())) == 5
 
 
+def test_a_mixture_of_lights_is_kept_when_it_comes_again(
+    make_table: MakeTable, cache: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Pictures go through a list of lights time and again; of lights drawn at random each comes once."""
+    lut, matrix = make_table(bits=1), ColourMatrix("mine", MATRIX, "")
+    # More than are in memory.
+    mixtures = [Mixture((0, 2), (part / 32, 1 - part / 32)) for part in range(1, 20)]
+    first = [colorimetric_mixtures(lut, mixture, matrix).cells for mixture in mixtures]
+    once = len(list(cache.iterdir()))
+    assert once <= 3, "lights of the table alone"
+    for mixture in mixtures:
+        colorimetric_mixtures(lut, mixture, matrix)
+    assert len(list(cache.iterdir())) == once + len(mixtures)
+    monkeypatch.setattr("generator.rendering.colorimetric.mix_cells", None)
+    for mixture, cells in zip(mixtures, first, strict=True):
+        np.testing.assert_array_equal(colorimetric_mixtures(lut, mixture, matrix).cells, cells)
+
+
 def test_lights_have_numbers_temperatures_and_mixtures(make_table: MakeTable) -> None:
     lut = make_table(bits=1)
     by_number, by_kelvin = colorimetric_mixtures(lut, 1), colorimetric_mixtures(lut, 5600.0)

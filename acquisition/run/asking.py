@@ -1,0 +1,40 @@
+"""Ask every device, also when another one failed, so that a lab is told all its faults at once.
+
+Whoever mends a cable wants to know of the other one too: each walk to the lab costs more than all questions.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+
+from foundation.errors import ConfigurationError, CropError, DeviceError
+
+
+def ask_all(questions: Mapping[str, Callable[[], object]]) -> None:
+    """Ask each question, and raise what went wrong with all of them together.
+
+    Parameters
+    ----------
+    questions
+        By the name of the device that is asked; each raises what its device says against it.
+
+    Raises
+    ------
+    DeviceError, ConfigurationError
+        One failed: as it failed. Several did: a list of all, one a line, each with its remedy; a ConfigurationError
+        (exit code 2) where all are the settings' faults, else a DeviceError (3).
+    """
+    faults: dict[str, CropError] = {}
+    for name, question in questions.items():
+        try:
+            question()
+        except (DeviceError, ConfigurationError) as fault:
+            faults[name] = fault
+    if not faults:
+        return
+    if len(faults) == 1:
+        raise next(iter(faults.values()))
+    of_settings = all(isinstance(fault, ConfigurationError) for fault in faults.values())
+    kind = ConfigurationError if of_settings else DeviceError
+    listed = "".join(f"\n  {name}: {fault}" for name, fault in faults.items())
+    raise kind(f"{len(faults)} of {len(questions)} devices cannot be used:{listed}") from next(iter(faults.values()))

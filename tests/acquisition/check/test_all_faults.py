@@ -1,0 +1,111 @@
+"""A check tells the faults of all devices at once, whichever of them fail."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Generator
+from contextlib import ExitStack, contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from acquisition.check import check as module
+from acquisition.config import LabSettings, load_lab, parse_lab
+from acquisition.run.devices import Devices
+from acquisition.run.rig import lab as rig
+from acquisition.run.rig.opening import open_rig
+from foundation.errors import ConfigurationError, DeviceError, LinkClosed
+from tests.acquisition.check.conftest import lab_toml
+
+DEVICES = ("camera", "display", "projector")
+FAULTY = [chosen for count in (1, 2, 3) for chosen in itertools.combinations(DEVICES, count)]
+
+SAYS = {
+    "camera": "the camera is asleep; wake it up",
+    "display": "HDMI-1 is covered; close what covers it",
+    "projector": "nobody answers at 192.0.2.7; look at its cable",
+}
+
+
+class Broken:
+    """A device all of whose verbs fail but that it can be closed."""
+
+    def __init__(self, says: str) -> None:
+        self._says = says
+
+    def close(self) -> None:
+        """Do nothing."""
+
+    def __getattr__(self, name: str) -> Any:
+        def fail(*_: object) -> None:
+            raise LinkClosed(self._says)
+
+        return fail
+
+
+@pytest.mark.parametrize("faulty", FAULTY, ids="+".join)
+def test_every_fault_of_simulated_devices_is_told_at_once(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, faulty: tuple[str, ...]
+) -> None:
+    @contextmanager
+    def opening(settings: LabSettings, *others: Any) -> Generator[Devices]:
+        with open_rig(settings, *others) as devices:
+            places = {"camera": "camera", "display": "presenter", "projector": "projector"}
+            broken: dict[str, Any] = {places[name]: Broken(SAYS[name]) for name in faulty}
+            yield replace(devices, **broken)
+
+    monkeypatch.setattr(module, "open_rig", opening)
+    (folder / "LAB.toml").write_text(lab_toml("chart1.json"))
+    with pytest.raises(DeviceError) as told:
+        module.check_lab(load_lab(folder / "LAB.toml"))
+    for name in DEVICES:
+        assert (SAYS[name] in str(told.value)) == (name in faulty)
+    assert told.value.exit_code == 3
+    if len(faulty) > 1:
+        assert str(told.value).startswith(f"{len(faulty)} of 3 devices cannot be used:")
+
+
+def lab_settings() -> LabSettings:
+    return parse_lab('rig = "lab"\nchart = "c"\nilluminations = "i"\n', "LAB.toml")
+
+
+@pytest.mark.parametrize("faulty", FAULTY, ids="+".join)
+def test_every_device_of_a_real_lab_is_opened_though_another_fails(
+    monkeypatch: pytest.MonkeyPatch, faulty: tuple[str, ...]
+) -> None:
+    closed: list[str] = []
+    places = {"camera": "_lab_camera", "display": "_lab_presenter", "projector": "_lab_projector"}
+
+    class Sound:
+        def __init__(self, name: str) -> None:
+            self._name = name
+
+        def close(self) -> None:
+            closed.append(self._name)
+
+    for name, place in places.items():
+
+        def opens(*_: object, name: str = name) -> Sound:
+            if name in faulty:
+                raise LinkClosed(SAYS[name])
+            return Sound(name)
+
+        monkeypatch.setattr(rig, place, opens)
+    with pytest.raises(DeviceError) as told, ExitStack() as opened:
+        rig.open_lab(lab_settings(), None, opened)
+    for name in DEVICES:
+        assert (SAYS[name] in str(told.value)) == (name in faulty)
+    # What was opened is closed, whatever failed beside it.
+    assert sorted(closed) == sorted(set(DEVICES) - set(faulty))
+
+
+def test_faults_of_the_settings_alone_are_the_settings_fault() -> None:
+    text = 'rig = "lab"\nchart = "c"\nilluminations = "i"\n[lab.camera]\nconnection = "ptpip"\n'
+    settings = parse_lab(text + '[lab.projector]\ncontrol = "pjlink"\n[lab.light]\nshown_by = "jvc"\n', "LAB.toml")
+    with pytest.raises(ConfigurationError) as told, ExitStack() as opened:
+        rig.open_lab(settings, None, opened)
+    for key in ("lab.projector.host", "lab.light.host"):
+        assert f"{key} is missing" in str(told.value)
+    assert told.value.exit_code == 2
