@@ -7,8 +7,12 @@ import numpy as np
 from calibration.checks.frame_consistency import has_enough_cells
 from calibration.figures.table_figures import TableFigures
 from calibration.sampling.windows import bleed
+from calibration.spread.fitting import MOST_MISFIT
 from calibration.verdict.retaking import added_bleed
 from foundation.angles import angles_deg
+
+_LEAST_CELLS = 8**4
+"""Cells from which on a veil is told from other smooth light."""
 
 
 def judged_values(figures: TableFigures) -> dict[str, float]:
@@ -40,7 +44,10 @@ def _registration_values(figures: TableFigures) -> dict[str, float]:
         "blocks_good": float(registration.blocks.good.mean()),
         "agreement": registration.agreement,
     }
-    if figures.lens.measured:
+    spread = figures.point_spread
+    # Smooth light that is no lens's, as a reflection, has figures of its own; few cells cannot tell it from a veil.
+    told = spread is None or spread.misfit <= MOST_MISFIT or _cell_count(figures) >= _LEAST_CELLS
+    if figures.lens.measured and told:
         values["correction_residual"] = figures.lens.left
     if registration.framing.field is None:
         found = len(registration.framing.tags)
