@@ -29,7 +29,14 @@ APPS = {
     "evaluate": "evaluation.cli",
     "sim": "synthesis.cli",
 }
-PAGES = sorted([ROOT / "README.md", *(ROOT / "docs").rglob("*.md")])
+MADE = ("docs/reference/commands/", "docs/reference/api/")
+"""What a build of the site leaves there: help texts, not written by anybody."""
+
+PAGES = sorted(
+    page
+    for page in (ROOT / "README.md", *(ROOT / "docs").rglob("*.md"))
+    if not page.relative_to(ROOT).as_posix().startswith(MADE)
+)
 TUTORIAL = ROOT / "docs" / "tutorials" / "first-dataset.md"
 
 
