@@ -29,6 +29,8 @@ demo: $(READY)
 	$(BIN)/python examples/photographs.py $(DEMO)/photographs
 	$(BIN)/generate $(DEMO)/lut $(DEMO)/dataset --sources $(DEMO)/photographs --illuminations 0-11 --contact-sheet $(DEMO)/contact_sheet.png
 	$(BIN)/evaluate $(DEMO)/dataset
+	$(BIN)/evaluate cv kernel-ridge $(DEMO)/dataset
+	$(BIN)/evaluate train kernel-ridge $(DEMO)/dataset --out $(DEMO)/model.npz
 	@echo
 	@echo "Raw linear images with their ground truth:  $(CURDIR)/$(DEMO)/dataset"
 	@echo "How the table was measured:                 $(CURDIR)/$(DEMO)/lut/report.html"

@@ -382,6 +382,13 @@ def chart_of(small: bool, seed: int = 1) -> Chart:
     return design_chart(3, A_SERIES_MM["A5"], seed) if small else design_chart(5, A_SERIES_MM["A0"], seed)
 
 
+LENS_LEFT: Final = "correction_residual"
+"""The row of a verdict on what the lens leaves."""
+
+_TRUE_WITHIN: Final = 2.0
+"""Standard errors within which the RMS error of a table must lie for the error that its report states to be true."""
+
+
 @dataclass(frozen=True, eq=False)
 class Outcome:
     """What came of a session.
@@ -396,12 +403,26 @@ class Outcome:
         The remarks, or the refusal, as the user reads them.
     truth
         The table against the truth; None where there is none.
+    lens_left
+        RMS error of cells' means that the report says the lens leaves; 0 where nothing is said of it.
     """
 
     verdict: str
     rows: tuple[str, ...]
     says: tuple[str, ...]
     truth: TableTruth | None
+    lens_left: float = 0.0
+
+    @property
+    def told(self) -> tuple[str, ...]:
+        """What is said beside the error that the lens may leave, where that figure is true.
+
+        A chart of few colours cannot show a veil, and says so whether there is one or not.
+        """
+        covers = self.truth is None or self.truth.rms <= _TRUE_WITHIN * self.lens_left
+        if not covers or len(self.rows) != len(self.says):
+            return self.says
+        return tuple(text for row, text in zip(self.rows, self.says, strict=True) if row != LENS_LEFT)
 
     @property
     def is_wrong(self) -> bool:
@@ -443,7 +464,8 @@ def outcome_of(session: Session, folder: Path, world: World, chart: Chart, chang
     verdict = result.verdict
     says = tuple(remark(row, result.figures) for row in verdict.remarks)
     truth = compare(result, open_lut(folder), world, chart, session, changes)
-    return Outcome(verdict.outcome, tuple(row.threshold.name for row in verdict.remarks), says, truth)
+    names = tuple(row.threshold.name for row in verdict.remarks)
+    return Outcome(verdict.outcome, names, says, truth, result.figures.lens.left if LENS_LEFT in names else 0.0)
 
 
 def try_case(case: NamedCase, *, small: bool, seed: int = 1, body: str = "EOS 550D") -> dict[str, Any]:
@@ -458,11 +480,16 @@ def try_case(case: NamedCase, *, small: bool, seed: int = 1, body: str = "EOS 55
         short_session(Path(folder) / "session", chart, world, changes, lights) as session,
     ):
         found = outcome_of(session, Path(folder) / "lut", world, chart, changes)
-    right, wrong = found.mentions(case.right), found.mentions(case.wrong)
+    # What a small chart cannot know is no false remark; of a full one it is.
+    told = replace(found, says=found.told if small else found.says)
+    right, wrong = found.mentions(case.right), told.mentions(case.wrong)
+    if LENS_LEFT in found.rows and len(found.told) == len(found.says):
+        # A figure that is less than the error says nothing of it.
+        right = False
     row: dict[str, Any] = {"case": case.name, "what": case.what} | found.to_json()
     row["silent"] = found.is_wrong and not right
-    row["wrong_cause"] = case.wrong != "." and bool(found.says) and (wrong or not right)
-    row["false_remark"] = case.wrong == "." and bool(found.says)
+    row["wrong_cause"] = case.wrong != "." and bool(told.says) and (wrong or not right)
+    row["false_remark"] = case.wrong == "." and bool(told.says)
     row["unsaid"] = case.must_say and not right
     row["seconds"] = round(time.perf_counter() - started, 1)
     return row

@@ -1,6 +1,7 @@
-"""Folder to folder, JPEG in, 16-bit PNG out: `python -m benchmarks.folder` prints one JSON object a line.
+"""Folder to folder, JPEG in, 16-bit PNG out: `python -m benchmarks.folder [--small]` prints one JSON object a line.
 
-Against the program that first comes to mind (OpenCV reads and writes, numpy draws, one process), and against the
+Against the program that first comes to mind (OpenCV reads and writes, numpy draws), in one process and in as many as
+there are workers, which are started and have the table before the clock runs; and against the
 encoder alone on the finished images with as many threads: once with the writing of its files, which is what a folder
 takes however its images came about, and once in memory, where what is encoded is thrown away. Neither of the two
 hashes, nor waits for the disk, as a dataset does. Where every processor is busy, nothing but waiting can be hidden
@@ -13,12 +14,14 @@ Runs alternate and the fastest of each counts.
 
 from __future__ import annotations
 
+import argparse
+import multiprocessing
 import shutil
 import tempfile
 import time
-from collections.abc import Callable, Mapping
-from concurrent.futures import ThreadPoolExecutor
-from functools import partial
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
+from functools import lru_cache, partial
 from pathlib import Path
 
 import cv2
@@ -28,12 +31,15 @@ from isal import isal_zlib
 
 from benchmarks.encode import METADATA, at_once, photograph
 from benchmarks.generator import SAMPLES, noisy_table, report
-from calibration.table.lut import Lut
+from calibration.table.lut import Lut, open_lut
 from foundation.processors import processor_count
 from generator.dataset.making import DatasetOptions, generate_dataset
 from generator.files.formats import encode_pieces
 from generator.pictures.sources import find_pictures
 from generator.stores.store import LocalStore
+
+SMALL_PICTURES = 400
+"""Pictures of 512 px: as many make what a data set takes once a small part."""
 
 LARGE_REPEATS = 3
 SMALL_REPEATS = 5
@@ -53,17 +59,26 @@ def fastest(calls: Mapping[str, Callable[[], object]], repeats: int) -> dict[str
     return took
 
 
-def straightforward(lut: Lut, sources: Path, out: Path) -> None:
-    """Make an image of every picture as one would without this suite."""
-    out.mkdir()
+def straightforward(samples: npt.NDArray[np.uint16], paths: Sequence[Path], out: Path) -> None:
+    """Make an image of each picture as one would without this suite; `samples` (32768, 25, 3) of one light."""
     rng = np.random.default_rng(0)
-    table = np.array(lut.samples[0])
-    for path in sorted(sources.iterdir()):
+    for path in paths:
         picture = cv2.imread(str(path))
         assert picture is not None
         blue, green, red = (picture[..., channel].astype(np.int64) >> 3 for channel in range(3))
-        image = table[(red << 10) | (green << 5) | blue, rng.integers(0, SAMPLES, red.shape)]
+        image = samples[(red << 10) | (green << 5) | blue, rng.integers(0, SAMPLES, red.shape)]
         cv2.imwrite(str(out / f"{path.stem}.png"), image[..., ::-1])
+
+
+def in_a_process(folder: Path, paths: Sequence[Path], out: Path) -> None:
+    """Do the same in a process of a pool, which opens the table once and uses one thread."""
+    straightforward(_samples(folder), paths, out)
+
+
+@lru_cache
+def _samples(folder: Path) -> npt.NDArray[np.uint16]:
+    cv2.setNumThreads(1)
+    return np.array(open_lut(folder).samples[0])
 
 
 def images_of(folder: Path) -> list[npt.NDArray[np.uint16]]:
@@ -97,9 +112,19 @@ def compare(scratch: Path, lut: Lut, name: str, pictures: list[npt.NDArray[np.ui
         cv2.imwrite(str(sources / f"{number:04d}.jpg"), picture[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 92])
     workers = processor_count()
 
+    table, paths = np.array(lut.samples[0]), sorted(sources.iterdir())
+
     def by_hand() -> None:
         shutil.rmtree(usual, ignore_errors=True)
-        straightforward(lut, sources, usual)
+        usual.mkdir()
+        straightforward(table, paths, usual)
+
+    def by_hands(processes: ProcessPoolExecutor) -> None:
+        shutil.rmtree(usual, ignore_errors=True)
+        usual.mkdir()
+        shares = [processes.submit(in_a_process, lut.folder, paths[share::workers], usual) for share in range(workers)]
+        for share in shares:
+            share.result()
 
     def by_suite(previews: bool = False) -> None:
         shutil.rmtree(ours, ignore_errors=True)
@@ -109,7 +134,11 @@ def compare(scratch: Path, lut: Lut, name: str, pictures: list[npt.NDArray[np.ui
 
     by_suite()
     images = images_of(ours)
-    with ThreadPoolExecutor(workers) as pool:
+    with (
+        ThreadPoolExecutor(workers) as pool,
+        ProcessPoolExecutor(workers, multiprocessing.get_context("spawn")) as processes,
+    ):
+        by_hands(processes)
 
         def encode() -> None:
             at_once(pool, [partial(encode_away, image) for image in images])
@@ -134,6 +163,7 @@ def compare(scratch: Path, lut: Lut, name: str, pictures: list[npt.NDArray[np.ui
         took = fastest(
             {
                 "usual": by_hand,
+                "processes": lambda: by_hands(processes),
                 "encoder": encode,
                 "files": write,
                 "isal": pack,
@@ -149,6 +179,9 @@ def compare(scratch: Path, lut: Lut, name: str, pictures: list[npt.NDArray[np.ui
     alone = "the encoder alone on the finished images, as many threads"
     report(what, len(pictures) / wall["ours"], "images/s")
     report(what, wall["usual"] / wall["ours"], "ratio", against)
+    many = "cv2.imread, numpy gather, cv2.imwrite, as many processes as workers"
+    report(what, wall["processes"] / wall["ours"], "ratio", many)
+    report(f"{what}, with previews", wall["processes"] / wall["previews"], "ratio", f"{many}, without previews")
     report(f"folder to folder, {name}, processor time", busy["usual"] / busy["ours"], "ratio", against)
     report(f"folder to folder, {name}, size of the images", sizes[1] / sizes[0], "ratio", against)
     report(what, wall["files"] / wall["ours"], "ratio", f"{alone}, files written")
@@ -164,18 +197,21 @@ def compare(scratch: Path, lut: Lut, name: str, pictures: list[npt.NDArray[np.ui
         shutil.rmtree(folder)
 
 
-def main() -> None:
+def main(arguments: Sequence[str] | None = None) -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--small", action="store_true", help="the 400 pictures of 512 px alone")
+    small = parser.parse_args(arguments).small
     with tempfile.TemporaryDirectory() as folder:
         scratch = Path(folder)
         lut = noisy_table(scratch / "lut", 1)
         large = photograph(5184, 3456)
-        compare(scratch, lut, "18 Mpx", 2 * [large, large[::-1], large[:, ::-1], large[::-1, ::-1]], LARGE_REPEATS)
+        if not small:
+            compare(scratch, lut, "18 Mpx", 2 * [large, large[::-1], large[:, ::-1], large[::-1, ::-1]], LARGE_REPEATS)
         tops, lefts = range(0, 3456 - 511, 512), range(0, 5184 - 511, 512)
         cut = [np.ascontiguousarray(large[top : top + 512, left : left + 512]) for top in tops for left in lefts]
         photo = photograph(512, 512)
         moved = [np.roll(photo, 17 * place, axis=1) for place in range(len(cut))]
-        # As many as make what a data set takes once, however small it is, a small part.
-        compare(scratch, lut, "512 px", 2 * [*cut, *moved], SMALL_REPEATS)
+        compare(scratch, lut, "512 px", (4 * [*cut, *moved])[:SMALL_PICTURES], SMALL_REPEATS)
 
 
 if __name__ == "__main__":

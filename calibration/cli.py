@@ -46,7 +46,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         0 done, 2 something given cannot be used, 4 the data are not good enough, 5 the disk is full or read-only,
         130 interrupted.
     """
-    return console.run(lambda: app(args=None if argv is None else list(argv)))
+    return console.run(lambda: app(args=None if argv is None else list(argv), prog_name="build-lut"))
 
 
 @app.command(

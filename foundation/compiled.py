@@ -7,10 +7,13 @@ functions hold no state and no lock and release the interpreter's.
 from __future__ import annotations
 
 import hashlib
+import inspect
 import logging
 import re
 import sys
 from collections.abc import Callable
+from functools import cache
+from importlib.util import find_spec
 from pathlib import Path
 from types import CellType, FunctionType
 from typing import Any, Final, TypeVar, cast
@@ -66,7 +69,7 @@ def _marked(function: _Function) -> _Function:
         raise ValueError(f"{function.__qualname__} closes over {code.co_freevars}; compile module functions only")
     digest = hashlib.sha256()
     for file in sorted(_files_behind(Path(code.co_filename), set())):
-        digest.update(file.read_bytes())
+        digest.update(_source(file)[0])
     marked = FunctionType(
         code.replace(co_freevars=("sources",)),
         function.__globals__,
@@ -84,9 +87,49 @@ def _files_behind(file: Path, found: set[Path]) -> set[Path]:
     if file in found or not file.is_file():
         return found
     found.add(file)
-    for module, names in _IMPORT.findall(file.read_text(encoding="utf-8")):
-        folder = _ROOT.joinpath(*module.split("."))
-        _files_behind(folder.with_suffix(".py"), found)
-        for name in re.findall(r"\w+", names):
-            _files_behind(folder / f"{name}.py", found)
+    for behind in _source(file)[1]:
+        _files_behind(behind, found)
     return found
+
+
+@cache
+def _source(file: Path) -> tuple[bytes, tuple[Path, ...]]:
+    """Return a file's bytes, and those files of this software that it imports from: many functions share them."""
+    data = file.read_bytes()
+    behind: list[Path] = []
+    for module, names in _IMPORT.findall(data.decode("utf-8")):
+        folder = _ROOT.joinpath(*module.split("."))
+        named = (folder / f"{name}.py" for name in re.findall(r"\w+", names))
+        behind += [path for path in (folder.with_suffix(".py"), *named) if path.is_file()]
+    return data, tuple(behind)
+
+
+def _without_linear_algebra() -> None:
+    """Keep numba from loading SciPy's linear algebra when the first function is called, which takes .2 s.
+
+    When it loads what it can compile, numba asks once whether BLAS is there (`numba.np.arraymath`), by importing
+    `scipy.linalg`. It is, where SciPy is installed; who compiles a product of matrices asks again. Where numba is made
+    otherwise, nothing changes.
+    """
+    if "numba.np.arraymath" in sys.modules or find_spec("scipy") is None:
+        return
+    try:
+        from numba.np import linalg
+    except ImportError:
+        return
+    module: Any = linalg
+    asks: Callable[[], None] | None = getattr(module, "ensure_blas", None)
+    if asks is None:
+        return
+
+    def answer() -> None:
+        caller = inspect.currentframe()
+        asking = None if caller is None or caller.f_back is None else caller.f_back.f_code.co_name
+        # Only the question at loading is answered without looking.
+        if asking != "_check_blas":
+            asks()
+
+    module.ensure_blas = answer
+
+
+_without_linear_algebra()

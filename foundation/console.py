@@ -10,6 +10,7 @@ device (``DEBUG``), and ``-q`` leaves errors alone: no warnings and no progress 
 from __future__ import annotations
 
 import errno
+import inspect
 import logging
 import os
 import re
@@ -21,6 +22,7 @@ from contextlib import ExitStack, contextmanager, suppress
 from typing import Annotated, Any
 
 import typer
+from typer.core import TyperCommand, TyperGroup
 
 from foundation.errors import EXIT_INTERRUPTED, CropError, InputError, StorageError
 from foundation.files import disk_remedy_of, remedy_of
@@ -347,6 +349,74 @@ def is_common(word: str) -> bool:
     return _COMMON.fullmatch(word) is not None
 
 
+_METAVARS = {"int": "N", "integer": "N", "float": "X", "str": "TEXT", "text": "TEXT", "path": "PATH"}
+"""What stands for a value of an option, by its type; an option whose value is of a kind of its own says it itself."""
+
+
+def _in_one_style(command: Any) -> None:
+    """Give a command's help the style of all: values in capitals, no types of Python, paragraphs without line ends."""
+    for parameter in command.params:
+        if getattr(parameter, "is_flag", False) or getattr(parameter, "count", False):
+            parameter.metavar = ""
+        elif parameter.metavar is None and parameter.param_type_name == "argument":
+            parameter.metavar = parameter.name.upper()
+        elif parameter.metavar is None:
+            parameter.metavar = _METAVARS.get(_type_name(parameter))
+    for name in ("help", "epilog"):
+        text = getattr(command, name)
+        if text:
+            setattr(command, name, re.sub(r"(?<!\n)\n(?!\n)", " ", inspect.cleandoc(text)))
+
+
+def _type_name(parameter: Any) -> str:
+    """Return the name of an option's type, whichever way this version of typer keeps it; empty of a choice."""
+    described = getattr(parameter, "type_descriptor", None)
+    if described is None:
+        name = str(parameter.type.name)
+    else:
+        name = "" if described.is_choice else str(parameter.display_type(None)).strip("<>")
+    return name.removesuffix(" range")
+
+
+class _StyledCommand(TyperCommand):
+    """A command whose help is in the style of all."""
+
+    def __init__(self, *arguments: Any, **named: Any) -> None:
+        super().__init__(*arguments, **named)
+        _in_one_style(self)
+
+    def get_help_option(self, ctx: Any) -> Any:
+        """Return the option ``--help`` without a type."""
+        return _untyped(super().get_help_option(ctx))
+
+
+class _StyledGroup(TyperGroup):
+    """A command with others below it, whose help is in the style of all."""
+
+    def __init__(self, *arguments: Any, **named: Any) -> None:
+        super().__init__(*arguments, **named)
+        _in_one_style(self)
+
+    def get_help_option(self, ctx: Any) -> Any:
+        """Return the option ``--help`` without a type."""
+        return _untyped(super().get_help_option(ctx))
+
+
+def _untyped(option: Any) -> Any:
+    if option is not None:
+        option.metavar = ""
+    return option
+
+
+class _StyledTyper(typer.Typer):
+    """An app whose commands have their help in the style of all."""
+
+    def command(self, name: str | None = None, **more: Any) -> Callable[[Any], Any]:
+        """Register a command."""
+        named: dict[str, Any] = {"cls": _StyledCommand, **more}
+        return super().command(name, **named)
+
+
 def new_app(help_text: str | None = None, **more: Any) -> typer.Typer:
     """Return an app in the style of all commands.
 
@@ -357,7 +427,8 @@ def new_app(help_text: str | None = None, **more: Any) -> typer.Typer:
     more
         Further arguments of `typer.Typer`.
     """
-    return typer.Typer(
+    return _StyledTyper(
+        cls=_StyledGroup,
         help=help_text,
         context_settings={"help_option_names": ["-h", "--help"]},
         pretty_exceptions_enable=False,

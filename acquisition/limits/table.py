@@ -94,7 +94,7 @@ ONLY_OF_A_SESSION: tuple[str, ...] = (
     # Of frames against each other.
     "softer_bleed", "unlike_scatter", "unlike_block", "disturbed_cells", "moved_anew", "black_drift_counts",
     "drift_left",
-    "other_camera", "other_lens", "other_exposure",
+    "other_camera", "other_lens", "other_exposure", "other_iso", "white_frames",
     # Of the lights.
     "truth_median_deg", "truth_worst_deg", "off_brightness", "white_short", "exchanged_lights", "exchange_deg",
     "held_share", "white_frame_deg", "white_frame_brightness", "primaries_lacking", "stray_share", "code_misfit",

@@ -108,7 +108,7 @@ def robust_least_squares(design: _Array, values: _Array, rounds: int) -> tuple[_
 
 
 def least_absolute_line(x: _Array, y: _Array) -> tuple[float, float]:
-    """Return intercept and slope of the line that minimises Σ |y − line|, so that a few points do not decide.
+    """Return intercept and slope of the line that minimises Σ ``|y − line|``, so that a few points do not decide.
 
     Reweighted least squares (E. J. Schlossmacher, J. Am. Stat. Assoc. 68 (1973) 857).
 

@@ -77,6 +77,8 @@ class Evidence:
         Light of a primary under a code of 0 that no dark frame shows, of that primary, the worst light.
     stray_primaries
         Light of the primaries' frames together beyond white's, alike in each, of white.
+    other_iso
+        Frames of another ISO speed than most, by their files.
     misplaced
         Share of the unfit cells whose place is not known well enough.
     uneven
@@ -119,6 +121,7 @@ class Evidence:
     room_change: float = NAN
     stray: float = NAN
     stray_primaries: float = NAN
+    other_iso: float = NAN
     misplaced: float = NAN
     uneven: float = NAN
     waves_px: float = NAN

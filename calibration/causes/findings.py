@@ -18,6 +18,7 @@ from calibration.causes.light_evidence import (
     brightness_evidence,
     camera_evidence,
     dark_evidence,
+    iso_evidence,
     light_evidence,
     name_evidence,
     stray_evidence,
@@ -231,6 +232,8 @@ _OFF_CODES_DEG = 2.0
 
 _GOES_WITH: dict[str, tuple[tuple[str, float], ...]] = {
     "unlike_scatter": (("unlike_block", 0.01), ("disturbed_cells", 0.0)),
+    "disturbed_cells": (("unlike_block", 0.01),),
+    "unfit_share": (("unlike_block", 0.01),),
     "off_brightness": (("off_codes_deg", _OFF_CODES_DEG), ("exchanged_lights", 0.0)),
 }
 """Figures that others move along: each with those whose cause it shares where it has none of its own, and from which on
@@ -264,5 +267,6 @@ _GATHERERS: dict[str, Callable[[TableFigures, float], Gathered | None]] = {
     "leak_share": dark_evidence,
     "dark_drift": dark_evidence,
     "stray_share": stray_evidence,
+    "other_iso": iso_evidence,
 }
 """How evidence is gathered for each figure."""

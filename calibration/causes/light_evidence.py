@@ -78,6 +78,12 @@ def camera_evidence(figures: TableFigures, limit: float) -> Gathered:
     return Gathered(evidence, tuple(frame.record for frame in foreign), ())
 
 
+def iso_evidence(figures: TableFigures, limit: float) -> Gathered:
+    """Return which frames state another ISO speed; `limit` as in `light_evidence`."""
+    frames = tuple(frame.record for frame in figures.origins.other_iso)
+    return Gathered(Evidence(frames=float(len(figures.frames)), other_iso=float(len(frames))), frames, ())
+
+
 def dark_evidence(figures: TableFigures, limit: float) -> Gathered:
     """Return what is known of the light while the projector shows black; `limit` as in `light_evidence`."""
     dark, whites = figures.dark_frames, [frame.paper.white for frame in figures.white_frames]

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
+from acquisition.limits.bleed import WINDOW_PX
 from acquisition.measures.least_squares import least_absolute_line
 from acquisition.measures.stains import Stains
 from acquisition.session.records import FrameRecord
@@ -207,12 +208,11 @@ def print_evidence(figures: TableFigures, figure: str) -> Gathered | None:
 def lens_evidence(figures: TableFigures) -> dict[str, float]:
     """Return what is known of what the lens brings into cells, and of the sheet's flatness, by `Evidence`'s names."""
     registration, unfit = figures.registration, figures.cells.unfit
-    # Of sharp cores alone it is what the blur gives.
-    core = bleed(registration.cell_px, registration.blur_px, figures.cells.window)
-    known = {
-        "waves_px": registration.lens_residual_px / registration.clearance,
-        "beyond_cell": core + figures.lens.beyond_cell,
-    }
+    known = {"waves_px": registration.lens_residual_px / registration.clearance}
+    # A window that is too large sees the neighbours through any lens.
+    if figures.cells.window <= WINDOW_PX:
+        core = bleed(registration.cell_px, registration.blur_px, figures.cells.window)
+        known["beyond_cell"] = core + figures.lens.beyond_cell
     if unfit:
         known["uneven"] = sum(cell.cause.startswith("uneven") for cell in unfit) / len(unfit)
     return known

@@ -128,6 +128,12 @@ RULES: tuple[Rule, ...] = (
         "the file states more exposure than the others'",
     ),
     Rule(
+        OTHER_EXPOSURE,
+        frozenset({"other_iso"}),
+        (Condition("other_iso", 1, _FAR),),
+        "the file states another ISO speed than the others'",
+    ),
+    Rule(
         WRONG_NAME,
         LIGHT,
         (Condition("named_right", 0, 0), Condition("exposure", 0.97, 1.03)),
@@ -232,12 +238,6 @@ RULES: tuple[Rule, ...] = (
             *_SHARP_PLACE,
         ),
         "in few frames light is added at one place, and the cells keep their own",
-    ),
-    Rule(
-        REFLECTION_IN_FRAME,
-        COVERED,
-        (*_IN_FEW_FRAMES, Condition("spot", 0, 0.1), Condition("deviation", 1e-9, _FAR), *_SHARP_PLACE),
-        "in few frames some cells next to each other are brighter, and none darker",
     ),
     Rule(
         OBJECT_IN_FRAME,

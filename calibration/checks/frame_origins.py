@@ -46,6 +46,8 @@ class OriginFigures:
         Frames through another lens.
     other_exposure
         Frames exposed otherwise by a hundredth or more.
+    other_iso
+        Frames of another ISO speed.
     stating_camera, stating_exposure
         How many frames state them at all.
     """
@@ -55,6 +57,7 @@ class OriginFigures:
     other_exposure: tuple[ForeignFrame, ...] = ()
     stating_camera: int = 0
     stating_exposure: int = 0
+    other_iso: tuple[ForeignFrame, ...] = ()
 
     @property
     def exposure_difference(self) -> float:
@@ -76,6 +79,7 @@ def origin_figures(frames: Sequence[tuple[FrameRecord, FrameOrigin]]) -> OriginF
         other_exposure=_other_exposures(frames),
         stating_camera=len(bodies),
         stating_exposure=sum(origin.exposure > 0 for _, origin in frames),
+        other_iso=_others([(record, f"ISO {origin.iso}") for record, origin in frames if origin.iso]),
     )
 
 

@@ -301,6 +301,9 @@ def _spread_frame(
         white=paper.white,
         usable=usable,
         unevenness=LOOSE_UNEVENNESS if mixed else USUAL_UNEVENNESS,
+        printed=np.concatenate(
+            [np.full(chart.colour_count, -1), np.zeros(len(points.whites_mm), dtype=np.int64), 1 + points.levels.level]
+        ),
     )
 
 

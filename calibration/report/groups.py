@@ -33,6 +33,8 @@ OF_THRESHOLDS: Final[dict[str, Group]] = {
     **dict.fromkeys(
         ("unlike_block", "other_camera", "other_lens", "other_exposure", "black_drift_counts"), "radiometry"
     ),
+    "other_iso": "radiometry",
+    "white_frames": "light",
     **dict.fromkeys(("linearity", "grey_tint_deg", "brightest_share", "darkest_counts"), "radiometry"),
     **dict.fromkeys(("noise_misfit", "noisy_share"), "noise"),
     "disturbed_cells": "radiometry",

@@ -21,7 +21,7 @@ from acquisition.measures.least_squares import least_squares
 from acquisition.measures.polynomials import page_polynomial, page_powers
 from calibration.registration.registration import Registration
 from calibration.sampling.samples import Sites, sites_at
-from calibration.spread.fitting import SpreadData, fit_spread, predicted_levels
+from calibration.spread.fitting import VARYING_BITS, ReferenceData, SpreadData, fit_spread, predicted_levels
 from calibration.spread.point_spread import FAR_PX, NEAR_PX, PLACES, PointSpread, kernel_of_terms, terms_of
 from calibration.spread.printed_grid import PrintedGrid
 from calibration.spread.surroundings import FrameLevels, NearLight, Surroundings, light_at, surroundings
@@ -31,6 +31,9 @@ _MARGIN_PX = 12.0
 
 _LATTICE_PX = 24
 """Distance of the places at which what lies behind the sheet is looked at."""
+
+_LEAST_REFERENCES = 3
+"""References of one colour for each term of what is smooth over the page, at least, for them to say anything else."""
 
 _FIELD_ORDER = 6
 """Highest order of the smooth change of white references by which a frame's field would change."""
@@ -164,6 +167,8 @@ class SpreadFrame:
         (P,) bool, patches that are in the frame, not clipped and not covered.
     unevenness
         As in `SpreadData`.
+    printed
+        (P,) int64, which references have one colour: a number for each, −1 of cells; None where they are not used.
     """
 
     levels: FrameLevels
@@ -172,6 +177,7 @@ class SpreadFrame:
     white: _Array
     usable: npt.NDArray[np.bool_]
     unevenness: float
+    printed: npt.NDArray[np.int64] | None = None
 
 
 @dataclass(frozen=True)
@@ -282,6 +288,7 @@ def measure_spread(
     count = 8**bits
     data: list[SpreadData] = []
     scales: list[_Array] = []
+    references: list[ReferenceData] = []
     # Of each channel the frame in which it has most light.
     best: list[int] = np.argmax([frame.white for frame in frames], axis=0).tolist() if frames else []
     for number, frame in enumerate(frames):
@@ -294,12 +301,15 @@ def measure_spread(
                 level = frame.levels.patches[:count, channel] / relative
                 even = _even(frame, channel) / relative
                 usable = frame.usable[:count]
-                data.append(SpreadData(channel, level, changes[:, :, channel].T, even, usable, frame.unevenness))
+                of_cells = changes[:, :count, channel].T
+                data.append(SpreadData(channel, level, of_cells, even, usable, frame.unevenness))
+                if bits < VARYING_BITS:
+                    references += _references(frame, channel, changes[:, :, channel].T)
                 scales.append(np.append(gains[:, channel], frame.white[channel]))
     if not data:
         return None
     cells_mm = frames[0].around.grid.points_mm[:count]
-    spread = fit_spread(data, cells_mm, page_mm, bits)
+    spread = fit_spread(data, cells_mm, page_mm, bits, references)
     return None if spread is None else (spread, _figures(spread, data, scales, frames[0].around, bits, least_counts))
 
 
@@ -308,24 +318,48 @@ def _even(frame: SpreadFrame, channel: int) -> float:
     return float(frame.around.image(frame.levels)[..., channel].mean(dtype=np.float64))
 
 
+def _references(frame: SpreadFrame, channel: int, changes: _Array) -> list[ReferenceData]:
+    """Return a channel's references, colour by colour; `changes` (P, T)."""
+    if frame.printed is None:
+        return []
+    found: list[ReferenceData] = []
+    level = frame.levels.patches[:, channel] / np.maximum(frame.field[:, channel] * frame.white[channel], 1e-6)
+    whites = np.zeros(len(level), dtype=np.bool_)
+    whites[frame.around.whites] = True
+    for number in range(int(frame.printed.max()) + 1):
+        chosen = np.flatnonzero((frame.printed == number) & frame.usable)
+        order = _white_order(len(chosen)) if whites[chosen].any() else 1
+        if len(chosen) >= _LEAST_REFERENCES * len(page_powers(order)):
+            places = frame.around.grid.points_mm[chosen]
+            found.append(ReferenceData(channel, level[chosen], changes[chosen], places, order))
+    return found
+
+
+def _white_order(count: int) -> int:
+    """Return the order of the smooth change that so many white references show."""
+    return next((n for n in range(_FIELD_ORDER, 0, -1) if 3 * len(page_powers(n)) <= count), 0)
+
+
 def _changes(frame: SpreadFrame, page_mm: tuple[float, float], bits: int) -> tuple[_Array, _Array]:
-    """Return the change (T, C, 3) of levels for a whole share of each unknown, and the mean change of white (T, 3).
+    """Return the change (T, P, 3) of levels for a whole share of each unknown, and the mean change of white (T, 3).
 
     What comes in, less what the white references get, since the field is fitted through them; their mean, by which
     all levels change alike, is returned apart.
     """
     around, levels, count = frame.around, frame.levels, 8**bits
     relative = np.maximum(frame.field * frame.white, 1e-6)
-    expected = predicted_levels((levels.patches / relative)[:count], bits)
+    expected = levels.patches / relative
+    expected[:count] = predicted_levels(expected[:count], bits)
+    if frame.printed is not None:
+        for number in range(int(frame.printed.max()) + 1):
+            expected[frame.printed == number] = np.median(expected[frame.printed == number], axis=0)
     points = around.grid.points_mm
     whites = np.arange(len(points))[around.whites]
     whites = whites[frame.usable[whites]]
-    order = next((n for n in range(_FIELD_ORDER, 0, -1) if 3 * len(page_powers(n)) <= len(whites)), 0)
-    at_whites, at_cells = (
-        np.ascontiguousarray(page_polynomial(where, page_mm, order)) for where in (points[whites], points[:count])
-    )
+    at_all = np.ascontiguousarray(page_polynomial(points, page_mm, _white_order(len(whites))))
+    at_whites = np.ascontiguousarray(at_all[whites])
     terms = kernel_of_terms()
-    changes, gains = np.empty((len(terms), count, 3)), np.empty((len(terms), 3))
+    changes, gains = np.empty((len(terms), len(points), 3)), np.empty((len(terms), 3))
     seen, own = _seen(frame)
     for term, (kernel, place) in enumerate(terms):
         share = np.ones((len(points), 1)) if place is None else around.places[:, [place]]
@@ -333,10 +367,10 @@ def _changes(frame: SpreadFrame, page_mm: tuple[float, float], bits: int) -> tup
         differs = share * (own[kernel] - own[kernel][:count].mean(axis=0))
         for channel in range(3):
             of_white = coming[whites, channel] + differs[whites, channel]
-            smooth = at_cells @ least_squares(at_whites, of_white, np.ones(len(whites)))
-            gains[term, channel] = smooth.mean()
-            kept = differs[:count, channel] - (smooth - gains[term, channel])
-            changes[term, :, channel] = coming[:count, channel] + kept * expected[:, channel]
+            smooth = at_all @ least_squares(at_whites, of_white, np.ones(len(whites)))
+            gains[term, channel] = smooth[:count].mean()
+            kept = differs[:, channel] - (smooth - gains[term, channel])
+            changes[term, :, channel] = coming[:, channel] + kept * expected[:, channel]
     return changes, gains
 
 

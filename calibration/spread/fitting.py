@@ -71,6 +71,10 @@ do not depend on the machine's linear algebra."""
 VARYING_BITS = 4
 """Bits of a channel from which on cells are enough for shares that change over the frame."""
 
+_SMALL_SHARE = 0.002
+"""Standard deviation of how a share changes over the frame that is allowed for where cells are too few to see it: half
+of what mild shoulders of 1 % have (chosen)."""
+
 _EVEN_TERMS = 3
 """Unknowns of a kernel that is the same all over the frame, at most: one for each channel."""
 
@@ -109,6 +113,31 @@ class SpreadData:
     even: _Array
     usable: npt.NDArray[np.bool_]
     unevenness: float
+
+
+@dataclass(frozen=True, eq=False)
+class ReferenceData:
+    """A channel of a frame at references of one colour, whose level no model of colours has to predict.
+
+    Attributes
+    ----------
+    channel
+        0, 1 or 2.
+    level
+        (N,) float64, bare paper 1, the field divided out.
+    changes
+        (N, T) float64, as in `SpreadData`.
+    places_mm
+        (N, 2) float64.
+    order
+        Order over the page of what the field's fit takes out of them, or may leave.
+    """
+
+    channel: int
+    level: _Array
+    changes: _Array
+    places_mm: _Array
+    order: int
 
 
 @dataclass(frozen=True, eq=False)
@@ -178,7 +207,11 @@ def predicted_levels(level: _Array, bits: int) -> _Array:
 
 
 def fit_spread(
-    data: Sequence[SpreadData], cells_mm: _Array, page_mm: tuple[float, float], bits: int
+    data: Sequence[SpreadData],
+    cells_mm: _Array,
+    page_mm: tuple[float, float],
+    bits: int,
+    references: Sequence[ReferenceData] = (),
 ) -> PointSpread | None:
     """Return the point spread that explains best what cells differ by; None where nothing can be fitted.
 
@@ -192,6 +225,8 @@ def fit_spread(
         Width and height of the page.
     bits
         Bits of each channel of a code.
+    references
+        The same frames' references: on a chart of few colours, whose codes stand far apart, they say more than cells.
     """
     if not data:
         return None
@@ -199,13 +234,17 @@ def fit_spread(
     shapes = len(page_powers(_FACTOR_ORDER)) - 1
     size = max(int(one.unknowns.max()) for one in rows) + 1
     prior = np.full(size, 1 / _PRIOR_SHARE**2)
-    prior[TERMS - 1] = 1 / USUAL_VEIL**2
+    # The widest kernel is a veil to all but large charts.
+    prior[TERMS - 2 : TERMS] = 1 / USUAL_VEIL**2
+    if bits < VARYING_BITS:
+        prior[:TERMS][_varying_terms()] = 1 / _SMALL_SHARE**2
     for one, row in zip(data, rows, strict=True):
         prior[row.unknowns[len(terms_of(0)) + shapes :]] = 1 / one.unevenness**2
     shape = np.arange(TERMS, TERMS + shapes)
     everything = np.delete(np.arange(size), shape)
     solution = np.zeros(size)
     normal, right = np.zeros((FOLDS, size, size)), np.zeros((FOLDS, size))
+    rows += [_reference_rows(one, page_mm) for one in references]
     for _ in range(_ROUNDS):
         normal, right = _normal_equations(rows, solution)
         solution[everything] = _solved(*_of(normal.sum(axis=0), right.sum(axis=0), prior, everything), np.arange(TERMS))
@@ -213,7 +252,9 @@ def fit_spread(
     normal, right = normal[:, everything][:, :, everything], right[:, everything]
     prior = prior[everything]
     matrix, vector = _without_factors(normal.sum(axis=0), right.sum(axis=0), prior)
-    covariance: _Array = np.asarray(misfit * np.linalg.inv(matrix), dtype=np.float64)
+    # What is known beforehand does not become less by what the print shows of other light.
+    inflated = _without_factors(normal.sum(axis=0), right.sum(axis=0), misfit * prior)[0]
+    covariance: _Array = np.asarray(misfit * np.linalg.inv(inflated), dtype=np.float64)
     candidates = groups_of_terms()
     if bits < VARYING_BITS:
         candidates = [group for group in candidates if len(group) <= _EVEN_TERMS]
@@ -230,6 +271,11 @@ def fit_spread(
         held_out += _explained(normal[fold], right[fold], with_kernels) - _explained(normal[fold], right[fold], without)
     found = PointSpread(np.round(shares / _ROUNDING) * _ROUNDING, covariance, gain, held_out, misfit)
     return found if found.proven else replace(found, shares=np.zeros(TERMS))
+
+
+def _varying_terms() -> npt.NDArray[np.int64]:
+    """Return the unknowns by which shares change over the frame."""
+    return np.concatenate([group for group in groups_of_terms() if len(group) > _EVEN_TERMS])
 
 
 def _of(normal: _Array, right: _Array, prior: _Array, chosen: npt.NDArray[np.int64]) -> tuple[_Array, _Array, _Array]:
@@ -279,10 +325,26 @@ def _rows(one: SpreadData, number: int, cells_mm: _Array, page_mm: tuple[float, 
     )
 
 
+def _reference_rows(one: ReferenceData, page_mm: tuple[float, float]) -> _Rows:
+    """Return the rows of references of one colour: what is not smooth over the page, of values and changes alike."""
+    smooth = page_polynomial(one.places_mm, page_mm, one.order)
+    columns = np.column_stack([one.level, one.changes])
+    rough = columns - smooth @ np.linalg.lstsq(smooth, columns, rcond=None)[0]
+    places = np.floor(one.places_mm / (max(page_mm) / _PATCHWORK)).astype(np.int64)
+    return _Rows(
+        value=rough[:, 0],
+        design=np.ascontiguousarray(rough[:, 1:]),
+        level=np.full(len(one.level), float(one.level.mean())),
+        fold=(places[:, 0] + 2 * places[:, 1]) % FOLDS,
+        unknowns=terms_of(one.channel),
+    )
+
+
 def _weights(left: _Array, level: _Array) -> _Array:
     """Return the weight (N,) of each row from what is left of it: over the usual variance of its level, Huber's."""
     variance = np.empty(len(left), dtype=np.float64)
-    parts: list[npt.NDArray[np.int64]] = np.array_split(np.argsort(level, kind="stable"), min(_LEVELS, len(left) // 8))
+    groups = min(_LEVELS, len(left) // 8) if float(np.ptp(level)) > 0 else 1
+    parts: list[npt.NDArray[np.int64]] = np.array_split(np.argsort(level, kind="stable"), groups)
     for part in parts:
         variance[part] = (MAD_TO_SIGMA * float(np.median(np.abs(left[part])))) ** 2 + 1e-12
     far = np.abs(left) / np.sqrt(variance)

@@ -133,16 +133,16 @@ def light_around(
 
 @compiled
 def blur_rows(image: _Float, taps: _Float, out: _Float) -> None:
-    """Fill out (R, K, 3) with an image (R, K, 3) blurred down its rows by odd `taps`; its border is repeated."""
+    """Fill out (R, N) with an image (R, N) blurred down its rows by odd `taps`; its border is repeated."""
     rows, reach = image.shape[0], len(taps) // 2
     for row in range(rows):
         out[row] = 0
         for tap in range(len(taps)):
             source = min(max(row + tap - reach, 0), rows - 1)
             weight = taps[tap]
-            for column in range(image.shape[1]):
-                for channel in range(3):
-                    out[row, column, channel] += weight * image[source, column, channel]
+            line, sums = image[source], out[row]
+            for place in range(image.shape[1]):
+                sums[place] += weight * line[place]
 
 
 @compiled

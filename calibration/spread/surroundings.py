@@ -133,11 +133,15 @@ class Surroundings:
     def far(self, image: _Float, scale_px: float) -> _Array:
         """Return what a far kernel brings to the patches, (P, 3) float64 counts, their own slots' light included."""
         width, height = self.pitch_px.mean(axis=0)
-        down, across = np.empty_like(image), np.empty_like(image)
-        kernels.blur_rows(image, far_taps(scale_px / height), down)
-        turned = np.ascontiguousarray(down.transpose(1, 0, 2))
-        across = np.empty_like(turned)
-        kernels.blur_rows(turned, far_taps(scale_px / width), across)
+        # Columns and channels in one, so that the compiled loop runs along them.
+        rows = image.reshape(image.shape[0], -1)
+        down = np.empty_like(rows)
+        kernels.blur_rows(rows, far_taps(scale_px / height), down)
+        turned = np.ascontiguousarray(down.reshape(image.shape).transpose(1, 0, 2))
+        columns = turned.reshape(turned.shape[0], -1)
+        across = np.empty_like(columns)
+        kernels.blur_rows(columns, far_taps(scale_px / width), across)
+        across = across.reshape(turned.shape)
         return across[self.grid.column, self.grid.row].astype(np.float64)
 
     def own_share(self, scale_px: float) -> float:

@@ -92,8 +92,9 @@ THRESHOLDS: tuple[Threshold, ...] = (
         "correction_residual", "Light of surroundings left in cells' means", "share", "at most", 0.01, 0.03,
         "what the lens spreads, or may spread as a veil that an evenly lit print cannot show, is in the samples",
         SIMULATED + ": 0.1 to 0.2 % where light falls off towards the corners, and the means are as good; 1.4 % in "
-        "even light, which does not show a veil of the usual 1 %",
-        "take frames of red, green and blue alone, shade the lens, and keep lights and bright walls out of its view",
+        "even light or on a chart of 512 colours, which do not show a veil of the usual 1 %",
+        "take frames of red, green and blue alone and a chart of more colours, shade the lens, and keep lights and "
+        "bright walls out of its view",
     ),
     Threshold(
         "tag_residual_px", "Residual of tags, plane and lens", "px RMS", "at most", 2.5, MAX_TAG_RESIDUAL_PX,
@@ -176,6 +177,18 @@ THRESHOLDS: tuple[Threshold, ...] = (
         "brightness would differ between lights that should be alike, and the noise with the ISO speed",
         "shutter times are steps of 26 % apart, and are written rounded",
         "keep one exposure and ISO speed for the session, and take these frames again",
+    ),
+    Threshold(
+        "other_iso", "Frames of another ISO speed", "", "at most", 0, None,
+        "their noise is another, and so is the count at which they saturate; their exposure is judged apart",
+        "by definition",
+        "keep one exposure and ISO speed for the session, and take these frames again",
+    ),
+    Threshold(
+        "white_frames", "White frames", "", "at least", 1, None,
+        "nothing says how the lamp drifted, whether the print has stains, or whether cells are of one colour",
+        "by definition; from two on a drift is seen",
+        "take white frames along with the lights (sequence.reference_every)",
     ),
     Threshold(
         "black_drift_counts", "Drift of the black level", "counts", "at most", MAX_BLACK_DRIFT, 16.0,

@@ -7,11 +7,12 @@ import numpy as np
 from calibration.checks.frame_consistency import has_enough_cells
 from calibration.figures.table_figures import TableFigures
 from calibration.sampling.windows import bleed
+from calibration.spread.fitting import MOST_MISFIT
 from calibration.verdict.retaking import added_bleed
 from foundation.angles import angles_deg
 
 _LEAST_CELLS = 8**4
-"""Cells from which on a spread that is not there is known well enough not to be feared."""
+"""Cells from which on a veil is told from other smooth light."""
 
 
 def judged_values(figures: TableFigures) -> dict[str, float]:
@@ -43,7 +44,10 @@ def _registration_values(figures: TableFigures) -> dict[str, float]:
         "blocks_good": float(registration.blocks.good.mean()),
         "agreement": registration.agreement,
     }
-    if figures.lens.measured and _cell_count(figures) >= _LEAST_CELLS:
+    spread = figures.point_spread
+    # Smooth light that is no lens's, as a reflection, has figures of its own; few cells cannot tell it from a veil.
+    told = spread is None or spread.misfit <= MOST_MISFIT or _cell_count(figures) >= _LEAST_CELLS
+    if figures.lens.measured and told:
         values["correction_residual"] = figures.lens.left
     if registration.framing.field is None:
         found = len(registration.framing.tags)
@@ -72,9 +76,11 @@ def _frame_values(figures: TableFigures) -> dict[str, float]:
         "other_camera": float(len(figures.origins.other_camera)),
         "other_lens": float(len(figures.origins.other_lens)),
         "other_exposure": figures.origins.exposure_difference,
+        "other_iso": float(len(figures.origins.other_iso)),
         "references_used": used / max(figures.session.white_references, 1),
     }
     if len(frames) > 1:
+        values["white_frames"] = float(len(figures.white_frames))
         values["moved_anew"] = float(sum(frame.reregistered for frame in frames))
     if has_enough_cells(_cell_count(figures)):
         values["unlike_scatter"] = max((frame.consistency.scatter for frame in frames), default=0.0)

@@ -131,6 +131,8 @@ def _place(row: JudgedValue, figures: TableFigures) -> str:
             return _foreign(figures.origins.other_camera)
         case "other_lens":
             return _foreign(figures.origins.other_lens)
+        case "other_iso":
+            return _foreign(figures.origins.other_iso)
         case "other_exposure":
             return _foreign(figures.origins.other_exposure)
         case _:

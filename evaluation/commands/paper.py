@@ -33,7 +33,7 @@ all of them as made with full tables of both cameras.
 app = new_app(no_args_is_help=True)
 
 Luts = Annotated[
-    list[Path], typer.Argument(metavar="LUT...", help="Tables made by build-lut, a folder each.", show_default=False)
+    list[Path], typer.Argument(metavar="LUT", help="Tables made by build-lut, a folder each.", show_default=False)
 ]
 Kind = Annotated[Literal["reproduction", "recovery"], typer.Option(help="Angular error to print.")]
 Out = Annotated[

@@ -140,17 +140,7 @@ def test_a_calm_room_has_no_more_of_anything_than_the_random_one_of_its_seed() -
         assert len({getattr(room, name) for room in drawn}) > 2, name
 
 
-NOT_YET = {"other-iso", "strong-shoulders", "veil", "mild-and-veil"}  # fmt: skip
-"""Cases that still fail; taken out as they are mended."""
-
-
-@pytest.mark.parametrize(
-    "name",
-    [
-        pytest.param(case.name, marks=[pytest.mark.xfail(reason="open", strict=False)] if case.name in NOT_YET else [])
-        for case in CASES
-    ],
-)
+@pytest.mark.parametrize("name", [case.name for case in CASES])
 def test_a_case_is_refused_or_named_or_right(name: str) -> None:
     row = try_case(BY_NAME[name], small=True)
     assert not [failure for failure in FAILURES if row[failure]], row["says"]

@@ -148,3 +148,17 @@ def test_the_first_start_says_on_a_terminal_why_it_takes_long(tmp_path: Path) ->
     (tmp_path / "kernels" / "power.py").write_text(POWER.format(exponent=3))
     # Compiled anew, but into a file that nobody watches.
     assert said("from kernels.square import square; print(square(5))") == ("125\n", "")
+
+
+def test_linear_algebra_is_loaded_by_whoever_compiles_a_product_of_matrices() -> None:
+    """And not by the first function that is called: loading it takes longer than a small picture."""
+    code = (
+        "import sys, numba, numpy as np, foundation.compiled\n"
+        "double = numba.njit(lambda x: 2 * x)\n"
+        "assert double(2) == 4\n"
+        "print('scipy.linalg' in sys.modules)\n"
+        "product = numba.njit(lambda a, b: a @ b)\n"
+        "print(product(np.eye(2), np.full((2, 2), 3.0)).sum(), 'scipy.linalg' in sys.modules)\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.split() == ["False", "12.0", "True"]

@@ -17,8 +17,8 @@ from foundation.robust import sigma_of
 _DARKER = -0.1
 """Median relative deviation below which places that deviate are called covered or dark, and not differently lit."""
 
-_OF_BEFORE = 0.02
-"""Power of the deviation, relative, that the light of the frame before may leave where it is seen: 8° off."""
+_OF_BEFORE = 0.01
+"""Power of the deviation, relative, that the light of the frame before may leave where it is seen: 6° off."""
 
 _BOTH_PARTS = 0.5
 """Share of the tiles off from which on it is the frame that deviates and not a part of it."""
@@ -199,8 +199,8 @@ def _uneven_reason(rest: Residuals, off: npt.NDArray[np.bool_], late: float) -> 
     if late:
         return (
             f"{amount} still showed the light of the frame before, for {max(late, 0.01):.0%} of the exposure: only a "
-            "part of the picture had changed; let it settle for longer (sequence.settle_s), and look for what else "
-            "draws on the screen"
+            "part of the picture had changed, or a window covers it that has that colour; let it settle for longer "
+            "(sequence.settle_s), and look for what else draws on the screen"
         )
     if share > _BOTH_PARTS:
         return (

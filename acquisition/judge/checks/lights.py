@@ -82,11 +82,11 @@ def judge_light(
         level = known.candidate[0]
         # Shown twice alike, and small: the lamp has another level now, and each light has a ground truth of its own.
         stepped = abs(fit.brightness) <= limits.LAMP_FOLLOWED and abs(fit.brightness - level) <= room / 2
-        lamp = "" if stepped else _brightness_reason(fit.brightness, light.amounts)
+        lamp = "" if stepped else _brightness_reason(fit.brightness)
     percent = 100 * float(np.expm1(fit.brightness))
     leaning = Leaning(((fit.brightness, fit.brightness_sd),), (_added(model, light, codes),))
     if not reason and not lamp and not stepped and not known.rested:
-        lamp, added = crept(known.leaning.then(leaning), light, drift_percent / 100)
+        lamp, added = crept(known.leaning.then(leaning), drift_percent / 100)
         reason = _ambient_reason(added) if added else ""
     ambient = (Check("ambient", round(100 * added, 2), None, None, "%", reason),) if added else ()
     # Where another cause changes the light, its brightness is none of the lamp's.
@@ -98,15 +98,13 @@ def judge_light(
     return LightVerdict(checks, fit.brightness, stepped, leaning)
 
 
-def crept(leaning: Leaning, light: FrameLight, drift: float) -> tuple[str, float]:
+def crept(leaning: Leaning, drift: float) -> tuple[str, float]:
     """Return the reason against the lamp, or how much light is added, of white, that the last lights together show.
 
     Parameters
     ----------
     leaning
         By how much the lights were off, the newest first; each alone is too little to be told.
-    light
-        Of the newest.
     drift
         Change of brightness that is always allowed, 0 … 1.
     """
@@ -116,7 +114,7 @@ def crept(leaning: Leaning, light: FrameLight, drift: float) -> tuple[str, float
             return "", added
         brightness, sd = combined(leaning.lamp[:count])
         if abs(brightness) > max(drift, limits.BRIGHTNESS_SIGMAS * sd):
-            return _brightness_reason(brightness, light.amounts), 0.0
+            return _brightness_reason(brightness), 0.0
     return "", 0.0
 
 
@@ -206,9 +204,11 @@ def _other(model: ProjectorModel, light: FrameLight, codes: Codes, plan: Sequenc
             found = left, other
     if found is None or squared - found[0] < limits.OTHER_ADVANTAGE or found[0] > limits.LIGHT_SIGMAS**2:
         return ""
+    # Faint light of a colour changes a light into its neighbour.
+    why = "is the picture late, or does other light fall on the chart" if _coloured(model, light, codes) else ""
     return (
         f"another light is seen, {_named(found[1])}, {_named(codes)} was ordered; "
-        "does something else draw on the screen, or is the picture late?"
+        f"does something else draw on the screen, {why or 'or is the picture late'}?"
     )
 
 
@@ -272,17 +272,16 @@ def _ambient_reason(added: float) -> str:
     )
 
 
-def _brightness_reason(brightness: float, amounts: _Array) -> str:
+def _brightness_reason(brightness: float) -> str:
     percent = 100 * float(np.expm1(brightness))
     if percent < 0:
         return (
             f"the light is {-percent:.1f} % weaker than expected, its colour is right; does the lamp fail, or did its "
             "power mode, the shutter or the aperture change?"
         )
-    elsewhere = ", or does other light fall on the chart" if amounts.min() > 0.2 * amounts.max() else ""
     return (
         f"the light is {percent:.1f} % stronger than expected, its colour is right; did the lamp's power mode, the "
-        f"shutter or the aperture change{elsewhere}?"
+        "shutter or the aperture change, or does other light fall on the chart?"
     )
 
 

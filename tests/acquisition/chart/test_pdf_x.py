@@ -165,7 +165,7 @@ def test_an_independent_reader_finds_no_font_and_the_boxes(pdf: Path) -> None:
 def test_another_library_opens_it(pdf: Path) -> None:
     library: Any = pytest.importorskip("pikepdf", reason="pikepdf is not installed")
     with library.open(pdf) as opened:
-        assert opened.check() == []
+        assert opened.check_pdf_syntax() == []
         assert opened.Root.OutputIntents[0].S == "/GTS_PDFX"
         assert "/Font" not in opened.pages[0].Resources
 

@@ -216,7 +216,9 @@ def test_check_and_build_agree_on_every_figure_that_both_know(name: str, said: C
 def test_the_foretold_verdict_is_what_the_room_deserves(name: str, said: Callable[[str], Said]) -> None:
     found, expected = said(name), ROOMS[name].expected
     outcome = "refuse" if found.foretold is None else found.foretold.outcome
-    built = "refuse" if found.built is None else max(found.built.values(), key=OUTCOMES.index)
+    # No chart of so few colours shows whether the lens has a veil, and a table says so; a check does not measure it.
+    known = None if found.built is None else {**found.built, "correction_residual": OUTCOMES[0]}
+    built = "refuse" if known is None else max(known.values(), key=OUTCOMES.index)
     if expected == "not accept":
         assert outcome != "accept"
         assert built != "accept"
