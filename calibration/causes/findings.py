@@ -232,6 +232,8 @@ _OFF_CODES_DEG = 2.0
 
 _GOES_WITH: dict[str, tuple[tuple[str, float], ...]] = {
     "unlike_scatter": (("unlike_block", 0.01), ("disturbed_cells", 0.0)),
+    "disturbed_cells": (("unlike_block", 0.01),),
+    "unfit_share": (("unlike_block", 0.01),),
     "off_brightness": (("off_codes_deg", _OFF_CODES_DEG), ("exchanged_lights", 0.0)),
 }
 """Figures that others move along: each with those whose cause it shares where it has none of its own, and from which on

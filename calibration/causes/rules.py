@@ -240,12 +240,6 @@ RULES: tuple[Rule, ...] = (
         "in few frames light is added at one place, and the cells keep their own",
     ),
     Rule(
-        REFLECTION_IN_FRAME,
-        COVERED,
-        (*_IN_FEW_FRAMES, Condition("spot", 0, 0.1), Condition("deviation", 1e-9, _FAR), *_SHARP_PLACE),
-        "in few frames some cells next to each other are brighter, and none darker",
-    ),
-    Rule(
         OBJECT_IN_FRAME,
         frozenset({"unlike_block"}),
         (*_IN_FEW_FRAMES, Condition("spot", 0, 0.1), Condition("kept", -_FAR, 0.85), *_SHARP_PLACE),

@@ -48,7 +48,8 @@ CASES: list[tuple[str, Evidence, Cause]] = [
     # Between a reflection and a pale hand: both are possible.
     ("unlike_block", replace(LIGHT, deviation=0.08, tint=0.2, added=0.02, kept=0.87), UNKNOWN),
     ("disturbed_cells", replace(LIGHT, deviation=-0.3), OBJECT_IN_FRAME),
-    ("disturbed_cells", replace(LIGHT, deviation=0.3), REFLECTION_IN_FRAME),
+    # Few cells, all brighter: a glint, or a pale hand.
+    ("disturbed_cells", replace(LIGHT, deviation=0.3), UNKNOWN),
     # Two dark cells that are brighter: a glint, or a finger.
     ("disturbed_cells", replace(LIGHT, deviation=math.nan), UNKNOWN),
     # Half of the frames: something came and stayed, and nobody knows what.
