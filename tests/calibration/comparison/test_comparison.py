@@ -261,7 +261,10 @@ def test_drift_that_is_not_of_these_lights_is_not_used(one: Lut) -> None:
     [
         (["session", "--out", "x"], "--out goes with --compare"),
         (["--compare", "a", "b", "--info", "a"], "are two commands"),
-        (["--compare", "a", "b", "--linearity", "x"], "--linearity is for one table that is kept"),
+        (
+            ["--compare", "a", "b", "--linearity", "x"],
+            "--linearity is for the report of one table; leave it out of --compare",
+        ),
         (["c", "--compare", "a", "b"], "--compare does not expect c"),
         (["--compare", "a", "b"], "a is no table"),
     ],
