@@ -386,7 +386,8 @@ class VariationOptions:
         option(
             "N/BASE",
             "Add the noise of ISO speed N to that of the table, which was photographed with speed BASE: 1600/100, or "
-            "1600/100:read=2.5, electrons of read noise before the amplifier. Computed tables know BASE.",
+            "1600/100:read=2.5, electrons of read noise before the amplifier. Tables that say their ISO speed need no "
+            "BASE.",
             _VARIATION,
         ),
     ] = None

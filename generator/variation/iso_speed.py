@@ -98,10 +98,11 @@ def parse_iso(text: str, base: float | None = None, sensor_electrons: float = SE
 def known_of_table(lut: Lut) -> tuple[float | None, float]:
     """Return the ISO speed of a table, None if it does not say it, and the read noise before the amplifier, electrons.
 
-    Computed tables say both; of photographed ones the noise is `SENSOR_ELECTRONS`.
+    Computed tables say both. Photographed ones say the speed, where they were built by software that keeps it; their
+    noise is `SENSOR_ELECTRONS`.
     """
-    computed = lut.provenance.computed or {}
+    computed, origin = lut.provenance.computed or {}, lut.provenance.origin
     try:
         return float(computed["exposure"]["iso"]), float(computed["body"]["sensor_noise_e"])
     except (KeyError, TypeError, ValueError):
-        return None, SENSOR_ELECTRONS
+        return None if origin is None or origin.iso is None else float(origin.iso), SENSOR_ELECTRONS

@@ -10,6 +10,7 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
+from calibration.citation.record import OriginRecord
 from calibration.table.lut import Lut
 from foundation.errors import InputError
 from generator.variation.iso_speed import known_of_table, parse_iso
@@ -34,7 +35,9 @@ def table(read: float, shot: float, response: float = 0.0, texture: float = 0.0,
             samples=counts,
             light_samples=counts.__getitem__,
             white=means[:, -1:].repeat(3, axis=1),
-            provenance=SimpleNamespace(computed=None, unfit=[SimpleNamespace(colour=colour) for colour in unfit]),
+            provenance=SimpleNamespace(
+                computed=None, origin=None, unfit=[SimpleNamespace(colour=colour) for colour in unfit]
+            ),
         ),
     )
 
@@ -86,6 +89,17 @@ def _of_body(body: Any, iso: int) -> tuple[Three, Three]:
 def test_read_noise_before_the_amplifier_is_no_more_than_all() -> None:
     assert SensorNoise((2.0, 2.0, 2.0), (1.0, 1.0, 1.0)).at(10, 100.0).read == pytest.approx([20.0] * 3)
     assert SensorNoise((2.0, 2.0, 2.0), (1.0, 1.0, 1.0)).at(10, 0.0).read == pytest.approx([2.0] * 3)
+
+
+def test_a_photographed_table_says_its_speed() -> None:
+    lut = table(6.0, 0.55)
+    object.__setattr__(lut.provenance, "origin", OriginRecord(iso=400))
+    assert known_of_table(lut) == (400.0, 2.5)
+    assert parse_iso("1600", *known_of_table(lut)).ratio == 4
+    with pytest.raises(InputError, match="says that the table is of ISO 100, and the table says 400"):
+        parse_iso("1600/100", *known_of_table(lut))
+    object.__setattr__(lut.provenance, "origin", OriginRecord())
+    assert known_of_table(lut) == (None, 2.5)
 
 
 def test_a_computed_table_says_its_speed() -> None:
