@@ -246,7 +246,7 @@ def test_a_hang_up_that_is_ignored_stays_ignored(number: int) -> None:
     before = signal.signal(number, signal.SIG_IGN)
     try:
         with orderly_end():
-            os.kill(os.getpid(), number)
+            signal.raise_signal(number)
         assert signal.getsignal(number) == signal.SIG_IGN
     finally:
         signal.signal(number, before)
@@ -259,7 +259,7 @@ def test_a_terminal_that_went_away_takes_no_last_line() -> None:
     def hang_up() -> None:
         with orderly_end(), ExitStack() as stack:
             stack.callback(draw)
-            os.kill(os.getpid(), signal.SIGHUP)
+            signal.raise_signal(signal.SIGHUP)
 
     with pytest.raises(KeyboardInterrupt):
         hang_up()
