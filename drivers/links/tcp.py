@@ -77,11 +77,19 @@ class TcpLink:
             raise LinkClosed(f"{self._far_end} hung up; open a new connection")
         return data
 
-    def close(self) -> None:
-        """Hang up; a reader in another thread is woken."""
+    def hang_up(self) -> None:
+        """End the connection and wake a reader in another thread, which is to close it.
+
+        Closed under a reader that is about to wait, its number may at once be that of another connection, and the
+        reader waits for that one.
+        """
         # A socket that the other side has left cannot be shut down any more, and need not be.
         with contextlib.suppress(OSError):
             self._socket.shutdown(socket.SHUT_RDWR)
+
+    def close(self) -> None:
+        """Hang up, and give the connection back; a reader in another thread is woken."""
+        self.hang_up()
         self._socket.close()
 
     def _limit(self, timeout: float) -> None:
@@ -142,11 +150,11 @@ class TcpServer:
         self.close()
 
     def hang_up(self) -> None:
-        """Close every connection there is, as a device does that restarts; new ones are still taken."""
+        """End every connection there is, as a device does that restarts; new ones are still taken."""
         with self._guard:
             links = list(self._links)
         for link in links:
-            link.close()
+            link.hang_up()
 
     def close(self) -> None:
         """Stop listening, hang up and wait for the threads; a second call does nothing."""
