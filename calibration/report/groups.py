@@ -15,31 +15,26 @@ QUESTIONS: Final[dict[Group, str]] = {
     "truth": "How well is each light's colour known?",
 }
 
-OF_THRESHOLDS: Final[dict[str, Group]] = {
-    **dict.fromkeys(
-        ("tags_found", "cell_px", "bleed", "softer_bleed", "tag_residual_px", "tag_final_px", "block_residual_px"),
-        "geometry",
+_THRESHOLDS: Final[dict[Group, tuple[str, ...]]] = {
+    "geometry": (
+        "tags_found", "cell_px", "bleed", "softer_bleed", "tag_residual_px", "tag_final_px", "block_residual_px",
+        "blocks_good", "agreement", "moved_anew",
     ),
-    **dict.fromkeys(("blocks_good", "agreement", "moved_anew"), "geometry"),
-    **dict.fromkeys(
-        ("white_drift", "drift_left", "white_drift_deg", "leak_share", "dark_drift", "stray_share"), "light"
+    "light": (
+        "white_drift", "drift_left", "white_drift_deg", "leak_share", "dark_drift", "stray_share", "additivity",
+        "white_short", "off_codes_deg", "off_brightness", "exchanged_lights", "code_misfit", "exchange_deg",
+        "held_share", "white_frame_deg", "white_frame_brightness", "white_frames", "primaries_lacking",
     ),
-    **dict.fromkeys(("additivity", "white_short", "off_codes_deg", "off_brightness", "exchanged_lights"), "light"),
-    **dict.fromkeys(("code_misfit", "exchange_deg", "held_share", "white_frame_deg"), "light"),
-    **dict.fromkeys(("white_frame_brightness", "primaries_lacking", "stray_share"), "light"),
-    **dict.fromkeys(
-        ("correction_residual", "unfit_share", "doubtful_share", "disturbed_cells", "unlike_scatter"), "radiometry"
+    "radiometry": (
+        "correction_residual", "unfit_share", "doubtful_share", "disturbed_cells", "unlike_scatter", "unlike_block",
+        "other_camera", "other_lens", "other_exposure", "other_iso", "black_drift_counts", "linearity",
+        "grey_tint_deg", "brightest_share", "darkest_counts",
     ),
-    **dict.fromkeys(
-        ("unlike_block", "other_camera", "other_lens", "other_exposure", "black_drift_counts"), "radiometry"
-    ),
-    "other_iso": "radiometry",
-    "white_frames": "light",
-    **dict.fromkeys(("linearity", "grey_tint_deg", "brightest_share", "darkest_counts"), "radiometry"),
-    **dict.fromkeys(("noise_misfit", "noisy_share"), "noise"),
-    "disturbed_cells": "radiometry",
-    **dict.fromkeys(("references_used", "reference_spread", "truth_median_deg", "truth_worst_deg"), "truth"),
-}
+    "noise": ("noise_misfit", "noisy_share"),
+    "truth": ("references_used", "reference_spread", "truth_median_deg", "truth_worst_deg"),
+}  # fmt: skip
+
+OF_THRESHOLDS: Final[dict[str, Group]] = {name: group for group, names in _THRESHOLDS.items() for name in names}
 """Group of each limit of `calibration.verdict.thresholds`, by name."""
 
 OF_SUMMARY: Final[dict[str, Group]] = {
