@@ -44,6 +44,13 @@ _LEAST_CELLS = 6
 _LEAST_BRIGHT = 4
 """Cells of a small place from which on light was added if all of them are brighter."""
 
+_MOSTLY = 0.8
+"""Share of the cells of a small place that a thin shadow darkens at least (chosen: all of them, but for noise)."""
+
+_COVERED = 0.1
+"""Deviation that what covers cells gives one of them at least, unless it darkens all (chosen: of a hand's reflectance
+are few colours of a print within a tenth)."""
+
 _BRIGHT_PERCENTILE = 99.0
 """Of the cells' levels, what is taken for paper white."""
 
@@ -120,6 +127,24 @@ def block_evidence(figures: TableFigures, worst: FrameFigures, limit: float, sof
     return Gathered(evidence, tuple(frame.record for frame in frames), (place,))
 
 
+def covered_deviation(off: npt.NDArray[np.float64]) -> float:
+    """Return how far cells are off that something may cover; NaN where they do not look covered.
+
+    Parameters
+    ----------
+    off
+        (N,) float64 deviations of cells next to each other, shares with their signs; 0 of those that are not known.
+    """
+    seen = off[off != 0]
+    darker = seen[seen < 0]
+    if not len(darker):
+        # Few cells that are brighter may be dark ones that a hand covers.
+        return float(np.median(seen)) if len(seen) >= _LEAST_BRIGHT else np.nan
+    # As many brighter as darker ones, all by little, is what cells show that have some of their neighbours' light.
+    mixed = len(darker) < _MOSTLY * len(seen) and np.abs(seen).max() < _COVERED
+    return np.nan if mixed else float(darker.min())
+
+
 def disturbed_evidence(figures: TableFigures, softer: float) -> Gathered | None:
     """Return what is known of the cells that something small covers in lights' frames; None where there are none.
 
@@ -144,10 +169,7 @@ def disturbed_evidence(figures: TableFigures, softer: float) -> Gathered | None:
         same = [any(cell in cells for cell, _ in frame.consistency.disturbed) for frame in among]
         return sum(same) / max(len(among), 1)
 
-    seen = off[off != 0]
-    darker = seen[seen < 0]
-    # Few cells that are brighter may be dark ones that a hand covers.
-    deviation = float(darker.min()) if len(darker) else float(np.median(seen)) if len(seen) >= _LEAST_BRIGHT else np.nan
+    deviation = covered_deviation(off)
     evidence = Evidence(
         frames=float(len(others)),
         showing=showing(others),
