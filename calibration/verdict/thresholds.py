@@ -152,8 +152,8 @@ THRESHOLDS: tuple[Threshold, ...] = (
     ),
     Threshold(
         "disturbed_cells", "Cells that something small covers in a light's frame", "", "at most", 0, None,
-        "a fly, a finger, a scrap or a glint, or neighbours' light in that frame; they are listed as unfit, the others not "
-        "touched",
+        "a fly, a finger, a scrap or a glint lay on them, or they have neighbours' light in that frame; they are "
+        "listed as unfit, and the other cells are not touched",
         SIMULATED + ": none in healthy rooms; two cells next to each other, five standard deviations off, are one",
         "see that nothing comes between lamp, print and camera",
     ),
