@@ -126,3 +126,9 @@ def test_the_advice_for_a_picture_of_eight_bits_gives_the_colours_of_the_mosaic(
         red, green, blue, second = (np.maximum(levels[colours == colour], 0).mean() for colour in range(4))
     expected = np.array([red, (green + second) / 2, blue])
     np.testing.assert_allclose(means / means.sum(), expected / expected.sum(), atol=1e-3)
+
+
+def test_a_black_level_is_subtracted_from_planes_as_from_pixels() -> None:
+    planes = np.arange(60, dtype=np.uint16).reshape(3, 4, 5)
+    expected = np.maximum(np.moveaxis(planes.astype(np.int64), 0, 2) - 30, 0)
+    np.testing.assert_array_equal(subtract_black(np.moveaxis(planes, 0, 2), 30.0), expected)
