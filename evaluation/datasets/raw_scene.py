@@ -168,7 +168,7 @@ def subtract_black(image: Image, black: float) -> Image:
         image = image.astype(np.float32)
     if black:
         # A TIFF may hold a plane a channel, which OpenCV does not write to.
-        image = np.ascontiguousarray(image)
+        image = image.copy(order="C")
         cv2.subtract(image, np.array([black, black, black, 0.0]), dst=image)  # Saturates at 0 in integers.
     return image if image.dtype == np.uint16 else np.maximum(image, 0, out=image)
 
