@@ -17,8 +17,8 @@ LEAST_CELLS = 6
 """Cells of a place for a line through them to mean anything."""
 
 LARGE_SPOT = 0.005
-"""Share of the cells from which on a place is so large that its cells are not simply listed as unfit (that of the limit
-on unfit cells). What shines on so much of the print goes on beyond the cells in which it is found."""
+"""Share of the cells from which on a place counts: that of the limit on unfit cells. A glint on fewer is listed, and
+what it leaves around them is a few cells' error."""
 
 OWN_KEPT = 0.85
 """Share of their own light that cells keep under a reflection at least: less, and something covers them (as in the
@@ -29,6 +29,10 @@ _BRIGHT_PERCENTILE = 99.0
 
 _BESIDE = 2.3
 """Distance, in sides of a cell, up to which deviating cells are of one place: one may lie between them."""
+
+_AROUND = 2.5
+"""Distance, in sides of a cell, from the cells of a spot up to which light is looked for in cells that are not listed:
+two rings, of which the first is half in the neighbourhoods of the spot (chosen)."""
 
 _Array = npt.NDArray[np.float64]
 _Index = npt.NDArray[np.int64]
@@ -81,18 +85,24 @@ def light_of_spot(stains: Stains, spot: _Index, channel: int) -> tuple[float, fl
 
 
 def added_light(stains: Stains) -> float:
-    """Return the light that a large reflection adds, 0 … 1 of paper white; 0 where there is none.
+    """Return the light that a large reflection adds to cells that are not listed, 0 … 1 of paper white; 0 without one.
 
-    The largest of all spots of `LARGE_SPOT` or more of the cells that are brighter than their codes and keep
-    `OWN_KEPT` of their own light.
+    Spots are those of more than `LARGE_SPOT` of the cells that are brighter than their codes and keep `OWN_KEPT` of
+    their own light. What deviates enough is listed as unfit and does no harm; a broad reflection goes on around it, and
+    there the light is measured. Of several spots the most.
     """
+    from scipy.spatial import cKDTree
+
     found = 0.0
     for spot in spots_of(stains):
         if len(spot) <= LARGE_SPOT * len(stains.places_mm):
             break
         colour = spot_colour(stains, spot)
         channel = int(np.argmax(np.abs(colour)))
-        added, kept = light_of_spot(stains, spot, channel)
-        if colour[channel] > 0 and kept >= OWN_KEPT:
-            found = max(found, added)
+        if not (colour[channel] > 0 and light_of_spot(stains, spot, channel)[1] >= OWN_KEPT):
+            continue
+        away = np.asarray(cKDTree(stains.places_mm[spot]).query(stains.places_mm)[0])
+        around = np.flatnonzero((away < _AROUND * cell_mm(stains)) & ~stains.stained)
+        added, _ = light_of_spot(stains, around, channel)
+        found = max(found, float(np.nan_to_num(added)))
     return found

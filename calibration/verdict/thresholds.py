@@ -89,7 +89,7 @@ THRESHOLDS: tuple[Threshold, ...] = (
         "focus on the print, stop down to f/8, bring the camera nearer, or take a smaller window (build-lut --window)",
     ),
     Threshold(
-        "correction_residual", "Light of surroundings left in cells' means", "share", "at most", 0.01, 0.03,
+        "correction_residual", "Light of surroundings that may be left in cells' means", "share", "at most", 0.01, 0.03,
         "what the lens spreads, or may spread as a veil that an evenly lit print cannot show, is in the samples",
         SIMULATED + ": 0.1 to 0.2 % where light falls off towards the corners, and the means are as good; 1.4 % in "
         "even light or on a chart of 512 colours, which do not show a veil of the usual 1 %",
