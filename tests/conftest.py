@@ -2,11 +2,18 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from pathlib import Path
 
 import pytest
 from hypothesis import settings
+
+# Test processes share the machine. Threads that libraries start in each of them spin while they wait for one another:
+# without this a system of a hundred equations takes OpenBLAS fifty times as long, and a build twice. Must stand before
+# NumPy is imported; what tests start inherits it. Threads of our own are as many as ever.
+for _threads in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "OPENCV_FOR_THREADS_NUM"):
+    os.environ.setdefault(_threads, "1")
 
 # PyTorch loads Triton's LLVM where that is installed, which crashes a process in which Mesa has loaded its own for
 # OpenGL. No program shows a full screen and trains; a test process may do both. None keeps a module from
