@@ -23,7 +23,7 @@ def print_with(radius: float, added: float = 0.0, kept: float = 1.0, *, broad: b
     away = np.linalg.norm(places - places.mean(axis=0), axis=1) / max(radius, 1e-9)
     share = (np.exp(-(away**2)) if broad else away < 1)[:, None]
     level = (1 - (1 - kept) * share) * level + added * 5400 * share
-    level *= random.normal(1, 0.003, level.shape)
+    level = np.asarray(level * random.normal(1, 0.003, level.shape), dtype=np.float64)
     return find_stains(level, places, 4)
 
 
