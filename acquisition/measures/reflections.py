@@ -70,7 +70,7 @@ def spot_colour(stains: Stains, spot: _Index) -> _Array:
 
 
 def light_of_spot(stains: Stains, spot: _Index, channel: int) -> tuple[float, float]:
-    """Return the light added in a spot, of paper white, and the share of their own that its cells keep.
+    """Return the light added in a spot, of paper white, and the share of their own that its cells (N,) int64 keep.
 
     By least absolute deviations in one channel; NaN of too few cells.
     """
