@@ -52,7 +52,7 @@ def read_entries(store: Store, description: Description) -> Iterator[Entry]:
     for part in SPLITS:
         if part in description.splits:
             with _text(store, f"splits/{part}.txt") as images:
-                part_of.update((_number(image), part) for image in images)
+                part_of.update((_number(image.rstrip("\r\n")), part) for image in images)
     with _text(store, TRUTHS) as truths, _text(store, GROUND_TRUTH) as table:
         last, count = -1, 0
         for image, group in groupby(_numbered_rows(name, table), key=lambda numbered: numbered[1].get("image")):
