@@ -37,11 +37,11 @@ demo: $(READY)
 	@echo "Look at this first:                         $(CURDIR)/$(DEMO)/contact_sheet.png"
 
 test: $(READY) lint
-	$(BIN)/python -m pytest -n auto
+	$(BIN)/python -m pytest -n auto --dist worksteal
 
 # What most mistakes are caught by: every test that takes no longer than two seconds. Under a minute on two cores.
 quick: $(READY)
-	$(BIN)/python -m pytest -n auto -m "not slow"
+	$(BIN)/python -m pytest -n auto --dist worksteal -m "not slow"
 
 lint: $(READY)
 	$(BIN)/ruff check .

@@ -13,6 +13,8 @@ simulated print, needs a table of full size, lies closer together, and is render
 
 The bound of fetching is a compiled loop that does nothing but copy the samples which the kernel draws, their places
 being known, to one place in the nearest cache: what the caches allow, whoever chooses. Two lights have a sample each.
+By colour the loop fetches each pixel's cell before its sample; its ratio to the kernel by codes is the most that
+rendering by colour could reach if finding cells cost nothing.
 """
 
 from __future__ import annotations
@@ -30,6 +32,7 @@ from pathlib import Path
 from typing import Any
 
 import cv2
+import numba
 import numpy as np
 import numpy.typing as npt
 import skimage.data
@@ -40,11 +43,11 @@ from calibration.table.writer import LutWriter
 from drivers.presenter import Colour
 from foundation.compiled import compiled
 from generator.kernels.choice import SCRATCH_BYTES, choose_group, row_keys
-from generator.kernels.dithering import checked_cells
+from generator.kernels.dithering import CellTable, checked_cells, dither_row, find_places_and_choose
 from generator.kernels.mixing import mix_samples
 from generator.kernels.planar import draw_planar
 from generator.kernels.rendering import draw_mosaic, draw_samples
-from generator.kernels.vector import GROUP, LINE, copy8, offset_at, prefetch_once
+from generator.kernels.vector import GROUP, LANES, LINE, SAMPLE_BYTES, copy8, offset_at, prefetch_once
 from generator.masks.request import parse_masks
 from generator.rendering.black_points import Veil, without_veil
 
@@ -158,6 +161,40 @@ def fetching(tables: npt.NDArray[np.uint16], picture: npt.NDArray[np.uint8]) -> 
     )
 
 
+@compiled
+def _place_all(picture: int, width: int, height: int, count: Any, places: int, choices: int) -> None:
+    groups = width // GROUP
+    for y in range(height):
+        keys, inks = dither_row(0, y, 0, np.uint64(0))
+        for group in range(groups):
+            source, word = picture + 3 * (y * width + GROUP * group), numba.uint32(LANES * group)
+            at = 4 * GROUP * (y * groups + group)
+            find_places_and_choose(source, word, keys[0], keys[1], keys[2], inks[1], count, places + at, choices + at)
+
+
+@compiled
+def _fetch_by_colour(samples: int, cells: int, stride: int, places: int, choices: int, count: int, target: int) -> None:
+    for i in range(0, count, GROUP):
+        place, choice = places + 4 * i, choices + 4 * i
+        for line in range(0, 4 * GROUP, LINE):
+            prefetch_once(place + 2048 + line)
+            prefetch_once(choice + 2048 + line)
+        for k in range(GROUP):
+            cell = offset_at(cells + 2 * offset_at(place + 4 * k)) & 0xFFFF
+            copy8(samples + stride * cell + offset_at(choice + 4 * k), target + 8 * k)
+
+
+def fetching_by_colour(samples: npt.NDArray[np.uint16], picture: npt.NDArray[np.uint8], cells: CellTable) -> Call:
+    """Return a call that loads the cell and then the sample of each pixel; the width must be whole groups."""
+    height, width = picture.shape[:2]
+    places, choices = np.zeros((2, height, width), np.uint32)
+    scratch = np.empty(SCRATCH_BYTES, np.uint8)
+    at = places.ctypes.data, choices.ctypes.data
+    _place_all(picture.ctypes.data, width, height, np.uint32(SAMPLES), *at)
+    tables = samples.ctypes.data, cells.cells.ctypes.data, SAMPLE_BYTES * SAMPLES
+    return lambda: (_fetch_by_colour(*tables, *at, width * height, scratch.ctypes.data), places, choices)
+
+
 def nearby_cells() -> npt.NDArray[np.uint16]:
     """Return 16 cells (32768, 16) uint16 for each source node, some six distinct ones within two codes of it."""
     rng = np.random.default_rng(6)
@@ -196,6 +233,7 @@ def measure_picture(name: str, picture: npt.NDArray[np.uint8], tables: npt.NDArr
         "kernel by colour": lambda: draw_samples(samples, picture, cells=cells, out=out),
         "streaming copy": lambda: np.copyto(out, picture),
         "bound of fetching": fetching(tables[:1], picture),
+        "bound of fetching by colour": fetching_by_colour(samples, picture, cells),
         "bound of fetching for two lights": fetching(tables, picture),
         "kernel": lambda: draw_samples(samples, picture, out=out),
         "mosaic": lambda: draw_mosaic(samples, picture, out=sites),
@@ -214,6 +252,10 @@ def measure_picture(name: str, picture: npt.NDArray[np.uint8], tables: npt.NDArr
     report(f"kernel, {name}, one thread", seconds["numpy take"] / seconds["kernel"], "ratio", "numpy take")
     by_colour = seconds["kernel"] / seconds["kernel by colour"]
     report(f"kernel by colour, {name}, one thread", by_colour, "ratio", "kernel by codes")
+    bound = seconds["bound of fetching by colour"]
+    report(f"bound of fetching by colour, {name}, one thread", seconds["kernel"] / bound, "ratio", "kernel by codes")
+    share = bound / seconds["kernel by colour"]
+    report(f"kernel by colour, {name}, one thread", share, "ratio", "bound of fetching by colour")
 
     threads = os.cpu_count() or 1
     with ThreadPoolExecutor(threads) as pool:

@@ -11,6 +11,7 @@ import contextlib
 import errno
 import os
 import shutil
+import sys
 from collections.abc import Callable, Generator
 from contextlib import contextmanager
 from io import BufferedRandom
@@ -66,6 +67,26 @@ file's that somebody reads meanwhile."""
 ATTEMPTS = 1000
 """How often a folder is made anew that another program takes away meanwhile: programs do so once or twice, special file
 systems (/proc) for ever."""
+
+
+def cache_folder() -> Path | None:
+    r"""Return the user's folder for what can be computed again, or None if there is no home.
+
+    `$XDG_CACHE_HOME/croplab` or `~/.cache/croplab` (XDG Base Directory Specification 0.8), on macOS
+    `~/Library/Caches/croplab`, on Windows `%LOCALAPPDATA%\croplab\Cache`. A relative `XDG_CACHE_HOME` is ignored, as
+    that specification says.
+    """
+    given = Path(os.environ.get("XDG_CACHE_HOME", ""))
+    if given.is_absolute():
+        return given / "croplab"
+    local = os.environ.get("LOCALAPPDATA")
+    if sys.platform == "win32" and local:
+        return Path(local) / "croplab" / "Cache"
+    try:
+        home = Path.home()
+    except RuntimeError:
+        return None
+    return home / ("Library/Caches" if sys.platform == "darwin" else ".cache") / "croplab"
 
 
 def partial_path(path: Path) -> Path:

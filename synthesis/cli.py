@@ -7,6 +7,7 @@ The devices are `sim.cli`'s; a table needs calibration's functions and format be
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -75,25 +76,45 @@ def table(
     threads: Annotated[
         int | None, typer.Option(min=1, help="Lights computed at a time; by default one a processor.")
     ] = None,
+    note: Annotated[
+        str | None, typer.Option("--note", help="What readers of the table should know.", show_default=False)
+    ] = None,
+    licence: Annotated[
+        str | None,
+        typer.Option(
+            "--licence", "--license", metavar="SPDX", help="Licence of the table, as CC-BY-4.0.", show_default=False
+        ),
+    ] = None,
+    author: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--author",
+            metavar='"FAMILY, GIVEN"',
+            help="Who made the table; several times for several.",
+            show_default=False,
+        ),
+    ] = None,
     *,
     told: JsonOutput,
 ) -> None:
     """Compute a whole table from spectra and the sensor's noise model, without a frame.
 
     Reads the sensitivities, the spectra of lights and the settings. Writes OUT/samples.npy, illuminations.csv,
-    references.csv and lut.json, which says that the table was computed: a table for generate like one that build-lut
-    makes of a session in the simulated lab, in minutes. Options come before what the settings say.
+    references.csv and lut.json, which says that the table was computed, and what is given of note, licence and authors.
+    It is a table for generate like one that build-lut makes of a session in the simulated lab, in minutes. Options come
+    before what the settings say.
     """
     from foundation.processors import processor_count
     from synthesis.light_spectra import read_lights
     from synthesis.settings import load_settings
     from synthesis.table import compute_table
-    from synthesis.tasks import table_task
+    from synthesis.tasks import stated_by_hand, table_task
 
     changes = {"profile": profile, "paper": paper, "hot_per_million": hot}
     given = load_settings(settings).changed(seed, {name: value for name, value in changes.items() if value is not None})
+    origin = stated_by_hand(note, licence, author or [])
     spectra = None if lights is None else read_lights(lights)
-    task = table_task(camera, given, str(settings or "the command line"), spectra)
+    task = replace(table_task(camera, given, str(settings or "the command line"), spectra), origin=origin)
     with orderly_end(), progress("lights") as shown:
         done = compute_table(task, out, threads or processor_count(), shown)
     told.add(table=out, lights=done.lights, colours=done.cells, samples=task.window**2, unfit=done.unfit)

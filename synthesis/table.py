@@ -21,6 +21,7 @@ import numpy.typing as npt
 from acquisition.chart.model import Chart
 from acquisition.framing.planes import CLIPPING_SHARE
 from acquisition.lights.illuminations import Illumination
+from calibration.citation.record import OriginRecord
 from calibration.pipeline.registered_frame import ChartPoints
 from calibration.radiometry.corrections import corrections
 from calibration.radiometry.greys import references_csv
@@ -71,6 +72,8 @@ class TableTask:
         Half-size pixels along a window's side.
     record
         What the provenance says under `computed`.
+    origin
+        Note, licence and authors, as whoever computes the table gives them; None where nothing is given.
     """
 
     chart: Chart
@@ -81,6 +84,7 @@ class TableTask:
     powers: _Array | None
     window: int
     record: dict[str, Any]
+    origin: OriginRecord | None = None
 
     @property
     def sample_bytes(self) -> int:
@@ -236,6 +240,7 @@ def _provenance(
         software=software(),
         unfit=unfit,
         computed=task.record,
+        origin=task.origin,
     )
 
 

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import asdict, replace
 from typing import Any
 
 import numpy as np
 
 from acquisition.chart.layout import design_chart
+from acquisition.config import CitationSettings
 from acquisition.lights.illuminations import plan_illuminations
+from calibration.citation.record import OriginRecord
+from calibration.citation.stated import with_changes
 from sim.spectral.sensitivities import describe_sensitivities, read_sensitivities
 from sim.world.body_settings import find_body
 from synthesis.light_spectra import LightSpectra, illuminations_of
@@ -59,3 +63,27 @@ def table_task(camera: str, settings: TableSettings, where: str, lights: LightSp
     powers = None if lights is None else np.array([light.power for light in lights.lights])
     record["lights"] |= {"count": len(planned)}
     return TableTask(chart, body, room, settings.exposed, planned, powers, settings.window, record)
+
+
+def stated_by_hand(note: str | None, licence: str | None, authors: Sequence[str]) -> OriginRecord | None:
+    """Return what is said of a computed table by whoever computes it; None where nothing is.
+
+    Parameters
+    ----------
+    note
+        What readers of the table should know.
+    licence
+        An SPDX expression (SPDX specification 2.3, annex D).
+    authors
+        Each as "Family, Given", or the name of an institution.
+
+    Raises
+    ------
+    InputError
+        One of them cannot be used; the message names its option.
+    """
+    given = {"note": note, "licence": licence, "authors": tuple(authors) or None}
+    stated = with_changes(CitationSettings(), {name: value for name, value in given.items() if value is not None})
+    if stated == CitationSettings():
+        return None
+    return OriginRecord(authors=list(stated.authors), note=stated.note or None, licence=stated.licence or None)

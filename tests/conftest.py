@@ -2,11 +2,29 @@
 
 from __future__ import annotations
 
+import os
+import shutil
 import sys
 from pathlib import Path
 
 import pytest
 from hypothesis import settings
+
+# Test processes share the machine. Threads that libraries start in each of them spin while they wait for one another:
+# without this a system of a hundred equations takes OpenBLAS fifty times as long, and a build twice. Must stand before
+# NumPy is imported; what tests start inherits it. Threads of our own are as many as ever.
+for _threads in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "OPENCV_FOR_THREADS_NUM"):
+    os.environ.setdefault(_threads, "1")
+
+# Sessions and tables are written to the disk for good, step by step: a run of twenty lights waits for it half a second.
+# What is lost with the power is of no interest here, and in memory nobody waits.
+MEMORY = Path("/dev/shm")
+MEMORY_BYTES = 4 << 30
+"""Free space from which temporary folders lie in memory: what is there at a time of a whole run is below a gigabyte,
+since the folders of tests that pass are removed at once."""
+
+if MEMORY.is_dir() and os.access(MEMORY, os.W_OK) and shutil.disk_usage(MEMORY).free > MEMORY_BYTES:
+    os.environ.setdefault("PYTEST_DEBUG_TEMPROOT", str(MEMORY))
 
 # PyTorch loads Triton's LLVM where that is installed, which crashes a process in which Mesa has loaded its own for
 # OpenGL. No program shows a full screen and trains; a test process may do both. None keeps a module from

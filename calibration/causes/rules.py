@@ -218,13 +218,25 @@ RULES: tuple[Rule, ...] = (
     ),
     Rule(
         OBJECT_IN_FRAME,
-        PLACE | SHEET | DRIFT,
+        frozenset({"unlike_block"}) | SHEET | DRIFT,
         (
             *_IN_FEW_FRAMES,
             Condition("even_showing", 1e-9, 1),
+            Condition("deviation", -1, _FAR),
             *_SHARP_PLACE,
         ),
         "one place is off in few frames, a white one among them, and as it should be in the others",
+    ),
+    Rule(
+        OBJECT_IN_FRAME,
+        frozenset({"disturbed_cells"}),
+        (
+            *_IN_FEW_FRAMES,
+            Condition("even_showing", 1e-9, 1),
+            Condition("deviation", -1, 0),
+            *_SHARP_PLACE,
+        ),
+        "few cells look covered in few frames, a white one among them, and are as they should be in the others",
     ),
     Rule(
         REFLECTION_IN_FRAME,

@@ -74,7 +74,7 @@ def with_changes(citation: CitationSettings, changes: dict[str, Any]) -> Citatio
         return CitationSettings.model_validate(citation.model_dump() | changes)
     except ValidationError as error:
         first = error.errors()[0]
-        key = str(first["loc"][0]).replace("_", "-").removeprefix("camera-")
+        key = str(first["loc"][0]).replace("_", "-").removeprefix("camera-").replace("authors", "author")
         reason = str(first["msg"]).removeprefix("Value error, ")
         raise InputError(f"--{key} {first['input']!r}: {reason}") from error
 

@@ -264,6 +264,27 @@ def with_lens(baseline: Baseline, first: DecodedFrame, primaries: Sequence[Decod
     return replace(corrected, lens=lens)
 
 
+def with_primaries(baseline: Baseline, primaries: Primaries | None) -> Baseline:
+    """Return the baseline with what frames of the primaries alone show; as it is where there are none.
+
+    Cells of later frames are divided by the field of their own colour, and so are those that they are compared with.
+
+    Raises
+    ------
+    QualityError
+        The white references cannot be used.
+    """
+    if primaries is None:
+        return baseline
+    paper, shape = baseline.paper.read(baseline.whites, baseline.first.file)
+    cells = len(baseline.points.cells_mm)
+    evened = baseline.means[:cells] / (shape * primaries.field_ratio(paper.white))
+    check = _consistency_check(
+        baseline.chart, baseline.points, evened, baseline.transfer, baseline.options, baseline.first
+    )
+    return replace(baseline, primaries=primaries, consistency_check=check)
+
+
 def lens_figures(baseline: Baseline) -> LensFigures:
     """Return what is said of the lens of a session, measured or not, corrected or not."""
     if baseline.lens is None:
@@ -323,16 +344,14 @@ def _baseline(
         references = references - added[len(cells) :, None].astype(np.float32)
     level = cells.mean(axis=1)
     whites = usable_means(references, highest, registered.references, first.saturation)[: len(points.whites_mm)]
-    there = registered.cells.inside & ~registered.registration.mismatched_cells[chart.cell_of_colour]
-    codes = chart.rgb[chart.cell_of_colour]
     base = PaperReader(points.whites_mm, points.cells_mm, chart.page_mm).read(whites, first.record.file)[0].field
     if not chart.tags:
         # Its references are in the margin, and do not show what light there is in the middle.
+        there, codes = _compared(chart, registered), chart.rgb[chart.cell_of_colour]
         base = field_of_cells(codes, points.cells_mm, level, there, points.whites_mm, whites, chart.page_mm)
     order = MAX_ORDER if chart.tags else MAX_ORDER_AROUND
     transfer = photon_transfer(level, spread, options.samples)
     evened = level / base.at(points.cells_mm)
-    variance = transfer.variance(evened) / options.samples
     return Baseline(
         chart=chart,
         points=points,
@@ -343,8 +362,27 @@ def _baseline(
         means=np.concatenate([level, references.mean(axis=1, dtype=np.float64)]),
         paper=PaperReader(points.whites_mm, points.cells_mm, chart.page_mm, base, order),
         transfer=transfer,
-        consistency_check=ConsistencyCheck(codes, points.cells_mm, evened, variance, there),
+        consistency_check=_consistency_check(chart, points, evened, transfer, options, registered),
     )
+
+
+def _compared(chart: Chart, registered: RegisteredFrame) -> npt.NDArray[np.bool_]:
+    """Return which cells (C,) are inside the frame and look like the chart's."""
+    return registered.cells.inside & ~registered.registration.mismatched_cells[chart.cell_of_colour]
+
+
+def _consistency_check(
+    chart: Chart,
+    points: ChartPoints,
+    evened: _Array,
+    transfer: PhotonTransfer,
+    options: BuildOptions,
+    registered: RegisteredFrame,
+) -> ConsistencyCheck:
+    """Return the check of frames against cells' levels `evened` (C, 3) counts, in the frame `registered`."""
+    variance = transfer.variance(evened) / options.samples
+    codes = chart.rgb[chart.cell_of_colour]
+    return ConsistencyCheck(codes, points.cells_mm, evened, variance, _compared(chart, registered))
 
 
 def usable_means(

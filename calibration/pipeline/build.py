@@ -28,7 +28,7 @@ from acquisition.session.folder import Session
 from acquisition.session.records import FrameRecord
 from calibration.figures.linearity_figures import LinearityFigures
 from calibration.figures.table_figures import TableFigures
-from calibration.pipeline.baseline import baseline_of, with_lens
+from calibration.pipeline.baseline import baseline_of, with_lens, with_primaries
 from calibration.pipeline.checkpoint import Checkpoint, UnfinishedTable, unfinished_table
 from calibration.pipeline.collecting import check_figures, table_figures
 from calibration.pipeline.frames import (
@@ -72,8 +72,8 @@ REPORT_FILES = (REPORT_PAGE, REPORT_JSON)
 CHECKPOINT_EVERY = 16
 """Frames from one checkpoint to the next: what a build that is killed has to do again."""
 
-METHOD = 9
-"""Raised when samples or ground truth come out otherwise than before, so that no table is made by two methods."""
+METHOD = 10
+"""Raised when samples, ground truth or unfit cells come out otherwise than before, so that no table is of two methods."""
 
 _IN_PLACE = Shift(0.0, 0.0, 0.0, 0)
 """The movement of the frame in which the chart is registered first."""
@@ -352,7 +352,7 @@ def _begin(job: _Job, checkpoint: Checkpoint | None, writer: LutWriter) -> _Buil
     pure = [decode_frame(session, record) for record in selected.primaries]
     baseline = with_lens(baseline_of(session.chart, first, job.options), first, pure)
     primaries = measure_primaries(baseline, pure)
-    intake = Intake(session, selected, replace(baseline, primaries=primaries))
+    intake = Intake(session, selected, with_primaries(baseline, primaries))
     linearity = None if job.linearity is None else read_linearity(job.linearity, baseline)
     taken = intake.before_all_frames(first.saturation)
     if checkpoint is not None:

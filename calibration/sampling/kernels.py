@@ -10,12 +10,11 @@ from __future__ import annotations
 
 from typing import Any
 
-import numba
 import numpy as np
 import numpy.typing as npt
-from numba import uint64
+from numpy import uint64
 
-from foundation.compiled import compiled
+from foundation.compiled import compiled, inlined
 
 _Array = npt.NDArray[np.float64]
 _Float = npt.NDArray[np.float32]
@@ -24,7 +23,7 @@ _Place = npt.NDArray[np.int64]
 _Mask = npt.NDArray[np.bool_]
 
 
-@numba.njit(inline="always")
+@inlined
 def _rounded(value: Any, field: Any) -> Any:
     """Return a sample as the table holds it."""
     return np.uint16(min(max(np.rint(value / field), np.float32(0)), np.float32(65535)))

@@ -270,7 +270,7 @@ def _drawn(
     reference = reference_light(lut, target.lights)
     black = None
     if rendered.black_point.kind == "like":
-        black = _black_under(lut, reference, grey=rendered.rendering == "colorimetric")
+        black = _black_under(lut, reference, rendered)
         rendered = replace(rendered, black_point=KEEP)
     photograph = partial(_photograph, lut, reference, rendered, seed)
     with progress("pictures") as shown:
@@ -278,12 +278,16 @@ def _drawn(
     return draw_pictures(measured, target, count, seed)
 
 
-def _black_under(lut: Lut, light: int, grey: bool) -> BlackShares:
+def _black_under(lut: Lut, light: int, rendered: DatasetOptions) -> BlackShares:
     """Return the print's black under a light of the table; a QualityError where it is as bright as half of white."""
-    from generator.lights.lighting import plain
+    from generator.dataset.production.photographing import rendering_of
+    from generator.lights.lighting import Lighting, plain
     from generator.likeness.pictures import BlackShares
     from generator.rendering.black_points import veil_of
 
+    grey = None
+    if rendered.rendering == "colorimetric":
+        grey = rendering_of(lut, rendered).mixtures_for(Lighting((plain(light),))).black
     red, green, blue = veil_of(lut, plain(light), 1.0, grey).taken.tolist()
     return BlackShares((red, green, blue))
 

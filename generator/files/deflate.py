@@ -24,7 +24,7 @@ from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
-from numba import uint16, uint32, uint64
+from numpy import uint16, uint32, uint64
 
 from foundation.compiled import compiled
 from generator.files.huffman import (

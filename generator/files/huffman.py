@@ -9,7 +9,7 @@ from __future__ import annotations
 from typing import Any, Final
 
 import numpy as np
-from numba import uint8, uint32, uint64
+from numpy import uint8, uint32, uint64
 
 from foundation.compiled import compiled
 

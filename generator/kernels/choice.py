@@ -22,10 +22,10 @@ from __future__ import annotations
 
 from typing import Any, Final
 
-import numba
 import numpy as np
-from numba import uint32, uint64
+from numpy import uint32, uint64
 
+from foundation.compiled import inlined
 from generator.kernels.vector import GROUP, LANES, LINE, choose, copy1, prefetch_once
 from generator.philox import KEY_STEPS, MULTIPLIERS, ROUNDS, SAMPLES
 
@@ -48,7 +48,7 @@ _HALF: Final = np.uint64(32)
 _PURPOSE: Final = np.uint32(SAMPLES)
 
 
-@numba.njit(inline="always")
+@inlined
 def philox4x32(c0: Any, c1: Any, c2: Any, c3: Any, seed: Any) -> Any:
     """Return the four words of Philox4x32-10, compiled; words and counter are uint32, `seed` is uint64."""
     k0, k1 = uint32(seed), uint32(seed >> _HALF)
@@ -64,26 +64,26 @@ def philox4x32(c0: Any, c1: Any, c2: Any, c3: Any, seed: Any) -> Any:
     return c0, c1, c2, c3
 
 
-@numba.njit(inline="always")
+@inlined
 def row_words(y: Any, place: Any, image: Any, seed: Any) -> Any:
     """Return the three keys (uint32) of row `y`, and the word that `dithering.py` has for its own; `seed` is uint64."""
     k0, k1, k2, k3 = philox4x32(uint32(y), uint32(place), uint32(image), _PURPOSE, seed)
     return (k0, k1, k2), k3
 
 
-@numba.njit(inline="always")
+@inlined
 def row_keys(y: Any, place: Any, image: Any, seed: Any) -> Any:
     """Return the three keys (uint32) of row `y`; `seed` is uint64."""
     return row_words(y, place, image, seed)[0]
 
 
-@numba.njit(inline="always")
+@inlined
 def offsets_slot(scratch: int, group: int) -> int:
     """Return where in a thread's scratch memory the offsets of `group` stand until they are used."""
     return scratch + EDGE_BYTES + OFFSETS_BYTES * (group & 3)
 
 
-@numba.njit(inline="always")
+@inlined
 def group_address(row: int, width: int, group: int, scratch: int) -> int:
     """Return where the pixels from x = 32 `group` on can be read; `row` is the address of a row's first pixel.
 
@@ -97,7 +97,7 @@ def group_address(row: int, width: int, group: int, scratch: int) -> int:
     return source
 
 
-@numba.njit(inline="always")
+@inlined
 def prefetch_group(row: int, group: int) -> None:
     """Prefetch a group's share of the pixels that will be read soon; to be called for every group in turn."""
     line = row + 3 * GROUP * group + _PREFETCH_BYTES
@@ -105,7 +105,7 @@ def prefetch_group(row: int, group: int) -> None:
     prefetch_once(line + LINE)
 
 
-@numba.njit(inline="always")
+@inlined
 def choose_group(row: int, width: int, group: int, keys: Any, count: Any, bits: Any, scratch: int, target: int) -> None:
     """Write the offsets, uint32 bytes, of the samples of a row's pixels from x = 32 `group` on at `target`."""
     source = group_address(row, width, group, scratch)

@@ -25,14 +25,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any, Final
 
-import numba
 import numpy as np
 import numpy.typing as npt
 from llvmlite import ir
-from numba import types, uint32
-from numba.extending import intrinsic
+from numpy import uint32
 
-from foundation.compiled import compiled
+from foundation.compiled import compiled, inlined, intrinsic
 from foundation.errors import InputError
 from generator.kernels.arguments import Picture, check_picture, check_seed, packed_rows, run_in_threads
 from generator.kernels.choice import OFFSETS_BYTES, SCRATCH_BYTES, group_address, row_words
@@ -141,7 +139,7 @@ def find_places(typing: Any, picture: Any, word: Any, k0: Any, k1: Any, k2: Any,
     `word` is the number of the group's first word; 96 bytes are read, 128 written.
     """
     del typing, picture, word, k0, k1, k2, k3, target
-    number = types.uint32
+    number = "uint32"
 
     def emit(
         builder: Builder, picture: Value, word: Value, k0: Value, k1: Value, k2: Value, k3: Value, target: Value
@@ -157,7 +155,7 @@ def find_places_and_choose(
 ) -> Any:
     """Do `find_places`, and write to `choices` the offsets, uint32 bytes, of the samples among those of a colour."""
     del typing, picture, word, k0, k1, k2, k3, count, target, choices
-    number = types.uint32
+    number = "uint32"
 
     def emit(
         builder: Builder,
@@ -205,7 +203,7 @@ def write_offsets(typing: Any, places: Any, cells: Any, stride: Any, choices: An
             chosen = load(builder, choices, 4 * LANES * half, WORDS)
             store(builder, builder.add(builder.mul(named, factor), chosen), target, 4 * LANES * half)
 
-    return void(emit, ADDRESS, ADDRESS, types.uint32, ADDRESS, ADDRESS)
+    return void(emit, ADDRESS, ADDRESS, "uint32", ADDRESS, ADDRESS)
 
 
 @intrinsic
@@ -242,24 +240,24 @@ def write_codes(typing: Any, cells: Any, bits: Any, target: Any) -> Any:
                 packed = builder.shuffle_vector(each, each, constant(ir.VectorType(I32, 16), [*lanes, *lanes[:4]]))
                 store(builder, packed, target, 3 * LANES * half + 12 * four)
 
-    return void(emit, ADDRESS, types.uint32, ADDRESS)
+    return void(emit, ADDRESS, "uint32", ADDRESS)
 
 
-@numba.njit(inline="always")
+@inlined
 def dither_row(cells: int, y: Any, image: Any, seed: Any) -> Any:
     """Return the keys of row `y` that `choice.row_keys` returns, and the table of cells with the row's fourth word."""
     keys, k3 = row_words(y, 0, image, seed)
     return keys, (cells, k3)
 
 
-@numba.njit(inline="always")
+@inlined
 def _slots(scratch: int, group: int) -> Any:
     """Return where in `DITHER_BYTES` of memory a group's places and choices stand until they are used."""
     slot = scratch + (PLACES_BYTES + OFFSETS_BYTES) * (group & 3)
     return slot, slot + PLACES_BYTES
 
 
-@numba.njit(inline="always")
+@inlined
 def locate(row: int, width: int, group: int, inks: Any, keys: Any, count: Any, scratch: int, memory: int) -> None:
     """Do the first step of a group: find where the cells of a row's pixels from x = 32 `group` on stand.
 
@@ -270,7 +268,7 @@ def locate(row: int, width: int, group: int, inks: Any, keys: Any, count: Any, s
     find_places_and_choose(source, word, keys[0], keys[1], keys[2], inks[1], count, places, choices)
 
 
-@numba.njit(inline="always")
+@inlined
 def offset_cells(group: int, inks: Any, stride: Any, memory: int, target: int) -> None:
     """Do the second step: write what `choice.choose_group` writes, for the cells; `stride` is a colour's bytes."""
     places, choices = _slots(memory, group)

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
-import numba
-from numba import uint32
+from numpy import uint32
 
-from foundation.compiled import compiled
+from foundation.compiled import compiled, inlined
 from generator.kernels.choice import LEAD, SCRATCH_BYTES, choose_group, offsets_slot, prefetch_group
 from generator.kernels.dithering import LOCATE_LEAD, locate, offset_cells
 from generator.kernels.vector import (
@@ -23,7 +22,7 @@ from generator.kernels.vector import (
 )
 
 
-@numba.njit(inline="always")
+@inlined
 def choose_first_groups(
     row: int, width: int, keys: Any, count: Any, bits: Any, scratch: int, begin: int, limit: int
 ) -> None:
@@ -32,7 +31,7 @@ def choose_first_groups(
         choose_group(row, width, group, keys, count, bits, scratch, offsets_slot(scratch, group))
 
 
-@numba.njit(inline="always")
+@inlined
 def draw_groups(
     row: int,
     width: int,
@@ -113,13 +112,13 @@ def draw_dithered(
                     copy6(samples + offset_at(offsets + 4 * i), at + SAMPLE_BYTES * i)
 
 
-@numba.njit(inline="always")
+@inlined
 def _prefetch_lines(prefetch_from: int, lines: int, group: int) -> None:
     for line in range(lines * group, lines * (group + 1)):
         prefetch(prefetch_from + LINE * line)
 
 
-@numba.njit(inline="always")
+@inlined
 def _copy_group(samples: int, offsets: int, target: int) -> None:
     """Write the samples of a whole group, and two bytes more: each copy's last two are the next one's first two."""
     for i in range(GROUP):

@@ -20,12 +20,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any, Final
 
-import numba
 import numpy as np
 import numpy.typing as npt
-from numba import uint32
+from numpy import uint32
 
-from foundation.compiled import compiled
+from foundation.compiled import compiled, inlined
 from foundation.errors import InputError
 from generator.kernels import streaming
 from generator.kernels.arguments import (
@@ -89,7 +88,7 @@ def _fill_means(samples: int, chosen: Any, count: int, means: int, step: int) ->
     return most
 
 
-@numba.njit(inline="always")
+@inlined
 def _single_light(pair_weights: Any, count: int) -> int:
     """Return the only light with weights other than 0 in a segment's first pixels if they are all 1, else -1."""
     lit, single = 0, -1

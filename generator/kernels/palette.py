@@ -9,12 +9,11 @@ from __future__ import annotations
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
-import numba
 import numpy as np
 import numpy.typing as npt
-from numba import uint32
+from numpy import uint32
 
-from foundation.compiled import compiled
+from foundation.compiled import compiled, inlined
 from foundation.errors import InputError, QualityError
 from generator.kernels.choice import EDGE_BYTES, OFFSETS_BYTES, group_address
 from generator.kernels.vector import GROUP, copy1, offset_at, write_colours
@@ -167,7 +166,7 @@ def _find(pixels: int, count: int, bits: Any, found: int, scratch: int) -> None:
             copy1(one, found + offset_at(places + 4 * i))
 
 
-@numba.njit(inline="always")
+@inlined
 def _colour_at(picture: Any, y: int, x: int, bits: Any) -> Any:
     low = np.uint32(8) - bits
     red, green, blue = picture[y, x, 0] >> low, picture[y, x, 1] >> low, picture[y, x, 2] >> low

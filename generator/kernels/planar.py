@@ -21,7 +21,7 @@ from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
-from numba import uint32
+from numpy import uint32
 
 from foundation.compiled import compiled
 from foundation.errors import InputError

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 import numpy.typing as npt
-from numba import uint32
+from numpy import uint32
 
 from foundation.compiled import compiled
 from foundation.errors import InputError

@@ -7,8 +7,7 @@ from __future__ import annotations
 
 from typing import Final
 
-import numba
-
+from foundation.compiled import inlined
 from generator.kernels.vector import LINE, copy2, copy_line, stream_line
 
 STREAMED_BYTES: Final = 24 << 20
@@ -20,13 +19,13 @@ def line_buffer_bytes(segment_bytes: int) -> int:
     return segment_bytes + 3 * LINE
 
 
-@numba.njit(inline="always")
+@inlined
 def first_line(buffer: int) -> int:
     """Return the address of the first whole line in the memory at `buffer`."""
     return (buffer + LINE - 1) & -LINE
 
 
-@numba.njit(inline="always")
+@inlined
 def stream_lines(lines: int, begin: int, stop: int, last: bool) -> int:
     """Stream the content of `lines` to its target, from the line of address `begin` up to `stop`; both are even.
 

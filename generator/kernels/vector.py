@@ -14,8 +14,8 @@ from collections.abc import Callable, Sequence
 from typing import Any, Final
 
 from llvmlite import ir
-from numba import types
-from numba.extending import intrinsic
+
+from foundation.compiled import intrinsic
 
 LANES: Final = 16
 """Numbers of 32 bits in a vector: one register of AVX-512."""
@@ -35,7 +35,7 @@ WORDS = ir.VectorType(I32, LANES)
 _PAIRS = ir.VectorType(I64, LANES // 2)
 _EIGHT_FLOATS, _EIGHT_WORDS = ir.VectorType(F32, EIGHT), ir.VectorType(I32, EIGHT)
 _LINE = ir.VectorType(I32, LINE // 4)
-ADDRESS = types.int64
+ADDRESS: Final = "int64"
 _MULTIPLIERS: Final = (0x21F0AAAD, 0x735A2D97, 0x31848BAB)
 """Of the three rounds of the choice rule; `choice.py` names their source."""
 
@@ -138,7 +138,15 @@ def digits(builder: Builder, h: Value, count: Value) -> tuple[Value, ...]:
     )
 
 
-def void(emit: Callable[..., None], *kinds: Any) -> Any:
+def signature(returned: str, *kinds: str) -> Any:
+    """Return numba's type of a function that returns one kind and takes others, by their names."""
+    from numba import types
+
+    named: Any = types
+    return getattr(named, returned)(*(getattr(named, kind) for kind in kinds))
+
+
+def void(emit: Callable[..., None], *kinds: str) -> Any:
     """Return what numba wants of an intrinsic that returns nothing."""
 
     def generate(context: Any, builder: Builder, signature: Any, arguments: Sequence[Value]) -> Value:
@@ -146,7 +154,7 @@ def void(emit: Callable[..., None], *kinds: Any) -> Any:
         emit(builder, *arguments)
         return context.get_dummy_value()
 
-    return types.void(*kinds), generate
+    return signature("void", *kinds), generate
 
 
 @intrinsic
@@ -156,7 +164,7 @@ def choose(typing: Any, picture: Any, word: Any, k0: Any, k1: Any, k2: Any, coun
     `word` is the number of the group's first word; 96 bytes are read, 128 written.
     """
     del typing, picture, word, k0, k1, k2, count, bits, target
-    number = types.uint32
+    number = "uint32"
 
     def emit(
         builder: Builder,
@@ -200,14 +208,14 @@ def write_colours(
             for factor, place in ((stride, target), (other_stride, other_target)):
                 store(builder, builder.mul(colours, broadcast(builder, factor, WORDS)), place, 4 * LANES * half)
 
-    return void(emit, ADDRESS, types.uint32, types.uint32, ADDRESS, types.uint32, ADDRESS)
+    return void(emit, ADDRESS, "uint32", "uint32", ADDRESS, "uint32", ADDRESS)
 
 
 @intrinsic
 def choose_for_colours(typing: Any, colours: Any, word: Any, k0: Any, k1: Any, k2: Any, count: Any, target: Any) -> Any:
     """Write what `choose` writes for the 32 pixels whose colours stand at `colours`, times the bytes of a colour."""
     del typing, colours, word, k0, k1, k2, count, target
-    number = types.uint32
+    number = "uint32"
 
     def emit(
         builder: Builder, colours: Value, word: Value, k0: Value, k1: Value, k2: Value, count: Value, target: Value
@@ -229,7 +237,7 @@ def offset_at(typing: Any, source: Any) -> Any:
         del context, signature
         return builder.zext(load(builder, arguments[0], 0, I32), I64)
 
-    return types.int64(ADDRESS), generate
+    return signature("int64", ADDRESS), generate
 
 
 def _copying(*parts: tuple[int, Any]) -> Callable[..., None]:
@@ -373,7 +381,7 @@ def plane1(typing: Any, source: Any, factor: Any, summand: Any, limit: Any, targ
         value = builder.fmul(builder.uitofp(load(builder, source, 0, I16), F32), factor)
         store(builder, minimum(builder, builder.fadd(value, summand), limit), target, 0)
 
-    return void(emit, ADDRESS, types.float32, types.float32, types.float32, ADDRESS)
+    return void(emit, ADDRESS, "float32", "float32", "float32", ADDRESS)
 
 
 def _prefetching(locality: int) -> Callable[..., None]:

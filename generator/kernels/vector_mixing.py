@@ -7,10 +7,8 @@ from contextlib import contextmanager
 from typing import Any, Final
 
 from llvmlite import ir
-from numba import types
-from numba.core import cgutils
-from numba.extending import intrinsic
 
+from foundation.compiled import intrinsic
 from generator.kernels.vector import (
     ADDRESS,
     F32,
@@ -29,6 +27,7 @@ from generator.kernels.vector import (
     constant,
     load,
     minimum,
+    signature,
     store,
     void,
 )
@@ -61,6 +60,8 @@ def mean4(typing: Any, source: Any, count: Any, target: Any) -> Any:
     del typing, source, count, target
 
     def generate(context: Any, builder: Builder, signature: Any, arguments: Sequence[Value]) -> Value:
+        from numba.core import cgutils
+
         del context, signature
         source, count, target = arguments
         wide, real = ir.VectorType(I64, _QUAD), ir.VectorType(ir.DoubleType(), _QUAD)
@@ -81,7 +82,7 @@ def mean4(typing: Any, source: Any, count: Any, target: Any) -> Any:
             largest = builder.select(builder.icmp_unsigned(">", value, largest), value, largest)
         return largest
 
-    return types.int64(ADDRESS, types.int64, ADDRESS), generate
+    return signature("int64", ADDRESS, "int64", ADDRESS), generate
 
 
 def _for_each_line(builder: Builder, weights: Value, count: Value, do: Callable[[Value, Value], None]) -> None:
@@ -112,6 +113,8 @@ def weight_flags(typing: Any, weights: Any, count: Any) -> Any:
     del typing, weights, count
 
     def generate(context: Any, builder: Builder, signature: Any, arguments: Sequence[Value]) -> Value:
+        from numba.core import cgutils
+
         del context, signature
         ones = builder.bitcast(ir.Constant(FLOATS, [1.0] * LANES), WORDS)
         found = [cgutils.alloca_once_value(builder, constant(WORDS, 0)) for _ in range(2)]
@@ -125,7 +128,7 @@ def weight_flags(typing: Any, weights: Any, count: Any) -> Any:
         lit, less = (_any_nonzero(builder, builder.load(seen)) for seen in found)
         return builder.or_(lit, builder.shl(less, ir.Constant(I64, 2)))
 
-    return types.int64(ADDRESS, types.int64), generate
+    return signature("int64", ADDRESS, "int64"), generate
 
 
 @intrinsic
@@ -155,6 +158,8 @@ def arrange_weights(typing: Any, weights: Any, count: Any, target: Any) -> Any:
     del typing, weights, count, target
 
     def generate(context: Any, builder: Builder, signature: Any, arguments: Sequence[Value]) -> Value:
+        from numba.core import cgutils
+
         del context, signature
         weights, count, target = arguments
         lanes = constant(WORDS, [2 * pixel + light for pixel, light in _ORDER])
@@ -168,7 +173,7 @@ def arrange_weights(typing: Any, weights: Any, count: Any, target: Any) -> Any:
         _for_each_line(builder, weights, count, put)
         return _any_nonzero(builder, builder.load(seen))
 
-    return types.int64(ADDRESS, types.int64, ADDRESS), generate
+    return signature("int64", ADDRESS, "int64", ADDRESS), generate
 
 
 @contextmanager
@@ -177,6 +182,8 @@ def _blocks(builder: Builder, count: Value) -> Generator[tuple[Value, Value]]:
 
     Where `count` is no multiple of eight, the last eight overlap the ones before.
     """
+    from numba.core import cgutils
+
     blocks = builder.lshr(builder.add(count, ir.Constant(I64, BLOCK - 1)), ir.Constant(I64, 3))
     last = builder.sub(count, ir.Constant(I64, BLOCK))
     with cgutils.for_range(builder, blocks) as loop:
@@ -264,6 +271,8 @@ def mix(typing: Any, plan: Any, pairs: Any, count: Any, means: Any, faults: Any,
         white: Value,
         target: Value,
     ) -> None:
+        from numba.core import cgutils
+
         def number(value: int) -> Value:
             return ir.Constant(I64, value)
 
@@ -293,6 +302,8 @@ def mix(typing: Any, plan: Any, pairs: Any, count: Any, means: Any, faults: Any,
             return totals
 
         def of_all(block: Value, place: Value) -> Sequence[Value]:
+            from numba.core import cgutils
+
             for one in sums:
                 builder.store(zero, one)
             with cgutils.for_range(builder, pairs) as loop:
@@ -308,4 +319,4 @@ def mix(typing: Any, plan: Any, pairs: Any, count: Any, means: Any, faults: Any,
                 fill(of_all)
         store(builder, builder.load(fault), faults, 0)
 
-    return void(emit, ADDRESS, types.int64, types.int64, ADDRESS, ADDRESS, types.float32, ADDRESS)
+    return void(emit, ADDRESS, "int64", "int64", ADDRESS, ADDRESS, "float32", ADDRESS)

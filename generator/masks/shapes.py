@@ -11,11 +11,10 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Final, Protocol
 
-import numba
 import numpy as np
 import numpy.typing as npt
 
-from foundation.compiled import compiled
+from foundation.compiled import compiled, inlined
 from generator import philox
 
 Array = npt.NDArray[np.floating[Any]]
@@ -73,7 +72,7 @@ class Shape(Protocol):
         ...
 
 
-@numba.njit(inline="always")
+@inlined
 def stepped(x: Any) -> Any:
     """Return for float32 x 0 below 0, 1 above 1, and 3x² − 2x³ between (the cubic Hermite step)."""
     x = min(max(x, _ZERO), _ONE)

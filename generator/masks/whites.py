@@ -4,16 +4,15 @@ from __future__ import annotations
 
 from typing import Any, Final
 
-import numba
 import numpy as np
 import numpy.typing as npt
 
-from foundation.compiled import compiled
+from foundation.compiled import compiled, inlined
 
 _ZERO: Final = np.float32(0)
 
 
-@numba.njit(inline="always")
+@inlined
 def _light_at(weights: Any, whites: Any, y: int, x: int) -> Any:
     """Return linear red, green and blue of the light of a pixel."""
     red = green = blue = _ZERO
@@ -25,7 +24,7 @@ def _light_at(weights: Any, whites: Any, y: int, x: int) -> Any:
     return red, green, blue
 
 
-@numba.njit(inline="always")
+@inlined
 def _quantised(red: Any, green: Any, blue: Any, full: Any) -> Any:
     """Return r, g and b as whole parts of `full` that sum to it; green takes the errors of rounding."""
     total = red + green + blue

@@ -11,7 +11,7 @@ from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
-from numba import uint8, uint16, uint64
+from numpy import uint8, uint16, uint64
 
 from foundation.compiled import compiled
 from generator.pictures.tonemap import DARK, flash_from_brightness

@@ -14,9 +14,9 @@ inside:
   have one. Cut off at 0, black would be too bright by .4 σ. So of a cell with samples below 0 these become 0, and all
   above are lowered by one number that keeps the cell's mean. Where a cell is darker than what is taken out, it is 0.
 - Rounding keeps the mean of a cell: each sample takes over what rounding the one before has left.
-- Black ink has a tint. Of images rendered by codes the black cell's b is taken out whole. Rendered by colour, greys lie
-  between one grey black point and one white point; taking out a tinted b would tint them, the darkest most. There b is
-  the grey in it: W times the least b / W of the channels.
+- Of images rendered by codes the black cell's b is taken out whole, its tint included. Rendered by colour, black is not
+  that cell: it was mapped to the darkest grey that mixtures of cells make, which is brighter. There b is that grey, of
+  every light on the image, so that a share of 1 undoes the mapping and greys stay grey.
 - What is saturated stays saturated: with W above the white level, the white level is taken for it.
 - Several lights on a pixel: each light's samples lose that light's veil before they are mixed, since light adds. To
   take the veil out of the mixture instead is the same where b / W is that of all its lights, and else differs by less
@@ -153,7 +153,7 @@ class Veil:
     stretch: _Array
 
 
-def black_of(lut: Lut, light: Mixture, grey: bool = False) -> _Array:
+def black_of(lut: Lut, light: Mixture) -> _Array:
     """Return what the camera sees of the chart's black cell under a light: (3,) float64, counts, the samples' mean.
 
     Where the table lists black as unfit, it is that of the nearest fit cell.
@@ -164,8 +164,6 @@ def black_of(lut: Lut, light: Mixture, grey: bool = False) -> _Array:
         The table.
     light
         The light.
-    grey
-        Whether only the grey in it is wanted: the light's white times the channels' least share of it.
 
     Raises
     ------
@@ -176,14 +174,10 @@ def black_of(lut: Lut, light: Mixture, grey: bool = False) -> _Array:
     unfit = sorted({cell.colour for cell in lut.provenance.unfit})
     cell = int(nearest_fit_colours(unfit, lut.provenance.bits)[0]) if unfit and unfit[0] == 0 else 0
     means = [lut.samples[number, cell].mean(axis=0, dtype=np.float64) for number in light.lights]
-    black = np.asarray(light.weights) @ np.array(means)
-    if not grey:
-        return black
-    white = light.white(lut)
-    return white * float((black / white).min())
+    return np.asarray(light.weights) @ np.array(means)
 
 
-def veil_of(lut: Lut, light: Mixture, share: float, grey: bool = False) -> Veil:
+def veil_of(lut: Lut, light: Mixture, share: float, grey: float | None = None) -> Veil:
     """Return what taking out a share of the print's black means under a light.
 
     Parameters
@@ -195,7 +189,8 @@ def veil_of(lut: Lut, light: Mixture, share: float, grey: bool = False) -> Veil:
     share
         0 … 1.
     grey
-        Whether only the grey in black is meant, as of images rendered by colour.
+        What black was mapped to, over the light's white, of images rendered by colour (`CellMixtures.black`); None for
+        the black cell.
 
     Raises
     ------
@@ -204,7 +199,7 @@ def veil_of(lut: Lut, light: Mixture, share: float, grey: bool = False) -> Veil:
     QualityError
         Black is half as bright as white or brighter in a channel.
     """
-    black = black_of(lut, light, grey)
+    black = black_of(lut, light) if grey is None else grey * light.white(lut)
     white = np.minimum(light.white(lut), lut.provenance.white_level)
     if (2 * black >= white).any():
         shown = " ".join(f"{part:.3g}" for part in black / white)

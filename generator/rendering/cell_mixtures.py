@@ -91,6 +91,11 @@ class CellMixtures:
     colours: npt.NDArray[np.float32]
     wanted: npt.NDArray[np.float32]
 
+    @property
+    def black(self) -> float:
+        """What black, the first wanted colour, was mapped to: the mean of its channels, over the white of the light."""
+        return float(self.wanted[0].mean(dtype=np.float64))
+
     @cached_property
     def distance(self) -> npt.NDArray[np.float32]:
         """(K,) float32, angle between the mean of the 16 and the wanted colour, degrees."""

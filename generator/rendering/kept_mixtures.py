@@ -9,8 +9,6 @@ folder.
 from __future__ import annotations
 
 import contextlib
-import os
-import sys
 import uuid
 import zlib
 from pathlib import Path
@@ -20,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from foundation.errors import CropError
-from foundation.files import whole_file
+from foundation.files import cache_folder, whole_file
 from foundation.hashing import sha256_of
 from generator.rendering.cell_mixtures import SLOTS, CellMixtures
 
@@ -37,26 +35,6 @@ _LEVEL: Final = 1
 
 MOST_BYTES: Final = 1 << 30
 """Room that kept mixtures may take, bytes: those of all 707 lights of a table with one matrix and more."""
-
-
-def cache_folder() -> Path | None:
-    r"""Return the user's folder for what can be computed again, or None if there is no home.
-
-    `$XDG_CACHE_HOME/croplab` or `~/.cache/croplab` (XDG Base Directory Specification 0.8), on macOS
-    `~/Library/Caches/croplab`, on Windows `%LOCALAPPDATA%\croplab\Cache`. A relative `XDG_CACHE_HOME` is ignored, as
-    that specification says.
-    """
-    given = Path(os.environ.get("XDG_CACHE_HOME", ""))
-    if given.is_absolute():
-        return given / "croplab"
-    local = os.environ.get("LOCALAPPDATA")
-    if sys.platform == "win32" and local:
-        return Path(local) / "croplab" / "Cache"
-    try:
-        home = Path.home()
-    except RuntimeError:
-        return None
-    return home / ("Library/Caches" if sys.platform == "darwin" else ".cache") / "croplab"
 
 
 def load_mixtures(key: str, nodes: int, folder: Path | None = None) -> CellMixtures | None:

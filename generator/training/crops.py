@@ -33,7 +33,7 @@ from generator.kernels.palette import replace_unfit_colours
 from generator.kernels.planar import draw_batch
 from generator.lights.lighting import Lighting, Mixture
 from generator.rendering import Rendering
-from generator.rendering.black_points import KEEP, BlackPoint, black_of, veil_of
+from generator.rendering.black_points import KEEP, BlackPoint, veil_of
 from generator.training.recycling import Recycled
 from generator.variation.iso_speed import IsoSpeed
 from generator.variation.sensor_noise import SensorNoise
@@ -213,11 +213,10 @@ class Crops:
             else replace_unfit_colours(gallery.picture(number), lut.provenance)[0]
             for number in range(len(gallery))
         ]
-        veiled, grey = black_point.kind != "keep", rendering == "colorimetric"
-        self._blacks = np.stack([black_of(lut, mixture, grey) for mixture in mixtures]) if veiled else None
+        self._blacks: list[npt.NDArray[np.float64]] = []
+        if black_point.kind != "keep" and not self._cells:
+            self._blacks = [veil_of(lut, mixture, 1.0).taken for mixture in mixtures]
         self._whites = np.minimum(whites, lut.provenance.white_level)
-        for mixture in mixtures if veiled else ():
-            veil_of(lut, mixture, 1.0, grey)
 
     def __reduce__(self) -> tuple[Any, ...]:
         # The table is gigabytes; its folder is enough to map it again.
@@ -282,8 +281,8 @@ class Crops:
         seeds = low.astype(np.uint64) | high.astype(np.uint64) << _HALF
         shares = self.black_point.shares(veil)
         taken, stretches = None, np.float64(1)
-        if self._blacks is not None:
-            taken = shares[:, None] * self._blacks[lights]
+        if self.black_point.kind != "keep":
+            taken = shares[:, None] * np.stack([self._black_of(light) for light in map(int, lights)])
             stretches = 1 / (1 - taken / self._whites[lights])
         images = draw_batch(
             self._tables,
@@ -316,6 +315,10 @@ class Crops:
                 threads=self.threads,
             )
         return Batch(images, self._truths[lights], lights, pictures, shares)
+
+    def _black_of(self, light: int) -> npt.NDArray[np.float64]:
+        """Return what a black point takes of a light at most, (3,) counts."""
+        return self._cells.black(light) if self._cells and not self._blacks else self._blacks[light]
 
     def __getitem__(self, item: int) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]:
         """Return the image (3, height, width) float32 and the illuminant (3,) float32 of one item.
@@ -367,21 +370,32 @@ def _tables_of(lut: Lut, lights: Sequence[Mixture], seed: int) -> tuple[npt.NDAr
 
 
 class _Cells:
-    """For each light the cells that stand for source colours under it, found when they are first asked for."""
+    """For each light what stands for source colours under it, found when it is first asked for."""
 
     def __init__(self, lut: Lut, lights: Sequence[Mixture], matrix: ColourMatrix | None) -> None:
         from generator.rendering.colorimetric import ColorimetricRendering
         from generator.rendering.table_matrix import matrix_for
 
+        self._lut = lut
         self._lights = lights
-        self._bits = lut.provenance.bits
         self._rendering = ColorimetricRendering(lut, matrix or matrix_for(lut))
-        self._found: dict[int, CellTable] = {}
+        self._found: dict[int, tuple[CellTable, float]] = {}
+        self._blacks: dict[int, npt.NDArray[np.float64]] = {}
 
     def __getitem__(self, light: int) -> CellTable:
+        """Return the cells of source colours under a light."""
+        return self._mixed(light)[0]
+
+    def black(self, light: int) -> npt.NDArray[np.float64]:
+        """Return what black was mapped to under a light, (3,) counts; a QualityError where it is half as bright."""
+        if light not in self._blacks:
+            self._blacks[light] = veil_of(self._lut, self._lights[light], 1.0, self._mixed(light)[1]).taken
+        return self._blacks[light]
+
+    def _mixed(self, light: int) -> tuple[CellTable, float]:
         if light not in self._found:
             mixtures = self._rendering.mixtures_for(Lighting((self._lights[light],)))
-            self._found[light] = checked_cells(mixtures.cells, self._bits)
+            self._found[light] = checked_cells(mixtures.cells, self._lut.provenance.bits), mixtures.black
         return self._found[light]
 
 

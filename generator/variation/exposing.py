@@ -21,12 +21,11 @@ from __future__ import annotations
 
 from typing import Any, Final
 
-import numba
 import numpy as np
 import numpy.typing as npt
-from numba import uint32, uint64
+from numpy import uint32, uint64
 
-from foundation.compiled import compiled
+from foundation.compiled import compiled, inlined
 from foundation.errors import InputError
 from generator import philox
 from generator.kernels.arguments import check_seed, check_white_level, run_in_threads
@@ -50,7 +49,7 @@ _ZERO: Final = np.float32(0)
 _ONE: Final = np.float32(1)
 
 
-@numba.njit(inline="always")
+@inlined
 def draw_row(key: Any, width: int, table: Any, deviates: Any) -> None:
     """Fill `deviates` (3 · width,) float32 with those of a row's pixels, red, green, blue."""
     state = key

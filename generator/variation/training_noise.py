@@ -9,7 +9,7 @@ from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
-from numba import uint32, uint64
+from numpy import uint32, uint64
 
 from foundation.compiled import compiled
 from foundation.errors import InputError

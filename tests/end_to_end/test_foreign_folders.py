@@ -15,6 +15,8 @@ COUNT = 40
 KNOWN = (
     ("dataset folder", 73),  # a list of hashes that names a file of a terabyte without a byte
     ("dataset folder", 1710),  # a mask of a thousand million pixels in a hundred bytes
+    ("dataset folder", 1002141),  # a folder that became a link before one of its files was changed
+    ("dataset parquet", 1000236),  # an image whose name has no ending
     ("dataset tiff", 85),
     ("dataset tar", 1685),  # a name of 70 000 characters, in a message
     ("session", 126),  # settings that are a link to a file outside

@@ -69,7 +69,7 @@ def main() -> int:
             pool = multiprocessing.get_context("fork").Pool(chosen.workers)
             results = pool.imap_unordered(_work, tasks)
         for found in results:
-            done += 200 * len(seeds)
+            done += min(200, chosen.count) * len(seeds)
             for fault in found:
                 last = fault.strip().splitlines()[-1]
                 faults[last[:100]] += 1

@@ -13,13 +13,8 @@ from typing import Any
 import pytest
 from typer.main import get_command
 
-COMMANDS = {
-    "acquire": "acquisition.cli",
-    "build-lut": "calibration.cli",
-    "generate": "generator.cli",
-    "evaluate": "evaluation.cli",
-    "sim": "synthesis.cli",
-}
+from tests.house_commands import COMMANDS
+
 ROOMS = ("drivers", "sim", "acquisition", "calibration", "synthesis", "generator", "evaluation")
 HEAVY = (
     *("numba", "matplotlib", "colour", "rawpy", "cv2", "scipy", "tifffile", "OpenImageIO"),

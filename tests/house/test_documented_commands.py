@@ -20,15 +20,9 @@ from typer.main import get_command
 from acquisition.config import load_lab
 from acquisition.lights.illuminations import plan_illuminations
 from acquisition.run.planning.work import planned_steps
+from tests.house_commands import COMMANDS
 
 ROOT = Path(__file__).parents[2]
-APPS = {
-    "acquire": "acquisition.cli",
-    "build-lut": "calibration.cli",
-    "generate": "generator.cli",
-    "evaluate": "evaluation.cli",
-    "sim": "synthesis.cli",
-}
 MADE = ("docs/reference/commands/", "docs/reference/api/")
 """What a build of the site leaves there: help texts, not written by anybody."""
 
@@ -52,20 +46,20 @@ def commands_in(text: str) -> Iterator[list[str]]:
 
 
 def _of_line(line: str) -> Iterator[list[str]]:
-    if not re.match(rf"(?:[A-Z_]+=\S+ )*(?:{'|'.join(APPS)}) ", line):
+    if not re.match(rf"(?:[A-Z_]+=\S+ )*(?:{'|'.join(COMMANDS)}) ", line):
         return
     try:
         words = shlex.split(re.sub(r"\s#\s.*$", "", line))
     except ValueError:
         return
-    words = words[next(k for k, word in enumerate(words) if word in APPS) :]
+    words = words[next(k for k, word in enumerate(words) if word in COMMANDS) :]
     ends = [k for k, word in enumerate(words) if word in ("|", "&&", "||", ">", "2>", "&", ";") or "…" in word]
     yield words[: min(ends, default=len(words))]
 
 
 def parse(words: list[str]) -> None:
     """Parse a command as it does itself, without running it."""
-    command: Any = get_command(import_module(APPS[words[0]]).app)
+    command: Any = get_command(import_module(COMMANDS[words[0]]).app)
     rest = words[1:]
     if words[0] == "evaluate" and rest and not rest[0].startswith("-") and rest[0] not in command.commands:
         # Data alone are run with the usual methods (evaluation.cli).

@@ -18,15 +18,9 @@ from typer.main import get_command
 
 from foundation.errors import QualityError
 from foundation.json_output import JsonOutput, json_output, plain, with_json
+from tests.house_commands import COMMANDS
 from tests.json_of import json_of
 
-COMMANDS = {
-    "acquire": "acquisition.cli",
-    "build-lut": "calibration.cli",
-    "generate": "generator.cli",
-    "evaluate": "evaluation.cli",
-    "sim": "synthesis.cli",
-}
 WITHOUT_FIGURES = {"acquire init", "acquire redact", "acquire monitor", "acquire report", "sim projector", "sim camera"}
 """Commands that write or serve something and have no figure to tell."""
 

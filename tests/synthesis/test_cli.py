@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 
+from calibration.cli import main as build_lut
 from calibration.table.lut import open_lut
 from synthesis.cli import main
 
@@ -32,9 +33,36 @@ def test_a_table_comes_of_one_command(settings: str, tmp_path: Path, capsys: pyt
     assert computed["room"]["profile"] == "unmanaged"
 
 
+def test_a_table_says_what_it_is_told_of_itself(
+    settings: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "lut"
+    told = ["--note", "for a course", "--licence", "CC-BY-4.0", "--author", "Lovelace, Ada", "--author", "An Institute"]
+    assert main(["table", str(out), "--settings", settings, "--lights", "D65", *told]) == 0
+    origin = open_lut(out).provenance.origin
+    assert origin is not None
+    assert (origin.note, origin.licence) == ("for a course", "CC-BY-4.0")
+    assert origin.authors == ["Lovelace, Ada", "An Institute"]
+    assert (origin.rig, origin.frames, origin.last_frame) == (None, 0, None)
+    assert build_lut(["--cite", str(out)]) == 0
+    cited = capsys.readouterr().out
+    assert "author = {Lovelace, Ada and {An Institute}}" in cited
+    assert "licence CC-BY-4.0" in cited
+    assert "Look-up table, computed" in cited
+    assert build_lut(["--info", str(out)]) == 0
+    assert "for a course" in capsys.readouterr().out
+
+
+def test_a_table_that_is_told_nothing_has_no_origin(settings: str, tmp_path: Path) -> None:
+    assert main(["table", str(tmp_path / "lut"), "--settings", settings, "--lights", "D65"]) == 0
+    assert '"origin"' not in (tmp_path / "lut" / "lut.json").read_text()
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
+        (["--licence", "free"], "--licence 'free': "),
+        (["--author", ""], "--author '': "),
         (["--camera", "Canon_EOS_1"], "no camera 'Canon_EOS_1'"),
         (["--lights", "D66"], "no published light 'D66'"),
         (["--paper", "silk"], "the command line: room.paper"),

@@ -11,11 +11,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 from llvmlite import ir
-from numba import types, uint32, uint64
-from numba.core import cgutils
-from numba.extending import intrinsic
+from numpy import uint32, uint64
 
-from foundation.compiled import compiled
+from foundation.compiled import compiled, intrinsic
 from generator.kernels.vector import ADDRESS, FLOATS, I32, I64, LINE, broadcast, constant, load, store, void
 
 if TYPE_CHECKING:
@@ -189,15 +187,20 @@ def _add_powers(typing: Any, source: Any, blocks: Any, scale: Any, p: Any, bits:
     del typing, source, blocks, scale, p, bits, sums
 
     def emit(builder: Any, source: Any, blocks: Any, scale: Any, p: Any, bits: Any, sums: Any) -> None:
+        from numba.core import cgutils
+
         one, places = ir.Constant(I64, 1), range(6)
         halves = [constant(ir.VectorType(I32, 8), range(first, first + 8)) for first in (0, 8)]
 
         def slot_of(value: Any) -> Any:
+            from numba.core import cgutils
+
             slot = cgutils.alloca_once(builder, _DOUBLES)
             builder.store(value, slot)
             return slot
 
         def multiply(slots: list[Any], by: list[Any]) -> None:
+
             for slot, other in zip(slots, by, strict=True):
                 builder.store(builder.fmul(builder.load(slot), builder.load(other)), slot)
 
@@ -220,7 +223,7 @@ def _add_powers(typing: Any, source: Any, blocks: Any, scale: Any, p: Any, bits:
         for at, total in enumerate(totals):
             store(builder, builder.load(total), sums, LINE * at)
 
-    return void(emit, ADDRESS, ADDRESS, types.float64, ADDRESS, ADDRESS, ADDRESS)
+    return void(emit, ADDRESS, ADDRESS, "float64", ADDRESS, ADDRESS, ADDRESS)
 
 
 @compiled

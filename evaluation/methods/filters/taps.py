@@ -14,9 +14,8 @@ from collections.abc import Sequence
 from typing import Any, Final
 
 from llvmlite import ir
-from numba.core import cgutils
-from numba.extending import intrinsic
 
+from foundation.compiled import intrinsic
 from generator.kernels.vector import ADDRESS, F32, FLOATS, I32, I64, LANES, LINE, broadcast, constant, load, store, void
 
 OUTPUTS: Final = 4
@@ -67,8 +66,11 @@ def _emit(
     before the first and after the last vector. The vectors are `OUTPUTS` neighbours, or the three vectors of `CHUNK`
     interleaved pixels side by side, whose neighbours are loaded from wherever they begin.
     """
+    from numba.core import cgutils
 
     def slot_of(value: Any) -> Any:
+        from numba.core import cgutils
+
         slot = cgutils.alloca_once(builder, FLOATS)
         builder.store(value, slot)
         return slot

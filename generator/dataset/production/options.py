@@ -25,8 +25,9 @@ RENDERING: Final[Rendering] = "codes"
 STRETCHED: Final[tuple[Format, ...]] = ("png", "tiff", "jxl")
 """Formats without a place for the white level that readers use, whose counts may be stretched over 16 bits."""
 
-RENDERING_VERSION: Final = 1
-"""Of colorimetric rendering: rises when its rules change, so that other pixels come of the same options."""
+RENDERING_VERSION: Final = 2
+"""Of colorimetric rendering: rises when its rules change, so that other pixels come of the same options.
+1 took the grey in the print's black cell out where 2 takes the grey that black was mapped to."""
 
 
 @dataclass(frozen=True)

@@ -77,7 +77,7 @@ def photograph(
         for light in mixture.lights:
             lut.require_unchanged(light)
     share = options.black_point.share(seed, number) if black_taken is None else black_taken
-    cells = None
+    cells = grey = None
     details: Details = {}
     if options.rendering == "colorimetric":
         rendering = rendering_of(lut, options)
@@ -85,6 +85,7 @@ def photograph(
             lut.require_unchanged(light)
         mixtures = rendering.mixtures_for(lighting)
         cells, name = _table(mixtures, lut.provenance.bits)
+        grey = mixtures.black
         missed = summarise(mixtures, nearest_nodes(picture).astype(np.float64))
         outside, distance = round(missed.outside, 6), round(missed.distance_deg, 6)
         details |= {"cells": name, "outside": outside, "distance": distance}
@@ -94,8 +95,8 @@ def photograph(
     if cells is not None and not (alone or (lighting.masks is None and picture.size >= 3 * WHOLE_LIGHT_PIXELS)):
         # Which samples are to be mixed, or freed of black, is known by the cells.
         picture, cells = dither(picture, cells, lut.provenance.bits, seed, number), None
-    by_colour, drawn_dithered = options.rendering == "colorimetric", cells is not None
-    tables = [_samples(lut, mixture, picture, share, seed, drawn_dithered, by_colour) for mixture in lighting.mixtures]
+    drawn_dithered = cells is not None
+    tables = [_samples(lut, mixture, picture, share, seed, drawn_dithered, grey) for mixture in lighting.mixtures]
     if lighting.masks is None:
         out = _reused(picture.shape)
         return draw_samples(tables[0], picture, seed=seed, image=number, cells=cells, out=out), None, details
@@ -105,11 +106,11 @@ def photograph(
 
 
 def _samples(
-    lut: Lut, mixture: Mixture, picture: Picture, share: float, seed: int, dithered: bool, by_colour: bool
+    lut: Lut, mixture: Mixture, picture: Picture, share: float, seed: int, dithered: bool, grey: float | None
 ) -> npt.NDArray[np.uint16]:
     """Return the samples of a light without a share of the print's black, at least those of a picture's colours.
 
-    A picture that is `dithered` while it is drawn may show any.
+    A picture that is `dithered` while it is drawn may show any. `grey` is as of `black_points.veil_of`.
     """
     from generator.kernels.palette import colours_in
     from generator.kernels.rendering import WHOLE_LIGHT_PIXELS
@@ -120,7 +121,7 @@ def _samples(
         return samples
     small = not dithered and picture.size < 3 * WHOLE_LIGHT_PIXELS
     colours = colours_in(picture, lut.provenance.bits) if small else None
-    veil = veil_of(lut, mixture, share, grey=by_colour)
+    veil = veil_of(lut, mixture, share, grey)
     return without_veil(samples, veil, lut.provenance.white_level, colours)
 
 

@@ -52,6 +52,12 @@ CASES: list[tuple[str, Evidence, Cause]] = [
     ("disturbed_cells", replace(LIGHT, deviation=0.3), UNKNOWN),
     # Two dark cells that are brighter: a glint, or a finger.
     ("disturbed_cells", replace(LIGHT, deviation=math.nan), UNKNOWN),
+    # Cells that are brighter and darker alike, in a white frame too: a hand does not do that.
+    ("disturbed_cells", replace(LIGHT, even_showing=0.33, deviation=math.nan), UNKNOWN),
+    ("unfit_share", replace(LIGHT, even_showing=0.33, deviation=math.nan), UNKNOWN),
+    ("disturbed_cells", replace(LIGHT, even_showing=0.33, deviation=0.3), UNKNOWN),
+    ("disturbed_cells", replace(LIGHT, even_showing=0.33, deviation=-0.3), OBJECT_IN_FRAME),
+    ("unlike_block", replace(LIGHT, even_showing=0.33, deviation=0.3), OBJECT_IN_FRAME),
     # Half of the frames: something came and stayed, and nobody knows what.
     ("unlike_block", replace(LIGHT, showing=0.5, deviation=-0.2), UNKNOWN),
     ("unlike_block", replace(LIGHT, showing=1, in_first=1, deviation=0.2), OBJECT_IN_FRAME),

@@ -97,6 +97,11 @@ def test_a_session_of_unlike_primaries_is_told_true(tmp_path: Path) -> None:
     fit = np.ones(len(codes), dtype=bool)
     fit[[cell.colour for cell in lut.provenance.unfit]] = False
     assert result.figures.primaries is not None
+    # Cells that frames are compared with have the field of their own colour, too: the same frame differs by nothing.
+    itself = result.figures.registered_frame.consistency
+    assert itself.scatter < 0.001
+    assert itself.block < 0.001
+    assert not itself.disturbed
     corrected: list[_Array] = []
     plain: list[_Array] = []
     for light in lights:

@@ -473,6 +473,8 @@ def _replaced(rng: random.Random, name: str) -> Callable[[Path], None]:
     def replace(folder: Path) -> None:
         path = folder / name
         outside = folder.parent / "outside"
+        if path.parent.is_symlink():
+            return  # By an earlier change: what lies behind is for nobody to touch.
         if kind == 10 and "/" in name:
             inner = folder / name.split("/")[0]
             for below in sorted(inner.rglob("*"), reverse=True):

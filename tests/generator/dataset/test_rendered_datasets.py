@@ -92,7 +92,7 @@ def test_an_image_is_drawn_from_its_code_picture_without_a_share_of_black(
         cells = mixtures.cells
         assert row["cells"] == hashlib.sha256(cells.tobytes()).hexdigest()[:16]
         codes = dither(sources[entry.source], cells, 3, 5, number)
-        veil = veil_of(lut, light, share, grey=True)
+        veil = veil_of(lut, light, share, mixtures.black)
         samples = without_veil(light.samples(lut), veil, lut.provenance.white_level)
         np.testing.assert_array_equal(dataset.read_image(entry), draw_samples(samples, codes, seed=5, image=number))
         assert float(row["black_taken"]) == pytest.approx(share, abs=1e-8)
@@ -104,7 +104,7 @@ def test_an_image_is_drawn_from_its_code_picture_without_a_share_of_black(
     made_of = dataset.description
     assert made_of.options["rendering"] == {
         "name": "colorimetric",
-        "version": 1,
+        "version": 2,
         "matrix": {"name": "mine", "source": "a test", "rows": MATRIX.rows.tolist()},
     }
     assert made_of.options["black_point"] == "random:0.97"
@@ -192,11 +192,12 @@ def test_several_lights_see_the_same_cell_of_a_pixel(make_lut: MakeLut, pictures
     rendering = ColorimetricRendering(lut, MATRIX)
     for number, (entry, source) in enumerate(zip(dataset.entries, sources, strict=True)):
         lighting = choice.lightings_of(number)[0]
-        cells = rendering.mixtures_for(lighting).cells
+        mixtures = rendering.mixtures_for(lighting)
+        cells = mixtures.cells
         codes = dither(source.read().picture, cells, 3, 5, number)
         level = lut.provenance.white_level
         tables = [
-            without_veil(mixture.samples(lut, 5), veil_of(lut, mixture, 1.0, grey=True), level)
+            without_veil(mixture.samples(lut, 5), veil_of(lut, mixture, 1.0, mixtures.black), level)
             for mixture in lighting.mixtures
         ]
         weights = dataset.read_weights(entry)

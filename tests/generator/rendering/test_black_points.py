@@ -2,18 +2,26 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 import pytest
 
+from foundation.angles import angles_deg
 from foundation.errors import InputError, QualityError
+from generator.dataset.production.options import DatasetOptions
+from generator.dataset.production.photographing import photograph
 from generator.kernels.mixing import mix_samples
 from generator.kernels.planar import draw_batch
-from generator.lights.lighting import Mixture, plain
+from generator.lights.lighting import Lighting, Mixture, plain
 from generator.rendering.black_points import BlackPoint, black_of, parse_black_point, veil_of, without_veil
+from generator.rendering.matrices import ColourMatrix
 from tests.generator.conftest import MakeLut
+from tests.generator.rendering.conftest import MakeTable
+from tests.generator.rendering.prints import MATRIX
 
 WHITE = np.array([3000.0, 6000.0, 4000.0])
 BLACK = np.array([110.0, 220.0, 150.0])
@@ -205,17 +213,52 @@ def test_faults_are_named(make_lut: MakeLut) -> None:
         veil_of(lut, plain(1), 0.5)
 
 
-def test_of_a_tinted_black_only_its_grey_is_taken_out_of_greys(make_lut: MakeLut) -> None:
+def test_of_greys_a_grey_is_taken_out_and_not_the_tinted_black_cell(make_lut: MakeLut) -> None:
     lut = make_lut()
     light = Mixture((1, 3), (0.25, 0.75))
     white, black = light.white(lut), black_of(lut, light)
     shares = black / white
     assert shares.max() > 1.1 * shares.min()
-    grey, whole = veil_of(lut, light, 1.0, grey=True), veil_of(lut, light, 1.0)
-    np.testing.assert_allclose(grey.taken, white * shares.min())
+    grey, whole = veil_of(lut, light, 1.0, 0.04), veil_of(lut, light, 1.0)
+    np.testing.assert_allclose(grey.taken, white * 0.04)
+    with pytest.raises(QualityError, match=r"has a black of 0\.5 0\.5 0\.5 of white"):
+        veil_of(lut, light, 1.0, 0.5)
     for brightness in (shares.max(), 0.2, 0.9):
         seen = (white * brightness - grey.taken) * grey.stretch / white
         assert np.ptp(seen) < 1e-12
     # What would be wrong: a dark grey takes on the complement of the black's tint.
     seen = (white * shares.max() - whole.taken) * whole.stretch / white
     assert np.ptp(seen) > 0.05 * seen.max()
+
+
+def test_black_of_a_picture_is_black_where_mixtures_are_brighter_than_the_black_cell(
+    make_table: MakeTable, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    tint = np.array([1.15, 1.0, 0.85])
+
+    def redden(samples: npt.NDArray[np.uint16]) -> None:
+        samples[:] = np.rint(samples * tint)
+
+    lut = make_table(bits=4, change=redden)
+    white = lut.white[1]
+    black = float((black_of(lut, plain(1)) / white).min())
+    codes = np.zeros((64, 64, 3), np.uint8)
+    codes[32:] = 40
+    codes[:, 32:] += 215
+    options = DatasetOptions(rendering="colorimetric", matrix=ColourMatrix("mine", MATRIX, ""))
+    seen: dict[float, npt.NDArray[np.float64]] = {}
+    for share in (0.0, 0.5, 1.0):
+        taken = options if share == 0 else replace(options, black_point=BlackPoint("compensate"))
+        image, _, _ = photograph(lut, codes, Lighting((plain(1),)), taken, 3, 4, 11536, share)
+        seen[share] = np.stack([part.mean(axis=(0, 1)) for part in (image[:32, :32], image[32:, :32])]) / white
+    dark, grey = seen[0.0]
+    # Mixtures make no grey as dark as the black cell, so what is in that cell is too little to take out.
+    assert dark.mean() > 1.2 * black
+    assert ((dark - black) / (1 - black)).mean() > 0.008
+    for share, (darker, greyer) in seen.items():
+        level = share * dark.mean()
+        # Cells of the mixture that are darker than what is taken out end at 0, and keep its mean from doing so.
+        np.testing.assert_allclose(darker, (dark - level) / (1 - level), atol=0.003)
+        np.testing.assert_allclose(greyer, (grey - level) / (1 - level), atol=0.0015)
+        assert angles_deg(greyer, np.ones(3)) < 1

@@ -185,7 +185,7 @@ class ParquetWriter:
 
 def _cell_of(file: str) -> tuple[str, int | None]:
     """Return the column that has a file, named as in a tar file, and its place where it is one of several."""
-    _, *kind, _ = file.split(".")
+    kind = file.split(".")[1:-1]
     if not kind:
         return "image", None
     name, several, place = kind[0].partition("masks_")
@@ -203,10 +203,10 @@ def read_member(store: Store, container: str, file: str) -> bytes:
     require_pyarrow()
     import pyarrow.parquet as pq
 
-    number = int(file.partition(".")[0])
-    column, place = _cell_of(file)
     with store.open(container) as stream:
         try:
+            number = int(file.partition(".")[0])
+            column, place = _cell_of(file)
             size = stream.seek(0, 2)
             table = pq.ParquetFile(
                 stream, thrift_string_size_limit=_MOST_THRIFT_BYTES, thrift_container_size_limit=_MOST_THRIFT_ITEMS

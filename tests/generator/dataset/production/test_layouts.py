@@ -268,6 +268,21 @@ def test_damaged_shards_are_named(make: Make, layout: Layout) -> None:
         made.read_image(entry)
 
 
+@pytest.mark.parametrize("layout", ["webdataset", "parquet"])
+def test_an_image_whose_name_lost_its_ending_is_read_or_refused(make: Make, layout: Layout) -> None:
+    """A tar file has it under its whole name, a Parquet file under its number."""
+    made = make(layout)
+    table = place_of(made) / "ground_truth.csv"
+    table.write_text(table.read_text().replace("000000.png", "000000"))
+    found = open_dataset(place_of(made))
+    if layout == "webdataset":
+        with pytest.raises(FormatError, match="holds no 000000"):
+            found.read_image(found.entries[0])
+    else:
+        np.testing.assert_array_equal(found.read_image(found.entries[0]), made.read_image(made.entries[0]))
+    np.testing.assert_array_equal(found.read_image(found.entries[1]), made.read_image(made.entries[1]))
+
+
 def test_the_layout_parquet_says_what_it_needs(make: Make, monkeypatch: pytest.MonkeyPatch) -> None:
     def find_spec(name: str) -> None:
         del name
