@@ -10,6 +10,7 @@ device (``DEBUG``), and ``-q`` leaves errors alone: no warnings and no progress 
 from __future__ import annotations
 
 import errno
+import gc
 import inspect
 import logging
 import os
@@ -45,7 +46,7 @@ def say_error(message: str) -> None:
         print(f"error: {printable(masked(message))}", file=sys.stderr)
 
 
-def run(command: Callable[[], object], *, keeps: bool = True) -> int:
+def run(command: Callable[[], object], *, keeps: bool = True, loads: bool = False) -> int:
     """Call `command` and return the exit code; a foreseeable fault is one line on stderr, no traceback.
 
     Parameters
@@ -54,9 +55,19 @@ def run(command: Callable[[], object], *, keeps: bool = True) -> int:
         What is to be done.
     keeps
         Whether it goes on, called again after an interruption, with what it had done; the user is told which.
+    loads
+        Whether it begins with loading modules and calls `loaded` then. Until then no garbage is looked for: modules
+        make none, and looking took a sixth of a short command.
     """
-    with logging_as_before():
-        code = _outcome(command, keeps)
+    collects = gc.isenabled()
+    if loads:
+        gc.disable()
+    try:
+        with logging_as_before():
+            code = _outcome(command, keeps)
+    finally:
+        if collects:
+            gc.enable()
     try:
         # What is still to be printed fails here, where it can be judged, and not while the interpreter ends.
         sys.stdout.flush()
@@ -67,6 +78,13 @@ def run(command: Callable[[], object], *, keeps: bool = True) -> int:
         _abandon_stdout()
         return code or StorageError.exit_code
     return code
+
+
+def loaded() -> None:
+    """Say that the modules of a command that `loads` are there: from here on garbage is looked for, if new."""
+    if not gc.isenabled() and not gc.get_freeze_count():
+        gc.freeze()
+    gc.enable()
 
 
 def _outcome(command: Callable[[], object], keeps: bool) -> int:

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from foundation.console import EXIT_CODES, new_app, run
+from foundation.console import EXIT_CODES, loaded, new_app, run
 from foundation.errors import InputError
 from foundation.json_output import JsonOutput, json_output
 from foundation.processors import processor_count
@@ -77,11 +77,13 @@ def generate(
         _check_sheet(sheet, work.verify or work.finish or places.out, work.shard, again=work.verify is None)
     with json_output("generate", common.as_json) as told:
         if work.verify is not None:
+            loaded()
             _draw_sheet(_verify(work.verify, work.workers, told), work.verify, sheet)
         elif work.finish is not None:
             from generator.dataset.making import finish_dataset
             from generator.dataset.production.workplace import holds_dataset
 
+            loaded()
             was_there = holds_dataset(work.finish)
             dataset = finish_dataset(work.finish)
             _print_summary(dataset, work.finish, told, was_there)
@@ -94,6 +96,7 @@ def generate(
                 )
             from generator.dataset.making import made_before
 
+            loaded()
             workers = work.makers()
             plan = _plan(places.lut, places.out, pictures, light, likeness, rendering, variation, images, work)
             there = made_before(plan, places.out)
@@ -316,7 +319,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
     `foundation.console.EXIT_CODES` lists the codes.
     """
-    return run(lambda: app(None if argv is None else list(argv), prog_name="generate"))
+    return run(lambda: app(None if argv is None else list(argv), prog_name="generate"), loads=True)
 
 
 if __name__ == "__main__":

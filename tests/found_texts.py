@@ -9,21 +9,26 @@ from pathlib import Path
 from urllib.parse import quote
 
 
-def files_with(folder: Path, text: str) -> list[str]:
+def files_with(folder: Path, *texts: str) -> list[str]:
     """Return the files below a folder, hidden ones included, whose name or content has a text, plain or encoded."""
-    wanted = [
-        text.encode("utf-8"),
-        text.encode("utf-16-le"),
-        base64.b64encode(text.encode()).rstrip(b"=")[:-1],
-        quote(text, safe="").encode(),
-    ]
+    wanted = [form for text in texts for form in _forms(text)]
     found: list[str] = []
     for path in sorted(folder.rglob("*")):
         name = path.relative_to(folder).as_posix()
         data = path.read_bytes() if path.is_file() else b""
-        if text in name or any(form in content for form in wanted for content in (data, _unpacked(data))):
+        contents = data, _unpacked(data)
+        if any(text in name for text in texts) or any(form in content for form in wanted for content in contents):
             found.append(name)
     return found
+
+
+def _forms(text: str) -> tuple[bytes, ...]:
+    return (
+        text.encode("utf-8"),
+        text.encode("utf-16-le"),
+        base64.b64encode(text.encode()).rstrip(b"=")[:-1],
+        quote(text, safe="").encode(),
+    )
 
 
 def _unpacked(data: bytes) -> bytes:

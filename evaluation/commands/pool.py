@@ -17,7 +17,7 @@ in one way, on the test images of all folders, each image once and with the same
 folder. Rows are matched by method, kind of training and name of the training set; by the first two alone where each
 folder has one training set. Prints the tables of evaluate transfer, and the ratios of each test set by itself. Folders
 that share a test image are refused. Writes nothing unless asked with --out: results.csv, errors.csv, by_test_set.csv,
-tables.tex and run.json.
+tables.tex, report.html with forest plots, and run.json.
 
 {EXIT_CODES}
 """

@@ -2,21 +2,29 @@
 
 from __future__ import annotations
 
+import sys
+import time
 from collections.abc import Generator
-from contextlib import contextmanager
-from dataclasses import dataclass
+from contextlib import ExitStack, contextmanager
 from datetime import timedelta
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
-from generator.dataset.production.workers import Callbacks
+from foundation.console import shows_progress
+from foundation.trust.secret_texts import printable
+from generator.dataset.production.workers import SILENT, Callbacks
 
 if TYPE_CHECKING:
-    from rich.progress import Progress, TaskID
+    from rich.progress import Progress
+
+SOON_S: Final = 0.5
+"""Work that is done within so many seconds gets no bar but its last line: what draws bars takes a tenth to load."""
 
 
 @contextmanager
 def shown_progress(images: int) -> Generator[Callbacks]:
     """Show how many images are made, how fast, and the time left while the block runs.
+
+    On a terminal that is a bar; elsewhere, and where the work is done at once, one line at the end.
 
     Parameters
     ----------
@@ -28,6 +36,89 @@ def shown_progress(images: int) -> Generator[Callbacks]:
     Callbacks
         To be called while they are made.
     """
+    if not shows_progress():
+        yield SILENT
+        return
+    with ExitStack() as shown:
+        told = _Images(images, shown)
+        try:
+            yield Callbacks(on_done=told.leave_out, on_image=told.advance, on_skip=told.skip, on_wait=told.warn)
+        finally:
+            told.end()
+
+
+class _Images:
+    """How many images are made.
+
+    Parameters
+    ----------
+    total
+        Images that are to be made.
+    shown
+        Takes the bar, if there is to be one.
+    """
+
+    def __init__(self, total: int, shown: ExitStack) -> None:
+        self._total = total
+        self._shown = shown
+        self._made = 0
+        self._began = time.monotonic()
+        self._bar: Progress | None = None
+
+    def leave_out(self, images: int) -> None:
+        """Show that images were made by an earlier run."""
+        if images:
+            self._total -= images
+            self._print(f"{images} images were made by an earlier run")
+
+    def advance(self) -> None:
+        """Show that one more image is made, and the mean rate: a cluster reports the images of a shard at once."""
+        self._made += 1
+        if self._bar is None and sys.stderr.isatty() and time.monotonic() - self._began > SOON_S:
+            self._bar = self._shown.enter_context(_bar())
+            self._bar.add_task("images", total=self._total, rate="", left="")
+        self._update()
+
+    def skip(self, name: str, reason: str, images: int) -> None:
+        """Show that a picture cannot be read, and why."""
+        self._total -= images
+        self.warn(f"left out {name}: {reason}")
+        self._update()
+
+    def warn(self, sentence: str) -> None:
+        """Show what the user should know meanwhile."""
+        self._print(sentence, style="yellow")
+
+    def end(self) -> None:
+        """Show what was made, where no bar does."""
+        if self._bar is None:
+            print(f"images {self._made}/{self._total} {self._rate():.1f}/s", file=sys.stderr)
+
+    def _rate(self) -> float:
+        return self._made / max(time.monotonic() - self._began, 0.1)
+
+    def _update(self) -> None:
+        if self._bar is None or not self._made:
+            return
+        rate = self._rate()
+        left = timedelta(seconds=round(max(self._total - self._made, 0) / rate))
+        task = self._bar.task_ids[0]
+        self._bar.update(task, completed=self._made, total=self._total, rate=f"{rate:.1f}/s", left=f"{left} left")
+
+    def _print(self, sentence: str, style: str | None = None) -> None:
+        """Print a line above the bar; names in it are others', and are not obeyed."""
+        sentence = printable(sentence)
+        if self._bar is not None:
+            self._bar.console.print(sentence, style=style, markup=False, highlight=False)
+        elif style and sys.stderr.isatty():
+            from rich.console import Console
+
+            Console(stderr=True).print(sentence, style=style, markup=False, highlight=False)
+        else:
+            print(sentence, file=sys.stderr)
+
+
+def _bar() -> Progress:
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 
@@ -38,41 +129,4 @@ def shown_progress(images: int) -> Generator[Callbacks]:
         TextColumn("{task.fields[rate]}"),
         TextColumn("{task.fields[left]}"),
     )
-    with Progress(*columns, console=Console(stderr=True)) as progress:
-        bar = _Bar(progress, progress.add_task("images", total=images, rate="", left=""))
-        yield Callbacks(on_done=bar.leave_out, on_image=bar.advance, on_skip=bar.skip, on_wait=bar.warn)
-
-
-@dataclass(frozen=True)
-class _Bar:
-    """A progress bar of images, with lines above it."""
-
-    progress: Progress
-    task: TaskID
-
-    @property
-    def total(self) -> float:
-        """Images that are to be made."""
-        return self.progress.tasks[0].total or 0
-
-    def leave_out(self, images: int) -> None:
-        """Show that images were made by an earlier run."""
-        if images:
-            self.progress.update(self.task, total=self.total - images)
-            self.progress.console.print(f"{images} images were made by an earlier run", highlight=False)
-
-    def advance(self) -> None:
-        """Show that one more image is made, and the mean rate: a cluster reports the images of a shard at once."""
-        shown = self.progress.tasks[0]
-        made, took = shown.completed + 1, max(shown.elapsed or 0, 0.1)
-        left = timedelta(seconds=round(max(self.total - made, 0) * took / made))
-        self.progress.update(self.task, advance=1, rate=f"{made / took:.1f}/s", left=f"{left} left")
-
-    def skip(self, name: str, reason: str, images: int) -> None:
-        """Show that a picture cannot be read, and why."""
-        self.progress.update(self.task, total=self.total - images)
-        self.warn(f"left out {name}: {reason}")
-
-    def warn(self, sentence: str) -> None:
-        """Show what the user should know meanwhile."""
-        self.progress.console.print(sentence, style="yellow", markup=False, highlight=False)
+    return Progress(*columns, console=Console(stderr=True))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import re
 import sys
 from collections.abc import Generator, Iterable, Iterator
 from contextlib import contextmanager
@@ -26,6 +27,8 @@ from generator.lights.lighting import parse_mixture
 from generator.stores.places import DESCRIPTION
 from generator.stores.store import Store
 
+_NAME: Final = re.compile(r"([0-9]{1,10})(\.[A-Za-z0-9.]*)?")
+"""A number, of which ten digits count all images that a dataset holds, and an ending."""
 _VALID: Final = "with r + g + b = 1 and none below 0"
 _ROUNDING: Final = 2e-6
 """What sums and means of chromaticities may be off by: more than six written digits are, and less than a thousandth of
@@ -143,10 +146,9 @@ def _text(store: Store, name: str) -> Generator[Iterator[str]]:
 
 
 def _number(image: str) -> int:
-    """Return the number of an image by its name; -1 if it has none."""
-    digits = image.partition(".")[0]
-    # Ten digits count all images that a dataset holds.
-    return int(digits) if digits.isdecimal() and len(digits) <= 10 else -1
+    """Return the number of an image by its name; -1 if it has none, or is no name of a file."""
+    found = _NAME.fullmatch(image)
+    return int(found[1]) if found else -1
 
 
 @lru_cache(maxsize=_KEPT)

@@ -15,6 +15,7 @@ light. With a tint the image has two lights of one name, and masks and maps as o
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -94,6 +95,32 @@ class Gradient:
     def describe(self) -> dict[str, Any]:
         """Return the shape and the numbers as plain values."""
         return {**self.shape.describe(), "stops": self.stops, "least": self.least, "colour": self.colour}
+
+
+def described_gradient(record: Mapping[str, Any]) -> Gradient:
+    """Return the gradient that `Gradient.describe` described.
+
+    Parameters
+    ----------
+    record
+        Its plain values, such as those of `dataset.json`.
+
+    Raises
+    ------
+    InputError
+        It describes none.
+
+    Examples
+    --------
+    >>> described_gradient(Gradient(stops=2.0).describe()) == Gradient(stops=2.0)
+    True
+    """
+    kind = str(record.get("masks"))
+    # A half plane is a soft edge of no width, which only its name says.
+    given = {name: value for name, value in record.items() if name != "masks" and value is not None}
+    if kind == "half-plane":
+        given.pop("width", None)
+    return parse_gradient(f"{kind}:{','.join(f'{name}={value}' for name, value in given.items())}")
 
 
 def parse_gradient(text: str) -> Gradient:

@@ -17,6 +17,7 @@ KNOWN = (
     ("dataset folder", 1710),  # a mask of a thousand million pixels in a hundred bytes
     ("dataset folder", 1002141),  # a folder that became a link before one of its files was changed
     ("dataset parquet", 1000236),  # an image whose name has no ending
+    ("dataset parquet", 1004394),  # an image whose name is a path
     ("dataset tiff", 85),
     ("dataset tar", 1685),  # a name of 70 000 characters, in a message
     ("session", 126),  # settings that are a link to a file outside

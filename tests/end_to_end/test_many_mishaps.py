@@ -1,4 +1,7 @@
-"""A hundred sessions of twenty lights with mishaps of every kind: most complete at once, all of them in the end."""
+"""Fifty sessions of twenty lights with mishaps of every kind: most complete at once, all of them in the end.
+
+`python -m tests.fuzz.fuzz_mishaps` takes as many as one likes.
+"""
 
 from __future__ import annotations
 
@@ -7,11 +10,11 @@ from pathlib import Path
 
 from tests.acquisition.run.mishaps import MISHAPS, TroubledLab, take_all
 
-SEEDS = range(10, 110)
+SEEDS = range(10, 60)
 
 
-def test_a_hundred_sessions_with_mishaps(tmp_path: Path) -> None:
+def test_fifty_sessions_with_mishaps(tmp_path: Path) -> None:
     happened = Counter(name for seed in SEEDS for name in TroubledLab(seed).mishaps)
     assert set(happened) == {mishap.__name__ for mishap in MISHAPS}, "every kind of mishap came up"
     complete = sum(take_all(tmp_path / f"{seed}", seed) for seed in SEEDS)
-    assert complete > 75, "most of what happens once is lived with"
+    assert complete > 37, "most of what happens once is lived with"

@@ -68,7 +68,7 @@ def test_no_file_of_a_session_and_its_table_holds_a_secret(
 
     def look(done: int, total: int) -> None:
         # While the run is under way its journal has a write-ahead log.
-        seen.append([*files_with(public, PASSWORD), *files_with(public, TOKEN)])
+        seen.append(files_with(public, PASSWORD, TOKEN))
 
     settings = load_lab(lab)
     assert run_session(settings, session, look, said.append, state=said.append).complete
@@ -80,7 +80,7 @@ def test_no_file_of_a_session_and_its_table_holds_a_secret(
     assert command("calibration.cli", session, public / "lut") in (0, 4)
     with open_monitor(session, 0) as server:
         shown = server.page.text + json.dumps(server.watch.state(""), default=str)
-    seen.append([*files_with(public, PASSWORD), *files_with(public, TOKEN)])
+    seen.append(files_with(public, PASSWORD, TOKEN))
     assert len(seen) > 6
     assert not any(seen)
     told = "".join(capsys.readouterr()) + "".join(said) + shown
@@ -102,9 +102,11 @@ def test_the_secrets_of_an_older_session_are_told_and_taken_out(
     said: list[str] = []
     run_session(load_lab(lab), session, lambda done, total: None, said.append)
     assert any("acquire redact" in sentence for sentence in said)
+    assert files_with(session, PASSWORD)
+    assert files_with(session, TOKEN)
     assert command("acquisition.cli", "redact", session) == 0
     assert "lab.projector.password and sequence.notify taken out" in capsys.readouterr().out
-    assert files_with(session, PASSWORD) == files_with(session, TOKEN) == []
+    assert files_with(session, PASSWORD, TOKEN) == []
     assert command("acquisition.cli", "redact", session) == 0
     assert "holds no secret" in capsys.readouterr().out
     assert command("acquisition.cli", "status", session) == 0

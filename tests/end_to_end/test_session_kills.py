@@ -1,4 +1,4 @@
-"""Two hundred runs killed at random operations and times; `python -m benchmarks.session_kills` kills ten thousand."""
+"""A hundred runs killed at random operations and times; `python -m benchmarks.session_kills` kills ten thousand."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import pytest
 
 from benchmarks.session_kills import KilledSessions
 
-KILLS = 200
+KILLS = 100
 
 pytestmark = pytest.mark.skipif(not hasattr(os, "fork"), reason="a run is killed in a process of its own")
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import gc
 import io
 import os
 import signal
@@ -14,7 +15,8 @@ from pathlib import Path
 import pytest
 
 from foundation import errors
-from foundation.console import EXIT_CODES, Ending, orderly_end, progress, run
+from foundation.console import EXIT_CODES, Ending, loaded, orderly_end, progress, run
+from foundation.errors import InputError
 
 
 def test_success_says_nothing(capsys: pytest.CaptureFixture[str]) -> None:
@@ -334,3 +336,26 @@ def test_a_working_folder_that_is_gone_is_said(
     assert run(lambda: Path("x").resolve()) == 2
     assert "the folder in which this was started is gone; change to one that is there" in capsys.readouterr().err
     monkeypatch.chdir(tmp_path)
+
+
+def test_garbage_is_looked_for_when_modules_are_loaded_and_after_every_end() -> None:
+    seen: list[bool] = []
+
+    def work() -> None:
+        seen.append(gc.isenabled())
+        loaded()
+        seen.append(gc.isenabled())
+
+    def fail() -> None:
+        raise InputError("no such file")
+
+    assert (run(work, loads=True), gc.isenabled(), seen) == (0, True, [False, True])
+    assert (run(fail, loads=True), gc.isenabled()) == (2, True)
+    assert run(lambda: seen.append(gc.isenabled())) == 0
+    assert seen[-1], "what does not say that it loads modules is left alone"
+    gc.disable()
+    try:
+        run(fail, loads=True)
+        assert not gc.isenabled(), "whoever has it off keeps it off"
+    finally:
+        gc.enable()

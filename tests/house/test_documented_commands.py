@@ -1,7 +1,8 @@
 """Every command that the documentation shows is one that the software takes: its options are there and fit each other.
 
-The commands of the tutorial are run by `make demo`, those of docs/how-to/rehearsal.md by their own test. Here all are
-parsed, by the parsers that the commands themselves use.
+The commands of the tutorial are run by `make demo`, those of the how-to pages by
+`tests/end_to_end/test_how_to_commands.py` and rehearsal.md's by their own test. Here all are parsed, by the parsers
+that the commands themselves use.
 """
 
 from __future__ import annotations

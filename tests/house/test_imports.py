@@ -62,7 +62,8 @@ def test_a_room_has_few_files() -> None:
 
 def test_a_file_can_be_read_in_one_go() -> None:
     lines = {place(path): len(path.read_text(encoding="utf-8").splitlines()) for path in FILES}
-    long = {file: count for file, count in lines.items() if count > LINES_OF_A_FILE}
+    benchmarks = {place(path): len(path.read_text("utf-8").splitlines()) for path in (ROOT / "benchmarks").glob("*.py")}
+    long = {file: count for file, count in (lines | benchmarks).items() if count > LINES_OF_A_FILE}
     assert not long, f"more than {LINES_OF_A_FILE} lines: {long}"
     # A package's opening is one line in most, and no measure of how long files are.
     median = statistics.median(count for file, count in lines.items() if not file.endswith("__init__.py"))

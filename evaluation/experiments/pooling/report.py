@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
+from evaluation.experiments.pooling.page import SHOWN, pool_page
 from evaluation.experiments.pooling.pool import Pool
 from evaluation.experiments.transfer.figures import TransferFigures, figures_of
 from evaluation.experiments.transfer.outcome import labelled_results
@@ -28,13 +29,10 @@ from foundation.errors import counted
 from foundation.files import whole_folder, write_whole
 from foundation.version import software
 
-_SHOWN = (1, 0, 4)
-"""Places in `bootstrap.STATISTICS` of what the table of single test sets shows: median, mean and worst quarter."""
-
 
 @dataclass(frozen=True)
 class PoolTables:
-    """The tables of a pool.
+    """What a pool comes to: tables, and what they were made of.
 
     Attributes
     ----------
@@ -44,11 +42,17 @@ class PoolTables:
         All numbers of the pool for other programs, see `transfer.tables.long_table`.
     single
         The same of each test set by itself, its name and images before them.
+    figures
+        What the rows come to over all images.
+    figures_of_tests
+        The same of each test set by itself, by its name.
     """
 
     shown: tuple[Table, ...]
     pooled: Table
     single: Table
+    figures: TransferFigures
+    figures_of_tests: Mapping[str, TransferFigures]
 
 
 def make_tables(pool: Pool, error: ErrorKind) -> PoolTables:
@@ -77,11 +81,13 @@ def make_tables(pool: Pool, error: ErrorKind) -> PoolTables:
         tuple(table for table in shown if table is not None),
         long_table(every),
         Table("All numbers of each test set", ("test", "test_images", *listed[0][1].columns), tuple(rows)),
+        every,
+        single,
     )
 
 
 def save_pool(pool: Pool, tables: PoolTables, places: Sequence[str], error: ErrorKind, folder: Path) -> None:
-    """Write the folder of a pool: `results.csv`, `errors.csv`, `by_test_set.csv`, `tables.tex`, `run.json`.
+    """Write the folder of a pool: three CSV files of results and errors, `tables.tex`, `report.html`, `run.json`.
 
     Parameters
     ----------
@@ -117,6 +123,8 @@ def save_pool(pool: Pool, tables: PoolTables, places: Sequence[str], error: Erro
         write_whole(partial / "by_test_set.csv", table_to_csv(tables.single))
         write_whole(partial / "errors.csv", errors_csv(pool.images, pool.truths, labelled_results(pool.rows)))
         write_whole(partial / "tables.tex", "\n".join(table_to_latex(table) for table in tables.shown))
+        report = pool_page(pool, tables.shown, tables.figures, tables.figures_of_tests, places)
+        write_whole(partial / "report.html", report)
         write_whole(partial / "run.json", json.dumps(about, indent=2, ensure_ascii=False) + "\n")
 
 
@@ -132,7 +140,7 @@ def _by_test_set(single: dict[str, TransferFigures], images: dict[str, int]) -> 
             one.row.method,
             one.row.training,
             *(
-                " / ".join(f"{figures.to_real[number].ratios[place].value:.2f}" for place in _SHOWN)
+                " / ".join(f"{figures.to_real[number].ratios[place].value:.2f}" for place in SHOWN)
                 for figures in single.values()
             ),
         )

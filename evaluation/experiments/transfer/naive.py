@@ -3,8 +3,9 @@
 For each image of a generated data set a scene of the same picture under the same light, as bright and as finely
 quantised, without a print, a camera or noise: codes become linear light by the sRGB curve, colours those of the camera
 by its matrix if one is given, and each channel is multiplied by the light. What a learned method gains by training on
-the generated image instead is what the table is worth. What `generate --exposure`, `--iso`, and a `--gradient` without
-a tint did to the generated image is not done to its counterpart.
+the generated image instead is what the table is worth. Several lights share the pixels of the counterpart by the masks
+of the generated image, and light falls off as it does there. What `generate --exposure` and `--iso` did to the
+generated image is not done to its counterpart.
 """
 
 from __future__ import annotations
@@ -12,17 +13,18 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
 
 from evaluation.datasets.generated import GeneratedScene
 from evaluation.experiments.transfer.pictures import FoundPicture
-from foundation.errors import FormatError
+from foundation.errors import FormatError, InputError
 from foundation.srgb import decode_srgb
 from generator.lights.lighting import parse_mixture
 from generator.rendering.matrices import ColourMatrix
+from generator.variation.gradients import Falloff, described_gradient
 
 _LINEAR: Final = decode_srgb(np.arange(256) / 255)
 """Linear light 0 … 1 of each code."""
@@ -125,6 +127,28 @@ class NaiveScene:
             whites[1] = whites[0] * end
         return np.array(whites)
 
+    @cached_property
+    def _falloff(self) -> Falloff | None:
+        """How the image's light falls off without a tint, which is not among its lights; None if it does not.
+
+        Raises
+        ------
+        FormatError
+            The data set describes a gradient that is none.
+        """
+        description = self.generated.dataset.description
+        variation: Any = description.options.get("variation", {})
+        try:
+            record = variation.get("gradient")
+            gradient = None if record is None else described_gradient(record)
+        except (InputError, AttributeError) as error:
+            raise FormatError(
+                f"the data set of {self.name} describes its variation as {variation}: {error}; make it again"
+            ) from error
+        if gradient is None or gradient.colour > 0:
+            return None
+        return gradient.of_image(description.seed, int(self.generated.entry.image.partition(".")[0]))
+
     @property
     def _details(self) -> Mapping[str, str]:
         """What options did to the generated image, by column of `images.csv`."""
@@ -137,7 +161,28 @@ class NaiveScene:
             light = self.generated.dataset.read_weights(self.generated.entry) @ self.whites
         matrix = None if self.matrix is None else self.matrix.rows
         codes = self.picture.codes(int(self._details.get("crop", 0)))
+        if self._falloff is not None:
+            far = self._falloff.weights(*codes.shape[:2])[..., 1:]
+            light = light * (1 - far * (1 - self._falloff.end[1]))
         return naive_image(codes, light, self.saturation, matrix), None
+
+
+@dataclass(frozen=True, eq=False)
+class NaiveMixedScene(NaiveScene):
+    """The naive counterpart of an image that several lights fall on."""
+
+    @property
+    def lights(self) -> npt.NDArray[np.float64]:
+        """The lights (K, 3) float64, linear camera RGB, r + g + b = 1."""
+        return np.array(self.generated.entry.truths)
+
+    def read_weights(self) -> npt.NDArray[np.float32]:
+        """Return the share of each light in each pixel: (H, W, K) float32, 0 … 1, sum 1."""
+        return self.generated.dataset.read_weights(self.generated.entry)
+
+    def read_truth_map(self) -> npt.NDArray[np.float32]:
+        """Return the light of each pixel: (H, W, 3) float32, r + g + b = 1."""
+        return self.generated.dataset.read_ground_truth_map(self.generated.entry)
 
 
 def naive_scenes(
@@ -154,4 +199,7 @@ def naive_scenes(
     matrix
         The camera's colour matrix, or None.
     """
-    return tuple(NaiveScene(scene, found[scene.entry.source], matrix) for scene in scenes)
+    return tuple(
+        (NaiveScene if len(scene.entry.lights) == 1 else NaiveMixedScene)(scene, found[scene.entry.source], matrix)
+        for scene in scenes
+    )

@@ -15,7 +15,7 @@ from evaluation.datasets.opening import open_scenes
 from evaluation.experiments.bootstrap import paired
 from evaluation.experiments.pooling.pool import pool_transfers
 from evaluation.experiments.pooling.reading import TransferResults, read_transfer
-from evaluation.experiments.pooling.report import make_tables
+from evaluation.experiments.pooling.report import make_tables, save_pool
 from evaluation.experiments.transfer.figures import figures_of
 from evaluation.experiments.transfer.rows import Kind, TransferRow
 from evaluation.metrics import summarise
@@ -160,6 +160,32 @@ def test_halves_of_one_camera_are_one_test_set() -> None:
     pooled = np.concatenate([part.rows[1].results[0].errors["recovery"] for part in parts[:2]])
     real = np.concatenate([part.rows[0].results[0].errors["recovery"] for part in parts[:2]])
     assert table.texts()[0][2].split(" / ")[0] == f"{np.median(pooled) / np.median(real):.2f}"
+
+
+def test_the_report_has_the_pool_the_test_sets_and_what_was_told(tmp_path: Path) -> None:
+    def made(*kinds: Kind, tests: tuple[str, ...]) -> str:
+        parts = [
+            part(f"{number}{test}", *(row(kind, errors(10)) for kind in kinds), test=test, first=20 * number)
+            for number, test in enumerate(tests)
+        ]
+        pool = replace(pool_transfers(parts), notes=("A note & more",))
+        out = tmp_path / f"{len(list(tmp_path.iterdir()))}"
+        save_pool(pool, make_tables(pool, "recovery"), ["one/here", "two"], "recovery", out)
+        return (out / "report.html").read_text()
+
+    text = made("cross-validation", "generated", "naive with matrix", tests=("A<b", "C"))
+    assert "<h1>Transfer to A&lt;b + C</h1>" in text
+    assert "20 images of A&lt;b (10 images), C (10 images)" in text
+    assert "A note &amp; more" in text
+    assert text.count("<svg") == 2
+    assert text.count("Squares: each test set by itself.") == 2
+    assert "made / naive with matrix" in text
+    for table in ("intervals of these errors", "Each test set by itself", "in parts of those with the same pictures"):
+        assert table in text
+    alone = made("cross-validation", "generated", tests=("C",))
+    assert alone.count("<svg") == 1
+    assert "Squares" not in alone
+    assert "naive" not in alone
 
 
 @pytest.fixture

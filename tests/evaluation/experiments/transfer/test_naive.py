@@ -2,20 +2,23 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from evaluation.datasets.generated import GeneratedMixedScene, GeneratedScene
+from evaluation.datasets.generated import GeneratedMixedScene, GeneratedScene, open_generated
 from evaluation.experiments.transfer.naive import naive_image, naive_scenes
 from evaluation.experiments.transfer.pictures import find_sources
+from evaluation.scene import MixedScene
+from foundation.errors import FormatError
 from generator.lights.choices import ListedLights, SimultaneousLights
 from generator.lights.lighting import mixture_of
 from generator.masks.request import parse_masks
 from generator.pictures.picture import Preparation
 from generator.rendering.matrices import ColourMatrix
-from tests.evaluation.experiments.transfer.conftest import LIGHTS, Maker, save_pictures, write_table
+from tests.evaluation.experiments.transfer.conftest import BOTH, LIGHTS, Maker, save_pictures, write_table
 
 MATRIX = np.array([[0.6, 0.3, 0.1], [0.1, 0.7, 0.2], [-0.2, 0.4, 0.8]])
 
@@ -122,3 +125,55 @@ def test_light_that_falls_off_with_a_tint_does_so_in_the_counterpart(maker: Make
     found, _ = find_sources(made[0].dataset, maker.pictures)
     for naive, scene in zip(naive_scenes(made, found), made, strict=True):
         np.testing.assert_allclose(naive.read()[0].astype(int), scene.read()[0].astype(int), atol=2)
+
+
+@pytest.mark.parametrize("lights", ["one", "two"])
+@pytest.mark.parametrize("gradient", ["smooth:stops=3,least=2", "half-plane:angle=20,stops=2,least=2"])
+def test_light_that_falls_off_without_a_tint_does_so_in_the_counterpart(
+    maker: Maker, lights: str, gradient: str
+) -> None:
+    choice = BOTH
+    if lights == "two":
+        choice = SimultaneousLights(BOTH, 2, parse_masks("soft-edge:angle=70,width=.6", 2, 0))
+    preparation = Preparation(crop=(16, 12), crops=2)
+    made = _generated(maker.make(lights=choice, gradient=gradient, preparation=preparation, seed=0).scenes)
+    found, _ = find_sources(made[0].dataset, maker.pictures)
+    unlike: list[int] = []
+    for naive, scene in zip(naive_scenes(made, found), made, strict=True):
+        expected = scene.read()[0].astype(int)
+        np.testing.assert_allclose(naive.read()[0].astype(int), expected, atol=3)
+        weights = scene.dataset.read_weights(scene.entry) if lights == "two" else np.ones((12, 16, 1), np.float32)
+        codes = naive.picture.codes(int(scene.dataset.details[scene.name]["crop"]))
+        even = naive_image(codes, weights @ naive.whites, naive.saturation).astype(int)
+        unlike.append(int(np.abs(even - expected).max()))
+    assert min(unlike) > 500
+
+
+def test_a_counterpart_under_several_lights_has_their_maps(maker: Maker) -> None:
+    choice = SimultaneousLights(BOTH, 2, parse_masks("soft-edge:angle=70,width=.6", 2, 0))
+    (made, *_) = _generated(maker.make(lights=choice).scenes)
+    found, _ = find_sources(made.dataset, maker.pictures)
+    (naive,) = naive_scenes([made], found)
+    assert isinstance(naive, MixedScene)
+    assert isinstance(made, GeneratedMixedScene)
+    np.testing.assert_array_equal(naive.lights, made.lights)
+    np.testing.assert_array_equal(naive.read_weights(), made.read_weights())
+    light = naive.read_weights() @ naive.whites
+    np.testing.assert_allclose(naive.read_truth_map(), light / light.sum(axis=2, keepdims=True), atol=1e-4)
+    np.testing.assert_allclose(naive.truth, light.mean(axis=(0, 1)) / light.mean(axis=(0, 1)).sum(), atol=1e-4)
+    (single, *_) = _generated(maker.make("single").scenes)
+    (plain,) = naive_scenes([single], found)
+    assert not isinstance(plain, MixedScene)
+
+
+def test_a_gradient_that_is_described_as_none_is_named(maker: Maker) -> None:
+    maker.make(gradient="smooth:stops=2")
+    described = maker.folder / "made" / "dataset.json"
+    record = json.loads(described.read_text())
+    for wrong in ({"gradient": {"masks": "stripes"}}, ["gradient"]):
+        record["options"]["variation"] = wrong
+        described.write_text(json.dumps(record))
+        (made, *_) = _generated(open_generated(maker.folder / "made").scenes)
+        (naive,) = naive_scenes([made], find_sources(made.dataset, maker.pictures)[0])
+        with pytest.raises(FormatError, match=r"describes its variation as .*; make it again"):
+            naive.read()

@@ -283,6 +283,18 @@ def test_an_image_whose_name_lost_its_ending_is_read_or_refused(make: Make, layo
     np.testing.assert_array_equal(found.read_image(found.entries[1]), made.read_image(made.entries[1]))
 
 
+@pytest.mark.parametrize("layout", LAYOUTS)
+@pytest.mark.parametrize("name", ["000000../outside/canary.png", "../000000.png", "٠٠٠٠٠٠.png", "000000", "0.0/0.png"])
+def test_an_image_is_a_number_with_an_ending_and_no_path(make: Make, layout: Layout, name: str) -> None:
+    table = place_of(make(layout)) / "ground_truth.csv"
+    table.write_text(table.read_text().replace("000000.png", name), encoding="utf-8")
+    if name == "000000":
+        assert open_dataset(table.parent).entries[0].image == name
+    else:
+        with pytest.raises(FormatError, match="is not in the order of the images"):
+            open_dataset(table.parent)
+
+
 def test_the_layout_parquet_says_what_it_needs(make: Make, monkeypatch: pytest.MonkeyPatch) -> None:
     def find_spec(name: str) -> None:
         del name

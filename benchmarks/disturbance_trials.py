@@ -1,0 +1,204 @@
+"""Disturbances of a frame, at which frames each is tried, and how often the live judge sees and names it."""
+
+from __future__ import annotations
+
+import itertools
+import re
+import sys
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from acquisition.session.judgement import Judgement
+from acquisition.session.plan import SessionStep
+from benchmarks.judged_labs import Lab, cause
+from drivers.presenter import BLACK, WHITE, Colour
+from sim.world.disturbances import (
+    AmbientStep,
+    AnyDisturbance,
+    Bump,
+    Defocus,
+    HalfChanged,
+    LampStep,
+    Person,
+    PopUp,
+    ScrambledRows,
+    ZeroedStrip,
+)
+
+LIGHT, ANY, LIT, TWO_COLOURED = "lights", "any", "lit", "lights with more of red than of blue, or less"
+
+
+@dataclass(frozen=True)
+class Trial:
+    """A disturbance: its size, how it is made, whether it stays, and at which frames it is tried.
+
+    `NAMED` has what a sentence must say to have named its cause.
+    """
+
+    name: str
+    size: str
+    events: tuple[AnyDisturbance, ...] = ()
+    stays: bool = True
+    at: str = LIGHT
+    special: str = ""
+
+    def is_named_in(self, reason: str) -> bool:
+        """Return whether the reason of a refusal says what was done."""
+        return re.search(NAMED[self.name], reason) is not None
+
+
+TRIALS = (
+    Trial("frozen screen, from a frame on", "another light", special="frozen"),
+    Trial("stale frame", "once", stays=False, special="frozen"),
+    Trial("pop-up during the exposure", "window, whole time", (PopUp(),), stays=False, at=LIT),
+    Trial("pop-up during the exposure", "window, 10 % of it", (PopUp(share=0.1),), stays=False, at=LIT),
+    Trial("pop-up during the exposure", "whole picture (255, 136, 0)", (PopUp(place=(-9, -9, 9, 9)),), False, LIT),
+    Trial("bump", "0.3 px", (Bump(px=0.3),), at=LIT),
+    Trial("bump", "1 px", (Bump(px=1),), at=LIT),
+    Trial("bump", "3 px", (Bump(px=3),), at=LIT),
+    Trial("bump", "8 px", (Bump(px=8),), at=LIT),
+    Trial("lamp", "−2 %", (LampStep(percent=-2),), at=LIT),
+    Trial("lamp", "−10 %", (LampStep(percent=-10),), at=LIT),
+    Trial("lamp", "−50 %", (LampStep(percent=-50),), at=LIT),
+    Trial("light in the room", "+1 %", (AmbientStep(percent=1),), at=ANY),
+    Trial("light in the room", "+3 %", (AmbientStep(percent=3),), at=ANY),
+    Trial("light in the room, warm", "+1 %", (AmbientStep(percent=1, rgb=(1.6, 1.0, 0.4)),), at=ANY),
+    Trial("defocus", "1 px", (Defocus(px=1),), at=LIT),
+    Trial("defocus", "3 px", (Defocus(px=3),), at=LIT),
+    Trial("person", "a quarter of the chart", (Person(),), at=LIT),
+    Trial("hand", "3 % of the chart", (Person(place=(0.3, 0.4, 0.5, 0.6), left=0.3),), at=LIT),
+    Trial("half-changed picture", "half", (HalfChanged(),), stays=False),
+    Trial("half-changed picture", "half, a fifth of the time", (HalfChanged(share=0.2),), stays=False),
+    Trial("half-changed picture", "a corner, 4 %", (HalfChanged(place=(-9, -9, 0.2, 0.2)),), stays=False),
+    Trial(
+        "late picture",
+        "5 % of the time the light before",
+        (HalfChanged(place=(-9, -9, 9, 9), share=0.05),),
+        stays=False,
+    ),
+    Trial("repeated file", "of the light before", stays=False, special="file"),
+    Trial("repeated file", "of the same light", stays=False, special="again"),
+    Trial("zeroed strip", "5 % of the rows", (ZeroedStrip(),), stays=False, at=ANY),
+    Trial("zeroed strip", "0.3 %", (ZeroedStrip(top=0.5, bottom=0.503),), stays=False, at=ANY),
+    Trial("scrambled rows", "20 %", (ScrambledRows(),), stays=False, at=LIT),
+    Trial("scrambled rows", "4 %", (ScrambledRows(top=0.5, bottom=0.54),), stays=False, at=LIT),
+    Trial("another camera", "serial number", special="serial", at=ANY),
+    Trial("another camera", "model", special="model", at=ANY),
+    Trial("another ISO speed", "200", special="iso", at=ANY),
+    Trial("colours exchanged", "red for blue", at=TWO_COLOURED, special="exchanged"),
+)
+
+
+_ANOTHER_LIGHT = "still seen|another light is seen|not the one ordered"
+_ELSEWHERE = "light from elsewhere|other light fall on the chart|was a lamp or a display switched"
+
+NAMED = {
+    "frozen screen, from a frame on": _ANOTHER_LIGHT,
+    "stale frame": _ANOTHER_LIGHT,
+    "pop-up during the exposure": f"a window cover|{_ANOTHER_LIGHT}",
+    "bump": "the chart has moved|not recognised where it was",
+    "lamp": "the lamp",
+    "light in the room": _ELSEWHERE,
+    "light in the room, warm": _ELSEWHERE,
+    "defocus": "focus",
+    "person": "does somebody or something stand before",
+    "hand": "does somebody or something stand before",
+    "half-changed picture": "only a part of the picture had changed|did only a part of the picture change|"
+    "did only a part of it change|did the picture change during",
+    "late picture": "light of the frame before|is the picture late|did the picture change during",
+    "repeated file": "a frame that it had given before",
+    "zeroed strip": "part of the file was lost",
+    "scrambled rows": "the file was damaged",
+    "another camera": "connect the camera",
+    "another ISO speed": "ISO speed 200",
+    "colours exchanged": _ANOTHER_LIGHT,
+}
+"""What of each disturbance a sentence names; what cannot be told apart by one frame is named with its alternatives."""
+
+
+@dataclass
+class Tally:
+    """How often something was refused at its frame, at the next one, not at all, with another cause, and by which."""
+
+    at_once: int = 0
+    next: int = 0
+    missed: int = 0
+    misnamed: int = 0
+    causes: Counter[str] = field(default_factory=Counter)
+
+
+def steps_of(lab: Lab, at: str, random: np.random.Generator) -> Iterator[SessionStep]:
+    """Yield steps at which a disturbance is tried: lights of the plan, deep blue and red ones, white, black."""
+    fixed = [Colour(0, 0, 255), Colour(255, 0, 0), Colour(255, 255, 255), Colour(0, 48, 255)]
+    lights = [*fixed, *(lab.plan[int(k)].colour for k in random.permutation(len(lab.plan)))]
+    if at == TWO_COLOURED:
+        lights = [colour for colour in lights if abs(colour.red - colour.blue) > 16]
+    if at in (ANY, LIT):
+        yield SessionStep(9000, "white", None, WHITE)
+    if at == ANY:
+        yield SessionStep(9001, "dark", None, BLACK)
+    for number, colour in enumerate(lights, 9002):
+        yield SessionStep(number, "light", 0, colour)
+
+
+def disturbed(lab: Lab, trial: Trial, step: SessionStep, shown: Colour) -> Judgement:
+    """Return what is said of a frame of a step with a disturbance; `shown` is the light of the frame before."""
+    if trial.special == "frozen":
+        judgement = lab.show(lab.counts(shown), step)
+    elif trial.special == "exchanged":
+        red, green, blue = step.colour.codes
+        judgement = lab.show(lab.counts(Colour(blue, green, red)), step)
+    elif trial.special == "serial":
+        judgement = lab.show(lab.counts(step.colour), step, serial="7")
+    elif trial.special == "model":
+        judgement = lab.show(lab.counts(step.colour), step, body=replace(lab.body, model="Canon EOS 77D"))
+    elif trial.special == "iso":
+        twice = replace(lab.settings.camera.exposure, iso=200)
+        counts = lab.world.expose(step.colour, twice, key=(next(lab.keys),))
+        judgement = lab.show(counts, step, settings=twice)
+    else:
+        judgement = lab.take(step, *trial.events)
+    return judgement
+
+
+def detection(labs: Sequence[Lab], tries: int) -> dict[tuple[str, str], Tally]:
+    """Return how often each disturbance was seen, tried so often in each lab."""
+    table: dict[tuple[str, str], Tally] = {}
+    for number, lab in enumerate(labs):
+        random = np.random.default_rng(number)
+        for trial in TRIALS:
+            tally = table.setdefault((trial.name, trial.size), Tally())
+            for step in itertools.islice(steps_of(lab, trial.at, random), tries):
+                before, after = (lab.plan[int(k)].colour for k in random.choice(len(lab.plan), 2, replace=False))
+                if step.colour in (before, after):
+                    continue
+                one = lab.fork()
+                counts = one.counts(before)
+                accepted = one.show(counts, SessionStep(8999, "light", 0, before))
+                one.before = before
+                if not accepted.accepted:
+                    tally.causes["(frame before refused)"] += 1
+                    continue
+                if trial.special == "file":
+                    said = one.show(counts, step)
+                elif trial.special == "again":
+                    said = one.show(counts, SessionStep(8999, "light", 0, before))
+                else:
+                    said = disturbed(one, trial, step, before)
+                if said.accepted and trial.stays:
+                    said = disturbed(one, trial, SessionStep(9999, "light", 0, after), before)
+                    tally.next += not said.accepted
+                else:
+                    tally.at_once += not said.accepted
+                tally.missed += said.accepted
+                tally.causes[cause(said) or "(missed)"] += 1
+                if said.accepted:
+                    print(f"missed: {trial.name} {trial.size} at {step.kind} {step.colour}", file=sys.stderr)
+                elif not trial.is_named_in(said.reason):
+                    tally.misnamed += 1
+                    where = f"{trial.name} {trial.size} in room {number} at {step.kind} {step.colour}"
+                    print(f"misnamed: {where} after {before}: {said.reason}", file=sys.stderr)
+    return table

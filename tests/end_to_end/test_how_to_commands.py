@@ -1,0 +1,189 @@
+"""The commands of the how-to pages are run as they stand there, page by page, each in a folder that has what it names.
+
+A small simulated lab stands in for the lab, a computed table of 64 colours for the table, a dozen generated images for
+each data set. What a command cannot be run on here is in `Page.skipped` with its reason; the commands of rehearsal.md
+have a test of their own, those of the tutorial are run by `make demo`.
+"""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from importlib import import_module
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from tests.house.test_documented_commands import FOUND
+from tests.house_commands import COMMANDS
+
+HOW_TO = "docs/how-to/"
+ELSEWHERE = {"rehearsal.md"}
+"""Pages whose commands have a test of their own."""
+
+LAB = 'rig = "simulated"\nchart = "chart/chart.json"\nilluminations = "illuminations.csv"\n'
+SIMULATED = '[simulated]\nbody = "Test"\nseed = 11\n'
+_REAL = (
+    "takes the real data set of the page, which is downloaded from its makers; tests/evaluation/commands has it made up"
+)
+_SERVES = "serves until somebody ends it; tests/acquisition/monitor"
+
+
+@dataclass(frozen=True)
+class Page:
+    """What the commands of a page are run on.
+
+    Attributes
+    ----------
+    needs
+        Names in its folder, and what stands there.
+    written
+        Words of the page, and what is written in their place.
+    added
+        Words that are added to commands that begin so.
+    fresh
+        What is removed before commands that begin so: the page has alternatives with one result.
+    refused
+        Commands that end in a sentence here, and its words: all is well in this lab.
+    skipped
+        Beginnings of commands that are not run, and why.
+    """
+
+    needs: Mapping[str, str] = field(default_factory=dict[str, str])
+    written: Mapping[str, str] = field(default_factory=dict[str, str])
+    added: Mapping[str, str] = field(default_factory=dict[str, str])
+    fresh: Mapping[str, str] = field(default_factory=dict[str, str])
+    refused: Mapping[str, str] = field(default_factory=dict[str, str])
+    skipped: Mapping[str, str] = field(default_factory=dict[str, str])
+
+
+_LAB = {name: name for name in ("LAB.toml", "chart", "illuminations.csv")}
+_GENERATE = {"lut": "computed", "photographs": "pictures"}
+
+PAGES = {
+    "check.md": Page(_LAB),
+    "citing.md": Page({"session": "session"}),
+    "comparing.md": Page(
+        {"runs/cube-plus": "results", "runs/before": "results", "runs/after": "results"}
+        | {"runs/a": "results", "runs/b": "results"},
+        written={"Gray-world=Mine": "Gray-world=White-Patch"},
+    ),
+    "describing.md": Page(
+        {"generated": "dataset", "real": "dataset", "LUT": "computed", "LUT1": "computed", "LUT2": "computed"}
+        | {"pictures": "pictures", "lights.csv": "gt.txt"},
+        written={"~/data/Cube+": "real", "~/data/mine": "real"},
+        fresh={"generate LUT ": "generated"},
+        skipped={"generate 5DSR": _REAL, "evaluate describe out": _REAL},
+    ),
+    "evaluate.md": Page(
+        {"DATA": "dataset", "brightest.py": "brightest.py", "c5.csv": "estimates.csv", "out/fc4.csv": "estimates.csv"},
+        fresh={"evaluate": "RESULTS"},
+    ),
+    "night-run.md": Page(
+        _LAB | {"session": "session"},
+        refused={"acquire run LAB.toml session/ --retake bad": "names no frame to be taken again"},
+        skipped={"acquire monitor": _SERVES},
+    ),
+    "rendering.md": Page(_GENERATE | {"lights.csv": "gt.txt"}, fresh={"generate": "out"}),
+    "repeatability.md": Page(
+        dict.fromkeys(("monday", "friday", "session"), "session")
+        | {"monday.lut": "lut", "friday.lut": "lut", "chart": "chart"}
+    ),
+    "table-without-a-lab.md": Page(
+        {"small.toml": "small.toml", "mine.json": "mine.json", "photographs": "pictures"},
+        written={"cie,2000:10000:200K": "cie-d,2000:10000:2000K"},
+        # Of 32 768 colours and 707 lights it takes a minute.
+        added={"sim table": "--settings small.toml", "sim table lut/ --camera Canon": "--lights 2000:10000:2000K"},
+        fresh={"sim table": "lut"},
+    ),
+    "taking-a-session.md": Page(
+        _LAB,
+        written={"12,40-44": "1,2-3"},
+        refused={"acquire run LAB.toml SESSION --retake bad": "no report of build-lut on SESSION lies beside it"},
+    ),
+    "train-and-cross-validate.md": Page({"DATA": "dataset", "OTHER": "dataset"}),
+    "training-set.md": Page(skipped={"": _REAL}),
+    "transfer.md": Page(skipped={"": _REAL}),
+    "tune.md": Page({"DATA": "dataset", "OTHER": "dataset"}),
+    "variation.md": Page(
+        _GENERATE | {"photographs": "large", "scenes": "large", "own_lights.csv": "own_lights.csv"},
+        fresh={"generate": "out"},
+    ),
+}
+
+
+def run(*words: object) -> int:
+    """Run a command as the shell would and return its exit code."""
+    name, *arguments = map(str, words)
+    return int(import_module(COMMANDS[name]).main(arguments))
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a folder with everything that a page may need."""
+    at = tmp_path_factory.mktemp("made")
+    rng = np.random.default_rng(1)
+    # Large ones have four places of 512 × 512 that do not touch.
+    for folder, count, side in (("pictures", 8, 48), ("large", 2, 1040)):
+        (at / folder).mkdir()
+        for number in range(count):
+            blocks = rng.integers(0, 256, (side // 8, side // 8, 3), dtype=np.uint8)
+            cv2.imwrite(str(at / folder / f"{number}.png"), cv2.resize(blocks, (side, side), interpolation=0))
+    (at / "small.toml").write_text("[chart]\nbits = 2\n")
+    sensitivities = next((Path(__file__).parents[2] / "sim" / "data").rglob("*EOS_600D*.json"))
+    shutil.copy(sensitivities, at / "mine.json")
+    assert run("acquire", "chart", at / "chart", "--bits", 2, "--no-tiff") == 0
+    assert run("acquire", "illuminations", at / "illuminations.csv", "--grid", 1, "--blackbodies", "3000,5000") == 0
+    (at / "LAB.toml").write_text(LAB + "[judge]\nresponse = false\n" + SIMULATED)
+    assert run("acquire", "run", at / "LAB.toml", at / "session") == 0
+    assert run("build-lut", at / "session", at / "lut") == 0
+    spectra = ("--lights", "2000:10000:2000K,D65")
+    assert run("sim", "table", at / "computed", "--settings", at / "small.toml", *spectra) == 0
+    assert run("generate", at / "computed", at / "dataset", "--sources", at / "pictures") == 0
+    shutil.copy(at / "dataset" / "gt.txt", at / "gt.txt")
+    lights = [line.replace(" ", ",") for line in (at / "gt.txt").read_text().splitlines()[:2]]
+    (at / "own_lights.csv").write_text(f"image,r,g,b\n0,{lights[0]}\n1,{lights[1]}\n")
+    assert run("evaluate", "run", at / "dataset", "--out", at / "results") == 0
+    rows = [line.split(",") for line in (at / "dataset" / "ground_truth.csv").read_text().splitlines()[1:]]
+    estimates = [",".join([row[0], *row[-3:]]) for row in rows]
+    (at / "estimates.csv").write_text("\n".join(["image,r,g,b", *estimates]) + "\n")
+    page = (Path(__file__).parents[2] / HOW_TO / "evaluate.md").read_text("utf-8")
+    (at / "brightest.py").write_text(page.partition("```python brightest.py\n")[2].partition("```")[0])
+    return at
+
+
+def test_every_page_with_commands_is_here() -> None:
+    pages = {page.removeprefix(HOW_TO) for page, _ in FOUND if page.startswith(HOW_TO)}
+    assert pages - ELSEWHERE == set(PAGES)
+
+
+@pytest.mark.parametrize("name", [name for name, page in PAGES.items() if "" not in page.skipped])
+def test_the_commands_of_a_page_run(
+    name: str, made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    page, done = PAGES[name], 0
+    for needed, what in page.needs.items():
+        (tmp_path / needed).parent.mkdir(parents=True, exist_ok=True)
+        (shutil.copytree if (made / what).is_dir() else shutil.copy)(made / what, tmp_path / needed)
+    monkeypatch.chdir(tmp_path)
+    for words in (words for where, words in FOUND if where == HOW_TO + name):
+        command = " ".join(words)
+        if any(command.startswith(beginning) for beginning in page.skipped):
+            continue
+        for beginning, result in page.fresh.items():
+            if command.startswith(beginning):
+                shutil.rmtree(result, ignore_errors=True)
+        more = [
+            word for beginning, added in page.added.items() if command.startswith(beginning) for word in added.split()
+        ]
+        code = run(*(page.written.get(word, word) for word in words), *more)
+        said = capsys.readouterr()
+        refusal = page.refused.get(command)
+        if refusal is not None:
+            assert refusal in " ".join(said.err.split())
+        assert code == (0 if refusal is None else 2), f"{command}: {code}\n{said.out[-2000:]}{said.err[-2000:]}"
+        done += 1
+    assert done
