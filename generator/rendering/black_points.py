@@ -46,8 +46,8 @@ if TYPE_CHECKING:
     from generator.lights.lighting import Mixture
 
 MOST: Final = 0.97
-"""Largest random share unless said otherwise. Chosen: with it, learned methods did best on real photographs, and
-a hundredth of white, that of deep shadows in real scenes, is left."""
+"""Largest random share unless said otherwise. Chosen: with it, learned methods did best on real photographs, of shares
+that others had tried (docs/transfer.md); real scenes have some veil of their own."""
 
 _HALVINGS: Final = 40
 """Steps to find what samples above 0 are lowered by: to 2⁻²⁴ counts."""
