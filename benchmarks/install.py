@@ -2,8 +2,8 @@
 
 `python -m benchmarks.install [--python PYTHON]… [--keep FOLDER]` makes the wheel, installs it with pip into a fresh
 environment in a folder of its own, runs the tutorial's commands there, without the repository, and prints one JSON
-object a line: megabytes of each large package, seconds of imports beside those of numpy and OpenCV, seconds of the
-tutorial's steps. Needs a package index, as any installation does, and 2 GB of disk.
+object a line: megabytes of each large package, seconds of imports beside those of numpy and OpenCV, of `generate` for
+one picture, and of the tutorial's steps. Needs a package index, as any installation does, and 2 GB of disk.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ import argparse
 import json
 import os
 import re
+import resource
 import shutil
 import subprocess
 import sys
@@ -81,7 +82,26 @@ def _tried(python: str, folder: Path) -> bool:
         folder,
     )
     print(json.dumps({"python": version, "name": "import generator loads of the lab's", "value": loaded.strip()}))
+    _one_picture(version, binaries, folder)
     return _tutorial(version, binaries, folder)
+
+
+def _one_picture(version: str, binaries: Path, folder: Path) -> None:
+    """Print how long `generate` takes for one picture once its kernels are compiled, the table made and files read."""
+    (picture,) = (ROOT / "docs" / "images").glob("prints.png")
+    environment = _away() | {"XDG_CACHE_HOME": str(folder / "cache")}
+    environment.pop("PYTHONDONTWRITEBYTECODE", None)
+    took: list[tuple[float, float]] = []
+    for number in range(1 + ROUNDS):
+        before, started = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
+        words = [str(binaries / "generate"), "demo:", f"one-{number}", "--sources", str(picture)]
+        subprocess.run(words, cwd=folder, env=environment, check=True, capture_output=True)
+        after = resource.getrusage(resource.RUSAGE_CHILDREN)
+        busy = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+        took.append((time.perf_counter() - started, busy))
+    _say(version, "generate, one picture, first start", took[0][0], "s")
+    _say(version, "generate, one picture, warm", min(wall for wall, _ in took[1:]), "s")
+    _say(version, "generate, one picture, warm, processor time", min(busy for _, busy in took[1:]), "s")
 
 
 def _tutorial(version: str, binaries: Path, folder: Path) -> bool:

@@ -131,6 +131,7 @@ def plain(value: Any) -> Any:
 
     Examples
     --------
+    >>> from pathlib import Path
     >>> plain({"place": Path("lut"), "angles": (0.5, float("nan"))})
     {'place': 'lut', 'angles': [0.5, None]}
     """

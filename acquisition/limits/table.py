@@ -72,6 +72,7 @@ TABLE_LIMITS: Mapping[str, TableLimit] = MappingProxyType(
         "bleed": TableLimit("share", "at most", 0.005, 0.03),
         "unfit_share": TableLimit("share", "at most", 0.005, 0.1),
         "doubtful_share": TableLimit("share", "at most", 0.0003, None),
+        "added_light": TableLimit("share", "at most", 0.004, 0.01),
         "references_used": TableLimit("share", "at least", 0.9, 0.3),
         "reference_spread": TableLimit("share", "at most", 0.01, 0.05),
         "leak_share": TableLimit("share", "at most", 0.005, 0.1),

@@ -251,6 +251,7 @@ _GATHERERS: dict[str, Callable[[TableFigures, float], Gathered | None]] = {
     "noisy_share": _noisy,
     "doubtful_share": lambda figures, limit: print_evidence(figures, "doubtful_share"),
     "unfit_share": lambda figures, limit: print_evidence(figures, "unfit_share"),
+    "added_light": lambda figures, limit: print_evidence(figures, "added_light"),
     "reference_spread": lambda figures, limit: print_evidence(figures, "reference_spread"),
     "additivity": _additivity,
     "white_short": light_evidence,

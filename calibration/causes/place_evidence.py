@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from acquisition.limits.bleed import WINDOW_PX
-from acquisition.measures.least_squares import least_absolute_line
+from acquisition.measures.reflections import cell_mm, joined_cells, light_of_spot, spot_colour, spots_of
 from acquisition.measures.stains import Stains
 from acquisition.session.records import FrameRecord
 from calibration.causes.evidence import Evidence
@@ -38,9 +38,6 @@ _LEAST_RESIDUAL = 0.02
 RIM_OFF = -0.005
 """Mean residual of the outermost references below which a frame's corners are darker than its field."""
 
-_LEAST_CELLS = 6
-"""Cells of a place for a line through them to mean anything."""
-
 _LEAST_BRIGHT = 4
 """Cells of a small place from which on light was added if all of them are brighter."""
 
@@ -50,9 +47,6 @@ _MOSTLY = 0.8
 _COVERED = 0.1
 """Deviation that what covers cells gives one of them at least, unless it darkens all (chosen: of a hand's reflectance
 are few colours of a print within a tenth)."""
-
-_BRIGHT_PERCENTILE = 99.0
-"""Of the cells' levels, what is taken for paper white."""
 
 _Array = npt.NDArray[np.float64]
 _Mask = npt.NDArray[np.bool_]
@@ -184,7 +178,7 @@ def disturbed_evidence(figures: TableFigures, softer: float) -> Gathered | None:
     places: list[PrintPlace] = []
     for frame in lights[:MOST_PLACES]:
         own = np.array([cell for cell, _ in frame.consistency.disturbed], dtype=np.int64)
-        places += [_place_of(stains, spot, frame.record.file) for spot in _joined(stains, own)]
+        places += [_place_of(stains, spot, frame.record.file) for spot in joined_cells(stains, own)]
     return Gathered(evidence, tuple(frame.record for frame in lights), tuple(places[:MOST_PLACES]))
 
 
@@ -240,35 +234,13 @@ def lens_evidence(figures: TableFigures) -> dict[str, float]:
     return known
 
 
-def spots_of(stains: Stains) -> list[npt.NDArray[np.int64]]:
-    """Return the cells (N,) int64 of each spot of deviating cells, the largest first."""
-    return _joined(stains, np.flatnonzero(stains.stained | stains.doubtful))
-
-
-def _joined(stains: Stains, cells: npt.NDArray[np.int64]) -> list[npt.NDArray[np.int64]]:
-    """Return cells (N,) in groups of those that lie next to each other, the largest first."""
-    from scipy.sparse import coo_matrix
-    from scipy.sparse.csgraph import connected_components
-    from scipy.spatial import cKDTree
-
-    if not len(cells):
-        return []
-    places = stains.places_mm[cells]
-    apart = 2.3 * _cell_mm(stains)
-    pairs = cKDTree(places).query_pairs(apart, output_type="ndarray")
-    graph = coo_matrix((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(len(cells), len(cells)))
-    count, label = connected_components(graph, directed=False)
-    return sorted((cells[label == number] for number in range(int(count))), key=len, reverse=True)
-
-
 def _of_spot(figures: TableFigures, stains: Stains, spot: npt.NDArray[np.int64]) -> Gathered:
     """Return what is known of one spot of the print."""
     place = _place_of(stains, spot, figures.registered_frame.record.file)
     at_mm = np.array([place.x_mm, place.y_mm])
-    alone = stains.alone[spot]
-    colour = np.array([float(np.median(one[np.isfinite(one)])) if np.isfinite(one).any() else 0.0 for one in alone.T])
+    colour = spot_colour(stains, spot)
     deviation, tint = _colour(colour)
-    added, kept = _light_of(stains, spot, int(np.argmax(np.abs(colour))))
+    added, kept = light_of_spot(stains, spot, int(np.argmax(np.abs(colour))))
     size_mm, least = max(place.size_mm, 1e-9), _HALF * abs(deviation)
     hottest = figures.dark_frames.hottest
     white_residual = _white_residual(figures, at_mm, place.size_mm, least)
@@ -301,7 +273,7 @@ def _of_spot(figures: TableFigures, stains: Stains, spot: npt.NDArray[np.int64])
 
 def _white_off(figures: TableFigures, at_mm: _Array, size_mm: float, least: float) -> list[FrameFigures]:
     """Return the white frames whose references are off at a place by `least` or more."""
-    reach = max(size_mm, 3 * _cell_mm(figures.cells.stains))
+    reach = max(size_mm, 3 * cell_mm(figures.cells.stains))
     return [
         frame
         for frame in figures.white_frames
@@ -360,7 +332,7 @@ def _of_references(figures: TableFigures) -> Gathered | None:
     if 0 < known.get("white_residual", 0.0) <= _HALF:
         return Gathered(Evidence(**known), (worst.record,), places)
     at_mm = np.array(left.at_mm)
-    near = [spot for spot in spots_of(stains) if _distance(stains, spot, at_mm) < 4 * _cell_mm(stains)]
+    near = [spot for spot in spots_of(stains) if _distance(stains, spot, at_mm) < 4 * cell_mm(stains)]
     if not near:
         place = PrintPlace(worst.record.file, *left.at_mm, 0.0)
         return Gathered(Evidence(**known), (), (place,))
@@ -412,41 +384,20 @@ def _colour(colour: _Array) -> tuple[float, float]:
     return deviation, float(np.ptp(lit)) / max(abs(deviation), 1e-9) if len(lit) > 1 else 0.0
 
 
-def _light_of(stains: Stains, spot: npt.NDArray[np.int64], channel: int) -> tuple[float, float]:
-    """Return the light added in a spot, of paper white, and the share of their own that its cells keep.
-
-    By least absolute deviations, in the channel that deviates most; NaN of too few cells.
-    """
-    seen, alone = stains.level[:, channel], stains.alone[:, channel]
-    there = spot[np.isfinite(alone[spot]) & (alone[spot] > -0.99)]
-    if len(there) < _LEAST_CELLS:
-        return np.nan, np.nan
-    top = float(np.nanpercentile(seen, _BRIGHT_PERCENTILE))
-    y = seen[there] / top
-    x = y / (1 + alone[there])
-    return least_absolute_line(x, y)
-
-
 def _place_of(stains: Stains, spot: npt.NDArray[np.int64], file: str) -> PrintPlace:
     x, y = stains.places_mm[spot].mean(axis=0).tolist()
-    return PrintPlace(file, x, y, 2 * float(np.sqrt(len(spot) / np.pi)) * _cell_mm(stains))
+    return PrintPlace(file, x, y, 2 * float(np.sqrt(len(spot) / np.pi)) * cell_mm(stains))
 
 
 def _distance(stains: Stains, spot: npt.NDArray[np.int64], at_mm: _Array) -> float:
     return float(np.linalg.norm(stains.places_mm[spot] - at_mm, axis=1).min())
 
 
-def _cell_mm(stains: Stains) -> float:
-    """Return the side of the square that a cell stands for."""
-    size = np.ptp(stains.places_mm, axis=0)
-    return float(np.sqrt(size[0] * size[1] / len(stains.places_mm)))
-
-
 def _spot_share(stains: Stains, at_mm: _Array, size_mm: float) -> float:
     """Return the share of the cells about a place that deviate in the mean of the white frames."""
     if not stains.known:
         return np.nan
-    near = np.linalg.norm(stains.places_mm - at_mm, axis=1) < max(size_mm / 2, 2 * _cell_mm(stains))
+    near = np.linalg.norm(stains.places_mm - at_mm, axis=1) < max(size_mm / 2, 2 * cell_mm(stains))
     return float((stains.stained | stains.doubtful)[near].mean()) if near.any() else np.nan
 
 

@@ -84,7 +84,7 @@ class Rule:
 PLACE = frozenset({"unlike_block", "disturbed_cells"})
 COVERED = frozenset({"disturbed_cells", "unfit_share"})
 ALL_CELLS = frozenset({"unlike_scatter", "softer_bleed", "moved_anew", "noisy_share"})
-PRINT = frozenset({"doubtful_share", "unfit_share", "reference_spread"})
+PRINT = frozenset({"doubtful_share", "unfit_share", "added_light", "reference_spread"})
 FOUND = frozenset({"agreement", "blocks_good", "tags_found"})
 SHEET = PRINT | {"noisy_share"}
 DRIFT = frozenset({"white_drift", "white_drift_deg"})

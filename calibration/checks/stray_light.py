@@ -6,7 +6,8 @@ best (`calibration.checks.light_codes`). Two sums are known far better, whatever
 
 - *Codes of 0.* A light is a sum of the three primaries, each of which has a frame of its own. Of a primary whose code
   is 0 it has nothing beyond the dark light. What it seems to have is room light in its own frame; what it seems to lack
-  was in the frame of a primary that it is made of, as much of it as the light takes of that primary.
+  was in the frame of a primary that it is made of, as much of it as the light takes of that primary. Light that is in a
+  primary's frame is missed so in all of them.
 - *White.* Red, green and blue alone together give white. Where they give more, by as much in each primary and under a
   lamp that is steady, light that is no projector's was in their frames, and is counted as often as it was there. A
   projector that holds full white back looks the same, and this has to be said. One that brightens white hides it.
@@ -157,10 +158,14 @@ def stray_light(
     worst = np.argmax(np.where(beyond.any(axis=1, keepdims=True), beyond, zero), axis=1)
     at_zero = amounts[np.arange(len(codes)), worst]
     has = checked & ~lights_of.all(axis=1)
+    of_primaries = _of_primaries(codes[list(primaries)], full, spread[list(primaries)])
+    mixed = has & (lights_of.sum(axis=1) > 1)
+    if of_primaries and _are_alone(amounts[mixed], lights_of[mixed], spread[mixed], of_primaries):
+        of_primaries = 0.0
     return StrayLight(
         at_zero=np.where(has, at_zero, np.nan),
         certain=beyond.max(axis=1, initial=0.0),
-        of_primaries=_of_primaries(codes[list(primaries)], full, spread[list(primaries)]),
+        of_primaries=of_primaries,
         primaries=primaries,
         lights_of=lights_of,
     )
@@ -181,6 +186,34 @@ def _of_primaries(codes: npt.NDArray[np.int64], full: _Array, spread: _Array) ->
     alike = float(np.ptp(lacking)) <= _ALIKE * float(lacking.mean())
     return share if alike and 0 < share <= _LARGEST else 0.0
 
+
+def _are_alone(amounts: _Array, lights_of: _Mask, spread: _Array, share: float) -> bool:
+    """Return whether lights of two primaries show that the primaries' frames hold no other light.
+
+    Parameters
+    ----------
+    amounts, spread
+        (N, 3) float64, of each primary, and their standard errors.
+    lights_of
+        (N, 3) bool, primaries with a code above 0.
+    share
+        By how much the primaries together exceed white: what lights would lack if it were other light.
+    """
+    holds = np.where(lights_of, amounts, 0.0) >= _MUCH
+    if not (holds.sum(axis=0) >= _WITNESSES).all():
+        return False
+    lacks = np.where(lights_of, 0.0, np.abs(amounts) + CERTAIN * spread).max(axis=1)
+    return bool(lacks[holds.any(axis=1)].max() <= _LITTLE * share)
+
+
+_MUCH = 0.5
+"""Amount of a primary from which on a light misses half of what else is in that primary's frame."""
+
+_WITNESSES = 3
+"""Lights of each primary that must agree (chosen: one could hold as much other light as it misses)."""
+
+_LITTLE = 0.25
+"""Share of what primaries exceed white by that lights may lack of it, noise included, for the primaries to be alone."""
 
 _FULL = 255
 """Code of a primary at its brightest."""

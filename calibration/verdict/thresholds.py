@@ -89,7 +89,7 @@ THRESHOLDS: tuple[Threshold, ...] = (
         "focus on the print, stop down to f/8, bring the camera nearer, or take a smaller window (build-lut --window)",
     ),
     Threshold(
-        "correction_residual", "Light of surroundings left in cells' means", "share", "at most", 0.01, 0.03,
+        "correction_residual", "Light of surroundings that may be left in cells' means", "share", "at most", 0.01, 0.03,
         "what the lens spreads, or may spread as a veil that an evenly lit print cannot show, is in the samples",
         SIMULATED + ": 0.1 to 0.2 % where light falls off towards the corners, and the means are as good; 1.4 % in "
         "even light or on a chart of 512 colours, which do not show a veil of the usual 1 %",
@@ -130,6 +130,14 @@ THRESHOLDS: tuple[Threshold, ...] = (
         "doubtful_share", "Cells in surroundings 1 % off their codes' colours", *TABLE_LIMITS["doubtful_share"].numbers,
         "the print, or the light on it, is not the same there as elsewhere; from 2 % on its cells are listed as unfit",
         SIMULATED + ": none on a clean flat print", "clean the print, hang it flatter, and look for shadows on it",
+    ),
+    Threshold(
+        "added_light", "Light added to a large part of the print, of paper white",
+        *TABLE_LIMITS["added_light"].numbers,
+        "it is the same on dark cells as on bright ones, and goes on beyond those that are listed as unfit",
+        SIMULATED + ": 0 in healthy rooms; 1 % of paper makes cells of a tenth of paper 10 % brighter, and those of a "
+        "thirtieth 30 %; a reflection of 3 % leaves a table with cells 57 % off",
+        "turn print or projector until nothing is mirrored on it, or print on matt paper",
     ),
     Threshold(
         "softer_bleed", "Light of neighbouring cells added in the most blurred frame", "share", "at most", 0.003, 0.012,
@@ -227,11 +235,13 @@ THRESHOLDS: tuple[Threshold, ...] = (
         JUDGEMENT + ": a hundredth of a cell of a fifth of white", "darken the room, and keep daylight out",
     ),
     Threshold(
-        "stray_share", "Light in some frames that no dark frame shows, of white", "share", "at most", 0.004, 0.1,
+        "stray_share", "Light in some frames that no dark frame shows, of white", "share", "at most", 0.004, 0.01,
         "a light contains it, or a primary that others are made of, so that deep colours are paler under some lights "
         "than under others; subtracting dark frames does not help",
-        SIMULATED + ": below 0.1 % in healthy rooms; 1 % of white makes the darkest cells 10 % brighter",
-        "darken the room, see that no door, lamp or display changes during the session, and take the frames again",
+        SIMULATED + ": below 0.1 % in healthy rooms; 1 % of white makes the darkest cells 10 % brighter, and puts deep "
+        "lights 1 to 2 degrees off, which is a good method's error",
+        "darken the room, see that no door, lamp or display changes during the session, switch power saving and "
+        "dynamic contrast off, and take the frames again",
     ),
     Threshold(
         "linearity", "Deviation from linearity, 5 to 95 % of saturation", *TABLE_LIMITS["linearity"].numbers,

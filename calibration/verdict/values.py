@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from acquisition.measures.reflections import added_light
 from calibration.checks.frame_consistency import has_enough_cells
 from calibration.figures.table_figures import TableFigures
 from calibration.sampling.windows import bleed
@@ -61,6 +62,7 @@ def _cell_values(figures: TableFigures) -> dict[str, float]:
     values = {"unfit_share": len(cells.unfit) / max(_cell_count(figures), 1)}
     if cells.stains.known:
         values["doubtful_share"] = float(cells.stains.doubtful.mean())
+        values["added_light"] = added_light(cells.stains)
     return values
 
 

@@ -36,6 +36,10 @@ _RESULTS: Final[dict[str, Callable[[Any], Any]]] = {"bool": bool, "float32": flo
 _DONE: Final = (0, -2)
 """Statuses of a function that returned: with a value, and with none."""
 
+_NAMES: Final = {np.dtype(name): name for name in _CTYPES}
+"""Names of numpy's types; numpy itself takes longer to tell one than a small kernel runs. Others' orders of bytes are
+none of them."""
+
 _ARRAY: Final[Any] = np.ndarray
 _OF_NUMPY: Final[Any] = (np.ndarray, np.generic)
 
@@ -52,10 +56,8 @@ def kind_of(value: Any) -> str | None:
     ('int64', 'uint32', 'uint8 2 C', None)
     """
     if isinstance(value, _OF_NUMPY):
-        kind: np.dtype[Any] = value.dtype
-        if kind.name not in _CTYPES or not kind.isnative:
-            return None
-        return _array_kind(kind.name, value) if isinstance(value, _ARRAY) else kind.name
+        name = _NAMES.get(value.dtype)
+        return _array_kind(name, value) if name and isinstance(value, _ARRAY) else name
     if isinstance(value, bool):
         return "bool"
     if isinstance(value, int):

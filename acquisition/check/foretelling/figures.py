@@ -23,6 +23,7 @@ from acquisition.lights.illuminations import Illumination
 from acquisition.limits.bleed import bleed
 from acquisition.limits.table import ONLY_OF_A_SESSION, TABLE_LIMITS, TableOutcome
 from acquisition.measures.paper import Paper, PaperReader
+from acquisition.measures.reflections import added_light
 from acquisition.measures.stains import Stains, find_stains
 from foundation.angles import angles_deg
 from foundation.errors import QualityError
@@ -101,6 +102,7 @@ def foretell(
         figures["unfit_share"] = share
     if stains is not None and stains.known:
         figures["doubtful_share"] = float(stains.doubtful.mean())
+        figures["added_light"] = added_light(stains)
     usable = int(np.isfinite(seen[white]).all(axis=1).sum())
     figures["references_used"] = usable / max(int(white.sum()), 1)
     if paper is not None:

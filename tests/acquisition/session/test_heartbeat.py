@@ -10,11 +10,12 @@ import signal
 import socket
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import closing
 from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from types import SimpleNamespace
 
 import pytest
@@ -126,14 +127,19 @@ class TestPlace:
     """Whose folder a sign of life was given for; a copy holds the same sign."""
 
     @pytest.fixture
-    def run(self, tmp_path: Path) -> Path:
-        """Return a session's folder in which a run has said that it takes frames, and still says so."""
-        folder = tmp_path / "night"
-        folder.mkdir()
-        Journal.create(folder / "journal.sqlite", ())
-        with closing(Journal.open_for_run(folder / "journal.sqlite")) as journal:
-            journal.beat("running", "frames are taken", NOW)
-        return folder
+    def run(self) -> Iterator[Path]:
+        """Return a session's folder in which a run has said that it takes frames, and still says so.
+
+        On the disk for temporary files, whose file system mostly tells folders of one number apart; one in memory
+        does not.
+        """
+        with TemporaryDirectory() as place:
+            folder = Path(place) / "night"
+            folder.mkdir()
+            Journal.create(folder / "journal.sqlite", ())
+            with closing(Journal.open_for_run(folder / "journal.sqlite")) as journal:
+                journal.beat("running", "frames are taken", NOW)
+            yield folder
 
     @staticmethod
     def of(folder: Path) -> tuple[Heartbeat, SessionPlace]:
@@ -161,6 +167,14 @@ class TestPlace:
         told, here = self.of(run)
         if here.generation:  # Else numbers may be given anew, and nothing tells.
             assert told.is_of(here) is False
+
+    def test_the_journal_of_a_backup_in_the_folder_of_the_run_is_another(self, run: Path) -> None:
+        _, before = self.of(run)
+        shutil.copy(run / "journal.sqlite", run / "copy")
+        (run / "copy").replace(run / "journal.sqlite")
+        _, here = self.of(run)
+        assert here.inode == before.inode
+        assert here.journal != before.journal
 
     def test_a_folder_that_bears_the_number_of_one_that_is_gone_is_another(self, run: Path) -> None:
         told, here = self.of(run)

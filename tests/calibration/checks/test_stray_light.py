@@ -76,6 +76,25 @@ def test_light_in_all_primaries_shows_against_white() -> None:
     assert set(stray.lights_beyond(0.004)) >= {0, 2}
 
 
+def held_back(share: float, leak: float = 0.0) -> Any:
+    """Return what is found where full white is held back by a share, and red's frame has other light, if any."""
+    levels = (0, 60, 150, 255)
+    mixed = [(r, g, b) for r in levels for g in levels for b in levels if (r, g, b).count(0) < 2]
+    codes = np.array([(255, 0, 0), (0, 255, 0), (0, 0, 255), *mixed], dtype=np.int64)
+    paper = np.array([[2000, 500, 100], [1100, 5700, 870], [110, 1130, 4600]], dtype=np.float64)
+    whites = (codes / 255) ** 2.2 @ paper
+    whites[(codes == 255).all(axis=1)] *= 1 - share
+    whites[0] += leak * paper.sum(axis=0)
+    full = np.repeat(paper.sum(axis=0)[None], 3, axis=0) * (1 - share)
+    return stray_light(codes, whites, 1e-4 * whites + 0.1, full, PRIMARIES)
+
+
+def test_a_projector_that_holds_full_white_back_is_known_by_its_other_lights() -> None:
+    assert held_back(0.03).share == 0
+    # Other light in a primary's frame is missed by lights of it.
+    assert held_back(0.03, leak=0.01).share > 0.008
+
+
 def test_a_light_of_another_name_is_none_of_a_room() -> None:
     """A frame of white under the name of a dim red one."""
     assert found(stray={DIM: 1.0}).share < 0.001

@@ -79,6 +79,7 @@ def test_a_serial_number_that_is_not_told_stands_nowhere(form: str) -> None:
     told = with_told_serials([BODY, replace(BODY, serial="99")], citation.camera_serial)
     assert BODY.serial not in text + repr(told)
     assert found.camera_serial_is == form
+    assert ("(hash)" in text) is (form == "hash")
     # Frames of another body must still be told apart.
     assert told[0].serial != told[1].serial
 
@@ -166,3 +167,14 @@ def test_dates_are_in_utc() -> None:
     found = origin_record(stated(), RECORDS, [BODY])
     assert found.last_frame is not None
     assert datetime.fromisoformat(found.last_frame).tzinfo == UTC
+
+
+def test_an_address_ends_no_entry() -> None:
+    origin = OriginRecord(url="https://doi.example/10.1/{a}\\b\n c")
+    assert "url = {https://doi.example/10.1/abc}," in bibtex("Test", 3, "croplab", "0" * 64, origin)
+
+
+def test_bodies_without_their_numbers_are_counted_as_they_come() -> None:
+    origins = [FrameOrigin("Test", serial) for serial in ("7", "8", "7")]
+    told = [one.serial for one in with_told_serials(origins, "withheld")]
+    assert told == ["withheld (1)", "withheld (2)", "withheld (1)"]

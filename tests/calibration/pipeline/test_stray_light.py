@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -13,6 +14,9 @@ from calibration.pipeline.build import build
 from calibration.pipeline.options import BuildOptions
 from calibration.report.summary import summary
 from calibration.verdict.result import BuildResult
+from calibration.verdict.thresholds import THRESHOLDS
+from calibration.verdict.values import judged_values
+from calibration.verdict.verdict import judge
 from calibration.verdict.wording import remark
 from drivers.presenter import Colour
 from sim.world.room import Room
@@ -23,6 +27,8 @@ LIGHTS = {
     "red": Colour(255, 0, 0), "green": Colour(0, 255, 0), "blue": Colour(0, 0, 255), "white": Colour(255, 255, 255),
     "yellow": Colour(255, 180, 0), "warm": Colour(255, 164, 73),
 }  # fmt: skip
+REMARKING = [replace(limit, refuse=None) for limit in THRESHOLDS]
+"""Limits that refuse nothing, so that there are figures to look at."""
 DAYLIGHT = Situation(ambient=(0.008, 0.01, 0.012))
 
 
@@ -35,7 +41,7 @@ def built(folder: Path, room: Room, leaking: frozenset[str] = frozenset(), subtr
 
     world = world_of(chart, BODIES["Test"], room)
     with short_session(folder / "session", chart, world, changes, lights) as session:
-        return build(session, folder / "lut", options=BuildOptions(subtract_dark=subtract_dark))
+        return build(session, folder / "lut", options=BuildOptions(subtract_dark=subtract_dark), thresholds=REMARKING)
 
 
 @pytest.mark.parametrize("leaking", [{"yellow"}, {"red", "blue", "warm"}], ids=["light", "primaries"])
@@ -43,6 +49,8 @@ def test_light_that_no_dark_frame_shows_is_the_rooms(tmp_path: Path, leaking: se
     result = built(tmp_path, Room(seed=3), frozenset(leaking))
     rows = {row.threshold.name: row for row in result.verdict.remarks}
     assert "stray_share" in rows
+    # One per cent of white in a deep light is degrees: no table is made of it.
+    assert "stray_share" in {row.threshold.name for row in judge(judged_values(result.figures)).refused}
     said = remark(rows["stray_share"], result.figures)
     assert "light of the room" in said
     stray = result.figures.lights.stray

@@ -6,7 +6,7 @@ import pytest
 
 from foundation.console import run
 from foundation.errors import InputError, StorageError
-from foundation.trust.secret_texts import masked, masked_values, printable
+from foundation.trust.secret_texts import is_webhook, masked, masked_values, printable, target_label
 
 
 @pytest.mark.parametrize(
@@ -21,6 +21,7 @@ from foundation.trust.secret_texts import masked, masked_values, printable
         ("https://s/a?X-Amz-Credential=s3cret&X-Amz-Date=1", "https://s/a?X-Amz-Credential=…&X-Amz-Date=1"),
         ("https://s/a?AWSAccessKeyId=s3cret", "https://s/a?AWSAccessKeyId=…"),
         ("https://s/a?access_token=s3cret#x", "https://s/a?access_token=…"),
+        ("https://ntfy.example/lab?auth=s3cret", "https://ntfy.example/lab?auth=…"),
         ("s3://bucket/a@b/c", "s3://bucket/a@b/c"),
         ("mail a@b.example, key=3", "mail a@b.example, key=3"),
     ],
@@ -32,8 +33,26 @@ def test_addresses_lose_their_secrets(text: str, shown: str) -> None:
 
 
 def test_values_for_json_keep_their_shape() -> None:
-    value = {"a": ["ftp://u:p@h/x", 3, None], "ftp://u:p@h": True}
-    assert masked_values(value) == {"a": ["ftp://…@h/x", 3, None], "ftp://u:p@h": True}
+    value = {"a": ["ftp://u:p@h/x", 3, None], "b": ("ftp://u:p@h/x",), "ftp://u:p@h": True}
+    assert masked_values(value) == {"a": ["ftp://…@h/x", 3, None], "b": ["ftp://…@h/x"], "ftp://u:p@h": True}
+
+
+@pytest.mark.parametrize(
+    ("target", "shown"),
+    [
+        ("HTTPS://user:s3cret@ntfy.example/s3cret", "https://ntfy.example/…"),
+        ("curl -H s3cret", "curl …"),
+        ("notify-me", "notify-me"),
+    ],
+)
+def test_of_a_target_its_host_or_first_word_is_shown(target: str, shown: str) -> None:
+    assert target_label(target) == shown
+    assert is_webhook(target) is target.startswith("HTTPS")
+
+
+@pytest.mark.parametrize("sign", ["\u2028", "\u202e", "\u2066", "\u2069", "\x9b", "\x7f"])
+def test_no_sign_that_reorders_or_obeys_is_printed(sign: str) -> None:
+    assert printable(f"a{sign}b") == f"a{sign.encode('unicode_escape').decode()}b"
 
 
 def test_every_error_is_masked(capsys: pytest.CaptureFixture[str]) -> None:

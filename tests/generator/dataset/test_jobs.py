@@ -120,6 +120,10 @@ class TestExactSplit:
         parts = exact_parts(random_scenes(count, 2, 2), (0.8, 0.1, 0.1), 4)
         assert tuple(Counter(parts)[part] for part in ("train", "validation", "test")) == sizes
 
+    def test_a_share_that_should_be_whole_is_rounded_as_one(self) -> None:
+        """0.7 · 12 and 0.2 · 12 leave the same remainder; as floating-point numbers the second leaves more."""
+        assert sizes_of(12, (0.7, 0.2, 0.1)) == (9, 2, 1)
+
     def test_another_seed_divides_otherwise(self) -> None:
         scenes = random_scenes(50, 2, 2)
         one, other = (exact_parts(scenes, (0.5, 0.2, 0.3), seed) for seed in (1, 2))
@@ -140,6 +144,9 @@ class TestExactSplit:
             assert len({parts[name] for name in ("0.png", "copy0.png", "copy1.png")}) == 1
             assert Counter(parts.values()) == {"train": 3, "validation": 3, "test": 3}
         some = [source for source in sources if source.name.startswith(("0", "1", "2", "3", "copy"))]
+        # Three copies fit into the part of three alone, and have it before others.
+        for seed in range(20):
+            assert Counter(exact_parts(some, (1 / 2, 1 / 3, 1 / 6), seed)) == {"train": 3, "validation": 2, "test": 1}
         with pytest.raises(InputError, match=r"3 copies of .*png stay in one part, and none .* exactly 2,2,2 has room"):
             exact_parts(some, (1 / 3, 1 / 3, 1 / 3), 1)
 

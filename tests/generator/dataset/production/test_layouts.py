@@ -295,6 +295,15 @@ def test_an_image_is_a_number_with_an_ending_and_no_path(make: Make, layout: Lay
             open_dataset(table.parent)
 
 
+@pytest.mark.parametrize("name", ["0.png", "000000.tiff", "1" * 11 + ".png", "1" * 5000 + ".png"])
+def test_a_number_comes_once_and_has_few_digits(make: Make, name: str) -> None:
+    table = place_of(make("folder")) / "ground_truth.csv"
+    text = table.read_text()
+    table.write_text(text.replace("\n000001.png,", f"\n{name},"))
+    with pytest.raises(FormatError, match="is not in the order of the images"):
+        open_dataset(table.parent)
+
+
 def test_the_layout_parquet_says_what_it_needs(make: Make, monkeypatch: pytest.MonkeyPatch) -> None:
     def find_spec(name: str) -> None:
         del name
