@@ -1,10 +1,16 @@
-"""What a table costs: `python -m benchmarks.build_lut` prints one JSON object a line for each figure; takes minutes.
+"""What a table costs: `python -m benchmarks.build_lut [PART …]` prints one JSON object a line for each figure.
+
+Parts are `memory`, `chart`, `DNG` and `CR2`; all of them, which takes some minutes, if none is named.
 
 A short session of full-size frames of the EOS 550D is built as `build-lut` builds it, once as the uncompressed DNG that
 the simulated camera writes and once with the same counts as CR2 (lossless JPEG, as the real body). Each is given beside
 a plain pass over the same files in turn with it, so that the machine's speed cancels: rawpy's unpacking alone, in as
-many threads as the build decodes with, and dcraw, where it is installed. The memory is that of the command, run on
-frames of the EOS 6D Mark II, for few lights and for more.
+many threads as the build decodes with, and dcraw, where it is installed.
+
+What the lens's correction and the comparison of every cell cost is the build's processor time over that of a build
+without either, frame by frame. Measuring the lens, once a session, is shared out among the frames of 707 lights, which
+flatters: a session of ten lights takes a quarter longer for it. The memory is that of the command, run on frames of the
+EOS 6D Mark II, for few lights and for more.
 """
 
 from __future__ import annotations
@@ -23,6 +29,7 @@ from datetime import UTC, datetime, timedelta
 from io import BytesIO
 from pathlib import Path
 from typing import NamedTuple
+from unittest.mock import patch
 
 import numpy as np
 import rawpy
@@ -35,7 +42,10 @@ from acquisition.session.folder import Session
 from acquisition.session.incoming import ReceivedFile
 from acquisition.session.judgement import Judgement
 from acquisition.session.plan import plan_steps
+from calibration.checks.frame_consistency import ConsistencyCheck
+from calibration.pipeline.baseline import baseline_of, with_lens
 from calibration.pipeline.build import build
+from calibration.pipeline.frames import decode_frame, select_frames
 from calibration.pipeline.options import PAPER_OPTIONS, BuildOptions
 from calibration.pipeline.prefetching import thread_count
 from calibration.registration.register import register
@@ -52,6 +62,9 @@ from tests.drivers.raw.raw_files import write_cr2
 
 RUNS = 4
 ROUNDS = 3
+
+PAPER_FRAMES = 707 + 2 * 30
+"""Frames of a session of the paper's lights: a white and a dark one with every 25, and at the end."""
 
 
 def least(work: Callable[[], object], runs: int = RUNS) -> float:
@@ -148,12 +161,16 @@ def compare(session: Session, out: Path, kind: str) -> None:
             subprocess.run([str(dcraw), "-D", "-4", "-T", "-c", file], stdout=subprocess.DEVNULL, check=True)
 
     rounds: list[tuple[Costs, Costs, float]] = []
-    lens: list[float] = []
+    frame: list[float] = []
+    session_of_707: list[float] = []
+    once = lens_measured(session)
     for _ in range(ROUNDS):
         unpacking = timed(unpack_all, len(files))
-        without = build_timed(session, out, replace(PAPER_OPTIONS, lens_correction=False))
+        with patch.object(ConsistencyCheck, "_disturbed", return_value=((), ())):
+            without = build_timed(session, out, replace(PAPER_OPTIONS, lens_correction=False))
         building = build_timed(session, out)
-        lens.append(building.processor / without.processor)
+        frame.append(building.processor / without.processor)
+        session_of_707.append((building.processor + once / PAPER_FRAMES) / without.processor)
         again = timed(unpack_all, len(files))
         unpacking = Costs(*(np.mean([unpacking, again], axis=0).tolist()))
         rounds.append((building, unpacking, timed(develop, 4).wall if dcraw else np.nan))
@@ -167,11 +184,21 @@ def compare(session: Session, out: Path, kind: str) -> None:
     report(f"one frame of a build, {kind}", float(np.median([b.wall for b, _, _ in rounds])), "s", count)
     report(f"one frame of a build, {kind}, to unpacking", wall, "1", f"rawpy's unpack alone, {count}")
     report(f"one frame of a build, {kind}, to unpacking, processor time", processor, "1", "rawpy's unpack alone")
-    report(
-        f"one frame of a build, {kind}, to one without lens correction", float(np.median(lens)), "1", "processor time"
-    )
+    before = "processor time of one without lens correction and comparison of every cell"
+    report(f"one frame of a build, {kind}, to before", float(np.median(frame)), "1", before)
+    report("measure the lens", once, "s", "processor time, once a session")
+    report(f"707 lights, {kind}, to before", float(np.median(session_of_707)), "1", f"{before}, chart found in either")
     if dcraw is not None:
         report(f"one frame of a build, {kind}, to dcraw", against_dcraw, "1", "dcraw -D -4 -T of it alone")
+
+
+def lens_measured(session: Session) -> float:
+    """Return the processor time that measuring the lens takes, seconds; once for each session."""
+    selected = select_frames(session)
+    first = decode_frame(session, selected.registered)
+    primaries = [decode_frame(session, record) for record in selected.primaries]
+    baseline = baseline_of(session.chart, first)
+    return min(timed(lambda: with_lens(baseline, first, primaries), 1).processor for _ in range(RUNS))
 
 
 def unpack(path: Path) -> None:
@@ -197,39 +224,54 @@ def memory(folder: Path, lights: int) -> None:
     report(f"memory of a build, EOS 6D Mark II, {lights} lights", peak, "GB", against)
 
 
+def chart_and_sampling(session: Session, world: World) -> None:
+    """Print what reading a frame, finding the chart and sampling cost."""
+    chart, path = session.chart, session.folder / "frames/0000_white.dng"
+    copying = least(lambda: np.fromfile(path, dtype=np.uint8).sum())
+    reading = least(lambda: read_raw(path))
+    report("read a raw frame", reading, "s", "-")
+    report("read a raw frame, ratio", reading / copying, "1", "reading the file's bytes and adding them up")
+    mosaic = read_raw(path)
+    registering = least(lambda: register(mosaic, chart), runs=2)
+    report("find the chart and its 32 768 cells", registering, "s", "once a session, and after a bump")
+    report("find the chart, ratio", registering / reading, "1", "reading a frame")
+    registration = register(mosaic, chart)
+    distance = np.linalg.norm(registration.to_pixels(chart.centres_mm) - world.project(chart.centres_mm), axis=1)
+    report("cell centres, RMS", float(np.sqrt((distance**2).mean())), "px", "World.project, default room")
+    report("cell centres, worst", float(distance.max()), "px", "World.project, default room")
+    black = frame_black(mosaic)
+    sites = sites_at(registration.to_pixels(chart.centres_mm), (mosaic.counts.shape[0] // 2, 2601))
+    even = np.ones((len(chart.colours), 3))
+    sampling = least(lambda: gather_values(mosaic, black, sites, even))
+    report("sample a frame", sampling, "s", "-")
+    report("sample a frame, ratio", sampling / reading, "1", "reading a frame")
+
+
+PARTS = ("memory", "chart", "DNG", "CR2")
+
+
 def main() -> None:
-    """Measure and print."""
+    """Measure and print the parts named on the command line, or all."""
+    parts = sys.argv[1:] or PARTS
+    if unknown := set(parts) - set(PARTS):
+        raise SystemExit(f"{', '.join(sorted(unknown))}: one of {', '.join(PARTS)} expected")
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        for lights in (4, 12):
+        for lights in (4, 12) if "memory" in parts else ():
             memory(folder, lights)
             shutil.rmtree(folder / f"session_{lights}")
-        session, world = take(folder / "session")
-        chart, path = session.chart, session.folder / "frames/0000_white.dng"
-        copying = least(lambda: np.fromfile(path, dtype=np.uint8).sum())
-        reading = least(lambda: read_raw(path))
-        report("read a raw frame", reading, "s", "-")
-        report("read a raw frame, ratio", reading / copying, "1", "reading the file's bytes and adding them up")
-        mosaic = read_raw(path)
-        registering = least(lambda: register(mosaic, chart), runs=2)
-        report("find the chart and its 32 768 cells", registering, "s", "once a session, and after a bump")
-        report("find the chart, ratio", registering / reading, "1", "reading a frame")
-        registration = register(mosaic, chart)
-        distance = np.linalg.norm(registration.to_pixels(chart.centres_mm) - world.project(chart.centres_mm), axis=1)
-        report("cell centres, RMS", float(np.sqrt((distance**2).mean())), "px", "World.project, default room")
-        report("cell centres, worst", float(distance.max()), "px", "World.project, default room")
-        black = frame_black(mosaic)
-        sites = sites_at(registration.to_pixels(chart.centres_mm), (mosaic.counts.shape[0] // 2, 2601))
-        even = np.ones((len(chart.colours), 3))
-        sampling = least(lambda: gather_values(mosaic, black, sites, even))
-        report("sample a frame", sampling, "s", "-")
-        report("sample a frame, ratio", sampling / reading, "1", "reading a frame")
-        compare(session, folder / "lut", "DNG")
-        session.close()
-        shutil.rmtree(session.folder)
-        session, _ = take(folder / "session_cr2", cr2=True)
-        compare(session, folder / "lut_cr2", "CR2")
-        session.close()
+        if {"chart", "DNG"} & set(parts):
+            session, world = take(folder / "session")
+            if "chart" in parts:
+                chart_and_sampling(session, world)
+            if "DNG" in parts:
+                compare(session, folder / "lut", "DNG")
+            session.close()
+            shutil.rmtree(session.folder)
+        if "CR2" in parts:
+            session, _ = take(folder / "session_cr2", cr2=True)
+            compare(session, folder / "lut_cr2", "CR2")
+            session.close()
 
 
 if __name__ == "__main__":

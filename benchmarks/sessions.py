@@ -296,8 +296,8 @@ class TableTruth:
         return red, green, blue
 
     def worst_offset_px(self) -> float:
-        """Return the largest distance of a fit cell's centre from the truth in green."""
-        return float(np.linalg.norm(self.offset_px[1][self.fit], axis=-1).max(initial=0))
+        """Return the largest distance of a fit cell's centre from the truth, in the channel where it is largest."""
+        return float(np.linalg.norm(self.offset_px[:, self.fit], axis=-1).max(initial=0))
 
 
 def compare(

@@ -198,13 +198,14 @@ class ConsistencyCheck:
         self._usable = usable[self._some]
         self._channels = [_Channel.of(terms, level[self._some, channel], self._usable) for channel in range(3)]
         self._basis = np.ascontiguousarray(every.T)
-        self._level = np.where(usable[:, None] & (level > LEAST_COUNTS), level, np.nan).T
-        self._noise2 = (variance / np.maximum(level, 1.0) ** 2).T
+        self._level = np.where(usable[:, None] & (level > LEAST_COUNTS), level, np.nan).T.copy()
+        self._noise2 = np.ascontiguousarray((variance / np.maximum(level, 1.0) ** 2).T)
         self._places = SmallPlaces(rgb, cells_mm, usable)
         places_mm = cells_mm[self._some]
         block, self._middles, self._block_mm2 = _blocks(places_mm)
         self._members = _members(block, len(self._middles))
-        self._around = np.atleast_2d(cKDTree(places_mm).query(places_mm, k=min(_AROUND + 1, len(places_mm)))[1])
+        around = cKDTree(places_mm).query(places_mm, k=min(_AROUND + 1, len(places_mm)))[1]
+        self._around = np.ascontiguousarray(np.atleast_2d(around), dtype=np.int64)
 
     def compare(self, mean: _Array, variance: _Array) -> FrameConsistency:
         """Return how far a frame is consistent with the reference.
@@ -256,12 +257,18 @@ class ConsistencyCheck:
         factors = np.zeros((3, len(self._basis)))
         for channel in channels:
             factors[channel] = known[channel].solution
-        with np.errstate(invalid="ignore"):
-            expected = (linear_combinations(self._basis, factors) * self._level)[channels]
-            expected = np.where(expected > LEAST_COUNTS, expected, np.nan)
-        scatter = np.array([[max(known[channel].scatter, LEAST_MODEL_ERROR)] for channel in channels])
-        deviation = mean.T[channels] / expected - 1
-        sigma = np.sqrt(variance.T[channels] / expected**2 + self._noise2[channels] + scatter**2)
+        sums = linear_combinations(self._basis, factors)
+        deviation, sigma = np.empty((2, len(channels), len(mean)))
+        for row, channel in enumerate(channels):
+            with np.errstate(invalid="ignore"):
+                expected = sums[channel] * self._level[channel]
+                expected[~(expected > LEAST_COUNTS)] = np.nan
+            np.divide(mean[:, channel], expected, out=deviation[row])
+            deviation[row] -= 1
+            np.divide(variance[:, channel], expected**2, out=sigma[row])
+            sigma[row] += self._noise2[channel]
+            sigma[row] += max(known[channel].scatter, LEAST_MODEL_ERROR) ** 2
+        np.sqrt(sigma, out=sigma)
         cells, off, alone = self._places.disturbed(deviation, sigma)
         return tuple(zip(cells.tolist(), off.round(6).tolist(), strict=True)), tuple(alone.tolist())
 
@@ -306,13 +313,11 @@ def _like_a_neighbour(values: _Array, around: npt.NDArray[np.int64]) -> _Array:
 
     `around` (N, K) are each one's places in `values`, its own among them; NaN is no value and stays.
     """
-    ordered = np.sort(values[around], axis=1)
-    count = np.isfinite(ordered).sum(axis=1)
-    rows, alone = np.arange(len(values)), count < 3
-    # NaN sorts last, so that the second highest stands two before what is known ends.
-    low = np.where(alone, -np.inf, ordered[:, min(1, ordered.shape[1] - 1)])
-    high = np.where(alone, np.inf, ordered[rows, np.maximum(count - 2, 0)])
-    return np.clip(values, low, high)
+    from calibration.checks import kernels
+
+    brought = np.empty_like(values)
+    kernels.clipped_to_neighbours(values, around, brought)
+    return brought
 
 
 def _known_means(values: _Array) -> tuple[_Array, npt.NDArray[np.int64]]:

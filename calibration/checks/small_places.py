@@ -74,11 +74,9 @@ class SmallPlaces:
     def __init__(self, rgb: npt.ArrayLike, cells_mm: _Array, usable: _Mask) -> None:
         count = len(cells_mm)
         found = cKDTree(cells_mm).query(cells_mm, k=min(_AROUND + 1, count))
-        far, near = np.asarray(found[0], dtype=np.float64), np.asarray(found[1], dtype=np.int64)
-        touching = far <= _NEXT * float(np.median(far[:, 1]))
-        touching[:, 0] = False
-        self._one: _Index = np.repeat(np.arange(count, dtype=np.int64), near.shape[1])[touching.ravel()]
-        self._other: _Index = np.asarray(near[touching], dtype=np.int64)
+        far, self._near = np.asarray(found[0], dtype=np.float64), np.asarray(found[1], dtype=np.int64)
+        self._touching: _Mask = far <= _NEXT * float(np.median(far[:, 1]))
+        self._touching[:, 0] = False
         codes = np.asarray(rgb, dtype=np.float64)
         self._alike: _Index = np.asarray(cKDTree(codes).query(codes, k=min(_ALIKE + 1, count))[1])[:, 1:]
         self._usable = usable
@@ -96,49 +94,52 @@ class SmallPlaces:
             (K, C) float64, its standard deviation: noise of both frames, and the model's usual error.
         """
         no_cells = np.zeros(0, dtype=np.int64)
-        far = np.abs(deviation) / sigma
-        compared = np.isfinite(far)
-        far = np.where(compared, far, 0.0)
+        far = np.abs(deviation)
+        far /= sigma
         candidates = np.flatnonzero((far > FAR).any(axis=0))
         if not len(candidates):
             return no_cells, np.zeros(0), no_cells
         own = deviation[:, candidates]
-        like = np.where(compared, deviation, np.nan)[:, self._alike[candidates]]
+        alike = self._alike[candidates]
+        like = np.where(np.isfinite(far[:, alike]), deviation[:, alike], np.nan)
         known = np.asarray(np.isfinite(like).any(axis=2))
         usual = np.where(known, np.nanmedian(np.where(known[..., None], like, 0.0), axis=2), 0.0)
         apart = np.abs(own - usual) / sigma[:, candidates]
         # As far off from its code as from those next to it.
-        certain = np.minimum(np.nan_to_num(apart), far[:, candidates])
-        seeds, alone = np.zeros((2, deviation.shape[1]), dtype=np.bool_)
-        seeds[candidates] = (certain > FAR).any(axis=0)
+        certain = np.nan_to_num(np.minimum(apart, far[:, candidates]))
         large = np.nan_to_num(np.minimum(np.abs(own), np.abs(own - usual))) > LEAST_ALONE
-        alone[candidates] = ((certain > ALONE) & large).any(axis=0)
-        seeds &= self._usable
+        usable = self._usable[candidates]
+        seeds = candidates[usable & (certain > FAR).any(axis=0)]
+        alone = candidates[usable & ((certain > ALONE) & large).any(axis=0)]
         places = self._places(seeds)
+        if not places.any():
+            return no_cells, np.zeros(0), alone
+        compared = np.isfinite(far)
+        far[~compared] = 0.0
         found = self._grown(places, self._usable & (far.max(axis=0) > ALSO))
         # Nothing is known of those that are too dark, so that a place does not grow through them.
         found |= self._touched(found) & self._usable & ~compared.any(axis=0)
         cells = np.flatnonzero(found)
         worst = np.argmax(far[:, cells], axis=0)
-        return cells, np.nan_to_num(deviation[worst, cells]), np.flatnonzero(alone & self._usable & ~found)
+        return cells, np.nan_to_num(deviation[worst, cells]), alone[~found[alone]]
 
-    def _places(self, seeds: _Mask) -> _Mask:
-        """Return which of the cells far off (C,) lie at places that chance does not make."""
-        cells = np.flatnonzero(seeds)
-        both = seeds[self._one] & seeds[self._other]
-        count = len(seeds)
-        pairs = (np.ones(int(both.sum())), (self._one[both], self._other[both]))
-        if not len(cells):
-            return seeds
-        label = connected_components(coo_matrix(pairs, shape=(count, count)), directed=False)[1]
-        size = np.bincount(label[cells], minlength=int(label.max()) + 1)[label[cells]]
-        # Of n cells strewn at random, n/2 (8 n / C)^(k - 1) places of k or more are to be expected.
-        by_chance = 0.5 * len(cells) * (_AROUND * len(cells) / count) ** (size - 1.0)
+    def _places(self, seeds: _Index) -> _Mask:
+        """Return which cells (C,) lie at places that chance does not make, given those far off (N,), ascending."""
+        count, cells = len(self._usable), len(seeds)
         kept = np.zeros(count, dtype=np.bool_)
-        kept[cells[(size > 1) & (by_chance < BY_CHANCE)]] = True
+        number = np.full(count, -1)
+        number[seeds] = np.arange(cells)
+        other = np.where(self._touching[seeds], number[self._near[seeds]], -1)
+        one, column = np.nonzero(other >= 0)
+        if not len(one):
+            return kept
+        pairs = coo_matrix((np.ones(len(one)), (one, other[one, column])), shape=(cells, cells))
+        label = connected_components(pairs, directed=False)[1]
+        size = np.bincount(label)[label]
+        # Of n cells strewn at random, n/2 (8 n / C)^(k - 1) places of k or more are to be expected.
+        by_chance = 0.5 * cells * (_AROUND * cells / count) ** (size - 1.0)
         # Where most of a print is far off, places are as large as it is.
-        largest = cells[size > max(1, len(cells) // 2)]
-        kept[largest] = True
+        kept[seeds[(size > 1) & ((by_chance < BY_CHANCE) | (size > cells // 2))]] = True
         return kept
 
     def _grown(self, places: _Mask, joins: _Mask) -> _Mask:
@@ -151,6 +152,6 @@ class SmallPlaces:
 
     def _touched(self, places: _Mask) -> _Mask:
         """Return which cells (C,) touch one of the places."""
-        touched = np.zeros_like(places)
-        touched[self._other[places[self._one]]] = True
+        touched, cells = np.zeros_like(places), np.flatnonzero(places)
+        touched[self._near[cells][self._touching[cells]]] = True
         return touched

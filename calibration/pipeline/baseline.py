@@ -37,7 +37,7 @@ from calibration.spread.correction import (
 )
 from calibration.spread.fitting import LEAST_COUNTS, LOOSE_UNEVENNESS, USUAL_UNEVENNESS
 from calibration.spread.printed_grid import printed_grid, unsuitable
-from calibration.spread.surroundings import FrameLevels, Surroundings, photosite_offsets_px
+from calibration.spread.surroundings import FrameLevels, photosite_offsets_px
 from drivers.raw.rawfile import Area, Mosaic
 from foundation.errors import FormatError
 
@@ -128,9 +128,14 @@ class Baseline:
 
     def correction(self, registration: Registration, cells: Sites, references: Sites) -> FrameCorrection | None:
         """Return what corrects the lens in frames that are sampled at these places; None where nothing is corrected."""
-        if self.lens is None or not (self.options.lens_correction and self.lens.spread.proven):
+        if self.lens is None or not self.corrects_lens:
             return None
         return self.lens.of(registration, cells, references)
+
+    @property
+    def corrects_lens(self) -> bool:
+        """Whether frames are corrected for what the lens spreads."""
+        return self.lens is not None and self.options.lens_correction and self.lens.spread.proven
 
     def movement(self, mosaic: Mosaic, black: _Array, channel: Channel, what: str) -> Shift:
         """Return how far the chart has moved in a frame since the first one.
@@ -244,17 +249,17 @@ def with_lens(baseline: Baseline, first: DecodedFrame, primaries: Sequence[Decod
         baseline.options.window,
     )
     around = view.around(registered.registration, registered.cells, registered.references)
-    frames = [frame for decoded in primaries if (frame := _spread_frame(baseline, decoded, view, around, False))]
+    frames = [frame for decoded in primaries if (frame := _spread_frame(baseline, decoded, view, False))]
     if not frames:
-        frames = [frame for frame in (_spread_frame(baseline, first, view, around, True),) if frame]
-    found = measure_spread(frames, chart.page_mm, chart.bits, LEAST_COUNTS)
+        frames = [frame for frame in (_spread_frame(baseline, first, view, True),) if frame]
+    found = measure_spread(frames, around, chart.page_mm, chart.bits, LEAST_COUNTS)
     if found is None:
         return baseline
     lens = LensCorrection(view, *found)
     measured = replace(baseline, lens=lens)
-    correction = measured.correction(registered.registration, registered.cells, registered.references)
-    if correction is None:
+    if not measured.corrects_lens:
         return measured
+    correction = FrameCorrection.of(lens.spread, view, around)
     corrected = _baseline(chart, points, baseline.options, first, replace(registered, lens=correction))
     return replace(corrected, lens=lens)
 
@@ -298,9 +303,7 @@ def beyond_print(decoded: DecodedFrame, beyond: Sites) -> _Array:
     return gather_means(decoded.mosaic, decoded.black, beyond).mean(axis=0)
 
 
-def _spread_frame(
-    baseline: Baseline, decoded: DecodedFrame, view: PrintView, around: Surroundings, mixed: bool
-) -> SpreadFrame | None:
+def _spread_frame(baseline: Baseline, decoded: DecodedFrame, view: PrintView, mixed: bool) -> SpreadFrame | None:
     """Return a frame as the lens is measured on it; None where the chart has moved in it.
 
     `mixed` is whether several primaries light it.
@@ -317,7 +320,6 @@ def _spread_frame(
     paper, _ = baseline.paper.read(np.where(usable[whites, None], means[whites], np.nan), decoded.record.file)
     return SpreadFrame(
         levels=FrameLevels(np.nan_to_num(means), beyond_print(decoded, view.beyond)),
-        around=around,
         field=paper.field.at(view.grid.points_mm),
         white=paper.white,
         usable=usable,

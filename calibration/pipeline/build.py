@@ -72,8 +72,8 @@ REPORT_FILES = (REPORT_PAGE, REPORT_JSON)
 CHECKPOINT_EVERY = 16
 """Frames from one checkpoint to the next: what a build that is killed has to do again."""
 
-METHOD = 9
-"""Raised when samples, ground truth or unfit cells come out otherwise than before: no table is of two methods."""
+METHOD = 10
+"""Raised when samples, ground truth or unfit cells come out otherwise, so that no table is made by two methods."""
 
 _IN_PLACE = Shift(0.0, 0.0, 0.0, 0)
 """The movement of the frame in which the chart is registered first."""

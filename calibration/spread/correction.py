@@ -17,14 +17,13 @@ import numpy as np
 import numpy.typing as npt
 
 from acquisition.measures.flat_field import FlatField
-from acquisition.measures.least_squares import least_squares
 from acquisition.measures.polynomials import page_polynomial, page_powers
 from calibration.registration.registration import Registration
 from calibration.sampling.samples import Sites, sites_at
 from calibration.spread.fitting import VARYING_BITS, ReferenceData, SpreadData, fit_spread, predicted_levels
 from calibration.spread.point_spread import FAR_PX, NEAR_PX, PLACES, PointSpread, kernel_of_terms, terms_of
 from calibration.spread.printed_grid import PrintedGrid
-from calibration.spread.surroundings import FrameLevels, NearLight, Surroundings, light_at, surroundings
+from calibration.spread.surroundings import FrameLevels, NearLight, Surroundings, UsualLight, light_at, surroundings
 
 _MARGIN_PX = 12.0
 """How far from the sheet's edge what lies behind it is looked at."""
@@ -55,8 +54,8 @@ class PrintView:
         (3, 2) float64, where each channel's photosites lie from a block's centre.
     frame_px
         Rows and columns of the half-size frame.
-    light, slot_light
-        The usual field at patches (P, 3) and slots (R K, 3).
+    light
+        The usual light.
     beyond
         Places that show what lies behind the print; none where the print fills the frame.
     """
@@ -66,8 +65,7 @@ class PrintView:
     whites: slice
     photosites_px: _Array
     frame_px: tuple[int, int]
-    light: _Array
-    slot_light: _Array
+    light: UsualLight
     beyond: Sites
 
     @staticmethod
@@ -98,13 +96,13 @@ class PrintView:
             Pixels along a patch's window.
         """
         beyond = _places_beyond(grid, registration, shape, window)
-        return PrintView(grid, grid.neighbours, whites, photosites_px, shape, *light_at(grid, field), beyond)
+        return PrintView(grid, grid.neighbours, whites, photosites_px, shape, light_at(grid, field), beyond)
 
     def around(self, registration: Registration, cells: Sites, references: Sites) -> Surroundings:
         """Return the surroundings of the patches of a frame, given where they are sampled."""
         return surroundings(
             self.grid, self.neighbours, self.photosites_px, self.frame_px, registration, cells, references, self.whites,
-            (self.light, self.slot_light),
+            self.light,
         )  # fmt: skip
 
 
@@ -139,15 +137,15 @@ class FrameCorrection:
 
     def added(self, levels: FrameLevels) -> _Array:
         """Return what the lens added to each patch, (P, 3) float64 counts; negative where it took more away."""
-        around = self.around
-        added = self.near.at(levels, around.local(levels)) - self.near.total * levels.patches
-        if self.far.any() or self.veil:
-            image = around.image(levels)
+        around, inks = self.around, self.around.inks(levels)
+        added = self.near.at(levels, inks) - self.near.total * levels.patches
+        if self.far.any():
+            image = around.image(levels, inks)
             for share, scale in zip(self.far.tolist(), FAR_PX, strict=True):
                 if share:
                     added += share * (around.far(image, scale) - levels.patches)
-            if self.veil:
-                added += self.veil * (image.mean(axis=(0, 1), dtype=np.float64) - levels.patches)
+        if self.veil:
+            added += self.veil * (around.mean(levels, inks) - levels.patches)
         return added
 
 
@@ -157,8 +155,8 @@ class SpreadFrame:
 
     Attributes
     ----------
-    levels, around
-        What it shows, and the patches' surroundings.
+    levels
+        What it shows.
     field
         (P, 3) float64, its flat field at the patches.
     white
@@ -172,7 +170,6 @@ class SpreadFrame:
     """
 
     levels: FrameLevels
-    around: Surroundings
     field: _Array
     white: _Array
     usable: npt.NDArray[np.bool_]
@@ -270,7 +267,7 @@ class LensCorrection:
 
 
 def measure_spread(
-    frames: list[SpreadFrame], page_mm: tuple[float, float], bits: int, least_counts: float
+    frames: list[SpreadFrame], around: Surroundings, page_mm: tuple[float, float], bits: int, least_counts: float
 ) -> tuple[PointSpread, LensFigures] | None:
     """Return the point spread that frames show, and its figures; None where no frame is bright enough.
 
@@ -278,6 +275,8 @@ def measure_spread(
     ----------
     frames
         Best of one primary each, whose field is the same for all cells.
+    around
+        The patches' surroundings, the same in all of them.
     page_mm
         Width and height of the page.
     bits
@@ -285,52 +284,58 @@ def measure_spread(
     least_counts
         Counts of bare paper from which on a channel is used, and of a cell from which on figures count it.
     """
+    if not frames:
+        return None
     count = 8**bits
     data: list[SpreadData] = []
     scales: list[_Array] = []
     references: list[ReferenceData] = []
+    near = [around.near(_whole(kernel)) for kernel in range(len(NEAR_PX))]
     # Of each channel the frame in which it has most light.
-    best: list[int] = np.argmax([frame.white for frame in frames], axis=0).tolist() if frames else []
+    best = np.argmax([frame.white for frame in frames], axis=0)
     for number, frame in enumerate(frames):
-        if number not in best:
+        bright = np.flatnonzero((best == number) & (frame.white >= least_counts))
+        if not len(bright):
             continue
-        changes, gains = _changes(frame, page_mm, bits)
-        for channel in range(3):
-            if best[channel] == number and frame.white[channel] >= least_counts:
-                relative = frame.field[:count, channel] * frame.white[channel]
-                level = frame.levels.patches[:count, channel] / relative
-                even = _even(frame, channel) / relative
-                usable = frame.usable[:count]
-                of_cells = changes[:, :count, channel].T
-                data.append(SpreadData(channel, level, of_cells, even, usable, frame.unevenness))
-                if bits < VARYING_BITS:
-                    references += _references(frame, channel, changes[:, :, channel].T)
-                scales.append(np.append(gains[:, channel], frame.white[channel]))
+        seen, inks = _seen(frame, around, near), around.inks(frame.levels)
+        even = around.mean(frame.levels, inks)
+        for channel in bright.tolist():
+            changes, gains = _changes(frame, around, seen, page_mm, bits, channel)
+            relative = frame.field[:count, channel] * frame.white[channel]
+            level = frame.levels.patches[:count, channel] / relative
+            usable = frame.usable[:count]
+            data.append(
+                SpreadData(channel, level, changes[:, :count].T, even[channel] / relative, usable, frame.unevenness)
+            )
+            if bits < VARYING_BITS:
+                references += _references(frame, around, channel, changes.T)
+            scales.append(np.append(gains, frame.white[channel]))
     if not data:
         return None
-    cells_mm = frames[0].around.grid.points_mm[:count]
-    spread = fit_spread(data, cells_mm, page_mm, bits, references)
-    return None if spread is None else (spread, _figures(spread, data, scales, frames[0].around, bits, least_counts))
+    spread = fit_spread(data, around.grid.points_mm[:count], page_mm, bits, references)
+    return None if spread is None else (spread, _figures(spread, data, scales, around, bits, least_counts))
 
 
-def _even(frame: SpreadFrame, channel: int) -> float:
-    """Return the mean light of a frame in a channel, counts."""
-    return float(frame.around.image(frame.levels)[..., channel].mean(dtype=np.float64))
+def _whole(kernel: int) -> _Array:
+    """Return amounts (9, 3, N): all of a near kernel, the same over the frame, and nothing of the others."""
+    amounts = np.zeros((PLACES, 3, len(NEAR_PX)))
+    amounts[0, :, kernel] = 1
+    return amounts
 
 
-def _references(frame: SpreadFrame, channel: int, changes: _Array) -> list[ReferenceData]:
+def _references(frame: SpreadFrame, around: Surroundings, channel: int, changes: _Array) -> list[ReferenceData]:
     """Return a channel's references, colour by colour; `changes` (P, T)."""
     if frame.printed is None:
         return []
     found: list[ReferenceData] = []
     level = frame.levels.patches[:, channel] / np.maximum(frame.field[:, channel] * frame.white[channel], 1e-6)
     whites = np.zeros(len(level), dtype=np.bool_)
-    whites[frame.around.whites] = True
+    whites[around.whites] = True
     for number in range(int(frame.printed.max()) + 1):
         chosen = np.flatnonzero((frame.printed == number) & frame.usable)
         order = _white_order(len(chosen)) if whites[chosen].any() else 1
         if len(chosen) >= _LEAST_REFERENCES * len(page_powers(order)):
-            places = frame.around.grid.points_mm[chosen]
+            places = around.grid.points_mm[chosen]
             found.append(ReferenceData(channel, level[chosen], changes[chosen], places, order))
     return found
 
@@ -340,57 +345,58 @@ def _white_order(count: int) -> int:
     return next((n for n in range(_FIELD_ORDER, 0, -1) if 3 * len(page_powers(n)) <= count), 0)
 
 
-def _changes(frame: SpreadFrame, page_mm: tuple[float, float], bits: int) -> tuple[_Array, _Array]:
-    """Return the change (T, P, 3) of levels for a whole share of each unknown, and the mean change of white (T, 3).
+def _changes(
+    frame: SpreadFrame,
+    around: Surroundings,
+    seen: list[tuple[_Array, _Array]],
+    page_mm: tuple[float, float],
+    bits: int,
+    channel: int,
+) -> tuple[_Array, _Array]:
+    """Return the change (T, P) of a channel's levels for a whole share of each unknown, and white's mean change (T,).
 
     What comes in, less what the white references get, since the field is fitted through them; their mean, by which
-    all levels change alike, is returned apart.
+    all levels change alike, is returned apart. `seen` is what `_seen` returns.
     """
-    around, levels, count = frame.around, frame.levels, 8**bits
-    relative = np.maximum(frame.field * frame.white, 1e-6)
-    expected = levels.patches / relative
-    expected[:count] = predicted_levels(expected[:count], bits)
+    count, points = 8**bits, around.grid.points_mm
+    seen_levels = frame.levels.patches[:, channel]
+    relative = np.maximum(frame.field[:, channel] * frame.white[channel], 1e-6)
+    expected = seen_levels / relative
+    expected[:count] = predicted_levels(expected[:count, None], bits)[:, 0]
     if frame.printed is not None:
         for number in range(int(frame.printed.max()) + 1):
-            expected[frame.printed == number] = np.median(expected[frame.printed == number], axis=0)
-    points = around.grid.points_mm
+            expected[frame.printed == number] = np.median(expected[frame.printed == number])
     whites = np.arange(len(points))[around.whites]
     whites = whites[frame.usable[whites]]
-    at_all = np.ascontiguousarray(page_polynomial(points, page_mm, _white_order(len(whites))))
-    at_whites = np.ascontiguousarray(at_all[whites])
+    at_all = page_polynomial(points, page_mm, _white_order(len(whites)))
     terms = kernel_of_terms()
-    changes, gains = np.empty((len(terms), len(points), 3)), np.empty((len(terms), 3))
-    seen, own = _seen(frame)
+    coming, differs = np.empty((2, len(terms), len(points)))
     for term, (kernel, place) in enumerate(terms):
-        share = np.ones((len(points), 1)) if place is None else around.places[:, [place]]
-        coming = share * (seen[kernel] - own[kernel] * levels.patches) / relative
-        differs = share * (own[kernel] - own[kernel][:count].mean(axis=0))
-        for channel in range(3):
-            of_white = coming[whites, channel] + differs[whites, channel]
-            smooth = at_all @ least_squares(at_whites, of_white, np.ones(len(whites)))
-            gains[term, channel] = smooth[:count].mean()
-            kept = differs[:, channel] - (smooth - gains[term, channel])
-            changes[term, :, channel] = coming[:, channel] + kept * expected[:, channel]
-    return changes, gains
+        light, own = (part[:, channel] for part in seen[kernel])
+        np.divide(light - own * seen_levels, relative, out=coming[term])
+        np.subtract(own, own[:count].mean(), out=differs[term])
+        if place is not None:
+            coming[term] *= around.places[:, place]
+            differs[term] *= around.places[:, place]
+    of_white = (coming[:, whites] + differs[:, whites]).T
+    smooth = (at_all @ np.linalg.lstsq(at_all[whites], of_white, rcond=None)[0]).T
+    gains = smooth[:, :count].mean(axis=1)
+    smooth -= gains[:, None]
+    differs -= smooth
+    differs *= expected
+    coming += differs
+    return coming, gains
 
 
-def _seen(frame: SpreadFrame) -> tuple[list[_Array], list[_Array]]:
+def _seen(frame: SpreadFrame, around: Surroundings, near: list[NearLight]) -> list[tuple[_Array, _Array]]:
     """Return for each kernel the light (P, 3) that it brings, counts, and the share (P, 3) of a patch's own in it."""
-    around, levels = frame.around, frame.levels
-    local, image = around.local(levels), around.image(levels)
-    seen: list[_Array] = []
-    own: list[_Array] = []
-    for kernel in range(len(NEAR_PX)):
-        whole = np.zeros((PLACES, 3, len(NEAR_PX)))
-        whole[0, :, kernel] = 1
-        near = around.near(whole)
-        seen.append(near.at(levels, local))
-        own.append(near.own)
-    for scale in FAR_PX:
-        seen.append(around.far(image, scale))
-        own.append(np.full_like(levels.patches, around.own_share(scale)))
-    seen.append(np.broadcast_to(image.mean(axis=(0, 1), dtype=np.float64), levels.patches.shape))
-    return seen, [*own, np.zeros_like(levels.patches)]
+    levels = frame.levels
+    inks = around.inks(levels)
+    image = around.image(levels, inks)
+    found = [(one.at(levels, inks), one.own) for one in near]
+    found += [(around.far(image, scale), np.full_like(levels.patches, around.own_share(scale))) for scale in FAR_PX]
+    even = np.broadcast_to(around.mean(levels, inks), levels.patches.shape)
+    return [*found, (even, np.zeros_like(levels.patches))]
 
 
 def _figures(
@@ -411,7 +417,7 @@ def _figures(
         change = (one.changes[lit] - np.outer(expected[lit], scale[:-1])) / one.level[lit, None]
         terms = terms_of(one.channel)
         corrected.append(change @ spread.shares[terms])
-        unknown.append(np.einsum("nk,kl,nl->n", change, spread.covariance[np.ix_(terms, terms)], change))
+        unknown.append(((change @ spread.covariance[np.ix_(terms, terms)]) * change).sum(axis=1))
     size, left = np.concatenate(corrected), np.concatenate(unknown)
     worst, mean = _beyond_cell(around)
     near = amounts[:, :, : len(NEAR_PX)]

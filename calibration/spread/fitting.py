@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 import numpy.typing as npt
@@ -146,12 +147,15 @@ class ReferenceData:
 
 @dataclass(frozen=True, eq=False)
 class _Rows:
-    """Rows of the regression: (N,) values, (N, T + M) design, (N,) levels, (N,) fold, and the columns' unknowns."""
+    """Rows of the regression, fold by fold.
+
+    (N,) values, (N, T + M) design, (N,) levels, where each fold's rows are, and the columns' unknowns.
+    """
 
     value: _Array
     design: _Array
     level: _Array
-    fold: npt.NDArray[np.int64]
+    folds: tuple[slice, ...]
     unknowns: npt.NDArray[np.int64]
 
 
@@ -316,19 +320,29 @@ def _rows(one: SpreadData, number: int, cells_mm: _Array, page_mm: tuple[float, 
     even = factor * one.even[:, None]
     columns = np.column_stack([level, one.changes, even, factor * expected[:, None], ink * dense[:, None]])
     residual, known = colour_residual(columns, bits)
-    chosen = known & one.usable
-    places = np.floor(cells_mm / (max(page_mm) / _PATCHWORK)).astype(np.int64)
+    chosen, folds = _by_fold(np.flatnonzero(known & one.usable), cells_mm, page_mm)
     common = TERMS + even.shape[1]
     own = factor.shape[1] + ink.shape[1]
     smooth: npt.NDArray[np.int64] = np.arange(own, dtype=np.int64) + common + number * own
     shape: npt.NDArray[np.int64] = np.arange(TERMS, common, dtype=np.int64)
     return _Rows(
         value=residual[chosen, 0],
-        design=np.ascontiguousarray(residual[chosen, 1:]),
+        design=residual[chosen, 1:],
         level=expected[chosen],
-        fold=((places[:, 0] + 2 * places[:, 1]) % FOLDS)[chosen],
+        folds=folds,
         unknowns=np.concatenate([terms_of(one.channel), shape, smooth]),
     )
+
+
+def _by_fold(
+    points: npt.NDArray[np.int64], places_mm: _Array, page_mm: tuple[float, float]
+) -> tuple[npt.NDArray[np.int64], tuple[slice, ...]]:
+    """Return points (N,) ordered by the fold of their places (P, 2), and where each fold's are."""
+    patch = np.floor(places_mm[points] / (max(page_mm) / _PATCHWORK)).astype(np.int64)
+    fold = (patch[:, 0] + 2 * patch[:, 1]) % FOLDS
+    order = np.argsort(fold, kind="stable")
+    ends = np.searchsorted(fold[order], np.arange(FOLDS + 1)).tolist()
+    return points[order], tuple(slice(start, end) for start, end in pairwise(ends))
 
 
 def _reference_rows(one: ReferenceData, page_mm: tuple[float, float]) -> _Rows:
@@ -336,12 +350,12 @@ def _reference_rows(one: ReferenceData, page_mm: tuple[float, float]) -> _Rows:
     smooth = page_polynomial(one.places_mm, page_mm, one.order)
     columns = np.column_stack([one.level, one.changes])
     rough = columns - smooth @ np.linalg.lstsq(smooth, columns, rcond=None)[0]
-    places = np.floor(one.places_mm / (max(page_mm) / _PATCHWORK)).astype(np.int64)
+    chosen, folds = _by_fold(np.arange(len(rough)), one.places_mm, page_mm)
     return _Rows(
-        value=rough[:, 0],
-        design=np.ascontiguousarray(rough[:, 1:]),
+        value=rough[chosen, 0],
+        design=rough[chosen, 1:],
         level=np.full(len(one.level), float(one.level.mean())),
-        fold=(places[:, 0] + 2 * places[:, 1]) % FOLDS,
+        folds=folds,
         unknowns=terms_of(one.channel),
     )
 
@@ -363,12 +377,11 @@ def _normal_equations(rows: Sequence[_Rows], solution: _Array) -> tuple[_Array, 
     size = len(solution)
     normal, right = np.zeros((FOLDS, size, size)), np.zeros((FOLDS, size))
     for one in rows:
-        weights = _weights(one.value - one.design @ solution[one.unknowns], one.level)
-        weighted = one.design * weights[:, None]
-        for fold in range(FOLDS):
-            there = one.fold == fold
-            normal[fold][np.ix_(one.unknowns, one.unknowns)] += weighted[there].T @ one.design[there]
-            right[fold][one.unknowns] += weighted[there].T @ one.value[there]
+        root = np.sqrt(_weights(one.value - one.design @ solution[one.unknowns], one.level))
+        weighted, value = one.design * root[:, None], one.value * root
+        for fold, there in enumerate(one.folds):
+            normal[fold][np.ix_(one.unknowns, one.unknowns)] += weighted[there].T @ weighted[there]
+            right[fold][one.unknowns] += weighted[there].T @ value[there]
     return normal, right
 
 

@@ -67,7 +67,7 @@ def weights_around(
     row: _Place, column: _Place, neighbours: _Index, parts: _Index, offset: _Array, pitch: _Array, shares: _Array,
     grid: _Array, amount: _Array, weights: _Float, others: _Float,
 ) -> None:  # fmt: skip
-    """Fill weights (N, 3, 25) and others (N, 3, 3) float32 of light from the slots around patches.
+    """Fill weights (N, 25, 3) and others (N, 3 kinds, 3) float32 of light from the slots around patches.
 
     Parameters
     ----------
@@ -88,8 +88,8 @@ def weights_around(
     x, y = np.empty(ACROSS * PARTS), np.empty(ACROSS * PARTS)
     for n in range(len(row)):
         for channel in range(3):
-            weights[n, channel] = 0
-            others[n, channel] = 0
+            weights[n, :, channel] = 0
+            others[n, :, channel] = 0
             for k in range(kernels):
                 share = amount[n, channel, k]
                 if share == 0:
@@ -104,31 +104,41 @@ def weights_around(
                             for part in range(PARTS):
                                 across += x[a * PARTS + part]
                                 down += y[b * PARTS + part]
-                            weights[n, channel, b * ACROSS + a] += np.float32(share * across * down)
+                            weights[n, b * ACROSS + a, channel] += np.float32(share * across * down)
                             continue
                         top, left = (row[n] + b - REACH) * PARTS, (column[n] + a - REACH) * PARTS
                         for j in range(PARTS):
                             for i in range(PARTS):
                                 kind = parts[top + j, left + i] - count
                                 part_share = x[a * PARTS + i] * y[b * PARTS + j]
-                                others[n, channel, kind] += np.float32(share * part_share)
+                                others[n, kind, channel] += np.float32(share * part_share)
 
 
 @compiled
 def light_around(
-    neighbours: _Index, weights: _Float, others: _Float, levels: _Array, local: _Array, out: _Array
+    neighbours: _Index, weights: _Float, others: _Float, levels: _Array, light: _Array, inks: _Array, out: _Array
 ) -> None:
-    """Fill out (N, 3) with the light from around patches: weighted levels (N, 3) and local levels (N, 3 kinds, 3)."""
+    """Fill out (N, 3) with the light from around patches.
+
+    Weighted levels (N, 3), and inks (3 kinds, 3) in the light (N, 3) of the place; the last kind, what lies behind the
+    print, has light of its own.
+    """
     for n in range(len(neighbours)):
-        for channel in range(3):
-            total = 0.0
-            for slot in range(neighbours.shape[1]):
-                source = neighbours[n, slot]
-                if source >= 0:
-                    total += weights[n, channel, slot] * levels[source, channel]
-            for kind in range(3):
-                total += others[n, channel, kind] * local[n, kind, channel]
-            out[n, channel] = total
+        # The channels side by side, since each is a chain of sums.
+        red, green, blue = 0.0, 0.0, 0.0
+        for slot in range(neighbours.shape[1]):
+            source = neighbours[n, slot]
+            if source >= 0:
+                red += weights[n, slot, 0] * levels[source, 0]
+                green += weights[n, slot, 1] * levels[source, 1]
+                blue += weights[n, slot, 2] * levels[source, 2]
+        out[n, 0], out[n, 1], out[n, 2] = red, green, blue
+        for kind in range(3):
+            for channel in range(3):
+                weight = others[n, kind, channel]
+                if weight != 0:
+                    lit = inks[kind, channel] if kind == 2 else light[n, channel] * inks[kind, channel]
+                    out[n, channel] += weight * lit
 
 
 @compiled

@@ -101,7 +101,8 @@ def _slots(chart: Chart) -> tuple[_Array, _Array]:
 
 def _fits_grid(chart: Chart) -> bool:
     _, slots = _slots(chart)
-    alike = all(np.allclose(reference.size_mm, chart.cell_mm, rtol=_OFF_GRID) for reference in chart.references)
+    sizes = np.array([reference.size_mm for reference in chart.references]).reshape(-1, 2)
+    alike = np.allclose(sizes, chart.cell_mm, rtol=_OFF_GRID)
     own = len(np.unique(np.rint(slots), axis=0)) == len(slots)
     return alike and own and bool(np.abs(slots - np.rint(slots)).max() < _OFF_GRID)
 
@@ -121,9 +122,10 @@ def printed_grid(chart: Chart) -> PrintedGrid:
     parts = np.where(sheet, count, count + 2).astype(np.int32)
     drawn = drawing(chart)
     plain = len(drawn.rgb) - drawn.tiles
-    for (left, top, right, bottom), rgb in zip(drawn.rectangles_mm[:plain], drawn.rgb[:plain], strict=True):
-        across, down = slice(*np.searchsorted(x, (left, right))), slice(*np.searchsorted(y, (top, bottom)))
-        parts[down, across] = count if rgb[0] > 127 else count + 1
+    rectangles = np.asarray(drawn.rectangles_mm[:plain], dtype=np.float64).reshape(-1, 2, 2)
+    edges = np.stack([np.searchsorted(x, rectangles[..., 0]), np.searchsorted(y, rectangles[..., 1])], axis=-1)
+    for ((left, top), (right, bottom)), rgb in zip(edges.tolist(), drawn.rgb[:plain], strict=True):
+        parts[top:bottom, left:right] = count if rgb[0] > 127 else count + 1
     of_slots = parts.reshape(rows, PARTS, columns, PARTS)
     patches = source[:, None, :, None]
     parts = np.where(patches >= 0, patches, of_slots).reshape(parts.shape).astype(np.int32)

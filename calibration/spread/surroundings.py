@@ -57,6 +57,30 @@ class FrameLevels:
 
 
 @dataclass(frozen=True, eq=False)
+class UsualLight:
+    """The field of the session's first frame, by which the light of what is not measured is known in all of them.
+
+    Attributes
+    ----------
+    patches, slots
+        (P, 3) and (R K, 3) float64, at patches and slots; beyond the outermost patches as at those.
+    elsewhere
+        (3 kinds, 3) float64, bare paper, black ink and what lies behind, the last unlit, summed over all slots.
+    """
+
+    patches: _Array
+    slots: _Array
+    elsewhere: _Array
+
+    @staticmethod
+    def of(grid: PrintedGrid, patches: _Array, slots: _Array) -> UsualLight:
+        """Return the light of a grid, given the field at patches (P, 3) and slots (R K, 3)."""
+        shares = grid.others.reshape(-1, 3).astype(np.float64)
+        lit = [(shares[:, kind, None] * slots).sum(axis=0) for kind in (0, 1)]
+        return UsualLight(patches, slots, np.stack([*lit, np.full(3, shares[:, 2].sum())]))
+
+
+@dataclass(frozen=True, eq=False)
 class Surroundings:
     """A frame's patches and what lies around them; made by `surroundings`.
 
@@ -74,8 +98,8 @@ class Surroundings:
         (P, 9) float64, the terms of a share over the frame at each patch (`place_terms`).
     whites
         Places of the white references among the patches.
-    light, slot_light
-        (P, 3) and (R K, 3) float64, the usual field of the session at patches and slots.
+    light
+        The usual light of the session.
     """
 
     grid: PrintedGrid
@@ -85,8 +109,7 @@ class Surroundings:
     pitch_px: _Array
     places: _Array
     whites: slice
-    light: _Array
-    slot_light: _Array
+    light: UsualLight
 
     def near(self, amounts: _Array) -> NearLight:
         """Return the light that near kernels bring, `amounts` (9, 3, N) of each: terms over the frame, by channel."""
@@ -98,7 +121,7 @@ class Surroundings:
         shares = np.empty((len(NEAR_PX), _PITCHES, number, kernels.ACROSS * PARTS))
         for k, scale in enumerate(NEAR_PX):
             kernels.window_shares(scale, pitches, offsets, self.window, shares[k])
-        weights = np.empty((count, 3, kernels.ACROSS**2), dtype=np.float32)
+        weights = np.empty((count, kernels.ACROSS**2, 3), dtype=np.float32)
         others = np.empty((count, 3, 3), dtype=np.float32)
         table = np.array([pitches[0], pitches[1] - pitches[0], first, step])
         grid, local = self.grid, np.ascontiguousarray(np.einsum("np,pck->nck", self.places, amounts))
@@ -106,26 +129,24 @@ class Surroundings:
             grid.row, grid.column, self.neighbours, grid.parts, self.offset_px, self.pitch_px, shares, table, local,
             weights, others,
         )  # fmt: skip
-        return NearLight(self.neighbours, weights, others, local.sum(axis=2))
+        return NearLight(self.neighbours, weights, others, local.sum(axis=2), self.light.patches)
 
-    def inks(self, levels: FrameLevels) -> tuple[_Array, _Array]:
-        """Return bare paper and black ink (3,) float64, counts where the field is 1."""
-        whites = levels.patches[self.whites] / self.light[self.whites]
+    def inks(self, levels: FrameLevels) -> _Array:
+        """Return bare paper, black ink, and what lies behind the print, (3, 3) float64 counts where the field is 1."""
+        whites = levels.patches[self.whites] / self.light.patches[self.whites]
         # The first colour is the code (0, 0, 0), which tags are printed with.
-        return np.median(whites, axis=0), levels.patches[0] / self.light[0]
+        return np.stack([np.median(whites, axis=0), levels.patches[0] / self.light.patches[0], levels.beyond])
 
-    def local(self, levels: FrameLevels) -> _Array:
-        """Return (P, 3 kinds, 3) float64 counts of bare paper, black ink, and what lies behind, at each patch."""
-        paper, black = self.inks(levels)
-        behind = np.broadcast_to(levels.beyond, self.light.shape)
-        return np.stack([self.light * paper, self.light * black, behind], axis=1)
+    def mean(self, levels: FrameLevels, inks: _Array) -> _Array:
+        """Return the mean light (3,) float64 counts of the print and what lies behind it; `inks` (3, 3) of `inks`."""
+        total = levels.patches.sum(axis=0) + (self.light.elsewhere * inks).sum(axis=0)
+        return total / self.grid.source.size
 
-    def image(self, levels: FrameLevels) -> _Float:
-        """Return the print slot by slot, (R, K, 3) float32 counts."""
-        paper, black = self.inks(levels)
-        shares = self.grid.others.reshape(-1, 3)
-        seen = shares[:, :1] * (self.slot_light * paper) + shares[:, 1:2] * (self.slot_light * black)
-        seen += shares[:, 2:] * levels.beyond
+    def image(self, levels: FrameLevels, inks: _Array) -> _Float:
+        """Return the print slot by slot, (R, K, 3) float32 counts; `inks` (3, 3) are those of `inks`."""
+        shares, light = self.grid.others.reshape(-1, 3), self.light.slots
+        seen = shares[:, :1] * (light * inks[0]) + shares[:, 1:2] * (light * inks[1])
+        seen += shares[:, 2:] * inks[2]
         image = seen.reshape(*self.grid.source.shape, 3).astype(np.float32)
         image[self.grid.row, self.grid.column] = levels.patches
         return image
@@ -160,25 +181,28 @@ class NearLight:
     neighbours
         (P, 25) int32, the patches around each.
     weights, others
-        (P, 3, 25) and (P, 3, 3) float32, of each of them, and of bare paper, black ink and what lies behind.
+        (P, 25, 3) and (P, 3 kinds, 3) float32, of each of them, and of bare paper, black ink and what lies behind.
     total
         (P, 3) float64, sum of a patch's weights.
+    light
+        (P, 3) float64, the usual field of the session at the patches.
     """
 
     neighbours: npt.NDArray[np.int32]
     weights: _Float
     others: _Float
     total: _Array
+    light: _Array
 
     @property
     def own(self) -> _Array:
         """(P, 3) float64, the weight of each patch's own slot."""
-        return self.weights[:, :, self.weights.shape[2] // 2].astype(np.float64)
+        return self.weights[:, self.weights.shape[1] // 2].astype(np.float64)
 
-    def at(self, levels: FrameLevels, local: _Array) -> _Array:
-        """Return the light (P, 3) float64 counts; `local` is what `Surroundings.local` returns."""
+    def at(self, levels: FrameLevels, inks: _Array) -> _Array:
+        """Return the light (P, 3) float64 counts; `inks` (3, 3) are those of `Surroundings.inks`."""
         out = np.empty_like(levels.patches)
-        kernels.light_around(self.neighbours, self.weights, self.others, levels.patches, local, out)
+        kernels.light_around(self.neighbours, self.weights, self.others, levels.patches, self.light, inks, out)
         return out
 
 
@@ -201,7 +225,7 @@ def surroundings(
     cells: Sites,
     references: Sites,
     whites: slice,
-    light: tuple[_Array, _Array],
+    light: UsualLight,
 ) -> Surroundings:
     """Return the surroundings of the patches of a frame.
 
@@ -220,7 +244,7 @@ def surroundings(
     whites
         Places of the white references among the patches.
     light
-        The usual field at the patches (P, 3) and at the slots (R K, 3).
+        The usual light of the session.
     """
     half = np.array(grid.pitch_mm) / 2
     points = grid.points_mm
@@ -237,7 +261,7 @@ def surroundings(
     from_centre = middle[:, None] + mosaic_offsets_px - seen
     offset = np.einsum("nij,ncj->nci", to_slots, from_centre) * pitch[:, None]
     places = place_terms(middle.astype(np.float64), frame_px)
-    return Surroundings(grid, cells.window, neighbours, np.ascontiguousarray(offset), pitch, places, whites, *light)
+    return Surroundings(grid, cells.window, neighbours, np.ascontiguousarray(offset), pitch, places, whites, light)
 
 
 def photosite_offsets_px(mosaic: Mosaic) -> _Array:
@@ -246,7 +270,7 @@ def photosite_offsets_px(mosaic: Mosaic) -> _Array:
     return np.array([channel_offset_px(found[channel]) for channel in CHANNELS])
 
 
-def light_at(grid: PrintedGrid, field: FlatField) -> tuple[_Array, _Array]:
-    """Return a field at the patches (P, 3) and at the slots (R K, 3); beyond the outermost patches as at those."""
+def light_at(grid: PrintedGrid, field: FlatField) -> UsualLight:
+    """Return the light of a field."""
     low, high = grid.points_mm.min(axis=0), grid.points_mm.max(axis=0)
-    return field.at(grid.points_mm), field.at(np.clip(grid.slots_mm, low, high))
+    return UsualLight.of(grid, field.at(grid.points_mm), field.at(np.clip(grid.slots_mm, low, high)))

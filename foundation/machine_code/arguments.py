@@ -86,8 +86,8 @@ def caller(address: int, kinds: Sequence[str], returned: str | Sequence[str] | N
     Returns
     -------
     callable
-        Takes positional arguments of those kinds. Raises MemoryError where memory is short, the only fault that machine
-        code that raises nothing itself can have.
+        Takes positional arguments of those kinds. Raises MemoryError where memory is short, or an array in another
+        order than C's is given another shape: the faults that machine code without a `raise` of its own can have.
     """
     taken: list[Any] = []
     arrays: list[bool] = []
@@ -114,7 +114,10 @@ def caller(address: int, kinds: Sequence[str], returned: str | Sequence[str] | N
                 flat.append(value.item() if isinstance(value, np.generic) else value)
         result, fault = value_type(), ctypes.c_void_p()
         if function(ctypes.addressof(result), ctypes.addressof(fault), *flat) not in _DONE:
-            raise MemoryError("compiled code ended with a fault instead of a value: no memory for its arrays")
+            raise MemoryError(
+                "compiled code ended with a fault instead of a value: no memory for its arrays, or an array that is "
+                "not in C's order was to get another shape"
+            )
         return value_of(result)
 
     return call

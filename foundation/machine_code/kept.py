@@ -20,7 +20,7 @@ from foundation.errors import CropError
 from foundation.files import cache_folder, whole_file
 from foundation.machine_code.loading import processor
 
-_VERSION: Final = 2
+_VERSION: Final = 3
 """Of the files, and of how functions in them are called; rises with every change of either."""
 
 

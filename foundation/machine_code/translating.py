@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dis
 import inspect
 import logging
 import sys
@@ -74,10 +75,30 @@ define linkonce_odr void @NRT_Free(ptr %memory) {
 
 define linkonce_odr i32 @numba_attempt_nocopy_reshape(
     i64 %dims, ptr %shape, ptr %strides, i64 %newdims, ptr %newshape, ptr %newstrides, i64 %itemsize, i32 %fortran) {
-  br label %loop
+  br label %look
+look:
+  %behind = phi i64 [ %dims, %0 ], [ %place, %on ]
+  %wanted = phi i64 [ %itemsize, %0 ], [ %further, %on ]
+  %seen = icmp eq i64 %behind, 0
+  br i1 %seen, label %loop, label %hold
+hold:
+  %place = sub i64 %behind, 1
+  %length_at = getelementptr i64, ptr %shape, i64 %place
+  %length = load i64, ptr %length_at
+  %found_at = getelementptr i64, ptr %strides, i64 %place
+  %found = load i64, ptr %found_at
+  %further = mul i64 %wanted, %length
+  %single = icmp eq i64 %length, 1
+  %as_wanted = icmp eq i64 %found, %wanted
+  %right = or i1 %single, %as_wanted
+  br i1 %right, label %on, label %refused
+on:
+  br label %look
+refused:
+  ret i32 0
 loop:
-  %left = phi i64 [ %newdims, %0 ], [ %at, %step ]
-  %stride = phi i64 [ %itemsize, %0 ], [ %next, %step ]
+  %left = phi i64 [ %newdims, %look ], [ %at, %step ]
+  %stride = phi i64 [ %itemsize, %look ], [ %next, %step ]
   %done = icmp eq i64 %left, 0
   br i1 %done, label %end, label %step
 step:
@@ -92,8 +113,9 @@ end:
   ret i32 1
 }
 """
-"""What numba's library does for code that makes arrays of its own, and gives contiguous ones another shape: its code
-is in a module of Python's that does not load without numba."""
+"""What numba's library does for code that makes arrays of its own, and gives those in C's order another shape: its code
+is in a module of Python's that does not load without numba. Arrays in another order are refused here, where numba sees
+whether they can have the shape without a copy."""
 
 _log: Final = logging.getLogger(__name__)
 
@@ -153,7 +175,7 @@ def dispatcher(function: FunctionType) -> Any:
 def code_of(function: FunctionType, arguments: Sequence[Any]) -> Code:
     """Return the machine code of a translated function for arguments of those kinds.
 
-    Without bytes where the code needs numba beside it: it returns an array, or calls into numba's libraries.
+    Without bytes where the code needs numba beside it: it returns an array, raises, or calls into numba's libraries.
     """
     library = numba()
     from llvmlite import binding
@@ -175,7 +197,7 @@ def code_of(function: FunctionType, arguments: Sequence[Any]) -> Code:
             target.typing_context, target.target_context, function, kinds, None, flags, {}
         )
         returned = _returned(made.signature.return_type)
-        if returned is ...:
+        if returned is ... or _raises(function):
             return Code(None)
         made.library.finalize()
         module = binding.parse_assembly(made.library.get_llvm_str())
@@ -188,6 +210,18 @@ def code_of(function: FunctionType, arguments: Sequence[Any]) -> Code:
             _log.debug("%s is left to numba: it calls %s", function.__qualname__, ", ".join(sorted(missing)))
             return Code(None)
         return Code(target_machine().emit_object(module), made.fndesc.llvm_func_name, returned)
+
+
+def _raises(function: FunctionType) -> bool:
+    """Return whether a function, or one that is compiled into it, has a `raise` or an `assert`.
+
+    numba makes Python's exception of the status that its code returns.
+    """
+    if any(step.opname == "RAISE_VARARGS" for step in dis.get_instructions(function)):
+        return True
+    named = (function.__globals__.get(name) for name in _names(function.__code__))
+    inner = (getattr(one, "py_func", None) for one in named)
+    return any(_raises(one) for one in inner if isinstance(one, FunctionType) and one is not function)
 
 
 def _returned(kind: Any) -> Any:

@@ -150,6 +150,55 @@ def test_every_kind_of_argument_gets_through_without_numba(tmp_path: Path) -> No
         assert _run(tmp_path, "import sys; sys.argv.append('last'); import kernels.kinds")[1] == ""
 
 
+FAULTS = """
+import sys
+import numpy as np
+from foundation.compiled import compiled, inlined
+
+@inlined
+def checked(number):
+    if number < 0:
+        raise ValueError("below zero")
+    return number
+
+@compiled
+def root(number):
+    return checked(number) ** 0.5
+
+@compiled
+def turned(numbers, target):
+    flat = numbers.T.copy().T.reshape(numbers.size) if numbers.ndim == 1 else numbers.T.reshape(numbers.size)
+    for place in range(flat.size):
+        target[place] = flat[place]
+
+target = np.zeros(6)
+grid = np.arange(6.0).reshape(2, 3)
+if "turned" in sys.argv:
+    try:
+        turned(grid, target)
+    except (MemoryError, NotImplementedError) as error:
+        print("refused")
+    turned(np.asfortranarray(grid), target)
+    print(target.tolist(), "numba" in sys.modules)
+else:
+    print(root(4))
+    try:
+        root(-4)
+    except ValueError as error:
+        print(error)
+"""
+
+
+def test_what_code_raises_is_raised_and_no_order_is_taken_for_another(tmp_path: Path) -> None:
+    _copied(tmp_path)
+    (tmp_path / "kernels" / "faults.py").write_text(FAULTS)
+    turned = "import sys; sys.argv.append('turned'); import kernels.faults"
+    for numba in (True, False):
+        assert _run(tmp_path, "import kernels.faults") == ("2.0\nbelow zero\n", "")
+        told = f"refused\n[0.0, 3.0, 1.0, 4.0, 2.0, 5.0] {numba}\n"
+        assert _run(tmp_path, turned) == (told, "")
+
+
 NO_FOLDER = """
 import importlib, sys
 import numba

@@ -26,7 +26,7 @@ from calibration.spread.correction import (
 from calibration.spread.fitting import LEAST_COUNTS, MOST_VEIL, USUAL_UNEVENNESS, colour_residual
 from calibration.spread.point_spread import PointSpread
 from calibration.spread.printed_grid import PAD, PARTS, printed_grid, unsuitable
-from calibration.spread.surroundings import FrameLevels, Surroundings, far_taps
+from calibration.spread.surroundings import FrameLevels, Surroundings, UsualLight, far_taps
 from foundation.angles import angles_deg
 
 _Array = npt.NDArray[np.float64]
@@ -74,8 +74,8 @@ class Photograph:
         usable = np.ones(len(self.true), dtype=np.bool_)
         # Paper as it is seen, and its field: a veil lifts it too.
         white = np.median(self.seen.patches[self.view.whites] / self.field[self.view.whites], axis=0)
-        frame = SpreadFrame(self.seen, self.around, self.field, white, usable, USUAL_UNEVENNESS, self.printed)
-        found = measure_spread([frame], self.chart.page_mm, self.chart.bits, LEAST_COUNTS)
+        frame = SpreadFrame(self.seen, self.field, white, usable, USUAL_UNEVENNESS, self.printed)
+        found = measure_spread([frame], self.around, self.chart.page_mm, self.chart.bits, LEAST_COUNTS)
         assert found is not None
         return found
 
@@ -154,12 +154,10 @@ def photograph(
     around = view.around(
         cast(Registration, place), sites_at(where[:cells], shape), sites_at(where[cells:references], shape)
     )
-    around = Surroundings(
-        grid, 5, around.neighbours, around.offset_px, around.pitch_px, around.places, view.whites, field_at,
-        ndimage.map_coordinates(
-            light, (grid.slots_mm / PX_MM + place.at_px).T[::-1], order=1, mode="nearest"
-        )[:, None].repeat(3, axis=1),
-    )  # fmt: skip
+    of_slots = ndimage.map_coordinates(
+        light, (grid.slots_mm / PX_MM + place.at_px).T[::-1], order=1, mode="nearest"
+    )[:, None].repeat(3, axis=1)  # fmt: skip
+    around = replace(around, light=UsualLight.of(grid, field_at, of_slots))
     beyond = image[:margin, :margin].mean(axis=(0, 1))
     levels = GreyLevels.of(greys).level
     printed = np.concatenate([np.full(cells, -1), np.zeros(len(whites), dtype=np.int64), 1 + levels])
@@ -267,18 +265,25 @@ def test_a_veil_in_even_light_is_not_known_and_that_is_said(sharp: Photograph) -
 
 
 def test_light_of_the_surroundings_is_that_of_an_even_print_where_all_is_even(sharp: Photograph) -> None:
-    around, count = sharp.around, len(sharp.true)
-    flat = Surroundings(
-        around.grid, 5, around.neighbours, around.offset_px, around.pitch_px, around.places, around.whites,
-        np.ones((count, 3)), np.ones((len(around.grid.slots_mm), 3)),
-    )  # fmt: skip
+    grid, count = sharp.around.grid, len(sharp.true)
+    even = UsualLight.of(grid, np.ones((count, 3)), np.ones((len(grid.slots_mm), 3)))
+    flat = replace(sharp.around, light=even)
     levels = FrameLevels(np.full((count, 3), 700.0), np.full(3, 700.0))
     whole = np.zeros((9, 3, 3))
     whole[0] = 0.2
     near = flat.near(whole)
     assert near.total == pytest.approx(0.6)
-    assert near.at(levels, flat.local(levels)) == pytest.approx(0.6 * 700, rel=1e-5)
-    assert flat.far(flat.image(levels), 24.0) == pytest.approx(700, rel=1e-5)
+    inks = flat.inks(levels)
+    assert near.at(levels, inks) == pytest.approx(0.6 * 700, rel=1e-5)
+    assert flat.mean(levels, inks) == pytest.approx(700)
+    assert flat.far(flat.image(levels, inks), 24.0) == pytest.approx(700, rel=1e-5)
+
+
+def test_the_mean_light_is_that_of_the_print_slot_by_slot(sharp: Photograph) -> None:
+    around, levels = sharp.around, sharp.seen
+    inks = around.inks(levels)
+    slot_by_slot = around.image(levels, inks).mean(axis=(0, 1), dtype=np.float64)
+    assert around.mean(levels, inks) == pytest.approx(slot_by_slot, rel=1e-6)
 
 
 def test_taps_of_a_far_kernel_add_up() -> None:
