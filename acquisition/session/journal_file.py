@@ -337,6 +337,10 @@ def _connect_with(path: Path, parameters: str) -> sqlite3.Connection:
     except sqlite3.DatabaseError:
         connection.close()
         raise
+    except UnicodeDecodeError as error:
+        # The message of SQLite quotes the damaged schema byte by byte.
+        connection.close()
+        raise sqlite3.DatabaseError(f"malformed database schema, which is no text: {error.reason}") from error
     return connection
 
 

@@ -24,6 +24,7 @@ KNOWN = (
     ("session", 128),  # a chart of a terabyte without a byte
     ("session", 1864),  # a number of 5000 digits
     ("session", 2981),
+    ("session", 1007352),  # a schema that is no text, quoted in the message of SQLite
     ("published", 1448),
 )
 
