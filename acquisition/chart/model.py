@@ -178,6 +178,8 @@ _Length = Annotated[float, Field(gt=0)]
 _Size = tuple[_Length, _Length]
 _Code = Annotated[int, Field(ge=0, le=255)]
 
+_Colour = Annotated[int, Field(ge=0, lt=8**5)]
+
 
 class _Strict(BaseModel):
     model_config = ConfigDict(extra="ignore", frozen=True, allow_inf_nan=False, strict=True)
@@ -185,7 +187,7 @@ class _Strict(BaseModel):
 
 class _Cells(_Strict):
     centre_mm: list[_Point]
-    colour: list[int]
+    colour: list[_Colour]
 
 
 class _Tag(_Strict):

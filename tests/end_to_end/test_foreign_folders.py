@@ -25,6 +25,7 @@ KNOWN = (
     ("session", 1864),  # a number of 5000 digits
     ("session", 2981),
     ("session", 1007352),  # a schema that is no text, quoted in the message of SQLite
+    ("session", 1010533),  # a chart with a colour of thirty digits
     ("published", 1448),
 )
 
