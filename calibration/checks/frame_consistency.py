@@ -311,7 +311,8 @@ class ConsistencyCheck:
 def _like_a_neighbour(values: _Array, around: npt.NDArray[np.int64]) -> _Array:
     """Return values (N,) brought between the second lowest and second highest of themselves and their neighbours.
 
-    `around` (N, K) are each one's places in `values`, its own among them; NaN is no value and stays.
+    `around` (N, K) are each one's places in `values`, its own among them. NaN is no value and stays; a value with fewer
+    than two others around becomes NaN, since a hot photosite in it would not be told from what covers cells.
     """
     from calibration.checks import kernels
 

@@ -19,7 +19,8 @@ _Index = npt.NDArray[np.int64]
 def clipped_to_neighbours(values: _Array, around: _Index, out: _Array) -> None:
     """Fill out (N,) with values brought between the second lowest and second highest of those `around` each (N, K).
 
-    NaN is no value and stays; where fewer than three values are around, a value stays as it is.
+    NaN is no value and stays; where fewer than three values are around, its own among them, nothing vouches for a value,
+    and it becomes NaN.
     """
     for n in range(len(values)):
         lowest, low, highest, high = np.inf, np.inf, -np.inf, -np.inf
@@ -34,4 +35,4 @@ def clipped_to_neighbours(values: _Array, around: _Index, out: _Array) -> None:
             high = max(high, min(highest, above))
             highest = max(highest, above)
             count += known
-        out[n] = values[n] if count < 3 or np.isnan(values[n]) else min(max(values[n], low), high)
+        out[n] = np.nan if count < 3 or np.isnan(values[n]) else min(max(values[n], low), high)

@@ -11,6 +11,7 @@ from functools import cache
 import numpy as np
 import numpy.typing as npt
 import pytest
+from scipy.spatial import cKDTree
 
 from calibration.checks.frame_consistency import ConsistencyCheck, FrameConsistency, has_enough_cells
 from calibration.verdict.thresholds import THRESHOLDS
@@ -127,6 +128,19 @@ def test_one_hot_photosite_is_no_hand(excess: float) -> None:
     seen = sheet.other.copy()
     dark = np.argsort(seen[:, 0])[sheet.random.integers(300, 600, 3)]
     seen[dark, 0] += excess
+    like = sheet.compared(seen)
+    assert like.block < 0.5 * LIMITS["unlike_block"].accept
+
+
+@pytest.mark.parametrize("percentile", [50.0, 60.0, 65.0])
+def test_one_hot_photosite_among_dark_cells_is_no_hand(percentile: float) -> None:
+    """Under a light in which most cells are too dark to be compared, so that few have a neighbour that is."""
+    sheet = Sheet(2)
+    seen = 70 * sheet.other / np.percentile(sheet.other, percentile, axis=0)
+    bright = seen[:, 2] > 60
+    around = cKDTree(sheet.places).query(sheet.places, k=9)[1]
+    lone = np.flatnonzero(bright & (seen[:, 2] < 90) & (bright[around].sum(axis=1) <= 2))
+    seen[sheet.random.choice(lone, 3, replace=False), 2] += 160
     like = sheet.compared(seen)
     assert like.block < 0.5 * LIMITS["unlike_block"].accept
 
