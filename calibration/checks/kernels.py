@@ -19,8 +19,8 @@ _Index = npt.NDArray[np.int64]
 def clipped_to_neighbours(values: _Array, around: _Index, out: _Array) -> None:
     """Fill out (N,) with values brought between the second lowest and second highest of those `around` each (N, K).
 
-    NaN is no value and stays; where fewer than three values are around, its own among them, nothing vouches for a value,
-    and it becomes NaN.
+    NaN is no value and stays; where fewer than three values are around, its own among them, nothing vouches for a
+    value, and it becomes NaN.
     """
     for n in range(len(values)):
         lowest, low, highest, high = np.inf, np.inf, -np.inf, -np.inf
