@@ -37,6 +37,10 @@ class _Later:
     def __call__(self, *arguments: Any) -> Any:
         return self.made()(*arguments)
 
+    def __reduce__(self) -> str:
+        """Pickle it as a function: by its name. Without this what holds one could not be sent to another process."""
+        return self._function.__qualname__
+
     @property
     def py_func(self) -> Callable[..., Any]:
         """The function in Python, by the name under which numba has it."""

@@ -199,6 +199,19 @@ def test_what_code_raises_is_raised_and_no_order_is_taken_for_another(tmp_path: 
         assert _run(tmp_path, turned) == (told, "")
 
 
+PICKLED = """
+import copy, pickle
+from kernels.square import square
+assert pickle.loads(pickle.dumps(square)) is square and copy.deepcopy([square]) == [square]
+"""
+
+
+def test_a_compiled_function_is_pickled_by_its_name(tmp_path: Path) -> None:
+    _copied(tmp_path)
+    (tmp_path / "kernels" / "power.py").write_text(POWER.format(exponent=2))
+    assert _run(tmp_path, PICKLED) == ("", "")
+
+
 NO_FOLDER = """
 import importlib, sys
 import numba
