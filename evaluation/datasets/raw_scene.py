@@ -167,8 +167,9 @@ def subtract_black(image: Image, black: float) -> Image:
     if image.dtype == np.uint16 and not float(black).is_integer():
         image = image.astype(np.float32)
     if black:
-        # A TIFF may hold a plane a channel, which OpenCV does not write to.
-        image = image.copy(order="C")
+        if not image.flags.c_contiguous:
+            # A TIFF may hold a plane a channel, which OpenCV does not write to.
+            image = image.copy(order="C")
         cv2.subtract(image, np.array([black, black, black, 0.0]), dst=image)  # Saturates at 0 in integers.
     return image if image.dtype == np.uint16 else np.maximum(image, 0, out=image)
 
