@@ -7,6 +7,7 @@ import inspect
 import logging
 import sys
 from collections.abc import Callable, Mapping, Sequence
+from functools import cache
 from importlib.util import find_spec
 from types import CellType, CodeType, FunctionType, ModuleType
 from typing import Any, Final
@@ -253,13 +254,9 @@ def announce() -> None:
     print(_COMPILING, file=sys.stderr)
 
 
-_prepared: Final[list[str]] = []
-
-
+@cache
 def _prepare() -> None:
     """Once: hear of what numba did not find on the disk, and keep it from SciPy."""
-    if _prepared:
-        return
     from numba.core import event
 
     class Announcement(event.Listener):
@@ -270,7 +267,6 @@ def _prepare() -> None:
             pass
 
     event.register("numba:compile", Announcement())
-    _prepared.append("numba")
     _without_linear_algebra()
 
 

@@ -318,7 +318,7 @@ class Crops:
 
     def _black_of(self, light: int) -> npt.NDArray[np.float64]:
         """Return what a black point takes of a light at most, (3,) counts."""
-        return self._cells.black(light) if self._cells and not self._blacks else self._blacks[light]
+        return self._cells.black(light) if self._cells else self._blacks[light]
 
     def __getitem__(self, item: int) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]:
         """Return the image (3, height, width) float32 and the illuminant (3,) float32 of one item.
