@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from calibration.citation.options import Licence, Note
 from calibration.table_jobs import (
     fetch_table,
     match_tables,
@@ -135,15 +136,8 @@ def build_lut(
             show_default=False,
         ),
     ] = None,
-    note: Annotated[
-        str | None, typer.Option("--note", help="What readers of the table should know.", show_default=False)
-    ] = None,
-    licence: Annotated[
-        str | None,
-        typer.Option(
-            "--licence", "--license", metavar="SPDX", help="Licence of the table, as CC-BY-4.0.", show_default=False
-        ),
-    ] = None,
+    note: Note = None,
+    licence: Licence = None,
     author: Annotated[
         list[str] | None,
         typer.Option(

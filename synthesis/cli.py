@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from calibration.citation.options import Licence, Note
 from foundation.console import EXIT_CODES, orderly_end, progress
 from foundation.json_output import JsonOutput, with_json
 from sim import cli as devices
@@ -76,15 +77,8 @@ def table(
     threads: Annotated[
         int | None, typer.Option(min=1, help="Lights computed at a time; by default one a processor.")
     ] = None,
-    note: Annotated[
-        str | None, typer.Option("--note", help="What readers of the table should know.", show_default=False)
-    ] = None,
-    licence: Annotated[
-        str | None,
-        typer.Option(
-            "--licence", "--license", metavar="SPDX", help="Licence of the table, as CC-BY-4.0.", show_default=False
-        ),
-    ] = None,
+    note: Note = None,
+    licence: Licence = None,
     author: Annotated[
         list[str] | None,
         typer.Option(
