@@ -9,7 +9,7 @@ behind an encoder, so its share of the processor time is reported too: no arrang
 faster the encoder, the less there is to hide behind, so the fastest in our libraries, ISA-L's deflate at level 1 of the
 same bytes unfiltered, is measured beside it.
 
-Runs alternate and the fastest of each counts.
+Runs alternate and the fastest of each counts; what an earlier run wrote is removed before the clock runs.
 """
 
 from __future__ import annotations
@@ -45,11 +45,17 @@ LARGE_REPEATS = 3
 SMALL_REPEATS = 5
 
 
-def fastest(calls: Mapping[str, Callable[[], object]], repeats: int) -> dict[str, tuple[float, float]]:
-    """Return the least seconds, and the least processor seconds, of some calls of each, taken in turn."""
+def fastest(
+    calls: Mapping[str, Callable[[], object]], repeats: int, prepare: Callable[[], object]
+) -> dict[str, tuple[float, float]]:
+    """Return the least seconds, and the least processor seconds, of some calls of each, taken in turn.
+
+    `prepare` is called before each, and not timed.
+    """
     took = dict.fromkeys(calls, (float("inf"), float("inf")))
     for _ in range(repeats):
         for name, call in calls.items():
+            prepare()
             start, busy = time.perf_counter(), time.process_time()
             call()
             took[name] = (
@@ -114,20 +120,21 @@ def compare(scratch: Path, lut: Lut, name: str, pictures: list[npt.NDArray[np.ui
 
     table, paths = np.array(lut.samples[0]), sorted(sources.iterdir())
 
+    def clear() -> None:
+        for folder in (usual, ours, written):
+            shutil.rmtree(folder, ignore_errors=True)
+
     def by_hand() -> None:
-        shutil.rmtree(usual, ignore_errors=True)
         usual.mkdir()
         straightforward(table, paths, usual)
 
     def by_hands(processes: ProcessPoolExecutor) -> None:
-        shutil.rmtree(usual, ignore_errors=True)
         usual.mkdir()
         shares = [processes.submit(in_a_process, lut.folder, paths[share::workers], usual) for share in range(workers)]
         for share in shares:
             share.result()
 
     def by_suite(previews: bool = False) -> None:
-        shutil.rmtree(ours, ignore_errors=True)
         generate_dataset(
             lut, ours, find_pictures([sources]), [0], options=DatasetOptions(previews=previews), workers=workers
         )
@@ -149,7 +156,6 @@ def compare(scratch: Path, lut: Lut, name: str, pictures: list[npt.NDArray[np.ui
             packed[:] = pool.map(by_isal, images)
 
         def write() -> None:
-            shutil.rmtree(written, ignore_errors=True)
             written.mkdir()
             put = LocalStore(written).put
             at_once(
@@ -171,7 +177,10 @@ def compare(scratch: Path, lut: Lut, name: str, pictures: list[npt.NDArray[np.ui
                 "ours": by_suite,
             },
             repeats,
+            clear,
         )
+        by_suite()
+        by_hands(processes)
     wall, busy = ({call: times[which] for call, times in took.items()} for which in (0, 1))
     sizes = [sum(path.stat().st_size for path in folder.iterdir()) for folder in (usual, ours / "images")]
     what = f"folder to folder, {name}, {workers} workers"
@@ -193,8 +202,8 @@ def compare(scratch: Path, lut: Lut, name: str, pictures: list[npt.NDArray[np.ui
         f"folder to folder, {name}, processor time", busy["files"] / busy["ours"], "ratio", f"{alone}, files written"
     )
     report(f"folder to folder, {name}, with previews", wall["ours"] / wall["previews"], "ratio", "without previews")
-    for folder in (sources, usual, ours, written):
-        shutil.rmtree(folder)
+    clear()
+    shutil.rmtree(sources)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

@@ -61,6 +61,9 @@ _JPEG_QUALITY: Final = 92
 """Of previews, on libjpeg's scale to 100: no blocks are visible."""
 
 
+_LONGEST_JPEG: Final = 65500
+"""Longest side that libjpeg writes, px (its JPEG_MAX_DIMENSION)."""
+
 _DEFLATE_RATIO: Final = 1032
 """Bytes that deflate makes of one at most (RFC 1951: 258 of two bits)."""
 
@@ -283,13 +286,11 @@ def encode_preview(picture: npt.NDArray[np.uint8]) -> bytes:
     InputError
         A side is longer than JPEG allows, 65 500 px.
     """
-    import cv2
+    import simplejpeg
 
-    done, data = cv2.imencode(
-        ".jpg", cv2.cvtColor(picture, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY]
-    )
-    if not done:
+    if max(picture.shape) > _LONGEST_JPEG:
         raise InputError(
             f"a preview of {picture.shape[1]}x{picture.shape[0]} px cannot be written as JPEG; make it smaller"
         )
-    return data.tobytes()
+    pixels = np.ascontiguousarray(picture)
+    return simplejpeg.encode_jpeg(pixels, _JPEG_QUALITY, colorspace="RGB", colorsubsampling="420")

@@ -1,7 +1,8 @@
 """The preview beside an image: the image in camera colours, made small and tone mapped by Flash.
 
 An image of 16 bits has few values, so every logarithm and power is taken once for each value and not once for each
-pixel; see `tonemap` for the operator.
+pixel; see `tonemap` for the operator. Nothing here starts threads of its own: the images of a dataset are made by as
+many threads as there are processors.
 """
 
 from __future__ import annotations
@@ -11,13 +12,14 @@ from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
-from numpy import uint8, uint16, uint64
+from numpy import float32, uint8, uint16, uint32, uint64
 
 from foundation.compiled import compiled
 from generator.pictures.tonemap import DARK, flash_from_brightness
 
-PREVIEW_SIDE: Final = 512
-"""Longest side of a preview, px: enough to judge content and colours by eye, in some tens of kB."""
+PREVIEW_SIDE: Final = 400
+"""Longest side of a preview, px: enough to judge content and colours by eye, in some tens of kB, and less than that of
+the images of most datasets, of which a preview of the same size would be a copy."""
 
 _GAMMA: Final = 2.2
 """Exponent of a usual display, as in the paper's figure of the generation process."""
@@ -26,17 +28,63 @@ _HALF: Final = np.float32(0.5)
 
 
 @compiled
-def _brightest(samples: Any, counts: Any) -> Any:
-    """Add to `counts` how often each value is the largest channel of a pixel; return the largest value of all."""
+def _shrink(image: Any, factor: int, out: Any) -> None:
+    """Fill `out` with the rounded means of the blocks of `image`, `factor` pixels wide and high, or what is left there.
+
+    `image` is (H, W, 3) uint16, `out` (⌈H / factor⌉, ⌈W / factor⌉, 3) uint16.
+    """
+    height, width = image.shape[0], image.shape[1]
+    sums = np.empty(3 * width, np.int64)
+    one, two = uint64(1), uint64(2)
+    for y in range(out.shape[0]):
+        top, end = factor * y, min(factor * (y + 1), height)
+        # Rows are added first, so that the compiler can vectorise what touches every sample.
+        first, small = image[top].reshape(-1), out[y].reshape(-1)
+        for i in range(3 * width):
+            sums[i] = first[i]
+        for row in range(top + 1, end):
+            samples = image[row].reshape(-1)
+            for i in range(3 * width):
+                sums[i] += samples[i]
+        left, at = uint64(0), uint64(0)
+        columns = min(factor, width)
+        share = 1.0 / ((end - top) * columns)
+        for x in range(out.shape[1]):
+            if factor * (x + 1) > width:
+                columns = width - factor * x
+                share = 1.0 / ((end - top) * columns)
+            red, green, blue = sums[left], sums[left + one], sums[left + two]
+            for _ in range(columns - 1):
+                left += uint64(3)
+                red += sums[left]
+                green += sums[left + one]
+                blue += sums[left + two]
+            left += uint64(3)
+            small[at] = uint16(red * share + 0.5)
+            small[at + one] = uint16(green * share + 0.5)
+            small[at + two] = uint16(blue * share + 0.5)
+            at += uint64(3)
+
+
+@compiled
+def _brightest(samples: Any, logs: Any) -> Any:
+    """Return the largest channel of all pixels, and the sum over pixels of the logarithm of the largest channel.
+
+    `samples` is (3 N,) uint16, `logs` (65536,) float64 the logarithm of each value.
+    """
+    # Two counters, so that equal values do not wait for each other.
+    counts = np.zeros((2, 1 << 16), np.uint32)
     top = uint16(0)
     i = uint64(0)
-    # Two counters, so that equal values do not wait for each other.
     for pixel in range(len(samples) // 3):
         brightness = max(samples[i], samples[i + uint64(1)], samples[i + uint64(2)])
-        counts[pixel & 1, brightness] += 1
+        counts[pixel & 1, brightness] += uint32(1)
         top = max(top, brightness)
         i += uint64(3)
-    return top
+    total = 0.0
+    for value in range(int(top) + 1):
+        total += (uint64(counts[0, value]) + uint64(counts[1, value])) * logs[value]
+    return top, total
 
 
 @compiled
@@ -54,14 +102,14 @@ def _map(samples: Any, roots: Any, shades: Any, out: Any) -> None:
 
 
 @lru_cache(maxsize=4)
-def _tables(white_level: int) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64], npt.NDArray[np.float32]]:
+def _tables(white_level: int) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float64], npt.NDArray[np.float32]]:
     """Return lookup tables (65536,) over the values of 16 bits: brightness, its logarithm, its gamma root.
 
     Brightness is the value over the white level, at least `DARK`.
     """
     linear = np.arange(1 << 16) / white_level
     brightness = np.maximum(linear, DARK)
-    return brightness, np.log(brightness), (linear ** (1 / _GAMMA)).astype(np.float32)
+    return brightness.astype(np.float32), np.log(brightness), (linear ** (1 / _GAMMA)).astype(np.float32)
 
 
 def preview_of(image: npt.NDArray[np.uint16], white_level: int, side: int = PREVIEW_SIDE) -> npt.NDArray[np.uint8]:
@@ -74,12 +122,13 @@ def preview_of(image: npt.NDArray[np.uint16], white_level: int, side: int = PREV
     white_level
         Value of saturation, in the units of the image.
     side
-        Longest side allowed, px.
+        Longest side allowed, px. A pixel of the preview is the mean of k × k pixels, k the least whole number that
+        makes it fit.
 
     Returns
     -------
     ndarray
-        (h, w, 3) uint8, codes for a display.
+        (⌈H / k⌉, ⌈W / k⌉, 3) uint8, codes for a display.
 
     Examples
     --------
@@ -88,22 +137,18 @@ def preview_of(image: npt.NDArray[np.uint16], white_level: int, side: int = PREV
     >>> preview.shape, preview[0, 0]
     ((2, 100, 3), array([186, 255, 224], dtype=uint8))
     """
-    import cv2
-
     height, width = image.shape[:2]
-    scale = side / max(height, width)
-    if scale < 1:
-        # In whole numbers: floats of the full size would take more memory than all else.
-        size = (max(1, round(width * scale)), max(1, round(height * scale)))
-        image = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), dtype=np.uint16)
+    factor = -(-max(height, width) // side)
+    if factor > 1:
+        small = np.empty((-(-height // factor), -(-width // factor), 3), np.uint16)
+        _shrink(np.ascontiguousarray(image), factor, small)
+        image = small
     brightness, logs, roots = _tables(white_level)
     samples = np.ascontiguousarray(image).reshape(-1)
-    counts = np.zeros((2, 1 << 16), np.int64)
-    seen = slice(0, int(_brightest(samples, counts)) + 1)
-    # Not a dot product: the library behind it may start threads of its own.
-    mean = float((counts[:, seen] * logs[seen]).sum()) / (samples.size // 3)
-    operator = flash_from_brightness(mean, float(brightness[seen][-1]), gamma=_GAMMA)
-    shades = operator.scale * (brightness[seen] + operator.k) ** (-1 / _GAMMA)
+    top, total = _brightest(samples, logs)
+    seen = brightness[: int(top) + 1]
+    operator = flash_from_brightness(float(total) / (samples.size // 3), float(seen[-1]), gamma=_GAMMA)
+    shades = float32(operator.scale) * (seen + float32(operator.k)) ** float32(-1 / _GAMMA)
     picture = np.empty(image.shape, np.uint8)
-    _map(samples, roots, shades.astype(np.float32), picture.reshape(-1))
+    _map(samples, roots, shades, picture.reshape(-1))
     return picture

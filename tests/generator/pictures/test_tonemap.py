@@ -86,3 +86,23 @@ def test_previews_are_small() -> None:
     image = np.full((300, 200, 3), 1000, np.uint16)
     assert preview_of(image, 12000, side=100).shape == (100, 67, 3)
     assert preview_of(image, 12000, side=400).shape == (300, 200, 3)
+
+
+@settings(deadline=None)
+@given(
+    hnp.arrays(np.uint16, st.tuples(st.integers(1, 12), st.integers(1, 12), st.just(3))),
+    st.integers(1, 12),
+)
+def test_a_pixel_of_a_preview_is_the_mean_of_what_it_stands_for(image: npt.NDArray[np.uint16], side: int) -> None:
+    factor = -(-max(image.shape[:2]) // side)
+    means = np.array(
+        [
+            [
+                image[top : top + factor, left : left + factor].reshape(-1, 3).mean(axis=0)
+                for left in range(0, image.shape[1], factor)
+            ]
+            for top in range(0, image.shape[0], factor)
+        ]
+    )
+    rounded = np.floor(means + 0.5).astype(np.uint16)
+    assert np.abs(preview_of(image, 65535, side).astype(int) - preview_of(rounded, 65535, side)).max() <= 1
