@@ -30,8 +30,15 @@ _TEXT = "typeof({0}) = 'text' AND length({0}) < 100000"
 _MAYBE_TEXT = "({0} IS NULL OR " + _TEXT + ")"
 _REAL = "typeof({0}) IN ('real', 'integer') AND abs({0}) < 9e300"
 _MAYBE_REAL = "({0} IS NULL OR typeof({0}) IN ('real', 'integer'))"
-_DAY = "[0-9][0-9][0-9][0-9]-[01][0-9]-[0-3][0-9]T[0-2][0-9]:[0-5][0-9]:[0-5][0-9]"
-_TIME = f"typeof({{0}}) = 'text' AND length({{0}}) < 40 AND {{0}} GLOB '{_DAY}*' AND datetime({{0}}) IS NOT NULL"
+_MOMENT = "[0-9][0-9][0-9][0-9]-[01][0-9]-[0-3][0-9]T[0-2][0-9]:[0-5][0-9]:[0-5][0-9]"
+_ZONE = "[+-][0-9][0-9]:[0-9][0-9]"
+_FORMS = f"{{0}} GLOB '{_MOMENT}.{6 * '[0-9]'}{_ZONE}' OR {{0}} GLOB '{_MOMENT}{_ZONE}'"
+# SQLite ends a text at a zero byte, takes 30 February for 2 March, and knows the zones that there are.
+_TIME = (
+    f"typeof({{0}}) = 'text' AND ({_FORMS}) AND length(CAST({{0}} AS BLOB)) = length({{0}}) "
+    "AND {0} BETWEEN '1970' AND '9999' AND datetime({0}) IS NOT NULL "
+    "AND strftime('%Y-%m-%dT%H:%M:%S', substr({0}, 1, 19), '+0 seconds') = substr({0}, 1, 19)"
+)
 _MAYBE_TIME = "({0} IS NULL OR {0} = '' OR (" + _TIME + "))"
 _SHA256 = "({0} IS NULL OR (typeof({0}) = 'text' AND length({0}) <= 64 AND {0} NOT GLOB '*[^0-9a-f]*'))"
 
