@@ -62,7 +62,8 @@ GREY_MET_DEG: Final = 0.05
 """Angle to grey from which two cells of a grey's mixture are exchanged at once: a tenth of what greys may be off."""
 
 PAIR_NEIGHBOURS: Final = 192
-"""Cells tried when two are exchanged at once: all pairs of moves to them take some ten milliseconds a grey."""
+"""Cells tried when two are exchanged at once: all pairs of moves to them take some ten milliseconds a grey. Greys that
+are then still off by `GREY_WITHIN_DEG`, dark ones most of all, are tried with `WIDE_NEIGHBOURS`."""
 
 _Array = npt.NDArray[np.float64]
 
@@ -148,12 +149,15 @@ def mix_cells(profile: PrintProfile, wanted: _Array) -> CellMixtures:
     again = np.flatnonzero(missed & near_grey(wanted))
     if len(again):
         cells[again] = chosen(again, WIDE_NEIGHBOURS, WIDE_SPREAD_COST)
-    off = angles_deg(colours[cells].mean(axis=1), np.ones(3)) > GREY_MET_DEG
-    greys = np.flatnonzero(off & (np.ptp(wanted, axis=1) <= _GREY_SPREAD * wanted.max(axis=1)))
-    if len(greys):
-        improved = np.ascontiguousarray(cells[greys])
-        _exchange_pairs(colours, wanted[greys], scale, nearest(greys, PAIR_NEIGHBOURS), WIDE_SPREAD_COST, improved)
-        cells[greys] = improved
+    is_grey = np.ptp(wanted, axis=1) <= _GREY_SPREAD * wanted.max(axis=1)
+    for neighbours, met in ((PAIR_NEIGHBOURS, GREY_MET_DEG), (WIDE_NEIGHBOURS, GREY_WITHIN_DEG)):
+        off = angles_deg(colours[cells].mean(axis=1), np.ones(3)) > met
+        greys = np.flatnonzero(off & is_grey)
+        if len(greys):
+            improved = np.ascontiguousarray(cells[greys])
+            near = nearest(greys, neighbours)
+            _exchange_pairs(colours, wanted[greys], scale, near, WIDE_SPREAD_COST, improved)
+            cells[greys] = improved
     return mixtures_of(np.sort(usable[cells], axis=1).astype(np.uint16), profile, wanted)
 
 

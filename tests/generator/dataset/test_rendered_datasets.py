@@ -104,7 +104,7 @@ def test_an_image_is_drawn_from_its_code_picture_without_a_share_of_black(
     made_of = dataset.description
     assert made_of.options["rendering"] == {
         "name": "colorimetric",
-        "version": 2,
+        "version": 3,
         "matrix": {"name": "mine", "source": "a test", "rows": MATRIX.rows.tolist()},
     }
     assert made_of.options["black_point"] == "random:0.97"

@@ -74,6 +74,16 @@ def test_greys_are_grey_on_a_print_whose_greys_are_not(tint: float) -> None:
     assert mix_cells(print_, greys).distance.max() < 0.5
 
 
+def test_a_dark_grey_that_is_far_from_its_cells_is_tried_with_more_of_them() -> None:
+    """A print whose black is red: with the 192 nearest cells alone one of these greys is .57 degrees off."""
+    colours = printed(5)
+    colours = colours * (1 + 0.04 / colours.mean(axis=1, keepdims=True) * np.array([0.2, 0.0, -0.2]))
+    colours = colours * np.exp(0.03 * np.random.default_rng(2).standard_normal(colours.shape))
+    print_ = PrintProfile(colours, np.ones(len(colours), np.bool_))
+    greys = np.linspace(print_.black, 2 * print_.black, 20)[:, None] * np.ones(3)
+    assert mix_cells(print_, greys).distance.max() < 0.4
+
+
 def test_what_the_print_cannot_show_is_said() -> None:
     print_ = profile()
     wanted = np.array([[0.5, 0.5, 0.5], [0.99, 0.99, 0.99], [0.9, 0.05, 0.05], [0.01, 0.01, 0.01]])
