@@ -179,6 +179,7 @@ def compare(scratch: Path, lut: Lut, name: str, pictures: list[npt.NDArray[np.ui
             repeats,
             clear,
         )
+        clear()
         by_suite()
         by_hands(processes)
     wall, busy = ({call: times[which] for call, times in took.items()} for which in (0, 1))
