@@ -128,7 +128,7 @@ def preview_of(image: npt.NDArray[np.uint16], white_level: int, side: int = PREV
     Returns
     -------
     ndarray
-        (⌈H / k⌉, ⌈W / k⌉, 3) uint8, codes for a display.
+        (h, w, 3) uint8, codes for a display; h and w are H / k and W / k, rounded up.
 
     Examples
     --------
