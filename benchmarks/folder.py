@@ -146,6 +146,7 @@ def compare(scratch: Path, lut: Lut, name: str, pictures: list[npt.NDArray[np.ui
         ProcessPoolExecutor(workers, multiprocessing.get_context("spawn")) as processes,
     ):
         by_hands(processes)
+        sizes = [sum(path.stat().st_size for path in folder.iterdir()) for folder in (usual, ours / "images")]
 
         def encode() -> None:
             at_once(pool, [partial(encode_away, image) for image in images])
@@ -179,11 +180,7 @@ def compare(scratch: Path, lut: Lut, name: str, pictures: list[npt.NDArray[np.ui
             repeats,
             clear,
         )
-        clear()
-        by_suite()
-        by_hands(processes)
     wall, busy = ({call: times[which] for call, times in took.items()} for which in (0, 1))
-    sizes = [sum(path.stat().st_size for path in folder.iterdir()) for folder in (usual, ours / "images")]
     what = f"folder to folder, {name}, {workers} workers"
     against = "cv2.imread, numpy gather, cv2.imwrite, one process"
     alone = "the encoder alone on the finished images, as many threads"
