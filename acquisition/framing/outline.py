@@ -60,6 +60,9 @@ _REFINE_STEPS = 6
 _INTERPOLATION_PX = 0.4
 """σ that linear interpolation adds to an edge."""
 
+_REFINED_PX = 1.5
+"""How far from where it was taken to be an edge may be: beyond, the profile ends before the blur does."""
+
 _CLEAR_EDGE = 0.15
 """Of paper: a lower step from cells to margin does not give its place to a tenth of a pixel."""
 
@@ -245,16 +248,17 @@ def trace_outline(picture: PreparedPicture, corners_px: _Points) -> Outline | No
 
 def refine_edges(
     planes: Sequence[Plane], places_px: _Points, normals: _Points, blur_px: float
-) -> tuple[_Points, npt.NDArray[np.bool_]]:
-    """Return places of the edge, (N, 2) float64 half-size px, found anew where it is clear, and where it is, (N,) bool.
+) -> tuple[_Points, npt.NDArray[np.float64]]:
+    """Return where each colour sees the edge, (K, N, 2) float64 half-size px, and how high its step is there, (K, N).
 
-    A blurred step is fitted to the colour in which it is highest. Farther than a mark in the margin begins nothing is
-    looked at: a ruler's ticks would draw the edge by a tenth of a pixel.
+    A blurred step is fitted to each colour by itself, for a lens shows an edge elsewhere in red and in blue. Heights
+    are in parts of paper; 0 where the edge is not clear, and the place is that given. Farther than a mark in the margin
+    begins nothing is looked at: a ruler's ticks would draw the edge by a tenth of a pixel.
 
     Parameters
     ----------
     planes
-        Of red, green and blue, as measured.
+        Of K colours, as measured.
     places_px, normals
         (N, 2) float64 half-size px, places known to a pixel, and unit vectors outwards.
     blur_px
@@ -263,19 +267,26 @@ def refine_edges(
     tangents = np.stack([-normals[:, 1], normals[:, 0]], axis=-1)
     grid = places_px[:, None, None] + _REFINE_ALONG_PX[None, :, None, None] * tangents[:, None, None]
     grid = grid + _REFINE_ACROSS_PX[None, None, :, None] * normals[:, None, None]
-    profiles: list[_Points] = []
-    for plane in planes:
+    places = np.repeat(places_px[None], len(planes), axis=0)
+    heights = np.zeros(places.shape[:2])
+    for number, plane in enumerate(planes):
         level = paper_level(plane)
         if level < MIN_SIGNAL:
             continue
         x, y = (np.ascontiguousarray((grid - plane.offset_px)[..., axis].reshape(len(grid), -1)) for axis in (0, 1))
         seen = cv2.remap(plane.values, x.astype(np.float32), y.astype(np.float32), cv2.INTER_LINEAR)
-        profiles.append(np.asarray(seen, dtype=np.float64).reshape(grid.shape[:-1]).mean(axis=1) / level)
-    rises = [profile[:, -3:].mean(axis=1) - profile[:, :5].mean(axis=1) for profile in profiles]
-    profile = np.stack(profiles)[np.argmax(rises, axis=0), np.arange(len(grid))]
-    sigma = float(np.hypot(blur_px, _INTERPOLATION_PX))
-    off: _Points = np.zeros(len(grid))
-    rise: _Points = np.zeros(len(grid))
+        profile = np.asarray(seen, dtype=np.float64).reshape(grid.shape[:-1]).mean(axis=1) / level
+        off, rise = _fitted_step(profile, float(np.hypot(blur_px, _INTERPOLATION_PX)))
+        clear = (rise > _CLEAR_EDGE) & (np.abs(off) < _REFINED_PX)
+        places[number] += np.where(clear, off, 0.0)[:, None] * normals
+        heights[number] = np.where(clear, rise, 0.0)
+    return places, heights
+
+
+def _fitted_step(profile: _Points, sigma: float) -> tuple[_Points, _Points]:
+    """Return where steps blurred by `sigma` px lie in profiles (N, M) across edges, (N,) px, and their heights (N,)."""
+    off: _Points = np.zeros(len(profile))
+    rise: _Points = np.zeros(len(profile))
     for _ in range(_REFINE_STEPS):
         aside = (_REFINE_ACROSS_PX[None] - off[:, None]) / sigma
         step, slope = ndtr(aside), np.exp(-0.5 * aside**2) / np.sqrt(2 * np.pi) / sigma
@@ -286,8 +297,7 @@ def refine_edges(
         solution = found[..., 0]
         rise = solution[:, 1]
         off = off - np.clip(solution[:, 2] / np.where(np.abs(rise) > 0.01, rise, 0.01), -0.5, 0.5)
-    clear = (rise > _CLEAR_EDGE) & (np.abs(off) < 1.5)
-    return places_px + np.where(clear, off, 0.0)[:, None] * normals, np.asarray(clear)
+    return off, rise
 
 
 def _bent(share: _Points, curve: _Points, start: _Points, end: _Points) -> _Points:

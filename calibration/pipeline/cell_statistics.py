@@ -276,13 +276,7 @@ def _disturbance(under: list[tuple[int, float]]) -> str:
 
 
 def _place_errors(chart: Chart, registered: RegisteredFrame) -> _Array:
-    """Return three standard errors (C,) of the cells' places, in the order of colours, over their clearance.
-
-    0 for a chart without tags: in a smooth order of colours the error is not that of the cells one by one, and whether
-    they are the right ones is tested part by part (`calibration.registration.colour_checks.slipped_parts`).
-    """
-    if not chart.tags:
-        return np.zeros(chart.colour_count)
+    """Return three standard errors (C,) of the cells' places, in the order of colours, over their clearance."""
     registration = registered.registration
     return 3 * registration.uncertainty_px(chart.centres_mm[chart.cell_of_colour]) / registration.clearance
 

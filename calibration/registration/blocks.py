@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 from scipy import ndimage
+from scipy.spatial import cKDTree
 
 from acquisition.chart.model import Chart
 from calibration.registration.displacement import Displacement
@@ -25,9 +26,16 @@ _AROUND_CELLS = 3
 _LEAST_SHARE = 0.15
 """Of the usual cell's information, from which on a cell's movement counts as much as others': a curled rim has less."""
 
-_SYSTEMATIC_PX = 0.01
+SYSTEMATIC_PX = 0.01
 """Standard error that no number of cells takes away: the print as predicted is not blurred quite as the frame is
 (simulated frames, small charts and large)."""
+
+_OF_OUTLINE = 4.0
+"""Square of a place's error for each square of the outline's residual: two axes for the one across, and twice that, as
+the map bends towards the outline's points and not towards places inside."""
+
+_NEAR_MARKS = 24
+"""Points of an outline of 640 whose mean square is that of a part of it: known to a third."""
 
 _NOISE = 2.0
 """Times the noise to be expected of such a mean that are taken off its square: what is left is no noise."""
@@ -124,19 +132,57 @@ class PlaceErrors:
         return np.asarray(ndimage.map_coordinates(self.error_px, [row, column], order=1, mode="nearest"))
 
 
+def unfollowed_px(
+    points_mm: _Array, marks_mm: _Array, residual_px: _Array, departure_px: float, reach_mm: float
+) -> _Array:
+    """Return the standard error (N,) float64 px of places by what the map does not follow of an outline.
+
+    A sheet is taken to wave as much inside as its outline does, along both axes; near a part of the outline, as much as
+    there. Where a part of the outline was not found, a curled corner for instance, it is taken to lie as far from a
+    plane seen through a lens as the sheet does elsewhere.
+
+    Parameters
+    ----------
+    points_mm
+        (N, 2) float64.
+    marks_mm, residual_px
+        (M, 2) float64, points of the outline, a rectangle, and how far from the map they are seen, across it.
+    departure_px
+        Usual distance of the sheet from the lens's map.
+    reach_mm
+        How far along the outline its points tell of places: the distance of the displacement's knots.
+    """
+    off2 = (residual_px**2).sum(axis=1)
+    far, near = cKDTree(marks_mm).query(points_mm, k=min(_NEAR_MARKS, len(off2)))
+    far, near = np.reshape(far, (len(points_mm), -1)), np.reshape(near, (len(points_mm), -1))
+    here = np.where(far[:, 0] <= reach_mm, off2[near].mean(axis=1), 0.0)
+    squared = _OF_OUTLINE * np.maximum(here, off2.mean())
+    low, high = marks_mm.min(axis=0), marks_mm.max(axis=0)
+    # Points at a corner may be of either side, and each tells of one direction alone.
+    on = (marks_mm - low < reach_mm / 4) | (high - marks_mm < reach_mm / 4)
+    for axis in (0, 1):
+        for end in (low[axis], high[axis]):
+            side = marks_mm[(np.abs(marks_mm[:, axis] - end) < reach_mm / 4) & ~on[:, 1 - axis]]
+            lost = cKDTree(side).query(points_mm)[0] > np.abs(points_mm[:, axis] - end) + reach_mm
+            squared = np.where(lost, np.maximum(squared, departure_px**2), squared)
+    return np.sqrt(squared)
+
+
 def place_errors(
     comparison: TileComparison,
     raster: Raster,
     per_cell: int,
     displacement: Displacement,
     anchors: tuple[_Array, _Array],
+    systematic_px: _Array | float = SYSTEMATIC_PX,
+    alike: bool = False,
 ) -> PlaceErrors:
     """Return how well places are known: what scatter leaves open, and what the cells still ask for.
 
     The first is the error of the smooth displacement's fit, its measurements taken to scatter as they are found to; it
     grows where nothing was compared. The second is what a displacement cannot follow, or has not: folds, a curled edge.
     In simulated rooms with waves, curl and dog-ears 99 % of a whole chart's cells lie within three standard errors,
-    98 % of a chart of 512 cells. Too large where a smooth order of colours leaves places open that folds of it fix.
+    98 % of a chart of 512 cells.
 
     Parameters
     ----------
@@ -148,6 +194,11 @@ def place_errors(
         As fitted.
     anchors
         (N, 2) mm and (N, 2, 2) px⁻², places that fix the map besides cells, and their information.
+    systematic_px
+        Standard error besides, at all tiles' middles or (N,) at each.
+    alike
+        Whether neighbouring cells err alike, as those of a smooth order do, whose misfit goes on from cell to cell: the
+        mean of some is then no surer than one.
     """
     shape, information = raster.tiles(per_cell), comparison.information
     known = np.linalg.eigvalsh(information)[:, 0] > _LEAST_INFORMATION
@@ -170,10 +221,13 @@ def place_errors(
 
     total = np.maximum(around(weight), 1e-6)
     asked = (around(weight * own[:, 0]) / total) ** 2 + (around(weight * own[:, 1]) / total) ** 2
-    noise = 2 * scatter * around(weight**2 / np.maximum(strength, 1e-6)) / (_AROUND_CELLS * total) ** 2
+    if alike:
+        noise = 2 * scatter * (around(weight / np.sqrt(np.maximum(strength, 1e-6))) / total) ** 2
+    else:
+        noise = 2 * scatter * around(weight**2 / np.maximum(strength, 1e-6)) / (_AROUND_CELLS * total) ** 2
     # In the margin and beside tags it would be one cell's noise.
     asked[total < 0.5 * most] = 0.0
     # What a displacement cannot follow swings about it: next to where it shows it may be hidden.
     asked = ndimage.maximum_filter(np.maximum(asked - _NOISE * noise, 0.0), _AROUND_CELLS)
     cells = Raster(raster.low_mm, raster.step_mm * per_cell, shape)
-    return PlaceErrors(cells, np.sqrt(fitted.reshape(shape) ** 2 + asked + _SYSTEMATIC_PX**2))
+    return PlaceErrors(cells, np.sqrt((fitted**2 + np.square(systematic_px)).reshape(shape) + asked))

@@ -17,6 +17,9 @@ ROUGHNESS_PX = 0.2
 """Usual second difference of the displacement between knots: a wave of 2 px amplitude every 20 knots, or of 0.2 px
 every 6. Where cells measure it, shorter waves are followed as well."""
 
+MOST_ROUGHNESS_PX = 2.0
+"""The same of a sheet that waves by 6 mm every 150 mm: rougher ones are refused, and not followed."""
+
 _RIDGE = 1e-3
 """px⁻², on the diagonal: keeps knots that no measurement reaches solvable, and is nothing to a measured cell's."""
 
@@ -90,7 +93,9 @@ class Displacement:
         solution = np.asarray(sparse_linalg.spsolve(matrix, right))
         return replace(self, coefficients=solution.reshape(2, rows, columns).transpose(1, 2, 0))
 
-    def errors_px(self, points_mm: _Array, information: _Array, at_mm: _Array) -> _Array:
+    def errors_px(
+        self, points_mm: _Array, information: _Array, at_mm: _Array, roughness_px: float | None = None
+    ) -> _Array:
         """Return the standard error (M,) float64 px of the displacement's length at places (M, 2) mm.
 
         From draws of the coefficients' posterior distribution, whose covariance is the inverse of the fit's matrix:
@@ -106,27 +111,55 @@ class Displacement:
             (N, 2, 2) inverse covariance of each measurement, px⁻²; 0 where nothing was seen.
         at_mm
             (M, 2) float64 mm, the places.
+        roughness_px
+            Usual second difference between knots; that which is found, `ROUGHNESS_PX` or more, if not given.
         """
-        random = np.random.Generator(np.random.SFC64(_SEED))
-        rows, columns = self.coefficients.shape[:2]
         bends = [np.diff(self.coefficients, 2, axis=axis) for axis in (0, 1)]
         roughness = max(ROUGHNESS_PX, *(float(np.sqrt((bend**2).mean())) for bend in bends))
-        matrix = self._normal_matrix(points_mm, information, roughness)
+        if roughness_px is not None:
+            roughness = roughness_px
+        drawn = self._drawn(points_mm, information, roughness)
+        wanted, half = self.basis(at_mm), len(drawn) // 2
+        x, y = (np.asarray(wanted @ part, dtype=np.float64) for part in (drawn[:half], drawn[half:]))
+        return np.sqrt((x**2 + y**2).mean(axis=1))
+
+    def likely_roughness_px(self, points_mm: _Array, information: _Array, roughness_px: float) -> float:
+        """Return the usual second difference between knots that the measurements make likely, `ROUGHNESS_PX` or more.
+
+        What the fit bends, squared, over the number of bends that the measurements determine: one step of a fixed-point
+        iteration (D. J. C. MacKay, "Bayesian interpolation", Neural Computation 1992).
+
+        Parameters
+        ----------
+        points_mm, information
+            Of the measurements to which this was fitted, as for `fitted`.
+        roughness_px
+            With which it was fitted.
+        """
+        rows, columns = self.coefficients.shape[:2]
+        bending = sparse.csr_array(sparse.vstack(_differences(rows, columns)))
+        drawn = self._drawn(points_mm, information, roughness_px)
+        half = len(drawn) // 2
+        open_px2 = sum(float((np.asarray(bending @ part) ** 2).sum()) for part in (drawn[:half], drawn[half:])) / _DRAWS
+        bent_px2 = float((np.asarray(bending @ self.coefficients.reshape(-1, 2)) ** 2).sum())
+        determined = max(2 * bending.shape[0] - open_px2 / roughness_px**2, 1.0)
+        return float(np.clip(np.sqrt(bent_px2 / determined), ROUGHNESS_PX, MOST_ROUGHNESS_PX))
+
+    def _drawn(self, points_mm: _Array, information: _Array, roughness_px: float) -> _Array:
+        """Return draws (2 K, draws) of the coefficients' posterior distribution about the fit; all x before all y."""
+        random = np.random.Generator(np.random.SFC64(_SEED))
+        rows, columns = self.coefficients.shape[:2]
+        matrix = self._normal_matrix(points_mm, information, roughness_px)
         # What a measurement with this information would scatter by: its Cholesky factor times normal deviates.
         root = np.linalg.cholesky(information + 1e-9 * np.eye(2))
         scatter = np.einsum("nij,njs->nis", root, random.standard_normal((len(points_mm), 2, _DRAWS)))
         basis = self.basis(points_mm)
         of_data = np.concatenate([basis.T @ scatter[:, axis] for axis in (0, 1)])
         bending = sparse.csr_array(sparse.vstack(_differences(rows, columns)))
-        of_sheet = [bending.T @ random.standard_normal((bending.shape[0], _DRAWS)) / roughness for _ in (0, 1)]
+        of_sheet = [bending.T @ random.standard_normal((bending.shape[0], _DRAWS)) / roughness_px for _ in (0, 1)]
         of_ridge = np.sqrt(_RIDGE) * random.standard_normal((2 * rows * columns, _DRAWS))
         right = of_data + np.concatenate(of_sheet) + of_ridge
-        drawn = np.asarray(sparse_linalg.splu(sparse.csc_matrix(matrix)).solve(right), dtype=np.float64)
-        wanted = self.basis(at_mm)
-        x, y = (
-            np.asarray(wanted @ part, dtype=np.float64) for part in (drawn[: rows * columns], drawn[rows * columns :])
-        )
-        return np.sqrt((x**2 + y**2).mean(axis=1))
+        return np.asarray(sparse_linalg.splu(sparse.csc_matrix(matrix)).solve(right), dtype=np.float64)
 
     def _normal_matrix(self, points_mm: _Array, information: _Array, roughness_px: float) -> sparse.csc_array:
         """Return the matrix (2 K, 2 K) of the normal equations, all x before all y; parameters as for `fitted`."""

@@ -31,6 +31,9 @@ _ROUNDS = 4
 _HUBER = 2.0
 """Usual misfits beyond which a block counts less."""
 
+_ONE_DIRECTION = 1e-9
+"""Share of the larger eigenvalue of an information below which the smaller is rounding, and none."""
+
 _MEDIAN_CHI2 = 3.357
 """Median of χ² with 4 degrees of freedom: two colours, two directions."""
 
@@ -72,6 +75,10 @@ class LateralColour:
         away = (places_px - self.centre_px) / self.radius_px
         return away * (linear + cubic * (away**2).sum(axis=-1, keepdims=True))
 
+    def seen_px(self, places_px: _Array) -> _Array:
+        """Return where red, green and blue see what green sees at places (N, 2) px, (3, N, 2) float64 px."""
+        return np.stack([places_px + self.shift_px(places_px, channel) for channel in CHANNELS])
+
     def corner_px(self, channel: Channel) -> float:
         """Return the shift at the frame's corner, half-size px, outwards positive."""
         return 0.0 if channel == "G" else float(self.terms_px[0 if channel == "R" else 1].sum())
@@ -99,11 +106,13 @@ class LateralColour:
             (3, B, 2) float64 px⁻¹, information times that displacement, from where the channels are taken to be now.
         """
         total: _Array = information.sum(axis=0)
-        seen = np.linalg.det(total) > 0
+        # What one colour alone shows says nothing of others.
+        seen = (np.trace(information, axis1=2, axis2=3) > 0).sum(axis=0) > 1
         if not seen.any():
             return self
         places, own, by = places_px[seen], information[:, seen], pull[:, seen]
-        inverse = np.asarray(np.linalg.inv(total[seen]), dtype=np.float64)
+        # A point of an edge is known across it alone.
+        inverse = np.asarray(np.linalg.pinv(total[seen], rcond=_ONE_DIRECTION, hermitian=True), dtype=np.float64)
         away = (places - self.centre_px) / self.radius_px
         design = np.stack([away, away * (away**2).sum(axis=1, keepdims=True)], axis=-1)
         colours = [CHANNELS.index("R"), CHANNELS.index("B")]

@@ -25,10 +25,10 @@ from acquisition.chart.model import PAPER_WHITE, Chart
 from acquisition.framing.homography import rms
 from acquisition.framing.planes import CHANNELS, Channel, Plane
 from calibration.registration.block_search import find_blocks
-from calibration.registration.blocks import Blocks, PlaceErrors, fit_blocks, place_errors
+from calibration.registration.blocks import SYSTEMATIC_PX, Blocks, PlaceErrors, fit_blocks, place_errors, unfollowed_px
 from calibration.registration.colour_checks import slipped_parts
 from calibration.registration.colour_model import ColourModel, fit_colours
-from calibration.registration.displacement import Displacement
+from calibration.registration.displacement import MOST_ROUGHNESS_PX, ROUGHNESS_PX, Displacement
 from calibration.registration.lateral_colour import LateralColour
 from calibration.registration.lens import Lens
 from calibration.registration.raster import Raster
@@ -38,10 +38,6 @@ from foundation.errors import RegistrationError
 _COARSE_BLOCKS = ((10, 1.5), (5, 1.0))
 """Cells along the blocks that are searched for, and how far, first and then: large ones are never taken for others,
 small ones follow waves of 150 mm and curled edges to 0.2 … 0.3 px RMS, in simulated frames (of 6 mm)."""
-
-_COARSE_ROUGHNESS_PX = 2.0
-"""Usual second difference of the displacement between knots of a sheet that waves by 6 mm every 150 mm. A smoother one
-leaves 1 to 2 px there, which the fine comparison needs ten steps for."""
 
 _BLOCK_CELLS = 8
 """Cells along the window of the fine comparison: blocks of 6 leave larger errors at the worst cell, .40 px for .38."""
@@ -66,6 +62,10 @@ _RIM_SIGMAS = 3.0
 
 _COLOURS_REPEAT = 10
 """How many neighbouring elements the misfit of the colours is alike over, where steps of colour are all there is."""
+
+_COLOURS_SHIFT = 0.005
+"""Of a cell: standard error of places by what the model of a smooth order's colours misses. It is taken for a movement,
+alike over many cells (simulated frames: .002 to .005 RMS at cells of 8 to 23 px)."""
 
 _BLURRED_CELLS = 0.6
 """Blur in cells at which blocks of a smooth order are compared with the chart's."""
@@ -94,17 +94,27 @@ class Anchors:
     points_mm
         (N, 2) float64.
     places_px
-        (N, 2) float64 where they are seen.
+        (3, N, 2) float64 where red, green and blue see them; any finite values where they were not measured.
     information
-        (N, 2, 2) float64, inverse covariance of the places, px⁻².
-    channel
-        The colour that they were seen in; "G" where it is all of them.
+        (3, N, 2, 2) float64, inverse covariance of the places, px⁻²; 0 where they were not measured.
     """
 
     points_mm: _Array
     places_px: _Array
     information: _Array
-    channel: Channel = "G"
+
+    def of(self, chosen: _Mask) -> Anchors:
+        """Return those chosen (N,)."""
+        return Anchors(self.points_mm[chosen], self.places_px[:, chosen], self.information[:, chosen])
+
+    def pull(self, expected_px: _Array) -> _Array:
+        """Return information times the distance (3, N, 2) float64 px⁻¹ from places (3, N, 2) expected."""
+        return np.einsum("cnij,cnj->cni", self.information, self.places_px - expected_px)
+
+    def residual_px(self, expected_px: _Array) -> _Array:
+        """Return the distance (N, 2) float64 px from places (3, N, 2) expected, the colours' weighted mean."""
+        inverse = np.asarray(np.linalg.pinv(self.information.sum(axis=0), rcond=1e-9, hermitian=True), dtype=np.float64)
+        return np.einsum("nij,cnj->ni", inverse, self.pull(expected_px))
 
 
 class Matcher:
@@ -120,6 +130,8 @@ class Matcher:
         The map that tags or outline give.
     anchors
         The same tags or outline, which fix the map where no cells are.
+    lateral
+        Where red and blue lie against green, as far as it is known.
     blur_px
         σ of printed edges in the frame.
     cell_px
@@ -130,21 +142,27 @@ class Matcher:
     displacement
         What is added to the lens; zero at first.
     lateral
-        Where red and blue lie against green; none at first.
+        Where red and blue lie against green.
     colours
         The frame's colour model, fitted again as the map moves.
     """
 
     def __init__(
-        self, chart: Chart, planes: list[Plane], lens: Lens, anchors: Anchors, blur_px: float, cell_px: float
+        self,
+        chart: Chart,
+        planes: list[Plane],
+        lens: Lens,
+        anchors: Anchors,
+        lateral: LateralColour,
+        blur_px: float,
+        cell_px: float,
     ) -> None:
         self._chart = chart
         # A smooth order of colours, as the paper's, has no more than the steps between neighbouring codes to go by.
         self._smooth_order = not chart.tags
         self._planes = planes
         self.lens = lens
-        height, width = planes[0].values.shape
-        self.lateral = LateralColour.unmeasured((width, height))
+        self.lateral = lateral
         self._anchors = anchors
         self.blur_px = blur_px
         self.cell_px = cell_px
@@ -168,6 +186,7 @@ class Matcher:
         self.displacement = Displacement.over(
             low, low + self._cells_across * cell, float(cell.max()) * max(2.0, min(_KNOT_CELLS, across / 3))
         )
+        self._roughness_px = ROUGHNESS_PX
         self._per_cell = int(np.clip(round(_PER_CELL_PX * cell_px), _LEAST_PER_CELL, _MOST_PER_CELL))
         self._raster = Raster.of(low, cell / self._per_cell, self._cells_across * self._per_cell)
         self._cover = self._raster.coverage(self._centres, self._sizes)
@@ -185,6 +204,10 @@ class Matcher:
         """Return the half-size pixels (N, 2) float64 where a channel sees points (N, 2) mm by the map of the moment."""
         places = self.lens.to_pixels(points_mm) + self.displacement.at(points_mm)
         return places + self.lateral.shift_px(places, channel)
+
+    def in_channels(self, points_mm: npt.ArrayLike) -> _Array:
+        """Return the half-size pixels (3, N, 2) float64 where red, green and blue see points (N, 2) mm."""
+        return self.lateral.seen_px(self.to_pixels(points_mm))
 
     def _seen(self) -> _Array:
         """Return the camera RGB (N, 3) at the middle of every patch, counts, NaN outside the frame."""
@@ -294,7 +317,7 @@ class Matcher:
             information = found.information(shift, self._cell * block, self.cell_px)
             total = self.displacement.at(centre) + shift
             self.displacement = self.displacement.fitted(
-                centre, information, np.einsum("nij,nj->ni", information, total), _COARSE_ROUGHNESS_PX
+                centre, information, np.einsum("nij,nj->ni", information, total), MOST_ROUGHNESS_PX
             )
             self.colours = self._fit_colours()
         if best < _LEAST_BLOCK_SCORE:
@@ -347,8 +370,18 @@ class Matcher:
     def place_errors(self) -> PlaceErrors:
         """Return how well places are known after the last step; a step must have been made."""
         assert self._left is not None
-        anchors = self._anchors.points_mm, self._anchors.information
-        return place_errors(self._left, self._raster, self._per_cell, self.displacement, anchors)
+        points, information = self._anchors.points_mm, self._anchors.information.sum(axis=0)
+        systematic: _Array | float = SYSTEMATIC_PX
+        if self._smooth_order:
+            residual = self._anchors.residual_px(self.in_channels(points))
+            reach = _KNOT_CELLS * float(self._cell.max())
+            departure = rms(self.displacement.at(points))
+            unfollowed = unfollowed_px(self._left.points_mm, points, residual, departure, reach)
+            systematic = np.hypot(unfollowed, _COLOURS_SHIFT * self.cell_px)
+        anchors = points, information
+        return place_errors(
+            self._left, self._raster, self._per_cell, self.displacement, anchors, systematic, self._smooth_order
+        )
 
     def slipped(self, mismatched_cells: _Mask) -> tuple[_Array, int]:
         """Return the middles (B, 2) mm of parts of the field with their neighbours' colours, and of how many parts.
@@ -378,10 +411,9 @@ class Matcher:
             compared = compared.weakened(_COLOURS_REPEAT)
         points = compared.points_mm
         before, places = self.displacement, self.to_pixels(points)
-        shifted = [self.lateral.shift_px(places, channel) for channel in CHANNELS]
-        self.lateral = self.lateral.remeasured(*self._in_blocks(compared, places))
-        turned = np.stack([self.lateral.shift_px(places, channel) for channel in CHANNELS]) - shifted
-        compared = compared.after(turned)
+        shifted = self.lateral.seen_px(places)
+        self.lateral = self.lateral.remeasured(*self._with_anchors(*self._in_blocks(compared, places)))
+        compared = compared.after(self.lateral.seen_px(places) - shifted)
         moved = self._move(compared)
         self._left = compared.after(self.displacement.at(points) - before.at(points))
         return moved
@@ -401,16 +433,28 @@ class Matcher:
         information, pull = (np.stack([summed(one) for one in channels]) for channels in compared.of_channels)
         return summed(places_px) / tiles[:, None], information, pull
 
+    def _with_anchors(self, places_px: _Array, information: _Array, pull: _Array) -> tuple[_Array, _Array, _Array]:
+        """Return what blocks measure channel by channel and, after them, what anchors do; arrays as of `_in_blocks`."""
+        anchors = self._anchors
+        places = self.in_channels(anchors.points_mm)
+        return (
+            np.concatenate([places_px, places[CHANNELS.index("G")]]),
+            np.concatenate([information, anchors.information], axis=1),
+            np.concatenate([pull, anchors.pull(places)], axis=1),
+        )
+
     def _move(self, compared: TileComparison) -> tuple[float, float]:
         """Move the map to where tiles and anchors measured it; return the tiles' RMS and largest movement, px."""
         anchors, points = self._anchors, compared.points_mm
         all_points = np.concatenate([points, anchors.points_mm])
-        all_information = np.concatenate([compared.information, anchors.information])
+        all_information = np.concatenate([compared.information, anchors.information.sum(axis=0)])
         before = self.displacement.at(all_points)
-        off = anchors.places_px - self.to_pixels(anchors.points_mm, anchors.channel)
-        anchored = np.einsum("nij,nj->ni", anchors.information, off)
+        anchored = anchors.pull(self.in_channels(anchors.points_mm)).sum(axis=0)
         total = np.concatenate([compared.pull, anchored]) + np.einsum("nij,nj->ni", all_information, before)
-        self.displacement = self.displacement.fitted(all_points, all_information, total)
+        self.displacement = self.displacement.fitted(all_points, all_information, total, self._roughness_px)
+        if self._smooth_order:
+            # Colours that only rise evenly leave the sheet's shape to what it is taken to be.
+            self._roughness_px = self.displacement.likely_roughness_px(all_points, all_information, self._roughness_px)
         moved = (self.displacement.at(all_points) - before)[: len(points)]
         moved = moved[compared.information[:, 0, 0] > 0]
         return rms(moved), float(np.linalg.norm(moved, axis=1).max(initial=0.0))

@@ -27,11 +27,12 @@ from acquisition.framing.homography import rms
 from acquisition.framing.outline import refine_edges
 from acquisition.framing.planes import CHANNELS, Plane, frame_black, plane_of
 from acquisition.framing.sharpness import blur_px
-from acquisition.framing.tagless_field import FoundField
+from acquisition.framing.tagless_field import FoundField, field_mm
 from acquisition.framing.visibility import MIN_CELL_PX
 from acquisition.limits.bleed import largest_blur_px
 from calibration.registration.blocks import Blocks
 from calibration.registration.colour_checks import agreement, mismatched
+from calibration.registration.lateral_colour import LateralColour
 from calibration.registration.lens import Lens, fit_lens
 from calibration.registration.matching import Anchors, Matcher, not_this_chart
 from calibration.registration.registration import Registration
@@ -70,6 +71,9 @@ _OUTLINE_SIGMA_PX = 0.1
 
 _APART, _APART_PX = 5.0, 1.0
 """Points of an outline further from the lens than five of their standard deviations, and a pixel, are not of it."""
+
+_SIDE_POINTS = 160
+"""Places along a side at which an outline that was not found is looked for again: as many as are traced."""
 
 _FOLLOWED_SOFTLY = (1.0, 1.0, 0.6)
 """Blur in cells of the steps that follow a chart without tags, before its cells are looked at."""
@@ -118,13 +122,18 @@ def register(
     blur = blur_px(framing)
     planes = [plane_of(mosaic, channel, black) for channel in CHANNELS]
     height, width = planes[0].values.shape
+    lateral = LateralColour.unmeasured((width, height))
     if framing.field is None:
         marks = _tag_corners(framing, chart)
-        lens, residual = fit_lens(marks.points_mm, marks.places_px, (width, height))
+        lens, residual = fit_lens(marks.points_mm, marks.places_px.sum(axis=0), (width, height))
     else:
-        clear = _clear_edges(framing.field, planes, blur)
-        field, lens, residual = _field_through_lens(clear, (width, height))
-        framing, marks = replace(framing, field=field), _outline(field)
+        field, _, lateral = _clear_edges(framing.field, planes, blur, lateral)
+        # About places that are a pixel off an edge seems softer than it is, and a softer one is found further out.
+        found_blur = blur_px(replace(framing, field=field))
+        field, _, lens, _ = _field_through_lens(field, (width, height))
+        field, marks, lateral = _clear_edges(_completed(field, lens, chart), planes, found_blur, lateral)
+        field, fits, lens, residual = _field_through_lens(field, (width, height))
+        framing, marks = replace(framing, field=field), marks.of(fits)
     lens_rms = rms(residual)
     if lens_rms > MAX_TAG_RESIDUAL_PX:
         raise RegistrationError(
@@ -133,7 +142,7 @@ def register(
         )
     cell_px = _cell_px(lens, chart)
     _require_size_and_focus(cell_px, blur, what)
-    matcher = Matcher(chart, planes, lens, marks, blur, cell_px)
+    matcher = Matcher(chart, planes, lens, marks, lateral, blur, cell_px)
     if chart.tags:
         matcher.match_coarsely(what)
     else:
@@ -154,28 +163,71 @@ def _tag_corners(framing: Framing, chart: Chart) -> Anchors:
     tags = {tag.id: tag for tag in chart.tags}
     corners_mm = np.concatenate([tags[tag.id].corners_mm for tag in framing.tags])
     corners_px = np.concatenate([tag.corners_px for tag in framing.tags])
+    own = (np.array(CHANNELS) == framing.plane.channel).astype(np.float64)
     known = np.broadcast_to(np.eye(2) / _TAG_SIGMA_PX**2, (len(corners_mm), 2, 2))
-    return Anchors(corners_mm, corners_px, known, framing.plane.channel)
+    return Anchors(corners_mm, own[:, None, None] * corners_px, own[:, None, None, None] * known)
 
 
-def _outline(field: FoundField) -> Anchors:
-    """Return the field's outline, whose places are known across it and not along it."""
-    known = np.einsum("ni,nj->nij", field.normals, field.normals) / _OUTLINE_SIGMA_PX**2
-    return Anchors(field.outline_mm, field.outline_px, known)
+def _clear_edges(
+    field: FoundField, planes: list[Plane], blur: float, lateral: LateralColour
+) -> tuple[FoundField, Anchors, LateralColour]:
+    """Return the field with its outline where green sees it, as it is seen channel by channel, and what lies between.
+
+    Points that are clear in no channel are left out.
+    """
+    places, heights = refine_edges(planes, field.outline_px, field.normals, blur)
+    clear = np.asarray(heights.any(axis=0))
+    places, heights, normals = places[:, clear], heights[:, clear], field.normals[clear]
+    # A step half as high is found half as well. All channels together are no surer than one: it is the same edge.
+    share = heights**2 / (heights**2).sum(axis=0)
+    across = np.einsum("ni,nj->nij", normals, normals) / _OUTLINE_SIGMA_PX**2
+    marks = Anchors(field.outline_mm[clear], places, share[..., None, None] * across)
+    rough = field.outline_px[clear]
+    lateral = lateral.remeasured(rough, marks.information, marks.pull(lateral.seen_px(rough)))
+    green = rough + marks.residual_px(lateral.seen_px(rough))
+    return replace(field, outline_mm=marks.points_mm, outline_px=green, normals=normals), marks, lateral
 
 
-def _clear_edges(field: FoundField, planes: list[Plane], blur: float) -> FoundField:
-    """Return the field with its outline measured finely, where it is clear enough for that."""
-    places, clear = refine_edges(planes, field.outline_px, field.normals, blur)
-    return replace(field, outline_mm=field.outline_mm[clear], outline_px=places[clear], normals=field.normals[clear])
+def _completed(field: FoundField, lens: Lens, chart: Chart) -> FoundField:
+    """Return the field with points of its outline also where none was found, at the places that the lens gives them.
+
+    Beside pale cells the outline is traced one cell inwards, or not at all; one colour may show it.
+    """
+    corners = field_mm(chart)
+    share = (np.arange(_SIDE_POINTS) + 0.5)[:, None] / _SIDE_POINTS
+    sides: list[tuple[_Array, _Array, _Array]] = []
+    for start, end in zip(corners, np.roll(corners, -1, axis=0), strict=True):
+        points, along = start + share * (end - start), (end - start) / _SIDE_POINTS
+        far = cKDTree(field.outline_mm).query(points)[0] > 2 * np.linalg.norm(along)
+        points = points[far]
+        inwards = lens.to_pixels(points + (corners.mean(axis=0) - points) / _SIDE_POINTS) - lens.to_pixels(points)
+        tangents = lens.to_pixels(points + along) - lens.to_pixels(points - along)
+        normals = np.stack([tangents[:, 1], -tangents[:, 0]], axis=-1) / np.linalg.norm(tangents, axis=1, keepdims=True)
+        normals *= -np.sign((normals * inwards).sum(axis=1, keepdims=True))
+        sides.append((points, lens.to_pixels(points), normals))
+    points, places, normals = (
+        np.concatenate([known, *parts])
+        for known, parts in zip(
+            (field.outline_mm, field.outline_px, field.normals), zip(*sides, strict=True), strict=True
+        )
+    )
+    return replace(field, outline_mm=points, outline_px=places, normals=normals)
 
 
-def _field_through_lens(field: FoundField, frame_size: tuple[int, int]) -> tuple[FoundField, Lens, _Array]:
-    """Return the field without outlying points of its outline, which are marks in the margin; its lens; residuals."""
+def _field_through_lens(field: FoundField, frame_size: tuple[int, int]) -> tuple[FoundField, _Mask, Lens, _Array]:
+    """Return the field without outlying points of its outline, which are marks in the margin.
+
+    Returns
+    -------
+    FoundField, ndarray, Lens, ndarray
+        The field; which of its points are left, (N,) bool; its lens; residuals of the points left, (M, 2) float64 px.
+    """
+    kept = np.ones(len(field.outline_mm), dtype=np.bool_)
     lens, residual = fit_lens(field.outline_mm, field.outline_px, frame_size, field.normals)
     for _ in range(2):
         size = np.linalg.norm(residual, axis=1)
         fits = size <= max(_APART * sigma_of(size), _APART_PX)
+        kept[kept] = fits
         field = replace(
             field,
             outline_mm=field.outline_mm[fits],
@@ -183,7 +235,7 @@ def _field_through_lens(field: FoundField, frame_size: tuple[int, int]) -> tuple
             normals=field.normals[fits],
         )
         lens, residual = fit_lens(field.outline_mm, field.outline_px, frame_size, field.normals)
-    return field, lens, residual
+    return field, kept, lens, residual
 
 
 def _require_own_cells(matcher: Matcher, mismatched_cells: _Mask, what: str) -> None:
@@ -224,9 +276,7 @@ def _registered(chart: Chart, framing: Framing, matcher: Matcher, marks: Anchors
     """Return the map with all figures of its quality."""
     seen, expected, paper = matcher.patches()
     there = np.asarray(np.isfinite(seen).all(axis=1))
-    residual = marks.places_px - matcher.to_pixels(marks.points_mm, marks.channel)
-    if framing.field is not None:
-        residual = (residual * framing.field.normals).sum(axis=1, keepdims=True) * framing.field.normals
+    residual = marks.residual_px(matcher.in_channels(marks.points_mm))
     mismatched_cells = mismatched(seen, expected, paper, chart)
     blocks = matcher.blocks()
     if not chart.tags:

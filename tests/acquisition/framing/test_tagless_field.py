@@ -207,13 +207,27 @@ def test_a_photograph_without_the_chart_has_no_chart(path: Path) -> None:
 
 def test_marks_in_the_margin_do_not_draw_the_refined_edge(white: Mosaic) -> None:
     field = find_field(planes_of(white), CHART, "the frame")
-    places, clear = refine_edges(planes_of(white), field.outline_px, field.normals, 0.58)
-    off = ((places - truth(UPRIGHT, white, field.outline_mm)) * field.normals).sum(axis=1)
-    assert clear.mean() > 0.7
+    places, heights = refine_edges(planes_of(white), field.outline_px, field.normals, 0.58)
+    off = ((places - truth(UPRIGHT, white, field.outline_mm)) * field.normals).sum(axis=2)
+    assert (heights > 0).any(axis=0).mean() > 0.7
     for side in ((0, -1), (1, 0), (0, 1), (-1, 0)):
-        of_side = clear & (field.normals @ np.array(side) > 0.9)
+        of_side = (heights > 0) & (field.normals @ np.array(side) > 0.9)
         assert abs(np.median(off[of_side])) < 0.05
         assert np.percentile(np.abs(off[of_side]), 80) < 0.12
+
+
+def test_each_colour_s_edge_is_where_the_lens_shows_it(tmp_path: Path) -> None:
+    room = Room(waviness_mm=0.5, lateral_red_px=1.0, lateral_blue_px=-1.0)
+    mosaic = frame_of(tmp_path, room)
+    field = find_field(planes_of(mosaic), CHART, "the frame")
+    places, heights = refine_edges(planes_of(mosaic), field.outline_px, field.normals, 0.58)
+    green = truth(room, mosaic, field.outline_mm)
+    for of_channel, height, channel in zip(places, heights, CHANNELS, strict=True):
+        shift = world_of(room).project(field.outline_mm, channel) - world_of(room).project(field.outline_mm)
+        assert channel == "G" or np.abs((shift * field.normals).sum(axis=1)).max() > 0.3
+        off = ((of_channel - green - shift) * field.normals).sum(axis=1)[height > 0]
+        assert len(off) > 300
+        assert np.sqrt((off**2).mean()) < 0.1
 
 
 def test_an_edge_that_is_not_clear_is_not_refined(white: Mosaic) -> None:
@@ -225,6 +239,6 @@ def test_an_edge_that_is_not_clear_is_not_refined(white: Mosaic) -> None:
         )
         for plane in planes_of(white)
     ]
-    places, clear = refine_edges(faint, field.outline_px, field.normals, 0.58)
-    assert not clear.any()
+    places, heights = refine_edges(faint, field.outline_px, field.normals, 0.58)
+    assert not heights.any()
     assert (places == field.outline_px).all()

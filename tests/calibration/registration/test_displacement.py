@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from calibration.registration.displacement import Displacement
+from calibration.registration.displacement import MOST_ROUGHNESS_PX, ROUGHNESS_PX, Displacement
 
 
 @settings(max_examples=20, deadline=None)
@@ -39,3 +41,26 @@ def test_its_error_is_what_it_scatters_by_and_grows_where_nothing_is_measured() 
     assert said[0] == pytest.approx(scattered[0], rel=0.4)
     assert said[1] > 2 * said[0]
     assert (said >= 0.6 * scattered).all()
+
+
+def test_a_sheet_that_bends_more_than_usual_is_found_to() -> None:
+    """The outline is measured, and inside nothing is: the bends there are those that the outline has."""
+    low, high = np.array([0.0, 0.0]), np.array([160.0, 100.0])
+    along = np.linspace(0, 1, 120)[:, None]
+    corners = [low, (high[0], 0.0), high, (0.0, high[1]), low]
+    points = np.concatenate([np.array(a) + along * (np.array(b) - a) for a, b in itertools.pairwise(corners)])
+    information = np.broadcast_to(np.eye(2) * 1e4, (len(points), 2, 2))
+    blank = Displacement.over(low, high, 10.0)
+
+    def found(wave_px: float) -> float:
+        moved = wave_px * np.sin(2 * np.pi * points / 60.0)
+        roughness = ROUGHNESS_PX
+        for _ in range(6):
+            fit = blank.fitted(points, information, 1e4 * moved, roughness)
+            roughness = fit.likely_roughness_px(points, information, roughness)
+        return roughness
+
+    # Second differences of a sine of 6 knots: (2 sin(π/6))² = 1 times its height, 1/√2 of that usually.
+    assert found(2.0) == pytest.approx(np.sqrt(2), rel=0.6)
+    assert found(0.02) == ROUGHNESS_PX
+    assert found(50.0) == MOST_ROUGHNESS_PX

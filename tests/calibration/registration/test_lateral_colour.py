@@ -50,6 +50,31 @@ def test_its_error_is_that_of_its_noise() -> None:
     assert 0.02 < found.corner_error_px("R") < 0.3
 
 
+def test_an_outline_known_across_alone_tells_it() -> None:
+    true = np.array([[0.4, 0.7], [-0.2, -0.3]])
+    blank = LateralColour.unmeasured(SIZE)
+    along = np.linspace(20, np.array(SIZE) - 20, 100)
+    level = np.full(100, 1.0)
+    sides = [(along[:, 0], level * 30, (0, 1)), (along[:, 0], level * 270, (0, 1))]
+    sides += [(level * 40, along[:, 1], (1, 0)), (level * 360, along[:, 1], (1, 0))]
+    places = np.concatenate([np.stack([x, y], axis=-1) for x, y, _ in sides])
+    normals = np.repeat(np.array([normal for _, _, normal in sides], dtype=np.float64), 100, axis=0)
+    across = np.einsum("ni,nj->nij", normals, normals)
+    information = np.array([100.0, 300.0, 50.0])[:, None, None, None] * across
+    # Where blue is not clear nothing was measured, and where only green is clear nothing is told of the others.
+    information[2, ::3] = 0
+    information[0, ::6] = 0
+    shifted = LateralColour(blank.centre_px, blank.radius_px, true, blank.covariance_px2)
+    moved = np.stack([0.2 + shifted.shift_px(places, channel) for channel in CHANNELS])
+    found = blank.remeasured(places, information, np.einsum("cnij,cnj->cni", information, moved))
+    assert found.terms_px == pytest.approx(true, abs=0.02)
+    assert found.corner_error_px("R") < 0.1
+    green = information * np.array([0, 1, 0])[:, None, None, None]
+    alone = blank.remeasured(places, green, np.einsum("cnij,cnj->cni", green, moved))
+    assert not alone.terms_px.any()
+    assert alone.corner_error_px("R") == blank.corner_error_px("R")
+
+
 def test_blocks_of_another_picture_do_not_count_much() -> None:
     true = np.array([[0.4, 0.7], [-0.2, -0.3]])
     places, information, pull = compared(true, noise_px=0.05)

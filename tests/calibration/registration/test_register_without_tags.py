@@ -11,7 +11,9 @@ import pytest
 
 from acquisition.chart.layout import paper_chart
 from acquisition.chart.model import Chart
+from acquisition.framing.planes import CHANNELS
 from acquisition.framing.tagless_field import field_mm
+from acquisition.limits.table import TABLE_LIMITS
 from calibration.registration.register import register
 from drivers.presenter import WHITE, Colour
 from drivers.raw.rawfile import Mosaic
@@ -38,6 +40,49 @@ def test_every_light_that_shows_which_way_up_registers(plain: Lab, tmp_path: Pat
     error = miss(plain, plain.mosaic(tmp_path, colour))
     assert np.sqrt(np.mean(error**2)) < 0.1
     assert error.max() < 0.4
+
+
+@pytest.mark.parametrize("seed", [1, 4])
+def test_every_colour_is_where_a_lens_with_lateral_colour_shows_it(tmp_path: Path, seed: int) -> None:
+    """The outline is clear in all colours, and in each it lies elsewhere."""
+    lab = hang_chart(SMALL, "Test", Room(waviness_mm=0.5, seed=seed, lateral_red_px=1.0, lateral_blue_px=-1.0))
+    mosaic = lab.mosaic(tmp_path)
+    registration = register(mosaic, SMALL)
+    green = lab.truth_px(SMALL.centres_mm, mosaic)
+    for channel in CHANNELS:
+        shift = lab.world.project(SMALL.centres_mm, channel) - lab.world.project(SMALL.centres_mm)
+        error = np.linalg.norm(registration.to_pixels(SMALL.centres_mm, channel) - green - shift, axis=1)
+        assert np.sqrt((error**2).mean()) < 0.04
+        assert error.max() < 0.1
+    assert registration.lateral.corner_px("R") == pytest.approx(1.0, abs=0.15)
+    assert registration.lateral.corner_px("B") == pytest.approx(-1.0, abs=0.15)
+
+
+WAVES = Room(waviness_mm=6.0, wave_mm=150.0, curl_mm=25.0, focal_diagonals=0.8)
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_cells_that_the_map_does_not_follow_are_known_to_be_uncertain(tmp_path: Path, seed: int) -> None:
+    """Waves shorter than the displacement's knots: cells are up to a pixel off, and the outline shows that they may be.
+
+    As many as to refuse the table: nothing tells which cells inside the field are off.
+    """
+    lab = hang_chart(SMALL, "Test", replace(WAVES, seed=seed))
+    mosaic = lab.mosaic(tmp_path)
+    registration = register(mosaic, SMALL)
+    error = np.linalg.norm(registration.to_pixels(SMALL.centres_mm) - lab.truth_px(SMALL.centres_mm, mosaic), axis=1)
+    assert error.max() > 0.5, "a room in which it matters"
+    uncertain = registration.uncertain(SMALL.centres_mm)
+    assert uncertain[error > 0.5].all()
+    assert uncertain.mean() > (TABLE_LIMITS["unfit_share"].refuse or 1)
+
+
+def test_a_flat_sheet_has_no_uncertain_cell(plain: Lab, tmp_path: Path) -> None:
+    mosaic = plain.mosaic(tmp_path)
+    registration = register(mosaic, SMALL)
+    assert not registration.uncertain(SMALL.centres_mm).any()
+    error = np.linalg.norm(registration.to_pixels(SMALL.centres_mm) - plain.truth_px(SMALL.centres_mm, mosaic), axis=1)
+    assert (error < 3 * registration.uncertainty_px(SMALL.centres_mm)).all()
 
 
 def test_upside_down_is_the_same_chart(tmp_path: Path) -> None:
