@@ -10,9 +10,9 @@ over the whole print and its lens's distortion:
   its smooth order of colours are all there is.
 
 Cells that the registration itself lists as not known well enough, or covered, are not counted, but said. Returns 1 when
-a cell that is not listed is more than half a pixel off, or a channel's cells more than .04 px RMS; .07 without tags,
-for the model of a smooth order's colours misses a part of them, which draws all cells by up to .005 of their size. A frame
-that is refused is no failure, and said. A room takes some 10 s of one core, one without tags 30.
+a cell that is not listed is more than half a pixel off, or a channel's cells more than .04 px RMS. Without tags .07 px
+are allowed: what the model of a smooth order's colours misses draws all cells by up to .005 of their size. A frame that
+is refused is no failure, and said. A room takes some 10 s of one core, one without tags 30.
 """
 
 from __future__ import annotations

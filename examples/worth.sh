@@ -11,7 +11,8 @@
 #
 # LEVERS (environment) chooses some of the renderings below, by default all. Naive rows are made for each of them, of the same
 # pictures under the same lights; NAIVE=no leaves them out, which are half of the work. DRAW=900 draws so many pictures
-# for the sets that are drawn to be like the real ones, by default as many as there are.
+# for the sets that are drawn to be like the real ones, by default as many as there are. LEARNERS names the methods; most
+# of the time is log-chroma's.
 set -euo pipefail
 pictures=$(realpath "$1") archives=$(realpath "$2") out=$3 seeds=${4:-5}
 here=$(realpath "$(dirname "$0")")
@@ -21,7 +22,7 @@ declare -A archive=([600d]=nus_canon_600d_64x64 [1ds]=nus_canon_1ds_mk3_64x64 [5
 declare -A part=([600d]=Canon [1ds]=Canon [5dsr]=field)
 declare -A sensitivities=([600d]=Canon_EOS_600D [1ds]=Canon_EOS-1Ds_Mark_III [5dsr]=Canon_EOS_5DS)
 declare -A matrix=([600d]="Canon EOS 600D" [1ds]="Canon EOS-1Ds Mark III" [5dsr]="Canon EOS 5DS R")
-learners=regression-trees,kernel-ridge,log-chroma
+learners=${LEARNERS:-regression-trees,kernel-ridge,log-chroma}
 
 once() { # RESULT COMMAND...: run the command unless its result is there
     [ -e "$1" ] || "${@:2}"

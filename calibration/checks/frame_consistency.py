@@ -7,7 +7,8 @@ code, for any two lights and whatever the inks. It is estimated by a polynomial 
 What is left is noise, the polynomial's own error, which is spread over the sheet at random as the codes are, and what
 is wrong with the frame:
 
-- `scatter`, over all cells: blur mixes neighbours, and another order of cells fits nothing;
+- `scatter`, over all cells: blur mixes neighbours, and another order of cells fits nothing. Of few cells, as a dim
+  light leaves, noise itself is known badly: what it may be by chance is taken off;
 - `block`, the mean over neighbouring cells: a hand, a shadow or a reflection lies in one place. A cell that none of
   its neighbours is like, as a hot photosite makes it, counts as the one next to it in value;
 - `disturbed`, cells next to each other that are far off: what covers too few of them to move a block's mean
@@ -21,7 +22,7 @@ Charts of 8 and 64 cells have no more cells than the polynomial has terms, or tw
 
 from __future__ import annotations
 
-from dataclasses import astuple, dataclass
+from dataclasses import astuple, dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -30,7 +31,7 @@ from scipy.spatial import cKDTree
 
 from acquisition.measures.least_squares import least_absolute_line, least_squares, linear_combinations, product
 from acquisition.measures.polynomials import code_polynomial, code_powers
-from calibration.checks.small_places import LEAST_MODEL_ERROR, SmallPlaces
+from calibration.checks.small_places import LEAST_MODEL_ERROR, SmallPlaces, cells_without_hot
 from foundation.robust import huber_weights, sigma_of
 
 DEGREE = 4
@@ -58,8 +59,12 @@ _ROUNDS = 3
 """Reweighted solutions in a row, after a first with equal weights."""
 
 _CERTAIN = 4.0
-"""Standard errors that are taken off a block's mean before it counts: among a full chart's 256 blocks noise alone
-exceeds them in one of sixty frames."""
+"""Standard errors that are taken off a block's mean, and off the cells' spread, before it counts: among a full chart's
+256 blocks noise alone exceeds them in one of sixty frames."""
+
+_SPREAD_ERROR2 = 1.36
+"""Variance of a standard deviation estimated by the median deviation of N normal values, over σ²/N (P. Rousseeuw and
+C. Croux, Journal of the American Statistical Association 88, 1993: an efficiency of 37 %)."""
 
 _AROUND = 8
 """Neighbours of a cell of which one at least must be as far off for it to count as it is: those of a square grid. What
@@ -86,7 +91,8 @@ class FrameConsistency:
     Attributes
     ----------
     scatter
-        Spread of the cells about what their codes give, as a share, the noise taken out; of the worst channel.
+        Spread of the cells about what their codes give, as a share, the noise taken out, beyond four standard errors;
+        of the worst channel.
     block
         How far the worst block of cells is off, as a share, beyond four standard errors.
     at_mm
@@ -104,6 +110,8 @@ class FrameConsistency:
     disturbed
         Cells that something covers, however few they are, and how far each is off, a share with its sign: of the
         channel that is off most, 0 where it is too dark to be compared.
+    seeds
+        Those of them that are far off by themselves; the others touch these.
     alone
         Cells that are far off, and none of their neighbours is.
     """
@@ -117,6 +125,7 @@ class FrameConsistency:
     added: float = 0.0
     kept: float = 1.0
     disturbed: tuple[tuple[int, float], ...] = ()
+    seeds: tuple[int, ...] = ()
     alone: tuple[int, ...] = ()
 
     def to_json(self) -> list[Any]:
@@ -126,10 +135,31 @@ class FrameConsistency:
     @staticmethod
     def from_json(stored: list[Any]) -> FrameConsistency:
         """Return the values of what `to_json` returned."""
-        scatter, block, (x_mm, y_mm), (red, green, blue), share, extent_mm, added, kept, disturbed, alone = stored
+        *found, disturbed, seeds, alone = stored
+        scatter, block, (x_mm, y_mm), (red, green, blue), share, extent_mm, added, kept = found
         cells = tuple((int(cell), float(off)) for cell, off in disturbed)
         place, colour = (x_mm, y_mm), (red, green, blue)
-        return FrameConsistency(scatter, block, place, colour, share, extent_mm, added, kept, cells, tuple(alone))
+        return FrameConsistency(
+            scatter, block, place, colour, share, extent_mm, added, kept, cells, tuple(seeds), tuple(alone)
+        )
+
+    def without_hot(self, hot: _Mask, cells_mm: _Array) -> FrameConsistency:
+        """Return the same where cells that are off by their hot photosites are not taken for covered ones.
+
+        Parameters
+        ----------
+        hot
+            (C,) bool, cells that hold a photosite which is hot in the dark frames.
+        cells_mm
+            (C, 2) places.
+        """
+        cells = np.array([cell for cell, _ in self.disturbed], dtype=np.int64)
+        if not hot[cells].any():
+            return self
+        kept, alone = cells_without_hot(cells, np.array(self.seeds, dtype=np.int64), hot, cells_mm)
+        disturbed = tuple(one for one, stays in zip(self.disturbed, kept.tolist(), strict=True) if stays)
+        seeds = tuple(cell for cell in self.seeds if kept[np.searchsorted(cells, cell)])
+        return replace(self, disturbed=disturbed, seeds=seeds, alone=tuple(sorted({*self.alone, *alone.tolist()})))
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,14 +167,15 @@ class _Deviations:
     """What is left of one channel.
 
     `solution` (K,) of the polynomial. Of the cells compared for blocks `seen` and `expected` (N,) counts, NaN of those
-    that cannot be, `scatter` of all, and of each block (B,) its `mean` deviation, a share, and how far that is `off`
-    beyond noise.
+    that cannot be, `scatter` of all as estimated and `certain_scatter` beyond its error, and of each block (B,) its
+    `mean` deviation, a share, and how far that is `off` beyond noise.
     """
 
     solution: _Array
     seen: _Array
     expected: _Array
     scatter: float
+    certain_scatter: float
     mean: _Array
     off: _Array
 
@@ -226,12 +257,12 @@ class ConsistencyCheck:
         known = {channel: one for channel, one in found.items() if one is not None}
         if not known:
             return FrameConsistency()
-        disturbed, alone = self._disturbed(known, mean, variance)
-        scatter = max(one.scatter for one in known.values())
+        disturbed, seeds, alone = self._disturbed(known, mean, variance)
+        scatter = max(one.certain_scatter for one in known.values())
         off = np.max([one.off for one in known.values()], axis=0)
         worst = int(np.argmax(off))
         if not off[worst] > 0:
-            return FrameConsistency(scatter, disturbed=disturbed, alone=alone)
+            return FrameConsistency(scatter, disturbed=disturbed, seeds=seeds, alone=alone)
         there = np.flatnonzero(off >= _AS_MUCH * off[worst])
         red, green, blue = (float(known[c].mean[worst]) if c in known else 0.0 for c in range(3))
         x, y = self._middles[worst].tolist()
@@ -246,13 +277,14 @@ class ConsistencyCheck:
             added=added,
             kept=kept,
             disturbed=disturbed,
+            seeds=seeds,
             alone=alone,
         )
 
     def _disturbed(
         self, known: dict[int, _Deviations], mean: _Array, variance: _Array
-    ) -> tuple[tuple[tuple[int, float], ...], tuple[int, ...]]:
-        """Return the cells that something covers, how far each is off, and those that are far off alone."""
+    ) -> tuple[tuple[tuple[int, float], ...], tuple[int, ...], tuple[int, ...]]:
+        """Return `disturbed`, `seeds` and `alone` of `FrameConsistency`."""
         channels = sorted(known)
         factors = np.zeros((3, len(self._basis)))
         for channel in channels:
@@ -269,8 +301,9 @@ class ConsistencyCheck:
             sigma[row] += self._noise2[channel]
             sigma[row] += max(known[channel].scatter, LEAST_MODEL_ERROR) ** 2
         np.sqrt(sigma, out=sigma)
-        cells, off, alone = self._places.disturbed(deviation, sigma)
-        return tuple(zip(cells.tolist(), off.round(6).tolist(), strict=True)), tuple(alone.tolist())
+        cells, off, seeds, alone = self._places.disturbed(deviation, sigma)
+        disturbed = tuple(zip(cells.tolist(), off.round(6).tolist(), strict=True))
+        return disturbed, tuple(seeds.tolist()), tuple(alone.tolist())
 
     def _of_channel(self, known: _Channel, mean: _Array, variance: _Array) -> _Deviations | None:
         if len(known.there) < CELLS_A_TERM * known.terms.shape[1]:
@@ -294,6 +327,8 @@ class ConsistencyCheck:
         deviation[there] = np.clip(mean[there] / expected[there] - 1, -1, 1)
         spread2 = sigma_of(deviation[there] - np.median(deviation[there])) ** 2
         noise2 = float(np.median(variance[there] / expected[there] ** 2))
+        # That of a square is twice that of its root.
+        error = _CERTAIN * 2 * float(np.sqrt(_SPREAD_ERROR2 / len(there)))
         deviation[:-1] = _like_a_neighbour(deviation[:-1], self._around)
         average, count = _known_means(deviation[self._members])
         off = np.abs(average) - _CERTAIN * np.sqrt(spread2 / np.maximum(count, 1))
@@ -303,6 +338,7 @@ class ConsistencyCheck:
             seen=np.where(compared, mean, np.nan),
             expected=np.where(compared, expected, np.nan),
             scatter=float(np.sqrt(max(spread2 - noise2, 0))),
+            certain_scatter=float(np.sqrt(max(spread2 / (1 + error) - noise2, 0))),
             mean=average,
             off=np.where(count >= LEAST_CELLS, off, 0.0),
         )
@@ -337,14 +373,16 @@ def _light_of(channels: list[_Deviations], members: npt.NDArray[np.int64]) -> tu
     own: list[_Array] = []
     seen: list[_Array] = []
     for one in channels:
-        top = float(np.nanpercentile(one.expected, _BRIGHT_PERCENTILE))
         there = cells[np.isfinite(one.expected[cells])]
+        # Of a channel so dim that its few bright cells lie apart none could be compared.
+        if not len(there):
+            continue
+        top = float(np.nanpercentile(one.expected, _BRIGHT_PERCENTILE))
         own.append(one.expected[there] / top)
         seen.append(one.seen[there] / top)
-    x, y = np.concatenate(own), np.concatenate(seen)
-    if len(x) < LEAST_CELLS:
+    if sum(map(len, own)) < LEAST_CELLS:
         return 0.0, 1.0
-    return least_absolute_line(x, y)
+    return least_absolute_line(np.concatenate(own), np.concatenate(seen))
 
 
 def _members(block: npt.NDArray[np.int64], blocks: int) -> npt.NDArray[np.int64]:

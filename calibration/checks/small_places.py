@@ -10,6 +10,9 @@ a hot photosite stands alone. A cell counts as far off that is
 
 A cell that stands alone is no hand, but it is not its colour either: where it is off by far more, it is told apart.
 
+Two hot photosites in cells next to each other are a place, too: a frame of a light does not show that they are hot. The
+dark frames do, and `cells_without_hot` leaves such cells out where these are known.
+
 How many neighbours are enough follows from how many cells of the frame are far off at all. What touches such a place
 and is off by less, or is too dark to be compared, belongs to it.
 
@@ -81,10 +84,10 @@ class SmallPlaces:
         self._alike: _Index = np.asarray(cKDTree(codes).query(codes, k=min(_ALIKE + 1, count))[1])[:, 1:]
         self._usable = usable
 
-    def disturbed(self, deviation: _Array, sigma: _Array) -> tuple[_Index, _Array, _Index]:
+    def disturbed(self, deviation: _Array, sigma: _Array) -> tuple[_Index, _Array, _Index, _Index]:
         """Return the cells (N,) int64 that something covers, ascending, how far each is off (N,), a share, and others.
 
-        The others (M,) int64 are cells that stand alone.
+        The others are those of them that are far off by themselves (K,) int64, and cells that stand alone (M,) int64.
 
         Parameters
         ----------
@@ -98,7 +101,7 @@ class SmallPlaces:
         far /= sigma
         candidates = np.flatnonzero((far > FAR).any(axis=0))
         if not len(candidates):
-            return no_cells, np.zeros(0), no_cells
+            return no_cells, np.zeros(0), no_cells, no_cells
         own = deviation[:, candidates]
         alike = self._alike[candidates]
         like = np.where(np.isfinite(far[:, alike]), deviation[:, alike], np.nan)
@@ -113,7 +116,7 @@ class SmallPlaces:
         alone = candidates[usable & ((certain > ALONE) & large).any(axis=0)]
         places = self._places(seeds)
         if not places.any():
-            return no_cells, np.zeros(0), alone
+            return no_cells, np.zeros(0), no_cells, alone
         compared = np.isfinite(far)
         far[~compared] = 0.0
         found = self._grown(places, self._usable & (far.max(axis=0) > ALSO))
@@ -121,7 +124,7 @@ class SmallPlaces:
         found |= self._touched(found) & self._usable & ~compared.any(axis=0)
         cells = np.flatnonzero(found)
         worst = np.argmax(far[:, cells], axis=0)
-        return cells, np.nan_to_num(deviation[worst, cells]), alone[~found[alone]]
+        return cells, np.nan_to_num(deviation[worst, cells]), seeds[found[seeds]], alone[~found[alone]]
 
     def _places(self, seeds: _Index) -> _Mask:
         """Return which cells (C,) lie at places that chance does not make, given those far off (N,), ascending."""
@@ -155,3 +158,27 @@ class SmallPlaces:
         touched, cells = np.zeros_like(places), np.flatnonzero(places)
         touched[self._near[cells][self._touching[cells]]] = True
         return touched
+
+
+def cells_without_hot(cells: _Index, seeds: _Index, hot: _Mask, cells_mm: _Array) -> tuple[_Mask, _Index]:
+    """Return which disturbed cells (N,) something covers, and which cells (M,) int64 stand alone, given the hot ones.
+
+    A place counts on where two of its cells are far off without a hot photosite of their own. Of other places no more
+    than one such cell is left.
+
+    Parameters
+    ----------
+    cells, seeds
+        (N,) int64, ascending, what `SmallPlaces.disturbed` found, and (K,) int64, those far off by themselves.
+    hot
+        (C,) bool, cells that hold a photosite which is hot in the dark frames.
+    cells_mm
+        (C, 2) places.
+    """
+    nearest = np.asarray(cKDTree(cells_mm).query(cells_mm, k=2)[0])[:, 1]
+    pairs = cKDTree(cells_mm[cells]).query_pairs(_NEXT * float(np.median(nearest)), output_type="ndarray")
+    graph = coo_matrix((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(len(cells), len(cells)))
+    label = connected_components(graph, directed=False)[1]
+    of_seed, own = label[np.searchsorted(cells, seeds)], ~hot[seeds]
+    counts = np.bincount(of_seed[own], minlength=len(cells))
+    return (counts[label] > 1) & ~hot[cells], seeds[own & (counts[of_seed] == 1)]

@@ -22,7 +22,6 @@ from scipy.spatial import cKDTree
 
 from acquisition.chart.model import Chart
 from acquisition.framing.planes import CLIPPING_SHARE
-from acquisition.measures.flat_field import FlatField
 from acquisition.measures.stains import Stains, find_stains
 from calibration.figures.frame_figures import FrameFigures
 from calibration.pipeline.measuring import MeasuredDarkFrame, MeasuredFrame
@@ -194,10 +193,14 @@ class CellStatistics:
         level = np.percentile(self.even_sum.mean(axis=1) / frames, _BRIGHTEST_PERCENTILE, axis=0)
         return np.sqrt(np.median(self.even_noise2 / frames, axis=0)) / np.maximum(level, 1e-6)
 
-    def stains(self, field: FlatField) -> Stains:
-        """Return where the print does not have its codes' colours; `field` is that of a frame of even light."""
+    def stains(self, field: _Array) -> Stains:
+        """Return where the print does not have its codes' colours.
+
+        `field` (C, 3) float64 is that of a frame of even light, of each cell's own colour as far as it is known: by the
+        field of paper alone, cells of one side would be off where the primaries light the print in different ways.
+        """
         cells_mm = self.chart.centres_mm[self.chart.cell_of_colour]
-        level = self.even_sum.mean(axis=1, dtype=np.float64) / max(self.even_frames, 1) / field.at(cells_mm)
+        level = self.even_sum.mean(axis=1, dtype=np.float64) / max(self.even_frames, 1) / field
         return find_stains(level, cells_mm, self.chart.bits, ~(self.outside | self.covered))
 
     def unfit(self, saturation_counts: int, stains: Stains, frames: Sequence[FrameFigures]) -> tuple[Unfit, ...]:
@@ -271,8 +274,9 @@ def disturbed_cells(frames: Sequence[FrameFigures]) -> dict[int, list[tuple[int,
 def _disturbance(under: list[tuple[int, float]]) -> str:
     light, off = max(under, key=lambda one: abs(one[1]))
     more = f" and {len(under) - 1} more" if len(under) > 1 else ""
-    how = f"{abs(off):.1%} {'darker' if off < 0 else 'brighter'} than its code gives" if off else "next to such a cell"
-    return f"under light {light}{more} something covers it and its neighbours; it is {how}"
+    deviation = f"{abs(off):.1%} {'darker' if off < 0 else 'brighter'} than its code gives"
+    how = deviation if off else "too dark to be compared"
+    return f"under light {light}{more} it is {how}, next to cells that are far off"
 
 
 def _place_errors(chart: Chart, registered: RegisteredFrame) -> _Array:

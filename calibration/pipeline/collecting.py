@@ -133,11 +133,12 @@ def _figures(
 ) -> TableFigures:
     statistics, saturation = taken.statistics, taken.saturation
     told = with_told_serials([one.origin for one in taken.figures], stated.citation.camera_serial)
-    stains = statistics.stains(even.paper.field)
+    stains, dark = statistics.stains(_field_at_cells(baseline, even)), statistics.dark_summary()
+    frames = _without_hot(taken.frames, dark.hottest, stains.places_mm)
     return TableFigures(
         session=session,
         registration=baseline.first.registration,
-        frames=taken.frames,
+        frames=frames,
         lights=lights,
         greys=GreyFigures(baseline.points.levels.names, *greys),
         sensor=SensorFigures(
@@ -148,14 +149,31 @@ def _figures(
             transfer=baseline.transfer,
             linearity=linearity,
         ),
-        dark_frames=statistics.dark_summary(),
-        cells=CellFigures(baseline.options.window, statistics.unfit(saturation, stains, taken.frames), stains),
+        dark_frames=dark,
+        cells=CellFigures(baseline.options.window, statistics.unfit(saturation, stains, frames), stains),
         origins=origin_figures([(one.record, origin) for one, origin in zip(taken.figures, told, strict=True)]),
         origin=origin_record(stated, taken.records, [one.origin for one in taken.figures]),
         primaries=baseline.primaries,
         lens=lens_figures(baseline),
         point_spread=None if baseline.lens is None else baseline.lens.spread,
     )
+
+
+def _field_at_cells(baseline: Baseline, even: FrameFigures) -> _Array:
+    """Return the field (C, 3) float64 by which the cells of a frame are evened, each by that of its own colour."""
+    field = even.paper.field.at(baseline.points.cells_mm)
+    return field if baseline.primaries is None else field * baseline.primaries.field_ratio(even.paper.white)
+
+
+def _without_hot(frames: tuple[FrameFigures, ...], hottest: _Array, cells_mm: _Array) -> tuple[FrameFigures, ...]:
+    """Return frames in which no cell counts as covered for the hot photosite that it holds.
+
+    `hottest` (C,) counts as of the dark frames, whenever these were taken; (0,) without any.
+    """
+    if not len(hottest):
+        return frames
+    hot = hottest > 0
+    return tuple(replace(one, consistency=one.consistency.without_hot(hot, cells_mm)) for one in frames)
 
 
 def _light_figures(intake: Intake, taken: IntakeState, by_light: Sequence[FrameFigures]) -> LightFigures:

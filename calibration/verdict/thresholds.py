@@ -148,8 +148,8 @@ THRESHOLDS: tuple[Threshold, ...] = (
     ),
     Threshold(
         "unlike_scatter", "Scatter of cells about their codes' colours, worst frame", "share", "at most", 0.012, 0.03,
-        "the frame is out of focus, or shows another print: its samples are not its colours'",
-        SIMULATED + ": to 0.8 % without noise; a blur of 1.1 px gives 1.4 %, 1.5 px 5 %, another print 50 %",
+        "the frame's samples are not of their cells' colours",
+        SIMULATED + ": to 0.8 % beyond noise; a blur of 1.1 px gives 1.4 %, 1.5 px 5 %, another print 50 %",
         "see that nothing changes during the session",
     ),
     Threshold(
@@ -159,10 +159,11 @@ THRESHOLDS: tuple[Threshold, ...] = (
         "see that nobody comes between lamp, print and camera",
     ),
     Threshold(
-        "disturbed_cells", "Cells that something small covers in a light's frame", "", "at most", 0, None,
-        "a fly, a finger, a scrap or a glint lay on them, or they have neighbours' light in that frame; they are "
-        "listed as unfit, and the other cells are not touched",
-        SIMULATED + ": none in healthy rooms; two cells next to each other, five standard deviations off, are one",
+        "disturbed_cells", "Cells next to each other that are far off in a light's frame", "", "at most", 0, None,
+        "their samples under that light are not of their own colours; they are listed as unfit, and the other cells "
+        "are not touched",
+        SIMULATED + ": none in healthy rooms; two cells next to each other, five standard deviations off, are one, "
+        "unless the dark frames show them to be hot",
         "see that nothing comes between lamp, print and camera",
     ),
     Threshold(

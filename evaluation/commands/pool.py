@@ -15,8 +15,9 @@ HELP = f"""Pool the results of several transfers, such as one for each of severa
 Reads results folders that evaluate transfer --out has written. A row of the pool has the errors of one method, trained
 in one way, on the test images of all folders, each image once and with the same weight; seed k is seed k of each
 folder. Rows are matched by method, kind of training and name of the training set; by the first two alone where each
-folder has one training set. Prints the tables of evaluate transfer, and the ratios of each test set by itself. Folders
-that share a test image are refused. Writes nothing unless asked with --out: results.csv, errors.csv, by_test_set.csv,
+folder has one training set. Prints the tables of evaluate transfer, and the ratios of each test set by itself; with
+--base also every row in parts of one of them, such as the naive images of pictures that nobody chose. Folders that
+share a test image are refused. Writes nothing unless asked with --out: results.csv, errors.csv, by_test_set.csv,
 tables.tex, report.html with forest plots, and run.json.
 
 {EXIT_CODES}
@@ -31,6 +32,14 @@ def pool(
     error: Annotated[
         Literal["reproduction", "recovery"] | None,
         typer.Option(help="Angular error to sum up. \\[default: that of the transfers]", show_default=False),
+    ] = None,
+    base: Annotated[
+        str | None,
+        typer.Option(
+            metavar="TRAINED_ON",
+            help="Also hold every row to the one trained on this, named as in the column, with x for ×.",
+            show_default=False,
+        ),
     ] = None,
     out: Annotated[
         Path | None, typer.Option(metavar="FOLDER", help="Write the results to this new folder.", show_default=False)
@@ -54,8 +63,8 @@ def pool(
         raise InputError("the transfers were summed up by different errors; say which with --error")
     chosen = error or parts[0].error
     made = pool_transfers(parts)
-    tables = make_tables(made, chosen)
-    told.add(results=results, error=chosen)
+    tables = make_tables(made, chosen, base)
+    told.add(results=results, error=chosen, base=base)
     show_tables(told, tables.shown, "")
     show_notes(told, made.notes)
     if out is not None:

@@ -68,6 +68,14 @@ def pool_page(
             "without a table (the line at 1). To the left of it the table is worth something.",
             against=True,
         ),
+        *_forest(
+            f"Against {whole.to_base[0].base.training}" if whole.to_base else "",
+            whole.to_base,
+            [figures.to_base for figures in single.values()],
+            list(single),
+            "Errors in parts of those of the same method with that training (the line at 1). To the left of it is "
+            "better; where pictures or lights are others, the choice of them is held against it, too.",
+        ),
         heading("Tables"),
         *map(table_part, shown),
         heading("Conditions"),

@@ -15,6 +15,7 @@ from evaluation.experiments.transfer.figures import TransferFigures, figures_of
 from evaluation.experiments.transfer.outcome import labelled_results
 from evaluation.experiments.transfer.rows import TransferRow
 from evaluation.experiments.transfer.tables import (
+    base_ratios_table,
     errors_table,
     intervals_table,
     long_table,
@@ -55,24 +56,36 @@ class PoolTables:
     figures_of_tests: Mapping[str, TransferFigures]
 
 
-def make_tables(pool: Pool, error: ErrorKind) -> PoolTables:
+def make_tables(pool: Pool, error: ErrorKind, base: str | None = None) -> PoolTables:
     """Return the tables of a pool, summed up by one kind of error.
+
+    Parameters
+    ----------
+    pool
+        The pool.
+    error
+        The kind of error.
+    base
+        What rows are trained on that every other one is held to, see `transfer.figures.figures_of`.
 
     Raises
     ------
     InputError
-        An error is not finite.
+        An error is not finite, or no row was trained like `base`.
     """
     tests = list(dict.fromkeys(pool.tests))
     name = " + ".join(tests)
-    every = figures_of(pool.rows, error)
+    every = figures_of(pool.rows, error, base=base)
     members = {test: np.flatnonzero(np.array(pool.tests) == test) for test in tests}
-    single = {test: figures_of([_at(row, places) for row in pool.rows], error) for test, places in members.items()}
+    single = {
+        test: figures_of([_at(row, places) for row in pool.rows], error, base=base) for test, places in members.items()
+    }
     shown = (
         errors_table(every, name, len(pool.images)),
         intervals_table(every, name),
         real_ratios_table(every, name),
         naive_ratios_table(every, name),
+        base_ratios_table(every, name),
         _by_test_set(single, {test: len(places) for test, places in members.items()}),
     )
     listed = [(test, long_table(figures)) for test, figures in single.items()]

@@ -18,6 +18,7 @@ from evaluation.experiments.bootstrap import STATISTICS
 from evaluation.experiments.resampling import ErrorSample, bca, resamples
 from evaluation.experiments.transfer.rows import NAIVE, TransferRow
 from evaluation.metrics import ErrorKind
+from foundation.errors import InputError
 
 COUNT: Final = 2000
 """Resamples: as many as `bootstrap.interval` takes by default."""
@@ -86,12 +87,15 @@ class TransferFigures:
         Every row that was trained elsewhere against the same method's real cross-validation.
     to_naive
         Every generated row against the naive rows of the same pictures and lights.
+    to_base
+        Every other row against those that were asked for, of the same method.
     """
 
     error: ErrorKind
     rows: tuple[RowFigures, ...]
     to_real: tuple[RowRatio, ...]
     to_naive: tuple[RowRatio, ...]
+    to_base: tuple[RowRatio, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,14 +107,29 @@ class _Replicates:
     without: Floats
 
 
-def figures_of(rows: Sequence[TransferRow], error: ErrorKind, seed: int = 0) -> TransferFigures:
-    """Return statistics, intervals and ratios of rows on the same test images; `seed` is of the resamples.
+def figures_of(
+    rows: Sequence[TransferRow], error: ErrorKind, seed: int = 0, base: str | None = None
+) -> TransferFigures:
+    """Return statistics, intervals and ratios of rows on the same test images.
+
+    Parameters
+    ----------
+    rows
+        All of the same images.
+    error
+        The kind of error that is summed up.
+    seed
+        Of the resamples.
+    base
+        `TransferRow.training` of rows that every other one is held to as well, with x for × and in any case; None for
+        no such ratios.
 
     Raises
     ------
     InputError
-        An error is not finite.
+        An error is not finite, or no row was trained like `base`.
     """
+    bases = _named(rows, base)
     samples = [[ErrorSample.of(result.errors[error]) for result in row.results] for row in rows]
     drawn: list[list[Floats]] = [[] for _ in rows]
     for counts in resamples(len(samples[0][0].order), seed, COUNT):
@@ -154,7 +173,28 @@ def figures_of(rows: Sequence[TransferRow], error: ErrorKind, seed: int = 0) -> 
         for base, other in enumerate(rows)
         if row.kind == "generated" and other.kind in NAIVE and (other.method, other.data) == (row.method, row.data)
     ]
-    return TransferFigures(error, listed, tuple(to_real), tuple(to_naive))
+    to_base = [
+        ratio(number, other)
+        for number, row in enumerate(rows)
+        for other in bases
+        if number not in bases and rows[other].method == row.method and row.kind != "none"
+    ]
+    return TransferFigures(error, listed, tuple(to_real), tuple(to_naive), tuple(to_base))
+
+
+def _named(rows: Sequence[TransferRow], base: str | None) -> list[int]:
+    """Return the places of the rows that were trained in the way of that name."""
+    if base is None:
+        return []
+    found = [number for number, row in enumerate(rows) if _plain(row.training) == _plain(base)]
+    if not found:
+        known = dict.fromkeys(row.training for row in rows if row.kind != "none")
+        raise InputError(f"no row was trained on {base!r}; expected one of: {'; '.join(known)}")
+    return found
+
+
+def _plain(training: str) -> str:
+    return " ".join(training.casefold().replace("×", " x ").split())
 
 
 _PLACES: Final = range(len(STATISTICS))

@@ -79,6 +79,18 @@ def naive_ratios_table(found: TransferFigures, name: str) -> Table | None:
     )
 
 
+def base_ratios_table(found: TransferFigures, name: str) -> Table | None:
+    """Return every row in parts of the row that was asked for; None if none was."""
+    if not found.to_base:
+        return None
+    return Table(
+        f"{name}: errors in parts of those of the same method, trained on {found.to_base[0].base.training}",
+        ("Method", "Trained on", *HEADS),
+        tuple((one.row.method, one.row.training, *_ratio_cells(one)) for one in found.to_base),
+        notes=("Paired by test image. Sets of other pictures or lights are held together with the choice of them.",),
+    )
+
+
 def paper_ratios_table() -> Table:
     """Return the paper's ratios, of its table 2.
 

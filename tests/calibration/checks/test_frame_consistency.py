@@ -200,6 +200,52 @@ def test_cells_that_stand_alone_are_no_place() -> None:
     assert set(found.alone) == set(np.flatnonzero(strewn).tolist())
 
 
+def test_a_dim_channel_of_few_bright_cells_does_not_scatter() -> None:
+    """Some 150 compared cells with noise of 3 %, in 30 frames: what the noise is by chance is no other print."""
+    sheet = Sheet(30, 8)
+    check = ConsistencyCheck(sheet.rgb, sheet.places, *sheet.seen(sheet.white), np.ones(len(sheet.rgb), dtype=np.bool_))
+    in_order = np.sort(sheet.other[::4], axis=0)
+    dim = 60 * sheet.other / in_order[[-4000, -4000, -160], [0, 1, 2]]
+    assert max(check.compare(*sheet.seen(dim)).scatter for _ in range(30)) < 0.5 * LIMITS["unlike_scatter"].accept
+    # Of as few cells another print is one.
+    assert check.compare(*sheet.seen(sheet.random.permutation(dim))).scatter > 0.3
+
+
+def test_a_channel_whose_bright_cells_lie_apart_says_nothing_of_a_place() -> None:
+    """Under a light of hardly any blue, with a shadow that green shows; what is not known raises no warning."""
+    sheet = Sheet(9)
+    column, row = (sheet.places / 5.0).T
+    apart = (column % 5 == 2) & (row % 5 == 2)
+    sheet.white[~apart, 2] = 50.0
+    seen = sheet.other * np.array([0.1, 0.1, 0.1])
+    seen[:, 2] = np.where(apart, 90.0 * sheet.white[:, 2] / sheet.white[apart, 2].mean(), 45.0)
+    under = np.linalg.norm(sheet.places - (200, 130), axis=1) < 45
+    like = sheet.compared(seen * np.where(under, 0.7, 1.0)[:, None])
+    assert like.block > LIMITS["unlike_block"].accept
+    assert like.kept == pytest.approx(0.7, abs=0.05)
+
+
+@pytest.mark.parametrize("beside", [0, 1, 2])
+def test_hot_photosites_side_by_side_are_nothing_that_lies_there(beside: int) -> None:
+    """Two hot cells that touch, and as many beside them that something covers indeed."""
+    sheet, check = checked_sheet(8)
+    at = {(int(column), int(row)): cell for cell, (column, row) in enumerate((sheet.places / 5.0).tolist())}
+    hot = np.zeros(len(sheet.rgb), dtype=np.bool_)
+    hot[[at[40, 40], at[41, 41]]] = True
+    covered = [at[42, 40], at[42, 42]][:beside] if beside < 2 else [at[42, 41], at[42, 42]]
+    seen = sheet.other + 2000.0 * hot[:, None]
+    seen[covered] *= 0.3
+    found = check.compare(*sheet.seen(seen))
+    assert {*np.flatnonzero(hot).tolist(), *covered} <= {cell for cell, _ in found.disturbed}
+    told = found.without_hot(hot, sheet.places)
+    disturbed = {cell for cell, _ in told.disturbed}
+    assert not disturbed & set(np.flatnonzero(hot).tolist())
+    assert set(covered) <= disturbed if beside > 1 else not disturbed
+    # What stands alone now is not its colour, whatever the reason.
+    assert set(told.alone) == (set(covered) if beside == 1 else set())
+    assert told.without_hot(hot, sheet.places) == told
+
+
 def test_what_is_found_is_restored_from_a_checkpoint(sheet: Sheet) -> None:
     like = sheet.compared(sheet.other * np.where(sheet.places[:, :1] < 60, 0.9, 1.0))
     assert FrameConsistency.from_json(json.loads(json.dumps(like.to_json()))) == like

@@ -1,4 +1,4 @@
-"""What the report says of a managed and an unmanaged print, and of a body with hot photosites."""
+"""What is said of a managed and an unmanaged print, of uneven primaries on a clean one, and of hot photosites."""
 
 from __future__ import annotations
 
@@ -11,9 +11,12 @@ from calibration.pipeline.build import build
 from calibration.report.report import write_report
 from calibration.table.lut import open_lut
 from calibration.verdict.values import judged_values
+from drivers.presenter import WHITE, Colour
+from sim.world.drawing import PAPER
 from sim.world.profile import ProfileName
 from sim.world.room import Room
 from sim.world.spectra import PaperName
+from tests.calibration.causes.rooms import BRIGHT, Counts, taken
 from tests.calibration.lab import LIGHTS, SETTINGS, hang, renumbered, take
 
 LIGHT = renumbered(LIGHTS[5:6])
@@ -41,6 +44,48 @@ def test_the_tint_of_greys_tells_a_managed_print(
     cosine = greys @ white / np.linalg.norm(greys, axis=1) / np.linalg.norm(white)
     assert tint == pytest.approx(float(np.degrees(np.arccos(cosine)).max()), abs=0.1)
     assert "Tint of the greys" in (tmp_path / "report.html").read_text()
+
+
+def test_uneven_primaries_are_no_dirt_on_the_print(tmp_path: Path) -> None:
+    """A cell's field differs from paper's by what it reflects of each primary; its colour is still its code's."""
+    lab = hang(room=Room(waviness_mm=0.5, primary_difference=0.3, projector_falloff=0.3, lamp_spectrum="led"))
+    with taken(lab, tmp_path / "session") as session:
+        stains = build(session, tmp_path / "lut").figures.cells.stains
+    codes, places = lab.chart.rgb[lab.chart.cell_of_colour], stains.places_mm
+    own = lab.world.seen(codes, places, WHITE, SETTINGS) / lab.world.reflected(codes, WHITE, SETTINGS)
+    of_paper = lab.world.seen([PAPER] * len(places), places, WHITE, SETTINGS) / lab.world.white(WHITE, SETTINGS)
+    expected = np.log(own / of_paper)
+    assert expected.std(axis=0).min() > 0.003
+    for channel in range(3):
+        there = np.isfinite(stains.alone[:, channel])
+        # 1 where cells are evened by the field of paper.
+        differs = expected[there, channel] - expected[there, channel].mean()
+        assert abs(differs @ stains.alone[there, channel] / (differs @ differs)) < 0.3
+
+
+def test_hot_photosites_side_by_side_are_no_object(tmp_path: Path) -> None:
+    """In two cells that touch, in every frame: under lights these are as far off as what lies there makes them."""
+    lab = hang()
+    light = next(light for light in BRIGHT if min(light.codes) > 80)
+    codes, places = lab.chart.rgb[lab.chart.cell_of_colour], lab.chart.centres_mm[lab.chart.cell_of_colour]
+    dark = np.argsort(lab.world.reflected(codes, light.colour, SETTINGS).max(axis=1))[40:160]
+    apart = np.linalg.norm(places[dark, None] - places[dark], axis=-1) + 1e3 * np.eye(len(dark))
+    pair = dark[np.array(divmod(int(apart.argmin()), len(dark)))]
+    at = np.rint(2 * lab.world.project(places[pair]) + 0.5).astype(np.int64) // 2 * 2
+
+    def heat(counts: Counts, colour: Colour) -> None:
+        visible = lab.world.body.visible
+        for x, y in at:
+            # The block's two corners: red and blue.
+            counts[visible.top + y, visible.left + x] += 2000
+            counts[visible.top + y + 1, visible.left + x + 1] += 2000
+
+    with taken(lab, tmp_path / "session", paint=heat) as session:
+        result = build(session, tmp_path / "lut")
+    unfit = {cell.colour: cell.cause for cell in result.figures.cells.unfit}
+    assert all(unfit[cell].startswith("hot") for cell in pair.tolist())
+    assert set(unfit) == set(pair.tolist())
+    assert "disturbed_cells" not in {row.threshold.name for row in result.verdict.remarks}
 
 
 def test_hot_photosites_stay_in_the_samples_and_are_told(tmp_path: Path) -> None:

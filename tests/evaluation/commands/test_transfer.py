@@ -184,6 +184,10 @@ def test_only_some_images_are_tested(place: Path, capsys: pytest.CaptureFixture[
         "30"
     }
     capsys.readouterr()
+    assert main(["pool", "part0", "part1", "--base", "MADE: GENERATED"]) == 0
+    assert "trained on made: generated" in " ".join(capsys.readouterr().out.split())
+    assert main(["pool", "part0", "part1", "--base", "guessed"]) == 2
+    assert "no row was trained on 'guessed'; expected one of: " in " ".join(capsys.readouterr().err.split())
     assert main(["pool", "part0", "whole"]) == 2
     assert "real_00 is a test image of part0 and of whole" in capsys.readouterr().err
     assert main(["compare", "pool", "--method", "Map of the mean, made: generated", "--method", "Gray-world"]) == 0

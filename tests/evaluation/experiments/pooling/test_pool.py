@@ -163,14 +163,14 @@ def test_halves_of_one_camera_are_one_test_set() -> None:
 
 
 def test_the_report_has_the_pool_the_test_sets_and_what_was_told(tmp_path: Path) -> None:
-    def made(*kinds: Kind, tests: tuple[str, ...]) -> str:
+    def made(*kinds: Kind, tests: tuple[str, ...], base: str | None = None) -> str:
         parts = [
             part(f"{number}{test}", *(row(kind, errors(10)) for kind in kinds), test=test, first=20 * number)
             for number, test in enumerate(tests)
         ]
         pool = replace(pool_transfers(parts), notes=("A note & more",))
         out = tmp_path / f"{len(list(tmp_path.iterdir()))}"
-        save_pool(pool, make_tables(pool, "recovery"), ["one/here", "two"], "recovery", out)
+        save_pool(pool, make_tables(pool, "recovery", base), ["one/here", "two"], "recovery", out)
         return (out / "report.html").read_text()
 
     text = made("cross-validation", "generated", "naive with matrix", tests=("A<b", "C"))
@@ -182,6 +182,10 @@ def test_the_report_has_the_pool_the_test_sets_and_what_was_told(tmp_path: Path)
     assert "made / naive with matrix" in text
     for table in ("intervals of these errors", "Each test set by itself", "in parts of those with the same pictures"):
         assert table in text
+    asked = made("cross-validation", "generated", "naive with matrix", tests=("C",), base="real, cross-validated")
+    assert "<h2>Against real, cross-validated</h2>" in asked
+    assert asked.count("<svg") == 3
+    assert "trained on real, cross-validated" in asked
     alone = made("cross-validation", "generated", tests=("C",))
     assert alone.count("<svg") == 1
     assert "Squares" not in alone

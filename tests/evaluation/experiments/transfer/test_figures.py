@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import numpy.typing as npt
 import pytest
@@ -11,6 +13,7 @@ from evaluation.experiments.transfer.figures import figures_of
 from evaluation.experiments.transfer.rows import Kind, TransferRow
 from evaluation.metrics import summarise
 from evaluation.results.result import Result
+from foundation.errors import InputError
 
 RANDOM = np.random.default_rng(3)
 REAL, OTHER, THIRD = (np.abs(RANDOM.normal(2, 1, 90)) for _ in range(3))
@@ -67,6 +70,28 @@ def test_methods_are_held_to_themselves_only() -> None:
     assert [(one.row.method, one.base.method) for one in found.to_real] == [("Cat", "Cat")]
     assert [figure.value for figure in found.to_real[0].ratios] == [1.0] * 6
     assert not found.to_naive
+
+
+def test_rows_are_held_to_one_that_is_asked_for_whatever_its_pictures() -> None:
+    chosen = replace(_row("generated", OTHER), data="chosen")
+    rows = [
+        _row("cross-validation", REAL),
+        chosen,
+        _row("naive with matrix", THIRD),
+        _row("naive with matrix", REAL, method="Cat"),
+        _row("none", REAL, method="Gray-world"),
+    ]
+    found = figures_of(rows, "recovery", base="Made:  matrix x linear sRGB x light")
+    assert [(one.row, one.base) for one in found.to_base] == [(rows[0], rows[2]), (chosen, rows[2])]
+    for compared, figure in zip(paired(OTHER, THIRD), found.to_base[1].ratios, strict=True):
+        assert (figure.value, figure.low, figure.high) == pytest.approx(compared.ratio)
+    assert not found.to_naive
+    assert not figures_of(rows, "recovery").to_base
+
+
+def test_a_base_that_is_not_there_is_told_with_those_that_are() -> None:
+    with pytest.raises(InputError, match=r"'naive'; expected one of: real, cross-validated; made: generated$"):
+        figures_of([_row("cross-validation", REAL), _row("generated", OTHER)], "recovery", base="naive")
 
 
 def test_a_faultless_base_has_no_ratio() -> None:
