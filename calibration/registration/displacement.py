@@ -131,8 +131,10 @@ class Displacement:
 
         Parameters
         ----------
-        points_mm, information
-            Of the measurements to which this was fitted, as for `fitted`.
+        points_mm
+            (N, 2) float64 mm, where it was measured.
+        information
+            (N, 2, 2) float64 px⁻², of the measurements to which this was fitted.
         roughness_px
             With which it was fitted.
         """
