@@ -35,7 +35,7 @@ _LEAST_LIGHT, _MUCH_LIGHT = 0.03, 0.2
 _THRESHOLDS = (0.35, 0.45, 0.55, 0.65, 0.75, 0.85)
 """Of paper: levels at which outlines are looked for, since nobody knows how dark the cells at the edge are."""
 
-_SIDE_POINTS = 160
+SIDE_POINTS = 160
 """Places along a side at which the edge is looked for: many times the six coefficients of its curve."""
 
 _PROFILE_STEP_PX = 0.5
@@ -218,7 +218,7 @@ def trace_outline(picture: PreparedPicture, corners_px: _Points) -> Outline | No
     """
     corners = np.asarray(corners_px, dtype=np.float64)
     curves = [np.zeros(1)] * 4
-    along = (np.arange(_SIDE_POINTS) + 0.5) / _SIDE_POINTS
+    along = (np.arange(SIDE_POINTS) + 0.5) / SIDE_POINTS
     seen_px: list[_Points] = []
     normals: list[_Points] = []
     for reach, order, known in _ROUNDS:

@@ -93,9 +93,7 @@ class Displacement:
         solution = np.asarray(sparse_linalg.spsolve(matrix, right))
         return replace(self, coefficients=solution.reshape(2, rows, columns).transpose(1, 2, 0))
 
-    def errors_px(
-        self, points_mm: _Array, information: _Array, at_mm: _Array, roughness_px: float | None = None
-    ) -> _Array:
+    def errors_px(self, points_mm: _Array, information: _Array, at_mm: _Array) -> _Array:
         """Return the standard error (M,) float64 px of the displacement's length at places (M, 2) mm.
 
         From draws of the coefficients' posterior distribution, whose covariance is the inverse of the fit's matrix:
@@ -111,13 +109,9 @@ class Displacement:
             (N, 2, 2) inverse covariance of each measurement, px⁻²; 0 where nothing was seen.
         at_mm
             (M, 2) float64 mm, the places.
-        roughness_px
-            Usual second difference between knots; that which is found, `ROUGHNESS_PX` or more, if not given.
         """
         bends = [np.diff(self.coefficients, 2, axis=axis) for axis in (0, 1)]
         roughness = max(ROUGHNESS_PX, *(float(np.sqrt((bend**2).mean())) for bend in bends))
-        if roughness_px is not None:
-            roughness = roughness_px
         drawn = self._drawn(points_mm, information, roughness)
         wanted, half = self.basis(at_mm), len(drawn) // 2
         x, y = (np.asarray(wanted @ part, dtype=np.float64) for part in (drawn[:half], drawn[half:]))
@@ -139,7 +133,7 @@ class Displacement:
             With which it was fitted.
         """
         rows, columns = self.coefficients.shape[:2]
-        bending = sparse.csr_array(sparse.vstack(_differences(rows, columns)))
+        bending = _differences(rows, columns)
         drawn = self._drawn(points_mm, information, roughness_px)
         half = len(drawn) // 2
         open_px2 = sum(float((np.asarray(bending @ part) ** 2).sum()) for part in (drawn[:half], drawn[half:])) / _DRAWS
@@ -157,7 +151,7 @@ class Displacement:
         scatter = np.einsum("nij,njs->nis", root, random.standard_normal((len(points_mm), 2, _DRAWS)))
         basis = self.basis(points_mm)
         of_data = np.concatenate([basis.T @ scatter[:, axis] for axis in (0, 1)])
-        bending = sparse.csr_array(sparse.vstack(_differences(rows, columns)))
+        bending = _differences(rows, columns)
         of_sheet = [bending.T @ random.standard_normal((bending.shape[0], _DRAWS)) / roughness_px for _ in (0, 1)]
         of_ridge = np.sqrt(_RIDGE) * random.standard_normal((2 * rows * columns, _DRAWS))
         right = of_data + np.concatenate(of_sheet) + of_ridge
@@ -168,7 +162,7 @@ class Displacement:
         basis = self.basis(points_mm)
         rows, columns = self.coefficients.shape[:2]
         blocks = [[basis.T @ sparse.diags_array(information[:, i, j]) @ basis for j in (0, 1)] for i in (0, 1)]
-        bending = sparse.vstack(_differences(rows, columns))
+        bending = _differences(rows, columns)
         penalty = bending.T @ bending / roughness_px**2 + sparse.identity(rows * columns) * _RIDGE
         matrix = sparse.block_array([[blocks[0][0] + penalty, blocks[0][1]], [blocks[1][0], blocks[1][1] + penalty]])
         return sparse.csc_array(matrix)
@@ -180,8 +174,8 @@ def _cubic_weights(t: _Array) -> _Array:
     return np.stack([s**3, 3 * t**3 - 6 * t**2 + 4, 3 * s**3 - 6 * s**2 + 4, t**3], axis=-1) / 6
 
 
-def _differences(rows: int, columns: int) -> list[sparse.csr_array]:
-    """Return all second differences on a grid of coefficients: yy, xx, and √2 times xy."""
+def _differences(rows: int, columns: int) -> sparse.csr_array:
+    """Return all second differences (D, K) on a grid of coefficients: yy, then xx, then √2 times xy."""
 
     def difference(n: int, order: int) -> sparse.csr_array:
         matrix = sparse.eye_array(n, format="csr")
@@ -192,4 +186,4 @@ def _differences(rows: int, columns: int) -> list[sparse.csr_array]:
     whole = [sparse.eye_array(n, format="csr") for n in (rows, columns)]
     xy = sparse.kron(difference(rows, 1), difference(columns, 1)) * np.sqrt(2)
     parts = (sparse.kron(whole[0], difference(columns, 2)), sparse.kron(difference(rows, 2), whole[1]), xy)
-    return [sparse.csr_array(part) for part in parts]
+    return sparse.csr_array(sparse.vstack([sparse.csr_array(part) for part in parts]))

@@ -24,7 +24,7 @@ from scipy.spatial import cKDTree
 from acquisition.chart.model import Chart
 from acquisition.framing.finding import Framing, find_chart
 from acquisition.framing.homography import rms
-from acquisition.framing.outline import refine_edges
+from acquisition.framing.outline import SIDE_POINTS, refine_edges
 from acquisition.framing.planes import CHANNELS, Plane, frame_black, plane_of
 from acquisition.framing.sharpness import blur_px
 from acquisition.framing.tagless_field import FoundField, field_mm
@@ -71,9 +71,6 @@ _OUTLINE_SIGMA_PX = 0.1
 
 _APART, _APART_PX = 5.0, 1.0
 """Points of an outline further from the lens than five of their standard deviations, and a pixel, are not of it."""
-
-_SIDE_POINTS = 160
-"""Places along a side at which an outline that was not found is looked for again: as many as are traced."""
 
 _FOLLOWED_SOFTLY = (1.0, 1.0, 0.6)
 """Blur in cells of the steps that follow a chart without tags, before its cells are looked at."""
@@ -194,13 +191,13 @@ def _completed(field: FoundField, lens: Lens, chart: Chart) -> FoundField:
     Beside pale cells the outline is traced one cell inwards, or not at all; one colour may show it.
     """
     corners = field_mm(chart)
-    share = (np.arange(_SIDE_POINTS) + 0.5)[:, None] / _SIDE_POINTS
+    share = (np.arange(SIDE_POINTS) + 0.5)[:, None] / SIDE_POINTS
     sides: list[tuple[_Array, _Array, _Array]] = []
     for start, end in zip(corners, np.roll(corners, -1, axis=0), strict=True):
-        points, along = start + share * (end - start), (end - start) / _SIDE_POINTS
+        points, along = start + share * (end - start), (end - start) / SIDE_POINTS
         far = cKDTree(field.outline_mm).query(points)[0] > 2 * np.linalg.norm(along)
         points = points[far]
-        inwards = lens.to_pixels(points + (corners.mean(axis=0) - points) / _SIDE_POINTS) - lens.to_pixels(points)
+        inwards = lens.to_pixels(points + (corners.mean(axis=0) - points) / SIDE_POINTS) - lens.to_pixels(points)
         tangents = lens.to_pixels(points + along) - lens.to_pixels(points - along)
         normals = np.stack([tangents[:, 1], -tangents[:, 0]], axis=-1) / np.linalg.norm(tangents, axis=1, keepdims=True)
         normals *= -np.sign((normals * inwards).sum(axis=1, keepdims=True))

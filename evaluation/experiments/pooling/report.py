@@ -47,6 +47,8 @@ class PoolTables:
         What the rows come to over all images.
     figures_of_tests
         The same of each test set by itself, by its name.
+    base
+        What the rows are trained on that every other one is held to, as it was asked for; None if none was.
     """
 
     shown: tuple[Table, ...]
@@ -54,6 +56,7 @@ class PoolTables:
     single: Table
     figures: TransferFigures
     figures_of_tests: Mapping[str, TransferFigures]
+    base: str | None
 
 
 def make_tables(pool: Pool, error: ErrorKind, base: str | None = None) -> PoolTables:
@@ -71,7 +74,7 @@ def make_tables(pool: Pool, error: ErrorKind, base: str | None = None) -> PoolTa
     Raises
     ------
     InputError
-        An error is not finite, or no row was trained like `base`.
+        As `transfer.figures.figures_of`.
     """
     tests = list(dict.fromkeys(pool.tests))
     name = " + ".join(tests)
@@ -96,6 +99,7 @@ def make_tables(pool: Pool, error: ErrorKind, base: str | None = None) -> PoolTa
         Table("All numbers of each test set", ("test", "test_images", *listed[0][1].columns), tuple(rows)),
         every,
         single,
+        base,
     )
 
 
@@ -129,6 +133,7 @@ def save_pool(pool: Pool, tables: PoolTables, places: Sequence[str], error: Erro
         "results": list(places),
         "tests": {test: pool.tests.count(test) for test in dict.fromkeys(pool.tests)},
         "error": error,
+        "base": tables.base,
         "notes": list(pool.notes),
     }
     with whole_folder(folder, "the results") as partial:

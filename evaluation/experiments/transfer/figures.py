@@ -127,7 +127,7 @@ def figures_of(
     Raises
     ------
     InputError
-        An error is not finite, or no row was trained like `base`.
+        An error is not finite, no row was trained like `base`, or no other row has the method of one that was.
     """
     bases = _named(rows, base)
     samples = [[ErrorSample.of(result.errors[error]) for result in row.results] for row in rows]
@@ -177,7 +177,7 @@ def figures_of(
         ratio(number, other)
         for number, row in enumerate(rows)
         for other in bases
-        if number not in bases and rows[other].method == row.method and row.kind != "none"
+        if number not in bases and rows[other].method == row.method
     ]
     return TransferFigures(error, listed, tuple(to_real), tuple(to_naive), tuple(to_base))
 
@@ -186,10 +186,14 @@ def _named(rows: Sequence[TransferRow], base: str | None) -> list[int]:
     """Return the places of the rows that were trained in the way of that name."""
     if base is None:
         return []
-    found = [number for number, row in enumerate(rows) if _plain(row.training) == _plain(base)]
+    trained = [(number, row) for number, row in enumerate(rows) if row.kind != "none"]
+    found = [number for number, row in trained if _plain(row.training) == _plain(base)]
     if not found:
-        known = dict.fromkeys(row.training for row in rows if row.kind != "none")
+        known = dict.fromkeys(row.training for _, row in trained)
         raise InputError(f"no row was trained on {base!r}; expected one of: {'; '.join(known)}")
+    methods = {rows[number].method for number in found}
+    if not any(row.method in methods for number, row in trained if number not in found):
+        raise InputError(f"no method was trained on anything but {base!r}; add results to hold to it, or leave it out")
     return found
 
 

@@ -94,6 +94,18 @@ def test_a_base_that_is_not_there_is_told_with_those_that_are() -> None:
         figures_of([_row("cross-validation", REAL), _row("generated", OTHER)], "recovery", base="naive")
 
 
+@pytest.mark.parametrize("base", ["none", " NONE"])
+def test_what_learns_nothing_is_no_base(base: str) -> None:
+    with pytest.raises(InputError, match=r"expected one of: real, cross-validated$"):
+        figures_of([_row("cross-validation", REAL), _row("none", THIRD, method="Gray-world")], "recovery", base=base)
+
+
+def test_a_base_with_nothing_to_hold_to_it_is_told() -> None:
+    rows = [_row("cross-validation", REAL), _row("generated", OTHER, method="Cat")]
+    with pytest.raises(InputError, match=r"no method was trained on anything but 'made: generated'; add results"):
+        figures_of(rows, "recovery", base="made: generated")
+
+
 def test_a_faultless_base_has_no_ratio() -> None:
     found = figures_of([_row("cross-validation", np.zeros(90)), _row("generated", OTHER)], "recovery")
     assert all(np.isnan(figure.value) and np.isnan(figure.low) for figure in found.to_real[0].ratios)
