@@ -7,7 +7,8 @@ over the whole print and its lens's distortion:
 - `lateral`: lateral chromatic aberration of 1 px at the corner, red out and blue in;
 - `waves`: that, and waves of 150 mm, 6 mm high, and a curl of 25 mm, before a wide-angle lens;
 - `tagless`: that of `lateral` on the publication's chart, which has no tags: its field's outline and the small steps of
-  its smooth order of colours are all there is.
+  its smooth order of colours are all there is;
+- `tagless-curl`: that chart with a curl of 25 mm, before a wide-angle lens.
 
 Cells that the registration itself lists as not known well enough, or covered, are not counted, but said. Returns 1 when
 a cell that is not listed is more than half a pixel off, or a channel's cells more than .04 px RMS. Without tags .07 px
@@ -54,6 +55,7 @@ ROOMS: Final[Mapping[str, Mapping[str, Any]]] = {
         "focal_diagonals": 0.8,
     },
     "tagless": {"lateral_red_px": 1.0, "lateral_blue_px": -1.0},
+    "tagless-curl": {"lateral_red_px": 1.0, "lateral_blue_px": -1.0, "curl_mm": 25.0, "focal_diagonals": 0.8},
 }
 """How each room differs from the default one."""
 
@@ -68,7 +70,7 @@ def listed(shot: PhotographedChart, registration: Registration) -> np.ndarray[An
 
 def tried(name: str, body: str, seed: int) -> dict[str, Any]:
     """Return a line of JSON on where the cells of a frame are found."""
-    chart = paper_chart("A0", 5) if name == "tagless" else design_chart(5, seed=seed)
+    chart = paper_chart("A0", 5) if name.startswith("tagless") else design_chart(5, seed=seed)
     case = Case(seed, body, "white", replace(Room(seed=seed), **ROOMS[name]))
     shot = photographed(case, chart)
     row: dict[str, Any] = {"room": name, "body": body, "seed": seed}

@@ -235,7 +235,7 @@ def trace_outline(picture: PreparedPicture, corners_px: _Points) -> Outline | No
             seen = strength > _MIN_EDGE
             if seen.mean() < 0.4:
                 return None
-            change, fits = _robust_curve(along[seen], off[seen], order)
+            change, fits = robust_curve(along[seen], off[seen], order)
             if fits.mean() < 0.5:
                 return None
             smooth.append(_bent(np.linspace(0, 1, 41), _sum(curves[side], change), start, end))
@@ -336,8 +336,23 @@ def _edges(paleness: _Float, across: _Points, known_px: float) -> tuple[_Points,
     return across[best] + part * _PROFILE_STEP_PX, middle.astype(np.float64)
 
 
-def _robust_curve(along: _Points, off: _Points, order: int) -> tuple[_Points, npt.NDArray[np.bool_]]:
-    """Return the Legendre coefficients of a curve through most of the points, and which points it fits."""
+def robust_curve(along: _Points, off: _Points, order: int) -> tuple[_Points, npt.NDArray[np.bool_]]:
+    """Return the curve through most of the points on a side, and which points it fits.
+
+    Parameters
+    ----------
+    along
+        (N,) float64, shares 0 … 1 of the side.
+    off
+        (N,) float64 half-size px across it.
+    order
+        Of the curve, a Legendre series.
+
+    Returns
+    -------
+    ndarray, ndarray
+        (order + 1,) float64, the series' coefficients on −1 … 1; (N,) bool.
+    """
     basis = np.polynomial.legendre.legvander(2 * along - 1, order)
     scale = max(sigma_of(off - np.median(off)), 0.5)
     weights = 1 / np.maximum(np.abs(off - np.median(off)), scale)

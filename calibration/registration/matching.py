@@ -30,7 +30,7 @@ from calibration.registration.colour_checks import slipped_parts
 from calibration.registration.colour_model import ColourModel, fit_colours
 from calibration.registration.displacement import MOST_ROUGHNESS_PX, ROUGHNESS_PX, Displacement
 from calibration.registration.lateral_colour import LateralColour
-from calibration.registration.lens import Lens
+from calibration.registration.lens import Lens, fit_lens
 from calibration.registration.raster import Raster
 from calibration.registration.tile_comparison import TileComparison, compare_tiles
 from foundation.errors import RegistrationError
@@ -75,6 +75,12 @@ _LEAST_BLOCK_SCORE = 0.3
 
 _COLOUR_PATCHES = 5000
 """Patches that the colour model is fitted on: more do not improve a polynomial of some dozen terms."""
+
+_LENS_POINTS = 2000
+"""Cells that the lens is fitted to again: more do not improve a dozen parameters."""
+
+_LENS_POINT_SIGMA_PX = 0.1
+"""How well they are known then (judgement): what is lost of the displacement, .02 px, the next steps measure again."""
 
 _INTERPOLATION_PX = 0.28
 """σ that cubic interpolation adds to a frame's edges: measured on edges of σ 0.4 to 0.7 px, less where they are softer.
@@ -184,7 +190,10 @@ class Matcher:
         across = float(self._cells_across.min())
         self._block_cells = int(np.clip(across // 4, 1, _BLOCK_CELLS))
         self.displacement = Displacement.over(
-            low, low + self._cells_across * cell, float(cell.max()) * max(2.0, min(_KNOT_CELLS, across / 3))
+            low,
+            low + self._cells_across * cell,
+            float(cell.max()) * max(2.0, min(_KNOT_CELLS, across / 3)),
+            lens if self._smooth_order else None,
         )
         self._roughness_px = ROUGHNESS_PX
         self._per_cell = int(np.clip(round(_PER_CELL_PX * cell_px), _LEAST_PER_CELL, _MOST_PER_CELL))
@@ -336,6 +345,19 @@ class Matcher:
         repeat = (_FOLLOWED_CELLS * _COARSE_PER_CELL) ** 2 / _WINDOW_WORTH
         self._move(self._compared_softly(sigma_cells).weakened(repeat))
         self.colours = self._fit_colours()
+
+    def refit_lens(self) -> None:
+        """Fit the lens to where the whole field is found, and the sheet's heights to what that leaves.
+
+        An outline alone does not tell a curl from distortion, whose steep corners no smooth displacement takes back.
+        """
+        points = self._chart.centres_mm[:: max(1, self._chart.colour_count // _LENS_POINTS)]
+        places = self.to_pixels(points)
+        height, width = self._planes[0].values.shape
+        self.lens, left = fit_lens(points, places, (width, height))
+        flat = replace(self.displacement, lens=self.lens)
+        known = np.broadcast_to(np.eye(2) / _LENS_POINT_SIGMA_PX**2, (len(points), 2, 2))
+        self.displacement = flat.fitted(points, known, left / _LENS_POINT_SIGMA_PX**2, self._roughness_px)
 
     def _compared_softly(self, sigma_cells: float) -> TileComparison:
         """Return the comparison of print and frame, both blurred by some cells."""

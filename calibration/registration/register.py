@@ -70,7 +70,7 @@ _OUTLINE_SIGMA_PX = 0.1
 """Standard error of a point of the outline, across it (judgement)."""
 
 _APART, _APART_PX = 5.0, 1.0
-"""Points of an outline further from the lens than five of their standard deviations, and a pixel, are not of it."""
+"""Points of an outline further from its run than five of their standard deviations, and a pixel, are not of it."""
 
 _FOLLOWED_SOFTLY = (1.0, 1.0, 0.6)
 """Blur in cells of the steps that follow a chart without tags, before its cells are looked at."""
@@ -145,6 +145,7 @@ def register(
     else:
         for softness in _FOLLOWED_SOFTLY:
             matcher.follow(softness)
+            matcher.refit_lens()
     for _ in range(_GAUSS_NEWTON_STEPS):
         moved, furthest = matcher.step()
         if moved < _SETTLED_PX and furthest < _SETTLED_CELL_PX:
@@ -214,6 +215,9 @@ def _completed(field: FoundField, lens: Lens, chart: Chart) -> FoundField:
 def _field_through_lens(field: FoundField, frame_size: tuple[int, int]) -> tuple[FoundField, _Mask, Lens, _Array]:
     """Return the field without outlying points of its outline, which are marks in the margin.
 
+    A sheet's curled corners lie pixels off a plane seen through a lens, and have neighbours that do: points are held
+    against the run of their side.
+
     Returns
     -------
     FoundField, ndarray, Lens, ndarray
@@ -222,7 +226,7 @@ def _field_through_lens(field: FoundField, frame_size: tuple[int, int]) -> tuple
     kept = np.ones(len(field.outline_mm), dtype=np.bool_)
     lens, residual = fit_lens(field.outline_mm, field.outline_px, frame_size, field.normals)
     for _ in range(2):
-        size = np.linalg.norm(residual, axis=1)
+        size = field.off_run_px(residual)
         fits = size <= max(_APART * sigma_of(size), _APART_PX)
         kept[kept] = fits
         field = replace(

@@ -21,7 +21,7 @@ from acquisition.framing.finding import find_chart
 from acquisition.framing.outline import refine_edges
 from acquisition.framing.planes import CHANNELS, Plane, plane_of
 from acquisition.framing.sharpness import blur_px
-from acquisition.framing.tagless_field import field_mm, find_field
+from acquisition.framing.tagless_field import FoundField, field_mm, find_field
 from drivers.camera import ExposureSettings
 from drivers.presenter import BLACK, WHITE, Colour
 from drivers.raw.rawfile import Mosaic, read_raw
@@ -242,3 +242,19 @@ def test_an_edge_that_is_not_clear_is_not_refined(white: Mosaic) -> None:
     places, heights = refine_edges(faint, field.outline_px, field.normals, 0.58)
     assert not heights.any()
     assert (places == field.outline_px).all()
+
+
+def test_a_curled_corner_is_of_the_outline_and_marks_in_the_margin_are_not() -> None:
+    along = (np.arange(160) + 0.5) / 160
+    top = np.stack([along * 1170, np.zeros(160)], axis=-1)
+    bottom = np.stack([along * 1170, np.full(160, 824.0)], axis=-1)
+    normals = np.repeat([(0.0, -1.0), (0.0, 1.0)], 160, axis=0)
+    outline = np.concatenate([top, bottom])
+    field = FoundField(np.zeros((4, 2)), np.eye(3), outline, outline, normals, 1.0)
+    across = np.concatenate([6 * (2 * along - 1) ** 6, np.random.default_rng(1).normal(0, 0.02, 160)])
+    marks = np.zeros(320, dtype=bool)
+    marks[[*range(60, 72), *range(200, 212)]] = True
+    across[marks] += 3
+    off = field.off_run_px(across[:, None] * normals)
+    assert off[~marks].max() < 0.2
+    assert off[marks].min() > 2.5

@@ -5,11 +5,13 @@ from __future__ import annotations
 import itertools
 
 import numpy as np
+import numpy.typing as npt
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from calibration.registration.displacement import MOST_ROUGHNESS_PX, ROUGHNESS_PX, Displacement
+from calibration.registration.lens import Lens
 
 
 @settings(max_examples=20, deadline=None)
@@ -41,6 +43,35 @@ def test_its_error_is_what_it_scatters_by_and_grows_where_nothing_is_measured() 
     assert said[0] == pytest.approx(scattered[0], rel=0.4)
     assert said[1] > 2 * said[0]
     assert (said >= 0.6 * scattered).all()
+
+
+@pytest.mark.parametrize("heights", [True, False])
+def test_an_edge_known_across_alone_tells_a_height_along_it_as_well(heights: bool) -> None:
+    """A sheet whose left edge stands off: its top edge moves left and up, and only the latter is seen."""
+    low, high = np.array([0.0, 0.0]), np.array([300.0, 200.0])
+    lens = Lens(np.eye(3), np.array([150.0, 100.0]), float(np.hypot(150, 100)), np.zeros(4))
+    along = np.linspace(0, 1, 160)
+    level, upright = along * 300, along * 200
+    points = np.concatenate(
+        [np.stack(side, axis=-1) for side in ((level, 0 * level), (level, 0 * level + 200))]
+        + [np.stack(side, axis=-1) for side in ((0 * upright, upright), (0 * upright + 300, upright))]
+    )
+    normals = np.repeat([(0, 1), (0, 1), (1, 0), (1, 0)], len(along), axis=0).astype(np.float64)
+
+    def sheet(at_mm: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+        height = 4.0 * np.sin(at_mm[:, :1] / 300 * 4 * np.pi)
+        return height * lens.parallax(at_mm)
+
+    information = 1e4 * np.einsum("ni,nj->nij", normals, normals)
+    pull = np.einsum("nij,nj->ni", information, sheet(points))
+    found = Displacement.over(low, high, 10.0, lens if heights else None).fitted(points, information, pull)
+    beside = np.stack([np.linspace(20, 280, 40), np.full(40, 2.0)], axis=-1)
+    off = np.linalg.norm(found.at(beside) - sheet(beside), axis=1)
+    if heights:
+        assert off.max() < 0.5
+        assert (off < 3 * found.errors_px(points, information, beside)).all()
+    else:
+        assert off.max() > 1.5
 
 
 def test_a_sheet_that_bends_more_than_usual_is_found_to() -> None:

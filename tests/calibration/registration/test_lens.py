@@ -6,7 +6,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from calibration.registration.lens import fit_lens
+from calibration.registration.lens import Lens, fit_lens
 from foundation.errors import RegistrationError
 
 
@@ -48,3 +48,30 @@ def test_two_small_tags_at_the_ends_of_a_sheet_are_not_on_one_line() -> None:
     lens, residual = fit_lens(points, places, (2601, 1733))
     assert np.abs(residual).max() < 0.02
     assert lens.to_pixels(points) == pytest.approx(places, abs=0.02)
+
+
+@pytest.mark.parametrize(("tilt_deg", "pan_deg"), [(0.0, 0.0), (8.0, -5.0)])
+def test_parallax_is_the_way_in_which_heights_are_seen(tilt_deg: float, pan_deg: float) -> None:
+    size = np.array([2601, 1733])
+    centre, radius = (size - 1) / 2, float(np.hypot(*size)) / 2
+    focal, distance = 2.2 * radius, 1500.0
+    tilt, pan = np.deg2rad([tilt_deg, pan_deg])
+    upright = np.array([[1, 0, 0], [0, np.cos(tilt), -np.sin(tilt)], [0, np.sin(tilt), np.cos(tilt)]])
+    turned = upright @ np.array([[np.cos(pan), 0, np.sin(pan)], [0, 1, 0], [-np.sin(pan), 0, np.cos(pan)]])
+    camera = np.array([[focal, 0, centre[0]], [0, focal, centre[1]], [0, 0, 1.0]])
+    start = np.array([-600.0, -420.0, distance])
+    homography = camera @ np.column_stack([turned[:, 0], turned[:, 1], start])
+    distortion = np.array([-0.05, 0.02, 1e-3, -5e-4])
+    lens = Lens(homography / homography[2, 2], centre, radius, distortion)
+    undistorted = Lens(np.eye(3), centre, radius, distortion)
+    points = np.stack(np.meshgrid(np.linspace(0, 1189, 5), np.linspace(0, 841, 4)), axis=-1).reshape(-1, 2)
+
+    def seen(height_mm: float) -> npt.NDArray[np.float64]:
+        raised = np.column_stack([points, np.full(len(points), -height_mm)])
+        places = (camera @ (turned @ raised.T + start[:, None])).T
+        return undistorted.to_pixels(places[:, :2] / places[:, 2:])
+
+    foot_mm = abs(float(turned[:, 2] @ start))
+    moved = (seen(1.0) - seen(-1.0)) / 2
+    assert lens.parallax(points) == pytest.approx(moved * foot_mm / radius, rel=2e-3, abs=1e-4)
+    assert lens.parallax(points[7]) == pytest.approx(lens.parallax(points)[7:8])
