@@ -89,14 +89,19 @@ def cache_folder() -> Path | None:
     return home / ("Library/Caches" if sys.platform == "darwin" else ".cache") / "croplab"
 
 
+def partial_name(name: str) -> str:
+    """Return the hidden name under which a file or folder called `name` is written before it is complete."""
+    return f".{name}{_PARTIAL}"
+
+
 def partial_path(path: Path) -> Path:
-    """Return the hidden name under which `path` is written before it is complete."""
-    return path.with_name(f".{path.name}{_PARTIAL}")
+    """Return the path under which `path` is written before it is complete."""
+    return path.with_name(partial_name(path.name))
 
 
-def is_partial(path: Path) -> bool:
-    """Return whether `path` is a leftover of a write that never finished."""
-    return path.name.startswith(".") and path.name.endswith(_PARTIAL)
+def is_partial(name: str) -> bool:
+    """Return whether a file or folder called `name` is a leftover of a write that never finished."""
+    return name.startswith(".") and name.endswith(_PARTIAL)
 
 
 def remedy_of(error: OSError) -> str | None:
