@@ -122,12 +122,23 @@ def storage_error(path: Path, error: OSError, what: str = "write") -> InputError
     what
         What cannot be done with it: "write", "look into".
     """
-    remedy = remedy_of(error)
+    remedy = _remedy_where_missing(path) if error.errno == errno.ENOENT else remedy_of(error)
     by_name = remedy is not None and not isinstance(error, PermissionError)
     return (InputError if by_name else StorageError)(
         f"cannot {what} {path}: {error.strerror or error}; "
         f"{remedy or disk_remedy_of(error) or f'see to the disk, or choose another, {_AGAIN}'}"
     )
+
+
+def _remedy_where_missing(path: Path) -> str | None:
+    """Return what helps if `path` cannot be made though its folder is there; None if that is gone."""
+    try:
+        if path.is_symlink():
+            return "it is a link to a place that is not there: make or mount that place, or name another"
+        takes_none = path.parent.is_dir() and not path.exists()
+        return "the system lets nobody make files there; name a place on an ordinary disk" if takes_none else None
+    except OSError:
+        return None
 
 
 def reading_error(path: Path, error: OSError, remedy: str, what: str = "") -> FormatError | StorageError:

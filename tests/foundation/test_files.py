@@ -22,6 +22,7 @@ from foundation.files import (
     read_whole,
     require_free,
     require_free_file,
+    storage_error,
     whole_file,
     whole_folder,
     write_whole,
@@ -124,6 +125,16 @@ class TestWholeFile:
         assert isinstance(caught.value.__cause__, OSError)
         assert path.read_text() == "old"
         assert names(tmp_path) == ["a.csv"]
+
+    def test_a_link_to_nowhere_is_told(self, tmp_path: Path) -> None:
+        (tmp_path / "link").symlink_to(tmp_path / "gone" / "a.csv")
+        with pytest.raises(InputError, match=r"link: .*it is a link to a place that is not there"):
+            raise storage_error(tmp_path / "link", FileNotFoundError(errno.ENOENT, "No such file or directory"))
+
+    @pytest.mark.skipif(not Path("/proc/self").exists(), reason="this system has no /proc")
+    def test_a_file_system_that_takes_no_files_is_told_from_a_disk_that_is_gone(self) -> None:
+        with pytest.raises(InputError, match=r"cannot write /proc/crop: .*name a place on an ordinary disk"):
+            write_whole(Path("/proc/crop"), "x")
 
     def test_a_name_below_a_file_is_told(self, tmp_path: Path) -> None:
         write_whole(tmp_path / "file", "x")
