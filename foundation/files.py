@@ -132,13 +132,12 @@ def storage_error(path: Path, error: OSError, what: str = "write") -> InputError
 
 def _remedy_where_missing(path: Path) -> str | None:
     """Return what helps if `path` cannot be made though its folder is there; None if that is gone."""
-    try:
+    with contextlib.suppress(OSError):
         if path.is_symlink():
             return "it is a link to a place that is not there: make or mount that place, or name another"
-        takes_none = path.parent.is_dir() and not path.exists()
-        return "the system lets nobody make files there; name a place on an ordinary disk" if takes_none else None
-    except OSError:
-        return None
+        if path.parent.is_dir() and not path.exists():
+            return "the system lets nobody make files there; name a place on an ordinary disk"
+    return None
 
 
 def reading_error(path: Path, error: OSError, remedy: str, what: str = "") -> FormatError | StorageError:
