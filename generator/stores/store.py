@@ -111,23 +111,25 @@ class LocalStore:
     @contextmanager
     def create(self, name: str) -> Generator[BinaryIO]:
         """Open a file to be written; it appears when the block ends well, and is on the disk once synchronised."""
-        path = self.root / name
+        # As text: to put a path together takes pathlib longer than to open, write and rename a small file.
+        path = f"{self.root}/{name}"
+        folder, _, leaf = path.rpartition("/")
         # Named by chance, because two programs may be at the same shard; see `foundation.files.is_partial`.
-        hidden = path.with_name(partial_name(f"{path.name}.{secrets.token_hex(8)}"))
+        hidden = f"{folder}/{partial_name(f'{leaf}.{secrets.token_hex(8)}')}"
         try:
             try:
-                stream = hidden.open("wb", _BUFFER)
+                stream = open(hidden, "wb", _BUFFER)  # noqa: PTH123, SIM115
             except FileNotFoundError:
-                self._make_folder(path.parent)
-                stream = hidden.open("wb", _BUFFER)
+                self._make_folder(Path(folder))
+                stream = open(hidden, "wb", _BUFFER)  # noqa: PTH123, SIM115
             with stream:
                 yield stream
-            hidden.replace(path)
+            os.replace(hidden, path)  # noqa: PTH105
         except BaseException as error:
             with contextlib.suppress(OSError):
-                hidden.unlink(missing_ok=True)
+                Path(hidden).unlink(missing_ok=True)
             if isinstance(error, OSError) and not isinstance(error, CropError):
-                raise storage_error(path, error) from error
+                raise storage_error(Path(path), error) from error
             raise
 
     def _make_folder(self, folder: Path) -> None:
