@@ -34,6 +34,8 @@ EXIT_CODES = (
     "5 the disk is full or read-only; 130 interrupted."
 )
 
+_LOST = "the folder in which this was started is gone; change to one that is there (cd), then run it again"
+"""Said in place of what it causes: every path of a user depends on that folder."""
 _WRITING_FAULTS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS)
 
 
@@ -91,7 +93,7 @@ def _outcome(command: Callable[[], object], keeps: bool) -> int:
     try:
         command()
     except CropError as error:
-        say_error(str(error))
+        say_error(_LOST if error.exit_code == InputError.exit_code and _has_lost_its_folder() else str(error))
         return error.exit_code
     except KeyboardInterrupt:
         return _interrupted(keeps)
@@ -108,9 +110,7 @@ def _outcome(command: Callable[[], object], keeps: bool) -> int:
             say_error(f"cannot {doing} {about}: {error.strerror}; {remedy}")
             return StorageError.exit_code
         if _has_lost_its_folder():
-            say_error(
-                "the folder in which this was started is gone; change to one that is there (cd), then run it again"
-            )
+            say_error(_LOST)
             return InputError.exit_code
         remedy = remedy_of(error)
         if remedy is None or not named:

@@ -89,14 +89,19 @@ def cache_folder() -> Path | None:
     return home / ("Library/Caches" if sys.platform == "darwin" else ".cache") / "croplab"
 
 
+def partial_name(name: str) -> str:
+    """Return the hidden name under which a file or folder called `name` is written before it is complete."""
+    return f".{name}{_PARTIAL}"
+
+
 def partial_path(path: Path) -> Path:
-    """Return the hidden name under which `path` is written before it is complete."""
-    return path.with_name(f".{path.name}{_PARTIAL}")
+    """Return the path under which `path` is written before it is complete."""
+    return path.with_name(partial_name(path.name))
 
 
-def is_partial(path: Path) -> bool:
-    """Return whether `path` is a leftover of a write that never finished."""
-    return path.name.startswith(".") and path.name.endswith(_PARTIAL)
+def is_partial(name: str) -> bool:
+    """Return whether a file or folder called `name` is a leftover of a write that never finished."""
+    return name.startswith(".") and name.endswith(_PARTIAL)
 
 
 def remedy_of(error: OSError) -> str | None:
@@ -117,12 +122,22 @@ def storage_error(path: Path, error: OSError, what: str = "write") -> InputError
     what
         What cannot be done with it: "write", "look into".
     """
-    remedy = remedy_of(error)
+    remedy = _remedy_where_missing(path) if error.errno == errno.ENOENT else remedy_of(error)
     by_name = remedy is not None and not isinstance(error, PermissionError)
     return (InputError if by_name else StorageError)(
         f"cannot {what} {path}: {error.strerror or error}; "
         f"{remedy or disk_remedy_of(error) or f'see to the disk, or choose another, {_AGAIN}'}"
     )
+
+
+def _remedy_where_missing(path: Path) -> str | None:
+    """Return what helps if `path` cannot be made though its folder is there; None if that is gone."""
+    with contextlib.suppress(OSError):
+        if path.is_symlink():
+            return "it is a link to a place that is not there: make or mount that place, or name another"
+        if path.parent.is_dir() and not path.exists():
+            return "the system lets nobody make files there; name a place on an ordinary disk"
+    return None
 
 
 def reading_error(path: Path, error: OSError, remedy: str, what: str = "") -> FormatError | StorageError:

@@ -9,14 +9,20 @@ from collections.abc import Callable, Mapping
 
 from foundation.errors import ConfigurationError, CropError, DeviceError
 
+Questions = Mapping[str, Callable[[], object]]
+"""What is asked, by the name of the device; each raises what its device says against it."""
 
-def ask_all(questions: Mapping[str, Callable[[], object]]) -> None:
+
+def ask_all(questions: Questions, further: Questions | None = None) -> None:
     """Ask each question, and raise what went wrong with all of them together.
 
     Parameters
     ----------
     questions
-        By the name of the device that is asked; each raises what its device says against it.
+        One of each device.
+    further
+        What a device that passed is asked besides where another one failed, so that its fault is told with the others:
+        a camera may be opened that is asked for its name much later.
 
     Raises
     ------
@@ -24,17 +30,23 @@ def ask_all(questions: Mapping[str, Callable[[], object]]) -> None:
         One failed: as it failed. Several did: a list of all, one a line, each with its remedy; a ConfigurationError
         (exit code 2) where all are the settings' faults, else a DeviceError (3).
     """
-    faults: dict[str, CropError] = {}
-    for name, question in questions.items():
-        try:
-            question()
-        except (DeviceError, ConfigurationError) as fault:
-            faults[name] = fault
+    faults = _faults_of(questions)
     if not faults:
         return
+    faults |= _faults_of({name: question for name, question in (further or {}).items() if name not in faults})
     if len(faults) == 1:
         raise next(iter(faults.values()))
     of_settings = all(isinstance(fault, ConfigurationError) for fault in faults.values())
     kind = ConfigurationError if of_settings else DeviceError
     listed = "".join(f"\n  {name}: {fault}" for name, fault in faults.items())
     raise kind(f"{len(faults)} of {len(questions)} devices cannot be used:{listed}") from next(iter(faults.values()))
+
+
+def _faults_of(questions: Questions) -> dict[str, CropError]:
+    faults: dict[str, CropError] = {}
+    for name, question in questions.items():
+        try:
+            question()
+        except (DeviceError, ConfigurationError) as fault:
+            faults[name] = fault
+    return faults

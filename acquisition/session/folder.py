@@ -399,7 +399,7 @@ class Session:
         counted = {frame.file for frame in self.frames()}
         moved: list[Path] = []
         for path in sorted(self.frames_folder.iterdir()):
-            if is_partial(path):
+            if is_partial(path.name):
                 path.unlink()
             elif f"frames/{path.name}" not in counted and not path.name.endswith(".stray"):
                 target = path.with_name(path.name + ".stray")

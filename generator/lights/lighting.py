@@ -14,6 +14,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import TYPE_CHECKING, Any, Final, Protocol, runtime_checkable
 
 import numpy as np
@@ -126,6 +127,7 @@ class Mixture:
             )
 
 
+@lru_cache(maxsize=1024)
 def plain(light: int) -> Mixture:
     """Return light number `light` alone: a mixture of one."""
     return Mixture((light,), (1.0,))

@@ -171,7 +171,9 @@ def read_picture(path: Path | str, max_side: int | None = None) -> Picture:
     return open_picture(Path(path), Preparation(max_side=max_side)).picture
 
 
-def open_picture(path: Path, preparation: Preparation = UNPREPARED, name: str | None = None) -> Reading:
+def open_picture(
+    path: Path, preparation: Preparation = UNPREPARED, name: str | None = None, data: bytes | None = None
+) -> Reading:
     """Return the sRGB codes of a picture file and how its profile was treated; the head of this file lists the steps.
 
     Parameters
@@ -182,6 +184,8 @@ def open_picture(path: Path, preparation: Preparation = UNPREPARED, name: str | 
         How the picture is prepared besides.
     name
         Name of the picture, which chooses the place of a random crop; its file's name if None.
+    data
+        The file's bytes, where they were read already.
 
     Returns
     -------
@@ -203,7 +207,7 @@ def open_picture(path: Path, preparation: Preparation = UNPREPARED, name: str | 
     >>> reading.picture.shape, reading.profile
     ((8, 8, 3), 'none, taken as sRGB')
     """
-    values = _read(path)
+    values = _read(path, data)
     light = values.light
     if values.linear:
         light = np.clip(np.nan_to_num(light, nan=0.0, posinf=1.0, neginf=0.0), 0.0, None)
@@ -244,7 +248,7 @@ class _Values:
     adobe_rgb: bool
 
 
-def _read(path: Path) -> _Values:
+def _read(path: Path, data: bytes | None) -> _Values:
     if not path.is_file():
         raise FormatError(f"cannot read {path}: there is no such file; name a picture")
     if path.suffix.lower() == ".avif":
@@ -253,10 +257,10 @@ def _read(path: Path) -> _Values:
         picture = read_avif(path, LARGEST_PICTURE)
         return _Values(picture.codes, picture.alpha, False, False, picture.orientation, picture.icc, False)
     with _named_in_text(path) as name:
-        return _read_named(path, name)
+        return _read_named(path, name, data)
 
 
-def _read_named(path: Path, name: str) -> _Values:
+def _read_named(path: Path, name: str, data: bytes | None) -> _Values:
     import OpenImageIO as oiio  # noqa: N813
 
     request = oiio.ImageSpec()
@@ -277,7 +281,9 @@ def _read_named(path: Path, name: str) -> _Values:
         kind = spec.format.basetype
         floating = kind in (oiio.HALF, oiio.FLOAT, oiio.DOUBLE)
         linear = floating and "srgb" not in space.replace("lin_srgb", "")
-        pixels = _jpeg(path) if stream.format_name() == "jpeg" and spec.nchannels == 3 else None
+        pixels = None
+        if stream.format_name() == "jpeg" and spec.nchannels == 3:
+            pixels = _jpeg(path.read_bytes() if data is None else data)
         if pixels is None:
             pixels = stream.read_image("float" if floating else "uint8" if kind == oiio.UINT8 else "uint16")
         if pixels is None or stream.has_error:
@@ -348,11 +354,10 @@ def _interoperability(path: Path) -> str:
     return str(index).strip("\0 ")
 
 
-def _jpeg(path: Path) -> npt.NDArray[np.uint8] | None:
+def _jpeg(data: bytes) -> npt.NDArray[np.uint8] | None:
     """Return the pixels (H, W, 3) uint8 of a usual colour JPEG in half of OpenImageIO's time, or None for another."""
     import simplejpeg
 
-    data = path.read_bytes()
     try:
         if simplejpeg.decode_jpeg_header(data)[2] != "YCbCr":
             return None

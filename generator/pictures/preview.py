@@ -66,6 +66,19 @@ def _shrink(image: Any, factor: int, out: Any) -> None:
             at += uint64(3)
 
 
+def _smaller(image: npt.NDArray[np.uint16], factor: int) -> npt.NDArray[np.uint16]:
+    """Return the rounded means (⌈H / factor⌉, ⌈W / factor⌉, 3) uint16 of the blocks of `image` (H, W, 3)."""
+    height, width = image.shape[:2]
+    if factor == 2 and height % 2 == width % 2 == 0:
+        # OpenCV's means of two by two are the same, halves rounded up, in a third of the time; of others they are not.
+        import cv2
+
+        return cv2.resize(image, (width // 2, height // 2), interpolation=cv2.INTER_AREA).astype(np.uint16, copy=False)
+    small = np.empty((-(-height // factor), -(-width // factor), 3), np.uint16)
+    _shrink(image, factor, small)
+    return small
+
+
 @compiled
 def _brightest(samples: Any, logs: Any) -> Any:
     """Return the largest channel of all pixels, and the sum over pixels of the logarithm of the largest channel.
@@ -140,9 +153,7 @@ def preview_of(image: npt.NDArray[np.uint16], white_level: int, side: int = PREV
     height, width = image.shape[:2]
     factor = -(-max(height, width) // side)
     if factor > 1:
-        small = np.empty((-(-height // factor), -(-width // factor), 3), np.uint16)
-        _shrink(np.ascontiguousarray(image), factor, small)
-        image = small
+        image = _smaller(np.ascontiguousarray(image), factor)
     brightness, logs, roots = _tables(white_level)
     samples = np.ascontiguousarray(image).reshape(-1)
     top, total = _brightest(samples, logs)

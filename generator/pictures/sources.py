@@ -34,6 +34,11 @@ SUFFIXES: Final = frozenset(
 UNREADABLE: Final = frozenset({".heic", ".heif"})
 """Ends of pictures' names that no library of a plain installation reads; those in a folder are told."""
 
+_CHUNK: Final = 1 << 20
+"""Bytes of a file that are read at a time."""
+_KEPT: Final = 1 << 25
+"""Most bytes of a file that is read once, to be hashed and decoded: 32 MiB are nothing beside what it unpacks to."""
+
 _log = logging.getLogger(__name__)
 
 _MACHINE_ERRORS: Final = frozenset(
@@ -136,12 +141,9 @@ class PictureFile:
             does not answer. The picture must not be left out then as if it were damaged.
         """
         with _local_file(self.location) as path:
-            digest = hashlib.sha256()
             try:
-                with path.open("rb") as stream:
-                    while chunk := stream.read(1 << 20):
-                        digest.update(chunk)
-                reading = open_picture(path, self.preparation, self.name)
+                sha256, data = _hashed(path)
+                reading = open_picture(path, self.preparation, self.name, data)
             except FormatError as error:
                 raise FormatError(str(error).replace(str(path), self.location)) from error
             except OSError as error:
@@ -150,7 +152,7 @@ class PictureFile:
                 raise InputError(
                     f"there is not enough memory to read {self.location}; use fewer workers, or leave it out"
                 ) from error
-        return SourcePicture(reading.picture, digest.hexdigest(), reading.profile, reading.cuts)
+        return SourcePicture(reading.picture, sha256, reading.profile, reading.cuts)
 
 
 def hash_since(source: Source, moment: float) -> str | None:
@@ -198,6 +200,19 @@ def _local_file(location: str) -> Generator[Path]:
             gone = isinstance(error, FileNotFoundError)
             raise _unreadable(location, error, of_the_file=gone and _folder_is_there(store, path)) from error
         yield Path(copy.name)
+
+
+def _hashed(path: Path) -> tuple[str, bytes | None]:
+    """Return the SHA-256 of a file, and its bytes where they are few enough to be kept until they are decoded."""
+    digest, chunks, size = hashlib.sha256(), list[bytes](), 0
+    # Without a buffer of Python's own, which asks the system four questions about each file.
+    with path.open("rb", buffering=0) as stream:
+        while chunk := stream.read(_CHUNK):
+            digest.update(chunk)
+            size += len(chunk)
+            if size <= _KEPT:
+                chunks.append(chunk)
+    return digest.hexdigest(), b"".join(chunks) if size <= _KEPT else None
 
 
 def _is_of_the_file(path: Path, error: OSError) -> bool:

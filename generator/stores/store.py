@@ -21,11 +21,12 @@ from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, BinaryIO, Final, Protocol, cast
 
 from foundation.errors import CropError, FormatError, StorageError
-from foundation.files import is_partial, partial_path, reading_error, storage_error, sync_folder
+from foundation.files import is_partial, partial_name, reading_error, storage_error, sync_folder
 from foundation.trust.foreign_folders import is_inside_name, open_inside
 from foundation.trust.secret_texts import masked
 from generator.stores.places import filesystem, is_remote, local_path
@@ -36,6 +37,10 @@ Pieces = Iterable[bytes | memoryview]
 _SYNC_THREADS: Final = 16
 """Files synchronised at a time: a file system commits its journal once for all that wait, so that sixteen waits cost
 little more than one."""
+
+_BUFFER: Final = 1 << 16
+"""Bytes that are gathered before they are written; larger pieces are written as they are. Python asks the system twice
+for a size where none is given, and each question hands the interpreter's lock to another thread."""
 
 _WITH_FOLDERS: Final = frozenset({"ftp", "sftp", "ssh", "smb", "webdav", "webdavs", "hdfs", "arrow_hdfs"})
 """Stores by fsspec's names in which a file lies in a folder that has to be there; an object store might make a bucket
@@ -106,23 +111,25 @@ class LocalStore:
     @contextmanager
     def create(self, name: str) -> Generator[BinaryIO]:
         """Open a file to be written; it appears when the block ends well, and is on the disk once synchronised."""
-        path = self.root / name
+        # As text: to put a path together takes pathlib longer than to open, write and rename a small file.
+        path = f"{self.root}/{name}"
+        folder, _, leaf = path.rpartition("/")
         # Named by chance, because two programs may be at the same shard; see `foundation.files.is_partial`.
-        hidden = partial_path(path.with_name(f"{path.name}.{secrets.token_hex(8)}"))
+        hidden = f"{folder}/{partial_name(f'{leaf}.{secrets.token_hex(8)}')}"
         try:
             try:
-                stream = hidden.open("wb")
+                stream = open(hidden, "wb", _BUFFER)  # noqa: PTH123, SIM115
             except FileNotFoundError:
-                self._make_folder(path.parent)
-                stream = hidden.open("wb")
+                self._make_folder(Path(folder))
+                stream = open(hidden, "wb", _BUFFER)  # noqa: PTH123, SIM115
             with stream:
                 yield stream
-            hidden.replace(path)
+            os.replace(hidden, path)  # noqa: PTH105
         except BaseException as error:
             with contextlib.suppress(OSError):
-                hidden.unlink(missing_ok=True)
+                Path(hidden).unlink(missing_ok=True)
             if isinstance(error, OSError) and not isinstance(error, CropError):
-                raise storage_error(path, error) from error
+                raise storage_error(Path(path), error) from error
             raise
 
     def _make_folder(self, folder: Path) -> None:
@@ -132,11 +139,10 @@ class LocalStore:
 
     def sync(self, names: Iterable[str]) -> None:
         """Wait until these files and their names are on the disk."""
-        paths = [self.root / name for name in names]
-        with ThreadPoolExecutor(_SYNC_THREADS) as pool:
-            list(pool.map(_sync_file, paths))
-        for folder in {path.parent for path in paths}:
-            sync_folder(folder)
+        paths = [f"{self.root}/{name}" for name in names]
+        list(_syncing().map(_sync_file, paths))
+        for folder in {path.rpartition("/")[0] for path in paths}:
+            sync_folder(Path(folder))
 
     def get(self, name: str) -> bytes:
         """Return a file's bytes."""
@@ -164,7 +170,7 @@ class LocalStore:
         """Return the names of all files below `folder`."""
         for path, _, files in os.walk(self.root / folder):
             below = Path(path).relative_to(self.root)
-            yield from ((below / file).as_posix() for file in files if not is_partial(Path(file)))
+            yield from ((below / file).as_posix() for file in files if not is_partial(file))
 
     def remove(self, folder: str) -> None:
         """Remove a folder with all that is below it, if it is there."""
@@ -174,11 +180,22 @@ class LocalStore:
         """Remove writes that never finished; nobody else may be writing."""
         for path, _, files in os.walk(self.root):
             for file in files:
-                if is_partial(Path(file)):
+                if is_partial(file):
                     (Path(path) / file).unlink(missing_ok=True)
 
 
-def _sync_file(path: Path) -> None:
+@lru_cache(maxsize=1)
+def _syncing() -> ThreadPoolExecutor:
+    """Return the threads that synchronise files: to start them for a few files takes as long as the files do."""
+    return ThreadPoolExecutor(_SYNC_THREADS, "sync")
+
+
+if hasattr(os, "register_at_fork"):
+    # A program that is forked has none of them.
+    os.register_at_fork(after_in_child=_syncing.cache_clear)
+
+
+def _sync_file(path: str) -> None:
     try:
         handle = os.open(path, os.O_RDONLY)
         try:
@@ -186,7 +203,7 @@ def _sync_file(path: Path) -> None:
         finally:
             os.close(handle)
     except OSError as error:
-        raise storage_error(path, error) from error
+        raise storage_error(Path(path), error) from error
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ import pytest
 
 from foundation import errors
 from foundation.console import EXIT_CODES, Ending, loaded, orderly_end, progress, run
-from foundation.errors import InputError
+from foundation.errors import FormatError, InputError
 
 
 def test_success_says_nothing(capsys: pytest.CaptureFixture[str]) -> None:
@@ -333,8 +333,15 @@ def test_a_working_folder_that_is_gone_is_said(
     gone.mkdir()
     monkeypatch.chdir(gone)
     gone.rmdir()
+    said = "the folder in which this was started is gone; change to one that is there"
     assert run(lambda: Path("x").resolve()) == 2
-    assert "the folder in which this was started is gone; change to one that is there" in capsys.readouterr().err
+    assert said in capsys.readouterr().err
+
+    def missing() -> None:
+        raise FormatError("x is no session: it holds no journal.sqlite; name a folder made by acquire run or import")
+
+    assert run(missing) == 2
+    assert said in capsys.readouterr().err
     monkeypatch.chdir(tmp_path)
 
 

@@ -22,6 +22,7 @@ from foundation.files import (
     read_whole,
     require_free,
     require_free_file,
+    storage_error,
     whole_file,
     whole_folder,
     write_whole,
@@ -125,6 +126,16 @@ class TestWholeFile:
         assert path.read_text() == "old"
         assert names(tmp_path) == ["a.csv"]
 
+    def test_a_link_to_nowhere_is_told(self, tmp_path: Path) -> None:
+        (tmp_path / "link").symlink_to(tmp_path / "gone" / "a.csv")
+        with pytest.raises(InputError, match=r"link: .*it is a link to a place that is not there"):
+            raise storage_error(tmp_path / "link", FileNotFoundError(errno.ENOENT, "No such file or directory"))
+
+    @pytest.mark.skipif(not Path("/proc/self").exists(), reason="this system has no /proc")
+    def test_a_file_system_that_takes_no_files_is_told_from_a_disk_that_is_gone(self) -> None:
+        with pytest.raises(InputError, match=r"cannot write /proc/crop: .*name a place on an ordinary disk"):
+            write_whole(Path("/proc/crop"), "x")
+
     def test_a_name_below_a_file_is_told(self, tmp_path: Path) -> None:
         write_whole(tmp_path / "file", "x")
         for path in (tmp_path / "file" / "a", tmp_path / "file" / "deeper" / "a"):
@@ -216,7 +227,7 @@ class TestWholeFile:
         done = subprocess.run([sys.executable, "-c", program, str(tmp_path / "a")], check=False)
         assert done.returncode == -signal.SIGKILL
         assert (tmp_path / "a").read_text() == "old"
-        assert [is_partial(tmp_path / name) for name in names(tmp_path)] == [True, False]
+        assert [is_partial(name) for name in names(tmp_path)] == [True, False]
         write_whole(tmp_path / "a", "new")
         assert names(tmp_path) == ["a"]
 
@@ -227,7 +238,7 @@ class TestWholeFolder:
         with whole_folder(path, "the table") as folder:
             (folder / "samples.npy").write_bytes(b"1")
             assert not path.exists()
-            assert is_partial(folder)
+            assert is_partial(folder.name)
         assert names(path) == ["samples.npy"]
         assert names(path.parent) == ["lut"]
 
@@ -291,9 +302,9 @@ class TestWholeFolder:
 
 def test_partial_names_are_told_from_others() -> None:
     assert partial_path(Path("frames/a.CR2")) == Path("frames/.a.CR2.partial")
-    assert is_partial(Path("frames/.a.CR2.partial"))
-    assert not is_partial(Path("frames/a.CR2.partial"))
-    assert not is_partial(Path("frames/.hidden"))
+    assert is_partial(".a.CR2.partial")
+    assert not is_partial("a.CR2.partial")
+    assert not is_partial(".hidden")
 
 
 def test_require_free(tmp_path: Path) -> None:

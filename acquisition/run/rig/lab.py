@@ -77,7 +77,13 @@ def open_lab(settings: LabSettings, session: Session | None, opened: ExitStack) 
         opened.callback(cameras[0].close)
 
     # One that cannot be opened does not keep the others' faults from being told.
-    ask_all({"projector": open_projector, "display": open_presenter, "camera": open_camera})
+    ask_all(
+        {"projector": open_projector, "display": open_presenter, "camera": open_camera},
+        {
+            "projector": lambda: [projector.identity() for projector in projectors],
+            "camera": lambda: [camera.identity() for camera in cameras],
+        },
+    )
     return Devices(cameras[0], presenters[0], projectors[0] if projectors else None, clock)
 
 

@@ -82,6 +82,9 @@ def test_every_device_of_a_real_lab_is_opened_though_another_fails(
         def __init__(self, name: str) -> None:
             self._name = name
 
+        def identity(self) -> str:
+            return self._name
+
         def close(self) -> None:
             closed.append(self._name)
 
@@ -99,6 +102,33 @@ def test_every_device_of_a_real_lab_is_opened_though_another_fails(
         assert (SAYS[name] in str(told.value)) == (name in faulty)
     # What was opened is closed, whatever failed beside it.
     assert sorted(closed) == sorted(set(DEVICES) - set(faulty))
+
+
+@pytest.mark.parametrize("silent", [("camera",), ("projector",), ("camera", "projector")], ids="+".join)
+def test_a_device_that_opens_and_does_not_answer_is_told_beside_one_that_does_not_open(
+    monkeypatch: pytest.MonkeyPatch, silent: tuple[str, ...]
+) -> None:
+    def no_display(*_: object) -> None:
+        raise ConfigurationError(SAYS["display"])
+
+    class Sound:
+        def identity(self) -> None:
+            pass
+
+        def close(self) -> None:
+            pass
+
+    monkeypatch.setattr(rig, "_lab_presenter", no_display)
+    for name in ("camera", "projector"):
+
+        def opens(*_: object, name: str = name) -> Broken | Sound:
+            return Broken(SAYS[name]) if name in silent else Sound()
+
+        monkeypatch.setattr(rig, f"_lab_{name}", opens)
+    with pytest.raises(DeviceError) as told, ExitStack() as opened:
+        rig.open_lab(lab_settings(), None, opened)
+    for name in DEVICES:
+        assert (SAYS[name] in str(told.value)) == (name in (*silent, "display"))
 
 
 def test_faults_of_the_settings_alone_are_the_settings_fault() -> None:

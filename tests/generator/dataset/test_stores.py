@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import hashlib
+import os
 import shutil
+import subprocess
+import sys
 from collections.abc import Callable, Iterator
 from contextlib import nullcontext
 from pathlib import Path
@@ -235,3 +238,24 @@ def test_a_file_of_a_block_that_fails_does_not_appear(tmp_path: Path) -> None:
             fail(store)
         assert not store.has("a/b")
         assert list(store.names()) == []
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="this system does not fork")
+def test_a_program_that_was_forked_synchronises_its_files(tmp_path: Path) -> None:
+    # In a process of its own: to fork this one with its threads is not safe.
+    program = (
+        "import os, signal, sys\n"
+        "from pathlib import Path\n"
+        "from generator.stores.store import LocalStore\n"
+        "store = LocalStore(Path(sys.argv[1]))\n"
+        "store.put('a', b'1'); store.sync(['a'])\n"
+        "child = os.fork()\n"
+        "if not child:\n"
+        "    signal.alarm(60)\n"
+        "    store.put('b', b'2'); store.sync(['b'])\n"
+        "    os._exit(0)\n"
+        "sys.exit(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))\n"
+    )
+    ran = subprocess.run([sys.executable, "-c", program, str(tmp_path)], capture_output=True, text=True, check=False)
+    assert ran.returncode == 0, ran.stderr
+    assert (tmp_path / "b").read_bytes() == b"2"

@@ -132,6 +132,19 @@ def test_a_picture_that_memory_does_not_hold_is_named(
         find_pictures(path)[0].read()
 
 
+@pytest.mark.parametrize("name", ["a.jpg", "a.png"])
+def test_a_file_of_any_size_is_read_and_hashed_alike(
+    tmp_path: Path, colours: npt.NDArray[np.uint8], monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
+    source = find_pictures(write(tmp_path / name, colours, "uint8"))[0]
+    at_once = source.read()
+    monkeypatch.setattr(scene, "_KEPT", 10)
+    monkeypatch.setattr(scene, "_CHUNK", 7)
+    in_pieces = source.read()
+    assert at_once.sha256 == in_pieces.sha256 == hashlib.sha256((tmp_path / name).read_bytes()).hexdigest()
+    np.testing.assert_array_equal(at_once.picture, in_pieces.picture)
+
+
 def test_links_that_lead_round_in_a_circle_are_passed_over(tmp_path: Path, colours: npt.NDArray[np.uint8]) -> None:
     write(tmp_path / "picture.png", colours, "uint8")
     (tmp_path / "a.png").symlink_to(tmp_path / "b.png")
@@ -149,7 +162,7 @@ def test_faults_of_a_file_and_of_the_machine_are_distinguished(
     (tmp_path / "a.png").write_bytes(b"any")
     (source,) = find_pictures([tmp_path])
 
-    def fail(*_: object) -> None:
+    def fail(*_: object, **__: object) -> None:
         raise OSError(number, os.strerror(number))
 
     monkeypatch.setattr(Path, "open", fail)

@@ -106,3 +106,14 @@ def test_a_pixel_of_a_preview_is_the_mean_of_what_it_stands_for(image: npt.NDArr
     )
     rounded = np.floor(means + 0.5).astype(np.uint16)
     assert np.abs(preview_of(image, 65535, side).astype(int) - preview_of(rounded, 65535, side)).max() <= 1
+
+
+@pytest.mark.parametrize("shape", [(64, 90, 3), (64, 89, 3), (63, 90, 3)])
+def test_means_of_two_by_two_are_rounded_as_all_others(shape: tuple[int, ...]) -> None:
+    image = np.random.default_rng(5).integers(0, 65536, shape, dtype=np.uint16)
+    rows, columns = np.arange(0, shape[0], 2), np.arange(0, shape[1], 2)
+    sums, pixels = image.astype(np.int64), np.ones(shape, np.int64)
+    for axis, starts in enumerate((rows, columns)):
+        sums, pixels = np.add.reduceat(sums, starts, axis), np.add.reduceat(pixels, starts, axis)
+    rounded = ((2 * sums + pixels) // (2 * pixels)).astype(np.uint16)
+    np.testing.assert_array_equal(preview_of(image, 65535, 45), preview_of(rounded, 65535, 45))
