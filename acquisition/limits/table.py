@@ -100,7 +100,7 @@ ONLY_OF_A_SESSION: tuple[str, ...] = (
     "truth_median_deg", "truth_worst_deg", "off_brightness", "white_short", "exchanged_lights", "exchange_deg",
     "held_share", "white_frame_deg", "white_frame_brightness", "primaries_lacking", "stray_share", "code_misfit",
     # Of the lens, which is measured on the frames of the primaries.
-    "correction_residual",
+    "correction_residual", "correction_worst",
     # Of the noise of the cells.
     "noise_misfit", "noisy_share",
 )  # fmt: skip

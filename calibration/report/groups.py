@@ -26,9 +26,9 @@ _THRESHOLDS: Final[dict[Group, tuple[str, ...]]] = {
         "held_share", "white_frame_deg", "white_frame_brightness", "white_frames", "primaries_lacking",
     ),
     "radiometry": (
-        "correction_residual", "unfit_share", "doubtful_share", "added_light", "disturbed_cells", "unlike_scatter",
-        "unlike_block", "other_camera", "other_lens", "other_exposure", "other_iso", "black_drift_counts", "linearity",
-        "grey_tint_deg", "brightest_share", "darkest_counts",
+        "correction_residual", "correction_worst", "unfit_share", "doubtful_share", "added_light", "disturbed_cells",
+        "unlike_scatter", "unlike_block", "other_camera", "other_lens", "other_exposure", "other_iso",
+        "black_drift_counts", "linearity", "grey_tint_deg", "brightest_share", "darkest_counts",
     ),
     "noise": ("noise_misfit", "noisy_share"),
     "truth": ("references_used", "reference_spread", "truth_median_deg", "truth_worst_deg"),

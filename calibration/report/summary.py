@@ -100,9 +100,11 @@ def _lens(figures: TableFigures) -> tuple[str, str]:
     if not lens.measured:
         return "not measured", lens.why_not
     veil = f"a veil of {100 * lens.veil:.2f} ± {100 * lens.veil_error:.2f} % of the mean light"
+    dark = f"{100 * lens.left_worst:.2g} % in cells of {100 * lens.worst_level:.2g} % of paper"
+    left = f"{100 * lens.left:.2g} % RMS, {dark},"
     if not lens.corrected and not lens.beyond_cell:
-        return "none", f"{lens.why_not}; {veil}, and {100 * lens.left:.2g} % RMS is what it may do to cells' means"
-    done = f"subtracted, {100 * lens.residual:.2g} % are left" if lens.corrected else f"not subtracted: {lens.why_not}"
+        return "none", f"{lens.why_not}; {veil} is likeliest, and {left} is what may be in cells' means"
+    done = f"subtracted, {left} may be left" if lens.corrected else f"not subtracted: {lens.why_not}"
     size = f"{100 * lens.rms:.2g} % RMS, {100 * lens.worst:.2g} % at most"
     return size, f"of cells' means above 300 counts, relative to paper, {veil} in it; {done}"
 

@@ -9,7 +9,7 @@ P patches as in `PrintedGrid`; counts above black; half-size pixels.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from itertools import pairwise
 from typing import Any
 
@@ -185,10 +185,13 @@ class LensFigures:
     ----------
     rms, worst
         Change of the cells' means relative to paper, RMS and the largest; 0 where nothing is corrected.
-    residual
-        RMS error that the means have after it, by the shares' standard errors, proven or not.
+    residual, residual_worst
+        RMS error that the means have after it, and that of the cell that it is largest of: by the shares' standard
+        errors, proven or not, and by what is likely of the veil but not subtracted.
+    worst_level
+        Level of that cell, bare paper 1.
     veil, veil_error
-        Share of the frame's mean light that lies on all of it, and its standard error.
+        Likeliest share of the frame's mean light that lies on all of it, subtracted or not, and its standard error.
     beyond_cell
         Share of the light of a window's worst sample that the kernels bring from beyond its cell, channel by channel
         the largest.
@@ -203,6 +206,8 @@ class LensFigures:
     rms: float
     worst: float
     residual: float
+    residual_worst: float
+    worst_level: float
     veil: float
     veil_error: float
     beyond_cell: float
@@ -214,7 +219,7 @@ class LensFigures:
     @staticmethod
     def unknown(why_not: str) -> LensFigures:
         """Return the figures of a lens that could not be measured, and why."""
-        return LensFigures(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, measured=False, corrected=False, why_not=why_not)
+        return LensFigures(*(0.0,) * 9, measured=False, corrected=False, why_not=why_not)
 
     @property
     def uncorrected_in_worst(self) -> float:
@@ -224,11 +229,24 @@ class LensFigures:
     @property
     def left(self) -> float:
         """RMS error that the lens leaves in the means of cells, relative to paper."""
-        return self.residual if self.corrected or not self.beyond_cell else float(np.hypot(self.rms, self.residual))
+        return self._left(self.rms, self.residual)
+
+    @property
+    def left_worst(self) -> float:
+        """The same of the cell that it is largest of."""
+        return self._left(self.worst, self.residual_worst)
+
+    def _left(self, size: float, residual: float) -> float:
+        return residual if self.corrected or not self.beyond_cell else float(np.hypot(size, residual))
+
+    @property
+    def veil_at_most(self) -> float:
+        """Share of the frame's mean light that the veil hardly exceeds: two standard errors above the likeliest."""
+        return self.veil + 2 * self.veil_error
 
     def to_json(self) -> dict[str, Any]:
         """Return the figures as `lut.json` and `report.json` state them."""
-        shares = ("rms", "worst", "residual", "veil", "veil_error", "beyond_cell", "left_in_worst")
+        shares = [one.name for one in fields(self) if isinstance(getattr(self, one.name), float)]
         found: dict[str, Any] = {name: float(f"{getattr(self, name):.4g}") for name in shares}
         return {"measured": self.measured, "corrected": self.corrected, "why_not": self.why_not, **found}
 
@@ -410,6 +428,8 @@ def _figures(
     amounts = spread.amounts()
     corrected: list[_Array] = []
     unknown: list[_Array] = []
+    levels: list[_Array] = []
+    mean_square = spread.unexplained
     for one, scale in zip(data, scales, strict=True):
         expected = predicted_levels(one.level[:, None], bits)[:, 0]
         lit = one.usable & (one.level * scale[-1] > least_counts)
@@ -417,8 +437,9 @@ def _figures(
         change = (one.changes[lit] - np.outer(expected[lit], scale[:-1])) / one.level[lit, None]
         terms = terms_of(one.channel)
         corrected.append(change @ spread.shares[terms])
-        unknown.append(((change @ spread.covariance[np.ix_(terms, terms)]) * change).sum(axis=1))
-    size, left = np.concatenate(corrected), np.concatenate(unknown)
+        unknown.append(((change @ mean_square[np.ix_(terms, terms)]) * change).sum(axis=1))
+        levels.append(one.level[lit])
+    size, left, level = np.concatenate(corrected), np.concatenate(unknown), np.concatenate(levels)
     worst, mean = _beyond_cell(around)
     near = amounts[:, :, : len(NEAR_PX)]
     wide = amounts[:, :, len(NEAR_PX) :].sum(axis=2)
@@ -427,7 +448,9 @@ def _figures(
         rms=0.0 if nothing else float(np.sqrt((size**2).mean())),
         worst=0.0 if nothing else float(np.abs(size).max()),
         residual=0.0 if nothing else float(np.sqrt(left.mean())),
-        veil=float(amounts[0, 0, -1]),
+        residual_worst=0.0 if nothing else float(np.sqrt(left.max())),
+        worst_level=0.0 if nothing else float(level[np.argmax(left)]),
+        veil=float(spread.likeliest[-1]),
         veil_error=float(spread.errors()[0, 0, -1]),
         beyond_cell=float((near @ worst + wide).max()),
         left_in_worst=float((near @ (worst - mean)).max()),

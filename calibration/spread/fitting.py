@@ -9,7 +9,8 @@ Rules that hold inside:
 - Nothing that carries a cell's own noise is among the regressors: own levels are predicted ones there.
 - What the field's fit and the print's unevenness can be wrong by, smooth factors of a cell's level, is fitted along,
   and held near 0 by what is usual of them. Veil is told from it since it adds the same to dark and bright cells.
-- A far kernel's share is not below 0, and a kernel whose omission costs less than `LEAST_GAIN` is left out.
+- A far kernel's share is not below 0, and a kernel whose omission costs less than `LEAST_GAIN` is left out. The veil is
+  not: beside kernels that are proven it has its likeliest share, which `USUAL_VEIL` holds towards 0.
 
 C cells in the order of colour indices; T unknowns of a channel.
 """
@@ -267,19 +268,23 @@ def fit_spread(
     if bits < VARYING_BITS:
         candidates = [group for group in candidates if len(group) <= _EVEN_TERMS]
     even = float(_positive(matrix, vector, _terms(candidates))[0][-1])
+    veil = _terms(candidates[-1:])
     if misfit > MOST_MISFIT or (bits < VARYING_BITS and even > MOST_VEIL):
         # Other light lies smoothly over the frame, or shares grow towards the corners where cells are too few to see
         # it; what an even veil would have been taken for is not known.
         covariance[-1, -1] += even**2
         candidates.pop()
+        veil = veil[:0]
     kept = _selected(matrix, vector, misfit, candidates)
-    shares, gain = _positive(matrix, vector, kept)
+    _, gain = _positive(matrix, vector, kept)
+    # No lens is without a veil: to leave out one that is not certain is to be wrong by all of it.
+    likeliest = np.round(_positive(matrix, vector, np.union1d(kept, veil))[0] / _ROUNDING) * _ROUNDING
     held_out = 0.0
     for fold in range(FOLDS):
         others = normal.sum(axis=0) - normal[fold], right.sum(axis=0) - right[fold]
         with_kernels, without = (_solved(*others, prior, chosen) for chosen in (kept, kept[:0]))
         held_out += _explained(normal[fold], right[fold], with_kernels) - _explained(normal[fold], right[fold], without)
-    found = PointSpread(np.round(shares / _ROUNDING) * _ROUNDING, covariance, gain, held_out, misfit)
+    found = PointSpread(likeliest, covariance, gain, held_out, misfit, likeliest)
     return found if found.proven else replace(found, shares=np.zeros(TERMS))
 
 

@@ -97,17 +97,20 @@ class PointSpread:
     Attributes
     ----------
     shares
-        (TERMS,) float64, unknowns as `terms_of` has them; 0 where a kernel is not proven.
+        (TERMS,) float64, unknowns as `terms_of` has them, by which frames are corrected: 0 where a kernel is not
+        proven, all of them where none is. Every lens has a veil: beside a proven kernel it has its likeliest share.
     covariance
         (TERMS, TERMS) float64, of all unknowns measured together, proven or not.
     gain
         By how much the kernels lower the sum of squares of what cells of known colour differ by, in units of its
-        variance: what chance gives is one for each unknown.
+        variance: what chance gives is one for each unknown; the proven ones'.
     held_out
         The same for parts of the print that the shares were not fitted on, each from the others.
     misfit
         What is left of light that lies smoothly over the print and is none of the kernels', over what chance leaves,
         ≥ 1: the covariance has been multiplied by it.
+    likeliest
+        (TERMS,) float64, as `shares`, whether they are proven or not: what is known beside the covariance.
     """
 
     shares: _Array
@@ -115,6 +118,16 @@ class PointSpread:
     gain: float
     held_out: float
     misfit: float
+    likeliest: _Array
+
+    @property
+    def unexplained(self) -> _Array:
+        """(T, T) float64, mean square of what the T shares may be off by: their variance, and what is left out.
+
+        Of what is likely but not subtracted the standard errors alone would say too little.
+        """
+        left_out = self.likeliest - self.shares
+        return self.covariance + np.outer(left_out, left_out)
 
     @property
     def proven(self) -> bool:

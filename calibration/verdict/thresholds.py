@@ -68,6 +68,10 @@ class Threshold:
 
 _FLATTEN = "hang the print flatter"
 _FIX = "fix camera and print, and let nobody walk about"
+_LESS_VEIL = (
+    "take frames of red, green and blue alone and a chart of more colours, use the lens's hood, hang black cloth "
+    "around the print, and keep lights and bright walls out of its view"
+)
 _WARM_UP = "let the lamp warm up for longer before the session"
 
 THRESHOLDS: tuple[Threshold, ...] = (
@@ -93,8 +97,14 @@ THRESHOLDS: tuple[Threshold, ...] = (
         "what the lens spreads, or may spread as a veil that an evenly lit print cannot show, is in the samples",
         SIMULATED + ": 0.1 to 0.2 % where light falls off towards the corners, and the means are as good; 1.4 % in "
         "even light or on a chart of 512 colours, which do not show a veil of the usual 1 %",
-        "take frames of red, green and blue alone and a chart of more colours, shade the lens, and keep lights and "
-        "bright walls out of its view",
+        _LESS_VEIL,
+    ),
+    Threshold(
+        "correction_worst", "The same in the cell that it is largest of", "share", "at most", 0.03, None,
+        "a veil adds as much to dark cells as to bright ones, so that dark ones are off by several times the mean",
+        "geometry: by a cell of a twentieth of paper six times the veil's error; 3 % is three standard deviations of "
+        "a mean of 300 counts; " + SIMULATED + ": 0.3 to 1.9 % where the mean is accepted",
+        _LESS_VEIL,
     ),
     Threshold(
         "tag_residual_px", "Residual of tags, plane and lens", "px RMS", "at most", 2.5, MAX_TAG_RESIDUAL_PX,

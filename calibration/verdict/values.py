@@ -10,10 +10,14 @@ from calibration.figures.table_figures import TableFigures
 from calibration.sampling.windows import bleed
 from calibration.spread.fitting import MOST_MISFIT
 from calibration.verdict.retaking import added_bleed
+from calibration.verdict.thresholds import THRESHOLDS
 from foundation.angles import angles_deg
 
 _LEAST_CELLS = 8**4
 """Cells from which on a veil is told from other smooth light."""
+
+_MOST_LEFT = next(limit.accept for limit in THRESHOLDS if limit.name == "correction_residual")
+"""RMS error left by the lens from which on its remark speaks of the worst cells, too."""
 
 
 def judged_values(figures: TableFigures) -> dict[str, float]:
@@ -50,6 +54,8 @@ def _registration_values(figures: TableFigures) -> dict[str, float]:
     told = spread is None or spread.misfit <= MOST_MISFIT or _cell_count(figures) >= _LEAST_CELLS
     if figures.lens.measured and told:
         values["correction_residual"] = figures.lens.left
+        if figures.lens.left <= _MOST_LEFT:
+            values["correction_worst"] = figures.lens.left_worst
     if registration.framing.field is None:
         found = len(registration.framing.tags)
         values["tags_found"] = found / max(found + len(registration.framing.missing), 1)

@@ -127,6 +127,8 @@ def _place(row: JudgedValue, figures: TableFigures) -> str:
         case "held_share":
             codes = figures.lights.codes
             return "" if codes is None else f"{int(codes.held.sum())} of {len(codes.held)}"
+        case "correction_residual" | "correction_worst":
+            return _left_by_lens(figures)
         case "other_camera":
             return _foreign(figures.origins.other_camera)
         case "other_lens":
@@ -137,6 +139,16 @@ def _place(row: JudgedValue, figures: TableFigures) -> str:
             return _foreign(figures.origins.other_exposure)
         case _:
             return places_text(explain(row.threshold.name, row.threshold.accept, figures))
+
+
+def _left_by_lens(figures: TableFigures) -> str:
+    """Return how large a veil may be, and which cells are furthest off by what the lens may have left."""
+    lens = figures.lens
+    found = f"{100 * lens.veil:.2f} ± {100 * lens.veil_error:.2f} % of the mean light"
+    return (
+        f"a veil of {found} was found, so that up to {100 * lens.veil_at_most:.2g} % is not excluded; cells of "
+        f"{100 * lens.worst_level:.2g} % of paper may be off by {100 * lens.left_worst:.2g} %"
+    )
 
 
 def _exchanges(figures: TableFigures) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +19,8 @@ from calibration.table.description import describe
 from calibration.table.lut import open_lut
 from calibration.table.verification import find_faults
 from calibration.verdict.values import judged_values
+from calibration.verdict.verdict import judge
+from calibration.verdict.wording import remark
 from foundation.errors import InputError
 
 
@@ -68,3 +71,18 @@ def test_the_command_takes_a_window(session: Session, tmp_path: Path, capsys: py
     assert code == 4
     assert "a smaller window (build-lut --window)" in said
     assert json.loads((tmp_path / "lut.refused" / "report.json").read_text())["channels"]["window"] == 9
+
+
+def test_dark_cells_that_the_lens_may_have_left_wrong_are_named_with_its_veil(session: Session, tmp_path: Path) -> None:
+    figures = build(session, tmp_path / "lut").figures
+    lens = replace(figures.lens, measured=True, corrected=True, residual=0.008, residual_worst=0.034, worst_level=0.045)
+    few = replace(figures, lens=replace(lens, veil=0.003, veil_error=0.0035), point_spread=None)
+    (row,) = (row for row in judge(judged_values(few)).remarks if row.threshold.name.startswith("correction"))
+    text = remark(row, few)
+    assert "up to 1 % is not excluded; cells of 4.5 % of paper may be off by 3.4 %" in text
+    assert "hood" in text
+    # Where the mean is remarked on, it is said once.
+    many = replace(few, lens=replace(few.lens, residual=0.02, residual_worst=0.06))
+    (row,) = (row for row in judge(judged_values(many)).remarks if row.threshold.name.startswith("correction"))
+    assert row.threshold.name == "correction_residual"
+    assert "cells of 4.5 % of paper may be off by 6 %" in remark(row, many)

@@ -264,6 +264,40 @@ def test_a_veil_in_even_light_is_not_known_and_that_is_said(sharp: Photograph) -
     assert known.veil == pytest.approx(0.01, abs=3 * known.veil_error)
 
 
+@pytest.mark.parametrize("seed", [0, 1])
+def test_a_veil_that_is_not_certain_is_taken_out_beside_shoulders_that_are(seed: int) -> None:
+    shot = photograph(shoulder=0.03, veil=0.006, falloff=0.25, seed=seed)
+    spread, figures = shot.measured()
+    assert figures.corrected
+    assert 0 < figures.veil < 4 * figures.veil_error
+    assert figures.veil == pytest.approx(0.006, abs=2 * figures.veil_error)
+    kernels = spread.shares.copy()
+    kernels[-1] = 0
+    left, with_veil = (
+        shot.error(shot.clean - FrameCorrection.of(one, shot.view, shot.around).added(shot.seen))
+        for one in (spread, replace(spread, shares=kernels))
+    )
+    assert left < 0.5 * with_veil
+    assert left < figures.residual
+
+
+def test_what_is_likely_and_not_subtracted_is_said_to_be_left() -> None:
+    """A lens of which nothing is certain: no sample is changed, and the figures are those of its likely veil."""
+    shot = photograph(veil=0.006, seed=1)
+    spread, figures = shot.measured()
+    assert not figures.corrected
+    assert not spread.shares.any()
+    assert figures.veil == pytest.approx(0.006, abs=2 * figures.veil_error)
+    assert figures.veil_at_most > 0.006
+    true = shot.true[: shot.chart.colour_count]
+    white = (shot.clean[shot.view.whites] / shot.true[shot.view.whites]).mean(axis=0)
+    off = np.abs(shot.clean[: shot.chart.colour_count] / white / true - 1)[true > LEAST_COUNTS]
+    assert 0.8 * shot.error(shot.clean) < figures.residual
+    assert 0.7 * off.max() < figures.residual_worst
+    # It is the darkest cells that are furthest off.
+    assert figures.worst_level < 0.05
+
+
 def test_light_of_the_surroundings_is_that_of_an_even_print_where_all_is_even(sharp: Photograph) -> None:
     grid, count = sharp.around.grid, len(sharp.true)
     even = UsualLight.of(grid, np.ones((count, 3)), np.ones((len(grid.slots_mm), 3)))
