@@ -166,7 +166,7 @@ def compare(session: Session, out: Path, kind: str) -> None:
     once = lens_measured(session)
     for _ in range(ROUNDS):
         unpacking = timed(unpack_all, len(files))
-        with patch.object(ConsistencyCheck, "_disturbed", return_value=((), ())):
+        with patch.object(ConsistencyCheck, "_disturbed", return_value=((), (), ())):
             without = build_timed(session, out, replace(PAPER_OPTIONS, lens_correction=False))
         building = build_timed(session, out)
         frame.append(building.processor / without.processor)
