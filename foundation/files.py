@@ -21,6 +21,7 @@ from typing import TypeGuard
 from foundation.errors import FormatError, InputError, StorageError
 
 _PARTIAL = ".partial"
+_A_LINK = "it is a link to a place that is not there: make or mount that place, or name another"
 _PART_IS_A_FILE = "a part of that path is a file, not a folder; name another"
 _REMEDIES = {
     errno.EACCES: "ask its owner for permission, or name another place",
@@ -89,14 +90,9 @@ def cache_folder() -> Path | None:
     return home / ("Library/Caches" if sys.platform == "darwin" else ".cache") / "croplab"
 
 
-def partial_name(name: str) -> str:
-    """Return the hidden name under which a file or folder called `name` is written before it is complete."""
-    return f".{name}{_PARTIAL}"
-
-
 def partial_path(path: Path) -> Path:
-    """Return the path under which `path` is written before it is complete."""
-    return path.with_name(partial_name(path.name))
+    """Return the hidden name under which `path` is written before it is complete."""
+    return path.with_name(f".{path.name}{_PARTIAL}")
 
 
 def is_partial(name: str) -> bool:
@@ -122,7 +118,7 @@ def storage_error(path: Path, error: OSError, what: str = "write") -> InputError
     what
         What cannot be done with it: "write", "look into".
     """
-    remedy = _remedy_where_missing(path) if error.errno == errno.ENOENT else remedy_of(error)
+    remedy = remedy_of(error)
     by_name = remedy is not None and not isinstance(error, PermissionError)
     return (InputError if by_name else StorageError)(
         f"cannot {what} {path}: {error.strerror or error}; "
@@ -130,14 +126,15 @@ def storage_error(path: Path, error: OSError, what: str = "write") -> InputError
     )
 
 
-def _remedy_where_missing(path: Path) -> str | None:
-    """Return what helps if `path` cannot be made though its folder is there; None if that is gone."""
-    with contextlib.suppress(OSError):
-        if path.is_symlink():
-            return "it is a link to a place that is not there: make or mount that place, or name another"
-        if path.parent.is_dir() and not path.exists():
-            return "the system lets nobody make files there; name a place on an ordinary disk"
-    return None
+def _making_error(path: Path, error: OSError) -> InputError | StorageError:
+    """Return why `path` cannot be made: where its folder is there, no disk is gone that would have to be mounted."""
+    made = error.filename if error.errno == errno.ENOENT and error.filename2 is None else None
+    if isinstance(made, str | bytes) and Path(os.fsdecode(made)).parent.is_dir():
+        return InputError(
+            f"cannot write {path}: {error.strerror}; the system lets nobody make files there; name a place on an "
+            "ordinary disk"
+        )
+    return storage_error(path, error)
 
 
 def reading_error(path: Path, error: OSError, remedy: str, what: str = "") -> FormatError | StorageError:
@@ -189,11 +186,13 @@ def make_folder(folder: Path, of: Path | None = None) -> None:
         except FileExistsError as error:
             # Another program may have taken it away between two calls.
             if os.path.lexists(folder) and not folder.is_dir():
-                raise InputError(f"cannot write {path}: {_PART_IS_A_FILE}") from error
+                raise InputError(
+                    f"cannot write {path}: {_A_LINK if folder.is_symlink() else _PART_IS_A_FILE}"
+                ) from error
         except NotADirectoryError as error:
             raise InputError(f"cannot write {path}: {_PART_IS_A_FILE}") from error
         except OSError as error:
-            raise storage_error(path, error) from error
+            raise _making_error(path, error) from error
         else:
             return
     raise StorageError(f"cannot write {path}: its folder is there and not there; name a place on an ordinary disk")
@@ -257,7 +256,7 @@ def whole_file(path: Path, final: Callable[[], Path] | None = None, *, make: boo
         with contextlib.suppress(OSError):
             partial.unlink(missing_ok=True)
         if _is_ours(error, path):
-            raise storage_error(path, error) from error
+            raise _making_error(path, error) from error
         raise
 
 

@@ -26,7 +26,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, BinaryIO, Final, Protocol, cast
 
 from foundation.errors import CropError, FormatError, StorageError
-from foundation.files import is_partial, partial_name, reading_error, storage_error, sync_folder
+from foundation.files import is_partial, partial_path, reading_error, storage_error, sync_folder
 from foundation.trust.foreign_folders import is_inside_name, open_inside
 from foundation.trust.secret_texts import masked
 from generator.stores.places import filesystem, is_remote, local_path
@@ -111,25 +111,23 @@ class LocalStore:
     @contextmanager
     def create(self, name: str) -> Generator[BinaryIO]:
         """Open a file to be written; it appears when the block ends well, and is on the disk once synchronised."""
-        # As text: to put a path together takes pathlib longer than to open, write and rename a small file.
-        path = f"{self.root}/{name}"
-        folder, _, leaf = path.rpartition("/")
+        path = self.root / name
         # Named by chance, because two programs may be at the same shard; see `foundation.files.is_partial`.
-        hidden = f"{folder}/{partial_name(f'{leaf}.{secrets.token_hex(8)}')}"
+        hidden = partial_path(path.with_name(f"{path.name}.{secrets.token_hex(8)}"))
         try:
             try:
-                stream = open(hidden, "wb", _BUFFER)  # noqa: PTH123, SIM115
+                stream = hidden.open("wb", _BUFFER)
             except FileNotFoundError:
-                self._make_folder(Path(folder))
-                stream = open(hidden, "wb", _BUFFER)  # noqa: PTH123, SIM115
+                self._make_folder(path.parent)
+                stream = hidden.open("wb", _BUFFER)
             with stream:
                 yield stream
-            os.replace(hidden, path)  # noqa: PTH105
+            hidden.replace(path)
         except BaseException as error:
             with contextlib.suppress(OSError):
-                Path(hidden).unlink(missing_ok=True)
+                hidden.unlink(missing_ok=True)
             if isinstance(error, OSError) and not isinstance(error, CropError):
-                raise storage_error(Path(path), error) from error
+                raise storage_error(path, error) from error
             raise
 
     def _make_folder(self, folder: Path) -> None:
@@ -139,10 +137,10 @@ class LocalStore:
 
     def sync(self, names: Iterable[str]) -> None:
         """Wait until these files and their names are on the disk."""
-        paths = [f"{self.root}/{name}" for name in names]
+        paths = [self.root / name for name in names]
         list(_syncing().map(_sync_file, paths))
-        for folder in {path.rpartition("/")[0] for path in paths}:
-            sync_folder(Path(folder))
+        for folder in {path.parent for path in paths}:
+            sync_folder(folder)
 
     def get(self, name: str) -> bytes:
         """Return a file's bytes."""
@@ -195,7 +193,7 @@ if hasattr(os, "register_at_fork"):
     os.register_at_fork(after_in_child=_syncing.cache_clear)
 
 
-def _sync_file(path: str) -> None:
+def _sync_file(path: Path) -> None:
     try:
         handle = os.open(path, os.O_RDONLY)
         try:
@@ -203,7 +201,7 @@ def _sync_file(path: str) -> None:
         finally:
             os.close(handle)
     except OSError as error:
-        raise storage_error(Path(path), error) from error
+        raise storage_error(path, error) from error
 
 
 @dataclass(frozen=True)

@@ -18,11 +18,11 @@ from foundation import files as storage
 from foundation.errors import InputError, StorageError
 from foundation.files import (
     is_partial,
+    make_folder,
     partial_path,
     read_whole,
     require_free,
     require_free_file,
-    storage_error,
     whole_file,
     whole_folder,
     write_whole,
@@ -129,12 +129,19 @@ class TestWholeFile:
     def test_a_link_to_nowhere_is_told(self, tmp_path: Path) -> None:
         (tmp_path / "link").symlink_to(tmp_path / "gone" / "a.csv")
         with pytest.raises(InputError, match=r"link: .*it is a link to a place that is not there"):
-            raise storage_error(tmp_path / "link", FileNotFoundError(errno.ENOENT, "No such file or directory"))
+            make_folder(tmp_path / "link")
 
     @pytest.mark.skipif(not Path("/proc/self").exists(), reason="this system has no /proc")
     def test_a_file_system_that_takes_no_files_is_told_from_a_disk_that_is_gone(self) -> None:
         with pytest.raises(InputError, match=r"cannot write /proc/crop: .*name a place on an ordinary disk"):
             write_whole(Path("/proc/crop"), "x")
+        with pytest.raises(InputError, match=r"cannot write /proc/crop: .*name a place on an ordinary disk"):
+            make_folder(Path("/proc/crop"))
+
+    def test_a_disk_that_was_taken_away_is_not_taken_for_one_that_takes_no_files(self, tmp_path: Path) -> None:
+        """The empty folder it was mounted on is there; what was written is not."""
+        with pytest.raises(StorageError, match="connect and mount the disk"), whole_file(tmp_path / "a.csv"):
+            (tmp_path / ".a.csv.partial").unlink()
 
     def test_a_name_below_a_file_is_told(self, tmp_path: Path) -> None:
         write_whole(tmp_path / "file", "x")
