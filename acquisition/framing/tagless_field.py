@@ -90,8 +90,7 @@ class FoundField:
                 along: _Points = share[of_side, 1 - axis]
                 if len(along) > 2 * _RUN_ORDER:
                     run, _ = robust_curve(along, across[of_side], _RUN_ORDER)
-                    basis = np.asarray(np.polynomial.legendre.legvander(2 * along - 1, _RUN_ORDER), dtype=np.float64)
-                    off[of_side] = np.abs(across[of_side] - basis @ run)
+                    off[of_side] = np.abs(across[of_side] - np.polynomial.legendre.legval(2 * along - 1, run))
         return off
 
 

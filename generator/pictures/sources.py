@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import errno
-import hashlib
 import logging
 import os
 import tempfile
@@ -16,7 +15,7 @@ from typing import TYPE_CHECKING, Any, Final, Protocol
 import numpy as np
 
 from foundation.errors import FormatError, InputError, StorageError
-from foundation.hashing import file_sha256
+from foundation.hashing import file_sha256, sha256_of, stream_sha256
 from foundation.trust.secret_texts import masked
 from generator import philox
 from generator.pictures.picture import LARGEST_SIDE, UNPREPARED, Cut, Picture, Preparation, open_picture
@@ -34,8 +33,6 @@ SUFFIXES: Final = frozenset(
 UNREADABLE: Final = frozenset({".heic", ".heif"})
 """Ends of pictures' names that no library of a plain installation reads; those in a folder are told."""
 
-_CHUNK: Final = 1 << 20
-"""Bytes of a file that are read at a time."""
 _KEPT: Final = 1 << 25
 """Most bytes of a file that is read once, to be hashed and decoded: 32 MiB are nothing beside what it unpacks to."""
 
@@ -204,15 +201,12 @@ def _local_file(location: str) -> Generator[Path]:
 
 def _hashed(path: Path) -> tuple[str, bytes | None]:
     """Return the SHA-256 of a file, and its bytes where they are few enough to be kept until they are decoded."""
-    digest, chunks, size = hashlib.sha256(), list[bytes](), 0
     # Without a buffer of Python's own, which asks the system four questions about each file.
     with path.open("rb", buffering=0) as stream:
-        while chunk := stream.read(_CHUNK):
-            digest.update(chunk)
-            size += len(chunk)
-            if size <= _KEPT:
-                chunks.append(chunk)
-    return digest.hexdigest(), b"".join(chunks) if size <= _KEPT else None
+        if os.fstat(stream.fileno()).st_size > _KEPT:
+            return stream_sha256(stream), None
+        data = stream.read()
+    return sha256_of(data), data
 
 
 def _is_of_the_file(path: Path, error: OSError) -> bool:

@@ -139,7 +139,6 @@ def test_a_file_of_any_size_is_read_and_hashed_alike(
     source = find_pictures(write(tmp_path / name, colours, "uint8"))[0]
     at_once = source.read()
     monkeypatch.setattr(scene, "_KEPT", 10)
-    monkeypatch.setattr(scene, "_CHUNK", 7)
     in_pieces = source.read()
     assert at_once.sha256 == in_pieces.sha256 == hashlib.sha256((tmp_path / name).read_bytes()).hexdigest()
     np.testing.assert_array_equal(at_once.picture, in_pieces.picture)
