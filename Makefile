@@ -5,7 +5,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 DEMO := build/demo
-ROOMS := foundation drivers sim acquisition calibration synthesis generator evaluation
+ROOMS := foundation drivers sim experiment calibration acquisition synthesis generator evaluation
 
 .PHONY: demo test quick lint docs bench full-session lock clean
 

@@ -1,1 +1,1 @@
-"""The experiment's design and its execution: chart, lights, plan, and the session that is taken."""
+"""The experiment's execution: the lab is checked, a session is planned, taken, judged and watched."""

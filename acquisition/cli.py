@@ -17,7 +17,7 @@ from foundation.errors import InputError, QualityError, first_of
 from foundation.json_output import JsonOutput, with_json
 
 if TYPE_CHECKING:
-    from acquisition.config import LabSettings
+    from experiment.config import LabSettings
 
 app = new_app(
     "Plan, print and take a session: a chart photographed raw under many known lights.\n\n" + EXIT_CODES,
@@ -113,10 +113,10 @@ def chart(
     printer's colour management off, at 100 %, on matte paper. A line on stderr warns when cells are too small for the
     paper's cameras.
     """
-    from acquisition.chart.layout import design_chart, paper_chart
-    from acquisition.chart.printing import save_pdf, save_preview, save_tiff
-    from acquisition.chart.proof import save_instructions, save_proof
-    from acquisition.framing.visibility import small_parts_warning
+    from experiment.chart.layout import design_chart, paper_chart
+    from experiment.chart.printing import save_pdf, save_preview, save_tiff
+    from experiment.chart.proof import save_instructions, save_proof
+    from experiment.framing.visibility import small_parts_warning
     from foundation.files import whole_folder
 
     if arrangement is Arrangement.PAPER:
@@ -182,8 +182,8 @@ def illuminations(
     """
     from collections import Counter
 
-    from acquisition.lights.illuminations import parse_ccts, plan_illuminations, save_illuminations
-    from acquisition.lights.plots import plot_illuminations
+    from experiment.lights.illuminations import parse_ccts, plan_illuminations, save_illuminations
+    from experiment.lights.plots import plot_illuminations
     from foundation.files import require_free
 
     plot = out.with_suffix(".png")
@@ -263,12 +263,12 @@ def check(
     import json
 
     from acquisition.check.check import CheckOptions, check_lab
-    from acquisition.config import load_lab
+    from experiment.config import load_lab
 
     settings = load_lab(lab)
     given = None
     if corners is not None:
-        from acquisition.framing.corners import parse_corners
+        from experiment.framing.corners import parse_corners
 
         given = parse_corners(corners)
     if identify:
@@ -319,9 +319,9 @@ def run(
     SESSION: session.toml, chart.json, illuminations.csv, frames/, previews/, journal.sqlite, frames.csv, report.html.
     Interrupt it as you like and run it again. Ends with 4 when frames were refused; the next run tries those again.
     """
-    from acquisition.config import load_lab
     from acquisition.run.run import run_session
     from acquisition.run.terminal import Terminal
+    from experiment.config import load_lab
 
     settings = load_lab(lab)
     if dry_run:
@@ -377,9 +377,9 @@ def status(
     from datetime import UTC, datetime
 
     from acquisition.monitor.reading import read_session
-    from acquisition.session.folder import journal_path
-    from acquisition.session.mending.redaction import secrets_warning
     from acquisition.status import status_json, status_lines
+    from experiment.session.folder import journal_path
+    from experiment.session.mending.redaction import secrets_warning
 
     journal_path(session)
     view, now = read_session(session), datetime.now(UTC)
@@ -398,8 +398,8 @@ def redact(session: Annotated[Path, typer.Argument(help="Session folder.")]) -> 
     Reads and writes SESSION/session.toml; frames and journal stay as they are. The projector's password is removed, of
     sequence.notify the host or the program's name is left. Sessions that this software takes hold no secret.
     """
-    from acquisition.session.mending.redaction import SETTINGS_FILE
-    from acquisition.session.mending.redaction import redact as take_out
+    from experiment.session.mending.redaction import SETTINGS_FILE
+    from experiment.session.mending.redaction import redact as take_out
 
     found = take_out(session)
     if found:

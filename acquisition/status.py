@@ -14,9 +14,9 @@ from typing import Any
 from acquisition.monitor.head import Head
 from acquisition.monitor.reading import SessionView
 from acquisition.monitor.rows import AttemptView
-from acquisition.session.judgement import Check
-from acquisition.session.progress import duration_text
-from acquisition.session.records import ACCEPTED
+from experiment.session.judgement import Check
+from experiment.session.progress import duration_text
+from experiment.session.records import ACCEPTED
 from foundation.errors import counted
 
 LAST = 5
@@ -28,15 +28,7 @@ BEYOND = " (beyond; it follows from another cause, or is followed)"
 
 
 def status_lines(view: SessionView, now: datetime) -> list[str]:
-    """Return a session's state for people, line by line.
-
-    Parameters
-    ----------
-    view
-        The session as read.
-    now
-        The machine's wall clock.
-    """
+    """Return a session's state for people, line by line."""
     head = view.head(now)
     lines = [
         f"state   {_state(head)}",

@@ -21,16 +21,16 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from acquisition.chart.layout import design_chart
-from acquisition.chart.model import Chart
-from acquisition.config import LabSettings, SequenceSettings, SimulatedSettings
-from acquisition.lights.illuminations import Illumination, plan_illuminations, save_illuminations
 from acquisition.run.rig.simulated import sheet, simulated_body, simulated_room
 from acquisition.run.run import run_session
-from acquisition.session.folder import Session
 from calibration.pipeline.build import build
 from calibration.table.lut import Lut, open_lut
 from drivers.camera import ExposureSettings
+from experiment.chart.layout import design_chart
+from experiment.chart.model import Chart
+from experiment.config import LabSettings, SequenceSettings, SimulatedSettings
+from experiment.lights.illuminations import Illumination, plan_illuminations, save_illuminations
+from experiment.session.folder import Session
 from foundation.angles import angles_deg
 from sim.world.sensors import BODIES, Body
 from sim.world.world import World
@@ -57,18 +57,12 @@ def report(name: str, value: float, unit: str, against: str) -> None:
 class TableErrors:
     """The errors of a table against the room that it was taken in.
 
-    Attributes
-    ----------
-    level
-        (L, C, 3) float64, the true mean of each cell in the table's counts.
-    error
-        (L, C, 3) float64, measured over true, less 1.
-    noise
-        (L, C, 3) float64, standard deviation that `error` has from photons and read noise alone.
-    scatter
-        (L, C, 3) float64, variance of the 25 samples over that of photons, read noise and the photosites' response.
-    clean
-        (C,) bool, cells that are fit for use.
+    - `level`: (L, C, 3) float64, the true mean of each cell in the table's counts.
+    - `error`: (L, C, 3) float64, measured over true, less 1.
+    - `noise`: (L, C, 3) float64, standard deviation that `error` has from photons and read noise alone.
+    - `scatter`: (L, C, 3) float64, variance of the 25 samples over that of photons, read noise and the photosites'
+      response.
+    - `clean`: (C,) bool, cells that are fit for use.
     """
 
     level: _Array
@@ -96,14 +90,8 @@ def table_errors(
 ) -> TableErrors:
     """Return the errors of a table against its room, which must have no light but the projector's (`Room.ambient`).
 
-    Parameters
-    ----------
-    lut, world, chart
-        The table, the room, the print.
-    fields
-        For each light (C, 3), the field that was divided out: with it the counts that the noise was made of are known.
-    exposure
-        Of every frame.
+    `fields`: for each light (C, 3), the field that was divided out: with it the counts that the noise was made of are
+    known.
     """
     codes = chart.rgb[chart.cell_of_colour]
     shape = (*lut.samples.shape[:2], 3)
@@ -127,12 +115,8 @@ def table_errors(
 def beyond_noise(error: _Array, noise: _Array, chosen: _Mask) -> tuple[float, float, float, float]:
     """Return RMS of errors, RMS of the noise in them, what is beyond it, and its upper bound (two standard errors).
 
-    Parameters
-    ----------
-    error, noise
-        (L, C, 3) errors and the standard deviation that each has by itself.
-    chosen
-        (L, C, 3) bool, which to use.
+    `error`, `noise`: (L, C, 3) errors and the standard deviation that each has by itself. `chosen`: (L, C, 3) bool,
+    which to use.
     """
     square, known = error**2, noise**2
     lights = [light for light in range(len(error)) if chosen[light].any()]
@@ -151,14 +135,7 @@ def repeated_variance(
 
     The difference of two frames is free of all that stands still: response, bleed, unevenness.
 
-    Parameters
-    ----------
-    one, other
-        (C, 25, 3) samples of the two.
-    counts, field
-        (C, 3) true counts, field included, and the field.
-    body, iso
-        The sensor.
+    `one`, `other`: (C, 25, 3) samples of the two. `counts`, `field`: (C, 3) true counts, field included, and the field.
     """
     measured = (one.astype(np.float64) - other).var(axis=1, ddof=1) / 2
     return measured / (sample_variance(counts, body, iso) / field**2 + 1 / 12)

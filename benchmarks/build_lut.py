@@ -34,14 +34,6 @@ from unittest.mock import patch
 import numpy as np
 import rawpy
 
-from acquisition.chart.layout import design_chart
-from acquisition.chart.printing import drawing
-from acquisition.framing.planes import frame_black
-from acquisition.lights.illuminations import plan_illuminations
-from acquisition.session.folder import Session
-from acquisition.session.incoming import ReceivedFile
-from acquisition.session.judgement import Judgement
-from acquisition.session.plan import plan_steps
 from calibration.checks.frame_consistency import ConsistencyCheck
 from calibration.pipeline.baseline import baseline_of, with_lens
 from calibration.pipeline.build import build
@@ -52,6 +44,14 @@ from calibration.registration.register import register
 from calibration.sampling.samples import gather_values, sites_at
 from drivers.camera import CapturedFrame
 from drivers.raw.rawfile import read_raw
+from experiment.chart.layout import design_chart
+from experiment.chart.printing import drawing
+from experiment.framing.planes import frame_black
+from experiment.lights.illuminations import plan_illuminations
+from experiment.session.folder import Session
+from experiment.session.incoming import ReceivedFile
+from experiment.session.judgement import Judgement
+from experiment.session.plan import plan_steps
 from sim.camera.dng import write_dng
 from sim.optics.photographic_lens import MILD_SHOULDERS
 from sim.world.drawing import Print

@@ -23,11 +23,6 @@ from typing import Any, Final
 
 import numpy as np
 
-from acquisition.chart.layout import A_SERIES_MM, design_chart
-from acquisition.chart.model import Chart
-from acquisition.lights.illuminations import Illumination
-from acquisition.session.folder import Session
-from acquisition.session.plan import SessionStep
 from benchmarks.sessions import (
     AS_PLANNED,
     EIGHT_LIGHTS,
@@ -46,6 +41,11 @@ from calibration.table.lut import open_lut
 from calibration.verdict.wording import remark
 from drivers.camera import ExposureSettings
 from drivers.presenter import WHITE, Colour
+from experiment.chart.layout import A_SERIES_MM, design_chart
+from experiment.chart.model import Chart
+from experiment.lights.illuminations import Illumination
+from experiment.session.folder import Session
+from experiment.session.plan import SessionStep
 from foundation.errors import CropError
 from sim.optics.photographic_lens import MILD_SHOULDERS, STRONG_SHOULDERS
 from sim.world.room import Room
@@ -73,22 +73,13 @@ _SPREAD: Final = r"bleed|neighbours'? (light|colour)|spread|veil|correction"
 class NamedCase:
     """A case.
 
-    Attributes
-    ----------
-    name, what
-        What it is called, and what it is.
-    right
-        Words, as a regular expression, one of which a remark or a refusal must have where the table is wrong.
-    wrong
-        Words of causes that are not there; ``.`` where nothing is the matter.
-    changes
-        How frames differ, from the room and the plan.
-    room
-        How the room differs.
-    lights
-        Of the plan, by name.
-    must_say
-        Whether the right words are expected although the table is right.
+    - `name`, `what`: what it is called, and what it is.
+    - `right`: words, as a regular expression, one of which a remark or a refusal must have where the table is wrong.
+    - `wrong`: words of causes that are not there; ``.`` where nothing is the matter.
+    - `changes`: how frames differ, from the room and the plan.
+    - `room`: how the room differs.
+    - `lights`: of the plan, by name.
+    - `must_say`: whether the right words are expected although the table is right.
     """
 
     name: str
@@ -393,18 +384,11 @@ _TRUE_WITHIN: Final = 2.0
 class Outcome:
     """What came of a session.
 
-    Attributes
-    ----------
-    verdict
-        ``accept``, ``accept with remarks`` or ``refuse``.
-    rows
-        Names of the verdict's rows that are not accepted; of a refusal by an error, nothing.
-    says
-        The remarks, or the refusal, as the user reads them.
-    truth
-        The table against the truth; None where there is none.
-    lens_left
-        RMS error of cells' means that the report says the lens leaves; 0 where nothing is said of it.
+    - `verdict`: ``accept``, ``accept with remarks`` or ``refuse``.
+    - `rows`: names of the verdict's rows that are not accepted; of a refusal by an error, nothing.
+    - `says`: the remarks, or the refusal, as the user reads them.
+    - `truth`: the table against the truth; None where there is none.
+    - `lens_left`: RMS error of cells' means that the report says the lens leaves; 0 where nothing is said of it.
     """
 
     verdict: str

@@ -14,11 +14,11 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
-from acquisition.chart.layout import design_chart
 from acquisition.check.check import check_lab
 from acquisition.check.findings import CheckReport
-from acquisition.config import load_lab
-from acquisition.lights.illuminations import plan_illuminations, save_illuminations
+from experiment.chart.layout import design_chart
+from experiment.config import load_lab
+from experiment.lights.illuminations import plan_illuminations, save_illuminations
 
 SEEDS = range(30)
 """Of the good rooms."""

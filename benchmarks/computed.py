@@ -20,14 +20,14 @@ from pathlib import Path
 
 import numpy as np
 
-from acquisition.chart.layout import A_SERIES_MM, design_chart
-from acquisition.config import LabSettings, SimulatedSettings
-from acquisition.lights.illuminations import plan_illuminations, save_illuminations
 from acquisition.run.run import run_session
-from acquisition.session.folder import Session
 from calibration.pipeline.build import build
 from calibration.table.lut import Lut, open_lut
 from calibration.table.verification import require_match
+from experiment.chart.layout import A_SERIES_MM, design_chart
+from experiment.config import LabSettings, SimulatedSettings
+from experiment.lights.illuminations import plan_illuminations, save_illuminations
+from experiment.session.folder import Session
 from sim.world.body_settings import find_body
 from synthesis.settings import TableSettings, room_of
 from synthesis.table import TableTask, compute_table

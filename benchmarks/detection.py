@@ -21,13 +21,13 @@ from pathlib import Path
 
 import numpy as np
 
-from acquisition.chart.layout import design_chart
 from acquisition.judge import limits
 from acquisition.judge.known.response import ProjectorModel
-from acquisition.lights.illuminations import Illumination
 from benchmarks.disturbance_trials import detection
 from benchmarks.false_alarms import false_alarms, odd_worlds
 from benchmarks.judged_labs import Lab, lab_of, rooms
+from experiment.chart.layout import design_chart
+from experiment.lights.illuminations import Illumination
 from sim.world.room import Room
 
 

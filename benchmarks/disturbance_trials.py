@@ -11,10 +11,10 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from acquisition.session.judgement import Judgement
-from acquisition.session.plan import SessionStep
 from benchmarks.judged_labs import Lab, cause
 from drivers.presenter import BLACK, WHITE, Colour
+from experiment.session.judgement import Judgement
+from experiment.session.plan import SessionStep
 from sim.world.disturbances import (
     AmbientStep,
     AnyDisturbance,

@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from acquisition.chart.layout import design_chart, paper_chart
-from acquisition.chart.model import Chart
 from benchmarks.judged_labs import Projector, cause, lab_of, rooms
 from drivers.presenter import Colour
+from experiment.chart.layout import design_chart, paper_chart
+from experiment.chart.model import Chart
 from sim.world.disturbances import Disturbances, LampDrift, SensorWarming
 from sim.world.room import Room
 

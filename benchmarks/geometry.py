@@ -27,11 +27,11 @@ from typing import Any, Final
 import numpy as np
 from scipy.spatial import cKDTree
 
-from acquisition.chart.layout import design_chart, paper_chart
-from acquisition.framing.planes import CHANNELS
 from benchmarks.rooms import Case, PhotographedChart, photographed
 from calibration.registration.register import register
 from calibration.registration.registration import Registration
+from experiment.chart.layout import design_chart, paper_chart
+from experiment.framing.planes import CHANNELS
 from foundation.errors import CropError
 from sim.world.room import Room
 

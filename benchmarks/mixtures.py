@@ -25,13 +25,13 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from acquisition.chart.layout import A_SERIES_MM, design_chart
-from acquisition.config import LabSettings, SimulatedSettings
-from acquisition.lights.illuminations import Illumination, plan_illuminations, save_illuminations
 from acquisition.run.run import run_session
-from acquisition.session.folder import Session
 from calibration.pipeline.build import build
 from calibration.table.lut import Lut, open_lut
+from experiment.chart.layout import A_SERIES_MM, design_chart
+from experiment.config import LabSettings, SimulatedSettings
+from experiment.lights.illuminations import Illumination, plan_illuminations, save_illuminations
+from experiment.session.folder import Session
 from foundation.angles import angles_deg
 from foundation.srgb import decode_srgb
 from generator.lights.gamut import Gamut, Match, OutsideGamutError

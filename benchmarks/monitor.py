@@ -19,11 +19,11 @@ from pathlib import Path
 from threading import Thread
 from typing import Any
 
-from acquisition.lights.illuminations import plan_illuminations, save_illuminations
 from acquisition.monitor.server import open_monitor
-from acquisition.session.journal import JOURNAL_FILE, Journal
-from acquisition.session.judgement import Check, Judgement
-from acquisition.session.plan import RESPONSE, SessionStep, plan_steps
+from experiment.lights.illuminations import plan_illuminations, save_illuminations
+from experiment.session.journal import JOURNAL_FILE, Journal
+from experiment.session.judgement import Check, Judgement
+from experiment.session.plan import RESPONSE, SessionStep, plan_steps
 
 ATTEMPTS = 800
 """Attempts of a night: 707 lights, references, response frames, and some that were refused."""

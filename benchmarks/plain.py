@@ -13,9 +13,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from acquisition.chart.layout import paper_chart
 from benchmarks.rooms import Case, photographed
 from calibration.registration.register import register
+from experiment.chart.layout import paper_chart
 from sim.world.room import Room
 from sim.world.sensors import BODIES
 

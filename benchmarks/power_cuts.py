@@ -33,10 +33,10 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
-from acquisition.chart.layout import design_chart
-from acquisition.session.folder import Session
-from acquisition.session.journal import Journal
 from benchmarks.session_kills import LIGHTS, SETTINGS, STEPS, contents, in_child, killed_at_operation, take
+from experiment.chart.layout import design_chart
+from experiment.session.folder import Session
+from experiment.session.journal import Journal
 
 CUTS = 200
 """Cuts that are made unless more are asked for: a few minutes on a quiet machine."""
@@ -50,13 +50,7 @@ NAME = "/disk"
 
 
 class CachedDisk:
-    """A disk with a cache: reads see everything, and a cut keeps what was flushed and some of the rest.
-
-    Parameters
-    ----------
-    content
-        What is on the disk at first.
-    """
+    """A disk with a cache: reads see everything, and a cut keeps what was flushed and some of the rest."""
 
     def __init__(self, content: bytes) -> None:
         self._flushed = bytearray(content)
@@ -137,12 +131,8 @@ def serve(disk: CachedDisk, folder: Path, at_cut: Callable[[], object]) -> None:
 class CutSessions:
     """Sessions whose power is cut by chance and which are then taken to their end.
 
-    Attributes
-    ----------
-    cuts, differing
-        How many there were, and how many sessions ended otherwise than the undisturbed one.
-    lost
-        Of the frames whose row was in the journal before the cut, those that were not afterwards.
+    - `cuts`, `differing`: how many there were, and how many sessions ended otherwise than the undisturbed one.
+    - `lost`: of the frames whose row was in the journal before the cut, those that were not afterwards.
     """
 
     def __init__(self, scratch: Path, seed: int, flushing: bool = True) -> None:

@@ -19,9 +19,9 @@ import time
 from collections.abc import Generator
 from typing import Any
 
-from acquisition.lights.illuminations import plan_illuminations
 from drivers.display.displays import list_displays
 from drivers.display.fullscreen import FullScreen
+from experiment.lights.illuminations import plan_illuminations
 
 SIZE = "1920x1080"
 

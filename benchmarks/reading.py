@@ -147,13 +147,7 @@ def trace(command: str, arguments: Sequence[str], out: Path) -> int:
 
 
 def called(folder: Path, command: str, *arguments: str) -> dict[Function, int]:
-    """Run a command in a process of its own in `folder`; return how often each function was called.
-
-    Raises
-    ------
-    RuntimeError
-        The command failed.
-    """
+    """Run a command in a process of its own in `folder`; return how often each function was called."""
     out = folder / "calls.json"
     line = [sys.executable, "-m", "benchmarks.reading", "--trace", str(out), command, *arguments]
     # The command runs in `folder`; this file and the product are found in the checkout all the same.

@@ -32,9 +32,6 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from acquisition.chart.layout import A_SERIES_MM, design_chart
-from acquisition.chart.model import Chart
-from acquisition.chart.printing import drawing
 from benchmarks.cases import BY_NAME, CASES, FAILURES, LENS_LEFT, WRONG_SHARE, Outcome, chart_of, outcome_of, try_case
 from benchmarks.sessions import short_session, world_of
 from calibration.registration.register import register
@@ -42,6 +39,9 @@ from calibration.registration.registration import Registration
 from drivers.camera import ExposureSettings
 from drivers.presenter import WHITE, Colour
 from drivers.raw.rawfile import Mosaic, read_raw
+from experiment.chart.layout import A_SERIES_MM, design_chart
+from experiment.chart.model import Chart
+from experiment.chart.printing import drawing
 from sim.camera.dng import write_dng
 from sim.optics.photographic_lens import MILD_SHOULDERS
 from sim.world.drawing import Print
@@ -173,12 +173,8 @@ def calm_case(seed: int) -> Case:
 class PhotographedChart:
     """One frame of a chart in a room.
 
-    Attributes
-    ----------
-    case, chart, world
-        The random case, the chart in its room, and the room.
-    mosaic
-        The frame as read from its file.
+    - `case`, `chart`, `world`: the random case, the chart in its room, and the room.
+    - `mosaic`: the frame as read from its file.
     """
 
     case: Case
@@ -217,13 +213,7 @@ def photographed(case: Case, chart: Chart) -> PhotographedChart:
 
 
 def miss(case: Case, bits: int = 5, page: str = "A0") -> npt.NDArray[np.float64]:
-    """Return (C,) float64, the distance of each registered cell from its true place, half-size px.
-
-    Raises
-    ------
-    QualityError
-        The room was refused.
-    """
+    """Return (C,) float64, the distance of each registered cell from its true place, half-size px."""
     shot = photographed_case(case, bits, page)
     return shot.miss_px(register(shot.mosaic, shot.chart, f"room {case.seed}"))
 

@@ -37,21 +37,21 @@ from typing import BinaryIO
 
 import numpy as np
 
-from acquisition.chart.layout import design_chart
-from acquisition.config import LabSettings, SequenceSettings
 from acquisition.judge.exposure import ExposureJudge
 from acquisition.judge.judge import LiveJudge
-from acquisition.lights.illuminations import Illumination, plan_illuminations
 from acquisition.run.devices import Devices
 from acquisition.run.sequencer import take_session
 from acquisition.run.taking.pipeline import Taken
-from acquisition.session.folder import Session
-from acquisition.session.journal import Journal
-from acquisition.session.judgement import Judgement
-from acquisition.session.plan import SessionStep, plan_steps
 from drivers.camera import CameraIdentity, CapturedFrame, ExposureSettings
 from drivers.presenter import BLACK, Colour
 from drivers.projector import Fault, Lamp, Power, ProjectorIdentity
+from experiment.chart.layout import design_chart
+from experiment.config import LabSettings, SequenceSettings
+from experiment.lights.illuminations import Illumination, plan_illuminations
+from experiment.session.folder import Session
+from experiment.session.journal import Journal
+from experiment.session.judgement import Judgement
+from experiment.session.plan import SessionStep, plan_steps
 from foundation.clock import Clock, SystemClock
 from sim.clock import OPENING, SimulatedClock
 from sim.world.sensors import BODIES
@@ -72,20 +72,13 @@ SAVED = 12
 class Latencies:
     """What devices take, seconds.
 
-    Attributes
-    ----------
-    release_s
-        From the command to the open shutter: mirror and two messages (60D: 2 … 40 ms a message; mirror chosen).
-    readout_s
-        From the closed shutter to the announcement: an EOS 550D's in `sim.camera.eos_bodies`.
-    bytes_per_s
-        Of the cable: USB 2.0 carries 25 to 40 million.
-    show_s
-        From the call to a colour that is known to be on the screen: a picture or two at 60 Hz.
-    verify_s
-        Reading the screen back.
-    question_s
-        A projector's answer over the network; it is asked five things a frame.
+    - `release_s`: from the command to the open shutter: mirror and two messages (60D: 2 … 40 ms a message; mirror
+      chosen).
+    - `readout_s`: from the closed shutter to the announcement: an EOS 550D's in `sim.camera.eos_bodies`.
+    - `bytes_per_s`: of the cable: USB 2.0 carries 25 to 40 million.
+    - `show_s`: from the call to a colour that is known to be on the screen: a picture or two at 60 Hz.
+    - `verify_s`: reading the screen back.
+    - `question_s`: A projector's answer over the network; it is asked five things a frame.
     """
 
     release_s: float = 0.08

@@ -29,19 +29,19 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any, BinaryIO
 
-from acquisition.chart.layout import design_chart
-from acquisition.config import LabSettings
-from acquisition.lights.illuminations import Illumination
 from acquisition.run.devices import Devices
 from acquisition.run.sequencer import take_session
 from acquisition.run.taking.agenda import Agenda
-from acquisition.session.folder import Session
-from acquisition.session.incoming import IncomingFile
-from acquisition.session.journal import Journal
-from acquisition.session.judgement import Judgement
-from acquisition.session.plan import SessionStep, plan_steps
 from drivers.camera import CameraIdentity, CapturedFrame, ExposureSettings
 from drivers.presenter import BLACK, Colour
+from experiment.chart.layout import design_chart
+from experiment.config import LabSettings
+from experiment.lights.illuminations import Illumination
+from experiment.session.folder import Session
+from experiment.session.incoming import IncomingFile
+from experiment.session.journal import Journal
+from experiment.session.judgement import Judgement
+from experiment.session.plan import SessionStep, plan_steps
 from sim.clock import OPENING, SimulatedClock
 
 KILLS = 10_000
@@ -229,12 +229,9 @@ def contents(folder: Path) -> dict[str, object]:
 class KilledSessions:
     """Sessions that are killed by chance and then taken to their end.
 
-    Attributes
-    ----------
-    kills, sessions, differing
-        How many there were, and how many sessions ended otherwise than the undisturbed one.
-    strays
-        Complete files that no row counts, set aside.
+    - `kills`, `sessions`, `differing`: how many there were, and how many sessions ended otherwise than the undisturbed
+      one.
+    - `strays`: complete files that no row counts, set aside.
     """
 
     def __init__(self, scratch: Path, seed: int) -> None:

@@ -23,15 +23,6 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from acquisition.chart.model import Chart
-from acquisition.chart.printing import drawing
-from acquisition.framing.movement import STILL_PX
-from acquisition.framing.planes import CHANNELS
-from acquisition.lights.illuminations import Illumination
-from acquisition.session.folder import Session
-from acquisition.session.incoming import ReceivedFile
-from acquisition.session.judgement import Judgement
-from acquisition.session.plan import SessionStep, plan_steps
 from calibration.figures.frame_figures import FrameFigures
 from calibration.registration.registration import Registration
 from calibration.sampling.samples import sites_at
@@ -40,6 +31,15 @@ from calibration.verdict.result import BuildResult
 from drivers.camera import CapturedFrame, ExposureSettings
 from drivers.presenter import Colour
 from drivers.raw.rawfile import read_raw
+from experiment.chart.model import Chart
+from experiment.chart.printing import drawing
+from experiment.framing.movement import STILL_PX
+from experiment.framing.planes import CHANNELS
+from experiment.lights.illuminations import Illumination
+from experiment.session.folder import Session
+from experiment.session.incoming import ReceivedFile
+from experiment.session.judgement import Judgement
+from experiment.session.plan import SessionStep, plan_steps
 from foundation.angles import angles_deg
 from sim.camera.dng import write_dng
 from sim.world.drawing import Print
@@ -93,24 +93,14 @@ def _printed(chart: Chart) -> Print:
 class FrameChange:
     """How one frame differs from what the plan says.
 
-    Attributes
-    ----------
-    colour
-        What the projector shows instead: the file is of another light.
-    settings
-        How it is exposed, and what its file says.
-    tagged
-        What its file says where that is not how it was exposed.
-    world
-        Another camera, room or chart that it is taken of.
-    situation
-        What is otherwise in the room.
-    counts_added
-        Photosites of the sensor, (row, column) from its corner, and what is added to their counts.
-    serial
-        Of the body, in the file.
-    reason
-        Why the frame was refused; None: it is accepted.
+    - `colour`: what the projector shows instead: the file is of another light.
+    - `settings`: how it is exposed, and what its file says.
+    - `tagged`: what its file says where that is not how it was exposed.
+    - `world`: another camera, room or chart that it is taken of.
+    - `situation`: what is otherwise in the room.
+    - `counts_added`: photosites of the sensor, (row, column) from its corner, and what is added to their counts.
+    - `serial`: of the body, in the file.
+    - `reason`: why the frame was refused; None: it is accepted.
     """
 
     colour: Colour | None = None
@@ -187,18 +177,7 @@ def record_session(
 ) -> Session:
     """Return an open session with a frame for every step of its plan.
 
-    Parameters
-    ----------
-    folder
-        Of the session.
-    chart, lights
-        What is photographed under what.
-    frame
-        The raw file of a step.
-    every
-        Lights from one pair of references to the next.
-    reason
-        Why a step's frame is refused; None where it is accepted.
+    `reason`: why a step's frame is refused; None where it is accepted.
     """
     with Session.create(folder, "rig = 'simulated'\n", chart, lights) as session:
         for step in plan_steps(lights, every):
@@ -241,21 +220,13 @@ def short_session(
 class TableTruth:
     """A table against the room that it should show; L lights, C cells.
 
-    Attributes
-    ----------
-    light_deg
-        (L,) float64, angle between the ground truth and the light of bare paper.
-    brightness
-        (L,) float64, the light's brightness over the truth, 1 for the median light.
-    level
-        (L, C, 3) float64 counts that cells should have in the table.
-    error
-        (L, C, 3) float64, mean of the samples over the truth, less 1, noise taken out; the light's own error and its
-        brightness are not in it.
-    fit
-        (C,) bool, cells that the table lists as fit for use.
-    offset_px
-        (3, C, 2) float64, by channel: where cells were found less where they are seen, half-size px.
+    - `light_deg`: (L,) float64, angle between the ground truth and the light of bare paper.
+    - `brightness`: (L,) float64, the light's brightness over the truth, 1 for the median light.
+    - `level`: (L, C, 3) float64 counts that cells should have in the table.
+    - `error`: (L, C, 3) float64, mean of the samples over the truth, less 1, noise taken out; the light's own error and
+      its brightness are not in it.
+    - `fit`: (C,) bool, cells that the table lists as fit for use.
+    - `offset_px`: (3, C, 2) float64, by channel: where cells were found less where they are seen, half-size px.
     """
 
     light_deg: _Array
@@ -309,17 +280,7 @@ def compare(
     changes: Changes = as_planned,
     every: int = 25,
 ) -> TableTruth:
-    """Return a table compared with the room that it should show.
-
-    Parameters
-    ----------
-    result, lut
-        The build and its table.
-    world, chart, session
-        What the session should show.
-    changes, every
-        How its frames differ, and how many lights lie between references, to know their noise.
-    """
+    """Return a table compared with the room that it should show."""
     lights = lut.illuminations
     cells_mm = chart.centres_mm[chart.cell_of_colour]
     codes = chart.rgb[chart.cell_of_colour]
@@ -358,16 +319,8 @@ def noise_of(
 ) -> _Array:
     """Return (C, 3) float64 counts: what noise adds to the means of cells in one frame.
 
-    Parameters
-    ----------
-    file, body
-        The frame, and the body that took it.
-    expected
-        (rows, columns) float32 counts above black of its visible photosites without noise.
-    places_px
-        (C, 2) float64, where the cells lie in the frame as read, half-size px.
-    samples
-        How many each has.
+    `expected`: (rows, columns) float32 counts above black of its visible photosites without noise. `places_px`: (C, 2)
+    float64, where the cells lie in the frame as read, half-size px.
     """
     from cv2 import BORDER_REPLICATE, boxFilter
 

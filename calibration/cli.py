@@ -25,10 +25,10 @@ from foundation.errors import FormatError, InputError, QualityError
 from foundation.json_output import AsJson, JsonOutput, json_output
 
 if TYPE_CHECKING:
-    from acquisition.session.folder import Session
     from calibration.pipeline.build import TableProgress
     from calibration.pipeline.options import BuildOptions
     from calibration.verdict.result import BuildResult
+    from experiment.session.folder import Session
 
 app = new_app()
 
@@ -36,16 +36,7 @@ app = new_app()
 def main(argv: Sequence[str] | None = None) -> int:
     """Run `build-lut` and return its exit code.
 
-    Parameters
-    ----------
-    argv
-        The arguments; those of the process if None.
-
-    Returns
-    -------
-    int
-        0 done, 2 something given cannot be used, 4 the data are not good enough, 5 the disk is full or read-only,
-        130 interrupted.
+    `argv`: the arguments; those of the process if None.
     """
     return console.run(lambda: app(args=None if argv is None else list(argv), prog_name="build-lut"))
 
@@ -299,9 +290,9 @@ def build_lut(
         elif fetch is not None:
             fetch_table(*fetch, expect, told)
         else:
-            from acquisition.framing.corners import parse_corners
             from calibration.pipeline.options import BuildOptions
             from calibration.sampling.samples import WINDOW
+            from experiment.framing.corners import parse_corners
 
             if picture is not None and not check:
                 raise InputError("--picture goes with --check; a table that is built has its report")
@@ -334,7 +325,7 @@ def _make(
         raise InputError(f"--check writes nothing, so a table's folder ({lut}) is not expected; leave one of them out")
     if session is None:
         raise InputError("a session is expected: build-lut SESSION LUT; see build-lut --help")
-    from acquisition.session.folder import Session
+    from experiment.session.folder import Session
 
     if check:
         with Session.open(session) as opened:
@@ -403,10 +394,10 @@ def _build(
 def _compare(
     one: Path, other: Path, options: BuildOptions, told: JsonOutput, out: Path | None, chart: Path | None
 ) -> None:
-    from acquisition.chart.model import load_chart
     from calibration.comparison.comparing import compare
     from calibration.comparison.sources import chart_of, table_of
     from calibration.comparison.wording import comparison_json, lines
+    from experiment.chart.model import load_chart
     from foundation.files import require_free
 
     if out is not None:

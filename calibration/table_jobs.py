@@ -53,8 +53,8 @@ def verify_table(folder: Path, session: Path | None, told: JsonOutput) -> None:
     with progress_bar("reading the samples") as progress:
         faults = find_faults(lut, lambda done, total: progress(done, total, "reading the samples"))
     if session is not None:
-        from acquisition.session.folder import Session
         from calibration.pipeline.frames import frame_faults
+        from experiment.session.folder import Session
 
         with Session.open(session) as opened, progress_bar("reading the frames") as progress:
             faults += frame_faults(lut, opened, progress)

@@ -9,16 +9,9 @@ import numpy.typing as npt
 def angles_deg(one: npt.ArrayLike, other: npt.ArrayLike) -> npt.NDArray[np.float64]:
     """Return the angles between colours and others, degrees.
 
-    Parameters
-    ----------
-    one, other
-        (..., 3) float or int each, broadcast against each other; linear RGB of any length above 0.
-
-    Returns
-    -------
-    ndarray
-        (...) float64, 0 … 180. By W. Kahan's formula of the half angle, which keeps its digits at every angle; the
-        arc cosine loses half of them at small ones.
+    `one`, `other`: (..., 3) float or int each, broadcast against each other; linear RGB of any length above 0. Returns
+    (...) float64, 0 … 180. By W. Kahan's formula of the half angle, which keeps its digits at every angle; the arc
+    cosine loses half of them at small ones.
     """
     a, b = _unit(one), _unit(other)
     return np.degrees(2 * np.arctan2(np.linalg.norm(a - b, axis=-1), np.linalg.norm(a + b, axis=-1)))

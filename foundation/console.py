@@ -49,18 +49,7 @@ def say_error(message: str) -> None:
 
 
 def run(command: Callable[[], object], *, keeps: bool = True, loads: bool = False) -> int:
-    """Call `command` and return the exit code; a foreseeable fault is one line on stderr, no traceback.
-
-    Parameters
-    ----------
-    command
-        What is to be done.
-    keeps
-        Whether it goes on, called again after an interruption, with what it had done; the user is told which.
-    loads
-        Whether it begins with loading modules and calls `loaded` then. Until then no garbage is looked for: modules
-        make none, and looking took a sixth of a short command.
-    """
+    """Call `command` and return the exit code; a foreseeable fault is one line on stderr, no traceback."""
     collects = gc.isenabled()
     if loads:
         gc.disable()
@@ -158,11 +147,6 @@ class Ending:
     A request comes as a signal, in the midst of anything. A block of work that must not be cut says so with
     `finishing`; a request that comes meanwhile is noted, answered with a sentence, and seen by the block where it can
     end. A second request ends it at once.
-
-    Parameters
-    ----------
-    say
-        Prints a sentence; called in the midst of anything.
     """
 
     def __init__(self, say: Callable[[str], object] = _say) -> None:
@@ -176,13 +160,7 @@ class Ending:
         return self._asked
 
     def ask(self) -> None:
-        """Ask for the end, as a signal does.
-
-        Raises
-        ------
-        KeyboardInterrupt
-            Nothing is being finished, or it was asked before: the process ends at once.
-        """
+        """Ask for the end, as a signal does."""
         first, self._asked = not self._asked, True
         if not (first and self._promise):
             raise KeyboardInterrupt
@@ -190,13 +168,7 @@ class Ending:
 
     @contextmanager
     def finishing(self, promise: str) -> Generator[None]:
-        """Let the first request wait for the end of the block; the block ends early where `asked` says so.
-
-        Parameters
-        ----------
-        promise
-            What whoever asks is told: when it will end.
-        """
+        """Let the first request wait for the end of the block; the block ends early where `asked` says so."""
         before, self._promise = self._promise, promise
         try:
             yield
@@ -205,13 +177,7 @@ class Ending:
 
     @contextmanager
     def at_once(self) -> Generator[None]:
-        """Let the first request end the block at once: nothing has begun in it that could be finished.
-
-        Raises
-        ------
-        KeyboardInterrupt
-            The end was asked for before.
-        """
+        """Let the first request end the block at once: nothing has begun in it that could be finished."""
         before, self._promise = self._promise, ""
         try:
             if self._asked:
@@ -226,11 +192,6 @@ def orderly_end() -> Generator[Ending]:
     """End as by Ctrl-C, devices closed, where the process is asked to end: by `kill`, or by a terminal that went away.
 
     A signal that is ignored already, as a hang-up is under `nohup`, stays ignored.
-
-    Yields
-    ------
-    Ending
-        By which a part of the block can put off the first request, Ctrl-C included, until what it has begun is done.
     """
     ending = Ending()
     if threading.current_thread() is not threading.main_thread():
@@ -262,18 +223,7 @@ def orderly_end() -> Generator[Ending]:
 
 @contextmanager
 def progress(unit: str) -> Generator[Callable[[int, int], None]]:
-    """Show a progress bar with the time left on stderr, from the first number told to the end of the block.
-
-    Parameters
-    ----------
-    unit
-        What is counted: "frames".
-
-    Yields
-    ------
-    callable
-        Takes how many are done and how many there are.
-    """
+    """Show a progress bar with the time left on stderr, from the first number told to the end of the block."""
     from rich.console import Console
     from rich.progress import (
         BarColumn,
@@ -438,12 +388,7 @@ class _StyledTyper(typer.Typer):
 def new_app(help_text: str | None = None, **more: Any) -> typer.Typer:
     """Return an app in the style of all commands.
 
-    Parameters
-    ----------
-    help_text
-        What ``--help`` says of it; that of its only command if None.
-    more
-        Further arguments of `typer.Typer`.
+    `help_text`: what ``--help`` says of it; that of its only command if None.
     """
     return _StyledTyper(
         cls=_StyledGroup,

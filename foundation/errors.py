@@ -17,9 +17,10 @@ The tree says whose move it is::
     │   └── RegistrationError     the chart cannot be found, or is not the one expected
     └── StorageError          5   the disk: full, read-only, gone
 
-The number is the exit code of a command that ends with it (0 success, 130 interrupted). A message holds the value,
-what was expected, the file or device it is about, and the remedy. Errors of libraries are raised again as one of
-these at the place where the library is called, with ``from error``.
+The number is the exit code of a command that ends with it (0 success, 130 interrupted). A sentence holds the value,
+what was expected, the file or device it is about, and the remedy: ``about: problem; remedy``. What a program asks of an
+error stands in attributes of its own, so that sentences can be worded anew. Errors of libraries are raised again as one
+of these at the place where the library is called, with ``from error``.
 """
 
 from __future__ import annotations
@@ -37,13 +38,44 @@ _LONGEST = 8000
 
 
 class CropError(Exception):
-    """Root of the tree: a foreseeable fault, described in one sentence that holds no secret of an address."""
+    """Root of the tree: a foreseeable fault, described in one sentence that holds no secret of an address.
+
+    Parameters
+    ----------
+    problem
+        What is wrong, with the value and what was expected.
+    about
+        File, folder or device that it is about: the sentence begins with it. None where the problem names it.
+    remedy
+        What to do, an imperative: the sentence ends with it. "" where the problem says it.
+    value, expected
+        What was found and what should have been, for programs; the problem says both in words.
+
+    Examples
+    --------
+    >>> str(FormatError("its version is 7, 1 is read", about="lut.json", remedy="build the table again", value=7))
+    'lut.json: its version is 7, 1 is read; build the table again'
+    """
 
     exit_code = 1
 
+    def __init__(
+        self,
+        problem: str = "",
+        *,
+        about: object = None,
+        remedy: str = "",
+        value: object = None,
+        expected: object = None,
+    ) -> None:
+        super().__init__(problem)
+        self.problem, self.remedy = problem, remedy
+        self.about, self.value, self.expected = about, value, expected
+
     def __str__(self) -> str:
         """Return the sentence, users, passwords and tokens of addresses in it masked; cut where it has no end."""
-        text = masked(super().__str__())
+        begin = "" if self.about is None else f"{self.about}: "
+        text = masked(f"{begin}{self.problem}{f'; {self.remedy}' if self.remedy else ''}")
         return text if len(text) <= _LONGEST else f"{text[: _LONGEST // 2]} … {text[-_LONGEST // 4 :]}"
 
 

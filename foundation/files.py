@@ -111,13 +111,7 @@ def disk_remedy_of(error: OSError) -> str | None:
 
 
 def storage_error(path: Path, error: OSError, what: str = "write") -> InputError | StorageError:
-    """Return what went wrong at `path` as one sentence with its remedy; an InputError if the name is to blame.
-
-    Parameters
-    ----------
-    what
-        What cannot be done with it: "write", "look into".
-    """
+    """Return what went wrong at `path` as one sentence with its remedy; an InputError if the name is to blame."""
     remedy = remedy_of(error)
     by_name = remedy is not None and not isinstance(error, PermissionError)
     return (InputError if by_name else StorageError)(
@@ -138,13 +132,7 @@ def _making_error(path: Path, error: OSError) -> InputError | StorageError:
 
 
 def reading_error(path: Path, error: OSError, remedy: str, what: str = "") -> FormatError | StorageError:
-    """Return why `path` cannot be read: the disk's fault with its own remedy, else the file's with `remedy`.
-
-    Parameters
-    ----------
-    what
-        What it is, before its name in the message: "chart".
-    """
+    """Return why `path` cannot be read: the disk's fault with its own remedy, else the file's with `remedy`."""
     of_disk = disk_remedy_of(error) if error.errno != errno.ENOENT else None
     named = f"{what} {path}" if what else str(path)
     return (StorageError if of_disk else FormatError)(
@@ -165,19 +153,7 @@ def _is_ours(error: BaseException, path: Path) -> TypeGuard[OSError]:
 def make_folder(folder: Path, of: Path | None = None) -> None:
     """Make a folder and those above it, where they are missing.
 
-    Parameters
-    ----------
-    folder
-        What to make.
-    of
-        What the folder is made for, named in the messages; the folder itself if None.
-
-    Raises
-    ------
-    InputError
-        The path cannot be a folder's: a part of it is a file, or it is too long.
-    StorageError
-        The disk is full, read-only or gone.
+    `of`: what the folder is made for, named in the messages; the folder itself if None.
     """
     path = folder if of is None else of
     for _ in range(ATTEMPTS):
@@ -199,13 +175,7 @@ def make_folder(folder: Path, of: Path | None = None) -> None:
 
 
 def sync_folder(folder: Path) -> None:
-    """Make the names in `folder` durable; does nothing where the system cannot.
-
-    Raises
-    ------
-    StorageError
-        The disk fails: a name that was given may be lost when the power is.
-    """
+    """Make the names in `folder` durable; does nothing where the system cannot."""
     try:
         handle = os.open(folder, os.O_RDONLY)
         try:
@@ -223,24 +193,6 @@ def whole_file(path: Path, final: Callable[[], Path] | None = None, *, make: boo
     """Open `path` for writing (and reading back) so that it appears complete, or not at all.
 
     An existing file of that name is replaced at the very end.
-
-    Parameters
-    ----------
-    path
-        The final name, or what it begins with if `final` is given.
-    final
-        Called when the content is complete and on the disk; returns the final name, in the same folder. For names
-        that are known only by then, such as a raw file's suffix.
-    make
-        Whether the folder is made if it is not there: not where that means that a disk was unmounted, for the file
-        would lie on another one then.
-
-    Raises
-    ------
-    InputError
-        `path` is a folder, too long, or below a file.
-    StorageError
-        The disk is full, read-only, broken or gone. What is under the final name is the old file or the new one, whole.
     """
     partial = partial_path(path)
     if make:
@@ -261,13 +213,7 @@ def whole_file(path: Path, final: Callable[[], Path] | None = None, *, make: boo
 
 
 def read_whole(path: Path) -> memoryview:
-    """Return a large file's bytes, to be read only: for a `bytes` object the system clears each page of memory first.
-
-    Raises
-    ------
-    OSError
-        The file cannot be read.
-    """
+    """Return a large file's bytes, read only: for a `bytes` object the system clears each page of memory first."""
     import numpy as np
 
     with path.open("rb", buffering=0) as stream:
@@ -287,15 +233,7 @@ def write_whole(path: Path, data: bytes | str) -> None:
 
 
 def require_free(path: Path, what: str) -> None:
-    """Refuse when `path` exists and is not an empty folder.
-
-    Raises
-    ------
-    InputError
-        Something is there already; the message says how to go on.
-    StorageError
-        The disk fails, so that nobody knows.
-    """
+    """Refuse when `path` exists and is not an empty folder."""
     try:
         empty = path.is_dir() and not any(path.iterdir())
     except OSError as error:
@@ -307,15 +245,7 @@ def require_free(path: Path, what: str) -> None:
 
 
 def require_free_file(path: Path, what: str) -> None:
-    """Refuse when `path` exists, be it an empty folder.
-
-    Raises
-    ------
-    InputError
-        Something is there already; the message says how to go on.
-    StorageError
-        The disk fails, so that nobody knows.
-    """
+    """Refuse when `path` exists, be it an empty folder."""
     try:
         taken = path.exists() or path.is_symlink()
     except OSError as error:
@@ -329,21 +259,7 @@ def require_free_file(path: Path, what: str) -> None:
 def publish_folder(folder: Path, path: Path, what: str) -> None:
     """Give a folder that is complete its final name, durably.
 
-    Parameters
-    ----------
-    folder
-        Complete and on the disk, beside its final place.
-    path
-        The final name; must be free, or an empty folder.
-    what
-        What the folder holds, for the message.
-
-    Raises
-    ------
-    InputError
-        `path` is taken.
-    StorageError
-        The disk is full, read-only or gone.
+    `path`: the final name; must be free, or an empty folder.
     """
     require_free(path, what)
     try:
@@ -357,24 +273,7 @@ def publish_folder(folder: Path, path: Path, what: str) -> None:
 def whole_folder(path: Path, what: str) -> Generator[Path]:
     """Build a folder under a hidden name and give it its final name when the block ends well.
 
-    Parameters
-    ----------
-    path
-        The final name; must be free, or an empty folder.
-    what
-        What the folder holds, for the message: "the table", "the dataset".
-
-    Yields
-    ------
-    Path
-        The hidden folder to fill.
-
-    Raises
-    ------
-    InputError
-        `path` is taken.
-    StorageError
-        The disk is full, read-only or gone. Nothing is left behind.
+    `path`: the final name; must be free, or an empty folder.
     """
     require_free(path, what)
     partial = partial_path(path)

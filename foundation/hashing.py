@@ -12,13 +12,7 @@ _BLOCK: Final = 1 << 20
 
 
 def sha256_of(data: Any) -> str:
-    """Return the SHA-256 of `data`: bytes, or an object with a contiguous buffer such as a C-ordered array.
-
-    Raises
-    ------
-    ValueError
-        The buffer does not lie in one piece.
-    """
+    """Return the SHA-256 of `data`: bytes, or an object with a contiguous buffer such as a C-ordered array."""
     return hashlib.sha256(data).hexdigest()
 
 
@@ -31,13 +25,7 @@ def stream_sha256(stream: BinaryIO) -> str:
 
 
 def file_sha256(path: Path) -> str:
-    """Return the SHA-256 of a file's bytes.
-
-    Raises
-    ------
-    OSError
-        The file cannot be read.
-    """
+    """Return the SHA-256 of a file's bytes."""
     with path.open("rb") as stream:
         return stream_sha256(stream)
 
@@ -45,10 +33,7 @@ def file_sha256(path: Path) -> str:
 class HashingWriter(io.RawIOBase):
     """A stream that is written in order, hashed and counted meanwhile.
 
-    Parameters
-    ----------
-    stream
-        Takes all bytes of every write, as a buffered file does; it is not closed by this one.
+    `stream`: takes all bytes of every write, as a buffered file does; it is not closed by this one.
     """
 
     def __init__(self, stream: BinaryIO) -> None:

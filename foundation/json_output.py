@@ -26,15 +26,7 @@ AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object, for
 
 
 class JsonOutput:
-    """Figures of a command, gathered for the object that is printed at its end.
-
-    Parameters
-    ----------
-    command
-        What was called, such as "evaluate cv".
-    asked
-        Whether an object is to be printed.
-    """
+    """Figures of a command, gathered for the object that is printed at its end."""
 
     def __init__(self, command: str, asked: bool) -> None:
         self.asked = asked
@@ -62,18 +54,6 @@ def json_output(command: str, asked: bool) -> Generator[JsonOutput]:
 
     What was gathered is printed also where data are not good enough or something else ends the command: the exit code
     says so, and standard error why.
-
-    Parameters
-    ----------
-    command
-        What was called.
-    asked
-        Whether ``--json`` was given; nothing differs if not.
-
-    Yields
-    ------
-    JsonOutput
-        Takes the figures.
     """
     output = JsonOutput(command, asked)
     if not asked:
@@ -90,13 +70,7 @@ def json_output(command: str, asked: bool) -> Generator[JsonOutput]:
 
 
 def with_json(command: str) -> Callable[[Callable[..., None]], Callable[..., None]]:
-    """Return a decorator of a typer command whose parameter `told: JsonOutput` is replaced by the option ``--json``.
-
-    Parameters
-    ----------
-    command
-        What is called, as the object says it.
-    """
+    """Return a decorator of a typer command whose parameter `told: JsonOutput` is replaced by the option ``--json``."""
 
     def decorate(function: Callable[..., None]) -> Callable[..., None]:
         signature = inspect.signature(function)

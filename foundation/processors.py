@@ -23,16 +23,6 @@ def processor_count() -> int:
 def ordered_map(function: Callable[[_In], _Out], things: Iterable[_In], workers: int) -> Iterator[_Out]:
     """Yield the function's values in the order of the things; with one worker in the calling thread.
 
-    Parameters
-    ----------
-    function
-        Called with each thing; what it raises is raised in the thing's turn.
-    things
-        Two a worker are taken in advance, no more, so that neither things nor values pile up. What has begun is waited
-        for when the caller stops, what has not is dropped.
-    workers
-        Threads.
-
     Examples
     --------
     >>> list(ordered_map(abs, [-3, 2, -1], workers=2))

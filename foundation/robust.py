@@ -28,12 +28,7 @@ def sigma_of(residual: npt.NDArray[np.floating]) -> float:
 def huber_weights(size: npt.NDArray[np.float64], sigma: float) -> npt.NDArray[np.float64]:
     """Return Huber's weights 0 … 1, of the shape of `size`.
 
-    Parameters
-    ----------
-    size
-        (...) float64, absolute residuals.
-    sigma
-        Their usual size, > 0 (`sigma_of`); residuals beyond twice that weigh in inverse proportion to their size.
+    `size`: (...) float64, absolute residuals.
     """
     return np.minimum(1, _HUBER_SIGMAS * sigma / np.maximum(size, 1e-12))
 
@@ -41,13 +36,6 @@ def huber_weights(size: npt.NDArray[np.float64], sigma: float) -> npt.NDArray[np
 def biweight(size: npt.NDArray[np.float64], sigma: float, cut: float = 6.0) -> npt.NDArray[np.float64]:
     """Return Tukey's biweights 0 … 1, of the shape of `size`.
 
-    Parameters
-    ----------
-    size
-        (...) float64, absolute residuals.
-    sigma
-        Their usual size, > 0 (`sigma_of`).
-    cut
-        Sigmas beyond which a residual has no weight.
+    `size`: (...) float64, absolute residuals.
     """
     return np.asarray(np.maximum(1 - (size / (cut * sigma)) ** 2, 0) ** 2, dtype=np.float64)

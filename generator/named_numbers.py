@@ -32,20 +32,6 @@ def is_number(text: str) -> bool:
 def parse_numbers(text: str, allowed: Mapping[str, Range], what: str) -> dict[str, float]:
     """Return the numbers of a text such as ``r=.3,b=.25``; empty text gives none.
 
-    Parameters
-    ----------
-    text
-        What was written.
-    allowed
-        Every name that may occur, with the least and the greatest number.
-    what
-        What the numbers are for, for the message.
-
-    Raises
-    ------
-    InputError
-        An entry is no ``name=number``, its name is unknown or occurs twice, or its number is out of range.
-
     Examples
     --------
     >>> parse_numbers("r=.3, b=.25", {"r": (0, 1), "b": (0, 1)}, "a light")

@@ -60,11 +60,6 @@ Words = npt.NDArray[np.uint32]
 def key_of(seed: int) -> tuple[int, int]:
     """Return the two key words of a seed 0 … 2⁶⁴ − 1.
 
-    Raises
-    ------
-    InputError
-        The seed is outside that range.
-
     Examples
     --------
     >>> key_of(2**32 + 7)
@@ -80,19 +75,7 @@ def words(
 ) -> tuple[Words, Words, Words, Words]:
     """Return the four random words of each place.
 
-    Parameters
-    ----------
-    seed
-        0 … 2⁶⁴ − 1.
-    a, b, number
-        (...) int, the first three counter words, 0 … 2³² − 1 each, of shapes that broadcast.
-    purpose
-        The fourth.
-
-    Returns
-    -------
-    tuple of four ndarray
-        uint32, of the broadcast shape of `a`, `b` and `number`, such as (N,).
+    Returns uint32, of the broadcast shape of `a`, `b` and `number`, such as (N,).
 
     Examples
     --------

@@ -30,13 +30,7 @@ app = new_app(
 
 
 def main(argv: Sequence[str] | None = None, read_chart: Callable[[Path], Print] | None = None) -> int:
-    """Run `sim` with these arguments, or those of the process, and return the exit code (`EXIT_CODES`).
-
-    Parameters
-    ----------
-    read_chart
-        Returns the print of a chart.json. Charts are known above this package, so whoever stands there hands it in.
-    """
+    """Run `sim` with these arguments, or those of the process, and return the exit code (`EXIT_CODES`)."""
     return console.run(lambda: app(args=common_first(argv), prog_name="sim", obj=read_chart))
 
 

@@ -29,15 +29,9 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def read_print(chart: Path) -> Print:
-    """Return the print of a chart.json, as the simulated room hangs it up.
-
-    Raises
-    ------
-    InputError, FormatError
-        There is no such file, or it is no chart's.
-    """
-    from acquisition.chart.model import load_chart
-    from acquisition.chart.printing import drawing
+    """Return the print of a chart.json, as the simulated room hangs it up."""
+    from experiment.chart.model import load_chart
+    from experiment.chart.printing import drawing
     from sim.world.drawing import Print
 
     drawn = drawing(load_chart(chart))

@@ -13,10 +13,10 @@ from typing import Protocol
 import numpy as np
 import numpy.typing as npt
 
-from acquisition.lights.illuminations import Illumination
 from calibration.radiometry.primaries import pure_lights
 from drivers.camera import ExposureSettings
 from drivers.presenter import WHITE
+from experiment.lights.illuminations import Illumination
 from sim.world.drawing import PAPER
 from sim.world.profile import printed_reflectance
 from sim.world.spectra import sensitivities
@@ -55,16 +55,10 @@ class ChartLamp(Protocol):
 class ProjectorLamp:
     """The simulated projector.
 
-    Attributes
-    ----------
-    world
-        Room, body and page.
-    settings
-        The exposure of every frame.
-    illuminations
-        The lights and their codes.
-    light
-        (3, rows, columns) float32, the light on every photosite under each primary at full drive.
+    - `world`: room, body and page.
+    - `settings`: the exposure of every frame.
+    - `illuminations`: the lights and their codes.
+    - `light`: (3, rows, columns) float32, the light on every photosite under each primary at full drive.
     """
 
     world: World
@@ -104,20 +98,11 @@ class SpectralLamp:
     Each light is exposed so that bare paper's strongest channel reaches the room's `white_level_share`, as a
     photographer would: a table of spectra has no brightness of its own.
 
-    Attributes
-    ----------
-    world
-        Body, print and room; the field is that of its projector's green.
-    illuminations
-        The lights.
-    powers
-        (L, 81) float64, relative power of each per nm.
-    sensor
-        The photosites under the patches.
-    reflectance
-        (N, 81) float64, of each patch's print.
-    field
-        (N,) float64, the light on each patch over that in the brightest place.
+    - `world`: body, print and room; the field is that of its projector's green.
+    - `powers`: (L, 81) float64, relative power of each per nm.
+    - `sensor`: the photosites under the patches.
+    - `reflectance`: (N, 81) float64, of each patch's print.
+    - `field`: (N,) float64, the light on each patch over that in the brightest place.
     """
 
     world: World

@@ -23,7 +23,7 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
-from acquisition.lights.illuminations import Illumination, parse_ccts, shown_colour
+from experiment.lights.illuminations import Illumination, parse_ccts, shown_colour
 from foundation.colorimetry.observer import linear_srgb, planck, xyz_of
 from foundation.errors import FormatError, InputError
 from sim.spectral.grids import regridded, require_grid
@@ -53,14 +53,8 @@ _Array = npt.NDArray[np.float64]
 class LightSpectrum:
     """A light.
 
-    Attributes
-    ----------
-    name
-        Its name.
-    power
-        (81,) float64 ≥ 0, relative power per nm at `sim.world.spectra.WAVELENGTHS_NM`.
-    cct_k
-        Its temperature if a black body, K; None otherwise.
+    - `power`: (81,) float64 ≥ 0, relative power per nm at `sim.world.spectra.WAVELENGTHS_NM`.
+    - `cct_k`: its temperature if a black body, K; None otherwise.
     """
 
     name: str
@@ -72,12 +66,7 @@ class LightSpectrum:
 class LightSpectra:
     """Lights, each once, and where they are from.
 
-    Attributes
-    ----------
-    lights
-        The lights.
-    source
-        What a record says of them: the file and its hash, or the names.
+    `source`: what a record says of them: the file and its hash, or the names.
     """
 
     lights: tuple[LightSpectrum, ...]
@@ -85,21 +74,7 @@ class LightSpectra:
 
 
 def read_lights(given: str) -> LightSpectra:
-    """Return the lights that a text names: a CSV file's, or published ones.
-
-    Parameters
-    ----------
-    given
-        The path of a file, or names separated by commas: ``D65,A,FL2,5600K,2000:10000:500K,daylight:4000:10000:500,
-        cie-led``.
-
-    Raises
-    ------
-    InputError
-        There is neither such a file nor such a light, or a light is named twice.
-    FormatError
-        The file's spectra cannot be a light's.
-    """
+    """Return the lights that a text names: a CSV file's, or published ones."""
     from foundation.hashing import sha256_of
 
     path = Path(given)
@@ -123,13 +98,7 @@ def read_lights(given: str) -> LightSpectra:
 
 
 def parse_spectra(data: bytes, where: str) -> tuple[LightSpectrum, ...]:
-    """Return the lights in the bytes of a CSV file; `where` names it in messages.
-
-    Raises
-    ------
-    FormatError
-        See `read_lights`.
-    """
+    """Return the lights in the bytes of a CSV file; `where` names it in messages."""
     try:
         rows = list(csv.reader(io.StringIO(data.decode("utf-8-sig"))))
     except (UnicodeDecodeError, csv.Error) as error:

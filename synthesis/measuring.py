@@ -12,13 +12,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from acquisition.measures.paper import MAX_ORDER, MAX_ORDER_AROUND, MIN_REFERENCES, Paper, PaperReader
-from acquisition.measures.sensor_range import saturation
 from calibration.pipeline.baseline import usable_means
 from calibration.pipeline.registered_frame import ChartPoints
 from calibration.radiometry.primaries import Primaries
 from calibration.sampling.patch_statistics import patch_means
 from calibration.sampling.samples import Sites, gather, gather_values
+from experiment.measures.paper import MAX_ORDER, MAX_ORDER_AROUND, MIN_REFERENCES, Paper, PaperReader
+from experiment.measures.sensor_range import saturation
 from foundation.errors import QualityError
 from synthesis.lamps import ChartLamp
 from synthesis.patch_frames import PatchSensor
@@ -30,20 +30,12 @@ _Array = npt.NDArray[np.float64]
 class ComputedFrame:
     """What the frame of one light shows; C cells of S samples, G levels of grey.
 
-    Attributes
-    ----------
-    light
-        Number of the light.
-    values
-        (C, S, 3) uint16, the table's samples.
-    highest
-        (C,) uint16, the highest raw count of each cell.
-    black
-        (2, 2) float64 counts, the black level that was subtracted.
-    paper
-        Field, ground truth and its standard error.
-    greys, grey_errors
-        (G, 3) float64 counts of each level of grey, field divided out, and their standard errors.
+    - `light`: number of the light.
+    - `values`: (C, S, 3) uint16, the table's samples.
+    - `highest`: (C,) uint16, the highest raw count of each cell.
+    - `black`: (2, 2) float64 counts, the black level that was subtracted.
+    - `paper`: field, ground truth and its standard error.
+    - `greys`, `grey_errors`: (G, 3) float64 counts of each level of grey, field divided out, and their standard errors.
     """
 
     light: int
@@ -59,20 +51,12 @@ class ComputedFrame:
 class PatchMeasurement:
     """What holds for the frames of all lights; made by `PatchMeasurement.of`.
 
-    Attributes
-    ----------
-    points
-        The chart's cells and references.
-    sensor
-        The photosites under them: cells first, then white, then grey references.
-    lamp
-        What lights them.
-    iso
-        ISO speed.
-    reader
-        Reads field and white, with the field of the even frame as base.
-    primaries
-        How the field of coloured cells differs from that of paper; None where the light has no primaries.
+    - `points`: the chart's cells and references.
+    - `sensor`: the photosites under them: cells first, then white, then grey references.
+    - `lamp`: what lights them.
+    - `iso`: ISO speed.
+    - `reader`: reads field and white, with the field of the even frame as base.
+    - `primaries`: how the field of coloured cells differs from that of paper; None where the light has no primaries.
     """
 
     points: ChartPoints
@@ -86,22 +70,7 @@ class PatchMeasurement:
     def of(
         points: ChartPoints, page_mm: tuple[float, float], among: bool, sensor: PatchSensor, lamp: ChartLamp, iso: int
     ) -> PatchMeasurement:
-        """Return what holds for all lights, from an even frame and those of the primaries.
-
-        Parameters
-        ----------
-        points, sensor, lamp, iso
-            As above.
-        page_mm
-            Width and height of the page.
-        among
-            Whether white references lie among the cells, and not around them only.
-
-        Raises
-        ------
-        QualityError
-            Bare paper is clipped, or fewer than six references are there.
-        """
+        """Return what holds for all lights, from an even frame and those of the primaries."""
         reader = PaperReader(points.whites_mm, points.cells_mm, page_mm)
         first = PatchMeasurement(points, sensor, lamp, iso, reader)
         order = MAX_ORDER if among else MAX_ORDER_AROUND
@@ -115,13 +84,7 @@ class PatchMeasurement:
         return replace(plain, primaries=Primaries.of(pure, papers, cells, points.cells_mm))
 
     def measure(self, light: int) -> ComputedFrame:
-        """Return what the frame of a light shows; any thread may ask for any light.
-
-        Raises
-        ------
-        QualityError
-            Bare paper is clipped.
-        """
+        """Return what the frame of a light shows; any thread may ask for any light."""
         mosaic, black = self.sensor.expose(*self.lamp.lit(light), self.iso, light + 1)
         cells, references = self._sites()
         samples, highest = gather(mosaic, black, references)

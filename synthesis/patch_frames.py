@@ -40,22 +40,14 @@ _Float = npt.NDArray[np.float32]
 class PatchSensor:
     """The photosites under the patches of a chart, with their response.
 
-    Attributes
-    ----------
-    body
-        The camera's body.
-    patches
-        N, how many patches there are.
-    window
-        Half-size pixels along a patch's side.
-    seed
-        Of response and noise.
-    response
-        (N · 2 · window, 2 · window) float32, what each photosite gives over what it should: the fixed pattern.
-    hot
-        The photosites whose dark current is out of proportion.
-    shutter_s
-        Exposure time of every frame, seconds: their excess grows with it.
+    - `body`: the camera's body.
+    - `patches`: N, how many patches there are.
+    - `window`: half-size pixels along a patch's side.
+    - `seed`: of response and noise.
+    - `response`: (N · 2 · window, 2 · window) float32, what each photosite gives over what it should: the fixed
+      pattern.
+    - `hot`: the photosites whose dark current is out of proportion.
+    - `shutter_s`: exposure time of every frame, seconds: their excess grows with it.
     """
 
     body: Body
@@ -89,15 +81,8 @@ class PatchSensor:
     def light(self, signals: _Array) -> _Float:
         """Return the light on every photosite.
 
-        Parameters
-        ----------
-        signals
-            (N, 3, P) float64, DN above black of each patch by channel under each of P ≤ 3 primaries.
-
-        Returns
-        -------
-        ndarray
-            (3, N · 2 · window, 2 · window) float32, response included; 0 for primaries that are not given.
+        `signals`: (N, 3, P) float64, DN above black of each patch by channel under each of P ≤ 3 primaries. Returns (3,
+        N · 2 · window, 2 · window) float32, response included; 0 for primaries that are not given.
         """
         side = 2 * self.window
         found = np.zeros((3, *self.response.shape), dtype=np.float32)
@@ -113,24 +98,10 @@ class PatchSensor:
     def expose(self, light: _Float, weights: _Array, iso: int, frame: int) -> tuple[Mosaic, _Array]:
         """Return a frame, and its black level as a masked border would show it.
 
-        Parameters
-        ----------
-        light
-            (3, N · 2 · window, 2 · window) float32, what `light` returned.
-        weights
-            (3,) float64, how much of each primary the frame collects.
-        iso
-            ISO speed, which sets gain and read noise.
-        frame
-            Its number, 0 or more; the same number has the same noise.
-
-        Returns
-        -------
-        mosaic
-            (N · 2 · window, 2 · window) counts, without borders.
-        black
-            (2, 2) float64 counts, the estimate for each position of the block: the mean of as many dark counts as the
-            body has masked photosites there, or its true black where it has none.
+        `light`: (3, N · 2 · window, 2 · window) float32, what `light` returned. `weights`: (3,) float64, how much of
+        each primary the frame collects. `iso`: ISO speed, which sets gain and read noise. Returns (N · 2 · window, 2 ·
+        window) counts, without borders. Returns (2, 2) float64 counts, the estimate for each position of the block: the
+        mean of as many dark counts as the body has masked photosites there, or its true black where it has none.
         """
         from sim.world.rendering import counts
 

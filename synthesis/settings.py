@@ -12,10 +12,10 @@ from typing import Annotated, Any, Final
 
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
-from acquisition.config import unknown_key
 from calibration.sampling.samples import WINDOW
 from calibration.sampling.windows import WINDOWS
 from drivers.camera import ExposureSettings
+from experiment.config import unknown_key
 from foundation.errors import ConfigurationError
 from sim.world.room import Room
 
@@ -80,13 +80,7 @@ class TableSettings(_Settings):
 
 
 def load_settings(path: Path | None) -> TableSettings:
-    """Return what a settings file says; the defaults where none is given.
-
-    Raises
-    ------
-    ConfigurationError
-        The file cannot be read, is not TOML, or holds an unknown key or an unusable value.
-    """
+    """Return what a settings file says; the defaults where none is given."""
     if path is None:
         return TableSettings()
     try:
@@ -101,13 +95,7 @@ def load_settings(path: Path | None) -> TableSettings:
 
 
 def parse_settings(document: dict[str, Any], where: str) -> TableSettings:
-    """Return the settings in a TOML document; `where` names it in errors.
-
-    Raises
-    ------
-    ConfigurationError
-        It holds an unknown key or an unusable value.
-    """
+    """Return the settings in a TOML document; `where` names it in errors."""
     try:
         settings = TableSettings.model_validate(document)
     except ValidationError as error:
@@ -124,13 +112,7 @@ def parse_settings(document: dict[str, Any], where: str) -> TableSettings:
 
 
 def room_of(settings: TableSettings, where: str) -> Room:
-    """Return the default room with the seed and the changes of the settings; its lamp does not age.
-
-    Raises
-    ------
-    ConfigurationError
-        A parameter is unknown, of the wrong type, or of no effect on a computed table.
-    """
+    """Return the default room with the seed and the changes of the settings; its lamp does not age."""
     known = [field.name for field in fields(Room) if field.name not in ("seed", *NOT_COMPUTED)]
     for key in settings.room:
         if key in NOT_COMPUTED:

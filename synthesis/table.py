@@ -18,9 +18,6 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
-from acquisition.chart.model import Chart
-from acquisition.framing.planes import CLIPPING_SHARE
-from acquisition.lights.illuminations import Illumination
 from calibration.citation.record import OriginRecord
 from calibration.pipeline.registered_frame import ChartPoints
 from calibration.radiometry.corrections import corrections
@@ -30,6 +27,9 @@ from calibration.table.provenance import Provenance, Unfit
 from calibration.table.source_frames import frames_sha256
 from calibration.table.writer import LutWriter
 from drivers.camera import ExposureSettings
+from experiment.chart.model import Chart
+from experiment.framing.planes import CLIPPING_SHARE
+from experiment.lights.illuminations import Illumination
 from foundation.errors import StorageError
 from foundation.files import require_free, whole_folder
 from foundation.processors import ordered_map
@@ -55,25 +55,14 @@ _Array = npt.NDArray[np.float64]
 class TableTask:
     """A table that is to be computed.
 
-    Attributes
-    ----------
-    chart
-        The chart that is thought to hang there.
-    body, room
-        The camera and the room.
-    exposure
-        Of every frame.
-    illuminations
-        The lights.
-    powers
-        (L, 81) float64, their spectra, relative power per nm (`synthesis.lamps.SpectralLamp`); None for those that the
-        simulated projector shows.
-    window
-        Half-size pixels along a window's side.
-    record
-        What the provenance says under `computed`.
-    origin
-        Note, licence and authors, as whoever computes the table gives them; None where nothing is given.
+    - `chart`: the chart that is thought to hang there.
+    - `body`, `room`: the camera and the room.
+    - `exposure`: of every frame.
+    - `powers`: (L, 81) float64, their spectra, relative power per nm (`synthesis.lamps.SpectralLamp`); None for those
+      that the simulated projector shows.
+    - `window`: half-size pixels along a window's side.
+    - `record`: what the provenance says under `computed`.
+    - `origin`: note, licence and authors, as whoever computes the table gives them; None where nothing is given.
     """
 
     chart: Chart
@@ -96,16 +85,9 @@ class TableTask:
 class ComputedTable:
     """What came of it.
 
-    Attributes
-    ----------
-    folder
-        The table.
-    lights, cells
-        How many it has.
-    unfit
-        Cells that are listed as unfit.
-    white
-        (L, 3) float64 counts, the ground truth.
+    - `lights`, `cells`: how many it has.
+    - `unfit`: cells that are listed as unfit.
+    - `white`: (L, 3) float64 counts, the ground truth.
     """
 
     folder: Path
@@ -118,25 +100,7 @@ class ComputedTable:
 def compute_table(task: TableTask, out: Path, threads: int, progress: ReportLights | None = None) -> ComputedTable:
     """Compute a table and write it.
 
-    Parameters
-    ----------
-    task
-        The table.
-    out
-        Its folder; must be free.
-    threads
-        How many lights are computed at a time; without effect on the bytes.
-    progress
-        Called after every light.
-
-    Raises
-    ------
-    InputError
-        `out` is taken.
-    QualityError
-        Bare paper is clipped under a light: less exposure is needed.
-    StorageError
-        The disk has not the room, or cannot be written.
+    `threads`: how many lights are computed at a time; without effect on the bytes.
     """
     require_free(out, "the table")
     _require_room(out, task.sample_bytes + SPARE_BYTES)

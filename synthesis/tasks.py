@@ -8,11 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from acquisition.chart.layout import design_chart
-from acquisition.config import CitationSettings
-from acquisition.lights.illuminations import plan_illuminations
 from calibration.citation.record import OriginRecord
 from calibration.citation.stated import with_changes
+from experiment.chart.layout import design_chart
+from experiment.config import CitationSettings
+from experiment.lights.illuminations import plan_illuminations
 from sim.spectral.sensitivities import describe_sensitivities, read_sensitivities
 from sim.world.body_settings import find_body
 from synthesis.light_spectra import LightSpectra, illuminations_of
@@ -23,23 +23,7 @@ from synthesis.table import TableTask
 def table_task(camera: str, settings: TableSettings, where: str, lights: LightSpectra | None = None) -> TableTask:
     """Return the table of a camera under lights.
 
-    Parameters
-    ----------
-    camera
-        As `sim.world.body_settings.find_body` takes it.
-    settings
-        The rest.
-    where
-        What the settings were read from, for messages.
-    lights
-        Spectra; None for the 707 lights of the simulated projector.
-
-    Raises
-    ------
-    InputError, FormatError
-        The camera is unknown, or its file cannot be used.
-    ConfigurationError
-        A setting cannot be used.
+    `lights`: spectra; None for the 707 lights of the simulated projector.
     """
     body = find_body(camera, settings.camera, where)
     room = room_of(settings, where)
@@ -68,19 +52,7 @@ def table_task(camera: str, settings: TableSettings, where: str, lights: LightSp
 def stated_by_hand(note: str | None, licence: str | None, authors: Sequence[str]) -> OriginRecord | None:
     """Return what is said of a computed table by whoever computes it; None where nothing is.
 
-    Parameters
-    ----------
-    note
-        What readers of the table should know.
-    licence
-        An SPDX expression (SPDX specification 2.3, annex D).
-    authors
-        Each as "Family, Given", or the name of an institution.
-
-    Raises
-    ------
-    InputError
-        One of them cannot be used; the message names its option.
+    `licence`: an SPDX expression (SPDX specification 2.3, annex D).
     """
     given = {"note": note, "licence": licence, "authors": tuple(authors) or None}
     stated = with_changes(CitationSettings(), {name: value for name, value in given.items() if value is not None})

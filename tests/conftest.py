@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import shutil
 import sys
 from pathlib import Path
@@ -31,114 +32,8 @@ if MEMORY.is_dir() and os.access(MEMORY, os.W_OK) and shutil.disk_usage(MEMORY).
 # being imported.
 sys.modules.setdefault("triton", None)  # pyright: ignore[reportArgumentType]
 
-TESTS = Path(__file__).parent
-SLOW = (
-    "acquisition/chart/test_layout.py",
-    "acquisition/chart/test_margins.py",
-    "acquisition/chart/test_model.py",
-    "acquisition/chart/test_printing.py",
-    "acquisition/chart/test_proof.py",
-    "acquisition/check/test_foretelling.py",
-    "acquisition/check/test_rooms.py",
-    "acquisition/framing/test_annotated.py",
-    "acquisition/framing/test_finding.py",
-    "acquisition/framing/test_tagless_field.py",
-    "acquisition/framing/test_visibility.py",
-    "acquisition/monitor/test_page.py",
-    "acquisition/run/test_planning.py",
-    "acquisition/session/test_disk_faults.py",
-    "acquisition/session/test_journal_file.py",
-    "acquisition/session/test_journal_model.py",
-    "acquisition/session/test_states.py",
-    "acquisition/test_chart_command.py",
-    "calibration/causes/test_sessions.py",
-    "calibration/checks/test_frame_consistency.py",
-    "calibration/checks/test_light_codes.py",
-    "calibration/checks/test_stains.py",
-    "calibration/comparison/test_compared_sessions.py",
-    "calibration/pipeline/test_build.py",
-    "calibration/pipeline/test_checkpoint.py",
-    "calibration/pipeline/test_drift_correction.py",
-    "calibration/pipeline/test_held_against_itself.py",
-    "calibration/pipeline/test_stray_light.py",
-    "calibration/pipeline/test_linearity.py",
-    "calibration/pipeline/test_options.py",
-    "calibration/pipeline/test_plain_session.py",
-    "calibration/pipeline/test_prefetching.py",
-    "calibration/pipeline/test_print_and_sensor.py",
-    "calibration/pipeline/test_refused_table.py",
-    "calibration/pipeline/test_retaking.py",
-    "calibration/pipeline/test_small_charts.py",
-    "calibration/radiometry/test_cell_field.py",
-    "calibration/radiometry/test_dark_subtraction.py",
-    "acquisition/framing/test_movement.py",
-    "acquisition/judge/test_judge.py",
-    "calibration/registration/test_register.py",
-    "calibration/registration/test_register_without_tags.py",
-    "calibration/report/test_places.py",
-    "calibration/sampling/test_windows.py",
-    "calibration/spread/test_spread.py",
-    "drivers/display/test_fullscreen.py",
-    "drivers/ptp/test_malformed.py",
-    "drivers/raw/test_rawfile.py",
-    "drivers/gphoto2_camera/test_camera.py",
-    "end_to_end",
-    "evaluation/commands/test_choosing.py",
-    "evaluation/commands/test_compare.py",
-    "evaluation/commands/test_describe.py",
-    "evaluation/commands/test_learning_commands.py",
-    "evaluation/commands/test_paper.py",
-    "evaluation/commands/test_transfer.py",
-    "evaluation/datasets/published/test_cube_plus.py",
-    "evaluation/datasets/published/test_cube_plus_plus.py",
-    "evaluation/datasets/published/test_mat5.py",
-    "evaluation/datasets/test_damage.py",
-    "evaluation/datasets/test_generated.py",
-    "evaluation/datasets/test_layouts.py",
-    "evaluation/experiments/describing/test_against.py",
-    "evaluation/experiments/describing/test_description.py",
-    "evaluation/experiments/test_bootstrap.py",
-    "evaluation/experiments/test_cross_validation.py",
-    "evaluation/experiments/test_run_folder.py",
-    "evaluation/experiments/test_tuning.py",
-    "evaluation/learning/test_learners.py",
-    "evaluation/learning/test_log_chroma.py",
-    "evaluation/methods/test_gray_edge.py",
-    "evaluation/results/test_method_records.py",
-    "evaluation/test_cli.py",
-    "foundation/test_compiled.py",
-    "foundation/test_disk_faults.py",
-    "generator/dataset/production/test_engines.py",
-    "generator/dataset/production/test_layouts.py",
-    "generator/dataset/production/test_workplace.py",
-    "generator/dataset/test_contact_sheet.py",
-    "generator/dataset/test_making.py",
-    "generator/dataset/test_reader.py",
-    "generator/dataset/test_rendered_datasets.py",
-    "generator/dataset/test_stores.py",
-    "generator/dataset/test_varied_datasets.py",
-    "generator/kernels/test_choice_statistics.py",
-    "generator/kernels/test_dithering.py",
-    "generator/kernels/test_patches.py",
-    "generator/lights/test_mixture_realism.py",
-    "generator/likeness/test_like.py",
-    "generator/likeness/test_same_lights.py",
-    "generator/rendering/test_colorimetric.py",
-    "generator/test_cli.py",
-    "generator/test_library.py",
-    "generator/test_rendering_told.py",
-    "generator/training/test_crops.py",
-    "house/test_commands.py",
-    "house/test_contributing.py",
-    "sim/camera/test_dng.py",
-    "sim/world/test_geometry.py",
-    "sim/world/test_profile.py",
-    "sim/world/test_world.py",
-    "synthesis/test_spectral_table.py",
-    "synthesis/test_table.py",
-)
-"""Folders and files, below this one, whose tests take more than their share of the minute."""
-
+SLOW_FILE = re.compile(r"^pytestmark = (\[\s*)?pytest\.mark\.slow\b", re.MULTILINE)
+"""What marks all tests of a file."""
 
 QUICK_EXAMPLES = 20
 """Examples of each property in `make quick`: a fifth of what `make test` tries, since
@@ -148,26 +43,13 @@ settings.register_profile("quick", max_examples=QUICK_EXAMPLES)
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Refuse a list that names what is not there; try fewer examples where slow tests are not wanted."""
+    """Try fewer examples where slow tests are not wanted."""
     if config.getoption("markexpr") == "not slow":
         settings.load_profile("quick")
-    missing = [name for name in SLOW if not (TESTS / name).exists()]
-    if missing:
-        raise pytest.UsageError(f"{__file__}: SLOW names {', '.join(missing)}, which are not there; correct the list")
 
 
 def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
     """Leave slow files unread where they are not wanted: what they import takes seconds, too."""
-    return True if config.getoption("markexpr") == "not slow" and is_slow(collection_path) else None
-
-
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark the tests of slow files and folders."""
-    for item in items:
-        if is_slow(item.path):
-            item.add_marker(pytest.mark.slow)
-
-
-def is_slow(path: Path) -> bool:
-    """Return whether a file or folder is on the list, or below a folder on it."""
-    return any(path == place or place in path.parents for place in (TESTS / name for name in SLOW))
+    if config.getoption("markexpr") != "not slow" or collection_path.suffix != ".py":
+        return None
+    return True if SLOW_FILE.search(collection_path.read_text(encoding="utf-8")) else None

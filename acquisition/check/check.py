@@ -14,7 +14,6 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from acquisition.chart.model import Chart, load_chart
 from acquisition.check.exposure import judge_exposure
 from acquisition.check.findings import CheckReport, Finding, not_checked
 from acquisition.check.foretelling.figures import ForetoldTable, foretell, foretell_lights, smallest_cell_px
@@ -37,10 +36,7 @@ from acquisition.check.print_state import judge_print
 from acquisition.check.sensor import judge_clipping, judge_hot, judge_linearity, judge_noise_reduction
 from acquisition.check.supplies import judge_disk, judge_supplies
 from acquisition.check.taking import Photographer
-from acquisition.config import LabSettings
-from acquisition.framing.corners import Corners
 from acquisition.judge.exposure import disagreement
-from acquisition.lights.illuminations import Illumination, load_illuminations
 from acquisition.run.asking import ask_all
 from acquisition.run.devices import Devices
 from acquisition.run.lamp import make_ready, reported_error
@@ -51,6 +47,10 @@ from acquisition.run.shutter import period_s
 from drivers.camera import keep_awake
 from drivers.presenter import Colour, ReportsWarnings
 from drivers.projector import Power, Projector, Severity
+from experiment.chart.model import Chart, load_chart
+from experiment.config import LabSettings
+from experiment.framing.corners import Corners
+from experiment.lights.illuminations import Illumination, load_illuminations
 from foundation.errors import DeviceError, counted
 from foundation.files import write_whole
 
@@ -64,16 +64,10 @@ _Array = npt.NDArray[np.float64]
 class CheckOptions:
     """What is asked of a check.
 
-    Attributes
-    ----------
-    picture
-        Where to draw what was found, PNG; None for nowhere.
-    corners
-        Of the field of a chart without tags, as given by hand, half-size px; `acquisition.framing.corners`.
-    linearity
-        Whether to take a series of exposures that shows the sensor's linearity and noise.
-    session
-        Where the session is to lie, for the disk's free space; the settings' folder if not given.
+    - `picture`: where to draw what was found, PNG; None for nowhere.
+    - `corners`: of the field of a chart without tags, as given by hand, half-size px; `experiment.framing.corners`.
+    - `linearity`: whether to take a series of exposures that shows the sensor's linearity and noise.
+    - `session`: where the session is to lie, for the disk's free space; the settings' folder if not given.
     """
 
     picture: Path | None = None
@@ -87,22 +81,7 @@ def check_lab(
     options: CheckOptions | None = None,
     announce: Callable[[str], None] = lambda sentence: None,
 ) -> CheckReport:
-    """Check the rig that the settings name; record nothing.
-
-    Parameters
-    ----------
-    settings
-        As `acquisition.config.load_lab` returns them.
-    options
-        What is asked; nothing beyond the usual if not given.
-    announce
-        Called with a sentence when a long wait begins.
-
-    Raises
-    ------
-    InputError, DeviceError
-        The settings or a device make a check impossible.
-    """
+    """Check the rig that the settings name; record nothing."""
     options = options or CheckOptions()
     chart = load_chart(settings.chart)
     lights = load_illuminations(settings.illuminations)
@@ -284,13 +263,7 @@ def _sensor_findings(
 def _make_devices_ready(
     devices: Devices, settings: LabSettings, announce: Callable[[str], None]
 ) -> tuple[list[str], list[Finding]]:
-    """Make every device ready for a frame; return a line about each, and what screen and projector report.
-
-    Raises
-    ------
-    DeviceError
-        A device cannot be used: of several all are named, since each was asked.
-    """
+    """Make every device ready for a frame; return a line about each, and what screen and projector report."""
     projector = devices.projector
     questions: dict[str, Callable[[], object]] = {
         "camera": lambda: (devices.camera.identity(), devices.camera.configure(settings.camera.exposure)),

@@ -17,9 +17,9 @@ import numpy.typing as npt
 
 from acquisition.check.findings import LIMITS, Finding, Grade, amount, judged, percent
 from acquisition.check.taking import Shot
-from acquisition.framing.planes import CHANNELS, CLIPPING_SHARE, PAPER_PERCENTILE, frame_black, phases
 from acquisition.run.shutter import holds_whole_turns
 from drivers.raw.rawfile import Mosaic
+from experiment.framing.planes import CHANNELS, CLIPPING_SHARE, PAPER_PERCENTILE, frame_black, phases
 
 TARGET = 0.7
 """White as a share of saturation that is looked for: the middle of what is good."""
@@ -52,14 +52,9 @@ _Array = npt.NDArray[np.float64]
 class Saturation:
     """Where the sensor saturates.
 
-    Attributes
-    ----------
-    counts
-        Raw count, the lowest of the positions of the 2×2 block.
-    measured
-        Whether a frame showed it; else it is what the file states.
-    stated
-        What the file states.
+    - `counts`: raw count, the lowest of the positions of the 2×2 block.
+    - `measured`: whether a frame showed it; else it is what the file states.
+    - `stated`: what the file states.
     """
 
     counts: float
@@ -97,14 +92,7 @@ def fitting_times(offered_s: Sequence[float], period_s: float | None) -> list[fl
 def measure_saturation(first: Shot, take: Callable[[float], Shot], times_s: Sequence[float]) -> Saturation:
     """Return where the sensor saturates, by frames of white exposed longer and longer.
 
-    Parameters
-    ----------
-    first
-        White at the time of the settings.
-    take
-        Takes a frame of white at a shutter time, seconds.
-    times_s
-        What may be tried.
+    `take`: takes a frame of white at a shutter time, seconds.
     """
     stated = float(first.mosaic.white_level)
     longer = first
@@ -137,15 +125,8 @@ def _paper_counts(mosaic: Mosaic) -> _Array:
 def level_of(shot: Shot, saturation: Saturation, white: _Array | None = None) -> Trial:
     """Return how bright white is in a frame.
 
-    Parameters
-    ----------
-    shot
-        The frame.
-    saturation
-        The sensor's.
-    white
-        (3,) float64 counts above black of the brightest paper; None where the chart's place is not known: then the
-        brightest hundredth of the frame stands for it.
+    `white`: (3,) float64 counts above black of the brightest paper; None where the chart's place is not known: then the
+    brightest hundredth of the frame stands for it.
     """
     black = frame_black(shot.mosaic)
     found = phases(shot.mosaic)
@@ -158,14 +139,7 @@ def level_of(shot: Shot, saturation: Saturation, white: _Array | None = None) ->
 def search(first: Trial, measure: Callable[[float], Trial], times_s: Sequence[float]) -> tuple[Trial, ...]:
     """Return the times that were tried until the best of those offered was among them; the first is `first`.
 
-    Parameters
-    ----------
-    first
-        White at the time of the settings.
-    measure
-        Takes a frame at a shutter time, seconds, and says how bright white is.
-    times_s
-        What may be tried, rising.
+    `measure`: takes a frame at a shutter time, seconds, and says how bright white is.
     """
     trials = [first]
     while len(trials) < TRIALS:
@@ -219,18 +193,7 @@ def judge_exposure(
 ) -> Finding:
     """Return the finding on the exposure of the settings, which is that of the first trial.
 
-    Parameters
-    ----------
-    trials
-        What was tried.
-    saturation
-        The sensor's.
-    times_s
-        Which times could be tried.
-    period_s
-        After which the light repeats, seconds; None where it is steady.
-    recorded
-        Whether frames come from a recording, which cannot be exposed anew.
+    `period_s`: after which the light repeats, seconds; None where it is steady.
     """
     first, best = trials[0], best_of(trials)
     channel = CHANNELS[int(np.argmax(first.level))]

@@ -7,7 +7,7 @@ Rules that hold inside:
 - What could not be looked at is `not checked`, with the reason; it is never good.
 - A finding that is not good says what to do about it.
 - What lies beyond `tolerable` is refused later, by the run or by `build-lut`, whose numbers these are
-  (`acquisition.limits.table`). Where `good` is narrower than what a table is accepted with, it is a warning while
+  (`experiment.limits.table`). Where `good` is narrower than what a table is accepted with, it is a warning while
   something can be mended, and the limit's source says so.
 """
 
@@ -19,7 +19,7 @@ from dataclasses import asdict, dataclass, field
 from types import MappingProxyType
 from typing import Any, Literal
 
-from acquisition.limits.table import TABLE_LIMITS, TableOutcome
+from experiment.limits.table import TABLE_LIMITS, TableOutcome
 
 CELL_PHOTOSITES = 100
 """Photosites under the 25 samples of a cell, each of which has four: any of them may be hot."""
@@ -39,20 +39,13 @@ JUDGEMENT = "judgement"
 class Limit:
     """What a value may be.
 
-    Attributes
-    ----------
-    name
-        Of the finding that it judges.
-    title
-        The value for people.
-    unit
-        Of the value and its limits: "share" (0 … 1, shown as per cent), "px", "°", "s", or "" for a plain number.
-    good, tolerable
-        Lowest and highest value that is good, and that is but remarked on; beyond `tolerable` it is a fault.
-    why
-        What goes wrong beyond.
-    source
-        Where the numbers come from.
+    - `name`: of the finding that it judges.
+    - `title`: the value for people.
+    - `unit`: of the value and its limits: "share" (0 … 1, shown as per cent), "px", "°", "s", or "" for a plain number.
+    - `good`, `tolerable`: lowest and highest value that is good, and that is but remarked on; beyond `tolerable` it is
+      a fault.
+    - `why`: what goes wrong beyond.
+    - `source`: where the numbers come from.
     """
 
     name: str
@@ -81,26 +74,14 @@ class Limit:
 class Finding:
     """One thing that was looked at.
 
-    Attributes
-    ----------
-    name
-        What: "exposure", "evenness".
-    grade
-        good, remark, fault, or not checked.
-    said
-        What was seen, with its numbers; or why nothing was.
-    value
-        The number that was judged; None where there is none.
-    unit
-        Of the value and the limits, as in `Limit`.
-    good, tolerable
-        The limits.
-    reason
-        What goes wrong beyond them; empty where the value is good.
-    remedy
-        What to do; empty where nothing is to be done.
-    details
-        Further numbers and words by name, for programs.
+    - `name`: what: "exposure", "evenness".
+    - `grade`: good, remark, fault, or not checked.
+    - `said`: what was seen, with its numbers; or why nothing was.
+    - `value`: the number that was judged; None where there is none.
+    - `unit`: of the value and the limits, as in `Limit`.
+    - `reason`: what goes wrong beyond them; empty where the value is good.
+    - `remedy`: what to do; empty where nothing is to be done.
+    - `details`: further numbers and words by name, for programs.
     """
 
     name: str
@@ -124,19 +105,12 @@ class Finding:
 class CheckReport:
     """What a whole check found.
 
-    Attributes
-    ----------
-    devices
-        What answered, a line each, and what was done with it.
-    findings
-        In the order in which they were looked at.
-    foretold
-        What `build-lut` would say, as far as these frames show it: "accept", "accept with remarks" or "refuse"; None
-        where the chart was not found.
-    figures
-        The table's figures that are known, by their names in `report.json`.
-    not_known
-        The names of those that are known only when there are frames of a session.
+    - `devices`: what answered, a line each, and what was done with it.
+    - `findings`: in the order in which they were looked at.
+    - `foretold`: what `build-lut` would say, as far as these frames show it: "accept", "accept with remarks" or
+      "refuse"; None where the chart was not found.
+    - `figures`: the table's figures that are known, by their names in `report.json`.
+    - `not_known`: the names of those that are known only when there are frames of a session.
     """
 
     devices: tuple[str, ...]

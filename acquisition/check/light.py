@@ -12,13 +12,13 @@ from typing import Protocol
 import numpy as np
 import numpy.typing as npt
 
-from acquisition.chart.model import Chart
 from acquisition.check.findings import LIMITS, Finding, judged, not_checked, percent
 from acquisition.check.places import Levels
-from acquisition.framing.planes import CHANNELS
-from acquisition.measures.least_squares import least_squares
-from acquisition.measures.paper import MIN_REFERENCES, PaperReader
-from acquisition.measures.polynomials import page_polynomial, page_powers
+from experiment.chart.model import Chart
+from experiment.framing.planes import CHANNELS
+from experiment.measures.least_squares import least_squares
+from experiment.measures.paper import MIN_REFERENCES, PaperReader
+from experiment.measures.polynomials import page_polynomial, page_powers
 from foundation.angles import angles_deg
 from foundation.robust import huber_weights, sigma_of
 
@@ -55,12 +55,7 @@ class SmoothLight(Protocol):
 class BentLight:
     """Light whose logarithm is a polynomial over the page, for charts of few references: positive everywhere.
 
-    Parameters
-    ----------
-    page_mm
-        Width and height of the page.
-    terms
-        (terms, 3) float64 of the logarithm, for R, G and B.
+    `terms`: (terms, 3) float64 of the logarithm, for R, G and B.
     """
 
     def __init__(self, page_mm: tuple[float, float], terms: _Array) -> None:
@@ -77,11 +72,6 @@ def measure_light(chart: Chart, references: Levels) -> SmoothLight | None:
 
     None where fewer than six white ones can be used, or lie among the cells: a margin alone says nothing of the
     middle.
-
-    Parameters
-    ----------
-    references
-        What white shows of the chart's references, in its order.
     """
     white = np.array([reference.is_white for reference in chart.references], dtype=np.bool_)
     seen = np.where(references.clipped[:, None], np.nan, references.mean)
@@ -134,12 +124,7 @@ def no_light(chart: Chart) -> str:
 def judge_evenness(light: SmoothLight | None, chart: Chart) -> list[Finding]:
     """Return the findings on how evenly the chart is lit, of lens and projector together.
 
-    Parameters
-    ----------
-    light
-        What the references show under white; None where there are too few.
-    chart
-        The chart.
+    `light`: what the references show under white; None where there are too few.
     """
     if light is None:
         return [not_checked(name, no_light(chart)) for name in ("evenness", "colour evenness")]
@@ -189,16 +174,8 @@ def judge_room_light(
     The ratio of a patch in the dark to the same patch under white does not depend on its colour, so every patch that
     white shows well enough takes part.
 
-    Parameters
-    ----------
-    points_mm
-        (N, 2) patches of the print.
-    white, dark
-        (N, 3) counts above black under white and under the black picture, at one exposure.
-    muted
-        (N, 3) the same with the projector's picture muted; None where it could not be.
-    why_not_muted
-        Why not.
+    `points_mm`: (N, 2) patches of the print. `white`, `dark`: (N, 3) counts above black under white and under the black
+    picture, at one exposure. `muted`: (N, 3) the same with the projector's picture muted; None where it could not be.
     """
     share, place = _worst_share(chart, points_mm, white, dark)
     if share is None:
@@ -255,12 +232,7 @@ def area_name(row: int, column: int) -> str:
 def judge_primaries(levels: Mapping[str, _Array], plan_has: bool) -> list[Finding]:
     """Return the findings on whether white is the brightest light, and the sum of the primaries.
 
-    Parameters
-    ----------
-    levels
-        (3,) counts above black of paper under "white", "red", "green", "blue" and "black", at one exposure.
-    plan_has
-        Whether the plan holds lights at all.
+    `levels`: (3,) counts above black of paper under "white", "red", "green", "blue" and "black", at one exposure.
     """
     white, black = levels["white"], levels["black"]
     alone = np.stack([levels[name] for name in ("red", "green", "blue")])
@@ -292,12 +264,7 @@ def judge_primaries(levels: Mapping[str, _Array], plan_has: bool) -> list[Findin
 def judge_flicker(whites: Sequence[_Array], shutter_s: float) -> list[Finding]:
     """Return the findings on how white differs between frames of one exposure.
 
-    Parameters
-    ----------
-    whites
-        (3,) counts above black of paper, frame by frame; at least three.
-    shutter_s
-        Their shutter time.
+    `whites`: (3,) counts above black of paper, frame by frame; at least three.
     """
     seen = np.stack(whites)
     ratio = seen[:, 0] / seen[:, 1]

@@ -12,7 +12,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from acquisition.chart.model import Chart
 from acquisition.check.exposure import (
     USABLE,
     Saturation,
@@ -29,12 +28,13 @@ from acquisition.check.places import ChartMap, Levels, levels, place_chart, wind
 from acquisition.check.print_state import PrintState, measure_print
 from acquisition.check.sensor import Transfer, fit_transfer, pair_noise, series_times
 from acquisition.check.taking import Photographer, Shot
-from acquisition.config import LabSettings
-from acquisition.framing.corners import Corners
-from acquisition.framing.finding import Framing, find_chart
-from acquisition.framing.planes import frame_black
-from acquisition.measures.sensor_range import saturation as shown_saturation
 from drivers.presenter import BLACK, WHITE, Colour
+from experiment.chart.model import Chart
+from experiment.config import LabSettings
+from experiment.framing.corners import Corners
+from experiment.framing.finding import Framing, find_chart
+from experiment.framing.planes import frame_black
+from experiment.measures.sensor_range import saturation as shown_saturation
 from foundation.errors import DeviceError, RegistrationError
 
 REPEATS = 6
@@ -51,14 +51,9 @@ _Array = npt.NDArray[np.float64]
 class PlacedChart:
     """The chart in the frames of a check, which all have it in one place.
 
-    Attributes
-    ----------
-    framing
-        Where it was found.
-    place
-        The map from the print to the frames.
-    window
-        Side of the windows that patches are read in, px.
+    - `framing`: where it was found.
+    - `place`: the map from the print to the frames.
+    - `window`: side of the windows that patches are read in, px.
     """
 
     framing: Framing
@@ -79,35 +74,20 @@ class Series:
 class CheckFrames:
     """What a check looked at.
 
-    Attributes
-    ----------
-    first
-        White at the shutter time of the settings.
-    trials
-        Shutter times tried, that of the settings first.
-    times_s
-        Those that can be used.
-    saturation
-        The sensor's.
-    chart
-        Where the chart is; None where it was not found.
-    trouble
-        Why not.
-    whites
-        Frames of white at `used_s`; one of a recording.
-    dark
-        A frame of black there.
-    muted
-        The same with the projector muted; None where it could not be.
-    why_not_muted
-        Why not.
-    primaries
-        Levels of paper, (3,) counts above black, under "white", "red", "green", "blue" and "black"; None of a
-        recording.
-    series
-        Exposures for linearity; None where not asked for.
-    focal_px
-        The focal length that files state, half-size px.
+    - `first`: white at the shutter time of the settings.
+    - `trials`: shutter times tried, that of the settings first.
+    - `times_s`: those that can be used.
+    - `saturation`: the sensor's.
+    - `chart`: where the chart is; None where it was not found.
+    - `trouble`: why not.
+    - `whites`: frames of white at `used_s`; one of a recording.
+    - `dark`: A frame of black there.
+    - `muted`: the same with the projector muted; None where it could not be.
+    - `why_not_muted`: why not.
+    - `primaries`: levels of paper, (3,) counts above black, under "white", "red", "green", "blue" and "black"; None of
+      a recording.
+    - `series`: exposures for linearity; None where not asked for.
+    - `focal_px`: the focal length that files state, half-size px.
     """
 
     first: Shot
@@ -188,23 +168,7 @@ def look(
     linearity: bool,
     announce: Callable[[str], None],
 ) -> CheckFrames:
-    """Take the frames of a check and find the chart in them.
-
-    Parameters
-    ----------
-    camera
-        Takes frames.
-    offered_s
-        Shutter times that the body offers.
-    period_s
-        After which the light repeats.
-    corners
-        Of the field of a chart without tags, as given by hand.
-    linearity
-        Whether to take a series of exposures.
-    announce
-        Called with a sentence when something begins that takes a while.
-    """
+    """Take the frames of a check and find the chart in them."""
     first = camera.take(WHITE)
     found = _Look(chart, corners)
     if settings.rig == "replay":
@@ -324,18 +288,11 @@ def mean_levels(shots: tuple[Shot, ...], placed: PlacedChart, points_mm: _Array,
 class ChartFigures:
     """What was measured of the chart, where it was found.
 
-    Attributes
-    ----------
-    placed
-        Where it is.
-    blur
-        Its sharpness from place to place.
-    cells, references
-        What white shows of it, in the chart's order.
-    light
-        The light on it; None where it has too few white references.
-    state
-        Stains on it; None likewise.
+    - `placed`: where it is.
+    - `blur`: its sharpness from place to place.
+    - `cells`, `references`: what white shows of it, in the chart's order.
+    - `light`: the light on it; None where it has too few white references.
+    - `state`: stains on it; None likewise.
     """
 
     placed: PlacedChart

@@ -10,15 +10,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from acquisition.chart.model import Chart
 from acquisition.check.findings import LIMITS, Finding, Grade, amount, judged, not_checked, percent, worst
 from acquisition.check.light import AREAS, area_name
 from acquisition.check.places import ChartMap
-from acquisition.framing.finding import Framing
-from acquisition.framing.homography import project
-from acquisition.framing.sharpness import edge_blurs
-from acquisition.framing.tags import MIN_MODULE_PX
-from acquisition.limits.bleed import bleed, largest_blur_px
+from experiment.chart.model import Chart
+from experiment.framing.finding import Framing
+from experiment.framing.homography import project
+from experiment.framing.sharpness import edge_blurs
+from experiment.framing.tags import MIN_MODULE_PX
+from experiment.limits.bleed import bleed, largest_blur_px
 
 USUAL_FOCAL_DIAGONALS = 1.3
 """Focal length over the frame's diagonal where the file states none: 35 mm on APS-C (chosen)."""
@@ -44,14 +44,8 @@ def measure_blur(framing: Framing) -> BlurMap:
 def judge_sharpness(blur: BlurMap, chart: Chart, module_px: float, cell_px: float) -> Finding:
     """Return the finding on sharpness: the worst area of the chart counts, for a fault the median of all places.
 
-    Parameters
-    ----------
-    blur, chart
-        The blur from place to place, and the chart.
-    module_px
-        Of the tags, half-size px; too small ones are not looked at.
-    cell_px
-        Shorter side of the smallest cell, half-size px.
+    `module_px`: of the tags, half-size px; too small ones are not looked at. `cell_px`: shorter side of the smallest
+    cell, half-size px.
     """
     if module_px < MIN_MODULE_PX:
         return not_checked(
@@ -123,10 +117,7 @@ def judge_turn(framing: Framing) -> Finding:
 def judge_tilt(framing: Framing, chart: Chart, focal_px: float | None) -> Finding:
     """Return the finding on keystone: by the sides' lengths, which need no focal length, and in degrees.
 
-    Parameters
-    ----------
-    focal_px
-        Focal length, half-size px; None where it is not known: degrees then hold for a usual lens.
+    `focal_px`: focal length, half-size px; None where it is not known: degrees then hold for a usual lens.
     """
     width, height = chart.page_mm
     corners = project(framing.homography, [(0, 0), (width, 0), (width, height), (0, height)])

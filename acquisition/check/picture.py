@@ -12,13 +12,13 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from acquisition.chart.model import Chart
 from acquisition.check.findings import GRADES, CheckReport
 from acquisition.check.light import light_share
 from acquisition.check.looking import ChartFigures, CheckFrames
 from acquisition.check.print_state import Spot
-from acquisition.framing.annotated import annotated_png
-from acquisition.framing.sharpness import MAX_BLUR_PX
+from experiment.chart.model import Chart
+from experiment.framing.annotated import annotated_png
+from experiment.framing.sharpness import MAX_BLUR_PX
 
 COLOURS = {"fault": "#b42318", "remark": "#b54708", "not checked": "#667085", "good": "#027a48"}
 """Of the grades: dark enough to be read on white."""

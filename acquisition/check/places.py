@@ -4,7 +4,7 @@ Tags alone place a wavy sheet to some pixels only. So the smooth map through the
 as printed is laid over the frame as seen, and shifted until it fits best. Good to a few tenths of a pixel, where
 `calibration.registration` is to a few hundredths: enough for the middle of a cell, and a tenth of the time.
 
-Places are half-size pixels (`acquisition.framing.planes`), points millimetres on the print.
+Places are half-size pixels (`experiment.framing.planes`), points millimetres on the print.
 """
 
 from __future__ import annotations
@@ -15,14 +15,14 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from acquisition.chart.model import Chart
-from acquisition.chart.printing import field_drawing
-from acquisition.framing.finding import Framing
-from acquisition.framing.homography import project
-from acquisition.framing.planes import CHANNELS, CLIPPING_SHARE, Plane, frame_black, plane_of
-from acquisition.measures.least_squares import robust_least_squares
-from acquisition.measures.polynomials import page_polynomial, page_powers
 from drivers.raw.rawfile import Mosaic
+from experiment.chart.model import Chart
+from experiment.chart.printing import field_drawing
+from experiment.framing.finding import Framing
+from experiment.framing.homography import project
+from experiment.framing.planes import CHANNELS, CLIPPING_SHARE, Plane, frame_black, plane_of
+from experiment.measures.least_squares import robust_least_squares
+from experiment.measures.polynomials import page_polynomial, page_powers
 
 MAX_TERMS_SHARE = 0.6
 """Terms of the smooth map over the number of tags, at most: each tag is one independent place."""
@@ -49,19 +49,12 @@ _Array = npt.NDArray[np.float64]
 class ChartMap:
     """The map from the print to a frame.
 
-    Attributes
-    ----------
-    page_mm
-        Width and height of the page.
-    homography
-        (3, 3) float64, mm to px.
-    bend
-        (terms, 2) float64 px, what a polynomial over the page adds.
-    shifts
-        (rows, columns, 2) float64 px, what blocks add, at places evenly spread over the page, the first and last of
-        each axis on its edges; (1, 1, 2) zeros where blocks were not matched.
-    matched
-        Share of the blocks whose shift was believed; NaN where none were tried.
+    - `page_mm`: width and height of the page.
+    - `homography`: (3, 3) float64, mm to px.
+    - `bend`: (terms, 2) float64 px, what a polynomial over the page adds.
+    - `shifts`: (rows, columns, 2) float64 px, what blocks add, at places evenly spread over the page, the first and
+      last of each axis on its edges; (1, 1, 2) zeros where blocks were not matched.
+    - `matched`: share of the blocks whose shift was believed; NaN where none were tried.
     """
 
     page_mm: tuple[float, float]
@@ -207,12 +200,8 @@ def _settled(found: _Array, good: npt.NDArray[np.bool_]) -> _Array:
 class Levels:
     """What patches of the print show in a frame.
 
-    Attributes
-    ----------
-    mean
-        (N, 3) float64 camera RGB, counts above black, mean over a window in the middle; NaN outside the frame.
-    clipped
-        (N,) bool, whether a photosite of the window is clipped.
+    - `mean`: (N, 3) float64 camera RGB, counts above black, mean over a window in the middle; NaN outside the frame.
+    - `clipped`: (N,) bool, whether a photosite of the window is clipped.
     """
 
     mean: _Array
@@ -230,18 +219,8 @@ def window_px(chart: Chart, place: ChartMap) -> int:
 def levels(mosaic: Mosaic, place: ChartMap, points_mm: npt.ArrayLike, window: int, saturation: float) -> Levels:
     """Return what patches about points (N, 2) mm show in a frame.
 
-    Parameters
-    ----------
-    mosaic
-        The frame.
-    place
-        Where the chart lies in it.
-    points_mm
-        (N, 2) float, middles of the patches.
-    window
-        Side of the window, px, odd.
-    saturation
-        Raw count at which the sensor saturates.
+    `points_mm`: (N, 2) float, middles of the patches. `window`: side of the window, px, odd. `saturation`: raw count at
+    which the sensor saturates.
     """
     from scipy.ndimage import map_coordinates
 

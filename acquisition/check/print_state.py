@@ -1,6 +1,6 @@
 """The print: stains, creases and shadows on it, each with its place and size.
 
-Cells are held against cells of nearly their code, which lie elsewhere on the sheet (`acquisition.measures.stains`);
+Cells are held against cells of nearly their code, which lie elsewhere on the sheet (`experiment.measures.stains`);
 references against references of their own code. What deviates together in one place is one spot.
 
 Rules that hold inside:
@@ -18,13 +18,13 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from acquisition.chart.model import Chart
 from acquisition.check.findings import LIMITS, Finding, judged, not_checked, percent
 from acquisition.check.light import SmoothLight, no_light
 from acquisition.check.places import Levels
-from acquisition.measures.least_squares import robust_least_squares
-from acquisition.measures.polynomials import page_polynomial, page_powers
-from acquisition.measures.stains import LEAST_BITS, LEAST_COUNTS, find_stains
+from experiment.chart.model import Chart
+from experiment.measures.least_squares import robust_least_squares
+from experiment.measures.polynomials import page_polynomial, page_powers
+from experiment.measures.stains import LEAST_BITS, LEAST_COUNTS, find_stains
 from foundation.robust import sigma_of
 
 LEAST_CELLS = 3
@@ -59,20 +59,12 @@ _Mask = npt.NDArray[np.bool_]
 class Spot:
     """A place of the print that has not its codes' colours.
 
-    Attributes
-    ----------
-    centre_mm
-        Its middle, from the sheet's top-left corner.
-    size_mm
-        Diameter of a circle of the area of its cells; of a crease its length.
-    patches
-        Its cells, or references.
-    deviation
-        Light there over what is expected, less 1, of the channel that deviates most.
-    crease
-        Whether it is long and narrow.
-    width_mm, angle_deg
-        Of a crease: its width, and its direction, clockwise from the right.
+    - `centre_mm`: its middle, from the sheet's top-left corner.
+    - `size_mm`: diameter of a circle of the area of its cells; of a crease its length.
+    - `patches`: its cells, or references.
+    - `deviation`: light there over what is expected, less 1, of the channel that deviates most.
+    - `crease`: whether it is long and narrow.
+    - `width_mm`, `angle_deg`: of a crease: its width, and its direction, clockwise from the right.
     """
 
     centre_mm: tuple[float, float]
@@ -95,18 +87,10 @@ class Spot:
 class PrintState:
     """How the print deviates from its codes.
 
-    Attributes
-    ----------
-    points_mm
-        (N, 2) patches that were judged.
-    deviation
-        (N,) float64 of the channel that deviates most, signed; NaN where it is not known.
-    off
-        (N,) bool, patches of spots.
-    spots
-        The largest first.
-    by_references
-        Whether references alone were judged.
+    - `points_mm`: (N, 2) patches that were judged.
+    - `deviation`: (N,) float64 of the channel that deviates most, signed; NaN where it is not known.
+    - `off`: (N,) bool, patches of spots.
+    - `by_references`: whether references alone were judged.
     """
 
     points_mm: _Array
@@ -117,15 +101,7 @@ class PrintState:
 
 
 def measure_print(chart: Chart, cells: Levels, references: Levels, field: SmoothLight) -> PrintState:
-    """Return how the print deviates from its codes.
-
-    Parameters
-    ----------
-    cells, references
-        What white frames show of the chart's cells and references, in the chart's order.
-    field
-        The smooth light on the chart.
-    """
+    """Return how the print deviates from its codes."""
     by_references = chart.bits < LEAST_BITS
     if by_references:
         points = np.array([reference.centre_mm for reference in chart.references], dtype=np.float64).reshape(-1, 2)
@@ -160,12 +136,7 @@ def measure_print(chart: Chart, cells: Levels, references: Levels, field: Smooth
 def judge_print(state: PrintState | None, chart: Chart, matched: float) -> Finding:
     """Return the finding on stains.
 
-    Parameters
-    ----------
-    state
-        None where the light on the chart is not known.
-    matched
-        Share of the places of the chart that were confirmed (`ChartMap.matched`).
+    `state`: none where the light on the chart is not known.
     """
     if state is None:
         return not_checked("stains", no_light(chart))

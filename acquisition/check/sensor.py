@@ -17,9 +17,9 @@ from acquisition.check.findings import LIMITS, Finding, Range, judged, not_check
 from acquisition.check.light import area_name
 from acquisition.check.places import ChartMap
 from acquisition.check.taking import Shot
-from acquisition.framing.planes import CHANNELS, CLIPPING_SHARE, frame_black, phases
-from acquisition.measures.linearity import HIGHEST, LOWEST, deviations
 from drivers.raw.rawfile import Mosaic
+from experiment.framing.planes import CHANNELS, CLIPPING_SHARE, frame_black, phases
+from experiment.measures.linearity import HIGHEST, LOWEST, deviations
 from foundation.robust import sigma_of
 
 HOT_COUNTS = 30.0
@@ -88,15 +88,7 @@ def _densest(full: npt.NDArray[np.bool_], place: ChartMap) -> str:
 
 
 def judge_hot(dark: Mosaic, share: float, white: Mosaic) -> Finding:
-    """Return the finding on photosites that stand out in a dark frame.
-
-    Parameters
-    ----------
-    dark, white
-        Frames of one exposure under the black picture and under white.
-    share
-        The black picture's light over white's: what the dark frame shows of the print.
-    """
+    """Return the finding on photosites that stand out in a dark frame."""
     sensor = dark.counts.astype(np.float32)
     count = 0
     for row in range(2):
@@ -119,10 +111,7 @@ def judge_hot(dark: Mosaic, share: float, white: Mosaic) -> Finding:
 def judge_noise_reduction(timings: Sequence[tuple[float, float]]) -> Finding:
     """Return the finding on whether the body takes a dark frame of its own after long exposures.
 
-    Parameters
-    ----------
-    timings
-        Of every frame taken: shutter time and the time until its file was here, seconds.
+    `timings`: of every frame taken: shutter time and the time until its file was here, seconds.
     """
     times = sorted(timings)
     if not times or times[-1][0] < 1.0 or times[-1][0] < 4 * times[0][0]:
@@ -164,12 +153,7 @@ class Transfer:
 def series_times(times_s: Sequence[float], white_s: float, white_level: float) -> list[float]:
     """Return the shutter times of a series in which white goes from 6 to 94 % of saturation, rising.
 
-    Parameters
-    ----------
-    times_s
-        What may be used, rising.
-    white_s, white_level
-        A shutter time, and white's share of saturation at it.
+    `white_s`, `white_level`: A shutter time, and white's share of saturation at it.
     """
     able = [time for time in times_s if 0.06 <= white_level * time / white_s <= 0.94]
     if len(able) <= SERIES:
@@ -230,12 +214,8 @@ def fit_transfer(level: _Array, variance: _Array) -> Transfer:
 def judge_linearity(seen: _Array, times_s: Sequence[float], transfer: Transfer) -> list[Finding]:
     """Return the findings of a series of exposures: proportion to light, and the sensor's noise.
 
-    Parameters
-    ----------
-    seen
-        (K, P, 3) float64 mean counts of patches, shares of saturation, NaN where one cannot be used.
-    times_s
-        (K,) shutter times, rising.
+    `seen`: (K, P, 3) float64 mean counts of patches, shares of saturation, NaN where one cannot be used. `times_s`:
+    (K,) shutter times, rising.
     """
     if len(times_s) < LEAST_TIMES:
         return [

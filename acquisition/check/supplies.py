@@ -17,17 +17,7 @@ SPARE = 1.5
 
 
 def judge_disk(folder: Path, frames: int, frame_bytes: int) -> Finding:
-    """Return the finding on the disk of a folder, or of the nearest folder above that exists.
-
-    Parameters
-    ----------
-    folder
-        Where the session is to lie.
-    frames
-        Frames of the plan.
-    frame_bytes
-        Size of the largest frame of this check.
-    """
+    """Return the finding on the disk of a folder, or of the nearest folder above that exists."""
     needed = needed_bytes(frames, frame_bytes)
     try:
         free = free_bytes_at(folder)

@@ -10,12 +10,12 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from acquisition.config import LabSettings
-from acquisition.framing.planes import CHANNELS, frame_black, phases
 from acquisition.run.devices import Devices
 from drivers.camera import capture
 from drivers.presenter import Colour
 from drivers.raw.rawfile import Mosaic, read_raw
+from experiment.config import LabSettings
+from experiment.framing.planes import CHANNELS, frame_black, phases
 from foundation.errors import DeviceError
 
 
@@ -23,18 +23,12 @@ from foundation.errors import DeviceError
 class Shot:
     """One frame.
 
-    Attributes
-    ----------
-    colour
-        What was shown.
-    shutter_s
-        The shutter time that was set, seconds.
-    mosaic
-        Its counts.
-    took_s
-        Seconds from the release until the file was here, by the lab's clock.
-    size
-        Bytes of its file.
+    `mosaic`: its counts.
+
+    - `colour`: what was shown.
+    - `shutter_s`: the shutter time that was set, seconds.
+    - `took_s`: seconds from the release until the file was here, by the lab's clock.
+    - `size`: bytes of its file.
     """
 
     colour: Colour
@@ -58,14 +52,7 @@ class Shot:
 class Photographer:
     """Takes frames with the devices of a rig; each is read and its file deleted.
 
-    Parameters
-    ----------
-    devices
-        Open, the camera configured by the settings.
-    settings
-        The lab's; ISO speed and aperture are never changed.
-    scratch
-        A folder for the files.
+    `settings`: the lab's; ISO speed and aperture are never changed.
     """
 
     def __init__(self, devices: Devices, settings: LabSettings, scratch: Path) -> None:
@@ -79,15 +66,7 @@ class Photographer:
         """Focal length in half-size px, as the last frame's file states it; None where it does not."""
 
     def take(self, colour: Colour, shutter_s: float | None = None) -> Shot:
-        """Return a frame of a plain colour, at the shutter time of the settings unless another is given.
-
-        Raises
-        ------
-        DeviceError
-            A device fails, or the body does not offer the time.
-        FormatError
-            The file that came is no raw file.
-        """
+        """Return a frame of a plain colour, at the shutter time of the settings unless another is given."""
         devices, settings = self._devices, self._settings
         wanted = settings.camera.shutter_s if shutter_s is None else shutter_s
         if wanted != self._shutter_s:
@@ -113,13 +92,7 @@ class Photographer:
 
     @contextmanager
     def muted(self) -> Generator[None]:
-        """Blank the projector's picture meanwhile.
-
-        Raises
-        ------
-        DeviceError
-            There is no control of the projector, or it does not do it.
-        """
+        """Blank the projector's picture meanwhile."""
         projector = self._devices.projector
         if projector is None:
             raise DeviceError("the projector is not under control (lab.projector.control)")

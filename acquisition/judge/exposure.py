@@ -1,7 +1,7 @@
 """Judge the exposure of a raw frame: as asked for, neither clipped nor too dark, and dark where it should be.
 
 Reads counts and the exposure that the file states; where the chart lies in the picture is found by
-`acquisition.framing.finding`.
+`experiment.framing.finding`.
 """
 
 from __future__ import annotations
@@ -12,12 +12,12 @@ from pathlib import Path
 
 import numpy as np
 
-from acquisition.config import LabSettings, LimitSettings
-from acquisition.framing.planes import CLIPPING_SHARE, frame_black
-from acquisition.session.judgement import Judgement
-from acquisition.session.plan import FrameKind, SessionStep
 from drivers.camera import ExposureSettings
 from drivers.raw.rawfile import Mosaic, read_raw
+from experiment.config import LabSettings, LimitSettings
+from experiment.framing.planes import CLIPPING_SHARE, frame_black
+from experiment.session.judgement import Judgement
+from experiment.session.plan import FrameKind, SessionStep
 from foundation.errors import FormatError
 
 BRIGHTEST_PERCENTILE = 99.9
@@ -34,14 +34,9 @@ in what the file states, so that most such turns are seen, and every one of more
 class Exposure:
     """How bright a frame's counts are.
 
-    Attributes
-    ----------
-    clipped
-        Share of photosites at or above `CLIPPING_SHARE` of saturation, 0 … 1.
-    brightest_dn
-        `BRIGHTEST_PERCENTILE` of the counts above black, of the brightest position of the 2×2 block.
-    range_dn
-        Saturation minus black.
+    - `clipped`: share of photosites at or above `CLIPPING_SHARE` of saturation, 0 … 1.
+    - `brightest_dn`: `BRIGHTEST_PERCENTILE` of the counts above black, of the brightest position of the 2×2 block.
+    - `range_dn`: saturation minus black.
     """
 
     clipped: float
@@ -118,7 +113,7 @@ def judge_file(path: Path, kind: FrameKind, settings: LabSettings) -> str | None
 
 
 class ExposureJudge:
-    """A `acquisition.session.judgement.FrameJudge` that looks at the exposure of each frame alone."""
+    """A `experiment.session.judgement.FrameJudge` that looks at the exposure of each frame alone."""
 
     def __init__(self, settings: LabSettings) -> None:
         self._settings = settings

@@ -18,37 +18,27 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from acquisition.chart.model import Chart
-from acquisition.config import LabSettings
-from acquisition.framing.planes import frame_black
-from acquisition.framing.previews import preview_jpeg
 from acquisition.judge.checks.causes import is_lasting, named_once, voids_others
 from acquisition.judge.checks.evenness import judge_evenness
 from acquisition.judge.checks.references import MOST_RESTARTS, judge_first_frames
 from acquisition.judge.known.knowledge import Examined, Knowledge
 from acquisition.judge.looking import is_compared, look
 from acquisition.judge.measured.frame import Frame
-from acquisition.lights.illuminations import Illumination
-from acquisition.session.judgement import Check, Judgement
-from acquisition.session.plan import REFERENCES, SessionStep
 from drivers.raw.rawfile import read_raw
+from experiment.chart.model import Chart
+from experiment.config import LabSettings
+from experiment.framing.planes import frame_black
+from experiment.framing.previews import preview_jpeg
+from experiment.lights.illuminations import Illumination
+from experiment.session.judgement import Check, Judgement
+from experiment.session.plan import REFERENCES, SessionStep
 from foundation.errors import FormatError
 
 _BESIDE = "it was under way when the frames before it were found to contradict each other; they are taken again first"
 
 
 class LiveJudge:
-    """Judges the frames of a session as they come: `acquisition.session.judgement.FrameJudge`.
-
-    Parameters
-    ----------
-    settings
-        Of the lab: limits, exposure, whether the chart is looked for.
-    chart
-        The print before the camera.
-    illuminations
-        The lights of the plan, among which another one than the one ordered is looked for.
-    """
+    """Judges the frames of a session as they come: `experiment.session.judgement.FrameJudge`."""
 
     def __init__(self, settings: LabSettings, chart: Chart, illuminations: Sequence[Illumination]) -> None:
         self._settings = settings
@@ -63,7 +53,7 @@ class LiveJudge:
         return self._known
 
     def recall(self, step: SessionStep, measurement: bytes, accepted: bool) -> None:
-        """Take in a frame of an earlier run; see `acquisition.session.judgement.FrameJudge.recall`."""
+        """Take in a frame of an earlier run; see `experiment.session.judgement.FrameJudge.recall`."""
         frame = Frame.of_bytes(measurement) if measurement else None
         if frame is None:
             lost = accepted and step.kind in ("white", "dark")
@@ -73,12 +63,12 @@ class LiveJudge:
         self._known = self._known.after(step, Examined(frame, light, accepted))
 
     def after_pause(self) -> None:
-        """Take in that lamp and chart may have changed; see `acquisition.session.judgement.OutlastsPauses`."""
+        """Take in that lamp and chart may have changed; see `experiment.session.judgement.OutlastsPauses`."""
         self._known = self._base = self._known.paused()
         self._fresh = False
 
     def judge(self, file: Path, step: SessionStep) -> Judgement:
-        """Return what is said of a raw file; see `acquisition.session.judgement.FrameJudge.judge`."""
+        """Return what is said of a raw file; see `experiment.session.judgement.FrameJudge.judge`."""
         if self._fresh:
             self.after_pause()
         expected, self._known = self._known.expected, replace(self._known, expected=None)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from typing import Final
 
-from acquisition.limits.table import TABLE_LIMITS
+from experiment.limits.table import TABLE_LIMITS
 
 LIGHT_SIGMAS: Final = 5.5
 """Standard deviations of two degrees of freedom: exceeded by chance once in four million frames."""

@@ -8,9 +8,6 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import numpy.typing as npt
 
-from acquisition.chart.model import Chart
-from acquisition.config import LabSettings
-from acquisition.framing.planes import phases
 from acquisition.judge.checks.evenness import judge_evenness
 from acquisition.judge.checks.files import judge_file
 from acquisition.judge.checks.lights import judge_light
@@ -21,9 +18,12 @@ from acquisition.judge.known.knowledge import Knowledge, Leaning, is_brightest_g
 from acquisition.judge.measured.anchor import Anchor
 from acquisition.judge.measured.frame import Frame
 from acquisition.judge.measured.measuring import measure
-from acquisition.session.judgement import Check
-from acquisition.session.plan import REFERENCES, SessionStep
 from drivers.raw.rawfile import Mosaic
+from experiment.chart.model import Chart
+from experiment.config import LabSettings
+from experiment.framing.planes import phases
+from experiment.session.judgement import Check
+from experiment.session.plan import REFERENCES, SessionStep
 from foundation.errors import RegistrationError
 
 _UNFOUNDED = (
@@ -56,18 +56,8 @@ def look(
 ) -> Looked:
     """Return what is found of a frame of a step.
 
-    Parameters
-    ----------
-    known
-        What is known before it.
-    mosaic, black
-        The frame and its black level, (2, 2) float64 counts.
-    step, settings
-        What was to be taken, and how.
-    chart
-        The print before the camera; None where none is looked for.
-    plan
-        Codes of the lights among which another one than the one ordered is looked for.
+    `mosaic`, `black`: the frame and its black level, (2, 2) float64 counts. `chart`: the print before the camera; None
+    where none is looked for.
     """
     measured = measure(mosaic, black)
     frame = Frame(measured, np.full(3, np.nan), UNTOLD_PX)

@@ -59,12 +59,7 @@ class Access:
     def judge(self, target: str, host: str | None) -> Request | Refusal:
         """Return what a request asks for, or why it is refused.
 
-        Parameters
-        ----------
-        target
-            The request line's address, path and query.
-        host
-            The Host header; None if there is none.
+        `host`: the Host header; None if there is none.
         """
         if not self._knows(host):
             return Refusal(421, "this server does not go by that name; open the address that acquire monitor printed")

@@ -15,11 +15,11 @@ from typing import Any
 
 import numpy as np
 
-from acquisition.lights.illuminations import Illumination
 from acquisition.monitor.head import Head
 from acquisition.monitor.rows import AttemptView, EventView
-from acquisition.session.judgement import Check
-from acquisition.session.plan import SessionStep
+from experiment.lights.illuminations import Illumination
+from experiment.session.judgement import Check
+from experiment.session.plan import SessionStep
 from foundation.srgb import decode_srgb
 
 Json = dict[str, Any]
@@ -32,7 +32,7 @@ def session_json(
     """Return what does not change while a session is taken: its name, plan, lights and devices.
 
     A step is [number, kind, light, red, green, blue], a light [index, kind, K, [r, b], red, green, blue]; its
-    chromaticity is that of `acquisition.lights.plots`, None for one without any light.
+    chromaticity is that of `experiment.lights.plots`, None for one without any light.
     """
     kinds = {light.index: (light.kind, light.cct_k) for light in lights}
     shown = {step.illumination: step.colour for step in steps if step.illumination is not None}
@@ -66,14 +66,8 @@ def place_of(red: float, green: float, blue: float) -> list[float] | None:
 def attempt_json(view: AttemptView, white: tuple[float, float, float] | None, preview: int | None) -> Json:
     """Return an attempt.
 
-    Parameters
-    ----------
-    view
-        The attempt.
-    white
-        What was seen of the white frame that it is held against; None if there is none.
-    preview
-        What names the version of its picture; None if there is none.
+    `white`: what was seen of the white frame that it is held against; None if there is none. `preview`: what names the
+    version of its picture; None if there is none.
     """
     seen = view.seen
     place = place_of(*(one / of for one, of in zip(seen, white, strict=True))) if seen and white else None

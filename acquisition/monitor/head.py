@@ -9,10 +9,10 @@ from dataclasses import dataclass
 from datetime import datetime, timedelta
 
 from acquisition.monitor.rows import AttemptView
-from acquisition.session.heartbeat import AGAIN, Heartbeat, SessionPlace
-from acquisition.session.plan import SessionStep
-from acquisition.session.progress import RECENT, TimedAttempt, time_left
-from acquisition.session.records import ACCEPTED, FAILED, REFUSED, VOIDED
+from experiment.session.heartbeat import AGAIN, Heartbeat, SessionPlace
+from experiment.session.plan import SessionStep
+from experiment.session.progress import RECENT, TimedAttempt, time_left
+from experiment.session.records import ACCEPTED, FAILED, REFUSED, VOIDED
 
 LAB_CLOCK_S = 600.0
 """How far the lab's clock may be from that of the wall for the end to be told as a time of day; a simulated lab's time
@@ -23,31 +23,22 @@ passes otherwise, and an attempt that is older than this says nothing of when th
 class Head:
     """How a session stands.
 
-    Attributes
-    ----------
-    state
-        ``running``, ``waiting`` or ``paused`` as the run says it; ``complete``; ``incomplete``: it has ended and frames
-        are left; ``stopped``: killed or power lost; ``copy``: the run's signs of life are those of another folder;
-        ``unknown``: the journal has no sign of life; ``absent``, ``gone``, ``unreadable``: there is no journal to read,
-        yet, or any more.
-    sentence
-        The same in words, with the remedy behind a semicolon where there is one; empty while there is nothing to say.
-    alive
-        Whether a run is at work.
-    beat, until
-        When it last gave a sign of life, and when the next is due, by the wall clock; None if it never did.
-    total, done, lights_total, lights_done
-        Frames of the plan, and those that are accepted; the same of the lights alone.
-    refused, failed, voided
-        Attempts that ended so.
-    seconds_per_frame
-        Median interval of the newest `RECENT` attempts; None before the second.
-    remaining_s
-        Time left by the lab's clock, retakes and references included; None while it is unknown.
-    eta
-        When all frames are there, by the wall clock; None where that cannot be told.
-    last
-        When the newest frame was released, by the lab's clock.
+    - `state`: ``running``, ``waiting`` or ``paused`` as the run says it; ``complete``; ``incomplete``: it has ended and
+      frames are left; ``stopped``: killed or power lost; ``copy``: the run's signs of life are those of another folder;
+      ``unknown``: the journal has no sign of life; ``absent``, ``gone``, ``unreadable``: there is no journal to read,
+      yet, or any more.
+    - `sentence`: the same in words, with the remedy behind a semicolon where there is one; empty while there is nothing
+      to say.
+    - `alive`: whether a run is at work.
+    - `beat`, `until`: when it last gave a sign of life, and when the next is due, by the wall clock; None if it never
+      did.
+    - `total`, `done`, `lights_total`, `lights_done`: frames of the plan, and those that are accepted; the same of the
+      lights alone.
+    - `refused`, `failed`, `voided`: attempts that ended so.
+    - `seconds_per_frame`: median interval of the newest `RECENT` attempts; None before the second.
+    - `remaining_s`: time left by the lab's clock, retakes and references included; None while it is unknown.
+    - `eta`: when all frames are there, by the wall clock; None where that cannot be told.
+    - `last`: when the newest frame was released, by the lab's clock.
     """
 
     state: str
@@ -80,22 +71,8 @@ def head_of(
 ) -> Head:
     """Return how a session stands.
 
-    Parameters
-    ----------
-    steps
-        The plan.
-    attempts
-        All attempts, oldest first.
-    heartbeat
-        The newest sign of life; None where the journal has none.
-    now
-        Wall clock.
-    process_alive
-        Whether the process that gave it is there; None if that cannot be told.
-    name
-        The session's folder, for the sentence that says what comes next.
-    here
-        Where it lies; None if that is not known.
+    `heartbeat`: the newest sign of life; None where the journal has none. `process_alive`: whether the process that
+    gave it is there; None if that cannot be told. `here`: where it lies; None if that is not known.
     """
     done = {view.step for view in attempts if view.verdict == ACCEPTED} & {step.number for step in steps}
     verdicts = [view.verdict for view in attempts]

@@ -38,17 +38,7 @@ def live_page(name: str) -> Page:
 
 
 def still_page(name: str, plain: str, state: Json) -> Page:
-    """Return a page that holds a state, and asks nobody.
-
-    Parameters
-    ----------
-    name
-        Its title.
-    plain
-        The same in a few lines, for a reader that runs no script.
-    state
-        As `SessionWatch.state` gives it, and `pictures`: data URLs by attempt.
-    """
+    """Return a page that holds a state, and asks nobody."""
     policy = _policy("img-src data:")
     data = f'<script type="application/json" id="embedded">{to_bytes(state).decode()}</script>'
     header = f'<meta http-equiv="Content-Security-Policy" content="{policy}">'

@@ -5,7 +5,7 @@ from __future__ import annotations
 from contextlib import suppress
 from pathlib import Path
 
-from acquisition.session.records import preview_path
+from experiment.session.records import preview_path
 
 MOST_PICTURE_BYTES = 4 << 20
 """Bytes of a preview that is shown: many times what one of 640 pixels has."""

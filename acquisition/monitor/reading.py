@@ -9,14 +9,14 @@ from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
 
-from acquisition.lights.illuminations import Illumination, load_illuminations
 from acquisition.monitor.head import Head, head_of
 from acquisition.monitor.rows import AttemptView, EventView, changed_attempts, events_after, with_seconds
-from acquisition.session.heartbeat import Heartbeat, SessionPlace
-from acquisition.session.journal import JOURNAL_FILE, Journal
-from acquisition.session.journal_file import open_to_read, reading_error
-from acquisition.session.plan import SessionStep
-from acquisition.session.records import ACCEPTED
+from experiment.lights.illuminations import Illumination, load_illuminations
+from experiment.session.heartbeat import Heartbeat, SessionPlace
+from experiment.session.journal import JOURNAL_FILE, Journal
+from experiment.session.journal_file import open_to_read, reading_error
+from experiment.session.plan import SessionStep
+from experiment.session.records import ACCEPTED
 from foundation.errors import CropError
 
 RUN_STARTS = "start"
@@ -27,22 +27,13 @@ RUN_STARTS = "start"
 class SessionView:
     """A session as it was read.
 
-    Attributes
-    ----------
-    name
-        Name of its folder.
-    given
-        The same as it was named by who asked, for the sentence that says what comes next.
-    steps, lights
-        The plan, and the lights that it shows; no lights if their file cannot be read.
-    records
-        What the journal says of devices, software and plan.
-    attempts, events
-        All of them, oldest first.
-    heartbeat
-        The newest sign of life; None where there is none.
-    place
-        Where it lies; None if that is not known.
+    - `name`: name of its folder.
+    - `given`: the same as it was named by who asked, for the sentence that says what comes next.
+    - `steps`, `lights`: the plan, and the lights that it shows; no lights if their file cannot be read.
+    - `records`: what the journal says of devices, software and plan.
+    - `attempts`, `events`: all of them, oldest first.
+    - `heartbeat`: the newest sign of life; None where there is none.
+    - `place`: where it lies; None if that is not known.
     """
 
     name: str
@@ -88,20 +79,7 @@ class SessionView:
 
 
 def read_session(folder: Path, before: SessionView | None = None) -> SessionView:
-    """Return a session as it stands on the disk.
-
-    Parameters
-    ----------
-    folder
-        The session.
-    before
-        How it stood earlier; only what can have changed since is read.
-
-    Raises
-    ------
-    FormatError
-        The journal cannot be read, is damaged, or of a version not known here.
-    """
+    """Return a session as it stands on the disk."""
     path = folder / JOURNAL_FILE
     connection, version = open_to_read(path)
     journal = Journal(path, connection, version)

@@ -18,9 +18,9 @@ from acquisition.monitor.pictures import read_picture
 from acquisition.monitor.reading import SessionView, read_session
 from acquisition.monitor.rows import AttemptView
 from acquisition.monitor.watching import SessionWatch
-from acquisition.session.heartbeat import Process
-from acquisition.session.progress import duration_text
-from acquisition.session.records import ACCEPTED, preview_path
+from experiment.session.heartbeat import Process
+from experiment.session.progress import duration_text
+from experiment.session.records import ACCEPTED, preview_path
 from foundation.errors import FormatError
 from foundation.files import write_whole
 
@@ -35,13 +35,6 @@ def write_session_report(folder: Path) -> Path:
     """Write the report of the session in `folder` into it, in place of one that is there, and return its path.
 
     To be called at the end of a run, also by the run itself: a run that goes on in this very process counts as ended.
-
-    Raises
-    ------
-    FormatError
-        The journal cannot be read.
-    StorageError
-        The disk is full, read-only or gone.
     """
     path = folder / REPORT_FILE
     save_report(folder, path)
@@ -49,17 +42,7 @@ def write_session_report(folder: Path) -> Path:
 
 
 def save_report(folder: Path, path: Path) -> None:
-    """Write the report of the session in `folder` to `path`, in place of a file that is there.
-
-    Raises
-    ------
-    FormatError
-        The folder is no session, or its journal cannot be read.
-    InputError
-        The path cannot be a file's.
-    StorageError
-        The disk is full, read-only or gone.
-    """
+    """Write the report of the session in `folder` to `path`, in place of a file that is there."""
     read_session(folder)
     watch = SessionWatch(folder)
     state, view = watch.state(), watch.view()

@@ -13,33 +13,23 @@ from dataclasses import dataclass, field, replace
 from datetime import datetime
 from typing import Any
 
-from acquisition.session.journal import AMONG, Journal
-from acquisition.session.judgement import AttemptDetails, Check
-from acquisition.session.records import VOIDED
+from experiment.session.journal import AMONG, Journal
+from experiment.session.judgement import AttemptDetails, Check
+from experiment.session.records import VOIDED
 
 
 @dataclass(frozen=True)
 class AttemptView:
     """One attempt at a frame as the page shows it.
 
-    Attributes
-    ----------
-    id, step
-        Its number, and that of its step in the plan.
-    file
-        Its raw file, relative to the session's folder.
-    started_at, ended_at, taken_at
-        Times of the lab's clock; None where it has not come so far.
-    verdict, reason
-        As in the journal; the verdict is None while it is under way, or if it was cut off.
-    seen
-        Camera RGB of the paper above black, counts; None if not measured.
-    checks
-        What was looked at, in the judge's order.
-    timings
-        Seconds of each part of it, by name.
-    seconds
-        From the start of the attempt before to the start of this one; None for the first of a run.
+    - `id`, `step`: its number, and that of its step in the plan.
+    - `file`: its raw file, relative to the session's folder.
+    - `started_at`, `ended_at`, `taken_at`: times of the lab's clock; None where it has not come so far.
+    - `verdict`, `reason`: as in the journal; the verdict is None while it is under way, or if it was cut off.
+    - `seen`: camera RGB of the paper above black, counts; None if not measured.
+    - `checks`: what was looked at, in the judge's order.
+    - `timings`: seconds of each part of it, by name.
+    - `seconds`: from the start of the attempt before to the start of this one; None for the first of a run.
     """
 
     id: int
@@ -80,17 +70,7 @@ def events_after(connection: sqlite3.Connection, last: int) -> tuple[EventView, 
 def changed_attempts(
     connection: sqlite3.Connection, journal: Journal, known: Mapping[int, AttemptView]
 ) -> tuple[AttemptView, ...]:
-    """Return the attempts that are new, or may have changed since they were read as `known`; oldest first.
-
-    Parameters
-    ----------
-    connection
-        In a transaction, so that a verdict is never read without its checks.
-    journal
-        The same journal, on this connection.
-    known
-        By their numbers.
-    """
+    """Return the attempts that are new, or may have changed since they were read as `known`; oldest first."""
     voided = {number for (number,) in connection.execute("SELECT id FROM attempts WHERE verdict = ?", (VOIDED,))}
     new = [number for (number,) in connection.execute("SELECT id FROM attempts WHERE id > ?", (max(known, default=0),))]
     stale = {number for number, view in known.items() if view.verdict is None}
@@ -103,11 +83,6 @@ def with_seconds(views: Sequence[AttemptView], starts: Iterable[datetime]) -> tu
     """Return attempts, oldest first, with the seconds since the one before; none across the start of a run.
 
     And none where time goes back, as in sessions of older software whose clock was set.
-
-    Parameters
-    ----------
-    starts
-        When runs began, by the lab's clock.
     """
     begun = sorted(starts)
     timed: list[AttemptView] = []

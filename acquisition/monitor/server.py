@@ -21,7 +21,7 @@ from acquisition.monitor.page import live_page
 from acquisition.monitor.pictures import read_picture
 from acquisition.monitor.reading import read_session
 from acquisition.monitor.watching import SessionWatch
-from acquisition.session.journal import JOURNAL_FILE
+from experiment.session.journal import JOURNAL_FILE
 from foundation.errors import FormatError, InputError
 
 MOST_CONNECTIONS = 64
@@ -38,15 +38,7 @@ _TEXT = "text/plain; charset=utf-8"
 
 
 class MonitorServer(ThreadingHTTPServer):
-    """Serves one session; not yet serving when it is made.
-
-    Parameters
-    ----------
-    watch
-        The session.
-    host, port
-        Where to listen; port 0 takes any free one.
-    """
+    """Serves one session; not yet serving when it is made."""
 
     daemon_threads = True
     request_queue_size = MOST_CONNECTIONS
@@ -167,24 +159,7 @@ class _Handler(BaseHTTPRequestHandler):
 
 
 def open_monitor(folder: Path, port: int, host: str = "127.0.0.1") -> MonitorServer:
-    """Return a server for a session, not yet serving.
-
-    Parameters
-    ----------
-    folder
-        The session; one that is not there yet is waited for.
-    port
-        Where to listen; 0 takes any free one.
-    host
-        Address to listen on: loopback, one of this machine's, or 0.0.0.0 for all of them.
-
-    Raises
-    ------
-    InputError
-        The port is taken, or the host is none of this machine's.
-    FormatError
-        The folder holds something else, or the session cannot be read.
-    """
+    """Return a server for a session, not yet serving."""
     if (folder / JOURNAL_FILE).exists():
         read_session(folder)
     elif folder.exists() and (not folder.is_dir() or any(folder.iterdir())):

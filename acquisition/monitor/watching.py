@@ -20,8 +20,8 @@ from acquisition.monitor.encoding import Json, attempt_json, digest, event_json,
 from acquisition.monitor.head import Head
 from acquisition.monitor.pictures import preview_version
 from acquisition.monitor.reading import SessionView, read_session
-from acquisition.session.journal import JOURNAL_FILE
-from acquisition.session.records import preview_path
+from experiment.session.journal import JOURNAL_FILE
+from experiment.session.records import preview_path
 from foundation.errors import CropError
 
 FRESH_S = 0.25
@@ -52,15 +52,7 @@ class _Numbered:
 
 
 class SessionWatch:
-    """A session that is looked at again and again; may be used from several threads.
-
-    Parameters
-    ----------
-    folder
-        The session; it need not be there yet.
-    wall
-        The wall clock.
-    """
+    """A session that is looked at again and again; may be used from several threads."""
 
     def __init__(self, folder: Path, wall: Callable[[], datetime] = lambda: datetime.now(UTC)) -> None:
         self.folder = folder
@@ -92,10 +84,7 @@ class SessionWatch:
     def state(self, since: str = "") -> Json | None:
         """Return what has changed since a page's cursor; None if nothing has.
 
-        Parameters
-        ----------
-        since
-            The `cursor` of the answer before; one that is not known here, or empty, gives everything.
+        `since`: the `cursor` of the answer before; one that is not known here, or empty, gives everything.
         """
         with self._lock:
             self._refresh()

@@ -14,22 +14,7 @@ Questions = Mapping[str, Callable[[], object]]
 
 
 def ask_all(questions: Questions, further: Questions | None = None) -> None:
-    """Ask each question, and raise what went wrong with all of them together.
-
-    Parameters
-    ----------
-    questions
-        One of each device.
-    further
-        What a device that passed is asked besides where another one failed, so that its fault is told with the others:
-        a camera may be opened that is asked for its name much later.
-
-    Raises
-    ------
-    DeviceError, ConfigurationError
-        One failed: as it failed. Several did: a list of all, one a line, each with its remedy; a ConfigurationError
-        (exit code 2) where all are the settings' faults, else a DeviceError (3).
-    """
+    """Ask each question, and raise what went wrong with all of them together."""
     faults = _faults_of(questions)
     if not faults:
         return

@@ -14,16 +14,10 @@ from foundation.clock import Clock
 class Devices:
     """The open devices of a rig.
 
-    Attributes
-    ----------
-    camera
-        Takes the frames.
-    presenter
-        Fills the projector's picture with one plain colour.
-    projector
-        The control port of the projector; None where its lamp is not under control.
-    clock
-        Measures and makes every pause.
+    - `camera`: takes the frames.
+    - `presenter`: fills the projector's picture with one plain colour.
+    - `projector`: the control port of the projector; None where its lamp is not under control.
+    - `clock`: measures and makes every pause.
     """
 
     camera: Camera

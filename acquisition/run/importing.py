@@ -15,16 +15,16 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import BinaryIO
 
-from acquisition.chart.model import load_chart
-from acquisition.config import LabSettings
 from acquisition.judge.exposure import judge_file
-from acquisition.lights.illuminations import Illumination, load_illuminations
-from acquisition.session.folder import FRAME_COLUMNS, Session
-from acquisition.session.judgement import Judgement
-from acquisition.session.plan import FrameKind, SessionStep
-from acquisition.session.records import ACCEPTED, REFUSED
 from drivers.camera import CapturedFrame
 from drivers.presenter import BLACK, WHITE
+from experiment.chart.model import load_chart
+from experiment.config import LabSettings
+from experiment.lights.illuminations import Illumination, load_illuminations
+from experiment.session.folder import FRAME_COLUMNS, Session
+from experiment.session.judgement import Judgement
+from experiment.session.plan import FrameKind, SessionStep
+from experiment.session.records import ACCEPTED, REFUSED
 from foundation.errors import FormatError
 from foundation.files import require_free
 from foundation.hashing import file_sha256
@@ -47,12 +47,8 @@ class ListedFrame:
 class Imported:
     """How an import ended.
 
-    Attributes
-    ----------
-    refused
-        What was refused, one line a frame.
-    left
-        Lights and kinds of frames of which none was accepted, in words.
+    - `refused`: what was refused, one line a frame.
+    - `left`: lights and kinds of frames of which none was accepted, in words.
     """
 
     refused: tuple[str, ...]
@@ -64,11 +60,6 @@ def read_frame_list(path: Path) -> tuple[list[ListedFrame], tuple[Illumination, 
 
     Only `kind`, `illumination` and `file` must be filled. Rows of the kind ``response`` are passed over: they serve
     while a session is taken, and the list does not say which codes they show.
-
-    Raises
-    ------
-    FormatError
-        The list is missing, lacks a column, or has an unusable row, which is named; or the lights are unusable.
     """
     try:
         rows = list(csv.DictReader(path.read_text(encoding="utf-8-sig").splitlines()))
@@ -118,27 +109,7 @@ def _listed(row: Mapping[str, str | None], where: str, folder: Path, lights: int
 def import_session(
     frame_list: Path, chart: Path, folder: Path, observe: Callable[[int, int], None] = lambda done, total: None
 ) -> Imported:
-    """Make a session of listed raw files.
-
-    Parameters
-    ----------
-    frame_list
-        The list; `illuminations.csv` lies beside it.
-    chart
-        `chart.json` of the print.
-    folder
-        The new session.
-    observe
-        Called with frames done and in all.
-
-    Raises
-    ------
-    FormatError
-        The list, the chart, the lights or a hash is wrong, or two lights have the same raw file; no session is left
-        behind.
-    InputError
-        `folder` holds something already.
-    """
+    """Make a session of listed raw files."""
     require_free(folder, "the session")
     frames, lights = read_frame_list(frame_list)
     loaded = load_chart(chart)

@@ -17,10 +17,10 @@ from collections.abc import Callable, Iterable
 from contextlib import suppress
 from typing import Final
 
-from acquisition.config import SequenceSettings
 from acquisition.run.patience import PAUSE_S, Patience, Pause
-from acquisition.session.progress import duration_text
 from drivers.projector import Power, Projector, ReportsPictureFault, Severity
+from experiment.config import SequenceSettings
+from experiment.session.progress import duration_text
 from foundation.clock import Clock
 from foundation.errors import DeviceError, DeviceFault, DeviceRefused, LinkError
 
@@ -38,19 +38,7 @@ _NAME: Final = "the projector"
 def make_ready(projector: Projector, sequence: SequenceSettings, patience: Patience) -> None:
     """Switch the lamp on if need be, wait until it burns steadily, and until its health is good.
 
-    Parameters
-    ----------
-    sequence
-        How long the lamp warms up.
-    patience
-        Waits, with a beat every few seconds; where it has no time, the first fault is raised.
-
-    Raises
-    ------
-    DeviceFault
-        The lamp does not light within `POWER_LIMIT_S`; or patience ended with an error that it reports.
-    DeviceError
-        It does not carry out a command, or could not be reached for as long as patience lasts.
+    `patience`: waits, with a beat every few seconds; where it has no time, the first fault is raised.
     """
     found_lit = _light(projector, patience)
     patience.attempt(lambda: _unmute(projector), _NAME)
@@ -67,13 +55,7 @@ def reported_error(projector: Projector) -> DeviceFault | None:
 
 
 def require_healthy(projector: Projector) -> None:
-    """Require that light leaves the projector and that it reports no error.
-
-    Raises
-    ------
-    DeviceFault
-        It is off, muted, frozen, without a signal, or reports an error.
-    """
+    """Require that light leaves the projector and that it reports no error."""
     for require in _REQUIRED:
         require(projector)
 
@@ -107,13 +89,7 @@ _REQUIRED: Final = (_require_no_error, _require_on, _require_unmuted, _require_p
 def health_fault(
     projector: Projector | None, required: Iterable[Callable[[Projector], None]] = _REQUIRED
 ) -> DeviceError | None:
-    """Return why the projector is not known to be healthy now, as `require_healthy` raises it; None where it is.
-
-    Parameters
-    ----------
-    required
-        What is asked; all of it if not given.
-    """
+    """Return why the projector is not known to be healthy now, as `require_healthy` raises it; None where it is."""
     try:
         if projector is not None:
             for require in required:
@@ -130,12 +106,7 @@ class HealthWatch:
     lamp that is out, a picture that is muted or stands still, needs not be asked each time; where it cannot see
     that, in the dark, or where it saw something, all is asked.
 
-    Parameters
-    ----------
-    projector
-        Which is asked; None: nobody is, and nothing is wrong.
-    clock
-        Measures what answers cost.
+    `projector`: which is asked; None: nobody is, and nothing is wrong.
     """
 
     def __init__(self, projector: Projector | None, clock: Clock) -> None:
@@ -146,13 +117,7 @@ class HealthWatch:
         self._next = 0
 
     def fault(self, thorough: bool) -> DeviceError | None:
-        """Return why the projector is not known to be healthy, of what is asked now; None where it is.
-
-        Parameters
-        ----------
-        thorough
-            Whether all is asked, whatever it costs.
-        """
+        """Return why the projector is not known to be healthy, of what is asked now; None where it is."""
         begun = self._clock.monotonic()
         frame_s, self._begun = begun - self._begun, begun
         if thorough or math.isinf(self._cost_s) or self._cost_s <= ASKING * frame_s:
@@ -168,11 +133,6 @@ def await_health(projector: Projector, sequence: SequenceSettings, patience: Pat
     """Pause while the projector is unhealthy; return when it is healthy, and warm, again.
 
     Parameters are those of `make_ready`.
-
-    Raises
-    ------
-    DeviceError
-        Patience has ended.
     """
     pause = patience.pause(_NAME)
     if _outlast(projector, patience, pause):

@@ -16,11 +16,11 @@ from contextlib import suppress
 from enum import Enum
 from typing import Final
 
-from acquisition.config import SequenceSettings
 from acquisition.run.devices import Devices
 from acquisition.run.patience import Report
 from drivers.presenter import BLACK
 from drivers.projector import Power, Projector
+from experiment.config import SequenceSettings
 from foundation.clock import Clock
 from foundation.errors import CropError, DeviceError
 
@@ -51,19 +51,7 @@ def end_of(error: BaseException) -> RunEnd:
 
 
 def leave_lab(devices: Devices, end: RunEnd, sequence: SequenceSettings, report: Report) -> None:
-    """Make the screen black, and let the lamp go out or burn on; what cannot be done is said, and raises nothing.
-
-    Parameters
-    ----------
-    devices
-        Still open.
-    end
-        What ended the run.
-    sequence
-        What the lamp is to do.
-    report
-        Told what the lamp does now, and what the screen could not.
-    """
+    """Make the screen black, and let the lamp go out or burn on; what cannot be done is said, and raises nothing."""
     try:
         devices.presenter.show(BLACK)
     except DeviceError as error:

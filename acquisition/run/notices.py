@@ -47,14 +47,7 @@ QUEUED: Final = 100
 class Notices:
     """Tells a target what happens; close it at the end, which waits for what was told, for `LIMIT_S` at most.
 
-    Parameters
-    ----------
-    target
-        A URL or a command line; empty: nobody is told.
-    session
-        Name of what it is about.
-    warn
-        Called with a sentence by `tell` and `close` when an earlier notice could not be delivered.
+    `target`: A URL or a command line; empty: nobody is told.
     """
 
     def __init__(self, target: str, session: str, warn: Callable[[str], object] = lambda sentence: None) -> None:
@@ -70,17 +63,7 @@ class Notices:
             self._thread.start()
 
     def tell(self, event: str, message: str, at: datetime) -> None:
-        """Tell what happens; returns at once.
-
-        Parameters
-        ----------
-        event
-            A word or two: ``paused``, ``resumed``, ``complete``.
-        message
-            A sentence.
-        at
-            When, timezone-aware.
-        """
+        """Tell what happens; returns at once."""
         if not self._target:
             return
         text = f"{self._session}: {event}: {message}"

@@ -38,8 +38,8 @@ from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext, suppress
 from typing import Final, Protocol, TypeVar
 
-from acquisition.session.journal_file import HeldJournalError
-from acquisition.session.progress import duration_text
+from experiment.session.journal_file import HeldJournalError
+from experiment.session.progress import duration_text
 from foundation import errors
 from foundation.clock import Clock
 from foundation.errors import CropError, DeviceError, StorageError
@@ -83,20 +83,8 @@ def is_curable(fault: CropError) -> bool:
 class Patience:
     """How long, and how, a run waits for what fails.
 
-    Parameters
-    ----------
-    clock
-        Measures and makes every pause.
-    limit_s
-        Seconds that one pause may last, ≥ 0; infinity: without end, 0: nothing is tried twice.
-    report
-        Told when something is tried again, pauses, changes its cause, and goes on.
-    idle
-        Keeps the other devices awake; called every few seconds. Its `DeviceError` is left to the device's own next use.
-    beat
-        Told every few seconds of a wait, with the time left in the sentence.
-    breakable
-        Entered for each wait for what fails: nothing has begun then that an end could spoil.
+    `idle`: keeps the other devices awake; called every few seconds. Its `DeviceError` is left to the device's own next
+    use. `beat`: told every few seconds of a wait, with the time left in the sentence.
     """
 
     def __init__(
@@ -122,24 +110,7 @@ class Patience:
         curable: Callable[[CropError], bool] = is_curable,
         idle: bool = True,
     ) -> _Result:
-        """Return what `action` returns, tried until it succeeds or patience ends.
-
-        Parameters
-        ----------
-        action
-            One try; it must be such that a failed one leaves nothing behind.
-        name
-            What is waited for, as messages name it: "the camera", "the screen", "the disk".
-        curable
-            Whether waiting may help against a fault; another is raised at once.
-        idle
-            Whether the other devices are spoken to meanwhile: not where it is they that are waited for.
-
-        Raises
-        ------
-        CropError
-            A fault that waiting does not cure; or, of the class of the first fault, that patience has ended.
-        """
+        """Return what `action` returns, tried until it succeeds or patience ends."""
         pause = self.pause(name, idle=idle)
         while True:
             try:
@@ -167,16 +138,7 @@ class Patience:
     def wait(self, seconds: float, state: str, sentence: Callable[[float], str], *, idle: bool = True) -> None:
         """Let `seconds` pass, with a beat every few of them.
 
-        Parameters
-        ----------
-        seconds
-            How long, ≥ 0.
-        state
-            ``paused`` or ``waiting``, for the beat.
-        sentence
-            Given the seconds left, returns what the beat says.
-        idle
-            Whether the devices are kept awake.
+        `sentence`: given the seconds left, returns what the beat says.
         """
         until = self.clock.monotonic() + seconds
         while (left := until - self.clock.monotonic()) >= _INSTANT_S:
@@ -215,13 +177,7 @@ class Pause:
         return 0.0 if self._first is None else self._patience.clock.monotonic() - self._failed_at
 
     def wait(self, fault: CropError) -> None:
-        """Say what holds now, and return when it is time for the next try.
-
-        Raises
-        ------
-        CropError
-            Patience has ended: the first fault, with what holds now.
-        """
+        """Say what holds now, and return when it is time for the next try."""
         with self._patience.breakable():
             self._wait(fault)
 

@@ -6,10 +6,7 @@ from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
 
-from acquisition.chart.model import load_chart
-from acquisition.config import LabSettings
 from acquisition.judge.judge import LiveJudge
-from acquisition.lights.illuminations import load_illuminations
 from acquisition.monitor.report import write_session_report
 from acquisition.run.patience import TRY_S
 from acquisition.run.planning.dry_run import checked_plan
@@ -18,9 +15,12 @@ from acquisition.run.rig.opening import open_rig
 from acquisition.run.sequencer import RunOutcome, take_session
 from acquisition.run.taking.pipeline import Taken
 from acquisition.run.taking.resuming import check_frames, clock_note, require_same_devices, tie, white_first
-from acquisition.session.folder import Session, busy_sentence, session_exists
-from acquisition.session.heartbeat import signs_of_life
-from acquisition.session.mending.redaction import secrets_warning
+from experiment.chart.model import load_chart
+from experiment.config import LabSettings
+from experiment.lights.illuminations import load_illuminations
+from experiment.session.folder import Session, busy_sentence, session_exists
+from experiment.session.heartbeat import signs_of_life
+from experiment.session.mending.redaction import secrets_warning
 from foundation.console import Ending
 from foundation.errors import CropError, InputError
 
@@ -37,31 +37,7 @@ def run_session(
 ) -> RunOutcome:
     """Take the session `folder`, new or interrupted, with the rig that the settings name.
 
-    Parameters
-    ----------
-    observe
-        Called with frames done and in all, once at the start and after each frame.
-    announce
-        Called with a sentence when a frame is refused, and when the run waits, tries again, pauses and goes on.
-    retake
-        What to take again (`Session.retake`); nothing if None.
-    ending
-        By which the run learns that it is to end after the running frame.
-    taken
-        Called with each frame when its verdict is known.
-    state
-        Called now and then with what the run does that takes long; the newest holds.
-
-    Raises
-    ------
-    InputError
-        The settings are not those that the session was begun with, or the folder holds something else.
-    CropError
-        The plan cannot be brought to its end (`RunPlan.require`): a disk that is too small, for one. Nothing has moved.
-    DeviceRefused
-        Another camera or projector is connected than the session was begun with.
-    DeviceError, QualityError, StorageError
-        See `acquisition.run.sequencer.take_session`; the session can be taken up again.
+    `retake`: what to take again (`Session.retake`); nothing if None.
     """
 
     def checking(done: int, total: int) -> None:

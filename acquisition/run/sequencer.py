@@ -11,7 +11,6 @@ from contextlib import suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 
-from acquisition.config import LabSettings
 from acquisition.judge.exposure import ExposureJudge
 from acquisition.run.devices import Devices
 from acquisition.run.lamp import make_ready
@@ -21,13 +20,14 @@ from acquisition.run.patience import Patience
 from acquisition.run.taking.agenda import Agenda, unclosed_kinds
 from acquisition.run.taking.pipeline import Pipeline, Taken
 from acquisition.run.taking.saving import Saver
-from acquisition.session.folder import Session
-from acquisition.session.heartbeat import RunState
-from acquisition.session.judgement import FrameJudge
-from acquisition.session.plan import FrameKind, SessionStep
-from acquisition.session.records import ACCEPTED, VOIDED
 from drivers.camera import keep_awake
 from drivers.presenter import BLACK, WHITE
+from experiment.config import LabSettings
+from experiment.session.folder import Session
+from experiment.session.heartbeat import RunState
+from experiment.session.judgement import FrameJudge
+from experiment.session.plan import FrameKind, SessionStep
+from experiment.session.records import ACCEPTED, VOIDED
 from foundation.clock import Clock
 from foundation.console import Ending
 from foundation.errors import StorageError
@@ -40,12 +40,8 @@ NOTIFIED = ("paused", "resumed")
 class RunOutcome:
     """Why a run ended.
 
-    Attributes
-    ----------
-    total, left
-        Steps of the plan, and those without an accepted frame.
-    refused
-        Why steps were left for the next run, a sentence each.
+    - `total`, `left`: steps of the plan, and those without an accepted frame.
+    - `refused`: why steps were left for the next run, a sentence each.
     """
 
     total: int
@@ -71,31 +67,9 @@ def take_session(
 ) -> RunOutcome:
     """Take every step of the session's plan that has no accepted frame yet.
 
-    Parameters
-    ----------
-    session
-        Opened for a run.
-    judge
-        Looks at every frame; None looks at its exposure alone.
-    observe
-        Called with each frame when its verdict is known, in the order of taking.
-    announce
-        Called with a sentence when a frame is refused, and when the run waits, tries again, pauses and goes on.
-    state
-        Called every few seconds of a wait with what is waited for and how long; the newest holds.
-    ending
-        By which the run learns that it is to end after the running frame; None for a run that nobody asks.
-    first
-        Numbers of steps that are taken before all others (`acquisition.run.taking.resuming.tie`).
-
-    Raises
-    ------
-    DeviceError, StorageError
-        A device or the disk failed for longer than `sequence.patience_s`; the session can be taken up again.
-    QualityError
-        Frames were refused for that long; likewise.
-    KeyboardInterrupt
-        The end was asked for by `ending`; the frames that were under way are in the journal.
+    `judge`: looks at every frame; None looks at its exposure alone. `state`: called every few seconds of a wait with
+    what is waited for and how long; the newest holds. `ending`: by which the run learns that it is to end after the
+    running frame; None for a run that nobody asks.
     """
     notices = Notices(settings.sequence.notify, session.folder.name, announce)
     telling = _Telling(session, devices.clock, announce, state, notices)

@@ -6,7 +6,7 @@ A DLP projector shows its primaries one after another; a frame that catches part
 
 from __future__ import annotations
 
-from acquisition.config import CameraSettings, LabSettings, ProjectorCable
+from experiment.config import CameraSettings, LabSettings, ProjectorCable
 from foundation.errors import ConfigurationError
 
 MAX_TURN_ERROR = 0.005
@@ -45,13 +45,7 @@ def holds_whole_turns(shutter_s: float, period_s: float) -> bool:
 
 
 def require_whole_turns(camera: CameraSettings, projector: ProjectorCable) -> None:
-    """Require that an exposure holds whole turns of the colour wheel, or whole pictures where there is no wheel.
-
-    Raises
-    ------
-    ConfigurationError
-        The shutter time is no whole multiple; the message names the nearest that cameras have.
-    """
+    """Require that an exposure holds whole turns of the colour wheel, or whole pictures where there is no wheel."""
     period = light_period_s(projector)
     shutter = camera.shutter_s
     if holds_whole_turns(shutter, period):

@@ -15,8 +15,8 @@ from typing import Self
 
 from acquisition.run.taking.agenda import step_name
 from acquisition.run.taking.pipeline import Taken
-from acquisition.session.judgement import Check, Judgement
-from acquisition.session.progress import RECENT, TimedAttempt, duration_text, time_left
+from experiment.session.judgement import Check, Judgement
+from experiment.session.progress import RECENT, TimedAttempt, duration_text, time_left
 
 SHOWN = ("light", "movement", "blur", "white drift", "dark", "ambient", "exposure")
 """Checks that the line about the last frame has, as far as they have a number."""
@@ -25,10 +25,7 @@ SHOWN = ("light", "movement", "blur", "white drift", "dark", "ambient", "exposur
 class TimeLeft:
     """Tells the time left by the machine's clock as the page and `acquire status` tell it by the journal's.
 
-    Parameters
-    ----------
-    clock
-        Returns seconds; the machine's own unless a test has another.
+    `clock`: returns seconds; the machine's own unless a test has another.
     """
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:

@@ -13,16 +13,10 @@ Mends = Literal["frames", "session", "nothing"]
 class Cause:
     """One probable cause.
 
-    Attributes
-    ----------
-    name
-        As in `report.json`.
-    says
-        What it is, for a sentence that begins with "probably".
-    remedy
-        What helps, an imperative.
-    mends
-        What is then to be taken again.
+    - `name`: as in `report.json`.
+    - `says`: what it is, for a sentence that begins with "probably".
+    - `remedy`: what helps, an imperative.
+    - `mends`: what is then to be taken again.
     """
 
     name: str

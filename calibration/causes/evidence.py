@@ -15,80 +15,44 @@ NAN = float("nan")
 class Evidence:
     """What is known of a deviation.
 
-    Attributes
-    ----------
-    frames
-        Frames of the print that were compared.
-    showing
-        Share of them that show it.
-    even_showing
-        Share of the white frames, but the one compared with, that show it; 0 where there is no other.
-    white_residual
-        Share of the white frames whose references are off there by half as much or more.
-    some_whites
-        1 where the references of some white frames are off there and those of others not; else 0.
-    spot
-        Share of the cells there that are not of their codes' colours in the mean of the white frames.
-    in_first
-        1 where all frames differ at one place from the frame that they are compared with, so that it is there; else 0.
-    share
-        Share of the print that deviates.
-    deviation
-        How far the place is off, relative, with its sign: below 0 it is darker; the channel that deviates most.
-    tint
-        How differently the channels are off, over `deviation`'s size: 0 where all are off alike.
-    added
-        Light that cells have there besides their own, whatever their colour, of paper white.
-    kept
-        Share of their own light that they have.
-    rim
-        Mean residual of the outermost references, relative, with its sign.
-    rim_frames
-        Share of the white frames in which it is below −0.5 %.
-    radial
-        Share of the residuals' variance that distance from the middle explains.
-    hot
-        Share of the cells concerned that hold a photosite which is hot in every dark frame.
-    scatter
-        Spread of all cells of the frame about their codes' colours, relative.
-    softer
-        Light of neighbouring cells added by the frame's blur, in the worst sample.
-    moved_px
-        How far the chart lies from where it was registered, half-size px.
-    anew
-        Share of the frames in which the chart had to be registered again.
-    agreement
-        Correlation of the cells with the chart where it was registered.
-    exposure
-        Exposure of the frame by its file over the other frames'.
-    brightness
-        Light of the frame over what its code gives.
-    off_codes_deg
-        Angle between a light's white and what its codes give, degrees.
-    named_right
-        1 where a light's white is what its codes give, 0 where it is what another light's give.
-    cameras
-        Cameras or lenses among the frames, by their files.
-    room
-        Light while the projector shows black, of white.
-    room_change
-        Change of it between dark frames, of white.
-    stray
-        Light of a primary under a code of 0 that no dark frame shows, of that primary, the worst light.
-    stray_primaries
-        Light of the primaries' frames together beyond white's, alike in each, of white.
-    other_iso
-        Frames of another ISO speed than most, by their files.
-    misplaced
-        Share of the unfit cells whose place is not known well enough.
-    uneven
-        Share of the unfit cells whose rim and middle differ.
-    waves_px
-        How far tags lie from where a flat sheet would have them, RMS, half-size px of cells of 10 px.
-    beyond_cell
-        Share of the light of a window's worst sample that the lens brings from beyond its cell.
-    veil
-        Light of the whole frame that the lens spreads over each place, of paper white.
+    - `frames`: frames of the print that were compared.
+    - `showing`: share of them that show it.
+    - `even_showing`: share of the white frames, but the one compared with, that show it; 0 where there is no other.
+    - `white_residual`: share of the white frames whose references are off there by half as much or more.
+    - `some_whites`: 1 where the references of some white frames are off there and those of others not; else 0.
+    - `spot`: share of the cells there that are not of their codes' colours in the mean of the white frames.
+    - `in_first`: 1 where all frames differ at one place from the frame that they are compared with, so that it is
+      there; else 0.
+    - `share`: share of the print that deviates.
+    - `deviation`: how far the place is off, relative, with its sign: below 0 it is darker; the channel that deviates
+      most.
+    - `tint`: how differently the channels are off, over `deviation`'s size: 0 where all are off alike.
+    - `added`: light that cells have there besides their own, whatever their colour, of paper white.
+    - `kept`: share of their own light that they have.
+    - `rim`: mean residual of the outermost references, relative, with its sign.
+    - `rim_frames`: share of the white frames in which it is below −0.5 %.
+    - `radial`: share of the residuals' variance that distance from the middle explains.
+    - `hot`: share of the cells concerned that hold a photosite which is hot in every dark frame.
+    - `scatter`: spread of all cells of the frame about their codes' colours, relative.
+    - `softer`: light of neighbouring cells added by the frame's blur, in the worst sample.
+    - `moved_px`: how far the chart lies from where it was registered, half-size px.
+    - `anew`: share of the frames in which the chart had to be registered again.
+    - `agreement`: correlation of the cells with the chart where it was registered.
+    - `exposure`: exposure of the frame by its file over the other frames'.
+    - `brightness`: light of the frame over what its code gives.
+    - `off_codes_deg`: angle between a light's white and what its codes give, degrees.
+    - `named_right`: 1 where a light's white is what its codes give, 0 where it is what another light's give.
+    - `cameras`: cameras or lenses among the frames, by their files.
+    - `room`: light while the projector shows black, of white.
+    - `room_change`: change of it between dark frames, of white.
+    - `stray`: light of a primary under a code of 0 that no dark frame shows, of that primary, the worst light.
+    - `stray_primaries`: light of the primaries' frames together beyond white's, alike in each, of white.
+    - `other_iso`: frames of another ISO speed than most, by their files.
+    - `misplaced`: share of the unfit cells whose place is not known well enough.
+    - `uneven`: share of the unfit cells whose rim and middle differ.
+    - `waves_px`: how far tags lie from where a flat sheet would have them, RMS, half-size px of cells of 10 px.
+    - `beyond_cell`: share of the light of a window's worst sample that the lens brings from beyond its cell.
+    - `veil`: light of the whole frame that the lens spreads over each place, of paper white.
     """
 
     frames: float = NAN

@@ -11,7 +11,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from acquisition.session.records import FrameRecord
 from calibration.causes.cause import UNKNOWN
 from calibration.causes.evidence import Evidence
 from calibration.causes.light_evidence import (
@@ -37,24 +36,18 @@ from calibration.causes.rules import RULES, Decision, decide
 from calibration.figures.frame_figures import FrameFigures
 from calibration.figures.table_figures import TableFigures
 from calibration.sampling.windows import bleed
+from experiment.session.records import FrameRecord
 
 
 @dataclass(frozen=True)
 class ProbableCause:
     """Why a figure is beyond its limit.
 
-    Attributes
-    ----------
-    figure
-        Name of its limit.
-    decision
-        The cause, and the rule that says so.
-    evidence
-        What it was decided by.
-    frames
-        The frames in which it shows, the worst first; empty where all share it.
-    places
-        Where on the print.
+    - `figure`: name of its limit.
+    - `decision`: the cause, and the rule that says so.
+    - `evidence`: what it was decided by.
+    - `frames`: the frames in which it shows, the worst first; empty where all share it.
+    - `places`: where on the print.
     """
 
     figure: str
@@ -75,17 +68,7 @@ class ProbableCause:
 
 
 def explain(figure: str, limit: float, figures: TableFigures) -> ProbableCause | None:
-    """Return why a figure is beyond its limit; None for a figure that explains itself, such as the size of a cell.
-
-    Parameters
-    ----------
-    figure
-        Name of the limit.
-    limit
-        From which on the figure is remarked on.
-    figures
-        What was measured.
-    """
+    """Return why a figure is beyond its limit; None for a figure that explains itself, such as the size of a cell."""
     gather = _GATHERERS.get(figure)
     if gather is None:
         return None

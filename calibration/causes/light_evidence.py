@@ -10,15 +10,7 @@ from calibration.figures.table_figures import TableFigures
 
 
 def light_evidence(figures: TableFigures, limit: float) -> Gathered:
-    """Return what is known of whites that do not add up, drift, or are not what their codes give.
-
-    Parameters
-    ----------
-    figures
-        What was measured.
-    limit
-        From which on the figure is remarked on.
-    """
+    """Return what is known of whites that do not add up, drift, or are not what their codes give."""
     frames = figures.frames
     stated = np.array([frame.exposure for frame in frames])
     known = stated > 0

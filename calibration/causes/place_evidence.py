@@ -7,14 +7,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from acquisition.limits.bleed import WINDOW_PX
-from acquisition.measures.reflections import cell_mm, joined_cells, light_of_spot, spot_colour, spots_of
-from acquisition.measures.stains import Stains
-from acquisition.session.records import FrameRecord
 from calibration.causes.evidence import Evidence
 from calibration.figures.frame_figures import FrameFigures
 from calibration.figures.table_figures import TableFigures
 from calibration.sampling.windows import bleed
+from experiment.limits.bleed import WINDOW_PX
+from experiment.measures.reflections import cell_mm, joined_cells, light_of_spot, spot_colour, spots_of
+from experiment.measures.stains import Stains
+from experiment.session.records import FrameRecord
 
 LEAST_BLOCK = 0.004
 """Deviation of a block beyond noise from which on a frame shows something there: clean frames in the simulated room
@@ -56,14 +56,9 @@ _Mask = npt.NDArray[np.bool_]
 class PrintPlace:
     """A place on the print.
 
-    Attributes
-    ----------
-    file
-        The frame in which it is seen best.
-    x_mm, y_mm
-        Its middle, from the sheet's top-left corner.
-    size_mm
-        Its diameter; 0 for a cell.
+    - `file`: the frame in which it is seen best.
+    - `x_mm`, `y_mm`: its middle, from the sheet's top-left corner.
+    - `size_mm`: its diameter; 0 for a cell.
     """
 
     file: str
@@ -84,16 +79,7 @@ class Gathered:
 def block_evidence(figures: TableFigures, worst: FrameFigures, limit: float, softer: float) -> Gathered:
     """Return what is known of the place that deviates most in one frame from the frame registered first.
 
-    Parameters
-    ----------
-    figures
-        What was measured.
-    worst
-        The frame.
-    limit
-        From which on a block is remarked on.
-    softer
-        Light of neighbouring cells added by the frame's blur, a share.
+    `softer`: light of neighbouring cells added by the frame's blur, a share.
     """
     seen = worst.consistency
     at_mm, size_mm = np.array(seen.at_mm), max(seen.extent_mm, 1e-9)
@@ -124,10 +110,7 @@ def block_evidence(figures: TableFigures, worst: FrameFigures, limit: float, sof
 def covered_deviation(off: npt.NDArray[np.float64]) -> float:
     """Return how far cells are off that something may cover; NaN where they do not look covered.
 
-    Parameters
-    ----------
-    off
-        (N,) float64 deviations of cells next to each other, shares with their signs; 0 of those that are not known.
+    `off`: (N,) float64 deviations of cells next to each other, shares with their signs; 0 of those that are not known.
     """
     seen = off[off != 0]
     darker = seen[seen < 0]
@@ -142,12 +125,7 @@ def covered_deviation(off: npt.NDArray[np.float64]) -> float:
 def disturbed_evidence(figures: TableFigures, softer: float) -> Gathered | None:
     """Return what is known of the cells that something small covers in lights' frames; None where there are none.
 
-    Parameters
-    ----------
-    figures
-        What was measured.
-    softer
-        Light of neighbouring cells added by the worst frame's blur, a share.
+    `softer`: light of neighbouring cells added by the worst frame's blur, a share.
     """
     lights = [frame for frame in figures.frames if frame.record.kind == "light" and frame.consistency.disturbed]
     if not lights:
@@ -183,15 +161,7 @@ def disturbed_evidence(figures: TableFigures, softer: float) -> Gathered | None:
 
 
 def print_evidence(figures: TableFigures, figure: str) -> Gathered | None:
-    """Return what is known of the print's largest spot, of unfit cells, or of what the field leaves.
-
-    Parameters
-    ----------
-    figures
-        What was measured.
-    figure
-        ``doubtful_share``, ``unfit_share`` or ``reference_spread``.
-    """
+    """Return what is known of the print's largest spot, of unfit cells, or of what the field leaves."""
     if figure == "reference_spread":
         return _of_references(figures)
     stains = figures.cells.stains

@@ -59,16 +59,10 @@ class Condition:
 class Rule:
     """One line of the table.
 
-    Attributes
-    ----------
-    cause
-        What is said where it holds.
-    figures
-        The figures that it may explain, by the names of their limits.
-    conditions
-        All of which must hold.
-    why
-        Why the cause follows.
+    - `cause`: what is said where it holds.
+    - `figures`: the figures that it may explain, by the names of their limits.
+    - `conditions`: all of which must hold.
+    - `why`: why the cause follows.
     """
 
     cause: Cause
@@ -343,12 +337,8 @@ RULES: tuple[Rule, ...] = (
 class Decision:
     """The probable cause of a figure beyond its limit, and the rule that says so; None where it is unknown.
 
-    Attributes
-    ----------
-    cause, rule
-        As said.
-    follows
-        The figure that the rule explains where it is another one, which this one goes with; "" else.
+    - `cause`, `rule`: as said.
+    - `follows`: the figure that the rule explains where it is another one, which this one goes with; "" else.
     """
 
     cause: Cause
@@ -357,17 +347,7 @@ class Decision:
 
 
 def decide(figure: str, evidence: Evidence, rules: Collection[Rule] = RULES) -> Decision:
-    """Return the cause of a figure by what is known; unknown where no rule of the table holds.
-
-    Parameters
-    ----------
-    figure
-        Name of the limit that is exceeded.
-    evidence
-        What is known.
-    rules
-        The table.
-    """
+    """Return the cause of a figure by what is known; unknown where no rule of the table holds."""
     for rule in rules:
         if rule.holds(figure, evidence):
             return Decision(rule.cause, rule)

@@ -29,9 +29,9 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial import cKDTree
 
-from acquisition.measures.least_squares import least_absolute_line, least_squares, linear_combinations, product
-from acquisition.measures.polynomials import code_polynomial, code_powers
 from calibration.checks.small_places import LEAST_MODEL_ERROR, SmallPlaces, cells_without_hot
+from experiment.measures.least_squares import least_absolute_line, least_squares, linear_combinations, product
+from experiment.measures.polynomials import code_polynomial, code_powers
 from foundation.robust import huber_weights, sigma_of
 
 DEGREE = 4
@@ -88,32 +88,19 @@ _Mask = npt.NDArray[np.bool_]
 class FrameConsistency:
     """How a frame differs from the registered print under its light; zeros where nothing can be compared.
 
-    Attributes
-    ----------
-    scatter
-        Spread of the cells about what their codes give, as a share, the noise taken out, beyond four standard errors;
-        of the worst channel.
-    block
-        How far the worst block of cells is off, as a share, beyond four standard errors.
-    at_mm
-        The middle of that block on the print.
-    colour
-        How far that block is off in R, G and B, as shares, with their signs; 0 of a channel that is too dim.
-    share
-        Share of the blocks that are off by a third as much or more.
-    extent_mm
-        Side of a square of the area of these.
-    added
-        Light that these blocks' cells have besides their own, as a share of the brightest cells'.
-    kept
-        Share of their own light that they have.
-    disturbed
-        Cells that something covers, however few they are, and how far each is off, a share with its sign: of the
-        channel that is off most, 0 where it is too dark to be compared.
-    seeds
-        Those of them that are far off by themselves; the others touch these.
-    alone
-        Cells that are far off, and none of their neighbours is.
+    - `scatter`: spread of the cells about what their codes give, as a share, the noise taken out, beyond four standard
+      errors; of the worst channel.
+    - `block`: how far the worst block of cells is off, as a share, beyond four standard errors.
+    - `at_mm`: the middle of that block on the print.
+    - `colour`: how far that block is off in R, G and B, as shares, with their signs; 0 of a channel that is too dim.
+    - `share`: share of the blocks that are off by a third as much or more.
+    - `extent_mm`: side of a square of the area of these.
+    - `added`: light that these blocks' cells have besides their own, as a share of the brightest cells'.
+    - `kept`: share of their own light that they have.
+    - `disturbed`: cells that something covers, however few they are, and how far each is off, a share with its sign: of
+      the channel that is off most, 0 where it is too dark to be compared.
+    - `seeds`: those of them that are far off by themselves; the others touch these.
+    - `alone`: cells that are far off, and none of their neighbours is.
     """
 
     scatter: float = 0.0
@@ -146,12 +133,7 @@ class FrameConsistency:
     def without_hot(self, hot: _Mask, cells_mm: _Array) -> FrameConsistency:
         """Return the same where cells that are off by their hot photosites are not taken for covered ones.
 
-        Parameters
-        ----------
-        hot
-            (C,) bool, cells that hold a photosite which is hot in the dark frames.
-        cells_mm
-            (C, 2) places.
+        `hot`: (C,) bool, cells that hold a photosite which is hot in the dark frames. `cells_mm`: (C, 2) places.
         """
         cells = np.array([cell for cell, _ in self.disturbed], dtype=np.int64)
         if not hot[cells].any():
@@ -209,16 +191,9 @@ def has_enough_cells(cells: int) -> bool:
 class ConsistencyCheck:
     """Compares frames with one reference frame of the print, whatever their lights.
 
-    Parameters
-    ----------
-    rgb
-        (C, 3) printed codes.
-    cells_mm
-        (C, 2) places.
-    level, variance
-        (C, 3) float64 mean counts above black in that frame, field divided out, and their variance.
-    usable
-        (C,) bool, cells that are inside the frame and not covered.
+    `rgb`: (C, 3) printed codes. `cells_mm`: (C, 2) places. `level`, `variance`: (C, 3) float64 mean counts above black
+    in that frame, field divided out, and their variance. `usable`: (C,) bool, cells that are inside the frame and not
+    covered.
     """
 
     def __init__(self, rgb: npt.ArrayLike, cells_mm: _Array, level: _Array, variance: _Array, usable: _Mask) -> None:
@@ -241,12 +216,8 @@ class ConsistencyCheck:
     def compare(self, mean: _Array, variance: _Array) -> FrameConsistency:
         """Return how far a frame is consistent with the reference.
 
-        Parameters
-        ----------
-        mean
-            (C, 3) float64 mean counts above black of all cells, field divided out.
-        variance
-            (C, 3) float64, of these means.
+        `mean`: (C, 3) float64 mean counts above black of all cells, field divided out. `variance`: (C, 3) float64, of
+        these means.
         """
         some, some_variance = mean[self._some], variance[self._some]
         light = np.median(some[self._usable], axis=0)

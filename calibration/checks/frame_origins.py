@@ -10,22 +10,16 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from acquisition.session.records import FrameRecord
 from drivers.raw.origin import FrameOrigin
+from experiment.session.records import FrameRecord
 
 
 @dataclass(frozen=True)
 class ForeignFrame:
     """A frame whose file states another camera, lens or exposure than most.
 
-    Attributes
-    ----------
-    record
-        The frame.
-    found, expected
-        What it states, and what most state, in words.
-    ratio
-        Its exposure over that of most; 1 where another thing differs.
+    - `found`, `expected`: what it states, and what most state, in words.
+    - `ratio`: its exposure over that of most; 1 where another thing differs.
     """
 
     record: FrameRecord
@@ -38,18 +32,11 @@ class ForeignFrame:
 class OriginFigures:
     """What the files of a session state of where they come from.
 
-    Attributes
-    ----------
-    other_camera
-        Frames of another model or body.
-    other_lens
-        Frames through another lens.
-    other_exposure
-        Frames exposed otherwise by a hundredth or more.
-    other_iso
-        Frames of another ISO speed.
-    stating_camera, stating_exposure
-        How many frames state them at all.
+    - `other_camera`: frames of another model or body.
+    - `other_lens`: frames through another lens.
+    - `other_exposure`: frames exposed otherwise by a hundredth or more.
+    - `other_iso`: frames of another ISO speed.
+    - `stating_camera`, `stating_exposure`: how many frames state them at all.
     """
 
     other_camera: tuple[ForeignFrame, ...] = ()

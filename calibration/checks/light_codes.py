@@ -87,14 +87,8 @@ _Whole = npt.NDArray[np.int64]
 class ExchangedLights:
     """Two lights that fit better with their names exchanged.
 
-    Attributes
-    ----------
-    one, other
-        Their indices.
-    angle_deg
-        Angle between what the two codes give.
-    evidence
-        Twice the logarithm of the odds that they are exchanged, all else left aside.
+    - `angle_deg`: angle between what the two codes give.
+    - `evidence`: twice the logarithm of the odds that they are exchanged, all else left aside.
     """
 
     one: int
@@ -107,29 +101,17 @@ class ExchangedLights:
 class CodeAgreement:
     """How the whites of L lights agree with their codes.
 
-    Attributes
-    ----------
-    angle_deg
-        (L,) float64 degrees between each white and the one that its codes give.
-    error_deg
-        (L,) float64 degrees, standard error of that, in the direction in which it is largest.
-    off_deg
-        (L,) float64 degrees, the angle beyond four standard errors; 0 where it is within.
-    brightness
-        (L,) float64, how much brighter a white is than its codes give, relative; −0.5 is half as bright.
-    off_brightness
-        (L,) float64, the same beyond four standard errors, ≥ 0.
-    seen_as
-        (L,) int64, for a light that is off its codes the one whose codes would give its white; −1 for none.
-    exchanges
-        Lights that fit better with their names exchanged, the surest first.
-    held
-        (L,) bool, whether a light is held against its codes (`HELD_DEG`).
-    exchange_deg
-        Largest angle between two lights whose exchange would go unnoticed; 0 where none would.
-    misfit
-        By how much whites and codes of few lights disagree, all taken together, over what healthy rooms have; 0 of
-        many.
+    - `angle_deg`: (L,) float64 degrees between each white and the one that its codes give.
+    - `error_deg`: (L,) float64 degrees, standard error of that, in the direction in which it is largest.
+    - `off_deg`: (L,) float64 degrees, the angle beyond four standard errors; 0 where it is within.
+    - `brightness`: (L,) float64, how much brighter a white is than its codes give, relative; −0.5 is half as bright.
+    - `off_brightness`: (L,) float64, the same beyond four standard errors, ≥ 0.
+    - `seen_as`: (L,) int64, for a light that is off its codes the one whose codes would give its white; −1 for none.
+    - `exchanges`: lights that fit better with their names exchanged, the surest first.
+    - `held`: (L,) bool, whether a light is held against its codes (`HELD_DEG`).
+    - `exchange_deg`: largest angle between two lights whose exchange would go unnoticed; 0 where none would.
+    - `misfit`: by how much whites and codes of few lights disagree, all taken together, over what healthy rooms have; 0
+      of many.
     """
 
     angle_deg: _Array
@@ -162,18 +144,9 @@ def code_agreement(
 ) -> CodeAgreement:
     """Return how whites agree with their codes.
 
-    Parameters
-    ----------
-    codes
-        (L, 3) int64, 0 … 255, of different lights or of the same.
-    white
-        (L, 3) float64 counts of bare paper, exposed alike, the lamp's drift and what is there at black taken off.
-    error
-        (L, 3) float64 counts, standard errors.
-    dark_known
-        Whether dark frames showed what is there at black.
-    drift_known
-        Whether white frames showed the lamp's drift.
+    `codes`: (L, 3) int64, 0 … 255, of different lights or of the same. `white`: (L, 3) float64 counts of bare paper,
+    exposed alike, the lamp's drift and what is there at black taken off. `error`: (L, 3) float64 counts, standard
+    errors.
     """
     fit, swapped, misfit = _fitted(np.asarray(codes), white, error, dark_known=dark_known, drift_known=drift_known)
     count = len(white)

@@ -157,23 +157,14 @@ class _Codes:
 class ProjectorFit:
     """Whites of L lights, as the other lights of the session and what is known of any projector predict them.
 
-    Attributes
-    ----------
-    white
-        (L, 3) float64, as given: counts, what is there at black taken off.
-    slopes
-        (L, 3, K) float64, of each white by the K numbers of the model, each with a normal prior of variance 1.
-    covariance
-        (K, K) float64 of these numbers.
-    residual
-        (L, 3) float64 counts, white less the fitted one.
-    noise
-        (L, 3, 3) float64, covariance of each white about the model: what is measured and the lamp's scatter.
-    trust
-        (L,) float64, 0 … 1, weight of each light in the fit.
-    misfit
-        Sum of the squared distances of the whites from the model and of the model from what is known of any projector,
-        in standard deviations: about 3 for each light, or fewer, where all is well.
+    - `white`: (L, 3) float64, as given: counts, what is there at black taken off.
+    - `slopes`: (L, 3, K) float64, of each white by the K numbers of the model, each with a normal prior of variance 1.
+    - `covariance`: (K, K) float64 of these numbers.
+    - `residual`: (L, 3) float64 counts, white less the fitted one.
+    - `noise`: (L, 3, 3) float64, covariance of each white about the model: what is measured and the lamp's scatter.
+    - `trust`: (L,) float64, 0 … 1, weight of each light in the fit.
+    - `misfit`: sum of the squared distances of the whites from the model and of the model from what is known of any
+      projector, in standard deviations: about 3 for each light, or fewer, where all is well.
     """
 
     white: _Array
@@ -187,17 +178,8 @@ class ProjectorFit:
     def predicted(self, lights: npt.NDArray[np.int64]) -> tuple[_Array, _Array]:
         """Return the whites that the lights not named predict for those named, and their covariance.
 
-        Parameters
-        ----------
-        lights
-            (B, n) int64, B sets of n lights that are left out together.
-
-        Returns
-        -------
-        mean
-            (B, 3 n) float64 counts.
-        covariance
-            (B, 3 n, 3 n) float64, of a new white of these codes: of the model, the measurement and the lamp.
+        `lights`: (B, n) int64, B sets of n lights that are left out together. Returns (B, 3 n) float64 counts. Returns
+        (B, 3 n, 3 n) float64, of a new white of these codes: of the model, the measurement and the lamp.
         """
         sets, count = lights.shape
         size = 3 * count
@@ -227,22 +209,9 @@ def fit_projector(
 ) -> ProjectorFit:
     """Return what the whites of a session say of its projector.
 
-    Parameters
-    ----------
-    codes
-        (L, 3) int64, 0 … 255.
-    white
-        (L, 3) float64 counts of bare paper, exposed alike, what is there at black taken off.
-    error
-        (L, 3) float64 counts, standard errors of them.
-    dark_known
-        Whether dark frames showed what is there at black.
-    chroma_sd, brightness_sd
-        Scatter of a channel against the others, and of all together, from light to light, relative: of the lamp, and
-        of what the model lacks.
-    used
-        (L,) bool, lights to learn from, each with its full weight; None where the distance from what others predict
-        decides.
+    `codes`: (L, 3) int64, 0 … 255. `white`: (L, 3) float64 counts of bare paper, exposed alike, what is there at black
+    taken off. `error`: (L, 3) float64 counts, standard errors of them. `used`: (L,) bool, lights to learn from, each
+    with its full weight; None where the distance from what others predict decides.
     """
     given = _Codes.of(codes)
     level = np.maximum(np.abs(white), _FLOOR * white.max())

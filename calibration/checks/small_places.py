@@ -64,14 +64,8 @@ _Mask = npt.NDArray[np.bool_]
 class SmallPlaces:
     """Finds cells that something covers in a frame, from how far each is off.
 
-    Parameters
-    ----------
-    rgb
-        (C, 3) printed codes.
-    cells_mm
-        (C, 2) places.
-    usable
-        (C,) bool, cells that are inside the frame and were not covered from the start.
+    `rgb`: (C, 3) printed codes. `cells_mm`: (C, 2) places. `usable`: (C,) bool, cells that are inside the frame and
+    were not covered from the start.
     """
 
     def __init__(self, rgb: npt.ArrayLike, cells_mm: _Array, usable: _Mask) -> None:
@@ -89,12 +83,8 @@ class SmallPlaces:
 
         The others are those of them that are far off by themselves (K,) int64, and cells that stand alone (M,) int64.
 
-        Parameters
-        ----------
-        deviation
-            (K, C) float64 of each channel that is lit, a share of what the code gives; NaN of cells not compared.
-        sigma
-            (K, C) float64, its standard deviation: noise of both frames, and the model's usual error.
+        `deviation`: (K, C) float64 of each channel that is lit, a share of what the code gives; NaN of cells not
+        compared. `sigma`: (K, C) float64, its standard deviation: noise of both frames, and the model's usual error.
         """
         no_cells = np.zeros(0, dtype=np.int64)
         far = np.abs(deviation)
@@ -166,14 +156,9 @@ def cells_without_hot(cells: _Index, seeds: _Index, hot: _Mask, cells_mm: _Array
     A place counts on where two of its cells are far off without a hot photosite of their own. Of other places no more
     than one such cell is left.
 
-    Parameters
-    ----------
-    cells, seeds
-        (N,) int64, ascending, what `SmallPlaces.disturbed` found, and (K,) int64, those far off by themselves.
-    hot
-        (C,) bool, cells that hold a photosite which is hot in the dark frames.
-    cells_mm
-        (C, 2) places.
+    `cells`, `seeds`: (N,) int64, ascending, what `SmallPlaces.disturbed` found, and (K,) int64, those far off by
+    themselves. `hot`: (C,) bool, cells that hold a photosite which is hot in the dark frames. `cells_mm`: (C, 2)
+    places.
     """
     nearest = np.asarray(cKDTree(cells_mm).query(cells_mm, k=2)[0])[:, 1]
     pairs = cKDTree(cells_mm[cells]).query_pairs(_NEXT * float(np.median(nearest)), output_type="ndarray")

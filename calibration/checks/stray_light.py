@@ -47,19 +47,13 @@ _Mask = npt.NDArray[np.bool_]
 class StrayLight:
     """Light that is in some frames and not in the dark ones; L lights.
 
-    Attributes
-    ----------
-    at_zero
-        (L,) float64, what a light has of a primary whose code is 0, in parts of that primary alone, with its sign, the
-        primary that is off most; NaN of lights that are not checked.
-    certain
-        (L,) float64, the size of that beyond four standard errors; 0 where not checked.
-    of_primaries
-        By how much the primaries together exceed white for certain, of white, in the primary that does least.
-    primaries
-        Lights that are the primaries, red, green and blue.
-    lights_of
-        (L, 3) bool, the primaries that a light has a code above 0 of.
+    - `at_zero`: (L,) float64, what a light has of a primary whose code is 0, in parts of that primary alone, with its
+      sign, the primary that is off most; NaN of lights that are not checked.
+    - `certain`: (L,) float64, the size of that beyond four standard errors; 0 where not checked.
+    - `of_primaries`: by how much the primaries together exceed white for certain, of white, in the primary that does
+      least.
+    - `primaries`: lights that are the primaries, red, green and blue.
+    - `lights_of`: (L, 3) bool, the primaries that a light has a code above 0 of.
     """
 
     at_zero: _Array
@@ -79,12 +73,9 @@ class StrayLight:
         return np.isfinite(self.at_zero)
 
     def lights_beyond(self, accepted: float) -> list[int]:
-        """Return the lights whose frames are concerned, the worst first; primaries where they are what has the light.
+        """Return the lights whose frames are concerned, the worst first.
 
-        Parameters
-        ----------
-        accepted
-            Share up to which a light is accepted.
+        Primaries where they are what has the light.
         """
         worst = [int(light) for light in np.argsort(-self.certain, kind="stable") if self.certain[light] > accepted]
         own = [light for light in worst if self.at_zero[light] > 0]
@@ -118,21 +109,11 @@ def stray_light(
 ) -> StrayLight | None:
     """Return what light is in frames that the dark frames do not show; None where it cannot be known.
 
-    Parameters
-    ----------
-    codes
-        (L, 3) int64, 0 … 255.
-    white, error
-        (L, 3) float64 counts of bare paper and their standard errors; dark light, drift and stated exposures taken out.
-    full_white
-        (W, 3) float64 counts, likewise, of white frames; of all, not of one, as their scatter is the lamp's.
-    primaries
-        The lights of red, green and blue alone; None where one is missing.
-
-    Returns
-    -------
-    StrayLight or None
-        None without the three primaries, or where the camera cannot tell them apart, or where a white is not known.
+    `codes`: (L, 3) int64, 0 … 255. `white`, `error`: (L, 3) float64 counts of bare paper and their standard errors;
+    dark light, drift and stated exposures taken out. `full_white`: (W, 3) float64 counts, likewise, of white frames; of
+    all, not of one, as their scatter is the lamp's. `primaries`: the lights of red, green and blue alone; None where
+    one is missing. Returns none without the three primaries, or where the camera cannot tell them apart, or where a
+    white is not known.
     """
     if primaries is None or not (np.isfinite(white).all() and np.isfinite(error).all()):
         return None
@@ -190,14 +171,8 @@ def _of_primaries(codes: npt.NDArray[np.int64], full: _Array, spread: _Array) ->
 def _are_alone(amounts: _Array, lights_of: _Mask, spread: _Array, share: float) -> bool:
     """Return whether lights of two primaries show that the primaries' frames hold no other light.
 
-    Parameters
-    ----------
-    amounts, spread
-        (N, 3) float64, of each primary, and their standard errors.
-    lights_of
-        (N, 3) bool, primaries with a code above 0.
-    share
-        By how much the primaries together exceed white: what lights would lack if it were other light.
+    `amounts`, `spread`: (N, 3) float64, of each primary, and their standard errors. `lights_of`: (N, 3) bool, primaries
+    with a code above 0.
     """
     holds = np.where(lights_of, amounts, 0.0) >= _MUCH
     if not (holds.sum(axis=0) >= _WITNESSES).all():

@@ -38,14 +38,7 @@ def bibtex(
 ) -> str:
     """Return a BibTeX entry of a table.
 
-    Parameters
-    ----------
-    camera, lights, software, sha256
-        Its camera, number of lights, the software that built it, and its hash.
-    origin
-        What it says of its origin; None for tables made before that was kept.
-    computed
-        Whether it was computed and nothing was photographed.
+    `origin`: what it says of its origin; None for tables made before that was kept.
     """
     known = origin or OriginRecord()
     year = known.year

@@ -14,7 +14,7 @@ NOT_RECORDED: Final = "not recorded"
 """What stands where a table does not say something."""
 
 Rig = Literal["lab", "simulated", "replay", "imported"]
-"""What stood at the end of the cables; see `acquisition.config.LabSettings`."""
+"""What stood at the end of the cables; see `experiment.config.LabSettings`."""
 
 Line = Annotated[str, Field(max_length=500)]
 Text = Annotated[str, Field(max_length=20_000)]
@@ -23,33 +23,20 @@ Text = Annotated[str, Field(max_length=20_000)]
 class OriginRecord(BaseModel):
     """With what, when and by whom the frames of a table were taken.
 
-    Attributes
-    ----------
-    rig
-        ``lab``, ``simulated``, ``replay`` or ``imported``; None where the session does not say.
-    camera_serial
-        Serial number of the body, or its hash, as `camera_serial_is` says.
-    camera_serial_is
-        ``hash`` (`calibration.citation.serial_numbers.serial_hash`), ``plain``, ``withheld`` by the lab's choice, or
-        ``not stated`` by the raw files.
-    lens
-        Model of the lens as the raw files state it, or the lab where they do not.
-    iso, aperture, shutter_s
-        ISO speed, f-number and exposure time in seconds of most frames.
-    exposure_by
-        Who states the exposure: the ``raw files``, or the session's ``settings`` where these are silent.
-    first_frame, last_frame
-        When the first and the last frame of the table were released, ISO 8601, UTC.
-    frames
-        How many frames the table was made from.
-    projector
-        Maker and model as its control port names it, or as the lab does where it has none.
-    screen
-        What showed the colours, as the session names it.
-    taken_by
-        Name and version of the software that took the session; `Provenance.software` is what built the table.
-    title, authors, note, licence, url
-        As the lab states them; the licence is an SPDX expression (SPDX specification 2.3, annex D).
+    - `rig`: ``lab``, ``simulated``, ``replay`` or ``imported``; None where the session does not say.
+    - `camera_serial`: serial number of the body, or its hash, as `camera_serial_is` says.
+    - `camera_serial_is`: ``hash`` (`calibration.citation.serial_numbers.serial_hash`), ``plain``, ``withheld`` by the
+      lab's choice, or ``not stated`` by the raw files.
+    - `lens`: model of the lens as the raw files state it, or the lab where they do not.
+    - `iso`, `aperture`, `shutter_s`: ISO speed, f-number and exposure time in seconds of most frames.
+    - `exposure_by`: who states the exposure: the ``raw files``, or the session's ``settings`` where these are silent.
+    - `first_frame`, `last_frame`: when the first and the last frame of the table were released, ISO 8601, UTC.
+    - `frames`: how many frames the table was made from.
+    - `projector`: maker and model as its control port names it, or as the lab does where it has none.
+    - `screen`: what showed the colours, as the session names it.
+    - `taken_by`: name and version of the software that took the session; `Provenance.software` is what built the table.
+    - `title`, `authors`, `note`, `licence`, `url`: as the lab states them; the licence is an SPDX expression (SPDX
+      specification 2.3, annex D).
     """
 
     model_config = ConfigDict(frozen=True, extra="ignore")

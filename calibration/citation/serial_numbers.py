@@ -20,7 +20,7 @@ from typing import Literal
 from drivers.raw.origin import FrameOrigin
 
 SerialForm = Literal["hash", "plain", "withheld"]
-"""How the serial number of a body is told (`acquisition.config.CitationSettings.camera_serial`)."""
+"""How the serial number of a body is told (`experiment.config.CitationSettings.camera_serial`)."""
 
 _COST, _BLOCK, _PARALLEL = 1 << 14, 8, 1
 """scrypt's N, r and p as RFC 7914, section 2, has them for interactive use: 16 MiB, some 40 ms. Changing one changes
@@ -32,15 +32,7 @@ _BYTES = 16
 
 @lru_cache(maxsize=64)
 def serial_hash(camera: str, serial: str) -> str:
-    """Return the hash of a body's serial number, 32 hexadecimal digits: scrypt with the camera's name as salt.
-
-    Parameters
-    ----------
-    camera
-        Maker and model as the raw files name them, ``Canon EOS 550D``: numbers of two models are then not alike.
-    serial
-        As the raw files state it.
-    """
+    """Return the hash of a body's serial number, 32 hexadecimal digits: scrypt with the camera's name as salt."""
     salt = f"crop camera serial {camera}".encode()
     return hashlib.scrypt(serial.encode(), salt=salt, n=_COST, r=_BLOCK, p=_PARALLEL, dklen=_BYTES).hex()
 

@@ -11,12 +11,12 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from acquisition.config import CameraSettings, CitationSettings
-from acquisition.session.folder import Session
-from acquisition.session.records import FrameRecord
 from calibration.citation.record import OriginRecord, Rig
 from calibration.citation.serial_numbers import told_serials
 from drivers.raw.origin import FrameOrigin
+from experiment.config import CameraSettings, CitationSettings
+from experiment.session.folder import Session
+from experiment.session.records import FrameRecord
 from foundation.errors import CropError, InputError
 
 _SERIAL = ", serial number "
@@ -32,16 +32,10 @@ _SETTING_RIGS = ("lab", "simulated")
 class StatedOrigin:
     """What `session.toml` and the journal state beside the frames.
 
-    Attributes
-    ----------
-    citation
-        What the lab states.
-    rig
-        What stood at the end of the cables; None where the settings do not say.
-    camera
-        The exposure as it was set; None where nothing set it, or it is not known.
-    devices
-        Names in the journal: ``camera``, ``projector``, ``screen``, ``software``; those that are known.
+    - `citation`: what the lab states.
+    - `rig`: what stood at the end of the cables; None where the settings do not say.
+    - `camera`: the exposure as it was set; None where nothing set it, or it is not known.
+    - `devices`: names in the journal: ``camera``, ``projector``, ``screen``, ``software``; those that are known.
     """
 
     citation: CitationSettings
@@ -63,13 +57,7 @@ def stated_origin(session: Session) -> StatedOrigin:
 
 
 def with_changes(citation: CitationSettings, changes: dict[str, Any]) -> CitationSettings:
-    """Return what the lab states with what was given on the command line in its place.
-
-    Raises
-    ------
-    InputError
-        A value cannot be used; the message names its option.
-    """
+    """Return what the lab states with what was given on the command line in its place."""
     try:
         return CitationSettings.model_validate(citation.model_dump() | changes)
     except ValidationError as error:
@@ -80,17 +68,7 @@ def with_changes(citation: CitationSettings, changes: dict[str, Any]) -> Citatio
 
 
 def origin_record(stated: StatedOrigin, records: Sequence[FrameRecord], origins: Sequence[FrameOrigin]) -> OriginRecord:
-    """Return what a table says of its origin.
-
-    Parameters
-    ----------
-    stated
-        What session and lab state.
-    records
-        Every frame that the table was made from.
-    origins
-        What the raw files of its light and white frames state.
-    """
+    """Return what a table says of its origin."""
     citation, exposures = stated.citation, [origin for origin in origins if origin.exposure > 0]
     serial, told_as = _serial(stated, origins)
     moments = [record.taken_at.astimezone(UTC) for record in records]

@@ -11,8 +11,8 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from acquisition.measures.stains import STAINED
 from calibration.comparison.values import CellDifferences, LightDifferences, NoiseAnswer
+from experiment.measures.stains import STAINED
 from foundation.errors import first_of
 
 CHANCE = 0.01

@@ -60,22 +60,7 @@ def compare(
     progress: ReportLights | None = None,
     places: tuple[Path | None, Path | None] = (None, None),
 ) -> TableComparison:
-    """Return how far two tables of one chart differ, and whether noise alone explains it.
-
-    Parameters
-    ----------
-    one, other
-        The tables, A and B.
-    progress
-        Called after every light.
-    places
-        What to call them, where their own folders are not theirs: the sessions they were made of for this.
-
-    Raises
-    ------
-    FormatError
-        The charts differ, no light is in both, or a light's samples are not those that were measured.
-    """
+    """Return how far two tables of one chart differ, and whether noise alone explains it."""
     require_one_chart(one, other)
     pairs = light_pairs(one.illuminations, other.illuminations)
     require_common_lights(pairs, one, other)
@@ -291,13 +276,7 @@ def _median_gains(one: _Array, other: _Array) -> _Array:
 
 
 def white_errors(lut: Lut) -> _Array:
-    """Return the standard errors (L, 3) float64 of a table's whites by `references.csv`; NaN where it does not say.
-
-    Raises
-    ------
-    FormatError
-        The file is damaged.
-    """
+    """Return the standard errors (L, 3) float64 of a table's whites by `references.csv`; NaN where it does not say."""
     errors = np.full(lut.white.shape, np.nan)
     path = lut.folder / REFERENCES
     if not path.is_file():

@@ -15,10 +15,7 @@ def geometry_difference(one: _Array, other: _Array) -> GeometryDifference:
 
     The closed solution with complex numbers, of which scale and turn are one; places are x + iy, y down.
 
-    Parameters
-    ----------
-    one, other
-        (N, 2) float64 half-size px, N at least 2: the same points of the print in two frames.
+    `one`, `other`: (N, 2) float64 half-size px, N at least 2: the same points of the print in two frames.
     """
     first, second = (places[:, 0] + 1j * places[:, 1] for places in (one, other))
     middle, after = first.mean(), second.mean()

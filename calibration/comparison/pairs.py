@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from acquisition.lights.illuminations import Illumination
 from calibration.table.lut import Lut
+from experiment.lights.illuminations import Illumination
 from foundation.errors import FormatError, counted
 
 
@@ -14,12 +14,8 @@ from foundation.errors import FormatError, counted
 class LightPairs:
     """The lights that two tables have in common, in the order of the first.
 
-    Attributes
-    ----------
-    one, other
-        Their numbers in either table.
-    only_one, only_other
-        Lights that only one of the tables has.
+    - `one`, `other`: their numbers in either table.
+    - `only_one`, `only_other`: lights that only one of the tables has.
     """
 
     one: tuple[int, ...]
@@ -49,13 +45,7 @@ def light_pairs(one: Sequence[Illumination], other: Sequence[Illumination]) -> L
 
 
 def require_one_chart(one: Lut, other: Lut) -> None:
-    """Refuse two tables of different charts: a colour then means another place, and nothing can be compared.
-
-    Raises
-    ------
-    FormatError
-        The charts or their bits differ.
-    """
+    """Refuse two tables of different charts: a colour then means another place, and nothing can be compared."""
     ours, theirs = one.provenance, other.provenance
     differs = ""
     if ours.bits != theirs.bits:
@@ -70,13 +60,7 @@ def require_one_chart(one: Lut, other: Lut) -> None:
 
 
 def require_common_lights(pairs: LightPairs, one: Lut, other: Lut) -> None:
-    """Refuse two tables without a light in common.
-
-    Raises
-    ------
-    FormatError
-        There is none.
-    """
+    """Refuse two tables without a light in common."""
     if not pairs.one:
         raise FormatError(
             f"{one.folder} has {counted(len(one.illuminations), 'light')} and {other.folder} "

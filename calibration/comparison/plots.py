@@ -6,10 +6,10 @@ from typing import Any
 
 import numpy as np
 
-from acquisition.chart.model import Chart
 from calibration.comparison.answers import ANGLE_FLOOR_DEG, CELL_SCORE
 from calibration.comparison.values import CellDifferences, LightDifferences
 from calibration.report.plots import FAINT, INK, MARK
+from experiment.chart.model import Chart
 
 _CHANNEL_INK = ("#c8382e", "#2f8f46", "#2f62c8")
 

@@ -7,13 +7,13 @@ import json
 from collections.abc import Sequence
 from pathlib import Path
 
-from acquisition.chart.model import Chart
 from calibration.comparison.plots import draw_cells, draw_lights, draw_map
 from calibration.comparison.values import ColourGroup, ComparedTable, NoiseAnswer, TableComparison
 from calibration.comparison.wording import cells_csv, comparison_json, geometry_text, lights_csv
 from calibration.report.page import Picture, picture_html
 from calibration.report.plots import png_of
 from calibration.report.style import STYLE
+from experiment.chart.model import Chart
 from foundation.files import whole_folder, write_whole
 
 PICTURES = ("lights.png", "cells.png", "map.png")
@@ -21,24 +21,7 @@ PICTURES = ("lights.png", "cells.png", "map.png")
 
 
 def write_comparison(comparison: TableComparison, folder: Path, chart: Chart | None = None) -> None:
-    """Write a comparison into a new folder, whole or not at all.
-
-    Parameters
-    ----------
-    comparison
-        What was found.
-    folder
-        Must be free.
-    chart
-        The chart of both tables; the map of the print is drawn where it is given.
-
-    Raises
-    ------
-    InputError
-        The folder is taken.
-    StorageError
-        The disk is full or read-only.
-    """
+    """Write a comparison into a new folder, whole or not at all."""
     pictures = _pictures(comparison, chart)
     with whole_folder(folder, "the comparison") as partial:
         write_whole(partial / "lights.csv", lights_csv(comparison))

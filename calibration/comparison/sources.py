@@ -8,15 +8,15 @@ from collections.abc import Callable, Generator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
-from acquisition.chart.model import Chart, load_chart
-from acquisition.session.folder import Session
-from acquisition.session.journal import JOURNAL_FILE
 from calibration.pipeline.build import build
 from calibration.pipeline.options import BuildOptions
 from calibration.report.report_json import report_json
 from calibration.table.file_names import REPORT_JSON
 from calibration.table.lut import Lut, open_lut
 from calibration.verdict.result import BuildResult
+from experiment.chart.model import Chart, load_chart
+from experiment.session.folder import Session
+from experiment.session.journal import JOURNAL_FILE
 from foundation.files import storage_error, write_whole
 
 CHART_FILE = "chart.json"
@@ -31,24 +31,6 @@ def table_of(place: Path, options: BuildOptions, progress: ReportBuild | None = 
     """Yield the table of a table's folder as it is, or of a session's, which is built as `build-lut` builds it.
 
     The table of a session lies in a hidden folder beside the session until the end: it needs 3.5 GB of 707 lights.
-
-    Parameters
-    ----------
-    place
-        A table, or a session.
-    options
-        How the table of a session is built.
-    progress
-        Called after every frame of a session.
-
-    Raises
-    ------
-    FormatError
-        The folder is neither.
-    QualityError, RegistrationError
-        The session makes no table.
-    StorageError
-        The disk beside the session is full or read-only.
     """
     if not (place / JOURNAL_FILE).is_file():
         yield open_lut(place)

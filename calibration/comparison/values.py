@@ -18,16 +18,10 @@ _Array = npt.NDArray[np.float64]
 class ComparedTable:
     """One of the two tables.
 
-    Attributes
-    ----------
-    place
-        Its folder, or that of the session that it was made of for the comparison.
-    camera, software
-        As `lut.json` has them.
-    lights, samples
-        Lights, and samples of each cell.
-    drift_corrected
-        Whether the lamp's drift was taken out of it.
+    - `place`: its folder, or that of the session that it was made of for the comparison.
+    - `camera`, `software`: as `lut.json` has them.
+    - `lights`, `samples`: lights, and samples of each cell.
+    - `drift_corrected`: whether the lamp's drift was taken out of it.
     """
 
     place: Path
@@ -42,30 +36,21 @@ class ComparedTable:
 class LightDifferences:
     """What differs light by light.
 
-    Attributes
-    ----------
-    one, other
-        (L,) int64, the light's number in A and in B.
-    angle_deg
-        (L,) float64 degrees between the two whites.
-    angle_noise_deg
-        (L,) float64 degrees, root mean square of that angle by the whites' standard errors alone; NaN where a table
-        does not have them.
-    angle_score
-        (L,) float64, the angle in units of its errors: χ² of two freedoms over 2 has this squared; NaN likewise.
-    brightness
-        (L,) float64, length of B's white over A's, less 1.
-    brightness_left
-        (L,) float64, the same after the drift that both tables record, and the median of the lights, are divided out.
-    brightness_noise
-        (L,) float64, standard error of either by the whites' errors alone; NaN where it is not known.
-    gains
-        (3,) float64, B's white over A's channel by channel, median of the lights with enough of it.
-    cell_rms, cell_noise
-        (L,) float64, root mean square over the cells of B over A less 1, each over its own light's white, and what
-        noise alone predicts of it; NaN where no cell is bright enough.
-    cell_score
-        (L,) float64, root mean square of the cells' differences in units of their standard errors: 1 by noise alone.
+    - `one`, `other`: (L,) int64, the light's number in A and in B.
+    - `angle_deg`: (L,) float64 degrees between the two whites.
+    - `angle_noise_deg`: (L,) float64 degrees, root mean square of that angle by the whites' standard errors alone; NaN
+      where a table does not have them.
+    - `angle_score`: (L,) float64, the angle in units of its errors: χ² of two freedoms over 2 has this squared; NaN
+      likewise.
+    - `brightness`: (L,) float64, length of B's white over A's, less 1.
+    - `brightness_left`: (L,) float64, the same after the drift that both tables record, and the median of the lights,
+      are divided out.
+    - `brightness_noise`: (L,) float64, standard error of either by the whites' errors alone; NaN where it is not known.
+    - `gains`: (3,) float64, B's white over A's channel by channel, median of the lights with enough of it.
+    - `cell_rms`, `cell_noise`: (L,) float64, root mean square over the cells of B over A less 1, each over its own
+      light's white, and what noise alone predicts of it; NaN where no cell is bright enough.
+    - `cell_score`: (L,) float64, root mean square of the cells' differences in units of their standard errors: 1 by
+      noise alone.
     """
 
     one: npt.NDArray[np.int64]
@@ -88,27 +73,16 @@ class CellDifferences:
 
     Only where both means are above `LEAST_COUNTS`; NaN where none is, and for cells that a table lists as unfit.
 
-    Attributes
-    ----------
-    lights
-        (C, 3) int64, lights that count.
-    mean, spread
-        (C, 3) float64, over the lights.
-    noise
-        (C, 3) float64, standard error of `mean` by noise alone.
-    worst, worst_light
-        (C, 3) float64, the largest difference in units of its standard error, with its sign; (C, 3) int64 the light
-        of A under which it is, −1 for none.
-    worst_share
-        (C, 3) float64, that difference, relative.
-    unfit_one, unfit_other
-        Cells that only A, and only B, lists as unfit.
-    score
-        Root mean square over cells, channels and lights of differences in units of their standard errors.
-    rms, predicted_rms
-        Root mean square of the differences, and by noise alone.
-    offset
-        (3,) float64, mean of all differences.
+    - `lights`: (C, 3) int64, lights that count.
+    - `mean`, `spread`: (C, 3) float64, over the lights.
+    - `noise`: (C, 3) float64, standard error of `mean` by noise alone.
+    - `worst`, `worst_light`: (C, 3) float64, the largest difference in units of its standard error, with its sign; (C,
+      3) int64 the light of A under which it is, −1 for none.
+    - `worst_share`: (C, 3) float64, that difference, relative.
+    - `unfit_one`, `unfit_other`: cells that only A, and only B, lists as unfit.
+    - `score`: root mean square over cells, channels and lights of differences in units of their standard errors.
+    - `rms`, `predicted_rms`: root mean square of the differences, and by noise alone.
+    - `offset`: (3,) float64, mean of all differences.
     """
 
     lights: npt.NDArray[np.int64]
@@ -135,18 +109,11 @@ class CellDifferences:
 class ColourGroup:
     """Cells of one part of the colour cube.
 
-    Attributes
-    ----------
-    name
-        Which channels of the code are in the upper half: ``black``, ``blue`` … ``white``.
-    cells
-        How many of them count.
-    mean, spread
-        Mean and standard deviation over the cells of their mean difference, in the channel that deviates most.
-    worst
-        The largest mean difference, with its sign.
-    worst_colour
-        Its colour index.
+    - `name`: which channels of the code are in the upper half: ``black``, ``blue`` … ``white``.
+    - `cells`: how many of them count.
+    - `mean`, `spread`: mean and standard deviation over the cells of their mean difference, in the channel that
+      deviates most.
+    - `worst`: the largest mean difference, with its sign.
     """
 
     name: str
@@ -161,16 +128,11 @@ class ColourGroup:
 class GeometryDifference:
     """How the chart lay elsewhere in the frame that was registered first; half-size px of A's frame.
 
-    Attributes
-    ----------
-    shift_px
-        (dx, dy) of the page's middle.
-    turned_deg
-        Clockwise in the picture.
-    scale
-        B's size over A's, less 1.
-    bent_px
-        Root mean square of what shift, turn and scale leave: perspective, another lens, another shape of the sheet.
+    - `shift_px`: (dx, dy) of the page's middle.
+    - `turned_deg`: clockwise in the picture.
+    - `scale`: B's size over A's, less 1.
+    - `bent_px`: root mean square of what shift, turn and scale leave: perspective, another lens, another shape of the
+      sheet.
     """
 
     shift_px: tuple[float, float]
@@ -183,14 +145,9 @@ class GeometryDifference:
 class NoiseAnswer:
     """Whether one thing is the same within noise.
 
-    Attributes
-    ----------
-    name
-        ``colour of lights``, ``brightness of lights``, ``cells``.
-    same
-        Yes, no, or None where it cannot be said.
-    said
-        The numbers, in words.
+    - `name`: ``colour of lights``, ``brightness of lights``, ``cells``.
+    - `same`: yes, no, or None where it cannot be said.
+    - `said`: the numbers, in words.
     """
 
     name: str

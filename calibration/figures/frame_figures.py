@@ -8,13 +8,13 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from acquisition.framing.movement import Shift
-from acquisition.framing.planes import Channel
-from acquisition.measures.flat_field import FlatField
-from acquisition.measures.paper import FieldResidual, Paper
-from acquisition.session.records import FrameRecord
 from calibration.checks.frame_consistency import FrameConsistency
 from drivers.raw.origin import FrameOrigin
+from experiment.framing.movement import Shift
+from experiment.framing.planes import Channel
+from experiment.measures.flat_field import FlatField
+from experiment.measures.paper import FieldResidual, Paper
+from experiment.session.records import FrameRecord
 
 _Array = npt.NDArray[np.float64]
 
@@ -23,34 +23,19 @@ _Array = npt.NDArray[np.float64]
 class FrameFigures:
     """What was measured on one light or white frame.
 
-    Attributes
-    ----------
-    record
-        The frame.
-    black
-        (2, 2) float64 counts, black level of each position of the Bayer block.
-    channel
-        The channel in which the chart's movement was measured.
-    shift
-        Movement against the frame that was registered last.
-    reregistered
-        Whether the chart had moved so far that it was registered again in this frame.
-    paper
-        Flat field and white of bare paper.
-    consistency
-        How much the frame differs from the print as it was first registered.
-    greys, grey_errors
-        (G, 3) float64 counts above black of each level of grey, field divided out, and their standard errors.
-    dark
-        (3,) float64 counts, dark light of bare paper that was subtracted; zeros where none was.
-    share_at_zero
-        Share, 0 … 1, of the frame's samples in the table that are 0.
-    blur_px
-        σ of the frame's blur, half-size px: that of the frame registered last, plus the change since.
-    exposure
-        Shutter time × ISO speed / f-number² by the raw file, s; 0 where it does not state them.
-    origin
-        Camera, lens and exposure as the raw file states them.
+    - `black`: (2, 2) float64 counts, black level of each position of the Bayer block.
+    - `channel`: the channel in which the chart's movement was measured.
+    - `shift`: movement against the frame that was registered last.
+    - `reregistered`: whether the chart had moved so far that it was registered again in this frame.
+    - `paper`: flat field and white of bare paper.
+    - `consistency`: how much the frame differs from the print as it was first registered.
+    - `greys`, `grey_errors`: (G, 3) float64 counts above black of each level of grey, field divided out, and their
+      standard errors.
+    - `dark`: (3,) float64 counts, dark light of bare paper that was subtracted; zeros where none was.
+    - `share_at_zero`: share, 0 … 1, of the frame's samples in the table that are 0.
+    - `blur_px`: σ of the frame's blur, half-size px: that of the frame registered last, plus the change since.
+    - `exposure`: shutter time × ISO speed / f-number² by the raw file, s; 0 where it does not state them.
+    - `origin`: camera, lens and exposure as the raw file states them.
     """
 
     record: FrameRecord

@@ -14,16 +14,11 @@ _Array = npt.NDArray[np.float64]
 class LinearityFigures:
     """Deviation of counts from proportion to the light (EMVA 1288, release 4.0, linearity error).
 
-    Attributes
-    ----------
-    files
-        The frames, by rising exposure.
-    exposure_s
-        (K,) float64 s, as the files state them.
-    level
-        (B,) float64, shares of saturation, rising.
-    deviation
-        (3, B) float64, relative, of R, G and B from the straight line that fits best; NaN where no patch has data.
+    - `files`: the frames, by rising exposure.
+    - `exposure_s`: (K,) float64 s, as the files state them.
+    - `level`: (B,) float64, shares of saturation, rising.
+    - `deviation`: (3, B) float64, relative, of R, G and B from the straight line that fits best; NaN where no patch has
+      data.
     """
 
     files: tuple[str, ...]

@@ -12,8 +12,6 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from acquisition.measures.sensor_range import black_drift
-from acquisition.measures.stains import Stains
 from calibration.checks.frame_origins import OriginFigures
 from calibration.checks.light_codes import CodeAgreement
 from calibration.checks.stray_light import StrayLight
@@ -29,6 +27,8 @@ from calibration.registration.registration import Registration
 from calibration.spread.correction import LensFigures
 from calibration.spread.point_spread import PointSpread
 from calibration.table.provenance import Unfit
+from experiment.measures.sensor_range import black_drift
+from experiment.measures.stains import Stains
 
 _Array = npt.NDArray[np.float64]
 
@@ -37,20 +37,12 @@ _Array = npt.NDArray[np.float64]
 class SessionFigures:
     """What was read.
 
-    Attributes
-    ----------
-    folder
-        The session's folder.
-    camera
-        Maker and model as the raw files name it.
-    lights
-        Lights with an accepted frame.
-    registered_file
-        The frame that was registered first, relative to the session.
-    white_references
-        White references that the chart has.
-    codes
-        Codes of each light of the plan, 0 … 255.
+    - `folder`: the session's folder.
+    - `camera`: maker and model as the raw files name it.
+    - `lights`: lights with an accepted frame.
+    - `registered_file`: the frame that was registered first, relative to the session.
+    - `white_references`: white references that the chart has.
+    - `codes`: codes of each light of the plan, 0 … 255.
     """
 
     folder: Path
@@ -65,29 +57,22 @@ class SessionFigures:
 class LightFigures:
     """What was measured of the lights, light by light; a check has one row, of the frame that it read.
 
-    Attributes
-    ----------
-    white, white_error
-        (L, 3) float64 counts, the ground truth and its standard error, in the units of the samples.
-    gains
-        (L, 3) float64, the lamp's light at each light over that in the first white frame; ones where it is not known.
-    subtracted
-        (L, 3) float64 counts, dark light of bare paper that was subtracted; None where none was to be.
-    share_at_zero
-        (L,) float64, share of each light's samples in the table that are 0; (0,) after a check.
-    additivity
-        (3,) float64, by how much the primaries together differ from white, relative to white; None where a frame
-        that is needed is missing.
-    codes
-        How the whites agree with their codes, by all other lights (`calibration.checks.light_codes`); lights from index
-        L on in `exchanges` and `seen_as` are white frames. None after a check.
-    white_frames
-        The same of the white frames: of the first alone where the others differ from it as a lamp drifts, or of all.
-        None without.
-    drift
-        How the lights are brought to one lamp in the table; None where that was not asked for. All else is as measured.
-    stray
-        Light in frames that the dark ones do not show; None without the three primaries each alone or a dark frame.
+    - `white`, `white_error`: (L, 3) float64 counts, the ground truth and its standard error, in the units of the
+      samples.
+    - `gains`: (L, 3) float64, the lamp's light at each light over that in the first white frame; ones where it is not
+      known.
+    - `subtracted`: (L, 3) float64 counts, dark light of bare paper that was subtracted; None where none was to be.
+    - `share_at_zero`: (L,) float64, share of each light's samples in the table that are 0; (0,) after a check.
+    - `additivity`: (3,) float64, by how much the primaries together differ from white, relative to white; None where a
+      frame that is needed is missing.
+    - `codes`: how the whites agree with their codes, by all other lights (`calibration.checks.light_codes`); lights
+      from index L on in `exchanges` and `seen_as` are white frames. None after a check.
+    - `white_frames`: the same of the white frames: of the first alone where the others differ from it as a lamp drifts,
+      or of all. None without.
+    - `drift`: how the lights are brought to one lamp in the table; None where that was not asked for. All else is as
+      measured.
+    - `stray`: light in frames that the dark ones do not show; None without the three primaries each alone or a dark
+      frame.
     """
 
     white: _Array
@@ -130,13 +115,9 @@ class LightFigures:
 class GreyFigures:
     """What was measured of the printed levels of grey.
 
-    Attributes
-    ----------
-    names
-        Of the G levels, brightest first.
-    values, errors
-        (L, G, 3) float64 counts under each light, field divided out, and their standard errors; NaN where no patch of
-        a level can be used.
+    - `names`: of the G levels, brightest first.
+    - `values`, `errors`: (L, G, 3) float64 counts under each light, field divided out, and their standard errors; NaN
+      where no patch of a level can be used.
     """
 
     names: tuple[str, ...]
@@ -158,20 +139,13 @@ class GreyFigures:
 class SensorFigures:
     """What was measured of the sensor.
 
-    Attributes
-    ----------
-    saturation_counts
-        Raw count of saturation.
-    saturation_measured
-        Whether a photosite of a cell reached it, so that the count is measured and not the raw file's statement.
-    white_level
-        Saturation as a sample value: counts above black.
-    noise
-        (3,) float64, median standard deviation of one sample under white, relative to paper white.
-    transfer
-        Photon-transfer curve of the frame that was registered first.
-    linearity
-        What a series of exposures shows; None where none was given.
+    - `saturation_counts`: raw count of saturation.
+    - `saturation_measured`: whether a photosite of a cell reached it, so that the count is measured and not the raw
+      file's statement.
+    - `white_level`: saturation as a sample value: counts above black.
+    - `noise`: (3,) float64, median standard deviation of one sample under white, relative to paper white.
+    - `transfer`: photon-transfer curve of the frame that was registered first.
+    - `linearity`: what a series of exposures shows; None where none was given.
     """
 
     saturation_counts: int
@@ -186,14 +160,9 @@ class SensorFigures:
 class CellFigures:
     """What was found of the chart's cells.
 
-    Attributes
-    ----------
-    window
-        Pixels along the side of a cell's window; S = window².
-    unfit
-        Cells not to be used, each with its cause.
-    stains
-        Where the print does not have its codes' colours, in the order of colour indices.
+    - `window`: pixels along the side of a cell's window; S = window².
+    - `unfit`: cells not to be used, each with its cause.
+    - `stains`: where the print does not have its codes' colours, in the order of colour indices.
     """
 
     window: int
@@ -205,25 +174,15 @@ class CellFigures:
 class TableFigures:
     """All that was measured by a build, or by a check.
 
-    Attributes
-    ----------
-    session, lights, greys, sensor, cells
-        The groups.
-    registration
-        Of the frame that was registered first.
-    frames
-        Figures of every light and white frame read, in the order taken.
-    dark_frames
-        What the dark frames show; of a check, the first of them.
-    origins
-        Which frames' files state another camera, lens or exposure than most.
-    primaries
-        The primaries each alone, by which the field of coloured cells is known apart from that of paper; None where
-        the plan has no light of each alone, or one is too dim.
-    lens, point_spread
-        What the lens spreads beside its sharp core, and what of it was subtracted; None where it was not measured.
-    origin
-        With what, when and by whom the frames were taken.
+    - `registration`: of the frame that was registered first.
+    - `frames`: figures of every light and white frame read, in the order taken.
+    - `dark_frames`: what the dark frames show; of a check, the first of them.
+    - `origins`: which frames' files state another camera, lens or exposure than most.
+    - `primaries`: the primaries each alone, by which the field of coloured cells is known apart from that of paper;
+      None where the plan has no light of each alone, or one is too dim.
+    - `lens`, `point_spread`: what the lens spreads beside its sharp core, and what of it was subtracted; None where it
+      was not measured.
+    - `origin`: with what, when and by whom the frames were taken.
     """
 
     session: SessionFigures
@@ -274,10 +233,7 @@ def direction_error_deg(white: _Array, error: _Array) -> _Array:
     The root of the mean square angle: of each component's error, the part across the vector counts (first-order
     propagation of errors).
 
-    Parameters
-    ----------
-    white, error
-        (L, 3) float64 and its standard errors, in one unit.
+    `white`, `error`: (L, 3) float64 and its standard errors, in one unit.
     """
     length = np.linalg.norm(white, axis=1, keepdims=True)
     along = white / np.maximum(length, 1e-9)

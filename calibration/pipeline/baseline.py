@@ -13,10 +13,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from acquisition.chart.model import Chart
-from acquisition.framing.movement import STILL_PX, Shift, gauges_of, shift_between
-from acquisition.framing.planes import CLIPPING_SHARE, Channel
-from acquisition.measures.paper import MAX_ORDER, MAX_ORDER_AROUND, PaperReader
 from calibration.checks.frame_consistency import ConsistencyCheck
 from calibration.pipeline.frames import DecodedFrame
 from calibration.pipeline.options import PAPER_OPTIONS, BuildOptions
@@ -39,6 +35,10 @@ from calibration.spread.fitting import LEAST_COUNTS, LOOSE_UNEVENNESS, USUAL_UNE
 from calibration.spread.printed_grid import printed_grid, unsuitable
 from calibration.spread.surroundings import FrameLevels, photosite_offsets_px
 from drivers.raw.rawfile import Area, Mosaic
+from experiment.chart.model import Chart
+from experiment.framing.movement import STILL_PX, Shift, gauges_of, shift_between
+from experiment.framing.planes import CLIPPING_SHARE, Channel
+from experiment.measures.paper import MAX_ORDER, MAX_ORDER_AROUND, PaperReader
 from foundation.errors import FormatError
 
 _Array = npt.NDArray[np.float64]
@@ -65,30 +65,17 @@ class SensorLayout:
 class Baseline:
     """What holds for all frames of a session; made by `baseline_of`.
 
-    Attributes
-    ----------
-    chart, points
-        The chart, and its points: C cells, W white and N grey references.
-    options
-        How the table is built.
-    layout
-        The sensor's, the same in all frames.
-    first
-        The frame that is registered first.
-    whites
-        (W, 3) float64 counts above black of its white references; NaN where one cannot be used.
-    means
-        (C + W + N, 3) float64 counts above black of its cells and references.
-    paper
-        Reads flat field and white of frames, with the shape of this one's as base.
-    transfer
-        Photon-transfer curve of its cells.
-    consistency_check
-        Compares other frames' cells with those of this one.
-    primaries
-        The primaries each alone; None where they were not given or cannot be used.
-    lens
-        What the lens spreads beside its sharp core, measured; None where it was not, or could not be.
+    - `chart`, `points`: the chart, and its points: C cells, W white and N grey references.
+    - `options`: how the table is built.
+    - `layout`: the sensor's, the same in all frames.
+    - `first`: the frame that is registered first.
+    - `whites`: (W, 3) float64 counts above black of its white references; NaN where one cannot be used.
+    - `means`: (C + W + N, 3) float64 counts above black of its cells and references.
+    - `paper`: reads flat field and white of frames, with the shape of this one's as base.
+    - `transfer`: photon-transfer curve of its cells.
+    - `consistency_check`: compares other frames' cells with those of this one.
+    - `primaries`: the primaries each alone; None where they were not given or cannot be used.
+    - `lens`: what the lens spreads beside its sharp core, measured; None where it was not, or could not be.
     """
 
     chart: Chart
@@ -105,13 +92,7 @@ class Baseline:
     lens: LensCorrection | None = None
 
     def require_layout(self, mosaic: Mosaic, what: str) -> None:
-        """Refuse a frame, called `what`, whose sensor or setting is not that of the first.
-
-        Raises
-        ------
-        FormatError
-            Visible area, shape of the sensor or Bayer pattern differ.
-        """
+        """Refuse a frame, called `what`, whose sensor or setting is not that of the first."""
         found = SensorLayout.of(mosaic)
         if found != self.layout:
             raise FormatError(
@@ -140,21 +121,7 @@ class Baseline:
     def movement(self, mosaic: Mosaic, black: _Array, channel: Channel, what: str) -> Shift:
         """Return how far the chart has moved in a frame since the first one.
 
-        Parameters
-        ----------
-        mosaic
-            The frame.
-        black
-            (2, 2) float64 counts.
-        channel
-            The channel to measure in.
-        what
-            The frame's name for messages.
-
-        Raises
-        ------
-        FormatError
-            The sensor is not that of the first frame.
+        `black`: (2, 2) float64 counts.
         """
         self.require_layout(mosaic, what)
         framing = self.first.registration.framing
@@ -163,19 +130,8 @@ class Baseline:
     def patches(self, mosaic: Mosaic, black: _Array) -> tuple[_Array, npt.NDArray[np.uint16]]:
         """Return what a frame has where cells and references were in the first one.
 
-        Parameters
-        ----------
-        mosaic
-            The frame.
-        black
-            (2, 2) float64 counts.
-
-        Returns
-        -------
-        means
-            (C + W + N, 3) float64 counts above black; NaN where a patch does not lie in the frame.
-        highest
-            (C + W + N,) uint16, the highest raw count of each patch.
+        `black`: (2, 2) float64 counts. Returns (C + W + N, 3) float64 counts above black; NaN where a patch does not
+        lie in the frame. Returns (C + W + N,) uint16, the highest raw count of each patch.
         """
         means: list[_Array] = []
         peaks: list[npt.NDArray[np.uint16]] = []
@@ -194,46 +150,13 @@ class Baseline:
 
 
 def baseline_of(chart: Chart, first: DecodedFrame, options: BuildOptions = PAPER_OPTIONS) -> Baseline:
-    """Return what holds for all frames, from the one that is registered first; still without primaries and lens.
-
-    Parameters
-    ----------
-    chart
-        The chart of the session.
-    first
-        A white frame, or the brightest light's.
-    options
-        How the table is built.
-
-    Raises
-    ------
-    RegistrationError
-        The chart is not found, or not the one expected.
-    QualityError
-        The white references cannot be used.
-    """
+    """Return what holds for all frames, from the one that is registered first; still without primaries and lens."""
     points = ChartPoints.of(chart)
     return _baseline(chart, points, options, first, register_frame(first, chart, points, options))
 
 
 def with_lens(baseline: Baseline, first: DecodedFrame, primaries: Sequence[DecodedFrame] = ()) -> Baseline:
-    """Return the baseline with the lens measured, and corrected where the print proves that it spreads light.
-
-    Parameters
-    ----------
-    baseline
-        Of the frame that is registered first.
-    first
-        That frame.
-    primaries
-        The frames of red, green and blue alone, whose field is the same for all cells: the lens is measured on them
-        where there are any in which the chart lies as in the first, and on the first frame else.
-
-    Raises
-    ------
-    QualityError
-        The white references cannot be used.
-    """
+    """Return the baseline with the lens measured, and corrected where the print proves that it spreads light."""
     chart, points = baseline.chart, baseline.points
     if unsuitable(chart):
         return baseline
@@ -268,11 +191,6 @@ def with_primaries(baseline: Baseline, primaries: Primaries | None) -> Baseline:
     """Return the baseline with what frames of the primaries alone show; as it is where there are none.
 
     Cells of later frames are divided by the field of their own colour, and so are those that they are compared with.
-
-    Raises
-    ------
-    QualityError
-        The white references cannot be used.
     """
     if primaries is None:
         return baseline
@@ -390,16 +308,8 @@ def usable_means(
 ) -> _Array:
     """Return the means (N, 3) float64, counts above black, of patches; NaN where one is cut off or clipped.
 
-    Parameters
-    ----------
-    samples
-        (N, S, 3) float32 counts above black.
-    highest
-        (N,) uint16, the highest raw count of each patch.
-    sites
-        Where the patches lie.
-    saturation
-        Raw count of saturation.
+    `samples`: (N, S, 3) float32 counts above black. `highest`: (N,) uint16, the highest raw count of each patch.
+    `saturation`: raw count of saturation.
     """
     means = samples.mean(axis=1, dtype=np.float64)
     means[~(sites.inside & (highest < CLIPPING_SHARE * saturation))] = np.nan

@@ -22,10 +22,6 @@ from typing import Any
 
 import numpy as np
 
-from acquisition.framing.annotated import annotated_png
-from acquisition.framing.movement import Shift
-from acquisition.session.folder import Session
-from acquisition.session.records import FrameRecord
 from calibration.figures.linearity_figures import LinearityFigures
 from calibration.figures.table_figures import TableFigures
 from calibration.pipeline.baseline import baseline_of, with_lens, with_primaries
@@ -62,6 +58,10 @@ from calibration.verdict.thresholds import THRESHOLDS, Threshold
 from calibration.verdict.values import judged_values
 from calibration.verdict.verdict import judge
 from calibration.verdict.wording import refusal
+from experiment.framing.annotated import annotated_png
+from experiment.framing.movement import Shift
+from experiment.session.folder import Session
+from experiment.session.records import FrameRecord
 from foundation.errors import FormatError, QualityError, RegistrationError, counted, first_of
 from foundation.files import write_whole
 from foundation.version import software
@@ -86,12 +86,8 @@ WriteReport = Callable[[BuildResult, Session, Path], None]
 class TableProgress:
     """How far a table has come that still lacks frames.
 
-    Attributes
-    ----------
-    lights, lights_planned
-        Lights that it has, and lights of the session.
-    new_frames, frames
-        Frames taken in now, and in all.
+    - `lights`, `lights_planned`: lights that it has, and lights of the session.
+    - `new_frames`, `frames`: frames taken in now, and in all.
     """
 
     lights: int
@@ -109,41 +105,7 @@ def build(
     linearity: Path | None = None,
     thresholds: Sequence[Threshold] = THRESHOLDS,
 ) -> BuildResult:
-    """Build the table of a session.
-
-    Parameters
-    ----------
-    session
-        A finished session: an accepted frame for every light.
-    out
-        The table's folder; must be free.
-    progress
-        Called after every frame.
-    report
-        Writes the report into the table's folder before it gets its name; none if not given.
-    options
-        How the table is built.
-    linearity
-        A folder of exposures that show the sensor's linearity (`calibration.pipeline.linearity`); read before the
-        frames, and part of the report alone.
-    thresholds
-        What the figures are judged by.
-
-    Raises
-    ------
-    FormatError
-        A light has no accepted frame, dark or white frames are lacking that are asked for, or a frame's file is missing
-        or not what the journal says.
-    RegistrationError
-        The chart is not found, or not the one expected.
-    QualityError
-        The white references cannot be used, or the verdict on the table is to refuse it; its report is then in
-        `refused_folder(out)`.
-    InputError
-        `out` is taken.
-    StorageError
-        The disk is full or read-only.
-    """
+    """Build the table of a session."""
     selected = select_frames(session)
     if selected.lights_without:
         raise FormatError(
@@ -198,25 +160,7 @@ def check(
 ) -> BuildResult:
     """Register a session's best frame and judge it; write nothing but a picture.
 
-    Parameters
-    ----------
-    session
-        The session.
-    options
-        How the table would be built; a window that is too large is refused. Nothing is subtracted.
-    linearity, thresholds
-        As for `build`.
-    picture
-        Where to draw what was found on the frame, or looked for, PNG; None for nowhere.
-
-    Raises
-    ------
-    FormatError
-        No frame can be used, two lights have the same file, or the file is not what the journal says.
-    RegistrationError
-        The chart is not found, or not the one expected.
-    QualityError
-        The white references cannot be used.
+    `picture`: where to draw what was found on the frame, or looked for, PNG; None for nowhere.
     """
     _require_dark_frames(session, options)
     selected = select_frames(session)

@@ -20,9 +20,6 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial import cKDTree
 
-from acquisition.chart.model import Chart
-from acquisition.framing.planes import CLIPPING_SHARE
-from acquisition.measures.stains import Stains, find_stains
 from calibration.figures.frame_figures import FrameFigures
 from calibration.pipeline.measuring import MeasuredDarkFrame, MeasuredFrame
 from calibration.pipeline.registered_frame import RegisteredFrame
@@ -30,6 +27,9 @@ from calibration.radiometry.dark_frames import DarkFrameFigures, DarkSummary, Ho
 from calibration.registration.registration import MAX_PLACE_ERROR_PX
 from calibration.sampling.patch_statistics import has_dead_photosite, unevenness
 from calibration.table.provenance import Unfit
+from experiment.chart.model import Chart
+from experiment.framing.planes import CLIPPING_SHARE
+from experiment.measures.stains import Stains, find_stains
 
 _BRIGHTEST_PERCENTILE = 99.5
 """Of the cells' levels, what is taken for paper white: the brightest of all may be a reflection."""
@@ -42,31 +42,17 @@ _Mask = npt.NDArray[np.bool_]
 class CellStatistics:
     """What the frames taken in so far show of the cells; each frame makes new ones.
 
-    Attributes
-    ----------
-    chart
-        The chart.
-    highest
-        (C,) uint16, the highest raw count of each cell.
-    highest_at
-        (C,) int64, the light under which it was reached; −1 for a white frame.
-    outside
-        (C,) bool, whether a cell was cut off in a frame.
-    covered
-        (C,) bool, whether a cell did not look like the chart's in a frame in which the chart was registered.
-    place_error
-        (C,) float64 half-size px, three standard errors of a cell's place, the worst of the frames in which the chart
-        was registered; over the clearance of its samples (`Registration.clearance`).
-    even_sum
-        (C, S, 3) float32, sum of the frames of even light, counts above black.
-    even_noise2
-        (C, 3) float64, sum of the variances of one sample in these frames, counts².
-    even_frames
-        How many they are.
-    hot
-        Samples that stand out in every dark frame.
-    darks
-        Figures of the dark frames.
+    - `highest`: (C,) uint16, the highest raw count of each cell.
+    - `highest_at`: (C,) int64, the light under which it was reached; −1 for a white frame.
+    - `outside`: (C,) bool, whether a cell was cut off in a frame.
+    - `covered`: (C,) bool, whether a cell did not look like the chart's in a frame in which the chart was registered.
+    - `place_error`: (C,) float64 half-size px, three standard errors of a cell's place, the worst of the frames in
+      which the chart was registered; over the clearance of its samples (`Registration.clearance`).
+    - `even_sum`: (C, S, 3) float32, sum of the frames of even light, counts above black.
+    - `even_noise2`: (C, 3) float64, sum of the variances of one sample in these frames, counts².
+    - `even_frames`: how many they are.
+    - `hot`: samples that stand out in every dark frame.
+    - `darks`: figures of the dark frames.
     """
 
     chart: Chart
@@ -83,17 +69,7 @@ class CellStatistics:
 
     @staticmethod
     def before_all_frames(chart: Chart, samples: int, first: RegisteredFrame) -> CellStatistics:
-        """Return the statistics before any frame is taken in.
-
-        Parameters
-        ----------
-        chart
-            The chart.
-        samples
-            Samples of each cell, S.
-        first
-            The frame that is registered first.
-        """
+        """Return the statistics before any frame is taken in."""
         count = chart.colour_count
         return CellStatistics(
             chart=chart,
@@ -206,14 +182,7 @@ class CellStatistics:
     def unfit(self, saturation_counts: int, stains: Stains, frames: Sequence[FrameFigures]) -> tuple[Unfit, ...]:
         """Return the cells not to be used, each with the first cause that applies.
 
-        Parameters
-        ----------
-        saturation_counts
-            Raw count of saturation.
-        stains
-            What `stains` returned.
-        frames
-            Figures of all frames taken in.
+        `saturation_counts`: raw count of saturation.
         """
         disturbed = disturbed_cells(frames)
         lit = [(frame.consistency.alone, frame.record.illumination) for frame in frames]

@@ -40,16 +40,10 @@ _TEXT = "text"
 class Checkpoint:
     """How far a table has come.
 
-    Attributes
-    ----------
-    identity
-        What it is made of and by what; a build goes on from a checkpoint of the same identity only.
-    frames
-        What names each frame taken in, in their order.
-    values
-        Anything JSON can hold; numbers are restored to the last bit.
-    arrays
-        Arrays of plain numbers, by name.
+    - `identity`: what it is made of and by what; a build goes on from a checkpoint of the same identity only.
+    - `frames`: what names each frame taken in, in their order.
+    - `values`: anything JSON can hold; numbers are restored to the last bit.
+    - `arrays`: arrays of plain numbers, by name.
     """
 
     identity: dict[str, Any]
@@ -103,15 +97,7 @@ class UnfinishedTable:
         self._keep = False
 
     def publish(self) -> None:
-        """Give the table its final name.
-
-        Raises
-        ------
-        InputError
-            The name is taken.
-        StorageError
-            The disk is full or read-only.
-        """
+        """Give the table its final name."""
         require_free(self._out, "the table")
         try:
             (self.folder / CHECKPOINT).unlink(missing_ok=True)
@@ -128,15 +114,7 @@ class UnfinishedTable:
 
 @contextmanager
 def unfinished_table(out: Path) -> Generator[UnfinishedTable]:
-    """Open, or make, the hidden folder of the table `out`; what is not published stays if it holds a checkpoint.
-
-    Raises
-    ------
-    InputError
-        `out` is taken, or another program is making it.
-    StorageError
-        The folder cannot be made.
-    """
+    """Open, or make, the hidden folder of the table `out`; what is not published stays if it holds a checkpoint."""
     require_free(out, "the table")
     folder = partial_path(out)
     busy = f"{out} is being made by another program; wait for it, or name another place"

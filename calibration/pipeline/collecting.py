@@ -8,8 +8,6 @@ from dataclasses import replace
 import numpy as np
 import numpy.typing as npt
 
-from acquisition.lights.illuminations import Illumination
-from acquisition.session.folder import Session
 from calibration.checks.frame_origins import origin_figures
 from calibration.checks.light_codes import CodeAgreement, code_agreement
 from calibration.checks.stray_light import StrayLight, stray_light
@@ -30,6 +28,8 @@ from calibration.pipeline.intake import Intake, IntakeState
 from calibration.radiometry.drift import drift_correction
 from calibration.radiometry.primaries import pure_lights
 from calibration.radiometry.projector import additivity, drift_gains
+from experiment.lights.illuminations import Illumination
+from experiment.session.folder import Session
 from foundation.angles import angles_deg
 
 _LEAST_WHITE = 1e-3
@@ -47,14 +47,7 @@ _Array = npt.NDArray[np.float64]
 def table_figures(intake: Intake, taken: IntakeState, camera: str, linearity: LinearityFigures | None) -> TableFigures:
     """Return the figures of a table, all of whose frames have been taken in.
 
-    Parameters
-    ----------
-    intake, taken
-        The frames, and what they have given.
-    camera
-        Maker and model as the raw files name it.
-    linearity
-        What a series of exposures shows; None where none was given.
+    `linearity`: what a series of exposures shows; None where none was given.
     """
     baseline, session = intake.baseline, intake.session
     even = next((frame for frame in taken.frames if intake.selected.is_even(frame.record)), taken.frames[0])
@@ -73,13 +66,7 @@ def table_figures(intake: Intake, taken: IntakeState, camera: str, linearity: Li
 
 
 def check_figures(intake: Intake, taken: IntakeState, camera: str, linearity: LinearityFigures | None) -> TableFigures:
-    """Return the figures of a check, which has taken in the frame that is registered, and a dark one where there is.
-
-    Parameters
-    ----------
-    intake, taken, camera, linearity
-        As for `table_figures`.
-    """
+    """Return the figures of a check, which has taken in the frame that is registered, and a dark one where there is."""
     (frame,) = taken.frames
     with_frame = len(intake.session.illuminations) - len(intake.selected.lights_without)
     lights = LightFigures(

@@ -20,14 +20,14 @@ from statistics import median
 import numpy as np
 import numpy.typing as npt
 
-from acquisition.framing.planes import Channel, frame_black, strongest_channel
-from acquisition.measures.sensor_range import saturation
-from acquisition.session.folder import Session
-from acquisition.session.records import FrameRecord
 from calibration.radiometry.primaries import pure_lights
 from calibration.table.lut import Lut
 from calibration.table.source_frames import SourceFrame, frames_sha256
 from drivers.raw.rawfile import Mosaic, decode_raw
+from experiment.framing.planes import Channel, frame_black, strongest_channel
+from experiment.measures.sensor_range import saturation
+from experiment.session.folder import Session
+from experiment.session.records import FrameRecord
 from foundation.errors import FormatError
 from foundation.files import read_whole
 from foundation.hashing import file_sha256
@@ -47,18 +47,11 @@ class ChangedFrame(FormatError):
 class DecodedFrame:
     """A frame as read.
 
-    Attributes
-    ----------
-    record
-        The frame.
-    mosaic
-        Its counts.
-    black
-        (2, 2) float64 counts, black level of each position of the block.
-    strongest
-        The channel with the brightest paper.
-    saturation
-        Raw count of saturation, as far as it can be seen in this frame.
+    `mosaic`: its counts.
+
+    - `black`: (2, 2) float64 counts, black level of each position of the block.
+    - `strongest`: the channel with the brightest paper.
+    - `saturation`: raw count of saturation, as far as it can be seen in this frame.
     """
 
     record: FrameRecord
@@ -72,16 +65,10 @@ class DecodedFrame:
 class SelectedFrames:
     """The frames that a table is made of.
 
-    Attributes
-    ----------
-    records
-        Every light's last accepted frame, and the accepted white and dark ones, in the order taken.
-    lights_without
-        Lights that have no accepted frame.
-    registered
-        The frame in which the chart is registered first.
-    primaries
-        The frames of red, green and blue alone; () where one of the three is lacking.
+    - `records`: every light's last accepted frame, and the accepted white and dark ones, in the order taken.
+    - `lights_without`: lights that have no accepted frame.
+    - `registered`: the frame in which the chart is registered first.
+    - `primaries`: the frames of red, green and blue alone; () where one of the three is lacking.
     """
 
     records: tuple[FrameRecord, ...]
@@ -106,13 +93,7 @@ class SelectedFrames:
 
 
 def select_frames(session: Session) -> SelectedFrames:
-    """Return the frames that a table of a session is made of, so far.
-
-    Raises
-    ------
-    FormatError
-        No frame is accepted, or two lights have the same raw file.
-    """
+    """Return the frames that a table of a session is made of, so far."""
     accepted = [record for record in session.frames() if record.accepted]
     if not any(record.kind in ("white", "light") for record in accepted):
         raise FormatError(
@@ -179,13 +160,7 @@ def _frame_to_register(session: Session, accepted: Sequence[FrameRecord]) -> Fra
 
 
 def decode_frame(session: Session, record: FrameRecord) -> DecodedFrame:
-    """Return a frame as read from its file, whose SHA-256 is checked first.
-
-    Raises
-    ------
-    FormatError
-        Its file is missing, not what the journal says, or no raw file.
-    """
+    """Return a frame as read from its file, whose SHA-256 is checked first."""
     path = session.folder / record.file
     try:
         data = read_whole(path)
@@ -217,13 +192,7 @@ def source_frames(records: Sequence[FrameRecord]) -> list[SourceFrame]:
 
 
 def frame_faults(lut: Lut, session: Session, progress: ReportProgress | None = None) -> list[str]:
-    """Return what is wrong with a session's frames that a table was made of, each fault in words: missing or changed.
-
-    Raises
-    ------
-    FormatError
-        The table lists no frames: it was made before they were recorded.
-    """
+    """Return which of the frames that a table was made of are missing or changed, each fault in words."""
     if lut.provenance.computed is not None:
         raise FormatError(f"{lut.folder} was computed, no frame was taken for it; verify it without a session")
     if not lut.frames:

@@ -17,9 +17,6 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from acquisition.framing.movement import Shift
-from acquisition.session.folder import Session
-from acquisition.session.records import FrameRecord
 from calibration.figures.frame_figures import FrameFigures
 from calibration.pipeline.baseline import Baseline
 from calibration.pipeline.cell_statistics import CellStatistics
@@ -35,6 +32,9 @@ from calibration.pipeline.measuring import (
 from calibration.pipeline.registered_frame import RegisteredFrame
 from calibration.radiometry.dark_frames import DarkFrameFigures
 from calibration.radiometry.dark_subtraction import DarkLight, DarkLightEstimator
+from experiment.framing.movement import Shift
+from experiment.session.folder import Session
+from experiment.session.records import FrameRecord
 
 EarlyMeasurement = MeasuredFrame | MeasuredDarkFrame | None
 """A frame as measured before its turn; None where the chart has to be registered again in it."""
@@ -44,20 +44,12 @@ EarlyMeasurement = MeasuredFrame | MeasuredDarkFrame | None
 class IntakeState:
     """What the frames taken in so far have given.
 
-    Attributes
-    ----------
-    figures
-        Of each frame taken in, in order.
-    statistics
-        What they show of the cells.
-    saturation
-        Raw count of saturation, the lowest that a frame shows.
-    registered
-        The frame registered last.
-    estimator
-        Estimates the dark light; only dark frames that are subtracted enter it.
-    dark
-        What is subtracted from the frames that follow; None where nothing is.
+    - `figures`: of each frame taken in, in order.
+    - `statistics`: what they show of the cells.
+    - `saturation`: raw count of saturation, the lowest that a frame shows.
+    - `registered`: the frame registered last.
+    - `estimator`: estimates the dark light; only dark frames that are subtracted enter it.
+    - `dark`: what is subtracted from the frames that follow; None where nothing is.
     """
 
     figures: tuple[FrameFigures | DarkFrameFigures, ...]
@@ -97,14 +89,8 @@ class IntakeState:
 class Intake:
     """The frames of a session on their way into a table: what does not change while they are taken in.
 
-    Attributes
-    ----------
-    session
-        Where the frames are read.
-    selected
-        The frames.
-    baseline
-        What holds for all of them.
+    - `session`: where the frames are read.
+    - `baseline`: what holds for all of them.
     """
 
     session: Session
@@ -133,15 +119,7 @@ class Intake:
         )
 
     def restored(self, stored: dict[str, Any], arrays: dict[str, npt.NDArray[Any]], begin: IntakeState) -> IntakeState:
-        """Return the state that a checkpoint stored.
-
-        Parameters
-        ----------
-        stored, arrays
-            What `IntakeState.to_json` and `to_arrays` returned; each array has the same shape and dtype as there.
-        begin
-            What `before_all_frames` returned.
-        """
+        """Return the state that a checkpoint stored; `arrays`: of `IntakeState.to_arrays`, (...), any dtype."""
         page_mm = self.baseline.chart.page_mm
         figures = tuple(
             DarkFrameFigures.from_json(record, figures)
@@ -185,17 +163,7 @@ class Intake:
     def take_in(
         self, record: FrameRecord, early: EarlyMeasurement, state: IntakeState
     ) -> tuple[IntakeState, MeasuredFrame | MeasuredDarkFrame]:
-        """Return the state after the next frame, and the frame as measured.
-
-        Parameters
-        ----------
-        record
-            The frame.
-        early
-            What `measure` returned for it, before its turn.
-        state
-            The state after the frames before it.
-        """
+        """Return the state after the next frame, and the frame as measured."""
         current = early is not None and early.registered is state.registered
         measured = early if current else self.measure(record, state)
         if measured is None:

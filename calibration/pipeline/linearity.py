@@ -1,6 +1,6 @@
 """A series of exposures of the chart, under one light, in its place: how linear the sensor is.
 
-What the patches show is computed by `acquisition.measures.linearity`.
+What the patches show is computed by `experiment.measures.linearity`.
 
 Rules that hold inside:
 
@@ -15,13 +15,13 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from acquisition.framing.movement import REREGISTER_PX, Shift
-from acquisition.framing.planes import CLIPPING_SHARE, frame_black, strongest_channel
-from acquisition.measures.linearity import HIGHEST, LOWEST, deviations
-from acquisition.measures.sensor_range import saturation
 from calibration.figures.linearity_figures import LinearityFigures
 from calibration.pipeline.baseline import Baseline
 from drivers.raw.rawfile import Mosaic, read_raw
+from experiment.framing.movement import REREGISTER_PX, Shift
+from experiment.framing.planes import CLIPPING_SHARE, frame_black, strongest_channel
+from experiment.measures.linearity import HIGHEST, LOWEST, deviations
+from experiment.measures.sensor_range import saturation
 from foundation.errors import FormatError, InputError
 
 LEAST_FRAMES = 4
@@ -33,20 +33,8 @@ _Array = npt.NDArray[np.float64]
 def read_linearity(folder: Path, baseline: Baseline) -> LinearityFigures:
     """Return what a series of exposures shows.
 
-    Parameters
-    ----------
-    folder
-        Raw files of the chart where the session's first registered frame has it, under one steady light, with one ISO
-        speed and aperture, from dim to the brink of saturation; eight are usual. Hidden files are passed over.
-    baseline
-        The session's, by which the patches are found.
-
-    Raises
-    ------
-    InputError
-        The folder is missing, or holds too few frames.
-    FormatError
-        A frame is no raw file, does not state its exposure, or is not of the series.
+    `folder`: raw files of the chart where the session's first registered frame has it, under one steady light, with one
+    ISO speed and aperture, from dim to the brink of saturation; eight are usual. Hidden files are passed over.
     """
     try:
         paths = sorted(path for path in folder.iterdir() if path.is_file() and not path.name.startswith("."))

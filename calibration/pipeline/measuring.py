@@ -16,8 +16,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from acquisition.framing.movement import REREGISTER_PX, STILL_PX, Shift, gauges_of, shift_between
-from acquisition.measures.paper import Paper
 from calibration.figures.frame_figures import FrameFigures
 from calibration.pipeline.baseline import Baseline, beyond_print, usable_means
 from calibration.pipeline.frames import DecodedFrame
@@ -29,6 +27,8 @@ from calibration.sampling.patch_statistics import patch_means, sample_noise
 from calibration.sampling.samples import Sites, gather, gather_means, gather_values, table_values
 from calibration.spread.correction import FrameCorrection
 from calibration.spread.surroundings import FrameLevels
+from experiment.framing.movement import REREGISTER_PX, STILL_PX, Shift, gauges_of, shift_between
+from experiment.measures.paper import Paper
 from foundation.errors import RegistrationError
 
 _Array = npt.NDArray[np.float64]
@@ -49,22 +49,14 @@ class _Grid:
 class MeasuredFrame:
     """A light or white frame as measured; C cells of S samples.
 
-    Attributes
-    ----------
-    figures
-        For the report, the ground truth and the flat field.
-    registered, dark
-        What it was measured with: the frame registered last, and the dark light subtracted.
-    saturation
-        Raw count of saturation, as far as it can be seen in this frame.
-    values
-        (C, S, 3) uint16, the table's samples.
-    highest
-        (C,) uint16, the highest raw count of each cell.
-    inside
-        (C,) bool, whether all pixels of a cell lie in the frame.
-    samples, noise
-        (C, S, 3) float32 counts above black and (C, 3) float64 counts, their noise; None where not asked for.
+    - `figures`: for the report, the ground truth and the flat field.
+    - `registered`, `dark`: what it was measured with: the frame registered last, and the dark light subtracted.
+    - `saturation`: raw count of saturation, as far as it can be seen in this frame.
+    - `values`: (C, S, 3) uint16, the table's samples.
+    - `highest`: (C,) uint16, the highest raw count of each cell.
+    - `inside`: (C,) bool, whether all pixels of a cell lie in the frame.
+    - `samples`, `noise`: (C, S, 3) float32 counts above black and (C, 3) float64 counts, their noise; None where not
+      asked for.
     """
 
     figures: FrameFigures
@@ -82,16 +74,10 @@ class MeasuredFrame:
 class MeasuredDarkFrame:
     """A dark frame as measured; C cells of S samples.
 
-    Attributes
-    ----------
-    figures
-        What it shows.
-    registered
-        The frame registered last, with which it was measured.
-    excess
-        (C, S, 3) int16 counts, how far samples stand above their cells.
-    means
-        (C + W + N, 3) float64 counts above black of cells, then references.
+    - `figures`: what it shows.
+    - `registered`: the frame registered last, with which it was measured.
+    - `excess`: (C, S, 3) int16 counts, how far samples stand above their cells.
+    - `means`: (C + W + N, 3) float64 counts above black of cells, then references.
     """
 
     figures: DarkFrameFigures
@@ -105,25 +91,7 @@ def measure_frame(
 ) -> MeasuredFrame | Shift:
     """Return what a frame shows; its movement alone, if that is such that the chart has to be registered again.
 
-    Parameters
-    ----------
-    baseline
-        What holds for all frames.
-    decoded
-        A light or white frame.
-    registered
-        The frame registered last.
-    keep_samples
-        Whether its samples are wanted, for what frames of even light show of the cells.
-    dark
-        What is subtracted from samples and references; nothing if None.
-
-    Raises
-    ------
-    FormatError
-        The sensor is not that of the first frame.
-    QualityError
-        The white references cannot be used.
+    `dark`: what is subtracted from samples and references; nothing if None.
     """
     baseline.require_layout(decoded.mosaic, decoded.record.file)
     channel, framing = decoded.strongest, registered.registration.framing
@@ -161,13 +129,7 @@ def measure_registered_frame(
 
 
 def sample_dark_frame(baseline: Baseline, decoded: DecodedFrame, registered: RegisteredFrame) -> MeasuredDarkFrame:
-    """Return what a dark frame shows; no tag is seen in it, so the chart is assumed to lie where it did.
-
-    Raises
-    ------
-    FormatError
-        The sensor is not that of the first frame.
-    """
+    """Return what a dark frame shows; no tag is seen in it, so the chart is assumed to lie where it did."""
     baseline.require_layout(decoded.mosaic, decoded.record.file)
     cells, _ = gather(decoded.mosaic, decoded.black, registered.cells)
     references, _ = gather(decoded.mosaic, decoded.black, registered.references)
@@ -183,11 +145,6 @@ def measure_primaries(baseline: Baseline, frames: Iterable[DecodedFrame]) -> Pri
     """Return what the frames of red, green and blue alone show; None where there are none or one cannot be used.
 
     The chart may lie elsewhere in them; `frames` are read once, one at a time.
-
-    Raises
-    ------
-    QualityError
-        The white references cannot be used.
     """
     lights: list[int] = []
     papers: list[Paper] = []

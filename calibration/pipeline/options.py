@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
-from acquisition.config import CitationSettings
-from acquisition.framing.corners import Corners
 from calibration.sampling.samples import WINDOW
 from calibration.sampling.windows import WINDOWS
+from experiment.config import CitationSettings
+from experiment.framing.corners import Corners
 from foundation.errors import InputError
 
 
@@ -16,27 +16,16 @@ from foundation.errors import InputError
 class BuildOptions:
     """How a table is built; by default 25 samples, the paper's, from which black and the lens's spread are subtracted.
 
-    Attributes
-    ----------
-    window
-        Pixels along the side of a cell's window: one of `calibration.sampling.windows.WINDOWS`.
-    subtract_dark
-        Whether the light of the dark frames is subtracted from samples and ground truth.
-    corners
-        Four corners (x, y) of the field of cells in the frame that is registered first, half-size px, clockwise from
-        the printed top-left, for a chart without tags; None to have it found.
-    correct_drift
-        Whether the lamp's drift between white frames is taken out of samples and ground truth at the end.
-    lens_correction
-        Whether what the lens spreads beside its sharp core is subtracted from samples and ground truth, where the print
-        proves that it does.
-    citation
-        What the lab states of the table's origin; None for what the session's settings state. No sample depends on it.
-
-    Raises
-    ------
-    InputError
-        The window is not one of those.
+    - `window`: pixels along the side of a cell's window: one of `calibration.sampling.windows.WINDOWS`.
+    - `subtract_dark`: whether the light of the dark frames is subtracted from samples and ground truth.
+    - `corners`: four corners (x, y) of the field of cells in the frame that is registered first, half-size px,
+      clockwise from the printed top-left, for a chart without tags; None to have it found.
+    - `correct_drift`: whether the lamp's drift between white frames is taken out of samples and ground truth at the
+      end.
+    - `lens_correction`: whether what the lens spreads beside its sharp core is subtracted from samples and ground
+      truth, where the print proves that it does.
+    - `citation`: what the lab states of the table's origin; None for what the session's settings state. No sample
+      depends on it.
     """
 
     window: int = WINDOW

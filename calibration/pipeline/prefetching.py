@@ -7,7 +7,7 @@ from collections.abc import Callable, Generator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import TypeVar
 
-from acquisition.session.records import FrameRecord
+from experiment.session.records import FrameRecord
 from foundation.processors import processor_count
 
 MOST_THREADS = 8
@@ -26,17 +26,7 @@ def prefetched(
     records: Sequence[FrameRecord],
     others_wait_for: Callable[[FrameRecord], bool],
 ) -> Generator[tuple[FrameRecord, _Result]]:
-    """Yield each frame with what `work` returned for it, in order, while threads work on those that follow.
-
-    Parameters
-    ----------
-    work
-        Called in a thread of its own. What it raises is raised in the frame's turn.
-    records
-        The frames.
-    others_wait_for
-        Whether work on those after a frame may begin only when the consumer asks for the next one.
-    """
+    """Yield each frame with what `work` returned for it, in order, while threads work on those that follow."""
     count = thread_count()
     with ThreadPoolExecutor(count) as pool:
         begun: deque[tuple[FrameRecord, Future[_Result]]] = deque()

@@ -15,9 +15,6 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from acquisition.chart.model import Chart
-from acquisition.framing.movement import gauges_of
-from acquisition.framing.planes import CHANNELS, Channel, Plane
 from calibration.pipeline.frames import DecodedFrame
 from calibration.pipeline.options import BuildOptions
 from calibration.radiometry.greys import GreyLevels
@@ -25,6 +22,9 @@ from calibration.registration.register import register
 from calibration.registration.registration import Registration
 from calibration.sampling.samples import Sites, sites_at
 from calibration.spread.correction import FrameCorrection
+from experiment.chart.model import Chart
+from experiment.framing.movement import gauges_of
+from experiment.framing.planes import CHANNELS, Channel, Plane
 
 _Array = npt.NDArray[np.float64]
 
@@ -33,14 +33,9 @@ _Array = npt.NDArray[np.float64]
 class ChartPoints:
     """The points of a chart that are sampled.
 
-    Attributes
-    ----------
-    cells_mm
-        (C, 2) float64 mm, centres of the cells in the order of colour indices.
-    whites_mm, greys_mm
-        (W, 2) and (N, 2) float64 mm, centres of the white and of the grey references.
-    levels
-        The level of each grey reference.
+    - `cells_mm`: (C, 2) float64 mm, centres of the cells in the order of colour indices.
+    - `whites_mm`, `greys_mm`: (W, 2) and (N, 2) float64 mm, centres of the white and of the grey references.
+    - `levels`: the level of each grey reference.
     """
 
     cells_mm: _Array
@@ -68,20 +63,11 @@ class ChartPoints:
 class RegisteredFrame:
     """A frame in which the chart was registered; it holds for those after it until the chart moves too far.
 
-    Attributes
-    ----------
-    file
-        The frame.
-    registration
-        The chart's place in it.
-    cells
-        Where the C cells are sampled.
-    references
-        Where the W + N references are sampled.
-    gauges
-        The frame around its tags, or the outline of its field, to measure movements against.
-    lens
-        Corrects frames sampled at these places for what the lens spreads; None where nothing is corrected.
+    - `registration`: the chart's place in it.
+    - `cells`: where the C cells are sampled.
+    - `references`: where the W + N references are sampled.
+    - `gauges`: the frame around its tags, or the outline of its field, to measure movements against.
+    - `lens`: corrects frames sampled at these places for what the lens spreads; None where nothing is corrected.
     """
 
     file: str
@@ -95,24 +81,7 @@ class RegisteredFrame:
 def register_frame(
     decoded: DecodedFrame, chart: Chart, points: ChartPoints, options: BuildOptions, near: Registration | None = None
 ) -> RegisteredFrame:
-    """Return a frame with the chart registered in it.
-
-    Parameters
-    ----------
-    decoded
-        The frame.
-    chart, points
-        The chart expected, and its points.
-    options
-        Window, and corners of a chart without tags.
-    near
-        The registration of the session's first frame: a chart without tags then hangs the same way up.
-
-    Raises
-    ------
-    RegistrationError
-        The chart is not found, or not the one expected.
-    """
+    """Return a frame with the chart registered in it."""
     registration = register(decoded.mosaic, chart, decoded.record.file, options.corners, near)
     cells, references = sites_of(registration, points, decoded.mosaic.block_planes().shape[2:], options.window)
     gauges: dict[Channel, Plane] = {

@@ -13,9 +13,9 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from acquisition.measures.flat_field import FlatField
-from acquisition.measures.least_squares import least_squares
-from acquisition.measures.polynomials import code_polynomial, code_powers, page_polynomial
+from experiment.measures.flat_field import FlatField
+from experiment.measures.least_squares import least_squares
+from experiment.measures.polynomials import code_polynomial, code_powers, page_polynomial
 from foundation.robust import huber_weights, sigma_of
 
 CODE_DEGREE = 8
@@ -53,20 +53,9 @@ def field_of_cells(
 ) -> FlatField:
     """Return the field of a frame from its cells.
 
-    Parameters
-    ----------
-    rgb
-        (C, 3) int printed codes, 0 … 255.
-    cells_mm
-        (C, 2) float64 mm, the cells' centres.
-    level
-        (C, 3) float64 mean counts above black.
-    usable
-        (C,) bool, cells that lie in the frame and are not covered.
-    paper_mm, paper
-        (N, 2) mm, white references, and (N, 3) their mean counts above black; NaN where one cannot be used.
-    page_mm
-        Width and height of the page.
+    `rgb`: (C, 3) int printed codes, 0 … 255. `cells_mm`: (C, 2) float64 mm, the cells' centres. `level`: (C, 3) float64
+    mean counts above black. `usable`: (C,) bool, cells that lie in the frame and are not covered. `paper_mm`, `paper`:
+    (N, 2) mm, white references, and (N, 3) their mean counts above black; NaN where one cannot be used.
     """
     degree = CODE_DEGREE
     while degree > 1 and len(cells_mm) < _LEAST_CELLS_A_TERM * len(code_powers(degree)):

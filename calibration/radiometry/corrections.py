@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from acquisition.framing.planes import CLIPPING_SHARE
-from acquisition.measures.flat_field import FlatField
+from experiment.framing.planes import CLIPPING_SHARE
+from experiment.measures.flat_field import FlatField
 
 _Array = npt.NDArray[np.float64]
 
@@ -27,24 +27,10 @@ def corrections(
 ) -> list[dict[str, Any]]:
     """Return what was done to the counts, in order, for `lut.json`.
 
-    Parameters
-    ----------
-    page_mm
-        Width and height of the page.
-    black
-        (L, 2, 2) float64 counts, black level of each light's frame.
-    saturation_counts
-        Raw count of saturation.
-    fields
-        The field divided out of each light.
-    measured
-        Whether saturation was seen, rather than stated by the raw file.
-    gains
-        (L, 3) the lamp's drift at each light; None without white frames.
-    subtracted
-        (L, 3) counts, dark light of bare paper that was subtracted; None where none was to be.
-    at_zero
-        (L,) share of each light's samples that are 0; None where it was not counted.
+    `black`: (L, 2, 2) float64 counts, black level of each light's frame. `saturation_counts`: raw count of saturation.
+    `gains`: (L, 3) the lamp's drift at each light; None without white frames. `subtracted`: (L, 3) counts, dark light
+    of bare paper that was subtracted; None where none was to be. `at_zero`: (L,) share of each light's samples that are
+    0; None where it was not counted.
     """
     done: list[dict[str, Any]] = [
         {

@@ -17,8 +17,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from acquisition.session.records import FrameRecord
 from drivers.raw.origin import FrameOrigin
+from experiment.session.records import FrameRecord
 from foundation.robust import MAD_TO_SIGMA, MEDIAN_ERROR
 
 HOT_COUNTS = 32.0
@@ -34,24 +34,16 @@ _Array = npt.NDArray[np.float64]
 class DarkSummary:
     """What the dark frames of a session show together.
 
-    Attributes
-    ----------
-    files
-        Dark frames read.
-    light
-        (3,) float64 counts above black on bare paper, field divided out: leak and ambient light, the median of the
-        frames; NaN without dark frames.
-    error
-        (3,) float64, standard error of `light`.
-    blacks
-        (2, 2) float64 counts of each frame.
-    noise
-        (3,) float64 counts, standard deviation of a sample: read noise, of green that of the mean of two photosites.
-    hottest
-        (C,) float64 counts, by how much the hottest sample of each cell exceeds its median in every frame; 0 where none
-        does.
-    lights
-        (3,) float64 counts on bare paper, of each frame.
+    - `files`: dark frames read.
+    - `light`: (3,) float64 counts above black on bare paper, field divided out: leak and ambient light, the median of
+      the frames; NaN without dark frames.
+    - `error`: (3,) float64, standard error of `light`.
+    - `blacks`: (2, 2) float64 counts of each frame.
+    - `noise`: (3,) float64 counts, standard deviation of a sample: read noise, of green that of the mean of two
+      photosites.
+    - `hottest`: (C,) float64 counts, by how much the hottest sample of each cell exceeds its median in every frame; 0
+      where none does.
+    - `lights`: (3,) float64 counts on bare paper, of each frame.
     """
 
     files: tuple[str, ...] = ()
@@ -67,18 +59,10 @@ class DarkSummary:
 class DarkFrameFigures:
     """What was measured on one dark frame.
 
-    Attributes
-    ----------
-    record
-        The frame.
-    black
-        (2, 2) float64 counts.
-    light, error
-        (3,) float64 counts above black on bare paper, field divided out, and their standard error.
-    noise
-        (3,) float64 counts, standard deviation of a sample.
-    origin
-        Camera, lens and exposure as the raw file states them.
+    - `black`: (2, 2) float64 counts.
+    - `light`, `error`: (3,) float64 counts above black on bare paper, field divided out, and their standard error.
+    - `noise`: (3,) float64 counts, standard deviation of a sample.
+    - `origin`: camera, lens and exposure as the raw file states them.
     """
 
     record: FrameRecord
@@ -109,25 +93,9 @@ def measure_dark_frame(
 ) -> tuple[DarkFrameFigures, npt.NDArray[np.int16]]:
     """Return the figures of a dark frame, and how far each sample is above the median of its cell.
 
-    Parameters
-    ----------
-    record
-        The frame.
-    black
-        (2, 2) counts.
-    cells
-        (C, S, 3) float32 samples of the cells, counts above black.
-    paper
-        (N, S, 3) float32 samples of the white references that lie in the frame.
-    shape
-        (N, 3) field at these references.
-
-    Returns
-    -------
-    figures
-        Of the frame.
-    excess
-        (C, S, 3) int16, whole counts above the cell's median.
+    `black`: (2, 2) counts. `cells`: (C, S, 3) float32 samples of the cells, counts above black. `paper`: (N, S, 3)
+    float32 samples of the white references that lie in the frame. `shape`: (N, 3) field at these references. Returns
+    (C, S, 3) int16, whole counts above the cell's median.
     """
     flat: _Array = paper.mean(axis=1, dtype=np.float64) / shape
     count = max(len(flat), 1)
@@ -142,13 +110,7 @@ def measure_dark_frame(
 
 
 class HotPixels:
-    """Accumulates, over dark frames, which samples exceed their cells' medians in every one of them.
-
-    Parameters
-    ----------
-    cells, samples
-        C cells of S samples.
-    """
+    """Accumulates, over dark frames, which samples exceed their cells' medians in every one of them."""
 
     def __init__(self, cells: int, samples: int) -> None:
         self._shape = cells, samples, 3

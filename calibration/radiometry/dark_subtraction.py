@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from acquisition.measures.paper import Paper
+from experiment.measures.paper import Paper
 from foundation.robust import MAD_TO_SIGMA
 
 _LEAST_WHITE = 50.0
@@ -42,14 +42,9 @@ _Array = npt.NDArray[np.float64]
 class DarkLight:
     """What is to be subtracted from frames.
 
-    Attributes
-    ----------
-    paper
-        (3,) float64 counts, of bare paper with the field divided out: for the record.
-    patches
-        (P, 3) float32 counts, of each patch as the camera sees it, field and all.
-    share
-        (3,) float64, 0 … 1, how much of what cells show beyond the prediction was added.
+    - `paper`: (3,) float64 counts, of bare paper with the field divided out: for the record.
+    - `patches`: (P, 3) float32 counts, of each patch as the camera sees it, field and all.
+    - `share`: (3,) float64, 0 … 1, how much of what cells show beyond the prediction was added.
     """
 
     paper: _Array
@@ -60,17 +55,8 @@ class DarkLight:
 def winsorised_means(samples: npt.NDArray[np.float32], noise: _Array) -> _Array:
     """Return the winsorised means of dark samples, since a hot photosite or a cosmic ray is no light.
 
-    Parameters
-    ----------
-    samples
-        (P, S, 3) float32 counts above black; those beyond 6 σ of their patch's median count as if they were there.
-    noise
-        (3,) float64 counts, σ of one sample.
-
-    Returns
-    -------
-    ndarray
-        (P, 3) float64 counts.
+    `samples`: (P, S, 3) float32 counts above black; those beyond 6 σ of their patch's median count as if they were
+    there. `noise`: (3,) float64 counts, σ of one sample. Returns (P, 3) float64 counts.
     """
     middle = np.median(samples, axis=1, keepdims=True)
     far = (_FAR_SIGMA * noise).astype(np.float32)
@@ -80,14 +66,8 @@ def winsorised_means(samples: npt.NDArray[np.float32], noise: _Array) -> _Array:
 def reflectances(seen: _Array, field: _Array, white: _Array) -> _Array:
     """Return the reflectance (P, 3) float64 of patches, 1 = bare paper.
 
-    Parameters
-    ----------
-    seen
-        (P, 3) mean counts above black in a frame of even light.
-    field
-        (P, 3) its flat field at the patches.
-    white
-        (3,) counts of bare paper in it. A channel without light has the reflectances of the brightest one.
+    `seen`: (P, 3) mean counts above black in a frame of even light. `field`: (P, 3) its flat field at the patches.
+    `white`: (3,) counts of bare paper in it. A channel without light has the reflectances of the brightest one.
     """
     found = np.clip(seen / (field * np.maximum(white, _LEAST_WHITE)), 0, _MOST_REFLECTANCE)
     found[:, white < _LEAST_WHITE] = found[:, [int(np.argmax(white))]]
@@ -97,14 +77,7 @@ def reflectances(seen: _Array, field: _Array, white: _Array) -> _Array:
 class DarkLightEstimator:
     """Estimates the dark light from dark frames, one after another.
 
-    Parameters
-    ----------
-    reflectance
-        (P, 3) of each patch.
-    inside
-        (P,) whether a patch lies in the frame.
-    samples
-        Samples of each patch.
+    `reflectance`: (P, 3) of each patch. `inside`: (P,) whether a patch lies in the frame.
     """
 
     def __init__(self, reflectance: _Array, inside: npt.NDArray[np.bool_], samples: int) -> None:
@@ -128,16 +101,8 @@ class DarkLightEstimator:
     def add(self, means: _Array, noise: _Array, paper: Paper, field: _Array) -> DarkLight:
         """Take in a dark frame and return what is to be subtracted from those after it.
 
-        Parameters
-        ----------
-        means
-            (P, 3) mean counts above black of each patch.
-        noise
-            (3,) standard deviation of one sample.
-        paper
-            What its white references show.
-        field
-            (P, 3) its field at the patches.
+        `means`: (P, 3) mean counts above black of each patch. `noise`: (3,) standard deviation of one sample. `field`:
+        (P, 3) its field at the patches.
         """
         predicted = paper.white * field * self._reflectance
         self._left += means - predicted

@@ -27,13 +27,9 @@ _Samples = npt.NDArray[np.uint16]
 class DriftCorrection:
     """How a table's lights are brought to one lamp.
 
-    Attributes
-    ----------
-    gains
-        (L, 3) float64, above 0 and at most 1: the lamp's light at each light over the brightest white frame's, linear
-        in time between white frames, rounded to `DIGITS`.
-    left
-        How far white frames leave the lamp undetermined between them, a share (`undetermined`).
+    - `gains`: (L, 3) float64, above 0 and at most 1: the lamp's light at each light over the brightest white frame's,
+      linear in time between white frames, rounded to `DIGITS`.
+    - `left`: how far white frames leave the lamp undetermined between them, a share (`undetermined`).
     """
 
     gains: _Array
@@ -43,17 +39,8 @@ class DriftCorrection:
 def drift_correction(at_s: _Array, white_at_s: _Array, white: _Array) -> DriftCorrection:
     """Return how lights are brought to the lamp at its brightest.
 
-    Parameters
-    ----------
-    at_s
-        (L,) when each light was taken.
-    white_at_s, white
-        (W,) and (W, 3) when the white frames were taken, rising, and paper in them; at least `LEAST_WHITES`.
-
-    Raises
-    ------
-    ValueError
-        There are fewer.
+    `at_s`: (L,) when each light was taken. `white_at_s`, `white`: (W,) and (W, 3) when the white frames were taken,
+    rising, and paper in them; at least `LEAST_WHITES`.
     """
     if len(white) < LEAST_WHITES:
         raise ValueError(f"{len(white)} white frames do not show a drift; {LEAST_WHITES} needed")
@@ -73,10 +60,7 @@ def undetermined(at_s: _Array, white_at_s: _Array, white: _Array) -> float:
     first white frame, or behind the last, have the nearest one's light, and what the lamp did in as much time beside it
     is added.
 
-    Parameters
-    ----------
-    at_s, white_at_s, white
-        As for `drift_correction`; (L,), (W,) seconds and (W, 3) float64 counts.
+    `at_s`, `white_at_s`, `white`: as for `drift_correction`; (L,), (W,) seconds and (W, 3) float64 counts.
     """
     steps = np.abs(np.diff(white, axis=0)) / white[:-1]
     if len(white) == LEAST_WHITES:
@@ -97,17 +81,7 @@ def corrected(samples: _Samples, gain: _Array) -> _Samples:
     samples of a cell alike, by up to half a count, as they are integers near one another; with thresholds spread evenly
     over the cell its mean is right to some hundredths.
 
-    Parameters
-    ----------
-    samples
-        (C, S, 3) uint16.
-    gain
-        (3,) float64 of the light, above 0 and at most 1.
-
-    Returns
-    -------
-    ndarray
-        (C, S, 3) uint16.
+    `samples`: (C, S, 3) uint16. `gain`: (3,) float64 of the light, above 0 and at most 1. Returns (C, S, 3) uint16.
     """
     return np.clip(_scaled(samples.astype(np.float64), gain), 0, 65535).astype(np.uint16)
 

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from acquisition.chart.model import Reference
+from experiment.chart.model import Reference
 from foundation.angles import angles_deg
 from foundation.robust import MAD_TO_SIGMA
 
@@ -38,12 +38,8 @@ _Array = npt.NDArray[np.float64]
 class GreyLevels:
     """The printed levels of grey of a chart.
 
-    Attributes
-    ----------
-    names
-        One for each level, brightest first.
-    level
-        (N,) int64, the level of each grey reference.
+    - `names`: one for each level, brightest first.
+    - `level`: (N,) int64, the level of each grey reference.
     """
 
     names: tuple[str, ...]
@@ -62,12 +58,8 @@ class GreyLevels:
     def read(self, seen: _Array, field: _Array) -> tuple[_Array, _Array]:
         """Return the value and standard error (G, 3) float64 of each level, counts, NaN where no patch can be used.
 
-        Parameters
-        ----------
-        seen
-            (N, 3) mean counts above black of each patch, NaN where it cannot be used.
-        field
-            (N, 3) the field at each patch.
+        `seen`: (N, 3) mean counts above black of each patch, NaN where it cannot be used. `field`: (N, 3) the field at
+        each patch.
         """
         flat = seen / field
         value, error = np.full((len(self.names), 3), np.nan), np.full((len(self.names), 3), np.nan)
@@ -88,14 +80,8 @@ class GreyLevels:
 def references_csv(names: Sequence[str], white: _Array, white_error: _Array, greys: _Array, errors: _Array) -> str:
     """Return the text of `references.csv`: every light's white, then its greys.
 
-    Parameters
-    ----------
-    names
-        Of the G levels of grey.
-    white, white_error
-        (L, 3), units of the samples.
-    greys, errors
-        (L, G, 3), the same units; NaN is left empty.
+    `white`, `white_error`: (L, 3), units of the samples. `greys`, `errors`: (L, G, 3), the same units; NaN is left
+    empty.
     """
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")

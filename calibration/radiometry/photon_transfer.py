@@ -27,20 +27,12 @@ _Array = npt.NDArray[np.float64]
 class PhotonTransfer:
     """The sensor's noise as the cells show it, per channel of half-size RGB; green is the mean of two photosites.
 
-    Attributes
-    ----------
-    gain_e
-        (3,) float64 electrons per count.
-    read_noise
-        (3,) float64 counts.
-    response
-        (3,) float64, standard deviation of the photosites' response, a share.
-    misfit
-        (3,) float64, RMS of the levels' variances about the curve, relative.
-    ratio
-        (N,) float64, each cell's variance over the model's, the largest of its channels.
-    allowed
-        The ratio from which a cell is noisier than its level explains.
+    - `gain_e`: (3,) float64 electrons per count.
+    - `read_noise`: (3,) float64 counts.
+    - `response`: (3,) float64, standard deviation of the photosites' response, a share.
+    - `misfit`: (3,) float64, RMS of the levels' variances about the curve, relative.
+    - `ratio`: (N,) float64, each cell's variance over the model's, the largest of its channels.
+    - `allowed`: the ratio from which a cell is noisier than its level explains.
     """
 
     gain_e: _Array
@@ -64,17 +56,8 @@ class PhotonTransfer:
 def noise_levels(level: _Array, variance: _Array, samples: int) -> tuple[_Array, _Array]:
     """Return the noise of one channel at levels: medians of cells of like levels.
 
-    Parameters
-    ----------
-    level, variance
-        (N,) float64 mean, counts above black, and variance of one sample, counts², of each cell.
-    samples
-        Samples of each cell.
-
-    Returns
-    -------
-    tuple of ndarray
-        Levels (B,), counts above black, and variances (B,), counts², both float64.
+    `level`, `variance`: (N,) float64 mean, counts above black, and variance of one sample, counts², of each cell.
+    Returns levels (B,), counts above black, and variances (B,), counts², both float64.
     """
     median = median_of_variance(samples - 1)
     order = np.argsort(level)
@@ -86,14 +69,8 @@ def noise_levels(level: _Array, variance: _Array, samples: int) -> tuple[_Array,
 def photon_transfer(level: _Array, variance: _Array, samples: int = 25) -> PhotonTransfer:
     """Return the curve through cells: non-negative least squares on the medians of cells of like levels.
 
-    Parameters
-    ----------
-    level
-        (N, 3) float64 mean of each cell, counts above black.
-    variance
-        (N, 3) float64 variance of one sample of each, counts².
-    samples
-        Samples of each cell.
+    `level`: (N, 3) float64 mean of each cell, counts above black. `variance`: (N, 3) float64 variance of one sample of
+    each, counts².
     """
     from scipy.optimize import nnls
     from scipy.stats import chi2

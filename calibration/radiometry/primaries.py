@@ -17,10 +17,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from acquisition.lights.illuminations import Illumination
-from acquisition.measures.flat_field import FlatField
-from acquisition.measures.least_squares import product
-from acquisition.measures.paper import Paper
+from experiment.lights.illuminations import Illumination
+from experiment.measures.flat_field import FlatField
+from experiment.measures.least_squares import product
+from experiment.measures.paper import Paper
 
 LEAST_PAPER = 300.0
 """Counts above black that paper must show under a primary for its field to be known well enough (judgement)."""
@@ -50,18 +50,11 @@ def pure_lights(illuminations: Sequence[Illumination]) -> tuple[int, int, int] |
 class Primaries:
     """The three primaries of a session, each from a frame of it alone.
 
-    Attributes
-    ----------
-    lights
-        Index of the light of red alone, of green and of blue.
-    fields
-        The flat field of each, from the channel in which it is brightest, the same for all channels.
-    paper
-        (3, 3) float64 counts above black of bare paper by primary and channel, field divided out.
-    at_cells
-        (3, C) float64, the fields at the cells.
-    cells
-        (3, C, 3) float64 mean counts of each cell by primary, as in the table's samples of that light.
+    - `lights`: index of the light of red alone, of green and of blue.
+    - `fields`: the flat field of each, from the channel in which it is brightest, the same for all channels.
+    - `paper`: (3, 3) float64 counts above black of bare paper by primary and channel, field divided out.
+    - `at_cells`: (3, C) float64, the fields at the cells.
+    - `cells`: (3, C, 3) float64 mean counts of each cell by primary, as in the table's samples of that light.
     """
 
     lights: tuple[int, int, int]
@@ -76,16 +69,8 @@ class Primaries:
     ) -> Primaries | None:
         """Return the primaries, None where paper shows less than `LEAST_PAPER` counts under one.
 
-        Parameters
-        ----------
-        lights
-            Indices of red, green and blue.
-        papers
-            Bare paper in the frame of each.
-        cells
-            (C, 3) float64 mean counts of each cell in each frame, field divided out.
-        cells_mm
-            (C, 2) float64 mm, the cells' centres.
+        `cells`: (C, 3) float64 mean counts of each cell in each frame, field divided out. `cells_mm`: (C, 2) float64
+        mm, the cells' centres.
         """
         white = np.array([paper.white for paper in papers])
         if white.max(axis=1).min() < LEAST_PAPER:
@@ -112,10 +97,7 @@ class Primaries:
     def field_ratio(self, white: _Array) -> _Array:
         """Return the field of each cell over the field of paper in its place, (C, 3) float64, near 1.
 
-        Parameters
-        ----------
-        white
-            (3,) counts of bare paper under the light, field divided out.
+        `white`: (3,) counts of bare paper under the light, field divided out.
         """
         amounts = self.amounts(white)
         shares = amounts[:, None] * self.paper

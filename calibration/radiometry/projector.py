@@ -10,7 +10,7 @@ from collections.abc import Sequence
 import numpy as np
 import numpy.typing as npt
 
-from acquisition.lights.illuminations import Illumination
+from experiment.lights.illuminations import Illumination
 
 _Array = npt.NDArray[np.float64]
 
@@ -24,23 +24,10 @@ def additivity(
     projector with a white segment on its wheel, or one that processes colours, gives more or less. It harms no table,
     since each light's ground truth is measured; it means that a light cannot be predicted from its codes.
 
-    Parameters
-    ----------
-    lights
-        L lights; used are the three with one full primary, and full white if `full_white` is None.
-    white
-        (L, 3) their ground truths.
-    full_white
-        (3,) paper under full white from the white frames, None without.
-    dark
-        (3,) paper in the dark frames; zeros where already subtracted.
-    gains
-        (L, 3) the lamp's drift at each light, of which white frames are free; `drift_gains`.
-
-    Returns
-    -------
-    ndarray or None
-        (3,) float64; None when a primary or white is missing.
+    `lights`: L lights; used are the three with one full primary, and full white if `full_white` is None. `white`: (L,
+    3) their ground truths. `full_white`: (3,) paper under full white from the white frames, None without. `dark`: (3,)
+    paper in the dark frames; zeros where already subtracted. `gains`: (L, 3) the lamp's drift at each light, of which
+    white frames are free; `drift_gains`. Returns (3,) float64; None when a primary or white is missing.
     """
     found: dict[tuple[int, int, int], _Array] = {}
     for light in lights:
@@ -56,17 +43,8 @@ def additivity(
 def drift_gains(at_s: _Array, white_at_s: _Array, white: _Array) -> _Array:
     """Return the lamp's light at times over that of the first white frame, linear between white frames.
 
-    Parameters
-    ----------
-    at_s
-        (L,) when each light was taken.
-    white_at_s, white
-        (W,) and (W, 3) when the white frames were taken, rising, and paper in them.
-
-    Returns
-    -------
-    ndarray
-        (L, 3) float64; ones where there are fewer than two white frames.
+    `at_s`: (L,) when each light was taken. `white_at_s`, `white`: (W,) and (W, 3) when the white frames were taken,
+    rising, and paper in them. Returns (L, 3) float64; ones where there are fewer than two white frames.
     """
     if len(white) < 2:
         return np.ones((len(at_s), 3))

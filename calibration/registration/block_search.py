@@ -40,16 +40,10 @@ _Mask = npt.NDArray[np.bool_]
 class FoundBlocks:
     """Where blocks of cells were found.
 
-    Attributes
-    ----------
-    centres_mm
-        (B, 2) float64, where the map has them, on the print.
-    moves_mm
-        (B, 2) float64, how far from there they were found, on the print.
-    score
-        (B,) float64, correlation with the print, −1 … 1.
-    least_score
-        Below it a block does not count.
+    - `centres_mm`: (B, 2) float64, where the map has them, on the print.
+    - `moves_mm`: (B, 2) float64, how far from there they were found, on the print.
+    - `score`: (B,) float64, correlation with the print, −1 … 1.
+    - `least_score`: below it a block does not count.
     """
 
     centres_mm: _Array
@@ -60,14 +54,7 @@ class FoundBlocks:
     def information(self, moves_px: _Array, spacing_mm: _Array, cell_px: float) -> _Array:
         """Return the inverse covariance (B, 2, 2) float64 px⁻² of the blocks' places.
 
-        Parameters
-        ----------
-        moves_px
-            (B, 2) the moves in the frame.
-        spacing_mm
-            (2,) distance of blocks in x and y.
-        cell_px
-            Half-size pixels along a cell's side.
+        `moves_px`: (B, 2) the moves in the frame. `spacing_mm`: (2,) distance of blocks in x and y.
         """
         score = np.where(self.score > self.least_score, self.score, 0.0)
         weight = _weights(self.centres_mm, moves_px, score, spacing_mm, cell_px)
@@ -79,18 +66,8 @@ def find_blocks(
 ) -> FoundBlocks:
     """Return where square blocks of the print are found in a rectified frame, by normalised correlation.
 
-    Parameters
-    ----------
-    raster
-        The raster (H, W).
-    expected, seen
-        (H, W, 3) float32 counts, the print as it should be seen and the frame.
-    there
-        (H, W) bool, where the frame exists; blocks beyond are left out.
-    size, reach
-        Elements along a block's side, and how far it is looked for.
-    cells
-        Cells in a block.
+    `raster`: the raster (H, W). `expected`, `seen`: (H, W, 3) float32 counts, the print as it should be seen and the
+    frame. `there`: (H, W) bool, where the frame exists; blocks beyond are left out.
     """
     # Square roots keep a bright light's gradient from deciding; noise is even after it too (Anscombe 1948).
     expected, seen = (np.sqrt(np.maximum(picture, 0)) for picture in (expected, seen))

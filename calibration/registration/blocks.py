@@ -9,10 +9,10 @@ import numpy.typing as npt
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
-from acquisition.chart.model import Chart
 from calibration.registration.displacement import Displacement
 from calibration.registration.raster import Raster, box_mean
 from calibration.registration.tile_comparison import MIN_SCORE, TileComparison
+from experiment.chart.model import Chart
 
 _LEAST_INFORMATION = 4.0
 """px⁻²: a block whose place has a standard error of half a pixel or more does not count as compared."""
@@ -48,14 +48,10 @@ _Mask = npt.NDArray[np.bool_]
 class Blocks:
     """How well the registration fits block by block, after the last step.
 
-    Attributes
-    ----------
-    centres_mm
-        (B, 2) float64.
-    score
-        (B,) float64, correlation of the frame with the print as predicted, −1 … 1; 0 where nothing can be compared.
-    residual_px
-        (B, 2) float64, displacement that the block alone would still need.
+    - `centres_mm`: (B, 2) float64.
+    - `score`: (B,) float64, correlation of the frame with the print as predicted, −1 … 1; 0 where nothing can be
+      compared.
+    - `residual_px`: (B, 2) float64, displacement that the block alone would still need.
     """
 
     centres_mm: _Array
@@ -73,18 +69,7 @@ def fit_blocks(
 ) -> Blocks:
     """Return how each block of cells fits, and by how much it alone would move.
 
-    Parameters
-    ----------
-    comparison
-        The raster's tiles of one cell each, as compared after the last step.
-    raster, per_cell
-        The raster, and its elements along a cell's side.
-    chart
-        The chart. Blank margins have nothing to compare: only tiles that hold a cell count.
-    block_cells
-        Cells along a block's side, about.
-    all_known
-        Whether the score of a block whose place is hardly determined is kept; else it is 0.
+    `chart`: the chart. Blank margins have nothing to compare: only tiles that hold a cell count.
     """
     rows, columns = raster.tiles(per_cell)
     across, down = (max(1, count // block_cells) for count in (columns, rows))
@@ -115,12 +100,9 @@ def fit_blocks(
 class PlaceErrors:
     """How well the places of a registration are known.
 
-    Attributes
-    ----------
-    raster
-        A raster on the print whose elements are cells.
-    error_px
-        (rows, columns) float64, standard error of the place of each element's middle, its length over x and y.
+    - `raster`: A raster on the print whose elements are cells.
+    - `error_px`: (rows, columns) float64, standard error of the place of each element's middle, its length over x and
+      y.
     """
 
     raster: Raster
@@ -141,16 +123,8 @@ def unfollowed_px(
     there. Where a part of the outline was not found, a curled corner for instance, it is taken to lie as far from a
     plane seen through a lens as the sheet does elsewhere.
 
-    Parameters
-    ----------
-    points_mm
-        (N, 2) float64.
-    marks_mm, residual_px
-        (M, 2) float64, points of the outline, a rectangle, and how far from the map they are seen, across it.
-    departure_px
-        Usual distance of the sheet from the lens's map.
-    reach_mm
-        How far along the outline its points tell of places: the distance of the displacement's knots.
+    `points_mm`: (N, 2) float64. `marks_mm`, `residual_px`: (M, 2) float64, points of the outline, a rectangle, and how
+    far from the map they are seen, across it.
     """
     off2 = (residual_px**2).sum(axis=1)
     far, near = cKDTree(marks_mm).query(points_mm, k=min(_NEAR_MARKS, len(off2)))
@@ -184,21 +158,8 @@ def place_errors(
     In simulated rooms with waves, curl and dog-ears 99 % of a whole chart's cells lie within three standard errors,
     98 % of a chart of 512 cells.
 
-    Parameters
-    ----------
-    comparison
-        The raster's tiles of one cell each, as compared after the last step.
-    raster, per_cell
-        The raster, and its elements along a cell's side.
-    displacement
-        As fitted.
-    anchors
-        (N, 2) mm and (N, 2, 2) px⁻², places that fix the map besides cells, and their information.
-    systematic_px
-        Standard error besides, at all tiles' middles or (N,) at each.
-    alike
-        Whether neighbouring cells err alike, as those of a smooth order do, whose misfit goes on from cell to cell: the
-        mean of some is then no surer than one.
+    `anchors`: (N, 2) mm and (N, 2, 2) px⁻², places that fix the map besides cells, and their information.
+    `systematic_px`: standard error besides, at all tiles' middles or (N,) at each.
     """
     shape, information = raster.tiles(per_cell), comparison.information
     known = np.linalg.eigvalsh(information)[:, 0] > _LEAST_INFORMATION

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial import cKDTree
 
-from acquisition.chart.model import Chart
+from experiment.chart.model import Chart
 from foundation.robust import MAD_TO_SIGMA
 
 MIN_COLOURS = 64
@@ -55,20 +55,9 @@ _Mask = npt.NDArray[np.bool_]
 def mismatched(seen: _Array, expected: _Array, paper: _Array, chart: Chart) -> _Mask:
     """Return which cells have not nearly the colour that the model expects: covered, damaged or misprinted ones.
 
-    Parameters
-    ----------
-    seen, expected
-        (C, 3) colours of the chart's cells, and perhaps (R, 3) of references after them, which set the usual error;
-        NaN outside the frame.
-    paper
-        (3,) of bare paper.
-    chart
-        The chart; of fewer than `MIN_COLOURS` colours none is called mismatched.
-
-    Returns
-    -------
-    ndarray
-        (C,) bool, in the chart's order, the cells amid mismatched ones included.
+    `seen`, `expected`: (C, 3) colours of the chart's cells, and perhaps (R, 3) of references after them, which set the
+    usual error; NaN outside the frame. `paper`: (3,) of bare paper. Returns (C,) bool, in the chart's order, the cells
+    amid mismatched ones included.
     """
     count = chart.colour_count
     if count < MIN_COLOURS:
@@ -92,10 +81,7 @@ def _with_neighbours(cells: _Mask, centres: _Array) -> _Mask:
 def agreement(seen: _Array, expected: _Array) -> float:
     """Return the correlation of colours with those expected, the mean of the channels that carry most light.
 
-    Parameters
-    ----------
-    seen, expected
-        (N, 3), all finite.
+    `seen`, `expected`: (N, 3), all finite.
     """
     light = np.median(seen, axis=0)
     used = np.flatnonzero(light >= 0.3 * light.max())
@@ -115,23 +101,9 @@ def slipped_parts(
     By the level of the colours, which the matching leaves free: seen less expected colours are fitted, part by part and
     by least squares, by what a displacement to the next cell would change.
 
-    Parameters
-    ----------
-    seen, expected
-        (C, 3) colours of the chart's cells.
-    paper
-        (3,) of bare paper.
-    ignored
-        (C,) bool, cells left out.
-    place
-        Row and column of each cell, (C,) each.
-    shape
-        Rows and columns of the grid.
-
-    Returns
-    -------
-    ndarray, int
-        (B, 2) float64 middles of the parts that have slipped, column then row, in cells from the grid's corner.
+    `seen`, `expected`: (C, 3) colours of the chart's cells. `paper`: (3,) of bare paper. `ignored`: (C,) bool, cells
+    left out. `place`: row and column of each cell, (C,) each. Returns (B, 2) float64 middles of the parts that have
+    slipped, column then row, in cells from the grid's corner.
     """
     rows, columns = shape
     row, column = place

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from acquisition.measures.least_squares import least_squares
-from acquisition.measures.polynomials import code_powers
+from experiment.measures.least_squares import least_squares
+from experiment.measures.polynomials import code_powers
 from foundation.robust import huber_weights, sigma_of
 
 _Array = npt.NDArray[np.float64]
@@ -21,16 +21,10 @@ _Array = npt.NDArray[np.float64]
 class ColourModel:
     """What camera RGB a printed code gives in one frame: a polynomial, times a smooth light over the page.
 
-    Attributes
-    ----------
-    degree
-        Of the polynomial in the three codes.
-    coefficients
-        (terms, 3) float64, counts.
-    light
-        (6, 3) float64, polynomial of second order in page coordinates −1 … 1, mean about 1.
-    page_mm
-        Width and height of the sheet.
+    - `degree`: of the polynomial in the three codes.
+    - `coefficients`: (terms, 3) float64, counts.
+    - `light`: (6, 3) float64, polynomial of second order in page coordinates −1 … 1, mean about 1.
+    - `page_mm`: width and height of the sheet.
     """
 
     degree: int
@@ -68,19 +62,9 @@ def fit_colours(
 
     Alternating least squares for polynomial and light, reweighted by Huber's weights.
 
-    Parameters
-    ----------
-    rgb
-        (N, 3) printed codes, 0 … 255.
-    points_mm
-        (N, 2) mm, centres.
-    seen
-        (N, 3) float64 camera RGB, counts above black.
-    page_mm
-        Width and height of the sheet.
-    finely
-        Whether the steps between neighbouring codes matter: a polynomial of degree 6 or 8 where patches suffice,
-        which leaves a third of what one of degree 3 leaves.
+    `rgb`: (N, 3) printed codes, 0 … 255. `points_mm`: (N, 2) mm, centres. `seen`: (N, 3) float64 camera RGB, counts
+    above black. `finely`: whether the steps between neighbouring codes matter: a polynomial of degree 6 or 8 where
+    patches suffice, which leaves a third of what one of degree 3 leaves.
     """
     degree = (
         (8 if len(rgb) >= 4000 else 6)

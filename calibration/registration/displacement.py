@@ -41,16 +41,11 @@ _Array = npt.NDArray[np.float64]
 class Displacement:
     """A smooth displacement over the print: tensor products of uniform cubic B-splines.
 
-    Attributes
-    ----------
-    origin_mm, knot_mm
-        (2,) first knot and distance of knots in x and y.
-    coefficients
-        (rows, columns, 2) float64, half-size px (dx, dy).
-    lens
-        That by which heights are seen; None: any displacement is as likely as that of a height.
-    heights
-        (rows, columns) float64, half-size px that a height moves points by at the frame's corner; None without `lens`.
+    - `origin_mm`, `knot_mm`: (2,) first knot and distance of knots in x and y.
+    - `coefficients`: (rows, columns, 2) float64, half-size px (dx, dy).
+    - `lens`: that by which heights are seen; None: any displacement is as likely as that of a height.
+    - `heights`: (rows, columns) float64, half-size px that a height moves points by at the frame's corner; None without
+      `lens`.
     """
 
     origin_mm: _Array
@@ -98,16 +93,9 @@ class Displacement:
 
         Minimises ``Σ ½ dᵀ A d − pullᵀ d + ½ |second differences|² / roughness²``.
 
-        Parameters
-        ----------
-        points_mm
-            (N, 2) mm, where it was measured.
-        information
-            (N, 2, 2) A: inverse covariance of each measurement, px⁻²; 0 where nothing was seen.
-        pull
-            (N, 2) A times the measured displacement, px⁻¹.
-        roughness_px
-            Usual second difference between knots.
+        `points_mm`: (N, 2) mm, where it was measured. `information`: (N, 2, 2) A: inverse covariance of each
+        measurement, px⁻²; 0 where nothing was seen. `pull`: (N, 2) A times the measured displacement, px⁻¹.
+        `roughness_px`: usual second difference between knots.
         """
         basis = self.basis(points_mm)
         rows, columns = self.coefficients.shape[:2]
@@ -126,14 +114,8 @@ class Displacement:
         "Gaussian sampling by local perturbations", NIPS 2010). Where nothing is measured, the sheet is taken to be as
         rough as it is found elsewhere.
 
-        Parameters
-        ----------
-        points_mm
-            (N, 2) mm, where it was measured.
-        information
-            (N, 2, 2) inverse covariance of each measurement, px⁻²; 0 where nothing was seen.
-        at_mm
-            (M, 2) float64 mm, the places.
+        `points_mm`: (N, 2) mm, where it was measured. `information`: (N, 2, 2) inverse covariance of each measurement,
+        px⁻²; 0 where nothing was seen. `at_mm`: (M, 2) float64 mm, the places.
         """
         what = self._bending.reshape(*self.coefficients.shape[:2], -1)
         bends = [np.diff(what, 2, axis=axis) for axis in (0, 1)]
@@ -151,14 +133,8 @@ class Displacement:
         What the fit bends, squared, over the number of bends that the measurements determine: one step of a fixed-point
         iteration (D. J. C. MacKay, "Bayesian interpolation", Neural Computation 1992).
 
-        Parameters
-        ----------
-        points_mm
-            (N, 2) float64 mm, where it was measured.
-        information
-            (N, 2, 2) float64 px⁻², of the measurements to which this was fitted.
-        roughness_px
-            With which it was fitted.
+        `points_mm`: (N, 2) float64 mm, where it was measured. `information`: (N, 2, 2) float64 px⁻², of the
+        measurements to which this was fitted.
         """
         bending = _differences(*self.coefficients.shape[:2])
         what = self._bending

@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from acquisition.framing.planes import CHANNELS, Channel
+from experiment.framing.planes import CHANNELS, Channel
 
 _USUAL_PX = 2.0
 """Shift at the frame's corner by which a term is taken to be 0 before it is measured: lenses have 0 to 1 px. It decides
@@ -44,16 +44,11 @@ _Array = npt.NDArray[np.float64]
 class LateralColour:
     """How far out red and blue lie against green.
 
-    Attributes
-    ----------
-    centre_px
-        (2,) float64, the frame's middle.
-    radius_px
-        Half the frame's diagonal.
-    terms_px
-        (2, 2) float64, of red and of blue: the linear and the cubic term at the frame's corner. Zeros until measured.
-    covariance_px2
-        (4, 4) float64 of `terms_px`, row by row.
+    - `centre_px`: (2,) float64, the frame's middle.
+    - `radius_px`: half the frame's diagonal.
+    - `terms_px`: (2, 2) float64, of red and of blue: the linear and the cubic term at the frame's corner. Zeros until
+      measured.
+    - `covariance_px2`: (4, 4) float64 of `terms_px`, row by row.
     """
 
     centre_px: _Array
@@ -95,15 +90,9 @@ class LateralColour:
 
         Whatever all channels share, block by block, is left to the map: it is eliminated, not assumed.
 
-        Parameters
-        ----------
-        places_px
-            (B, 2) float64, the blocks' middles.
-        information
-            (3, B, 2, 2) float64 px⁻², of red, green and blue: inverse covariance of the displacement that each alone
-            measures; 0 where nothing was seen.
-        pull
-            (3, B, 2) float64 px⁻¹, information times that displacement, from where the channels are taken to be now.
+        `places_px`: (B, 2) float64, the blocks' middles. `information`: (3, B, 2, 2) float64 px⁻², of red, green and
+        blue: inverse covariance of the displacement that each alone measures; 0 where nothing was seen. `pull`: (3, B,
+        2) float64 px⁻¹, information times that displacement, from where the channels are taken to be now.
         """
         total: _Array = information.sum(axis=0)
         # What one colour alone shows says nothing of others.

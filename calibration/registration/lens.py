@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy import optimize
 
-from acquisition.framing.homography import fit_homography, on_one_line, project
+from experiment.framing.homography import fit_homography, on_one_line, project
 from foundation.errors import RegistrationError
 
 _PAIRS_FOR_ALL, _PAIRS_FOR_ONE = 48, 16
@@ -38,16 +38,10 @@ _Array = npt.NDArray[np.float64]
 class Lens:
     """A plane seen through a lens: homography, then Brown's radial and tangential distortion about the frame's middle.
 
-    Attributes
-    ----------
-    homography
-        (3, 3) float64, millimetres to undistorted half-size px.
-    centre_px
-        (2,) middle of the frame.
-    radius_px
-        Unit of distance for the coefficients: half the frame's diagonal.
-    distortion
-        (4,) k1, k2, p1, p2.
+    - `homography`: (3, 3) float64, millimetres to undistorted half-size px.
+    - `centre_px`: (2,) middle of the frame.
+    - `radius_px`: unit of distance for the coefficients: half the frame's diagonal.
+    - `distortion`: (4,) k1, k2, p1, p2.
     """
 
     homography: _Array
@@ -100,24 +94,9 @@ def fit_lens(
 
     Plain least squares first, then robust (soft L1 beyond 1 px): robust from the start it stops in a local minimum.
 
-    Parameters
-    ----------
-    points_mm, places_px
-        (N, 2) float64 pairs, mm and half-size px, N ≥ 8.
-    frame_size
-        Width and height of the frame, half-size px.
-    normals
-        (N, 2) the directions in which places are known, if they lie on lines; None where they are points.
-
-    Returns
-    -------
-    Lens, ndarray
-        (N, 2) float64 residuals, seen minus fitted, px; along the normals if there are some.
-
-    Raises
-    ------
-    RegistrationError
-        The points lie on one line.
+    `points_mm`, `places_px`: (N, 2) float64 pairs, mm and half-size px, N ≥ 8. `frame_size`: width and height of the
+    frame, half-size px. `normals`: (N, 2) the directions in which places are known, if they lie on lines; None where
+    they are points. Returns (N, 2) float64 residuals, seen minus fitted, px; along the normals if there are some.
     """
     centre = (np.array(frame_size, dtype=np.float64) - 1) / 2
     radius = float(np.hypot(*frame_size)) / 2

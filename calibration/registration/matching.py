@@ -21,9 +21,6 @@ import numpy as np
 import numpy.typing as npt
 from scipy import ndimage, sparse
 
-from acquisition.chart.model import PAPER_WHITE, Chart
-from acquisition.framing.homography import rms
-from acquisition.framing.planes import CHANNELS, Channel, Plane
 from calibration.registration.block_search import find_blocks
 from calibration.registration.blocks import SYSTEMATIC_PX, Blocks, PlaceErrors, fit_blocks, place_errors, unfollowed_px
 from calibration.registration.colour_checks import slipped_parts
@@ -33,6 +30,9 @@ from calibration.registration.lateral_colour import LateralColour
 from calibration.registration.lens import Lens, fit_lens
 from calibration.registration.raster import Raster
 from calibration.registration.tile_comparison import TileComparison, compare_tiles
+from experiment.chart.model import PAPER_WHITE, Chart
+from experiment.framing.homography import rms
+from experiment.framing.planes import CHANNELS, Channel, Plane
 from foundation.errors import RegistrationError
 
 _COARSE_BLOCKS = ((10, 1.5), (5, 1.0))
@@ -95,14 +95,9 @@ _Mask = npt.NDArray[np.bool_]
 class Anchors:
     """Places found by other means, which fix the map where no cells are.
 
-    Attributes
-    ----------
-    points_mm
-        (N, 2) float64.
-    places_px
-        (3, N, 2) float64 where red, green and blue see them; any finite values where they were not measured.
-    information
-        (3, N, 2, 2) float64, inverse covariance of the places, px⁻²; 0 where they were not measured.
+    - `points_mm`: (N, 2) float64.
+    - `places_px`: (3, N, 2) float64 where red, green and blue see them; any finite values where they were not measured.
+    - `information`: (3, N, 2, 2) float64, inverse covariance of the places, px⁻²; 0 where they were not measured.
     """
 
     points_mm: _Array
@@ -126,31 +121,9 @@ class Anchors:
 class Matcher:
     """Compares a frame with the print, in the print's own raster, and moves the map until they coincide.
 
-    Parameters
-    ----------
-    chart
-        The chart.
-    planes
-        The frame's red, green and blue.
-    lens
-        The map that tags or outline give.
-    anchors
-        The same tags or outline, which fix the map where no cells are.
-    lateral
-        Where red and blue lie against green, as far as it is known.
-    blur_px
-        σ of printed edges in the frame.
-    cell_px
-        Half-size pixels along a cell's shorter side.
-
-    Attributes
-    ----------
-    displacement
-        What is added to the lens; zero at first.
-    lateral
-        Where red and blue lie against green.
-    colours
-        The frame's colour model, fitted again as the map moves.
+    - `displacement`: what is added to the lens; zero at first.
+    - `lateral`: where red and blue lie against green.
+    - `colours`: the frame's colour model, fitted again as the map moves.
     """
 
     def __init__(
@@ -231,12 +204,8 @@ class Matcher:
     def patches(self) -> tuple[_Array, _Array, _Array]:
         """Return camera RGB of all patches as seen and as expected, and of bare paper, counts.
 
-        Returns
-        -------
-        seen, expected
-            (N, 3) float64 of the cells in the chart's order, then of the references; seen NaN outside the frame.
-        paper
-            (3,) float64.
+        Returns (N, 3) float64 of the cells in the chart's order, then of the references; seen NaN outside the frame.
+        Returns (3,) float64.
         """
         self.colours = self._fit_colours()
         return self._seen(), self.colours.seen(self._rgb, self._centres), self._paper()
@@ -289,18 +258,7 @@ class Matcher:
         return image, there
 
     def match_coarsely(self, what: str) -> None:
-        """Find blocks of cells where they are, up to one and a half cells away, and follow them smoothly.
-
-        Parameters
-        ----------
-        what
-            The frame's name for messages.
-
-        Raises
-        ------
-        RegistrationError
-            Too little of the chart is in the frame, or the cells are not the chart's.
-        """
+        """Find blocks of cells where they are, up to one and a half cells away, and follow them smoothly."""
         n, across = _COARSE_PER_CELL, int(self._cells_across.min())
         blocks = [int(np.clip(across // 3, 2, cells)) for cells, _ in _COARSE_BLOCKS]
         reaches = [round(n * min(far, 0.25 * blocks[0])) for _, far in _COARSE_BLOCKS]
@@ -483,15 +441,7 @@ class Matcher:
 
 
 def not_this_chart(what: str, measured: str) -> RegistrationError:
-    """Return the error that the chart seen is another one.
-
-    Parameters
-    ----------
-    what
-        The frame's name.
-    measured
-        What was measured, and expected.
-    """
+    """Return the error that the chart seen is another one."""
     return RegistrationError(
         f"{what}: a chart is there, but its cells' colours are not those of the chart: {measured}; "
         "name the chart.json of this print, or uncover it"

@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy import sparse
 
-from acquisition.chart.model import TAG_MODULES, Tag
+from experiment.chart.model import TAG_MODULES, Tag
 
 _Float = npt.NDArray[np.float32]
 _Array = npt.NDArray[np.float64]
@@ -30,14 +30,9 @@ _LATTICE_STRIDE = 8
 class Raster:
     """A raster on the print: element (row, column) has its centre at low + (column + ½, row + ½) · step.
 
-    Attributes
-    ----------
-    low_mm
-        (2,) float64, corner of the first element, x then y.
-    step_mm
-        (2,) float64, an element's width and height.
-    shape
-        Rows and columns.
+    - `low_mm`: (2,) float64, corner of the first element, x then y.
+    - `step_mm`: (2,) float64, an element's width and height.
+    - `shape`: rows and columns.
     """
 
     low_mm: _Array
@@ -95,10 +90,7 @@ class Raster:
     def coverage(self, centres_mm: _Array, sizes_mm: _Array) -> sparse.csr_array:
         """Return the share of each element that each rectangle covers, (H · W, N) float32.
 
-        Parameters
-        ----------
-        centres_mm, sizes_mm
-            (N, 2) float64, x then y.
+        `centres_mm`, `sizes_mm`: (N, 2) float64, x then y.
         """
         height, width = self.shape
         low = (centres_mm - sizes_mm / 2 - self.low_mm) / self.step_mm

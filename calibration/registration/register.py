@@ -21,15 +21,6 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial import cKDTree
 
-from acquisition.chart.model import Chart
-from acquisition.framing.finding import Framing, find_chart
-from acquisition.framing.homography import rms
-from acquisition.framing.outline import SIDE_POINTS, refine_edges
-from acquisition.framing.planes import CHANNELS, Plane, frame_black, plane_of
-from acquisition.framing.sharpness import blur_px
-from acquisition.framing.tagless_field import FoundField, field_mm
-from acquisition.framing.visibility import MIN_CELL_PX
-from acquisition.limits.bleed import largest_blur_px
 from calibration.registration.blocks import Blocks
 from calibration.registration.colour_checks import agreement, mismatched
 from calibration.registration.lateral_colour import LateralColour
@@ -37,6 +28,15 @@ from calibration.registration.lens import Lens, fit_lens
 from calibration.registration.matching import Anchors, Matcher, not_this_chart
 from calibration.registration.registration import Registration
 from drivers.raw.rawfile import Mosaic
+from experiment.chart.model import Chart
+from experiment.framing.finding import Framing, find_chart
+from experiment.framing.homography import rms
+from experiment.framing.outline import SIDE_POINTS, refine_edges
+from experiment.framing.planes import CHANNELS, Plane, frame_black, plane_of
+from experiment.framing.sharpness import blur_px
+from experiment.framing.tagless_field import FoundField, field_mm
+from experiment.framing.visibility import MIN_CELL_PX
+from experiment.limits.bleed import largest_blur_px
 from foundation.errors import RegistrationError
 from foundation.robust import sigma_of
 
@@ -94,25 +94,8 @@ def register(
 
     About 5 s of one processor for the 32 768 cells on an 18-megapixel frame, three times that without tags.
 
-    Parameters
-    ----------
-    mosaic
-        The frame; a white one is best, any with light in it will do if the chart has tags.
-    chart
-        The chart expected.
-    what
-        The frame's name for messages.
-    corners
-        For a chart without tags: (4, 2) float half-size px, the corners of the field of cells, clockwise from the
-        printed top-left, to some 20 px; found by themselves if not given.
-    near
-        An earlier registration of the same session: a chart without tags is then taken to hang the same way up.
-
-    Raises
-    ------
-    RegistrationError
-        The tags or the field are missing, mirrored, too small or do not fit; the frame is out of focus or too small in
-        the picture; the cells' colours are not those of the chart, or are those of their neighbours.
+    `corners`: for a chart without tags: (4, 2) float half-size px, the corners of the field of cells, clockwise from
+    the printed top-left, to some 20 px; found by themselves if not given.
     """
     black = frame_black(mosaic)
     framing = find_chart(mosaic, chart, what, corners, None if near is None else near.framing)
@@ -218,10 +201,8 @@ def _field_through_lens(field: FoundField, frame_size: tuple[int, int]) -> tuple
     A sheet's curled corners lie pixels off a plane seen through a lens, and have neighbours that do: points are held
     against the run of their side.
 
-    Returns
-    -------
-    FoundField, ndarray, Lens, ndarray
-        The field; which of its points are left, (N,) bool; its lens; residuals of the points left, (M, 2) float64 px.
+    Returns the field; which of its points are left, (N,) bool; its lens; residuals of the points left, (M, 2) float64
+    px.
     """
     kept = np.ones(len(field.outline_mm), dtype=np.bool_)
     lens, residual = fit_lens(field.outline_mm, field.outline_px, frame_size, field.normals)

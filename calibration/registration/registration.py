@@ -7,15 +7,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from acquisition.framing.finding import Framing
-from acquisition.framing.homography import rms
-from acquisition.framing.planes import Channel
-from acquisition.limits.bleed import SAMPLE_REACH_PX
 from calibration.registration.blocks import Blocks, PlaceErrors
 from calibration.registration.colour_model import ColourModel
 from calibration.registration.displacement import Displacement
 from calibration.registration.lateral_colour import LateralColour
 from calibration.registration.lens import Lens
+from experiment.framing.finding import Framing
+from experiment.framing.homography import rms
+from experiment.framing.planes import Channel
+from experiment.limits.bleed import SAMPLE_REACH_PX
 
 MAX_PLACE_ERROR_PX = 0.5
 """Three standard errors of the place of a cell of 10 px, at most: at 0.5 px the outermost of its 25 pixels, rounding
@@ -32,34 +32,21 @@ _Mask = npt.NDArray[np.bool_]
 class Registration:
     """The chart's place in a frame.
 
-    Attributes
-    ----------
-    framing
-        The tags, or the field's outline, as found.
-    lens, displacement
-        The two parts of the map of green.
-    lateral
-        Where red and blue lie against it.
-    marks_residual_px
-        (N, 2) float64, the tags' corners against the final map; of a chart without tags the field's outline, across.
-    lens_residual_px
-        RMS of the same against the lens alone: what the paper's waviness leaves.
-    blocks
-        Fit of the cells.
-    place_errors
-        How well places are known.
-    colours
-        The colour model of the frame.
-    mismatched_cells
-        (N,) bool, cells in the chart's order whose colour is not nearly the model's: covered, damaged, misprinted.
-    agreement
-        Correlation of the cells' colours with the model's, the mean of the channels that carry light.
-    blur_px
-        σ of the tags' edges, or of the field's.
-    cell_px
-        Half-size pixels per cell, the shorter side of the smallest.
-    shift_px
-        Movement since the frame that was registered, (dx, dy).
+    - `framing`: the tags, or the field's outline, as found.
+    - `lens`, `displacement`: the two parts of the map of green.
+    - `lateral`: where red and blue lie against it.
+    - `marks_residual_px`: (N, 2) float64, the tags' corners against the final map; of a chart without tags the field's
+      outline, across.
+    - `lens_residual_px`: RMS of the same against the lens alone: what the paper's waviness leaves.
+    - `blocks`: fit of the cells.
+    - `place_errors`: how well places are known.
+    - `colours`: the colour model of the frame.
+    - `mismatched_cells`: (N,) bool, cells in the chart's order whose colour is not nearly the model's: covered,
+      damaged, misprinted.
+    - `agreement`: correlation of the cells' colours with the model's, the mean of the channels that carry light.
+    - `blur_px`: σ of the tags' edges, or of the field's.
+    - `cell_px`: half-size pixels per cell, the shorter side of the smallest.
+    - `shift_px`: movement since the frame that was registered, (dx, dy).
     """
 
     framing: Framing

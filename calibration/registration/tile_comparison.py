@@ -29,18 +29,12 @@ _Array = npt.NDArray[np.float64]
 class TileComparison:
     """Displacements that the tiles of a raster measure.
 
-    Attributes
-    ----------
-    points_mm
-        (N, 2) float64, the tiles' middles.
-    information
-        (N, 2, 2) float64 px⁻², inverse covariance of the displacement that each tile measures; 0 where it is not used.
-    pull
-        (N, 2) float64 px⁻¹, information times the measured displacement.
-    score
-        (N,) float64, correlation of frame and print around each tile, −1 … 1; 0 where nothing can be compared.
-    of_channels
-        (3, N, 2, 2) and (3, N, 2) float64, what red, green and blue contribute to information and pull.
+    - `points_mm`: (N, 2) float64, the tiles' middles.
+    - `information`: (N, 2, 2) float64 px⁻², inverse covariance of the displacement that each tile measures; 0 where it
+      is not used.
+    - `pull`: (N, 2) float64 px⁻¹, information times the measured displacement.
+    - `score`: (N,) float64, correlation of frame and print around each tile, −1 … 1; 0 where nothing can be compared.
+    - `of_channels`: (3, N, 2, 2) and (3, N, 2) float64, what red, green and blue contribute to information and pull.
     """
 
     points_mm: _Array
@@ -82,23 +76,9 @@ def compare_tiles(
 ) -> TileComparison:
     """Return how tiles of size × size elements would move the map by which a frame was rectified.
 
-    Parameters
-    ----------
-    raster, size
-        The raster (H, W), and the elements of a tile along a side.
-    expected, seen
-        (H, W, 3) float32 counts, the print as it should be seen and the frame.
-    weight
-        (H, W) float32, 1 where they can be compared, else 0.
-    window
-        Elements over which gain and offset are taken for constant.
-    to_pixels
-        The map, from points (N, 2) mm to places (N, 2) px.
-    cell_px
-        Half-size pixels along a cell's side; a tile is taken to be as large, or finer.
-    without_gradient
-        Whether an even gradient of the colours is left out of the slopes, since an offset explains it as well as a
-        movement does.
+    `raster`, `size`: the raster (H, W), and the elements of a tile along a side. `expected`, `seen`: (H, W, 3) float32
+    counts, the print as it should be seen and the frame. `weight`: (H, W) float32, 1 where they can be compared, else
+    0. `to_pixels`: the map, from points (N, 2) mm to places (N, 2) px.
     """
     mean = _LocalMean(weight, window, without_gradient)
     agreeing = np.zeros(raster.shape, dtype=np.float32)

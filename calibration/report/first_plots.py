@@ -7,12 +7,12 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from acquisition.chart.model import Chart
 from calibration.figures.table_figures import TableFigures
 from calibration.radiometry.photon_transfer import PhotonTransfer, noise_levels
 from calibration.registration.registration import Registration
 from calibration.report.plots import CHANNEL_INK, FAINT, INK, MARK
 from calibration.sampling.samples import sites_at
+from experiment.chart.model import Chart
 
 _LEAST_LEVEL = 1.0
 """Counts from which on a level is drawn: the axes are logarithmic."""
@@ -67,12 +67,7 @@ def _mark(axes: Any, place_mm: _Array) -> None:
 def cell_noise(picture: _Image, chart: Chart, registration: Registration, window: int) -> tuple[_Array, _Array]:
     """Return mean and variance of the samples of each cell that is in the frame, both (N, 3) float64.
 
-    Parameters
-    ----------
-    picture
-        (H, W, 3) float32 counts above black, the frame at half size.
-    chart, registration, window
-        As for `calibration.report.plots.draw_registration`.
+    `picture`: (H, W, 3) float32 counts above black, the frame at half size.
     """
     height, width = picture.shape[:2]
     sites = sites_at(registration.to_pixels(chart.centres_mm), (height, width), window)
@@ -86,16 +81,7 @@ def cell_noise(picture: _Image, chart: Chart, registration: Registration, window
 def draw_noise(figure: Any, noise: tuple[_Array, _Array], transfer: PhotonTransfer, samples: int) -> None:
     """Draw the photon-transfer curve: the variance of one sample over its level, measured and fitted.
 
-    Parameters
-    ----------
-    figure
-        To draw on.
-    noise
-        Mean and variance of each cell, both (N, 3) float64, as `cell_noise` returns them.
-    transfer
-        The fitted curve.
-    samples
-        Samples of each cell.
+    `noise`: mean and variance of each cell, both (N, 3) float64, as `cell_noise` returns them.
     """
     from matplotlib.ticker import LogLocator, StrMethodFormatter
 

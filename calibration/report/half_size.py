@@ -11,25 +11,16 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from acquisition.framing.planes import CHANNELS, frame_black, phases
 from drivers.raw.rawfile import Mosaic
+from experiment.framing.planes import CHANNELS, frame_black, phases
 
 
 def half_size(mosaic: Mosaic, black: npt.NDArray[np.float64] | None = None) -> npt.NDArray[np.float32]:
     """Return a frame as linear RGB.
 
-    Parameters
-    ----------
-    mosaic
-        The frame, of any Bayer phase.
-    black
-        (2, 2) float64 counts of each position of the block; the masked border's mean if not given, or where there is
-        none, what the metadata state.
-
-    Returns
-    -------
-    ndarray
-        (H // 2, W // 2, 3) float32, counts above black; noise makes some of a dark frame's negative.
+    `black`: (2, 2) float64 counts of each position of the block; the masked border's mean if not given, or where there
+    is none, what the metadata state. Returns (H // 2, W // 2, 3) float32, counts above black; noise makes some of a
+    dark frame's negative.
     """
     black = frame_black(mosaic) if black is None else black
     blocks = mosaic.block_planes()

@@ -49,19 +49,7 @@ class Picture:
 def page(
     result: BuildResult, pictures: Sequence[Picture], places: Sequence[Picture] = (), worsts: Sequence[Worst] = ()
 ) -> str:
-    """Return the text of `report.html`: verdict, what to do, what to look at first, then all figures in groups.
-
-    Parameters
-    ----------
-    result
-        What the build found.
-    pictures
-        Of the figures, each with its group.
-    places
-        Of frames in which something is beyond its limit, shown with its causes.
-    worsts
-        Where the worst of each figure is.
-    """
+    """Return the text of `report.html`: verdict, what to do, what to look at first, then all figures in groups."""
     session = result.figures.session
     title = f"Table of {session.lights} lights, {session.camera}"
     first = "".join(picture_html(picture) for picture in pictures if picture.group == "first")

@@ -7,11 +7,11 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from acquisition.chart.model import Chart
 from calibration.causes.place_evidence import PrintPlace
 from calibration.figures.frame_figures import FrameFigures
 from calibration.registration.registration import Registration
 from calibration.report.plots import FAINT, INK, MARK, viewable
+from experiment.chart.model import Chart
 
 _LEAST_CIRCLE = 0.012
 """Radius of a circle at least, as a share of the page's width: one about a single cell is not seen in a thumbnail."""
@@ -29,16 +29,7 @@ LabelledPlace = tuple[str, PrintPlace]
 def draw_places(figure: Any, picture: _Image, chart: Chart, registration: Registration, places: Any) -> None:
     """Draw a frame with places circled and numbered as their list below the picture.
 
-    Parameters
-    ----------
-    figure
-        To draw on.
-    picture
-        (H, W, 3) float32 counts, the frame at half size.
-    chart, registration
-        The chart, and where it lies.
-    places
-        Labelled places (`LabelledPlace`); those of one label have one number.
+    `picture`: (H, W, 3) float32 counts, the frame at half size.
     """
     height, width = picture.shape[:2]
     numbers = {label: number for number, label in enumerate(dict.fromkeys(label for label, _ in places), 1)}
@@ -78,16 +69,8 @@ def draw_places(figure: Any, picture: _Image, chart: Chart, registration: Regist
 def reference_residuals(picture: _Image, places_mm: _Array, registration: Registration, frame: FrameFigures) -> _Array:
     """Return how far references are from a frame's field, (N,) shares, in its strongest channel; NaN beyond the frame.
 
-    Parameters
-    ----------
-    picture
-        (H, W, 3) float32 counts above black, the frame at half size.
-    places_mm
-        (N, 2) float64 mm, the white references.
-    registration
-        Where they lie.
-    frame
-        Its field and white.
+    `picture`: (H, W, 3) float32 counts above black, the frame at half size. `places_mm`: (N, 2) float64 mm, the white
+    references.
     """
     height, width = picture.shape[:2]
     columns, rows = np.rint(registration.to_pixels(places_mm)).astype(np.int64).T
@@ -103,16 +86,7 @@ def reference_residuals(picture: _Image, places_mm: _Array, registration: Regist
 def draw_reference_residuals(figure: Any, chart: Chart, places_mm: _Array, residual: _Array) -> None:
     """Draw what the field leaves of the white references, over the page and against the distance from its middle.
 
-    Parameters
-    ----------
-    figure
-        To draw on.
-    chart
-        The chart.
-    places_mm
-        (N, 2) float64 mm.
-    residual
-        (N,) shares, as `reference_residuals` returned them.
+    `places_mm`: (N, 2) float64 mm. `residual`: (N,) shares, as `reference_residuals` returned them.
     """
     page_w, page_h = chart.page_mm
     figure.set_size_inches(10, 3.6)

@@ -13,15 +13,15 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from acquisition.chart.model import Chart
-from acquisition.framing.movement import STILL_PX
-from acquisition.measures.flat_field import FlatField
-from acquisition.measures.stains import Stains
 from calibration.checks.frame_consistency import has_enough_cells
 from calibration.figures.table_figures import TableFigures
 from calibration.registration.registration import Registration
 from calibration.sampling.patch_statistics import rim_difference, sample_noise
 from calibration.sampling.samples import sites_at
+from experiment.chart.model import Chart
+from experiment.framing.movement import STILL_PX
+from experiment.measures.flat_field import FlatField
+from experiment.measures.stains import Stains
 from foundation.srgb import decode_srgb
 
 INK, FAINT, MARK = "#22262b", "#8a929c", "#e8502a"
@@ -255,20 +255,9 @@ def draw_chromaticities(
 ) -> None:
     """Draw the rb-chromaticities of the lights, as projected and as the camera sees them (the paper's figures).
 
-    Parameters
-    ----------
-    figure
-        To draw on.
-    codes
-        (L, 3) float64, 8-bit codes of the lights.
-    black_body
-        (L,) bool, which lights are black bodies.
-    white
-        (L, 3) float64 counts, the ground truth.
-    seen
-        Title of what the camera sees.
-    worst
-        Number of the light whose ground truth is known worst, which is ringed; None for no ring.
+    `codes`: (L, 3) float64, 8-bit codes of the lights. `black_body`: (L,) bool, which lights are black bodies. `white`:
+    (L, 3) float64 counts, the ground truth. `worst`: number of the light whose ground truth is known worst, which is
+    ringed; None for no ring.
     """
     figure.set_size_inches(10, 3.7)
     planned = decode_srgb(codes / 255)

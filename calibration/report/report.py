@@ -14,10 +14,6 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from acquisition.chart.model import Chart
-from acquisition.measures.flat_field import FlatField
-from acquisition.measures.stains import Stains
-from acquisition.session.folder import Session
 from calibration.figures.table_figures import TableFigures
 from calibration.report.first_plots import cell_noise, draw_errors, draw_noise
 from calibration.report.half_size import half_size
@@ -45,6 +41,10 @@ from calibration.table.file_names import REPORT_JSON, REPORT_PAGE
 from calibration.verdict.result import BuildResult
 from calibration.verdict.retaking import findings
 from drivers.raw.rawfile import read_raw
+from experiment.chart.model import Chart
+from experiment.measures.flat_field import FlatField
+from experiment.measures.stains import Stains
+from experiment.session.folder import Session
 from foundation.files import write_whole
 
 MOST_FRAMES = 4
@@ -52,17 +52,7 @@ MOST_FRAMES = 4
 
 
 def write_report(result: BuildResult, session: Session, folder: Path) -> None:
-    """Write `report.html` and `report.json` into a table's folder; costs some seconds.
-
-    Parameters
-    ----------
-    result
-        What the build found.
-    session
-        The session; the frame that was registered is read again for its pictures.
-    folder
-        Where the files are written.
-    """
+    """Write `report.html` and `report.json` into a table's folder; costs some seconds."""
     worsts = worst_of(result.figures, session.chart)
     pictures = _pictures(result, session, worsts)
     write_whole(folder / REPORT_PAGE, page(result, pictures, _place_pictures(result, session), worsts))

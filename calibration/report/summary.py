@@ -7,27 +7,21 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from acquisition.framing.visibility import MIN_CELL_PX
-from acquisition.measures.sensor_range import MAX_BLACK_DRIFT
 from calibration.checks.stray_light import CERTAIN
 from calibration.figures.table_figures import LightFigures, TableFigures
 from calibration.sampling.windows import SAFE_BLEED, bleed, largest_window
+from experiment.framing.visibility import MIN_CELL_PX
+from experiment.measures.sensor_range import MAX_BLACK_DRIFT
 
 
 @dataclass(frozen=True)
 class SummaryRow:
     """A figure in words.
 
-    Attributes
-    ----------
-    name
-        What was measured.
-    value
-        The figure with its unit.
-    note
-        What it means, or what is usual; may be "".
-    brief
-        Whether it is among the few that a command prints.
+    - `name`: what was measured.
+    - `value`: the figure with its unit.
+    - `note`: what it means, or what is usual; may be "".
+    - `brief`: whether it is among the few that a command prints.
     """
 
     name: str

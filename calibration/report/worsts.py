@@ -12,12 +12,12 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from acquisition.chart.model import Chart
 from calibration.causes.place_evidence import PrintPlace
 from calibration.figures.frame_figures import FrameFigures
 from calibration.figures.table_figures import TableFigures
 from calibration.report.groups import Group
 from calibration.verdict.thresholds import THRESHOLDS
+from experiment.chart.model import Chart
 
 _TITLES = {threshold.name: threshold.title for threshold in THRESHOLDS}
 
@@ -26,20 +26,12 @@ _TITLES = {threshold.name: threshold.title for threshold in THRESHOLDS}
 class Worst:
     """The worst of a figure.
 
-    Attributes
-    ----------
-    figure
-        Name of its limit (`calibration.verdict.thresholds`).
-    group
-        Its group of the report.
-    what
-        What is worst, in few words.
-    file
-        The frame, relative to the session; "" where it is of no frame alone.
-    light
-        The light's number; None where it is of no light alone.
-    place
-        Where on the print; None where it has no place.
+    - `figure`: name of its limit (`calibration.verdict.thresholds`).
+    - `group`: its group of the report.
+    - `what`: what is worst, in few words.
+    - `file`: the frame, relative to the session; "" where it is of no frame alone.
+    - `light`: the light's number; None where it is of no light alone.
+    - `place`: where on the print; None where it has no place.
     """
 
     figure: str

@@ -44,24 +44,10 @@ def sample(
 ) -> None:
     """Fill samples (N, window², 3) float32 and their highest counts `peak` (N,); patches that are not inside get 0.
 
-    Parameters
-    ----------
-    sensor
-        (photosites,) uint16.
-    corner
-        (N,) the top-left photosite of each patch's first pixel.
-    order
-        (N,) the patches as they are best visited: neighbours on the sensor one after another, for the memory's sake.
-    inside
-        (N,) whether a patch lies on the sensor.
-    step
-        Photosites from a block to the one below.
-    places
-        (4,) photosites from a block's top-left one to its red, its two greens and its blue.
-    window
-        Pixels along a patch's side.
-    black
-        (3,) float32 counts, of red, green and blue.
+    `sensor`: (photosites,) uint16. `corner`: (N,) the top-left photosite of each patch's first pixel. `order`: (N,) the
+    patches as they are best visited: neighbours on the sensor one after another, for the memory's sake. `inside`: (N,)
+    whether a patch lies on the sensor. `places`: (4,) photosites from a block's top-left one to its red, its two greens
+    and its blue. `black`: (3,) float32 counts, of red, green and blue.
     """
     red, green, other, blue = uint64(places[0]), uint64(places[1]), uint64(places[2]), uint64(places[3])
     for patch in order:

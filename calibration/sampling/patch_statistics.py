@@ -47,17 +47,8 @@ def rim_difference(
 ) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
     """Return by how much rim and middle of patches differ, and the standard deviation of that difference.
 
-    Parameters
-    ----------
-    samples
-        (N, S, 3) float32 or float64 counts above black, S = 9, 25, 49 or 81 row by row.
-    noise
-        (N, 3) float32 or float64, standard deviation of one of them, counts.
-
-    Returns
-    -------
-    difference, sigma
-        (N, 3) float64 counts.
+    `samples`: (N, S, 3) float32 or float64 counts above black, S = 9, 25, 49 or 81 row by row. `noise`: (N, 3) float32
+    or float64, standard deviation of one of them, counts. Returns (N, 3) float64 counts.
     """
     inner = _inner(samples.shape[1])
     middle = samples[:, inner].mean(axis=1, dtype=np.float64)
@@ -72,17 +63,9 @@ def unevenness(samples: npt.NDArray[np.floating], noise: npt.NDArray[np.floating
     exceeds both 5 of its standard deviations and 1 % of the patch. In a window of 3×3 the inner one is a single pixel,
     and what is found is coarse: 1.06 σ of one sample's noise, against 0.42 σ in 5×5.
 
-    Parameters
-    ----------
-    samples
-        (N, S, 3) float32 or float64 counts above black, the mean of one or more frames of equal light.
-    noise
-        (N, 3) float32 or float64 counts, standard deviation of one of these values.
-
-    Returns
-    -------
-    ndarray
-        (N,) float64, a share of the patch's level.
+    `samples`: (N, S, 3) float32 or float64 counts above black, the mean of one or more frames of equal light. `noise`:
+    (N, 3) float32 or float64 counts, standard deviation of one of these values. Returns (N,) float64, a share of the
+    patch's level.
     """
     difference, sigma = rim_difference(samples, noise)
     level = np.maximum(samples.mean(axis=1, dtype=np.float64), 1e-6)

@@ -17,9 +17,9 @@ from functools import cached_property
 import numpy as np
 import numpy.typing as npt
 
-from acquisition.framing.planes import CHANNELS, phases
-from acquisition.limits.bleed import WINDOW_PX
 from drivers.raw.rawfile import Mosaic
+from experiment.framing.planes import CHANNELS, phases
+from experiment.limits.bleed import WINDOW_PX
 
 WINDOW = WINDOW_PX
 """Pixels along the side of a cell's window, where the user names no other: the paper's."""
@@ -31,14 +31,9 @@ _Array = npt.NDArray[np.float64]
 class Sites:
     """Which half-size pixels patches are sampled at.
 
-    Attributes
-    ----------
-    rows, columns
-        (N,) int64, the pixel in the middle of each patch.
-    inside
-        (N,) bool, whether all its pixels lie in the frame.
-    window
-        Pixels along a patch's side, odd.
+    - `rows`, `columns`: (N,) int64, the pixel in the middle of each patch.
+    - `inside`: (N,) bool, whether all its pixels lie in the frame.
+    - `window`: pixels along a patch's side, odd.
     """
 
     rows: npt.NDArray[np.int64]
@@ -69,21 +64,9 @@ def gather(
 ) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.uint16]]:
     """Return the samples of patches.
 
-    Parameters
-    ----------
-    mosaic
-        The frame.
-    black
-        (2, 2) float64, counts, black level of each position of the block.
-    sites
-        N patches of S pixels.
-
-    Returns
-    -------
-    samples
-        (N, S, 3) float32, camera RGB, counts above black, row by row within a patch; 0 for patches outside.
-    highest
-        (N,) uint16, the highest raw count of a patch's photosites.
+    `black`: (2, 2) float64, counts, black level of each position of the block. Returns (N, S, 3) float32, camera RGB,
+    counts above black, row by row within a patch; 0 for patches outside. Returns (N,) uint16, the highest raw count of
+    a patch's photosites.
     """
     from calibration.sampling import kernels
 
@@ -144,19 +127,8 @@ def table_values(
     bright: by 0.4 σ where there is no light at all, by less than 0.01 σ from 2 σ of light on (σ one sample's noise).
     The ground truth is not clipped.
 
-    Parameters
-    ----------
-    samples
-        (N, S, 3) float32, counts above black.
-    field
-        (N, 3) float64, of each patch.
-    dark
-        (N, 3) float32, counts to subtract from each patch's samples; none if not given.
-
-    Returns
-    -------
-    ndarray
-        (N, S, 3) uint16.
+    `samples`: (N, S, 3) float32, counts above black. `field`: (N, 3) float64, of each patch. `dark`: (N, 3) float32,
+    counts to subtract from each patch's samples; none if not given. Returns (N, S, 3) uint16.
     """
     from calibration.sampling import kernels
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from acquisition.limits.bleed import bleed
+from experiment.limits.bleed import bleed
 
 WINDOWS = (3, 5, 7, 9)
 """Sides of windows, half-size px: odd, so that a cell has a middle pixel; a cell is about 10 px wide."""
@@ -16,11 +16,6 @@ def largest_window(cell_px: float, blur_px: float) -> int:
 
     5 on the EOS 550D and 7 on the 6D Mark II, whose cells have 10.2 and 12.4 px, at a blur of σ = 0.7 px.
 
-    Parameters
-    ----------
-    cell_px
-        Shorter side of a cell, half-size px.
-    blur_px
-        σ of the blur, half-size px.
+    `cell_px`: shorter side of a cell, half-size px. `blur_px`: σ of the blur, half-size px.
     """
     return max((window for window in WINDOWS if bleed(cell_px, blur_px, window) <= SAFE_BLEED), default=0)

@@ -16,14 +16,14 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from acquisition.measures.flat_field import FlatField
-from acquisition.measures.polynomials import page_polynomial, page_powers
 from calibration.registration.registration import Registration
 from calibration.sampling.samples import Sites, sites_at
 from calibration.spread.fitting import VARYING_BITS, ReferenceData, SpreadData, fit_spread, predicted_levels
 from calibration.spread.point_spread import FAR_PX, NEAR_PX, PLACES, PointSpread, kernel_of_terms, terms_of
 from calibration.spread.printed_grid import PrintedGrid
 from calibration.spread.surroundings import FrameLevels, NearLight, Surroundings, UsualLight, light_at, surroundings
+from experiment.measures.flat_field import FlatField
+from experiment.measures.polynomials import page_polynomial, page_powers
 
 _MARGIN_PX = 12.0
 """How far from the sheet's edge what lies behind it is looked at."""
@@ -44,20 +44,10 @@ _Array = npt.NDArray[np.float64]
 class PrintView:
     """What holds for all frames of a session: the print's grid, its usual light, and where it is looked past.
 
-    Attributes
-    ----------
-    grid, neighbours
-        The print.
-    whites
-        Places of the white references among the patches.
-    photosites_px
-        (3, 2) float64, where each channel's photosites lie from a block's centre.
-    frame_px
-        Rows and columns of the half-size frame.
-    light
-        The usual light.
-    beyond
-        Places that show what lies behind the print; none where the print fills the frame.
+    - `whites`: places of the white references among the patches.
+    - `photosites_px`: (3, 2) float64, where each channel's photosites lie from a block's centre.
+    - `frame_px`: rows and columns of the half-size frame.
+    - `beyond`: places that show what lies behind the print; none where the print fills the frame.
     """
 
     grid: PrintedGrid
@@ -80,20 +70,7 @@ class PrintView:
     ) -> PrintView:
         """Return the view of a session.
 
-        Parameters
-        ----------
-        grid, whites
-            As the attributes.
-        photosites_px
-            (3, 2) float64, where each channel's photosites lie from a block's centre.
-        field
-            Of the frame that is registered first.
-        registration
-            The chart's place in it.
-        shape
-            Rows and columns of the half-size frame.
-        window
-            Pixels along a patch's window.
+        `photosites_px`: (3, 2) float64, where each channel's photosites lie from a block's centre.
         """
         beyond = _places_beyond(grid, registration, shape, window)
         return PrintView(grid, grid.neighbours, whites, photosites_px, shape, light_at(grid, field), beyond)
@@ -110,16 +87,10 @@ class PrintView:
 class FrameCorrection:
     """The correction of frames that are sampled at the same places.
 
-    Attributes
-    ----------
-    around
-        The patches' surroundings.
-    near
-        Weights of the near kernels.
-    far, veil
-        Shares of the far kernels (F,), and of the veil.
-    beyond
-        Places that show what lies behind the print.
+    - `around`: the patches' surroundings.
+    - `near`: weights of the near kernels.
+    - `far`, `veil`: shares of the far kernels (F,), and of the veil.
+    - `beyond`: places that show what lies behind the print.
     """
 
     around: Surroundings
@@ -153,20 +124,13 @@ class FrameCorrection:
 class SpreadFrame:
     """A frame that the point spread is measured on.
 
-    Attributes
-    ----------
-    levels
-        What it shows.
-    field
-        (P, 3) float64, its flat field at the patches.
-    white
-        (3,) float64 counts, its bare paper.
-    usable
-        (P,) bool, patches that are in the frame, not clipped and not covered.
-    unevenness
-        As in `SpreadData`.
-    printed
-        (P,) int64, which references have one colour: a number for each, −1 of cells; None where they are not used.
+    - `levels`: what it shows.
+    - `field`: (P, 3) float64, its flat field at the patches.
+    - `white`: (3,) float64 counts, its bare paper.
+    - `usable`: (P,) bool, patches that are in the frame, not clipped and not covered.
+    - `unevenness`: as in `SpreadData`.
+    - `printed`: (P,) int64, which references have one colour: a number for each, −1 of cells; None where they are not
+      used.
     """
 
     levels: FrameLevels
@@ -181,26 +145,18 @@ class SpreadFrame:
 class LensFigures:
     """What the correction comes to under the light of the frames that it was measured on; cells above 300 counts.
 
-    Attributes
-    ----------
-    rms, worst
-        Change of the cells' means relative to paper, RMS and the largest; 0 where nothing is corrected.
-    residual, residual_worst
-        RMS error that the means have after it, and that of the cell that it is largest of: by the shares' standard
-        errors, proven or not, and by what is likely of the veil but not subtracted.
-    worst_level
-        Level of that cell, bare paper 1.
-    veil, veil_error
-        Likeliest share of the frame's mean light that lies on all of it, subtracted or not, and its standard error.
-    beyond_cell
-        Share of the light of a window's worst sample that the kernels bring from beyond its cell, channel by channel
-        the largest.
-    left_in_worst
-        The same beyond that of the window's mean, which is what is corrected.
-    measured, corrected
-        Whether the lens could be measured on the print, and whether samples and ground truth are corrected by it.
-    why_not
-        Why nothing was measured or nothing is corrected; "" where it is.
+    - `rms`, `worst`: change of the cells' means relative to paper, RMS and the largest; 0 where nothing is corrected.
+    - `residual`, `residual_worst`: RMS error that the means have after it, and that of the cell that it is largest of:
+      by the shares' standard errors, proven or not, and by what is likely of the veil but not subtracted.
+    - `worst_level`: level of that cell, bare paper 1.
+    - `veil`, `veil_error`: likeliest share of the frame's mean light that lies on all of it, subtracted or not, and its
+      standard error.
+    - `beyond_cell`: share of the light of a window's worst sample that the kernels bring from beyond its cell, channel
+      by channel the largest.
+    - `left_in_worst`: the same beyond that of the window's mean, which is what is corrected.
+    - `measured`, `corrected`: whether the lens could be measured on the print, and whether samples and ground truth are
+      corrected by it.
+    - `why_not`: why nothing was measured or nothing is corrected; "" where it is.
     """
 
     rms: float
@@ -255,10 +211,7 @@ class LensFigures:
 class LensCorrection:
     """The lens of a session: its point spread, what is said of it, and the view by which frames are corrected.
 
-    Attributes
-    ----------
-    view, spread, figures
-        As said.
+    `view`, `spread`, `figures`: as said.
     """
 
     view: PrintView
@@ -289,18 +242,7 @@ def measure_spread(
 ) -> tuple[PointSpread, LensFigures] | None:
     """Return the point spread that frames show, and its figures; None where no frame is bright enough.
 
-    Parameters
-    ----------
-    frames
-        Best of one primary each, whose field is the same for all cells.
-    around
-        The patches' surroundings, the same in all of them.
-    page_mm
-        Width and height of the page.
-    bits
-        Bits of each channel of a code.
-    least_counts
-        Counts of bare paper from which on a channel is used, and of a cell from which on figures count it.
+    `least_counts`: counts of bare paper from which on a channel is used, and of a cell from which on figures count it.
     """
     if not frames:
         return None

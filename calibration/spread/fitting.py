@@ -24,8 +24,8 @@ from itertools import pairwise
 import numpy as np
 import numpy.typing as npt
 
-from acquisition.measures.polynomials import page_polynomial, page_powers
 from calibration.spread.point_spread import LEAST_GAIN, TERMS, PointSpread, free_terms, groups_of_terms, terms_of
+from experiment.measures.polynomials import page_polynomial, page_powers
 from foundation.robust import MAD_TO_SIGMA
 
 MOST_MISFIT = 5.0
@@ -97,20 +97,13 @@ _Array = npt.NDArray[np.float64]
 class SpreadData:
     """A channel of a frame: what cells show, and what kernels would change of it.
 
-    Attributes
-    ----------
-    channel
-        0, 1 or 2.
-    level
-        (C,) float64, bare paper 1, the field divided out.
-    changes
-        (C, T) float64, change of `level` for a whole share of each unknown of the channel, by the light that comes in.
-    even
-        (C,) float64, change of `level` for light that lies evenly over all of the frame.
-    usable
-        (C,) bool.
-    unevenness
-        Standard deviation of the coefficients of smooth factors.
+    - `channel`: 0, 1 or 2.
+    - `level`: (C,) float64, bare paper 1, the field divided out.
+    - `changes`: (C, T) float64, change of `level` for a whole share of each unknown of the channel, by the light that
+      comes in.
+    - `even`: (C,) float64, change of `level` for light that lies evenly over all of the frame.
+    - `usable`: (C,) bool.
+    - `unevenness`: standard deviation of the coefficients of smooth factors.
     """
 
     channel: int
@@ -125,18 +118,11 @@ class SpreadData:
 class ReferenceData:
     """A channel of a frame at references of one colour, whose level no model of colours has to predict.
 
-    Attributes
-    ----------
-    channel
-        0, 1 or 2.
-    level
-        (N,) float64, bare paper 1, the field divided out.
-    changes
-        (N, T) float64, as in `SpreadData`.
-    places_mm
-        (N, 2) float64.
-    order
-        Order over the page of what the field's fit takes out of them, or may leave.
+    - `channel`: 0, 1 or 2.
+    - `level`: (N,) float64, bare paper 1, the field divided out.
+    - `changes`: (N, T) float64, as in `SpreadData`.
+    - `places_mm`: (N, 2) float64.
+    - `order`: order over the page of what the field's fit takes out of them, or may leave.
     """
 
     channel: int
@@ -167,17 +153,8 @@ def colour_residual(columns: npt.NDArray[np.floating], bits: int) -> tuple[_Arra
     further apart than the 32 levels of a full chart, it is corrected for the curvature: the mean over the codes beside
     it across that axis.
 
-    Parameters
-    ----------
-    columns
-        (C, M) float, values of C = 8**bits cells in the order of colour indices.
-    bits
-        Bits of each channel of a code, 2 or more.
-
-    Returns
-    -------
-    residual, known
-        (C, M) float64, and (C,) bool, whether a cell has two neighbours along any axis.
+    `columns`: (C, M) float, values of C = 8**bits cells in the order of colour indices. Returns (C, M) float64, and
+    (C,) bool, whether a cell has two neighbours along any axis.
     """
     from calibration.spread import kernels
 
@@ -224,18 +201,7 @@ def fit_spread(
 ) -> PointSpread | None:
     """Return the point spread that explains best what cells differ by; None where nothing can be fitted.
 
-    Parameters
-    ----------
-    data
-        Channels of frames.
-    cells_mm
-        (C, 2) float64 mm, the cells' centres.
-    page_mm
-        Width and height of the page.
-    bits
-        Bits of each channel of a code.
-    references
-        The same frames' references: on a chart of few colours, whose codes stand far apart, they say more than cells.
+    `cells_mm`: (C, 2) float64 mm, the cells' centres.
     """
     if not data:
         return None

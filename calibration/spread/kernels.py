@@ -69,20 +69,11 @@ def weights_around(
 ) -> None:  # fmt: skip
     """Fill weights (N, 25, 3) and others (N, 3 kinds, 3) float32 of light from the slots around patches.
 
-    Parameters
-    ----------
-    row, column, neighbours, parts
-        (N,), (N,) int64, (N, 25) and (5 R, 5 K) int32, as in `PrintedGrid`.
-    offset
-        (N, 3, 2) float64 px along the print's axes, from a patch's centre to its window's, for each channel.
-    pitch
-        (N, 2) float64 px, a slot's width and height at each patch.
-    shares
-        (K, pitches, offsets, 25) float64, from `window_shares`.
-    grid
-        (4,) first pitch and its step, first offset and its step.
-    amount
-        (N, 3, K) float64, how much of each kernel there is in each channel at each patch.
+    `row`, `column`, `neighbours`, `parts`: (N,), (N,) int64, (N, 25) and (5 R, 5 K) int32, as in `PrintedGrid`.
+    `offset`: (N, 3, 2) float64 px along the print's axes, from a patch's centre to its window's, for each channel.
+    `pitch`: (N, 2) float64 px, a slot's width and height at each patch. `shares`: (K, pitches, offsets, 25) float64,
+    from `window_shares`. `grid`: (4,) first pitch and its step, first offset and its step. `amount`: (N, 3, K) float64,
+    how much of each kernel there is in each channel at each patch.
     """
     kernels, count = shares.shape[0], len(row)
     x, y = np.empty(ACROSS * PARTS), np.empty(ACROSS * PARTS)

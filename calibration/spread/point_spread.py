@@ -49,12 +49,7 @@ def kernel_names() -> list[str]:
 def place_terms(places_px: npt.NDArray[np.floating], frame_px: tuple[int, int]) -> _Array:
     """Return the terms (N, 9) float64 of a near kernel's share at pixels: products of Legendre polynomials, 1 first.
 
-    Parameters
-    ----------
-    places_px
-        (N, 2) float half-size px, x then y.
-    frame_px
-        Rows and columns of the frame.
+    `places_px`: (N, 2) float half-size px, x then y.
     """
     unit = 2 * np.clip(places_px / (np.array(frame_px[::-1]) - 1.0), 0, 1) - 1
     x, y = (np.stack([np.ones_like(t), t, 1.5 * t**2 - 0.5], axis=-1) for t in unit.T)
@@ -94,23 +89,15 @@ def free_terms() -> npt.NDArray[np.bool_]:
 class PointSpread:
     """What a lens spreads beside its sharp core, as measured on the print.
 
-    Attributes
-    ----------
-    shares
-        (TERMS,) float64, unknowns as `terms_of` has them, by which frames are corrected: 0 where a kernel is not
-        proven, all of them where none is. Every lens has a veil: beside a proven kernel it has its likeliest share.
-    covariance
-        (TERMS, TERMS) float64, of all unknowns measured together, proven or not.
-    gain
-        By how much the kernels lower the sum of squares of what cells of known colour differ by, in units of its
-        variance: what chance gives is one for each unknown; the proven ones'.
-    held_out
-        The same for parts of the print that the shares were not fitted on, each from the others.
-    misfit
-        What is left of light that lies smoothly over the print and is none of the kernels', over what chance leaves,
-        ≥ 1: the covariance has been multiplied by it.
-    likeliest
-        (TERMS,) float64, as `shares`, whether they are proven or not: what is known beside the covariance.
+    - `shares`: (TERMS,) float64, unknowns as `terms_of` has them, by which frames are corrected: 0 where a kernel is
+      not proven, all of them where none is. Every lens has a veil: beside a proven kernel it has its likeliest share.
+    - `covariance`: (TERMS, TERMS) float64, of all unknowns measured together, proven or not.
+    - `gain`: by how much the kernels lower the sum of squares of what cells of known colour differ by, in units of its
+      variance: what chance gives is one for each unknown; the proven ones'.
+    - `held_out`: the same for parts of the print that the shares were not fitted on, each from the others.
+    - `misfit`: what is left of light that lies smoothly over the print and is none of the kernels', over what chance
+      leaves, ≥ 1: the covariance has been multiplied by it.
+    - `likeliest`: (TERMS,) float64, as `shares`, whether they are proven or not: what is known beside the covariance.
     """
 
     shares: _Array

@@ -1,6 +1,6 @@
 """What is printed around each patch: cells and references in slots of one size, tags and margins in fifths of a slot.
 
-Charts of `acquisition.chart.layout` are made so: every cell and reference fills a slot, a tag has 4 × 4 of them and a
+Charts of `experiment.chart.layout` are made so: every cell and reference fills a slot, a tag has 4 × 4 of them and a
 module is two fifths of one. A patch is a cell (in the order of colour indices) or a reference behind them, the white
 ones before the grey ones. Slots and millimetres on the print; knows nothing of frames.
 """
@@ -12,8 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from acquisition.chart.model import Chart
-from acquisition.chart.printing import drawing
+from experiment.chart.model import Chart
+from experiment.chart.printing import drawing
 
 PARTS = 5
 """Parts along a slot: a tag's module is two of them, so that every edge printed lies between two parts."""
@@ -36,23 +36,14 @@ _Index = npt.NDArray[np.int32]
 class PrintedGrid:
     """The print as a grid of slots.
 
-    Attributes
-    ----------
-    pitch_mm
-        Width and height of a slot.
-    points_mm
-        (P, 2) float64 mm, centres of the patches: C cells, then references.
-    row, column
-        (P,) int64, the slot of each patch.
-    source
-        (R, K) int32, the patch in each slot; −1 where there is none.
-    parts
-        (5 R, 5 K) int32, the patch that each part of a slot shows; P for bare paper, P + 1 for black ink, P + 2 beyond
-        the sheet.
-    others
-        (R, K, 3) float32, share of each slot that is bare paper, black ink, and beyond the sheet.
-    slots_mm
-        (R K, 2) float64 mm, centres of the slots.
+    - `pitch_mm`: width and height of a slot.
+    - `points_mm`: (P, 2) float64 mm, centres of the patches: C cells, then references.
+    - `row`, `column`: (P,) int64, the slot of each patch.
+    - `source`: (R, K) int32, the patch in each slot; −1 where there is none.
+    - `parts`: (5 R, 5 K) int32, the patch that each part of a slot shows; P for bare paper, P + 1 for black ink, P + 2
+      beyond the sheet.
+    - `others`: (R, K, 3) float32, share of each slot that is bare paper, black ink, and beyond the sheet.
+    - `slots_mm`: (R K, 2) float64 mm, centres of the slots.
     """
 
     pitch_mm: tuple[float, float]

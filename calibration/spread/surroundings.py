@@ -17,14 +17,14 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from acquisition.framing.planes import CHANNELS, channel_offset_px, phases
-from acquisition.measures.flat_field import FlatField
 from calibration.registration.registration import Registration
 from calibration.sampling.samples import Sites
 from calibration.spread import kernels
 from calibration.spread.point_spread import NEAR_PX, place_terms
 from calibration.spread.printed_grid import PARTS, PrintedGrid
 from drivers.raw.rawfile import Mosaic
+from experiment.framing.planes import CHANNELS, channel_offset_px, phases
+from experiment.measures.flat_field import FlatField
 
 _OFFSETS_PX = (-2.0, 1 / 16, 65)
 """First, step and number of the offsets of windows that shares are tabulated at: rounding, a quarter pixel of the
@@ -44,12 +44,8 @@ _Float = npt.NDArray[np.float32]
 class FrameLevels:
     """What a frame shows, before the lens is corrected.
 
-    Attributes
-    ----------
-    patches
-        (P, 3) float64 counts, mean of each patch.
-    beyond
-        (3,) float64 counts, what lies behind the print.
+    - `patches`: (P, 3) float64 counts, mean of each patch.
+    - `beyond`: (3,) float64 counts, what lies behind the print.
     """
 
     patches: _Array
@@ -60,12 +56,9 @@ class FrameLevels:
 class UsualLight:
     """The field of the session's first frame, by which the light of what is not measured is known in all of them.
 
-    Attributes
-    ----------
-    patches, slots
-        (P, 3) and (R K, 3) float64, at patches and slots; beyond the outermost patches as at those.
-    elsewhere
-        (3 kinds, 3) float64, bare paper, black ink and what lies behind, the last unlit, summed over all slots.
+    - `patches`, `slots`: (P, 3) and (R K, 3) float64, at patches and slots; beyond the outermost patches as at those.
+    - `elsewhere`: (3 kinds, 3) float64, bare paper, black ink and what lies behind, the last unlit, summed over all
+      slots.
     """
 
     patches: _Array
@@ -84,22 +77,14 @@ class UsualLight:
 class Surroundings:
     """A frame's patches and what lies around them; made by `surroundings`.
 
-    Attributes
-    ----------
-    grid, window
-        The print, and pixels along a patch's window.
-    neighbours
-        (P, 25) int32, as in `PrintedGrid`.
-    offset_px
-        (P, 3, 2) float64, from each patch's centre to the middle of its window, along the print's axes, by channel.
-    pitch_px
-        (P, 2) float64, a slot's width and height.
-    places
-        (P, 9) float64, the terms of a share over the frame at each patch (`place_terms`).
-    whites
-        Places of the white references among the patches.
-    light
-        The usual light of the session.
+    - `grid`, `window`: the print, and pixels along a patch's window.
+    - `neighbours`: (P, 25) int32, as in `PrintedGrid`.
+    - `offset_px`: (P, 3, 2) float64, from each patch's centre to the middle of its window, along the print's axes, by
+      channel.
+    - `pitch_px`: (P, 2) float64, a slot's width and height.
+    - `places`: (P, 9) float64, the terms of a share over the frame at each patch (`place_terms`).
+    - `whites`: places of the white references among the patches.
+    - `light`: the usual light of the session.
     """
 
     grid: PrintedGrid
@@ -176,16 +161,11 @@ class Surroundings:
 class NearLight:
     """The weights by which near kernels bring light to patches.
 
-    Attributes
-    ----------
-    neighbours
-        (P, 25) int32, the patches around each.
-    weights, others
-        (P, 25, 3) and (P, 3 kinds, 3) float32, of each of them, and of bare paper, black ink and what lies behind.
-    total
-        (P, 3) float64, sum of a patch's weights.
-    light
-        (P, 3) float64, the usual field of the session at the patches.
+    - `neighbours`: (P, 25) int32, the patches around each.
+    - `weights`, `others`: (P, 25, 3) and (P, 3 kinds, 3) float32, of each of them, and of bare paper, black ink and
+      what lies behind.
+    - `total`: (P, 3) float64, sum of a patch's weights.
+    - `light`: (P, 3) float64, the usual field of the session at the patches.
     """
 
     neighbours: npt.NDArray[np.int32]
@@ -229,22 +209,8 @@ def surroundings(
 ) -> Surroundings:
     """Return the surroundings of the patches of a frame.
 
-    Parameters
-    ----------
-    grid
-        The print.
-    neighbours
-        (P, 25) int32, as in `PrintedGrid`.
-    mosaic_offsets_px
-        (3, 2) float64, where each channel's photosites lie from a block's centre, `photosite_offsets_px`.
-    frame_px
-        Rows and columns of the half-size frame.
-    registration, cells, references
-        The chart's place, and where the patches are sampled.
-    whites
-        Places of the white references among the patches.
-    light
-        The usual light of the session.
+    `neighbours`: (P, 25) int32, as in `PrintedGrid`. `mosaic_offsets_px`: (3, 2) float64, where each channel's
+    photosites lie from a block's centre, `photosite_offsets_px`.
     """
     half = np.array(grid.pitch_mm) / 2
     points = grid.points_mm

@@ -20,12 +20,12 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from acquisition.lights.illuminations import Illumination, load_illuminations
 from calibration.table.file_names import FRAMES, ILLUMINATIONS, PROVENANCE, SAMPLES, SUMS
 from calibration.table.provenance import Provenance, parse_provenance
 from calibration.table.sample_hashes import light_sha256, map_samples
 from calibration.table.source_frames import SourceFrame, load_frames
 from calibration.table.sums import require_listed, require_plain_table
+from experiment.lights.illuminations import Illumination, load_illuminations
 from foundation.errors import FormatError
 from foundation.files import partial_path
 from foundation.hashing import file_sha256

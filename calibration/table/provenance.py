@@ -34,39 +34,23 @@ class Unfit(BaseModel):
 class Provenance(BaseModel):
     """The content of `lut.json`.
 
-    Attributes
-    ----------
-    camera
-        Maker and model as the raw files name it.
-    bits
-        Bits kept of each channel; the table has 8**bits colours.
-    white_level
-        Sample value of sensor saturation: linear camera RGB after black subtraction.
-    corrections
-        What was applied to the counts, with its parameters, in order.
-    session_sha256
-        Hash over the frames' hashes (`calibration.table.source_frames.frames_sha256`).
-    chart_sha256
-        Hash of the chart.
-    software
-        Name and version of the program that built the table.
-    unfit
-        Cells unfit for use.
-    samples_sha256, illuminations_sha256
-        Of the files; None in tables made before they were recorded.
-    lights_sha256
-        Of each light's samples as they lie in the file, in the order of lights, so that damage can be traced to a
-        light; empty in tables made before they were recorded.
-    files_sha256
-        Of further files of the table, `references.csv`; empty in tables made before they were recorded.
-    has_sums
-        Whether `SHA256SUMS` lists every file of the table; false in tables made before it was written.
-    computed
-        Where the table was computed from spectra and a model of the sensor and nothing was photographed: by what,
-        and with which settings. None where it was made from frames.
-    origin
-        With what, when and by whom the frames were taken, and under which licence the table may be used; None in tables
-        made before it was kept, and in computed ones of which nothing is stated.
+    - `camera`: maker and model as the raw files name it.
+    - `bits`: bits kept of each channel; the table has 8**bits colours.
+    - `white_level`: sample value of sensor saturation: linear camera RGB after black subtraction.
+    - `corrections`: what was applied to the counts, with its parameters, in order.
+    - `session_sha256`: hash over the frames' hashes (`calibration.table.source_frames.frames_sha256`).
+    - `chart_sha256`: hash of the chart.
+    - `software`: name and version of the program that built the table.
+    - `unfit`: cells unfit for use.
+    - `samples_sha256`, `illuminations_sha256`: of the files; None in tables made before they were recorded.
+    - `lights_sha256`: of each light's samples as they lie in the file, in the order of lights, so that damage can be
+      traced to a light; empty in tables made before they were recorded.
+    - `files_sha256`: of further files of the table, `references.csv`; empty in tables made before they were recorded.
+    - `has_sums`: whether `SHA256SUMS` lists every file of the table; false in tables made before it was written.
+    - `computed`: where the table was computed from spectra and a model of the sensor and nothing was photographed: by
+      what, and with which settings. None where it was made from frames.
+    - `origin`: with what, when and by whom the frames were taken, and under which licence the table may be used; None
+      in tables made before it was kept, and in computed ones of which nothing is stated.
     """
 
     model_config = ConfigDict(frozen=True, extra="ignore")
@@ -109,20 +93,7 @@ class _Head(BaseModel):
 
 
 def parse_provenance(text: bytes, path: Path) -> Provenance:
-    """Return the content of `lut.json` from its bytes.
-
-    Parameters
-    ----------
-    text
-        UTF-8.
-    path
-        Where it was read, for messages.
-
-    Raises
-    ------
-    FormatError
-        It is damaged, no table's, or of a version not known here.
-    """
+    """Return the content of `lut.json` from its bytes."""
     try:
         head = _Head.model_validate_json(text)
     except ValidationError as error:

@@ -25,20 +25,7 @@ def light_sha256(samples: npt.NDArray[np.uint16]) -> str:
 
 
 def map_samples(path: Path, lights: int, bits: int) -> npt.NDArray[np.uint16]:
-    """Return `samples.npy` (lights, 8**bits, samples, 3) uint16, mapped from the disk.
-
-    Parameters
-    ----------
-    path
-        The file; it may be a stranger's.
-    lights, bits
-        Its shape, as the table's other files say.
-
-    Raises
-    ------
-    FormatError
-        It cannot be read, is of another shape or type, or has fewer or more bytes than its head says.
-    """
+    """Return `samples.npy` (lights, 8**bits, samples, 3) uint16, mapped from the disk."""
     try:
         with path.open("rb") as stream:
             version = np.lib.format.read_magic(stream)
@@ -66,19 +53,7 @@ def samples_sha256(
 ) -> tuple[str, list[str]]:
     """Return the hash of the file, and of each light's part of it, read once and in order.
 
-    Parameters
-    ----------
-    path
-        `samples.npy`.
-    samples
-        (L, 8**bits, S, 3) uint16, the same file mapped: its shape is used.
-    progress
-        Called with the number of lights read, and the number of all.
-
-    Raises
-    ------
-    FormatError
-        The file cannot be read.
+    `samples`: (L, 8**bits, S, 3) uint16, the same file mapped: its shape is used.
     """
     whole, lights = hashlib.sha256(), list[str]()
     size = samples[0].nbytes

@@ -20,16 +20,10 @@ COLUMNS: Final = ("kind", "illumination", "file", "sha256")
 class SourceFrame:
     """A raw file that a table was made from.
 
-    Attributes
-    ----------
-    kind
-        ``light``, ``white`` or ``dark``.
-    illumination
-        Number of the light; None for white and dark frames.
-    file
-        Path relative to the session's folder.
-    sha256
-        Of the file.
+    - `kind`: ``light``, ``white`` or ``dark``.
+    - `illumination`: number of the light; None for white and dark frames.
+    - `file`: path relative to the session's folder.
+    - `sha256`: of the file.
     """
 
     kind: str
@@ -56,13 +50,7 @@ def frames_csv(frames: Sequence[SourceFrame]) -> str:
 
 
 def load_frames(path: Path) -> tuple[SourceFrame, ...]:
-    """Return the frames that a `frames.csv` lists, in the order taken; none where the file does not exist.
-
-    Raises
-    ------
-    FormatError
-        The file is damaged or cannot be read.
-    """
+    """Return the frames that a `frames.csv` lists, in the order taken; none where the file does not exist."""
     if not path.is_file():
         return ()
     try:

@@ -51,29 +51,14 @@ RESTORE: Final = "restore it from a copy, fetch the table again, or build it ane
 
 
 def sums_of(folder: Path, samples_sha256: str, provenance: str) -> str:
-    """Return the text of `SHA256SUMS` of a table that is complete but for `lut.json`.
-
-    Parameters
-    ----------
-    folder
-        The table; the hashes of its texts are read from it.
-    samples_sha256, provenance
-        Hash of `samples.npy`, and of the text of `lut.json`.
-    """
+    """Return the text of `SHA256SUMS` of a table that is complete but for `lut.json`."""
     hashes = {name: file_sha256(folder / name) for name in _TEXTS if (folder / name).is_file()}
     hashes |= {SAMPLES: samples_sha256, PROVENANCE: provenance}
     return "".join(f"{hashes[name]}  {name}\n" for name in sorted(hashes))
 
 
 def parse_sums(text: str, path: Path) -> dict[str, str]:
-    """Return the hashes of a table's files by name.
-
-    Raises
-    ------
-    FormatError
-        A line is none of `sha256sum`'s, names a file twice or one outside the folder, or a file that every table has is
-        not listed.
-    """
+    """Return the hashes of a table's files by name."""
     hashes: dict[str, str] = {}
     for number, line in enumerate(text.splitlines(), 1):
         found = _LINE.fullmatch(line)
@@ -92,13 +77,7 @@ def require_plain_table(folder: Path) -> None:
 
 
 def known_sums(folder: Path, provenance: Provenance) -> dict[str, str]:
-    """Return the recorded hashes of a table's files by name, `samples.npy` included; of older tables what they have.
-
-    Raises
-    ------
-    FormatError
-        `SHA256SUMS` is missing or damaged.
-    """
+    """Return the recorded hashes of a table's files by name, `samples.npy` included; of older tables what they have."""
     if provenance.has_sums:
         path = folder / SUMS
         try:
@@ -115,15 +94,7 @@ def known_sums(folder: Path, provenance: Provenance) -> dict[str, str]:
 
 
 def changed_files(folder: Path, known: Mapping[str, str]) -> Iterator[str]:
-    """Yield, in words, each file of a table but its samples that is not as it was built, is gone, or is not listed.
-
-    Parameters
-    ----------
-    folder
-        The table.
-    known
-        As `known_sums` returns them.
-    """
+    """Yield, in words, each file of a table but its samples that is not as it was built, is gone, or is not listed."""
     for name, then in known.items():
         path = folder / name
         if name == SAMPLES or (name in OPTIONAL and not path.exists()):
@@ -142,22 +113,7 @@ def changed_files(folder: Path, known: Mapping[str, str]) -> Iterator[str]:
 
 
 def require_listed(folder: Path, provenance: Provenance, lights: int) -> dict[str, str]:
-    """Return the recorded hashes of a table's files after holding all but the samples against them.
-
-    Parameters
-    ----------
-    folder
-        The table.
-    provenance
-        Its `lut.json`.
-    lights
-        How many lights it has.
-
-    Raises
-    ------
-    FormatError
-        A file has changed, is gone, or is not listed; or the hashes are not as many as the lights.
-    """
+    """Return the recorded hashes of a table's files after holding all but the samples against them."""
     hashes = len(provenance.lights_sha256)
     if hashes not in (lights, 0) or (provenance.has_sums and not hashes):
         raise FormatError(

@@ -13,20 +13,7 @@ from foundation.errors import FormatError, InputError, first_of
 
 
 def find_faults(lut: Lut, progress: Callable[[int, int], None] | None = None) -> list[str]:
-    """Return what of a table is not as it was built, each fault in words; none where all is. Reads every byte of it.
-
-    Parameters
-    ----------
-    lut
-        The table.
-    progress
-        Called with the number of lights read, and the number of all.
-
-    Raises
-    ------
-    InputError
-        The table was made before hashes were recorded, so nothing can be said.
-    """
+    """Return what of a table is not as it was built, each fault in words; none where all is. Reads every byte of it."""
     known = lut.provenance
     if known.samples_sha256 is None or len(known.lights_sha256) != len(lut.illuminations):
         raise InputError(
@@ -63,11 +50,6 @@ def require_match(one: Lut, other: Lut) -> None:
 
     Tables of one chart under one list of lights, photographed by two bodies or on two days, pass: colour index and
     light index then mean the same in both.
-
-    Raises
-    ------
-    FormatError
-        The chart, its bits, or the lights differ; the message says in what.
     """
     ours, theirs = one.provenance, other.provenance
     found: list[str] = []

@@ -12,13 +12,13 @@ from types import MappingProxyType
 import numpy as np
 import numpy.typing as npt
 
-from acquisition.lights.illuminations import COLUMNS, NAME, Illumination
 from calibration.table.file_names import FRAMES, ILLUMINATIONS, PROVENANCE, SAMPLES, SUMS
 from calibration.table.lut import WHITE_COLUMNS
 from calibration.table.provenance import Provenance
 from calibration.table.sample_hashes import light_sha256, samples_sha256
 from calibration.table.source_frames import SourceFrame, frames_csv
 from calibration.table.sums import sums_of
+from experiment.lights.illuminations import COLUMNS, NAME, Illumination
 from foundation.errors import StorageError
 from foundation.files import storage_error, write_whole
 from foundation.hashing import sha256_of
@@ -29,24 +29,7 @@ class LutWriter:
 
     The samples' whole size is claimed at the start, so that a full disk is met before the work and not in its midst.
 
-    Parameters
-    ----------
-    folder
-        Where the table is made.
-    lights, colours, samples
-        Its shape.
-    written
-        SHA-256 of the samples of lights that an earlier writer put into this folder; they are left as they are.
-
-    Attributes
-    ----------
-    sha256
-        SHA-256 of the samples of each light that was put, by its number.
-
-    Raises
-    ------
-    StorageError
-        The disk is full or read-only.
+    `sha256`: SHA-256 of the samples of each light that was put, by its number.
     """
 
     def __init__(
@@ -69,13 +52,7 @@ class LutWriter:
             raise storage_error(self._path, error) from error
 
     def put(self, light: int, samples: npt.NDArray[np.uint16]) -> None:
-        """Store the samples (colours, samples, 3) uint16 of light number `light`.
-
-        Raises
-        ------
-        StorageError
-            The disk is full or read-only.
-        """
+        """Store the samples (colours, samples, 3) uint16 of light number `light`."""
         data = np.ascontiguousarray(np.broadcast_to(samples, self._shape[1:]), dtype="<u2").tobytes()
         try:
             with self._path.open("r+b") as stream:
@@ -90,13 +67,7 @@ class LutWriter:
         return np.array(np.load(self._path, mmap_mode="r", allow_pickle=False)[light])
 
     def flush(self) -> None:
-        """Wait until the disk holds what was put (`fsync`).
-
-        Raises
-        ------
-        StorageError
-            It cannot.
-        """
+        """Wait until the disk holds what was put (`fsync`)."""
         try:
             with self._path.open("r+b") as stream:
                 os.fsync(stream.fileno())
@@ -120,23 +91,7 @@ class LutWriter:
 
         A report of the table must be in the folder by now: its hash is written too.
 
-        Parameters
-        ----------
-        illuminations
-            The L lights.
-        white
-            (L, 3) float64, the ground truth.
-        provenance
-            The content of `lut.json`; the hashes of samples and lights are added here.
-        frames
-            What the table was made from, in the order taken.
-        files
-            Further files of the table, their text by name.
-
-        Raises
-        ------
-        StorageError
-            The disk is full or read-only, or did not keep what was written to it.
+        `white`: (L, 3) float64, the ground truth.
         """
         self.flush()
         whole, lights = samples_sha256(self._path, np.load(self._path, mmap_mode="r", allow_pickle=False))

@@ -27,7 +27,6 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
-from acquisition.lights.illuminations import load_illuminations
 from calibration.table.file_names import ILLUMINATIONS, PROVENANCE, SAMPLES
 from calibration.table.lut import Lut, open_lut
 from calibration.table.provenance import parse_provenance
@@ -47,6 +46,7 @@ from calibration.table.published_claims import (
 )
 from calibration.table.sample_hashes import light_sha256
 from calibration.table.sums import known_sums, require_listed
+from experiment.lights.illuminations import load_illuminations
 from foundation.errors import CropError, FormatError, InputError, StorageError
 from foundation.files import require_free, storage_error, whole_folder, write_whole
 from foundation.hashing import file_sha256
@@ -59,25 +59,7 @@ ReportLights = Callable[[int, int], None]
 
 
 def publish(lut: Lut, url: str, progress: ReportLights | None = None) -> None:
-    """Write a table to a store.
-
-    Parameters
-    ----------
-    lut
-        The table.
-    url
-        Where to: a path, or a URL that fsspec knows, such as ``s3://bucket/eos550d``. Must be free, or hold a table
-        that was never finished.
-    progress
-        Called with the number of lights written, and the number of all.
-
-    Raises
-    ------
-    InputError
-        Something is there already, or zarr is not installed.
-    StorageError
-        The store cannot be written.
-    """
+    """Write a table to a store."""
     zarr = _zarr()
     lights, colours, samples, _ = lut.samples.shape
     _require_free(url)
@@ -117,26 +99,7 @@ def fetch(url: str, folder: Path, progress: ReportLights | None = None, expect: 
     What a store claims is believed only as far as it fits together and on the disk: the texts come first, and say how
     large the samples are; each light is held against its hash when it has come.
 
-    Parameters
-    ----------
-    url
-        Where it was published.
-    folder
-        Must be free; appears when the table is complete and verified.
-    progress
-        Called with the number of lights read, and the number of all.
-    expect
-        The table's hash as `Lut.sha256`, told by somebody who is trusted; None for any.
-
-    Raises
-    ------
-    InputError
-        The folder is taken, `expect` is no hash, or zarr is not installed.
-    FormatError
-        There is no table, it was never finished, it is another one than expected, or what came is not what was
-        published.
-    StorageError
-        The disk is full or read-only.
+    `expect`: the table's hash as `Lut.sha256`, told by somebody who is trusted; None for any.
     """
     zarr = _zarr()
     if expect is not None and not HASH.fullmatch(expect):

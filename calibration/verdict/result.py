@@ -13,14 +13,9 @@ from calibration.verdict.verdict import Verdict
 class BuildResult:
     """A table as measured and judged.
 
-    Attributes
-    ----------
-    figures
-        What was measured.
-    verdict
-        The judgement on the figures.
-    lut
-        The table's folder; None after a check.
+    - `figures`: what was measured.
+    - `verdict`: the judgement on the figures.
+    - `lut`: the table's folder; None after a check.
     """
 
     figures: TableFigures

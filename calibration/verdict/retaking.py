@@ -11,14 +11,14 @@ import sys
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from acquisition.session.mending.retaking import lights_text
-from acquisition.session.records import FrameRecord
 from calibration.causes.findings import ProbableCause, explain
 from calibration.figures.frame_figures import FrameFigures
 from calibration.figures.table_figures import TableFigures
 from calibration.registration.registration import Registration
 from calibration.sampling.windows import bleed
 from calibration.verdict.verdict import JudgedValue, Verdict
+from experiment.session.mending.retaking import lights_text
+from experiment.session.records import FrameRecord
 
 COMMAND = "acquire run LAB.toml SESSION --retake bad"
 """What takes them again, as the report names them."""
@@ -63,17 +63,7 @@ def findings(verdict: Verdict, figures: TableFigures) -> dict[str, ProbableCause
 
 
 def retake_json(records: tuple[FrameRecord, ...], registered_sha256: str, newest_sha256: str) -> dict[str, Any]:
-    """Return what `acquire run --retake bad` reads of a report (docs/formats.md).
-
-    Parameters
-    ----------
-    records
-        The frames to be taken again.
-    registered_sha256
-        Hash of a frame of the session, by which the report is known to be on it.
-    newest_sha256
-        Hash of the frame that was taken last of those that the report is on.
-    """
+    """Return what `acquire run --retake bad` reads of a report (docs/formats.md)."""
     return {
         "retake": lights_text([record.illumination for record in records if record.illumination is not None]),
         "retake_sha256": [record.sha256 for record in records],

@@ -6,21 +6,21 @@ Rules that hold inside:
   table.
 - A limit without `refuse` is only ever remarked on: what it measures does not make the table wrong.
 - Where a measurement refuses by itself (`calibration.registration.register`), the number is defined there and imported.
-- Numbers that `acquire check` or the live judge use as well stand in `acquisition.limits.table`.
+- Numbers that `acquire check` or the live judge use as well stand in `experiment.limits.table`.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
-from acquisition.limits.table import TABLE_LIMITS, Sense
-from acquisition.measures.sensor_range import MAX_BLACK_DRIFT
 from calibration.registration.register import (
     MAX_BLOCK_RESIDUAL_PX,
     MAX_TAG_RESIDUAL_PX,
     MIN_AGREEMENT,
     MIN_GOOD_BLOCKS,
 )
+from experiment.limits.table import TABLE_LIMITS, Sense
+from experiment.measures.sensor_range import MAX_BLACK_DRIFT
 
 JUDGEMENT = "judgement"
 """The source of a limit that nothing but experience supports."""
@@ -33,26 +33,15 @@ SIMULATED = "measured on simulated frames"
 class Threshold:
     """One limit.
 
-    Attributes
-    ----------
-    name
-        Of the value that it judges, as in `report.json`.
-    title
-        The value for people.
-    unit
-        Of the value and both limits; "" for a count or a plain number, "share" for 0 … 1.
-    sense
-        On which side of the limits a value is accepted.
-    accept
-        Up to here nothing is remarked.
-    refuse
-        Beyond it no table is made; None where the value is only ever remarked on.
-    why
-        What goes wrong beyond.
-    source
-        Where the number comes from.
-    remedy
-        What to do about it; "" where it depends on the cause (`calibration.verdict.wording`).
+    - `name`: of the value that it judges, as in `report.json`.
+    - `title`: the value for people.
+    - `unit`: of the value and both limits; "" for a count or a plain number, "share" for 0 … 1.
+    - `sense`: on which side of the limits a value is accepted.
+    - `accept`: up to here nothing is remarked.
+    - `refuse`: beyond it no table is made; None where the value is only ever remarked on.
+    - `why`: what goes wrong beyond.
+    - `source`: where the number comes from.
+    - `remedy`: what to do about it; "" where it depends on the cause (`calibration.verdict.wording`).
     """
 
     name: str

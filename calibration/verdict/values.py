@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from acquisition.measures.reflections import added_light
 from calibration.checks.frame_consistency import has_enough_cells
 from calibration.figures.table_figures import TableFigures
 from calibration.sampling.windows import bleed
 from calibration.spread.fitting import MOST_MISFIT
 from calibration.verdict.retaking import added_bleed
 from calibration.verdict.thresholds import THRESHOLDS
+from experiment.measures.reflections import added_light
 from foundation.angles import angles_deg
 
 _LEAST_CELLS = 8**4

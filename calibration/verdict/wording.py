@@ -42,15 +42,7 @@ _REMEDIES = {
 
 
 def refusal(verdict: Verdict, figures: TableFigures, *, reported: bool = False) -> str:
-    """Return why there is no table and what helps, in a line; of the first of the verdict's refused rows.
-
-    Parameters
-    ----------
-    verdict, figures
-        Of the table.
-    reported
-        Whether a report was written, so that the frames it names can be taken again by it.
-    """
+    """Return why there is no table and what helps, in a line; of the first of the verdict's refused rows."""
     found = findings(verdict, figures)
     # What is explained explains more than what comes first.
     known = [row for row in verdict.refused if row.threshold.name in found and found[row.threshold.name].is_known]

@@ -60,13 +60,7 @@ class Scale:
         return f"code 0x{code:02x}" if step is None else step.label
 
     def value(self, code: int) -> float:
-        """Return the nominal value of a code that a camera reports.
-
-        Raises
-        ------
-        ProtocolError
-            The code is special (bulb, auto) or in no table.
-        """
+        """Return the nominal value of a code that a camera reports."""
         step = self._step(code)
         if step is None:
             raise ProtocolError(
@@ -78,17 +72,7 @@ class Scale:
     def code(self, wanted: float | str, available: Iterable[int] | None = None) -> int:
         """Return the code of a nominal value or label, one of `available` where a camera's list is given.
 
-        Parameters
-        ----------
-        wanted
-            Seconds, f-number or ISO speed; or text as on the dial: ``1/60``, ``0.5``, ``30``, ``auto``, ``bulb``.
-        available
-            Codes that the camera offers now. Without it all are, and third stops come before half stops.
-
-        Raises
-        ------
-        InputError
-            Nothing offered has that nominal value; the message lists the nearest.
+        `wanted`: seconds, f-number or ISO speed; or text as on the dial: ``1/60``, ``0.5``, ``30``, ``auto``, ``bulb``.
         """
         offered = None if available is None else tuple(available)
         for code, label in self.specials.items():

@@ -88,15 +88,7 @@ _RELEASE_RESULTS = {
 
 
 class EosBody:
-    """An EOS body behind an open cable.
-
-    Parameters
-    ----------
-    transport
-        Stays the caller's to close.
-    clock
-        Measures and makes every pause.
-    """
+    """An EOS body behind an open cable."""
 
     def __init__(self, transport: Transport, clock: Clock) -> None:
         self._clock = clock
@@ -118,15 +110,7 @@ class EosBody:
         return CameraIdentity(self._info.manufacturer, self._info.model, serial, self._info.device_version)
 
     def connect(self) -> None:
-        """Open the session, take the body under remote control and learn its state.
-
-        Raises
-        ------
-        DeviceRefused
-            It is no EOS body, or cannot send frames to the host.
-        LinkError, ProtocolError
-            From the cable.
-        """
+        """Open the session, take the body under remote control and learn its state."""
         self._session.open()
         _, data = self._session.call(Operation.GET_DEVICE_INFO)
         self._info = DeviceInfo.decode(data)
@@ -181,26 +165,14 @@ class EosBody:
                 return
 
     def set(self, code: int, value: bytes) -> None:
-        """Set a property, and see that the body reports it.
-
-        Raises
-        ------
-        DeviceRefused
-            It declines, or goes on reporting another value.
-        """
+        """Set a property, and see that the body reports it."""
         if self.state.holds(code, value):
             return
         self._send(code, value)
         self._verify(code, value)
 
     def make_ready(self) -> None:
-        """Empty the event queue and the memory, and wait until the body can take a frame.
-
-        Raises
-        ------
-        DeviceRefused
-            Its memory stays full.
-        """
+        """Empty the event queue and the memory, and wait until the body can take a frame."""
         self.drain()
         self.free_waiting()
         # A body whose "idle" was lost would seem busy for ever; its answer shows whether it takes the release.
@@ -210,13 +182,7 @@ class EosBody:
             raise DeviceRefused(f"{self.label} has no room for a frame; switch it off and on to empty its memory")
 
     def release(self) -> None:
-        """Press the release down and let it go, without autofocus.
-
-        Raises
-        ------
-        DeviceRefused
-            The body declines; no frame was taken.
-        """
+        """Press the release down and let it go, without autofocus."""
         if self._offers(Operation.EOS_REMOTE_RELEASE_ON):
             try:
                 self._press()
@@ -256,21 +222,7 @@ class EosBody:
         self._let_go()
 
     def await_object(self, not_before: float, until: float, wanted: Callable[[WaitingObject], bool]) -> WaitingObject:
-        """Return the newest object that waits and is wanted.
-
-        Parameters
-        ----------
-        not_before
-            Moment of the clock before which nothing can be the frame; what is announced earlier is left over from
-            before and thrown away.
-        until
-            Moment of the clock at which waiting ends.
-
-        Raises
-        ------
-        LinkTimeout
-            Nothing came.
-        """
+        """Return the newest object that waits and is wanted."""
         pauses = iter(_PAUSES_S)
         while True:
             if self.poll():
@@ -286,17 +238,7 @@ class EosBody:
             self._clock.sleep(next(pauses, _PAUSES_S[-1]))
 
     def fetch(self, waiting: WaitingObject, into: BinaryIO, offset: int = 0) -> None:
-        """Append an object's bytes from `offset` on to `into`, piece by piece.
-
-        Raises
-        ------
-        OperationDeclined
-            There is no such object (`ResponseCode.INVALID_OBJECT_HANDLE`), or the body will not give it.
-        DeviceError
-            It gives less than it announced, or announced a size that no frame has.
-        ProtocolError
-            It gives more than was asked for.
-        """
+        """Append an object's bytes from `offset` on to `into`, piece by piece."""
         if not 0 < waiting.size <= MAX_FRAME_BYTES:
             raise DeviceError(
                 f"{self.label} announces {waiting.name!r} of {waiting.size} bytes; 1 to {MAX_FRAME_BYTES} were expected"

@@ -63,16 +63,11 @@ _Result = TypeVar("_Result")
 class CanonLimits:
     """How long one call to a body may go on against trouble before it fails; chosen, not measured.
 
-    Attributes
-    ----------
-    recoveries
-        How often a call renews the connection: a fault that comes back more often lasts.
-    recovery_s
-        Seconds after the first fault of a call in which the connection may be renewed; a body that was switched off and
-        on, or put back on its cable, is there within 10 s.
-    frame_s
-        Seconds after its exposure within which a frame may be announced, beside as much time again as it was exposed:
-        so long a dark frame takes that some bodies subtract.
+    - `recoveries`: how often a call renews the connection: a fault that comes back more often lasts.
+    - `recovery_s`: seconds after the first fault of a call in which the connection may be renewed; a body that was
+      switched off and on, or put back on its cable, is there within 10 s.
+    - `frame_s`: seconds after its exposure within which a frame may be announced, beside as much time again as it was
+      exposed: so long a dark frame takes that some bodies subtract.
     """
 
     recoveries: int = 3
@@ -102,17 +97,7 @@ class _Shot:
 
 
 class CanonEos:
-    """A `drivers.camera.Camera` over PTP, whatever the cable.
-
-    Parameters
-    ----------
-    open_transport
-        Opens a new cable to the same body, wherever it is now; called again after a fault.
-    clock
-        Measures and makes every pause.
-    limits
-        When a call gives up.
-    """
+    """A `drivers.camera.Camera` over PTP, whatever the cable."""
 
     def __init__(
         self, open_transport: Callable[[], Transport], clock: Clock = _SYSTEM_CLOCK, limits: CanonLimits = _LIMITS
@@ -135,26 +120,12 @@ class CanonEos:
         return self._carry_out(EosBody.identity)
 
     def supplies(self) -> Supplies:
-        """Return what is left of battery and card; see `drivers.camera.ReportsSupplies`.
-
-        Raises
-        ------
-        DeviceError
-            It cannot be reached.
-        """
+        """Return what is left of battery and card; see `drivers.camera.ReportsSupplies`."""
         self._begin()
         return self._carry_out(EosBody.supplies)
 
     def configure(self, settings: ExposureSettings) -> None:
-        """Set and verify the exposure, raw format and destination; a frame that was not downloaded is dropped.
-
-        Raises
-        ------
-        DeviceRefused
-            The body does not offer a value, or has a setting that spoils a series; all of it in one message.
-        DeviceError
-            It cannot be reached.
-        """
+        """Set and verify the exposure, raw format and destination; a frame that was not downloaded is dropped."""
 
         def configured(body: EosBody) -> None:
             body.make_ready()
@@ -166,13 +137,7 @@ class CanonEos:
         self._settings = settings
 
     def shutter_speeds(self) -> tuple[float, ...]:
-        """Return the shutter times that the body offers now, as engraved, seconds, rising; empty if it lists none.
-
-        Raises
-        ------
-        DeviceError
-            It cannot be reached.
-        """
+        """Return the shutter times that the body offers now, as engraved, seconds, rising; empty if it lists none."""
 
         def listed(body: EosBody) -> tuple[float, ...]:
             body.drain()
@@ -185,13 +150,6 @@ class CanonEos:
         """Release the shutter without autofocus; return when it was released, UTC, once the body announces the frame.
 
         A frame that was exposed before and has not been downloaded is dropped.
-
-        Raises
-        ------
-        DeviceRefused
-            The body was never configured, or declines to take a frame.
-        DeviceError
-            No frame was announced; it may be exposed again.
         """
         settings = self._settings
         if settings is None:
@@ -212,11 +170,6 @@ class CanonEos:
 
         A download that failed, for whatever reason, may be tried again with a new stream as long as the body holds the
         frame in its memory: until the next exposure, or until it is switched off.
-
-        Raises
-        ------
-        DeviceError
-            The frame did not arrive, and what `into` holds is worthless; or there is none, and the message says so.
         """
         shot = self._shot
         if shot is None:

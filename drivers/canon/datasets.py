@@ -26,16 +26,10 @@ _TIME_LENGTH: Final = 4
 class ObjectEntry:
     """An object as EOS bodies list it, in GetObjectInfoEx and in events.
 
-    Attributes
-    ----------
-    group
-        A second handle; one and the same for files that belong together, else often the handle again.
-    name
-        At most `name_width` characters.
-    time
-        Seconds since 1970 on the camera's clock; None where the body leaves it out.
-    name_width
-        Bytes of the name's field, padded with NUL; 16 on all bodies recorded.
+    - `group`: A second handle; one and the same for files that belong together, else often the handle again.
+    - `name`: at most `name_width` characters.
+    - `time`: seconds since 1970 on the camera's clock; None where the body leaves it out.
+    - `name_width`: bytes of the name's field, padded with NUL; 16 on all bodies recorded.
     """
 
     handle: int

@@ -162,11 +162,6 @@ def decode_events(data: bytes) -> tuple[Record, ...]:
     """Return the records that GetEvent (0x9116) answers, without the closing one; no bytes are no records.
 
     A chain that ends with its last record, or with NULs, is whole: no cable hands on a part of an answer as all of it.
-
-    Raises
-    ------
-    ProtocolError
-        The chain is longer than `MAX_EVENTS` or `MAX_RECORDS`, or a record does not hold what its sizes say.
     """
     cursor = Cursor(data, "GetEvent", MAX_EVENTS)
     records: list[Record] = []

@@ -89,20 +89,12 @@ class WaitingObject:
 class EosState:
     """The properties of a body, what they can be set to, and the objects that wait in its memory.
 
-    Attributes
-    ----------
-    values
-        The value of each property reported so far.
-    lists, formats
-        What a property can be set to now.
-    functions
-        The custom functions: number to first value.
-    busy
-        Whether the body reported that it is exposing or writing.
-    shutting_down
-        Whether it reported that it will soon switch itself off.
-    waiting
-        By handle, in the order of their announcement.
+    - `values`: the value of each property reported so far.
+    - `lists`, `formats`: what a property can be set to now.
+    - `functions`: the custom functions: number to first value.
+    - `busy`: whether the body reported that it is exposing or writing.
+    - `shutting_down`: whether it reported that it will soon switch itself off.
+    - `waiting`: by handle, in the order of their announcement.
     """
 
     values: dict[int, bytes] = field(default_factory=dict[int, bytes])
@@ -226,13 +218,7 @@ def problems(state: EosState) -> list[str]:
 
 
 def plan(state: EosState, settings: ExposureSettings) -> dict[int, bytes]:
-    """Return which property gets which value for a series of raw frames, in the order of setting.
-
-    Raises
-    ------
-    DeviceRefused
-        The body does not offer a value, or has a setting that spoils a series; all of it in one message.
-    """
+    """Return which property gets which value for a series of raw frames, in the order of setting."""
     refused = problems(state)
     wanted: dict[int, bytes] = {}
     try:
@@ -263,13 +249,7 @@ def shutter_speeds(state: EosState) -> tuple[float, ...]:
 
 
 def host_destination(state: EosState) -> bytes:
-    """Return the value of property 0xd11c that sends frames to the host.
-
-    Raises
-    ------
-    DeviceRefused
-        The body does not list it.
-    """
+    """Return the value of property 0xd11c that sends frames to the host."""
     offered = state.lists.get(Property.EOS_CAPTURE_DESTINATION, ())
     if CaptureDestination.HOST not in offered and state.number(Property.EOS_CAPTURE_DESTINATION) != int(
         CaptureDestination.HOST

@@ -62,14 +62,9 @@ def text_of(value: bytes) -> str:
 class ImageFile:
     """One of the files that a release makes.
 
-    Attributes
-    ----------
-    kind
-        1 JPEG, 6 raw.
-    size
-        0 large, 1 medium (of raw: mRAW), 2 small (sRAW), 5 and 6 M1 and M2, 14, 15 and 16 S1, S2 and S3.
-    compression
-        Of JPEG 2 normal and 3 fine; of raw 4 lossless and 3 lossy.
+    - `kind`: 1 JPEG, 6 raw.
+    - `size`: 0 large, 1 medium (of raw: mRAW), 2 small (sRAW), 5 and 6 M1 and M2, 14, 15 and 16 S1, S2 and S3.
+    - `compression`: of JPEG 2 normal and 3 fine; of raw 4 lossless and 3 lossy.
     """
 
     kind: int

@@ -47,13 +47,7 @@ class Display:
 
 
 def list_displays() -> tuple[Display, ...]:
-    """Return every display, from left to right, then from top to bottom; `number` counts them from 1.
-
-    Raises
-    ------
-    DeviceError
-        There is no desktop to ask.
-    """
+    """Return every display, from left to right, then from top to bottom; `number` counts them from 1."""
     with running_glfw() as glfw:
         return tuple(display for display, _ in displays_of(glfw))
 
@@ -61,16 +55,8 @@ def list_displays() -> tuple[Display, ...]:
 def choose_display(displays: tuple[Display, ...], wanted: str | int | None = None) -> Display:
     """Return the display that `wanted` names.
 
-    Parameters
-    ----------
-    wanted
-        Its name (``"HDMI-1"``), its place (``"+1920+0"``), ``"left"``, ``"right"``, or its number; None stands for
-        the only one.
-
-    Raises
-    ------
-    ConfigurationError
-        None fits, or several do; the message lists what there is.
+    `wanted`: its name (``"HDMI-1"``), its place (``"+1920+0"``), ``"left"``, ``"right"``, or its number; None stands
+    for the only one.
     """
     there = "; ".join(str(display) for display in displays) or "none"
     if wanted is None:
@@ -105,13 +91,7 @@ def choose_display(displays: tuple[Display, ...], wanted: str | int | None = Non
 
 @contextlib.contextmanager
 def running_glfw() -> Generator[ModuleType]:
-    """Yield GLFW's module, running; it is terminated when the last block that needs it ends.
-
-    Raises
-    ------
-    DeviceError
-        There is no desktop, or GLFW cannot be loaded.
-    """
+    """Yield GLFW's module, running; it is terminated when the last block that needs it ends."""
     global _users
     glfw = _library()
     if not _users:

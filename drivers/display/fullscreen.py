@@ -64,20 +64,6 @@ class FullScreen:
     """A `drivers.presenter.Presenter` on a display; black from the moment it opens.
 
     Use it from the thread that opened it. It takes no keys: it ends by `close`, or with the process.
-
-    Parameters
-    ----------
-    display
-        As `choose_display` takes it.
-    clock
-        Waits between two looks at the screen.
-
-    Raises
-    ------
-    ConfigurationError
-        There is no such display, or several.
-    DeviceError
-        There is no desktop or no OpenGL, or the window does not come to fill the display.
     """
 
     def __init__(self, display: str | int | None = None, clock: Clock = _SYSTEM_CLOCK) -> None:
@@ -105,13 +91,7 @@ class FullScreen:
         self._open = True
 
     def show(self, colour: Colour) -> None:
-        """Fill the display with exactly `colour`; returns when every pixel has been read back from the screen.
-
-        Raises
-        ------
-        DeviceError
-            A pixel has another colour, the display is gone, or another thread than its own asks.
-        """
+        """Fill the display with exactly `colour`; returns when every pixel has been read back from the screen."""
         self._require_usable()
         self._require_server()
         if not self._is_full():
@@ -124,11 +104,6 @@ class FullScreen:
 
         On X what the server shows is read, whoever drew it, and a window in front is named. On Windows and macOS it is
         the window's own front buffer, which knows nothing of a window in front.
-
-        Raises
-        ------
-        DeviceError
-            A pixel has another colour, the display is gone or dark, or another thread than its own asks.
         """
         self._require_usable()
         self._require_server()
@@ -162,13 +137,7 @@ class FullScreen:
         self._glfw.poll_events()
 
     def warnings(self) -> tuple[str, ...]:
-        """Return what changes, or may change, the light behind the codes that were read back; empty when nothing does.
-
-        Raises
-        ------
-        DeviceError
-            It is closed, or another thread than its own asks.
-        """
+        """Return what may change the light behind the codes that were read back; empty when nothing does."""
         self._require_usable()
         found: list[str] = []
         bent = self._bent_ramp()
@@ -198,13 +167,7 @@ class FullScreen:
         return tuple(found)
 
     def close(self) -> None:
-        """Leave the display black and give it back to the desktop; a second call does nothing.
-
-        Raises
-        ------
-        DeviceError
-            Another thread than its own asks.
-        """
+        """Leave the display black and give it back to the desktop; a second call does nothing."""
         if not self._open:
             return
         self._require_usable()
@@ -434,13 +397,7 @@ def _is_noise(ramp: npt.NDArray[np.float64]) -> bool:
 
 
 def identify_displays(seconds: float, clock: Clock = _SYSTEM_CLOCK) -> tuple[Display, ...]:
-    """Show on every display its number for a while, and return them.
-
-    Raises
-    ------
-    DeviceError
-        As `FullScreen`.
-    """
+    """Show on every display its number for a while, and return them."""
     with contextlib.ExitStack() as opened:
         displays = list_displays()
         for display in displays:

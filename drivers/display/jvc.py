@@ -54,13 +54,7 @@ def encode_acknowledgement(text: bytes) -> bytes:
 
 
 def parse_operation(line: bytes) -> bytes:
-    """Return the text of a command, `line` being its bytes up to and with LF.
-
-    Raises
-    ------
-    ProtocolError
-        It is not one.
-    """
+    """Return the text of a command, `line` being its bytes up to and with LF."""
     head = _OPERATION + UNIT
     if not (line.startswith(head) and line.endswith(_END)):
         raise ProtocolError(f"{line!r} is no command; expected {head!r}, text and LF")
@@ -73,24 +67,7 @@ def encode_level(channel: str, code: int) -> bytes:
 
 
 class JvcFlatField:
-    """A `drivers.presenter.Presenter`; black from the moment it opens.
-
-    Parameters
-    ----------
-    connect
-        Opens a new cable to the network port (`PORT`); called again after the projector hung up.
-    timeout
-        Seconds to wait for each answer.
-    label
-        What messages call it.
-    clock
-        Measures `timeout` across the pieces of an answer.
-
-    Raises
-    ------
-    DeviceError
-        The projector cannot be reached, or does not obey.
-    """
+    """A `drivers.presenter.Presenter`; black from the moment it opens."""
 
     def __init__(
         self,

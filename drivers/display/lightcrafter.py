@@ -64,17 +64,7 @@ _SYSTEM_CLOCK = SystemClock()
 
 
 def find_lightcrafter(serial: str | None = None, *, backend: IBackend | None = None) -> HidReports:
-    """Open the one LightCrafter on USB, of whatever kind; `serial` names one of several.
-
-    Raises
-    ------
-    LinkClosed
-        There is none, or libusb is not installed.
-    InputError
-        There are several.
-    DeviceRefused
-        It may not be opened, or another program holds it.
-    """
+    """Open the one LightCrafter on USB, of whatever kind; `serial` names one of several."""
     for controller, product in PRODUCTS.items():
         with contextlib.suppress(LinkClosed):
             return open_hid(VENDOR, product, name=f"LightCrafter {controller}", serial=serial, backend=backend)
@@ -86,20 +76,7 @@ def find_lightcrafter(serial: str | None = None, *, backend: IBackend | None = N
 
 
 class LightCrafter:
-    """A `drivers.presenter.Presenter`; black from the moment it opens.
-
-    Parameters
-    ----------
-    connect
-        Opens the cable, for instance `find_lightcrafter`; called again after a fault.
-    clock
-        Waits while the controller changes its mode.
-
-    Raises
-    ------
-    DeviceError
-        The controller cannot be reached, or does not do what it was sent.
-    """
+    """A `drivers.presenter.Presenter`; black from the moment it opens."""
 
     def __init__(self, connect: Callable[[], HidReports], clock: Clock = _SYSTEM_CLOCK) -> None:
         self._connect = connect
@@ -128,13 +105,7 @@ class LightCrafter:
             raise
 
     def verify(self, colour: Colour) -> None:
-        """Return if the controller generates exactly `colour` now; see `drivers.presenter.ReadsBack`.
-
-        Raises
-        ------
-        DeviceError
-            It generates another, does something else, or cannot be asked.
-        """
+        """Return if the controller generates exactly `colour` now; see `drivers.presenter.ReadsBack`."""
         if not self._open or self._reports is None:
             raise DeviceError("the LightCrafter was closed, or its cable was lost; show the colour again")
         try:

@@ -71,13 +71,7 @@ def encode_request(request: LightCrafterRequest) -> bytes:
 
 
 def parse_request(report: bytes) -> LightCrafterRequest:
-    """Return the request in a report.
-
-    Raises
-    ------
-    ProtocolError
-        It is not one.
-    """
+    """Return the request in a report."""
     flags, sequence, length, command = struct.unpack_from("<BBHH", _whole(report))
     if not 2 <= length <= 2 + MAX_DATA:
         raise ProtocolError(f"a request of {length} bytes; 2 … {2 + MAX_DATA} fit in a report")
@@ -91,13 +85,7 @@ def encode_reply(reply: LightCrafterReply, *, reads: bool) -> bytes:
 
 
 def parse_reply(report: bytes) -> LightCrafterReply:
-    """Return the reply in a report.
-
-    Raises
-    ------
-    ProtocolError
-        It is not one.
-    """
+    """Return the reply in a report."""
     flags, sequence, length = struct.unpack_from("<BBH", _whole(report))
     if length > REPORT - 4:
         raise ProtocolError(f"a reply of {length} bytes; {REPORT - 4} fit in a report: {report.hex(' ')}")
@@ -123,13 +111,7 @@ def encode_colour(colour: Colour) -> bytes:
 
 
 def parse_colour(data: bytes) -> tuple[int, int, int]:
-    """Return the foreground in the data of `LightCrafterCommand.PATTERN_COLOUR`, 10 bits each.
-
-    Raises
-    ------
-    ProtocolError
-        There are not six codes of 10 bits.
-    """
+    """Return the foreground in the data of `LightCrafterCommand.PATTERN_COLOUR`, 10 bits each."""
     codes = struct.unpack("<6H", data) if len(data) == 12 else ()
     if not codes or max(codes) > FULL:
         raise ProtocolError(f"no colours in {data.hex(' ')!r}; expected six 10-bit codes in 12 bytes")

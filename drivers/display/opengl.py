@@ -29,13 +29,7 @@ UNSIGNED_INT_8_8_8_8_REVERSED: Final = 0x8367
 
 
 class OpenGl:
-    """The functions of the current context.
-
-    Raises
-    ------
-    DeviceError
-        One is missing.
-    """
+    """The functions of the current context."""
 
     def __init__(self, glfw: ModuleType) -> None:
         kind: Callable[..., Any] = ctypes.WINFUNCTYPE if sys.platform == "win32" else ctypes.CFUNCTYPE

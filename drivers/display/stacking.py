@@ -56,17 +56,7 @@ class Cover:
 
 
 class WindowStack:
-    """The windows of a server, by a connection of libxcb that stays the caller's.
-
-    Parameters
-    ----------
-    xcb
-        libxcb.
-    connection
-        ``xcb_connection_t *`` of an open connection.
-    root
-        The root window.
-    """
+    """The windows of a server, by a connection of libxcb that stays the caller's."""
 
     def __init__(self, xcb: ctypes.CDLL, connection: int, root: int) -> None:
         self._xcb = xcb

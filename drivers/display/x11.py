@@ -95,17 +95,7 @@ class _Screens(ctypes.Structure):
 class XScreen:
     """The screen of an X server.
 
-    Parameters
-    ----------
-    display
-        The server's name, such as ``:1``; None: what DISPLAY names.
-    keep_awake
-        Whether to hold off screen saver and power saving while this is open.
-
-    Raises
-    ------
-    DeviceError
-        The server cannot be reached, or libxcb is not installed.
+    `display`: the server's name, such as ``:1``; None: what DISPLAY names.
     """
 
     def __init__(self, display: str | None = None, *, keep_awake: bool = True) -> None:
@@ -133,13 +123,7 @@ class XScreen:
         """Whether screen saver and power saving are held off while this is open."""
 
     def size(self) -> tuple[int, int]:
-        """Return width and height of the whole screen now, px; a change of mode changes them.
-
-        Raises
-        ------
-        DeviceError
-            The server is gone.
-        """
+        """Return width and height of the whole screen now, px; a change of mode changes them."""
         if self._connection is None:
             raise DeviceError("the screen was closed; open it again")
         cookie = self._xcb.xcb_get_geometry(self._connection, self._root)
@@ -153,13 +137,7 @@ class XScreen:
         return width, height
 
     def read(self, x: int, y: int, width: int, height: int) -> npt.NDArray[np.uint32]:
-        """Return what the server shows there, (height, width) uint32, 0xRRGGBB; the next call writes over it.
-
-        Raises
-        ------
-        DeviceError
-            The rectangle is not on the screen any more, the server is gone, or it does not keep 8 bits a channel.
-        """
+        """Return what the server shows there, (height, width) uint32, 0xRRGGBB; the next call writes over it."""
         if self._connection is None:
             raise DeviceError("the screen was closed; open it again")
         cookie = self._xcb.xcb_get_image(

@@ -61,14 +61,8 @@ _IDENTITY = {
 class Gphoto2Camera:
     """A `drivers.camera.Camera` through libgphoto2.
 
-    Parameters
-    ----------
-    port
-        libgphoto2's name of the port, ``usb:001,005`` or ``ptpip:192.168.1.1``; None takes the first camera found.
-    model
-        libgphoto2's name of the model; None lets it find out, which works on USB. ``PTP/IP Camera`` on a network.
-    clock
-        Stamps the releases.
+    `port`: libgphoto2's name of the port, ``usb:001,005`` or ``ptpip:192.168.1.1``; None takes the first camera found.
+    `model`: libgphoto2's name of the model; None lets it find out, which works on USB. ``PTP/IP Camera`` on a network.
     """
 
     def __init__(self, port: str | None = None, model: str | None = None, clock: Clock = _SYSTEM_CLOCK) -> None:
@@ -87,38 +81,23 @@ class Gphoto2Camera:
             return CameraIdentity(**{field: _text(camera, names) for field, names in _IDENTITY.items()})
 
     def configure(self, settings: ExposureSettings) -> None:
-        """Set and verify the exposure, raw format and destination.
-
-        Raises
-        ------
-        DeviceRefused
-            The body does not offer a value, or has a setting that spoils a series; all of it in one message.
-        """
+        """Set and verify the exposure, raw format and destination."""
         self._settings = None
         with self._speaking() as camera:
             self._apply(camera, settings)
         self._settings = settings
 
     def shutter_speeds(self) -> tuple[float, ...]:
-        """Return the shutter times in libgphoto2's list, seconds, rising; empty if it shows none.
-
-        Raises
-        ------
-        DeviceError
-            The body cannot be reached.
-        """
+        """Return the shutter times in libgphoto2's list, seconds, rising; empty if it shows none."""
         with self._speaking() as camera:
             setting = first_of(lambda name: _setting(camera, name), SHUTTER)
             numbers = (number_of(label) for label in (setting.choices if setting is not None else ()))
             return tuple(sorted({number for number in numbers if number is not None}))
 
     def supplies(self) -> Supplies:
-        """Return what is left of battery and card, as far as libgphoto2 shows it; see `drivers.camera.ReportsSupplies`.
+        """Return what is left of battery and card, as far as libgphoto2 shows it.
 
-        Raises
-        ------
-        DeviceError
-            The body cannot be reached.
+        See `drivers.camera.ReportsSupplies`.
         """
         with self._speaking() as camera:
             power = _text(camera, ("acpower",))
@@ -136,13 +115,6 @@ class Gphoto2Camera:
         """Release the shutter; return when it was released, UTC, once libgphoto2 names the file.
 
         A frame that was exposed before and has not been downloaded is dropped.
-
-        Raises
-        ------
-        DeviceRefused
-            The body was never configured.
-        DeviceError
-            No frame was taken, or it cannot be reached; it may be exposed again.
         """
         settings = self._settings
         if settings is None:
@@ -167,11 +139,6 @@ class Gphoto2Camera:
         """Write the raw file of the frame exposed last, whole and unchanged, to `into`.
 
         It may be tried again where writing failed; after a fault of the connection libgphoto2 has forgotten the frame.
-
-        Raises
-        ------
-        DeviceError
-            The frame did not arrive, and what `into` holds is worthless; or there is none, and the message says so.
         """
         if self._exposed is None:
             raise DeviceError("no exposed frame waits in the camera to be downloaded; expose it again")
@@ -267,13 +234,7 @@ class Gphoto2Camera:
 
 
 def library():
-    """Return python-gphoto2.
-
-    Raises
-    ------
-    ConfigurationError
-        It is not installed.
-    """
+    """Return python-gphoto2."""
     try:
         import gphoto2
     except ImportError as error:

@@ -70,18 +70,11 @@ _BATTERY_WORDS = {"low": 0.0, "empty": 0.0, "full": 1.0}
 class BodySetting:
     """A setting as a body shows it now.
 
-    Attributes
-    ----------
-    name
-        libgphoto2's, such as ``f-number``.
-    value
-        What is set: a label, or a number as text.
-    choices
-        What it can be set to; empty where the body lists nothing.
-    bounds
-        Least and greatest number that it can be set to, where it is a range.
-    fixed
-        Whether it cannot be set.
+    - `name`: libgphoto2's, such as ``f-number``.
+    - `value`: what is set: a label, or a number as text.
+    - `choices`: what it can be set to; empty where the body lists nothing.
+    - `bounds`: least and greatest number that it can be set to, where it is a range.
+    - `fixed`: whether it cannot be set.
     """
 
     name: str
@@ -109,14 +102,7 @@ def first_of(body: Body, names: Iterable[str]) -> BodySetting | None:
 
 
 def plan(body: Body, settings: ExposureSettings) -> dict[str, str]:
-    """Return which setting gets which value for a series of raw frames, in the order of setting.
-
-    Raises
-    ------
-    DeviceRefused
-        The body does not offer a value, no raw format among them, or has a setting that spoils a series; all of it in
-        one message.
-    """
+    """Return which setting gets which value for a series of raw frames, in the order of setting."""
     refused: list[str] = []
     wanted: dict[str, str] = {}
     for names, allowed, remedy in _STATES:

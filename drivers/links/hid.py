@@ -61,26 +61,7 @@ class HidReports(Protocol):
 def open_hid(
     vendor: int, product: int, *, name: str, serial: str | None = None, backend: IBackend | None = None
 ) -> HidDevice:
-    """Open the one HID device with these marks.
-
-    Parameters
-    ----------
-    name
-        What messages call it.
-    serial
-        Its serial number, where several are connected.
-    backend
-        Another bus than the machine's own.
-
-    Raises
-    ------
-    LinkClosed
-        There is none, or libusb is not installed.
-    InputError
-        There are several.
-    DeviceRefused
-        It may not be opened, or another program holds it.
-    """
+    """Open the one HID device with these marks."""
     marks = f"{name} ({vendor:04x}:{product:04x}{f', serial number {serial}' if serial else ''})"
 
     def fits(device: usb.core.Device) -> bool:
@@ -167,13 +148,7 @@ class _ReportPipes:
 
 
 def _report_pipes(configuration: usb.core.Configuration, label: str) -> _ReportPipes:
-    """Return the first HID interface that has interrupt pipes both ways; `label` names the device.
-
-    Raises
-    ------
-    ProtocolError
-        There is none.
-    """
+    """Return the first HID interface that has interrupt pipes both ways; `label` names the device."""
     for interface in configuration:
         ends = {
             bool(endpoint.bEndpointAddress & 0x80): endpoint.bEndpointAddress

@@ -13,27 +13,11 @@ class Link(Protocol):
     """One open, ordered, two-way stream of bytes to a device."""
 
     def write(self, data: bytes, timeout: float) -> None:
-        """Send all of `data` within `timeout` seconds.
-
-        Raises
-        ------
-        LinkTimeout
-            Not everything went out in time; how much did is unknown.
-        LinkClosed
-            The other side hung up.
-        """
+        """Send all of `data` within `timeout` seconds."""
         ...
 
     def read(self, limit: int, timeout: float) -> bytes:
-        """Return the next 1 … `limit` bytes, waiting at most `timeout` seconds for the first.
-
-        Raises
-        ------
-        LinkTimeout
-            Nothing arrived in time.
-        LinkClosed
-            The other side hung up and everything it sent has been read.
-        """
+        """Return the next 1 … `limit` bytes, waiting at most `timeout` seconds for the first."""
         ...
 
     def close(self) -> None:

@@ -31,17 +31,7 @@ class SerialLink:
 
     @classmethod
     def open(cls, device: str, baud: int, parity: str = "N") -> SerialLink:
-        """Open the port `device`, such as ``/dev/ttyUSB0`` or ``COM3``, at `baud` bits per second.
-
-        Raises
-        ------
-        ConfigurationError
-            The port cannot run at this speed, or there is no such parity.
-        DeviceRefused
-            This user may not open the port, or another program has it.
-        LinkClosed
-            There is no such port; the message lists the ports there are.
-        """
+        """Open the port `device`, such as ``/dev/ttyUSB0`` or ``COM3``, at `baud` bits per second."""
         if parity not in PARITIES:
             raise ConfigurationError(f"parity {parity!r} for {device}; expected one of {', '.join(PARITIES)}")
         try:

@@ -31,15 +31,7 @@ class TcpLink:
 
     @classmethod
     def connect(cls, host: str, port: int, timeout: float) -> TcpLink:
-        """Open a connection within `timeout` seconds.
-
-        Raises
-        ------
-        LinkTimeout
-            Nobody answers at that address.
-        LinkClosed
-            The name is unknown, or nothing listens there.
-        """
+        """Open a connection within `timeout` seconds."""
         far_end = f"{host}:{port}"
         try:
             return cls(socket.create_connection((host, port), timeout), far_end)
@@ -109,19 +101,6 @@ class TcpServer:
     """Takes connections and gives each to `handle` in a thread of its own, until closed.
 
     Use it in a `with` block; leaving it hangs up every connection and joins every thread.
-
-    Parameters
-    ----------
-    handle
-        Called with each new link; the link is closed when it returns. A `LinkError` that it raises ends that
-        connection quietly, for that is how connections end.
-    port
-        0 lets the system pick one, which `address` names.
-
-    Raises
-    ------
-    LinkClosed
-        The port is taken, or may not be used.
     """
 
     def __init__(self, handle: Callable[[TcpLink], None], port: int = 0, host: str = LOOPBACK) -> None:

@@ -23,20 +23,7 @@ Address = tuple[str, int]
 
 
 class UdpSocket:
-    """Sends and receives datagrams at one port, until closed; use it in a `with` block.
-
-    Parameters
-    ----------
-    port
-        Where it listens, and from where it sends; 0 lets the system pick one, which `address` names.
-    host
-        The own address to listen at; all of them unless given.
-
-    Raises
-    ------
-    LinkClosed
-        The port is taken, or may not be used.
-    """
+    """Sends and receives datagrams at one port, until closed; use it in a `with` block."""
 
     def __init__(self, port: int = 0, host: str = ANY_HOST) -> None:
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
@@ -60,13 +47,7 @@ class UdpSocket:
         self.close()
 
     def send(self, data: bytes, address: Address) -> None:
-        """Send one datagram to host and port; whether it arrives is unknown.
-
-        Raises
-        ------
-        LinkClosed
-            The network takes no datagram for that address.
-        """
+        """Send one datagram to host and port; whether it arrives is unknown."""
         host, port = address
         try:
             self._socket.sendto(data, address)
@@ -76,15 +57,7 @@ class UdpSocket:
             ) from error
 
     def receive(self, timeout: float) -> tuple[bytes, Address]:
-        """Return the next datagram and who sent it, waiting at most `timeout` seconds.
-
-        Raises
-        ------
-        LinkTimeout
-            None came in time.
-        LinkClosed
-            This socket was closed.
-        """
+        """Return the next datagram and who sent it, waiting at most `timeout` seconds."""
         host, port = self.address
         deadline = time.monotonic() + timeout
         while True:

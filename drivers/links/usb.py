@@ -68,13 +68,7 @@ class UsbDevice:
 
 
 def list_devices(*, backend: IBackend | None = None) -> tuple[UsbDevice, ...]:
-    """Return the still image devices on the bus; `backend` stands for another bus than the machine's own.
-
-    Raises
-    ------
-    LinkClosed
-        libusb is not installed.
-    """
+    """Return the still image devices on the bus; `backend` stands for another bus than the machine's own."""
     return tuple(description for _, description, _ in _found(backend))
 
 
@@ -86,17 +80,7 @@ def open_usb(
     port: str | None = None,
     backend: IBackend | None = None,
 ) -> OpenUsbDevice:
-    """Open the one still image device that has all the marks given, and claim its interface.
-
-    Raises
-    ------
-    LinkClosed
-        There is none, or libusb is not installed.
-    InputError
-        There are several.
-    DeviceRefused
-        It may not be opened, or another program holds it.
-    """
+    """Open the one still image device that has all the marks given, and claim its interface."""
     matching: list[tuple[usb.core.Device, UsbDevice]] = []
     others: list[UsbDevice] = []
     hidden: DeviceRefused | None = None
@@ -221,16 +205,10 @@ class OpenUsbDevice:
 class _StillImageInterface:
     """A still image interface as its descriptors have it.
 
-    Attributes
-    ----------
-    number
-        The interface's.
-    addresses
-        Endpoint of each pipe.
-    packet_size, interrupt_size
-        Bytes of a full packet on the bulk pipes and on the interrupt pipe.
-    polling_s
-        Seconds between two looks at the interrupt pipe.
+    - `number`: the interface's.
+    - `addresses`: endpoint of each pipe.
+    - `packet_size`, `interrupt_size`: bytes of a full packet on the bulk pipes and on the interrupt pipe.
+    - `polling_s`: seconds between two looks at the interrupt pipe.
     """
 
     number: int
@@ -241,13 +219,7 @@ class _StillImageInterface:
 
 
 def _pipes_of(interface: usb.core.Interface, label: str) -> _StillImageInterface:
-    """Return the pipes that the endpoints of an interface describe; `label` names the device.
-
-    Raises
-    ------
-    ProtocolError
-        A pipe is missing.
-    """
+    """Return the pipes that the endpoints of an interface describe; `label` names the device."""
     endpoints: dict[Pipe, usb.core.Endpoint] = {}
     for endpoint in interface:
         kind = endpoint.bmAttributes & 3

@@ -94,24 +94,10 @@ class PjLinkProjector:
     Every question and command may raise `DeviceRefused` (not known, not offered, not now, wrong password),
     `DeviceFault` (the projector reports a failure of its own), `LinkError` and `ProtocolError`.
 
-    Parameters
-    ----------
-    connect
-        Opens a new cable to the control port; called again after the projector hung up.
-    password
-        The PJLink password, None where the projector has none.
-    timeout
-        Seconds to wait for each answer.
-    label
-        What messages call it.
-    clock
-        Measures `timeout` across the pieces of an answer.
-    sha256
-        Offer the password by SHA-256 (PJLink 2.10) first, and by MD5 only where the projector does not take that up.
-        Off unless asked for: it is tried against the standard's example and our simulated projector alone, and a
-        projector with MD5 alone may take the offer for a wrong password and count it.
-    nonce
-        Gives the 16 random bytes that SHA-256 needs.
+    `password`: the PJLink password, None where the projector has none. `sha256`: offer the password by SHA-256 (PJLink
+    2.10) first, and by MD5 only where the projector does not take that up. Off unless asked for: it is tried against
+    the standard's example and our simulated projector alone, and a projector with MD5 alone may take the offer for a
+    wrong password and count it. `nonce`: gives the 16 random bytes that SHA-256 needs.
     """
 
     def __init__(
@@ -201,18 +187,7 @@ class PjLinkProjector:
         return Input(code, self._input_name(code) if level == 2 else "")
 
     def select_input(self, code: str) -> None:
-        """Show another input; refused unless the projector is on, and for one that it has not.
-
-        Parameters
-        ----------
-        code
-            As in `inputs`, two characters.
-
-        Raises
-        ------
-        ValueError
-            Our own mistake: that is no input's code.
-        """
+        """Show another input; refused unless the projector is on, and for one that it has not."""
         try:
             code = wire.parse_input(code)
         except ProtocolError as error:

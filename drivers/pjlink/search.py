@@ -65,27 +65,7 @@ def search(
 ) -> tuple[FoundProjector, ...]:
     """Ask all projectors of the network to answer, and return those that do, in the order of their answers.
 
-    Parameters
-    ----------
-    seconds
-        How long answers are collected. A projector may take 10 s by the standard, which collects for 30 s.
-    enough
-        Return as soon as so many have answered; None waits the whole time.
-    address
-        Whom to ask. With several networks, give the broadcast address of the projector's own (192.168.10.255).
-    port
-        The projectors' port.
-    listen_port
-        Our own port, to which they answer; the standard allows 4352 only.
-    open_socket
-        Opens that port.
-    clock
-        Measures `seconds`.
-
-    Raises
-    ------
-    LinkClosed
-        Another program holds the port, or there is no network to ask.
+    `enough`: return as soon as so many have answered; None waits the whole time. `clock`: measures `seconds`.
     """
     found: dict[FoundProjector, None] = {}
     datagrams = open_socket(listen_port)
@@ -113,20 +93,7 @@ def search(
 
 
 class NoticePort:
-    """Hears the notices of all projectors in whose menus this computer's address was entered; close it.
-
-    Parameters
-    ----------
-    port
-        Where projectors send them; the standard allows 4352 only. 0 lets the system pick one, which `address` names.
-    host
-        The own address to listen at; all of them unless given.
-
-    Raises
-    ------
-    LinkClosed
-        Another program holds the port.
-    """
+    """Hears the notices of all projectors in whose menus this computer's address was entered; close it."""
 
     def __init__(self, port: int = wire.PORT, host: str = ANY_HOST, clock: Clock = _SYSTEM_CLOCK) -> None:
         self._socket = UdpSocket(port, host)
@@ -144,13 +111,7 @@ class NoticePort:
         self.close()
 
     def receive(self, timeout: float) -> tuple[str, PjLinkNotice]:
-        """Return the next notice and the address of the projector that sent it.
-
-        Raises
-        ------
-        LinkTimeout
-            None came within `timeout` seconds.
-        """
+        """Return the next notice and the address of the projector that sent it."""
         deadline = self._clock.monotonic() + timeout
         while not self._waiting:
             datagram, (host, _) = self._socket.receive(max(deadline - self._clock.monotonic(), 0.0))

@@ -100,13 +100,7 @@ class LineCutter:
         self._rest = bytearray()
 
     def feed(self, data: bytes) -> list[bytes]:
-        """Take the next bytes and return the lines that they complete, without their ends; empty lines are dropped.
-
-        Raises
-        ------
-        ProtocolError
-            A line, complete or not, is longer than the limit; the rest of the stream cannot be trusted.
-        """
+        """Take the next bytes and return the lines that they complete, without their ends; empty lines are dropped."""
         self._rest += data.replace(b"\0", b"")
         *lines, rest = re.split(rb"[\r\n]", bytes(self._rest))
         self._rest = bytearray(rest)
@@ -148,17 +142,7 @@ def parse_challenge(line: bytes) -> bytes | None:
 def sha256_digest(challenge: bytes, nonce: bytes, password: str) -> str:
     """Return the digest that proves the password to a projector with SHA-256 (2.10, 5.1).
 
-    Parameters
-    ----------
-    challenge
-        The projector's 16 random bytes.
-    nonce
-        The controller's own 16 random bytes.
-
-    Returns
-    -------
-    str
-        96 lowercase hex digits: `nonce`, then SHA-256 of the hex digits of `challenge` xor `nonce` and the password.
+    `challenge`: the projector's 16 random bytes. `nonce`: the controller's own 16 random bytes.
     """
     mixed = bytes(ours ^ theirs for ours, theirs in zip(nonce, challenge, strict=True))
     return nonce.hex() + hashlib.sha256((mixed.hex() + password).encode()).hexdigest()
@@ -188,13 +172,7 @@ def parse_greeting(line: bytes) -> Greeting | Refused:
 
 
 def encode_request(request: PjLinkRequest) -> bytes:
-    """Return a command line.
-
-    Raises
-    ------
-    ValueError
-        Our own mistake: the command is no four letters, or the parameter is longer than 128 bytes.
-    """
+    """Return a command line."""
     if not re.fullmatch(r"[A-Z0-9]{4}", request.command):
         raise ValueError(f"{request.command!r} is no PJLink command")
     line = f"%{request.level}{request.command} {request.parameter}\r".encode()

@@ -81,13 +81,7 @@ class ContainerReader:
         return not self._rest and not self._in_data
 
     def feed(self, piece: bytes) -> list[Message]:
-        """Take the next bytes, an empty piece for a zero-length packet, and return what they complete.
-
-        Raises
-        ------
-        ProtocolError
-            A header is none. Messages before it are returned first, and the next call raises.
-        """
+        """Take the next bytes, an empty piece for a zero-length packet, and return what they complete."""
         if self._in_data and self._payload_left is None:
             return self._feed_until_short(piece)
         messages: list[Message] = []
@@ -165,13 +159,7 @@ class ContainerReader:
 
 
 def encode(message: PtpRequest | PtpResponse | PtpEvent) -> bytes:
-    """Return the container of a message.
-
-    Raises
-    ------
-    ValueError
-        It has more than five parameters, or a number that does not fit.
-    """
+    """Return the container of a message."""
     if len(message.parameters) > MAX_PARAMETERS:
         raise ValueError(f"{message} has {len(message.parameters)} parameters; at most {MAX_PARAMETERS} are possible")
     match message:

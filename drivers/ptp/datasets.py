@@ -56,13 +56,7 @@ def read_string(cursor: Cursor, field: str) -> str:
 
 
 def encode_string(text: str) -> bytes:
-    """Return `text` as a string of PTP.
-
-    Raises
-    ------
-    ValueError
-        It is longer than 254 UTF-16 units, or holds a NUL or half a surrogate pair.
-    """
+    """Return `text` as a string of PTP."""
     if not text:
         return b"\0"
     octets = text.encode("utf-16-le")

@@ -57,14 +57,7 @@ _EVENT_READS: Final = 64
 class IpConnection:
     """Both connections to one device, which has accepted this initiator.
 
-    Parameters
-    ----------
-    command, event
-        The two links with their cutters, past the greetings.
-    name
-        What the device calls itself; may be empty.
-    events
-        Those that came with the greetings.
+    `name`: what the device calls itself; may be empty.
     """
 
     def __init__(
@@ -89,17 +82,7 @@ class IpConnection:
         self._event.write(data, timeout)
 
     def next_command(self, timeout: float) -> Packet:
-        """Return the next packet on the command connection, waiting `timeout` seconds for each of its bytes.
-
-        Raises
-        ------
-        LinkTimeout
-            None came.
-        LinkClosed
-            The device hung up either connection.
-        ProtocolError
-            What came is no packet.
-        """
+        """Return the next packet on the command connection, waiting `timeout` seconds for each of its bytes."""
         left = timeout
         while not self._packets:
             wait = min(left, _PING_EVERY_S)
@@ -116,15 +99,7 @@ class IpConnection:
         return self._packets.popleft()
 
     def attend(self) -> None:
-        """Take what the event connection holds, and answer pings; never waits.
-
-        Raises
-        ------
-        LinkClosed
-            The device hung up the event connection.
-        ProtocolError
-            It sends what is no packet there.
-        """
+        """Take what the event connection holds, and answer pings; never waits."""
         for _ in range(_EVENT_READS):
             try:
                 piece = self._event.read(_READ, 0.0)
@@ -164,25 +139,7 @@ def greet(
 ) -> IpConnection:
     """Open both connections and introduce the initiator on them (clause 2.2).
 
-    Parameters
-    ----------
-    open_command, open_event
-        Open the two connections; the second is tried for `EVENT_CHANNEL_S`.
-    initiator
-        Who we are.
-    clock
-        Measures what is waited.
-    place
-        What messages call the device.
-
-    Raises
-    ------
-    DeviceRefused
-        The device does not want this initiator, or has another one.
-    LinkTimeout, LinkClosed
-        It cannot be reached.
-    ProtocolError
-        What answers is no PTP/IP device.
+    `open_command`, `open_event`: open the two connections; the second is tried for `EVENT_CHANNEL_S`.
     """
     hello = encode(initiator)
     command, cutter = open_command(), PacketCutter()

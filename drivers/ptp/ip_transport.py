@@ -46,28 +46,9 @@ _CALL_OFF_S: Final = 2.0
 class IpTransport:
     """A `drivers.ptp.transport.Transport` over two links.
 
-    Parameters
-    ----------
-    open_command, open_event
-        Open the two connections; called again by `reset`. The second may raise `LinkClosed` for as long as the device
-        has not opened its port: it is tried for 2 s.
-    guid
-        16 bytes by which a camera knows a computer that it was paired with.
-    name
-        What the camera shows, at most 39 characters.
-    clock
-        Measures what is waited.
-    label
-        What messages call the device until it has named itself.
-
-    Raises
-    ------
-    DeviceRefused
-        The device does not want this initiator, or has another one.
-    LinkTimeout, LinkClosed
-        It cannot be reached.
-    ProtocolError
-        What answers is no PTP/IP device.
+    `open_command`, `open_event`: open the two connections; called again by `reset`. The second may raise `LinkClosed`
+    for as long as the device has not opened its port: it is tried for 2 s. `guid`: 16 bytes by which a camera knows a
+    computer that it was paired with.
     """
 
     def __init__(
@@ -126,26 +107,12 @@ class IpTransport:
         return self._state.take(Reception(request, receive, self.label), exchange, self._call_off)
 
     def events(self) -> tuple[PtpEvent, ...]:
-        """Return the events that have come since the last call, and answer pings; never waits.
-
-        Raises
-        ------
-        LinkClosed
-            The device hung up the event connection.
-        ProtocolError
-            It sends what is no packet there.
-        """
+        """Return the events that have come since the last call, and answer pings; never waits."""
         self._connection.attend()
         return self._connection.take_events()
 
     def reset(self) -> None:
-        """Hang up and connect anew; the session that was open is over.
-
-        Raises
-        ------
-        DeviceRefused, LinkTimeout, LinkClosed, ProtocolError
-            As when connecting first.
-        """
+        """Hang up and connect anew; the session that was open is over."""
         self.close()
         # A device needs a moment to see that the old connection is gone; until then we ourselves keep it busy.
         deadline = self._clock.monotonic() + EVENT_CHANNEL_S

@@ -182,13 +182,7 @@ _DATA_OUT = 2
 
 
 def encode(packet: Packet) -> bytes:
-    """Return a packet's bytes.
-
-    Raises
-    ------
-    ValueError
-        A number does not fit, a GUID is not 16 bytes, a name is too long, or there are more than five parameters.
-    """
+    """Return a packet's bytes."""
     match packet:
         case InitCommandRequest(guid, name, version):
             kind, body = PacketType.INIT_COMMAND_REQUEST, _guid(guid) + _name(name) + encode_integer(version, 4)
@@ -260,13 +254,7 @@ class PacketCutter:
         return not self._waiting and not self._data_kind
 
     def feed(self, piece: bytes) -> list[Packet]:
-        """Take the next bytes and return what they complete.
-
-        Raises
-        ------
-        ProtocolError
-            A packet is none. Packets before it are returned first, and the next call raises.
-        """
+        """Take the next bytes and return what they complete."""
         packets: list[Packet] = []
         # Data are handed on at once, so that what waits is never more than the beginning of a short packet.
         self._waiting = self._waiting + piece if self._waiting else piece

@@ -33,22 +33,7 @@ class TransactionState:
         exchange: Callable[[Reception], Transaction],
         call_off: Callable[[int], bool],
     ) -> Transaction:
-        """Carry out one transaction.
-
-        Parameters
-        ----------
-        exchange
-            Sends the request, and feeds the reception until the response.
-        call_off
-            Cancels the transaction of this number; returns whether the next can follow.
-
-        Raises
-        ------
-        LinkClosed
-            The cable was closed, or is lost now.
-        ProtocolError
-            The transaction before did not end.
-        """
+        """Carry out one transaction."""
         self.check_open(reception.label)
         if not self.between_transactions:
             raise ProtocolError(
@@ -102,13 +87,7 @@ class Reception:
         self._announced = length
 
     def take(self, piece: bytes) -> None:
-        """Take the next bytes of the data phase.
-
-        Raises
-        ------
-        ProtocolError
-            They are more than were announced, or more than may be collected.
-        """
+        """Take the next bytes of the data phase."""
         if not self._started:
             raise ProtocolError(f"{self.label} sends data with {self.request} but never announced them; reset it")
         self._taken += len(piece)
@@ -126,13 +105,7 @@ class Reception:
             self._collected += piece
 
     def end(self, response: PtpResponse) -> Transaction:
-        """Return the transaction that `response` ends.
-
-        Raises
-        ------
-        ProtocolError
-            It is another transaction's, or reports success although data are missing.
-        """
+        """Return the transaction that `response` ends."""
         self._check_transaction("a response", response.transaction)
         # A device that gives up in the middle reports that by its response: then the response is what counts.
         if response.ok and self._announced is not None and self._taken != self._announced:

@@ -53,15 +53,7 @@ class OperationDeclined(DeviceRefused):
 
 
 class PtpSession:
-    """The initiator's side of a session.
-
-    Parameters
-    ----------
-    transport
-        An open cable; whoever opened it closes it.
-    clock
-        Measures and makes the pauses before an operation is asked again.
-    """
+    """The initiator's side of a session."""
 
     def __init__(self, transport: Transport, clock: Clock) -> None:
         self._transport = transport
@@ -74,15 +66,7 @@ class PtpSession:
         return self._transport.label
 
     def open(self) -> None:
-        """Open the session; one that a former host left open is taken over.
-
-        Raises
-        ------
-        LinkTimeout, LinkClosed, ProtocolError
-            No answer, after `OPEN_TRIES` tries.
-        OperationDeclined
-            The device answers, and refuses.
-        """
+        """Open the session; one that a former host left open is taken over."""
         faults = 0
         session = 1
         pauses = self._pauses(PASSING_LIMIT_S)
@@ -121,30 +105,9 @@ class PtpSession:
     ) -> tuple[tuple[int, ...], bytes]:
         """Carry out an operation.
 
-        Parameters
-        ----------
-        operation, parameters
-            What is asked.
-        send
-            The data phase to the device; None where the operation has none.
-        receive
-            Takes the data phase from the device piece by piece; None collects it.
-        timeout
-            Longest wait for each answer, seconds.
-        patience
-            How long it is asked again when the device declines for the moment, seconds.
-
-        Returns
-        -------
-        parameters, data
-            Of the response, and the data phase if it was collected.
-
-        Raises
-        ------
-        OperationDeclined
-            The device answered something else than OK.
-        LinkError, ProtocolError
-            From the transport; the session is spent.
+        `send`: the data phase to the device; None where the operation has none. `receive`: takes the data phase from
+        the device piece by piece; None collects it. `timeout`: longest wait for each answer, seconds. `patience`: how
+        long it is asked again when the device declines for the moment, seconds.
         """
         pauses = self._pauses(patience)
         while True:

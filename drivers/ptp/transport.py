@@ -42,25 +42,9 @@ class Transport(Protocol):
     ) -> Transaction:
         """Carry out one transaction.
 
-        Parameters
-        ----------
-        request
-            With its transaction number.
-        send
-            The data phase to the device; None where the operation has none.
-        receive
-            Takes the data phase from the device piece by piece; None collects up to `MAX_COLLECTED` bytes.
-        timeout
-            Longest wait for each answer of the device, seconds.
-
-        Raises
-        ------
-        LinkTimeout
-            The device fell silent. `reset` before the next transaction.
-        LinkClosed
-            The device is gone: unplugged, switched off. Only a new transport helps.
-        ProtocolError
-            It sent what PTP does not allow, another transaction's response, or more data than allowed.
+        `send`: the data phase to the device; None where the operation has none. `receive`: takes the data phase from
+        the device piece by piece; None collects up to `MAX_COLLECTED` bytes. `timeout`: longest wait for each answer of
+        the device, seconds.
         """
         ...
 

@@ -91,13 +91,6 @@ class UsbTransport:
         """Return the events that have come since the last call.
 
         Takes one polling interval of the interrupt pipe, some milliseconds, for the bus looks no more often.
-
-        Raises
-        ------
-        LinkClosed
-            The device is gone.
-        ProtocolError
-            It sends what is no event; what follows will be read again.
         """
         self._state.check_open(self.label)
         events: list[PtpEvent] = []
@@ -120,15 +113,7 @@ class UsbTransport:
         return tuple(events)
 
     def reset(self) -> None:
-        """Have the device forget everything; the session that was open is over.
-
-        Raises
-        ------
-        LinkClosed
-            The device is gone, or left the bus to come back under another address: open it anew.
-        LinkTimeout
-            It does not come back.
-        """
+        """Have the device forget everything; the session that was open is over."""
         self._state.check_open(self.label)
         try:
             self._pipes.control_out(ControlRequest.RESET_DEVICE, b"", _CONTROL_S)

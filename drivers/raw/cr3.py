@@ -51,15 +51,10 @@ class Cr3Damaged(ValueError):
 class Cr3:
     """What a CR3 says of itself.
 
-    Attributes
-    ----------
-    maker, model
-        As ``Canon`` and ``Canon EOS R``; empty where the file does not say.
-    black
-        Optically black areas that it states for its largest picture, on the whole sensor: left, upper; those that it
-        leaves empty are left out.
-    exif
-        Directories of its Exif box, with serial number and lens; none where it has no such box.
+    - `maker`, `model`: as ``Canon`` and ``Canon EOS R``; empty where the file does not say.
+    - `black`: optically black areas that it states for its largest picture, on the whole sensor: left, upper; those
+      that it leaves empty are left out.
+    - `exif`: directories of its Exif box, with serial number and lens; none where it has no such box.
     """
 
     maker: str = ""
@@ -81,13 +76,7 @@ def is_cr3(data: bytes | memoryview) -> bool:
 
 
 def read_cr3(data: bytes | memoryview) -> Cr3:
-    """Return what a CR3 says of itself.
-
-    Raises
-    ------
-    Cr3Damaged
-        A box reaches beyond the end of the file, one that every file has is missing, or it has more than any file.
-    """
+    """Return what a CR3 says of itself."""
     if not is_cr3(data):
         raise Cr3Damaged("it does not begin as a CR3 does")
     maker = model = ""

@@ -36,16 +36,11 @@ _MOST_TEXT = 128
 class FrameOrigin:
     """What a raw file states of camera, lens and exposure.
 
-    Attributes
-    ----------
-    camera
-        Maker and model, ``Canon EOS 550D``; empty where the file does not say.
-    serial
-        Serial number of the body; empty where the file does not say.
-    lens
-        The lens's model; empty where the file does not say, as without contacts.
-    iso, aperture, shutter_s
-        ISO speed, f-number and exposure time in seconds; None where the file does not say.
+    - `camera`: maker and model, ``Canon EOS 550D``; empty where the file does not say.
+    - `serial`: serial number of the body; empty where the file does not say.
+    - `lens`: the lens's model; empty where the file does not say, as without contacts.
+    - `iso`, `aperture`, `shutter_s`: ISO speed, f-number and exposure time in seconds; None where the file does not
+      say.
     """
 
     camera: str = ""
@@ -75,12 +70,7 @@ class FrameOrigin:
 def body_and_lens(data: bytes | memoryview, directories: Sequence[Directory]) -> tuple[str, str]:
     """Return serial number of the body and model of the lens as a file states them; each empty where it does not.
 
-    Parameters
-    ----------
-    data
-        The file's bytes.
-    directories
-        Its TIFF directories; of a CR3, those of its Exif box.
+    `data`: the file's bytes.
     """
     serial = _first(directories, (TiffTag.BODY_SERIAL_NUMBER, TiffTag.CAMERA_SERIAL_NUMBER))
     lens = _first(directories, (TiffTag.LENS_MODEL,))

@@ -36,20 +36,11 @@ class Area:
 class PlainDng:
     """A DNG whose counts are in the file as in memory.
 
-    Attributes
-    ----------
-    sensor
-        (RH, RW) uint16, read-only, a view into the file's bytes.
-    active
-        Its visible area.
-    pattern
-        Colours of the 2×2 block at the visible top-left.
-    black
-        (2, 2) float64 counts for that block, read-only.
-    white_level
-        Counts.
-    iso, aperture, shutter_s
-        The exposure; None where it is not stated.
+    - `sensor`: (RH, RW) uint16, read-only, a view into the file's bytes.
+    - `pattern`: colours of the 2×2 block at the visible top-left.
+    - `black`: (2, 2) float64 counts for that block, read-only.
+    - `white_level`: counts.
+    - `iso`, `aperture`, `shutter_s`: the exposure; None where it is not stated.
     """
 
     sensor: NDArray[np.uint16]
@@ -81,12 +72,7 @@ def read_plainly(data: bytes | memoryview, directories: Sequence[Directory]) -> 
 
     LibRaw copies such counts one by one, which takes longer than all that is done with a frame afterwards.
 
-    Parameters
-    ----------
-    data
-        The file's bytes.
-    directories
-        Its TIFF directories.
+    `data`: the file's bytes.
     """
     pixels = raw_pixels(directories)
     if pixels is None or data[:2] != b"II" or sys.byteorder != "little":

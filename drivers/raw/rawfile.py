@@ -57,30 +57,20 @@ _LEAST_MASKED = 256
 class Mosaic:
     """One raw frame as the sensor gave it; every array is read-only.
 
-    Attributes
-    ----------
-    counts
-        (H, W) uint16, the visible area, unprocessed counts, not rotated; a view into `sensor`. H and W may be odd.
-    pattern
-        Colours of the 2×2 block at the visible top-left, row by row: one of `BAYER_PATTERNS`.
-    black
-        (2, 2) float64, counts, the black level for each position of that block, as the file's metadata states it or,
-        for Canon's own formats, as LibRaw finds it in the borders, cut to an integer.
-    white_level
-        Counts, as the metadata or LibRaw's table states it. It is not the saturation: 15 831 is stated for a 550D that
-        saturates at 13 584 (ISO 100). Measure that from an overexposed frame.
-    camera
-        Maker and model, ``Canon EOS 550D``; empty where the file does not say.
-    sensor
-        (RH, RW) uint16, the whole sensor with its masked borders.
-    visible
-        Where `counts` lies on the sensor.
-    masked
-        Optically black areas in sensor coordinates; empty if none is known.
-    iso, aperture, shutter_s
-        The exposure as the file states it: ISO speed, f-number, seconds; None where it does not.
-    serial, lens
-        Serial number of the body and model of the lens; empty where the file does not state them.
+    - `counts`: (H, W) uint16, the visible area, unprocessed counts, not rotated; a view into `sensor`. H and W may be
+      odd.
+    - `pattern`: colours of the 2×2 block at the visible top-left, row by row: one of `BAYER_PATTERNS`.
+    - `black`: (2, 2) float64, counts, the black level for each position of that block, as the file's metadata states it
+      or, for Canon's own formats, as LibRaw finds it in the borders, cut to an integer.
+    - `white_level`: counts, as the metadata or LibRaw's table states it. It is not the saturation: 15 831 is stated for
+      a 550D that saturates at 13 584 (ISO 100). Measure that from an overexposed frame.
+    - `camera`: maker and model, ``Canon EOS 550D``; empty where the file does not say.
+    - `sensor`: (RH, RW) uint16, the whole sensor with its masked borders.
+    - `visible`: where `counts` lies on the sensor.
+    - `masked`: optically black areas in sensor coordinates; empty if none is known.
+    - `iso`, `aperture`, `shutter_s`: the exposure as the file states it: ISO speed, f-number, seconds; None where it
+      does not.
+    - `serial`, `lens`: serial number of the body and model of the lens; empty where the file does not state them.
     """
 
     counts: NDArray[np.uint16]
@@ -105,13 +95,10 @@ class Mosaic:
     def masked_black(self) -> NDArray[np.float64] | None:
         """Return the black level measured in the masked areas.
 
-        Returns
-        -------
-        (2, 2) float64 or None
-            Counts, the mean for each position of the visible top-left block, over photosites within six robust
-            standard deviations of the median; the first four columns of each area are left out. None where no masked
-            area is known or it is too small. Kept as a float: an integer would lose up to one count (LibRaw's 2047
-            for 2047.98).
+        Returns (2, 2) float64 counts, the mean for each position of the visible top-left block, over photosites within
+        six robust standard deviations of the median; the first four columns of each area are left out. None where no
+        masked area is known or it is too small. A float: an integer would lose up to one count (LibRaw's 2047 for
+        2047.98).
         """
         means = np.empty((2, 2))
         for row in range(2):
@@ -130,13 +117,10 @@ class Mosaic:
         return means
 
     def block_planes(self) -> NDArray[np.uint16]:
-        """Return the four positions of the 2×2 blocks as planes.
+        """Return the four positions of the 2×2 blocks as planes, (2, 2, H/2, W/2).
 
-        Returns
-        -------
-        (2, 2, H // 2, W // 2) uint16
-            ``[r, c, i, j]`` is ``counts[2 i + r, 2 j + c]``; a view, nothing is copied. An odd last row or column is
-            left out.
+        ``[r, c, i, j]`` is ``counts[2 i + r, 2 j + c]``; a view, nothing is copied. An odd last row or column
+        is left out.
         """
         height, width = (size // 2 for size in self.counts.shape)
         down, right = self.counts.strides
@@ -197,24 +181,12 @@ _MASKED = {
 
 
 def read_raw(path: Path) -> Mosaic:
-    """Read a camera's raw file: CR2, CR3, CRW, DNG or whatever else LibRaw reads, with a Bayer sensor.
-
-    Raises
-    ------
-    FormatError
-        The file is missing, no raw file, cut or damaged, or its sensor is not of the Bayer kind.
-    """
+    """Read a camera's raw file: CR2, CR3, CRW, DNG or whatever else LibRaw reads, with a Bayer sensor."""
     return decode_raw(_read_bytes(path), path)
 
 
 def decode_raw(data: bytes | memoryview, path: Path) -> Mosaic:
-    """Return the mosaic of a raw file's bytes, for those who have read them already; `path` names it in messages.
-
-    Raises
-    ------
-    FormatError
-        As in `read_raw`.
-    """
+    """Return the mosaic of a raw file's bytes, for those who have read them already; `path` names it in messages."""
     if not data:
         raise _unreadable(path, "it is empty")
     cr3 = _check_cr3(path, data)

@@ -69,13 +69,7 @@ LANGUAGES: Mapping[str, Language] = {
 
 
 def language(name: str) -> Language:
-    """Return the language called `name`, in any case.
-
-    Raises
-    ------
-    ConfigurationError
-        There is none; the message names those there are.
-    """
+    """Return the language called `name`, in any case."""
     try:
         return LANGUAGES[name.lower()]
     except KeyError:

@@ -91,17 +91,7 @@ def reply_parser(command: bytes) -> MessageParser[str]:
 
 
 def value_of(name: str, reply: str) -> str:
-    """Return the value in the answer to a command about `name`.
-
-    Raises
-    ------
-    Blocked
-        The projector cannot do it now.
-    DeviceRefused
-        The projector does not know the command, or not on this model.
-    ProtocolError
-        The answer belongs to another command.
-    """
+    """Return the value in the answer to a command about `name`."""
     text = reply.removeprefix("*").removesuffix("#").strip()
     match text.lower():
         case "block item":
@@ -150,13 +140,7 @@ class BenqProjector:
             return ProjectorIdentity("BenQ", "", "")
 
     def power(self) -> Power:
-        """Return the power state now.
-
-        Raises
-        ------
-        DeviceRefused
-            It is changing its state and was not asked before: it does not report whether it warms up or cools down.
-        """
+        """Return the power state now."""
         try:
             lit = on_or_off("pow", self._command("pow"))
         except Blocked as error:

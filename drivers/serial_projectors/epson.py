@@ -104,15 +104,7 @@ def take_command(data: bytes) -> tuple[str, int] | None:
 
 
 def value_of(name: str, reply: str) -> str:
-    """Return the value in the answer to the question after `name`.
-
-    Raises
-    ------
-    DeviceRefused
-        The projector answers ERR.
-    ProtocolError
-        The answer belongs to another question.
-    """
+    """Return the value in the answer to the question after `name`."""
     if reply == REFUSAL:
         raise DeviceRefused(f"the projector answers ERR to {name}?; wait until its power is on and try again")
     found, equals, value = reply.partition("=")
@@ -139,13 +131,7 @@ def format_power(power: Power) -> str:
 
 
 def parse_power(code: str) -> Power:
-    """Return the power state of PWR's code.
-
-    Raises
-    ------
-    DeviceFault
-        The code means that the projector is in an abnormal state.
-    """
+    """Return the power state of PWR's code."""
     if code == _ABNORMAL:
         raise DeviceFault("the projector answers PWR=05: it stopped itself; look at its indicators, unplug and plug it")
     if code not in _POWERS:
@@ -168,13 +154,7 @@ def parse_faults(codes: str) -> tuple[Fault, ...]:
 
 
 class EpsonProjector:
-    """A `drivers.projector.Projector` over ESC/VP21.
-
-    Parameters
-    ----------
-    network
-        Whether the cable is a TCP connection to port 3629, which wants the handshake of ESC/VP.net.
-    """
+    """A `drivers.projector.Projector` over ESC/VP21."""
 
     def __init__(
         self,

@@ -39,21 +39,7 @@ MessageParser = Callable[[bytes], tuple[_T, int] | None]
 
 
 class Exchange:
-    """Questions and answers over connections that `connect` opens.
-
-    Parameters
-    ----------
-    connect
-        Opens a new cable to the projector; called again after a fault.
-    timeout
-        Seconds to wait for each answer.
-    label
-        What messages call the projector.
-    clock
-        Measures `timeout` across the pieces of an answer.
-    greet
-        Called with this exchange when a connection has been opened, to say what comes first.
-    """
+    """Questions and answers over connections that `connect` opens."""
 
     def __init__(
         self,
@@ -72,17 +58,7 @@ class Exchange:
         self._rest = b""
 
     def ask(self, question: bytes, take: MessageParser[_T], overheard: Callable[[_T], bool] | None = None) -> _T:
-        """Send `question` and return the first message that `overheard` does not claim.
-
-        Raises
-        ------
-        LinkTimeout
-            No whole message came in time.
-        LinkClosed
-            The cable is gone, or cannot be opened.
-        ProtocolError
-            What came is no message of the language.
-        """
+        """Send `question` and return the first message that `overheard` does not claim."""
         used = self._link is not None
         try:
             return self._ask_once(question, take, overheard)
@@ -195,13 +171,7 @@ def quoted(data: bytes) -> str:
 
 
 def text_of(data: bytes) -> str:
-    """Return printable ASCII as text.
-
-    Raises
-    ------
-    ProtocolError
-        It is something else, as what arrives at the wrong speed is.
-    """
+    """Return printable ASCII as text."""
     if any(not 0x20 <= byte < 0x7F for byte in data):
         raise ProtocolError(f"the projector sends {quoted(data)}, which is no text; {CHECK_SPEED}")
     return data.decode("ascii")

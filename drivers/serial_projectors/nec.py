@@ -167,13 +167,7 @@ def format_running(power: Power) -> bytes:
 
 
 def parse_running(data: bytes, ordered_off: bool = False) -> Power:
-    """Return the power state in the data of the running status.
-
-    Parameters
-    ----------
-    ordered_off
-        Whether a projector that is switching was commanded off.
-    """
+    """Return the power state in the data of the running status."""
     if len(data) < 6:
         raise ProtocolError(f"the running status holds {len(data)} bytes; expected 16")
     powered, cooling, switching, operation = data[2:6]

@@ -126,13 +126,7 @@ def is_tiff(data: bytes | memoryview) -> bool:
 
 
 def read_directories(data: bytes | memoryview) -> list[Directory]:
-    """Return the directories of the main chain and, after each, those it points to by SubIFDs and as Exif.
-
-    Raises
-    ------
-    TiffDamaged
-        `data` is no TIFF, or a directory or a decoded value reaches beyond its end: the file has been cut or damaged.
-    """
+    """Return the directories of the main chain and, after each, those it points to by SubIFDs and as Exif."""
     if not is_tiff(data) or len(data) < 8:
         raise TiffDamaged("it does not begin as a TIFF file does")
     order = "<" if data[:2] == b"II" else ">"

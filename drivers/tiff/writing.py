@@ -64,27 +64,7 @@ def rationals(*values: float | Fraction) -> Value:
 
 
 def head(main: Tags, strip: int, exif: Tags | None = None) -> bytes:
-    """Return the bytes before the pixels.
-
-    Parameters
-    ----------
-    main
-        Tags of the picture, without StripOffsets, StripByteCounts and the Exif pointer, which are added.
-    strip
-        Bytes of the pixels that will follow.
-    exif
-        Tags of an Exif directory.
-
-    Returns
-    -------
-    bytes
-        Of a length that is a multiple of 16, so that the pixels lie aligned.
-
-    Raises
-    ------
-    ValueError
-        The file would be larger than its 32-bit offsets reach.
-    """
+    """Return the bytes before the pixels."""
     tags: Tags = {
         **main,
         TiffTag.STRIP_OFFSETS: (ValueType.LONG, [0]),

@@ -28,16 +28,10 @@ _PANEL = "Reading the data"
 class DataReading:
     """How the data sets that a command is given are read; see `evaluation.datasets.options.DataOptions`.
 
-    Attributes
-    ----------
-    layout
-        A name of `evaluation.datasets.LAYOUTS`; None takes the one that a place looks like.
-    camera, subset, truth
-        Of a data set that has several.
-    black, saturation
-        Levels that replace those of the layout, in the units of the files.
-    partial
-        Whether missing images are left out and counted.
+    - `layout`: A name of `evaluation.datasets.LAYOUTS`; None takes the one that a place looks like.
+    - `camera`, `subset`, `truth`: of a data set that has several.
+    - `black`, `saturation`: levels that replace those of the layout, in the units of the files.
+    - `partial`: whether missing images are left out and counted.
     """
 
     layout: str | None = None
@@ -56,13 +50,7 @@ class DataReading:
 
     @property
     def options(self) -> DataOptions:
-        """The options without the layout.
-
-        Raises
-        ------
-        InputError
-            A level is none.
-        """
+        """The options without the layout."""
         from evaluation.datasets.options import DataOptions
 
         return DataOptions(self.camera, self.subset, self.truth, self.black, self.saturation, self.partial)
@@ -123,13 +111,7 @@ _OPTIONS: dict[str, Any] = {
 
 
 def with_data_options(command: Callable[..., None]) -> Callable[..., None]:
-    """Return a command whose parameter `reading` is replaced by the options of `DataReading`, for typer.
-
-    Parameters
-    ----------
-    command
-        A function with a keyword-only parameter `reading`.
-    """
+    """Return a command whose parameter `reading` is replaced by the options of `DataReading`, for typer."""
     signature = inspect.signature(command)
     if "reading" not in signature.parameters:
         raise ValueError(f"{command.__name__} has no parameter 'reading' to put the options in the place of")

@@ -46,13 +46,7 @@ def is_ffcc(folder: Folder) -> bool:
 
 
 def open_ffcc(place: str, options: DataOptions, listed: Folder | None = None) -> SceneSet:
-    """Return the thumbnails of a folder and of those below it; thumbnails and lights are read when they are used.
-
-    Raises
-    ------
-    FormatError
-        There is none, or a text file is missing or has no thumbnail.
-    """
+    """Return the thumbnails of a folder and of those below it; thumbnails and lights are read when they are used."""
     folder = listed or Folder(Path(place))
     black = 0.0 if options.black is None else options.black
     scenes: list[ThumbnailScene] = []

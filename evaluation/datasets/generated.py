@@ -64,18 +64,7 @@ class GeneratedMixedScene(GeneratedScene):
 
 
 def open_generated(place: Path | str) -> SceneSet:
-    """Return a dataset made by `generate`; images are read when they are evaluated.
-
-    Parameters
-    ----------
-    place
-        The dataset's folder, or its URL on a store that fsspec knows.
-
-    Raises
-    ------
-    FormatError
-        There is no dataset in that place.
-    """
+    """Return a dataset made by `generate`; images are read when they are evaluated."""
     dataset = open_dataset(place)
     table = dataset.description.table
     white = table.white_level

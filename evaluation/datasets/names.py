@@ -17,13 +17,7 @@ IMAGE_ENDINGS = (".png", ".tif", ".tiff", ".npy")
 
 @dataclass(frozen=True)
 class Folder:
-    """The names in a folder, read once; hidden files, such as those that systems leave behind, are not seen.
-
-    Attributes
-    ----------
-    path
-        The folder.
-    """
+    """The names in a folder, read once; hidden files, such as those that systems leave behind, are not seen."""
 
     path: Path
 
@@ -62,13 +56,7 @@ class Folder:
                 yield from folder.within(depth - 1)
 
     def images(self, endings: Collection[str] = (".png",)) -> dict[str, str]:
-        """Return the paths of its images by their names without ending, in natural order.
-
-        Raises
-        ------
-        FormatError
-            Two differ in their endings only.
-        """
+        """Return the paths of its images by their names without ending, in natural order."""
         found: dict[str, str] = {}
         for name in self.files:
             stem, _, ending = name.rpartition(".")
@@ -82,13 +70,7 @@ class Folder:
 
 
 def gather(folders: Iterable[Folder], endings: Collection[str] = (".png",)) -> dict[str, str]:
-    """Return the paths of the images in several folders by their names without ending.
-
-    Raises
-    ------
-    FormatError
-        Two folders have an image of the same name.
-    """
+    """Return the paths of the images in several folders by their names without ending."""
     found: dict[str, str] = {}
     for folder in folders:
         images = folder.images(endings)
@@ -135,31 +117,6 @@ def present(
     names: Sequence[str], images: Mapping[str, str], source: str, folder: Path | str, partial: bool
 ) -> tuple[list[int], str]:
     """Return which of the images that a data set should have are there, and a sentence on their number.
-
-    Parameters
-    ----------
-    names
-        The images that should be there, without ending.
-    images
-        The paths of those that are, by name.
-    source
-        What says which should be there, for messages: "cube+_gt.txt".
-    folder
-        Where the images lie, for messages.
-    partial
-        Whether images may be missing.
-
-    Returns
-    -------
-    list of int
-        The positions in `names` of those that are there.
-    str
-        How many there are, and how many are left out.
-
-    Raises
-    ------
-    FormatError
-        None is there; or one is missing and `partial` is False; or one is there that should not be.
 
     Examples
     --------

@@ -46,22 +46,13 @@ _MOST = 50
 class OwnScene(RawScene):
     """An image of the user's.
 
-    Attributes
-    ----------
-    mask_path
-        A picture that is not 0 where a pixel must not be used; "" for none.
+    `mask_path`: A picture that is not 0 where a pixel must not be used; "" for none.
     """
 
     mask_path: str = ""
 
     def mask(self, image: Image) -> Mask | None:
-        """Return (H, W) bool, True where the picture of the mask is not 0, of an image (H, W, 3), or None without one.
-
-        Raises
-        ------
-        FormatError
-            The picture cannot be read or is of another size.
-        """
+        """Return (H, W) bool, True where the mask's picture is not 0, of an image (H, W, 3); None without one."""
         if not self.mask_path:
             return None
         import cv2
@@ -87,24 +78,7 @@ def is_plain_folder(folder: Folder) -> bool:
 
 
 def open_plain_folder(place: str, options: DataOptions, listed: Folder | None = None) -> SceneSet:
-    """Return the images of a table; they are read when they are used.
-
-    Parameters
-    ----------
-    place
-        The folder with the table, or the table.
-    options
-        `black` and `saturation` serve images whose levels the table does not give.
-    listed
-        The names in that folder, where they were read already.
-
-    Raises
-    ------
-    InputError
-        There are several tables.
-    FormatError
-        There is no table, it is damaged, or an image is missing, named twice, a picture for the eye or without a row.
-    """
+    """Return the images of a table; they are read when they are used."""
     path = _table_of(Path(place), listed)
     folder = path.parent
     scenes: list[OwnScene] = []
@@ -298,11 +272,6 @@ def _without_row(
     """Return a sentence on the images that the table does not name; "" if there are none.
 
     Where a table was named and has others beside it, it is a choice of the images; else one without a row is an error.
-
-    Raises
-    ------
-    FormatError
-        An image lies among those of the table and has no row.
     """
     folders = {file.rpartition(os.sep)[0] or "." for file in images}
     root = Folder(path.parent)

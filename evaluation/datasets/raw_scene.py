@@ -26,18 +26,10 @@ Mask = npt.NDArray[np.bool_]
 class RawScene:
     """An image in a file, with its levels; a layout with a mask has a subclass.
 
-    Attributes
-    ----------
-    name
-        The image's name, unique in its data set.
-    path
-        Its file.
-    light
-        Linear camera RGB of the light, of any length.
-    black
-        Black level, in the units of the file.
-    white
-        Value from which a pixel is clipped, in the units of the file, black not subtracted; None if none is.
+    - `name`: the image's name, unique in its data set.
+    - `light`: linear camera RGB of the light, of any length.
+    - `black`: black level, in the units of the file.
+    - `white`: value from which a pixel is clipped, in the units of the file, black not subtracted; None if none is.
     """
 
     name: str
@@ -57,13 +49,7 @@ class RawScene:
         return None if self.white is None else self.white - self.black
 
     def read(self) -> tuple[Image, Mask | None]:
-        """Return the image (H, W, 3), linear camera RGB with black at 0, and its mask (H, W) bool or None.
-
-        Raises
-        ------
-        FormatError
-            The file is missing, damaged or not such an image.
-        """
+        """Return the image (H, W, 3), linear camera RGB with black at 0, and its mask (H, W) bool or None."""
         image = subtract_black(decode_image(self.path), self.black)
         return image, self.mask(image)
 
@@ -78,24 +64,13 @@ class BesideTextScene(RawScene):
     """An image whose light stands in a text file of its own, read when it is asked for; `light` is not used.
 
     Pixels that are zero in every channel are masked: in such data sets that is how charts and faces are painted over.
-
-    Attributes
-    ----------
-    truth_path
-        The text file.
     """
 
     truth_path: str = ""
 
     @property
     def truth(self) -> npt.NDArray[np.float64]:
-        """The light (3,) float64, linear camera RGB of any length.
-
-        Raises
-        ------
-        FormatError
-            Its file cannot be read or holds no light.
-        """
+        """The light (3,) float64, linear camera RGB of any length."""
         return np.array(read_light(self.truth_path))
 
     def mask(self, image: Image) -> Mask:
@@ -131,12 +106,7 @@ def box_mask(shape: tuple[int, int], rows: slice, columns: slice) -> Mask:
 def polygon_mask(shape: tuple[int, int], corners: npt.NDArray[np.float64]) -> Mask:
     """Return a mask (H, W) bool of that shape, True in and on a polygon.
 
-    Parameters
-    ----------
-    shape
-        H and W.
-    corners
-        (N, 2) float64, x then y, px, pixel centres at integers; rounded to whole pixels.
+    `corners`: (N, 2) float64, x then y, px, pixel centres at integers; rounded to whole pixels.
 
     Examples
     --------
@@ -177,17 +147,7 @@ def subtract_black(image: Image, black: float) -> Image:
 def decode_image(path: str, eight_bits: bool = False) -> Image:
     """Return the image (H, W, 3) of a file as its numbers are, red first: uint16, float32 or float64.
 
-    Parameters
-    ----------
-    path
-        A PNG, TIFF or NumPy file.
-    eight_bits
-        Whether 8 bits a channel are taken, as uint16 of the same values.
-
-    Raises
-    ------
-    FormatError
-        The file is missing, damaged, of another kind, not of three channels, or of 8 bits where they are not taken.
+    `eight_bits`: whether 8 bits a channel are taken, as uint16 of the same values.
     """
     image = _values(path)
     if image.ndim != 3 or image.shape[2] != 3 or not image.size:

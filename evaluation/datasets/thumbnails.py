@@ -24,16 +24,10 @@ _EXPECTED = "expected images (N, H, W, 3), gt (N, 3) and names (N,), as numpy.sa
 class Thumbnail:
     """A thumbnail in memory.
 
-    Attributes
-    ----------
-    name
-        The image's name.
-    truth
-        (3,) float64, linear camera RGB of the light, of any length.
-    image
-        (H, W, 3) float32 or uint16, linear camera RGB, black at zero.
-    saturation
-        Always None: averaged pixels do not show what was clipped.
+    - `name`: the image's name.
+    - `truth`: (3,) float64, linear camera RGB of the light, of any length.
+    - `image`: (H, W, 3) float32 or uint16, linear camera RGB, black at zero.
+    - `saturation`: always None: averaged pixels do not show what was clipped.
     """
 
     name: str
@@ -47,13 +41,7 @@ class Thumbnail:
 
 
 def open_thumbnails(path: Path | str) -> SceneSet:
-    """Return the thumbnails of an archive; they are held in memory.
-
-    Raises
-    ------
-    FormatError
-        The file is no such archive.
-    """
+    """Return the thumbnails of an archive; they are held in memory."""
     try:
         with np.load(path) as content:
             images, truths, names = content["images"], content["gt"].astype(np.float64), content["names"]

@@ -14,20 +14,7 @@ Light = tuple[float, float, float]
 
 
 def check_light(values: Sequence[float], where: str) -> Light:
-    """Return a light, after checking that it is one.
-
-    Parameters
-    ----------
-    values
-        Red, green, blue.
-    where
-        File and line, for the message.
-
-    Raises
-    ------
-    FormatError
-        It is not three finite numbers, none below 0 and not all 0.
-    """
+    """Return a light, after checking that it is one."""
     if len(values) != 3 or not all(map(math.isfinite, values)) or min(values) < 0 or not any(values):
         raise FormatError(
             f"{where}: {' '.join(f'{value:g}' for value in values) or 'nothing'} is no light, expected red, green and "
@@ -38,13 +25,7 @@ def check_light(values: Sequence[float], where: str) -> Light:
 
 
 def read_text(path: Path | str) -> str:
-    """Return the content of a text file.
-
-    Raises
-    ------
-    FormatError
-        It cannot be read, or is no text.
-    """
+    """Return the content of a text file."""
     try:
         return Path(path).read_text(encoding="utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
@@ -54,11 +35,6 @@ def read_text(path: Path | str) -> str:
 
 def numbers_in(text: str, where: str) -> list[float]:
     """Return the numbers in a text, between blanks, commas or line ends.
-
-    Raises
-    ------
-    FormatError
-        Something in it is no number.
 
     Examples
     --------
@@ -72,13 +48,7 @@ def numbers_in(text: str, where: str) -> list[float]:
 
 
 def read_lights(path: Path) -> list[Light]:
-    """Return the lights of a file that has one a line, red, green, blue; empty lines at its end do not count.
-
-    Raises
-    ------
-    FormatError
-        The file cannot be read, or a line is no light.
-    """
+    """Return the lights of a file that has one a line, red, green, blue; empty lines at its end do not count."""
     lines = read_text(path).rstrip().splitlines()
     return [
         check_light(numbers_in(line, f"{path}, line {number}"), f"{path}, line {number}")
@@ -87,31 +57,12 @@ def read_lights(path: Path) -> list[Light]:
 
 
 def read_light(path: Path | str) -> Light:
-    """Return the light of a file that holds one, on one line or three.
-
-    Raises
-    ------
-    FormatError
-        The file cannot be read, or holds no light.
-    """
+    """Return the light of a file that holds one, on one line or three."""
     return check_light(numbers_in(read_text(path), str(path)), str(path))
 
 
 def read_rows(path: Path, needed: Sequence[str]) -> Iterator[tuple[str, Mapping[str, str]]]:
-    """Yield the rows of a table, each with its place for messages.
-
-    Parameters
-    ----------
-    path
-        A CSV file whose first line names its columns.
-    needed
-        Columns that it must have.
-
-    Raises
-    ------
-    FormatError
-        The file cannot be read, a column is missing, or a row has more or fewer fields than the head.
-    """
+    """Yield the rows of a table, each with its place for messages."""
     try:
         with path.open(newline="", encoding="utf-8-sig") as file:
             rows = csv.reader(file, skipinitialspace=True)
@@ -138,24 +89,12 @@ def read_rows(path: Path, needed: Sequence[str]) -> Iterator[tuple[str, Mapping[
 
 
 def light_of(row: Mapping[str, str], columns: Sequence[str], where: str) -> Light:
-    """Return the light in three columns of a row.
-
-    Raises
-    ------
-    FormatError
-        It is none.
-    """
+    """Return the light in three columns of a row."""
     return check_light([number_of(row[column], where, column) for column in columns], where)
 
 
 def number_of(text: str, where: str, column: str) -> float:
-    """Return a field as a number.
-
-    Raises
-    ------
-    FormatError
-        It is none.
-    """
+    """Return a field as a number."""
     try:
         return float(text)
     except ValueError as error:

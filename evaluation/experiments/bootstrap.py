@@ -42,28 +42,7 @@ def interval(
 ) -> tuple[float, float]:
     """Return the confidence interval of a statistic of errors.
 
-    Parameters
-    ----------
-    errors
-        (N,) float, N ≥ 1, finite: degrees, or any other number an image.
-    statistic
-        A name of `STATISTICS`.
-    seed
-        Of the resamples; the same for all functions here, so that results of one seed are of the same resamples.
-    count
-        Resamples, ≥ 1.
-    level
-        Confidence, between 0 and 1.
-
-    Returns
-    -------
-    tuple of float
-        Lower and upper end, in the unit of the errors. A single image has both at its own error.
-
-    Raises
-    ------
-    InputError
-        There is no error, or one is NaN or infinite; or no such statistic, count or level.
+    `errors`: (N,) float, N ≥ 1, finite: degrees, or any other number an image.
 
     Examples
     --------
@@ -93,16 +72,9 @@ def intervals(
 class Compared:
     """A statistic of one set of errors against that of another.
 
-    Attributes
-    ----------
-    statistic
-        Its name.
-    one, other
-        Its values, in the unit of the errors.
-    difference
-        one - other, with the ends of its confidence interval.
-    ratio
-        one / other, with the ends of its confidence interval; all NaN where `other` is 0.
+    - `one`, `other`: its values, in the unit of the errors.
+    - `difference`: one - other, with the ends of its confidence interval.
+    - `ratio`: one / other, with the ends of its confidence interval; all NaN where `other` is 0.
     """
 
     statistic: Statistic
@@ -124,22 +96,7 @@ def paired_difference(
 
     The same images are drawn for both, so what makes an image hard for both methods does not widen the interval.
 
-    Parameters
-    ----------
-    errors_a, errors_b
-        (N,) float each, N ≥ 1, finite, in the same order of images.
-    statistic, seed, count, level
-        As for `interval`.
-
-    Returns
-    -------
-    tuple of float
-        Difference, lower end, upper end, in the unit of the errors.
-
-    Raises
-    ------
-    InputError
-        As `interval`; or the two are not of one length.
+    `errors_a`, `errors_b`: (N,) float each, N ≥ 1, finite, in the same order of images.
 
     Examples
     --------
@@ -160,17 +117,8 @@ def paired_ratio(
 ) -> tuple[float, float, float]:
     """Return the ratio a / b of a statistic of two methods' errors on the same images, and its interval.
 
-    Parameters
-    ----------
-    errors_a, errors_b
-        (N,) float each, N ≥ 1, finite, in the same order of images.
-    statistic, seed, count, level
-        As for `interval`.
-
-    Returns
-    -------
-    tuple of float
-        Ratio, lower end, upper end; all NaN where the statistic of b is 0.
+    `errors_a`, `errors_b`: (N,) float each, N ≥ 1, finite, in the same order of images. Returns ratio, lower end, upper
+    end; all NaN where the statistic of b is 0.
 
     Examples
     --------
@@ -186,12 +134,7 @@ def paired(
 ) -> tuple[Compared, ...]:
     """Return difference and ratio of every statistic for two methods on the same images; see `paired_difference`.
 
-    Parameters
-    ----------
-    errors_a, errors_b
-        (N,) float each, N ≥ 1, finite, in the same order of images.
-    seed, count, level
-        As for `interval`.
+    `errors_a`, `errors_b`: (N,) float each, N ≥ 1, finite, in the same order of images.
     """
     one, other = ErrorSample.of(errors_a), ErrorSample.of(errors_b)
     if len(one.order) != len(other.order):
@@ -215,12 +158,8 @@ def independent(
 ) -> tuple[Compared, ...]:
     """Return difference and ratio of every statistic for two sets of images that have nothing to do with each other.
 
-    Parameters
-    ----------
-    errors_a, errors_b
-        (N,) and (M,) float, N and M ≥ 1, finite: errors, or any other number an image; each is resampled by itself.
-    seed, count, level
-        As for `interval`.
+    `errors_a`, `errors_b`: (N,) and (M,) float, N and M ≥ 1, finite: errors, or any other number an image; each is
+    resampled by itself.
 
     Examples
     --------

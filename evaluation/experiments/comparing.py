@@ -35,18 +35,10 @@ _NAMED: Final = 5
 class Matched:
     """The errors of two methods on the images that both have.
 
-    Attributes
-    ----------
-    names
-        Of the two, for tables and figures.
-    kind
-        The error compared.
-    images
-        N names, in the first's order, at least one.
-    one, other
-        (N,) float64 each, degrees.
-    missing
-        Images that only the other has, and images that only the one has.
+    - `names`: of the two, for tables and figures.
+    - `images`: N names, in the first's order, at least one.
+    - `one`, `other`: (N,) float64 each, degrees.
+    - `missing`: images that only the other has, and images that only the one has.
     """
 
     names: tuple[str, str]
@@ -61,17 +53,13 @@ class Matched:
 class SignedRank:
     """Wilcoxon's signed-rank test of paired errors.
 
-    Attributes
-    ----------
-    wins, losses, ties
-        Images on which the one's error is smaller, larger, equal.
-    p
-        Two-sided probability of a rank sum as uneven as this where neither is better. Equal errors are ranked and then
-        left out (J. W. Pratt, JASA 54 (1959) 655-667). Exact up to 50 images where none are equal, else from the normal
-        distribution that the rank sum tends to, corrected for ties.
-    effect
-        Matched-pairs rank-biserial correlation (D. S. Kerby, Comprehensive Psychology 3 (2014)): (losses - wins) / all
-        as shares of the rank sum; -1 where the one is better on every image, 0 where neither is, 1 where it is worse.
+    - `wins`, `losses`, `ties`: images on which the one's error is smaller, larger, equal.
+    - `p`: two-sided probability of a rank sum as uneven as this where neither is better. Equal errors are ranked and
+      then left out (J. W. Pratt, JASA 54 (1959) 655-667). Exact up to 50 images where none are equal, else from the
+      normal distribution that the rank sum tends to, corrected for ties.
+    - `effect`: matched-pairs rank-biserial correlation (D. S. Kerby, Comprehensive Psychology 3 (2014)): (losses -
+      wins) / all as shares of the rank sum; -1 where the one is better on every image, 0 where neither is, 1 where it
+      is worse.
     """
 
     wins: int
@@ -85,16 +73,9 @@ class SignedRank:
 class Comparison:
     """All that is said of a pair.
 
-    Attributes
-    ----------
-    matched
-        The errors.
-    test
-        Their signed-rank test.
-    p_holm
-        Its p among those of all comparisons made together (`holm`).
-    statistics
-        Each statistic of the one against that of the other, with intervals.
+    - `test`: their signed-rank test.
+    - `p_holm`: its p among those of all comparisons made together (`holm`).
+    - `statistics`: each statistic of the one against that of the other, with intervals.
     """
 
     matched: Matched
@@ -104,13 +85,7 @@ class Comparison:
 
 
 def match(one: MethodErrors, other: MethodErrors, names: tuple[str, str], kind: ErrorKind) -> Matched:
-    """Return the errors of two methods on the images of the same name.
-
-    Raises
-    ------
-    InputError
-        No image is in both, or the ground truths of one differ: the runs are of different data.
-    """
+    """Return the errors of two methods on the images of the same name."""
     places = {image: place for place, image in enumerate(other.images)}
     both = [(place, places[image]) for place, image in enumerate(one.images) if image in places]
     if not both:
@@ -146,10 +121,7 @@ def match(one: MethodErrors, other: MethodErrors, names: tuple[str, str], kind: 
 def signed_rank(one: npt.ArrayLike, other: npt.ArrayLike) -> SignedRank:
     """Return the signed-rank test of paired errors.
 
-    Parameters
-    ----------
-    one, other
-        (N,) float each, degrees, in the same order of images.
+    `one`, `other`: (N,) float each, degrees, in the same order of images.
 
     Examples
     --------
@@ -189,17 +161,7 @@ def holm(probabilities: Sequence[float]) -> list[float]:
 
 
 def compare(pairs: Sequence[Matched], seed: int = 0, level: float = 0.95) -> tuple[Comparison, ...]:
-    """Return the comparison of each pair; their p-values are corrected for one another.
-
-    Parameters
-    ----------
-    pairs
-        The pairs that one question is asked of.
-    seed
-        Of the bootstrap.
-    level
-        Confidence of its intervals, between 0 and 1.
-    """
+    """Return the comparison of each pair; their p-values are corrected for one another."""
     tests = [signed_rank(pair.one, pair.other) for pair in pairs]
     corrected = holm([test.p for test in tests])
     return tuple(

@@ -90,17 +90,7 @@ def images_table(comparison: Comparison, count: int = 10) -> Table:
 
 
 def comparison_page(comparisons: Sequence[Comparison], notes: Sequence[str], level: float) -> str:
-    """Return the HTML page of comparisons.
-
-    Parameters
-    ----------
-    comparisons
-        At least one.
-    notes
-        Sentences on the data, below the title.
-    level
-        Confidence of the intervals.
-    """
+    """Return the HTML page of comparisons."""
     parts: list[Part] = [*(paragraph(note) for note in notes)]
     parts += [paragraph(verdict(made, level)) for made in comparisons]
     parts.append(table_part(tests_table(comparisons)))
@@ -121,15 +111,7 @@ def comparison_page(comparisons: Sequence[Comparison], notes: Sequence[str], lev
 
 
 def write_comparisons(folder: Path, comparisons: Sequence[Comparison], notes: Sequence[str], level: float) -> None:
-    """Write a new folder: `tests.csv`, `statistics.csv`, `images.csv`, `tables.tex` and `report.html`.
-
-    Raises
-    ------
-    InputError
-        The folder is taken.
-    StorageError
-        The disk is full, read-only or gone.
-    """
+    """Write a new folder: `tests.csv`, `statistics.csv`, `images.csv`, `tables.tex` and `report.html`."""
     with whole_folder(folder, "the comparison") as place:
         (place / "tests.csv").write_text(table_to_csv(tests_table(comparisons)), encoding="utf-8")
         (place / "statistics.csv").write_text(_statistics_csv(comparisons), encoding="utf-8")

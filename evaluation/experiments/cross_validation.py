@@ -38,33 +38,7 @@ def cross_validate(
     Images are read once for all learners that extract features, and again in each fold by those that only have
     `fit(scenes, seed)`.
 
-    Parameters
-    ----------
-    scenes
-        N images with their ground truths.
-    learners
-        At least one.
-    folds
-        (N,) int64, the fold of each image, of at least two kinds.
-    seed
-        Handed to every fit; folds are drawn by the caller.
-    workers
-        Threads that read images and extract features; no number depends on it.
-    on_scene
-        Called once a scene when its features have been extracted; where no learner has any, at the end.
-
-    Returns
-    -------
-    tuple of Result
-        One a learner, in their order, rows in the order of the scenes.
-
-    Raises
-    ------
-    InputError
-        There is no scene or learner or only one fold; folds part images of one group; a ground truth is no light; or a
-        training part has no usable pixel; or a method needs what is not installed.
-    FormatError
-        An image cannot be read.
+    `folds`: (N,) int64, the fold of each image, of at least two kinds.
     """
     truths = truths_of(scenes)
     kinds = sorted(set(folds.tolist()))

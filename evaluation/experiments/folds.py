@@ -36,22 +36,8 @@ def group_of(scene: Scene) -> str:
 def choose_folds(data: SceneSet, text: str | None = None, seed: int = 0) -> tuple[npt.NDArray[np.int64], str]:
     """Return the fold of each image, (N,) int64 from 0, and where the folds come from, for the reader.
 
-    Parameters
-    ----------
-    data
-        The data set.
-    text
-        What --folds was given: a number of folds to draw, or the path of a CSV file with the columns image,fold. None
-        takes the data set's own folds, else draws `FOLDS`.
-    seed
-        Of folds that are drawn.
-
-    Raises
-    ------
-    InputError
-        The text is neither, or so many folds cannot be drawn; see `draw_folds`.
-    FormatError
-        The file has no folds of these images; see `read_folds`.
+    `text`: what --folds was given: a number of folds to draw, or the path of a CSV file with the columns image,fold.
+    None takes the data set's own folds, else draws `FOLDS`.
     """
     if text is None and data.folds is not None:
         return np.asarray(data.folds, dtype=np.int64), "the data set's own"
@@ -69,21 +55,7 @@ def choose_folds(data: SceneSet, text: str | None = None, seed: int = 0) -> tupl
 def draw_folds(count: int, folds: int, seed: int = 0, groups: Sequence[str] | None = None) -> npt.NDArray[np.int64]:
     """Return the fold of each image, (N,) int64 from 0; the folds differ in size as little as the groups allow.
 
-    Parameters
-    ----------
-    count
-        N images.
-    folds
-        Number of folds, 2 … the number of groups.
-    seed
-        Of the order in which the images are dealt.
-    groups
-        The group of each of the N images; None if every image is one of its own.
-
-    Raises
-    ------
-    InputError
-        There are fewer than two folds, or more folds than groups.
+    `groups`: the group of each of the N images; None if every image is one of its own.
 
     Examples
     --------
@@ -111,13 +83,7 @@ def draw_folds(count: int, folds: int, seed: int = 0, groups: Sequence[str] | No
 
 
 def draw_scene_folds(scenes: Sequence[Scene], folds: int, seed: int = 0) -> npt.NDArray[np.int64]:
-    """Return the fold of each scene, (N,) int64 from 0, groups and copies kept together: the same for all commands.
-
-    Raises
-    ------
-    InputError
-        As `draw_folds`.
-    """
+    """Return the fold of each scene, (N,) int64 from 0, groups and copies kept together: the same for all commands."""
     groups = [group_of(scene) for scene in scenes]
     if len(set(groups)) == len(groups):
         groups = [groups[first] for first in first_copies(scenes)]
@@ -130,18 +96,6 @@ def read_folds(path: Path, names: Sequence[str]) -> npt.NDArray[np.int64]:
 
     Folds may be any words or numbers; they are counted in their sorted order. Images that the data set lacks are
     refused as well as images that the file lacks.
-
-    Parameters
-    ----------
-    path
-        The file.
-    names
-        Names of the N images.
-
-    Raises
-    ------
-    FormatError
-        The file is not there or no such table, does not name each image once, or has a single fold.
     """
     try:
         with path.open(newline="", encoding="utf-8-sig") as stream:
@@ -167,20 +121,7 @@ def read_folds(path: Path, names: Sequence[str]) -> npt.NDArray[np.int64]:
 
 
 def read_names(path: Path, names: Sequence[str]) -> frozenset[str]:
-    """Return the images of a data set that a CSV file names in its column `image`.
-
-    Parameters
-    ----------
-    path
-        The file.
-    names
-        Names of the data set's images.
-
-    Raises
-    ------
-    FormatError
-        The file is not there or no such table, names no image, or one that the data set lacks.
-    """
+    """Return the images of a data set that a CSV file names in its column `image`."""
     try:
         with path.open(newline="", encoding="utf-8-sig") as stream:
             table = csv.DictReader(stream)
@@ -218,13 +159,7 @@ def folds_to_csv(names: Sequence[str], folds: npt.NDArray[np.int64]) -> str:
 
 
 def require_apart(scenes: Sequence[Scene], folds: npt.NDArray[np.int64]) -> None:
-    """Refuse folds (N,) int64 that part images of one group.
-
-    Raises
-    ------
-    InputError
-        Some images of a group are in one fold and some in another.
-    """
+    """Refuse folds (N,) int64 that part images of one group."""
     seen: dict[str, int] = {}
     for scene, fold in zip(scenes, folds, strict=True):
         group = group_of(scene)

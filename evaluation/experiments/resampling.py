@@ -48,12 +48,8 @@ def _hazen(count: int, percent: float) -> tuple[int, int, float]:
 class ErrorSample:
     """Errors, sorted once.
 
-    Attributes
-    ----------
-    order
-        (N,) int64: the image at each place of the sorted errors.
-    errors
-        (N,) float64, sorted.
+    - `order`: (N,) int64: the image at each place of the sorted errors.
+    - `errors`: (N,) float64, sorted.
     """
 
     order: npt.NDArray[np.int64]
@@ -139,16 +135,8 @@ def _with_avg(*parts: Floats) -> Floats:
 def bca(estimate: float, replicates: Floats, left_out: list[Floats], level: float) -> tuple[float, float]:
     """Return the ends of the BCa interval (Efron 1987, equations 2.3 and 6.6).
 
-    Parameters
-    ----------
-    estimate
-        The statistic of the images themselves.
-    replicates
-        (B,) float64, that of the resamples; infinite ones, where a ratio's divisor is 0, count as large.
-    left_out
-        For each independent sample (N,) float64, the statistic without one of its images.
-    level
-        Confidence, between 0 and 1.
+    `replicates`: (B,) float64, that of the resamples; infinite ones, where a ratio's divisor is 0, count as large.
+    `left_out`: for each independent sample (N,) float64, the statistic without one of its images.
     """
     if not 0 < level < 1:
         raise InputError(f"a confidence of {level:g}; expected one between 0 and 1, such as .95")

@@ -61,29 +61,7 @@ def run_methods(
 ) -> Run:
     """Return what methods make of a data set, and write it to a results folder where one is named.
 
-    Parameters
-    ----------
-    data
-        The data set.
-    methods
-        At least one, no two of one name.
-    folder
-        The new results folder; None for none.
-    kind
-        The error that the folder's LaTeX table and figures show; the other files have both.
-    workers
-        Threads, one image each; no byte depends on it.
-    on_scene
-        Called after each image with how many are done, and how many there are.
-
-    Raises
-    ------
-    InputError
-        The folder is taken, or another run's or program's; two methods have one name; or as `running.evaluate`.
-    FormatError
-        An image cannot be read.
-    StorageError
-        The disk is full, read-only or gone; what was answered until then is kept.
+    `folder`: the new results folder; None for none.
     """
     names = [method.name for method in methods]
     twice = [name for number, name in enumerate(names) if name in names[:number]]
@@ -119,28 +97,7 @@ def run_methods(
 def write_run(
     run: Run, scenes: Sequence[Scene], folder: Path, kind: ErrorKind = "reproduction", workers: int = 1
 ) -> None:
-    """Write results that were made otherwise, such as by cross-validation, to a new results folder.
-
-    Parameters
-    ----------
-    run
-        The results; see `describe_run`.
-    scenes
-        The images that they are of, from which some are shown.
-    folder
-        The new folder.
-    kind
-        The error that the LaTeX table and the figures show.
-    workers
-        Threads.
-
-    Raises
-    ------
-    InputError
-        The folder is taken.
-    StorageError
-        The disk is full, read-only or gone.
-    """
+    """Write results that were made otherwise, such as by cross-validation, to a new results folder."""
     require_free(folder, WHAT)
     partial = partial_path(folder)
     make_folder(folder.parent, folder)
@@ -158,20 +115,7 @@ def describe_run(
 ) -> Run:
     """Return results as a run.
 
-    Parameters
-    ----------
-    data
-        The data set.
-    results
-        One a method, of its N images.
-    methods
-        A JSON object each, see `method_records.describe_method`.
-    settings
-        What else the results depend on: JSON.
-    folds
-        (N,) int64, the fold of each image; None where the methods were not cross-validated.
-    notes
-        Sentences that belong beside the results.
+    `folds`: (N,) int64, the fold of each image; None where the methods were not cross-validated.
     """
     return Run(
         subject=Subject(
@@ -238,13 +182,7 @@ def _require_same(
     known: Sequence[Sequence[SceneAnswer]],
     place: Path,
 ) -> None:
-    """Answer for the first, the middle and the last known image again: pixels and what a method reads may have changed.
-
-    Raises
-    ------
-    InputError
-        An answer is another than before.
-    """
+    """Answer for the first, middle and last known image again: pixels and what a method reads may have changed."""
     again = sorted({0, len(known) // 2, len(known) - 1})
     for number, answers in zip(again, answer_scenes([scenes[number] for number in again], methods), strict=True):
         for method, now, before in zip(methods, answers, known[number], strict=True):

@@ -55,29 +55,6 @@ def evaluate(
 ) -> tuple[Result, ...]:
     """Return the estimates and errors of every method on every scene; each image is read once.
 
-    Parameters
-    ----------
-    scenes
-        The images with their ground truths, at least one.
-    methods
-        At least one.
-    workers
-        Threads, one image each; no number depends on it. See `answer_scenes`.
-    on_scene
-        Called after each scene, from the calling thread.
-
-    Returns
-    -------
-    tuple of Result
-        One a method, in their order.
-
-    Raises
-    ------
-    InputError
-        There is no scene or no method, the ground truth of a scene is no light, or a method fails.
-    FormatError
-        An image cannot be read.
-
     Examples
     --------
     Any value with a name, a ground truth, a saturation and `read` is a scene. Gray-world is right on an image that is
@@ -103,13 +80,7 @@ def evaluate(
 
 
 def truths_of(scenes: Sequence[Scene], methods: Sequence[object]) -> npt.NDArray[np.float64]:
-    """Return the ground truths (N, 3) float64 of scenes, camera RGB of any length.
-
-    Raises
-    ------
-    InputError
-        There is no scene or no method, or a ground truth is no light.
-    """
+    """Return the ground truths (N, 3) float64 of scenes, camera RGB of any length."""
     if not scenes or not methods:
         raise InputError(f"{len(methods)} methods on {len(scenes)} images: name at least one of each")
     return np.stack([_light(scene) for scene in scenes])
@@ -122,22 +93,6 @@ def answer_scenes(
 
     Methods of this suite are called by several threads at once. Others are called by one thread at a time and get a
     copy of the image, which they may change; with one worker everything runs in the calling thread.
-
-    Parameters
-    ----------
-    scenes
-        The images.
-    methods
-        The methods, of which no answer may depend on the images before.
-    workers
-        Threads, one image each; as many images are held in memory.
-
-    Raises
-    ------
-    InputError
-        A method fails; the message names it, the image and the line.
-    FormatError
-        An image cannot be read.
     """
     runners = [_runner_of(method) for method in methods]
     blind = all(isinstance(method, SceneMethod) for method in methods)
@@ -201,11 +156,6 @@ def fit_anew(learner: Learner, scenes: Sequence[Scene], seed: int) -> Method:
 
     The learner itself stays as it is: one that keeps in itself what it learns would take it along from fold to fold,
     and with it the images that it is tested on.
-
-    Raises
-    ------
-    InputError
-        The learner cannot be copied, fails, or returns what cannot estimate; the message names it, and the line.
     """
     try:
         fresh = copy.deepcopy(learner)
@@ -231,13 +181,7 @@ def fit_anew(learner: Learner, scenes: Sequence[Scene], seed: int) -> Method:
 
 
 def _field(given: object, image: Any) -> tuple[npt.NDArray[np.floating[Any]], str]:
-    """Return a map of lights (H, W, 3) float with grey where a pixel has none, and how many pixels those are in words.
-
-    Raises
-    ------
-    ValueError
-        It is no such map.
-    """
+    """Return a map of lights (H, W, 3) float, grey where a pixel has none, and in words how many those are."""
     field = np.asarray(given)
     if field.shape != image.shape or not np.issubdtype(field.dtype, np.floating):
         raise ValueError(

@@ -37,14 +37,7 @@ _FLOOR: Final = 1e-9
 def suspicions(images: Sequence[str], truths: npt.NDArray[np.float64], results: Sequence[Result]) -> tuple[str, ...]:
     """Return a sentence for each other way of reading lights under which results would be far better.
 
-    Parameters
-    ----------
-    images
-        Names of the N images.
-    truths
-        (N, 3) float64, linear camera RGB of any length.
-    results
-        The methods' results on these images.
+    `truths`: (N, 3) float64, linear camera RGB of any length.
 
     Examples
     --------

@@ -27,16 +27,10 @@ from foundation.processors import ordered_map
 class FamilySetting:
     """One set of parameters of a family, and how it did.
 
-    Attributes
-    ----------
-    text
-        What `--method` takes for it: "gray-edge-1:p=4:sigma=2".
-    name
-        The method's name in tables.
-    spread
-        Standard deviation of the green chromaticity g / (r + g + b) of its estimates.
-    errors
-        Its errors on the images that count, degrees; None where nobody asked.
+    - `text`: what `--method` takes for it: "gray-edge-1:p=4:sigma=2".
+    - `name`: the method's name in tables.
+    - `spread`: standard deviation of the green chromaticity g / (r + g + b) of its estimates.
+    - `errors`: its errors on the images that count, degrees; None where nobody asked.
     """
 
     text: str
@@ -49,18 +43,12 @@ class FamilySetting:
 class Tuning:
     """What tuning a family on a data set found.
 
-    Attributes
-    ----------
-    family
-        What was asked for: "gray-edge-1", or "gray-edge-1@360".
-    data
-        The data set's name.
-    settings
-        All sets of parameters, the chosen one first, by rising spread.
-    images, counted
-        Number of images, and of those for which every setting gives a light: the others do not count.
-    kind
-        Which errors stand beside; None if none do.
+    - `family`: what was asked for: "gray-edge-1", or "gray-edge-1@360".
+    - `data`: the data set's name.
+    - `settings`: all sets of parameters, the chosen one first, by rising spread.
+    - `images`, `counted`: number of images, and of those for which every setting gives a light: the others do not
+      count.
+    - `kind`: which errors stand beside; None if none do.
     """
 
     family: str
@@ -73,16 +61,6 @@ class Tuning:
 
 def settings_of(family: str) -> tuple[tuple[str, Method], ...]:
     """Return what `--method` takes for each set of parameters of a family, and its method.
-
-    Parameters
-    ----------
-    family
-        A name of `green_stability.FAMILIES`; with "@PIXELS" behind it, on images shrunk to that size.
-
-    Raises
-    ------
-    InputError
-        There is no such family.
 
     Examples
     --------
@@ -104,27 +82,7 @@ def tune_family(
 ) -> Tuning:
     """Return the sets of parameters of a family by how much their estimates spread in green chromaticity.
 
-    Parameters
-    ----------
-    family
-        See `settings_of`.
-    data
-        The data set's name.
-    scenes
-        Its images, at least two: of one camera, under many lights.
-    kind
-        Which errors to state beside; None reads no ground truth.
-    workers
-        Threads, one image each; no number depends on it.
-    on_scene
-        Called after each image.
-
-    Raises
-    ------
-    InputError
-        There is no such family, or there are too few images for which every setting gives a light.
-    FormatError
-        An image cannot be read.
+    `kind`: which errors to state beside; None reads no ground truth.
     """
     texts, methods = zip(*settings_of(family), strict=True)
     require_enough(len(methods), len(scenes))

@@ -44,16 +44,11 @@ _STEP = (0.5, 0.02)
 class ColorBeaver(FeatureLearner):
     """The method with its settings.
 
-    Attributes
-    ----------
-    norms
-        Minkowski norms of the underlying method between spaces, of which the training chooses one: "1" is Gray-world.
-    corners
-        Corners of the polyline, from 2.
-    population
-        Genomes a generation.
-    generations
-        Generations.
+    - `norms`: minkowski norms of the underlying method between spaces, of which the training chooses one: "1" is
+      Gray-world.
+    - `corners`: corners of the polyline, from 2.
+    - `population`: genomes a generation.
+    - `generations`: generations.
     """
 
     norms: str = "1"
@@ -107,14 +102,10 @@ class ColorBeaver(FeatureLearner):
 class LightBand:
     """What was learned.
 
-    Attributes
-    ----------
-    corners
-        (K, 2) float64, the polyline in the plane of r and b.
-    widths
-        (2,) float64, half-width of the band at its first and at its last corner, linear in between along the corners.
-    base
-        () int64, which of the underlying methods is used.
+    - `corners`: (K, 2) float64, the polyline in the plane of r and b.
+    - `widths`: (2,) float64, half-width of the band at its first and at its last corner, linear in between along the
+      corners.
+    - `base`: () int64, which of the underlying methods is used.
     """
 
     corners: npt.NDArray[np.float64]
@@ -136,14 +127,8 @@ def bounded(
 ) -> npt.NDArray[np.float64]:
     """Return points (N, 2) moved into each of P bands, (P, N, 2) float64: those inside stay.
 
-    Parameters
-    ----------
-    points
-        (N, 2) float64.
-    corners
-        (P, K, 2) float64, the polyline of each band.
-    widths
-        (P, 2) float64 ≥ 0, its half-width at the first and the last corner.
+    `points`: (N, 2) float64. `corners`: (P, K, 2) float64, the polyline of each band. `widths`: (P, 2) float64 ≥ 0, its
+    half-width at the first and the last corner.
 
     Examples
     --------

@@ -54,10 +54,7 @@ class ConstantLight(FeatureLearner):
 class MedianLight:
     """The same light for every image.
 
-    Attributes
-    ----------
-    light
-        (3,) float64, linear camera RGB, r + g + b = 1.
+    `light`: (3,) float64, linear camera RGB, r + g + b = 1.
     """
 
     light: npt.NDArray[np.float64]

@@ -42,16 +42,10 @@ _DECAY = 1e-4
 class ConvNet(FeatureLearner):
     """The method with its settings.
 
-    Attributes
-    ----------
-    working_size
-        Side of the square that an image is brought to, px.
-    width
-        Channels of the first convolution; the others have twice as many.
-    epochs
-        Times that each image is seen.
-    rate
-        Learning rate of Adam, which falls to zero along a cosine.
+    - `working_size`: side of the square that an image is brought to, px.
+    - `width`: channels of the first convolution; the others have twice as many.
+    - `epochs`: times that each image is seen.
+    - `rate`: learning rate of Adam, which falls to zero along a cosine.
     """
 
     working_size: int = 64
@@ -129,10 +123,7 @@ class ConvNet(FeatureLearner):
 class ConvNetModel:
     """What was learned.
 
-    Attributes
-    ----------
-    weights
-        Weights (O, I, K, K) and biases (O,) of the convolutions, float32, by their names.
+    `weights`: weights (O, I, K, K) and biases (O,) of the convolutions, float32, by their names.
     """
 
     weights: Mapping[str, npt.NDArray[np.float32]]

@@ -71,25 +71,13 @@ class FeatureLearner(ABC):
     def fit_features(self, features: Features, truths: npt.NDArray[np.float64], seed: int = 0) -> LightModel:
         """Return the model that was fitted to features and lights; the same for the same seed.
 
-        Parameters
-        ----------
-        features
-            (N, ...) of the learner's dtype, N ≥ 1.
-        truths
-            (N, 3) float64, lights in linear camera RGB, r + g + b = 1.
-        seed
-            Of all that is random in the fit.
+        `features`: (N, ...) of the learner's dtype, N ≥ 1. `truths`: (N, 3) float64, lights in linear camera RGB, r + g
+        + b = 1.
         """
 
     @abstractmethod
     def restore(self, arrays: Mapping[str, npt.NDArray[np.generic]]) -> LightModel:
-        """Return the model whose `arrays` (of any shape and dtype, see there) are given.
-
-        Raises
-        ------
-        KeyError, ValueError
-            An array is missing, or has not the shape or numbers of such a model.
-        """
+        """Return the model whose `arrays` (of any shape and dtype, see there) are given."""
 
     def fit(self, scenes: Sequence[Scene], seed: int = 0) -> LearnedMethod:
         """Return the method fitted to scenes; see `methods.method.Learner.fit`."""
@@ -101,14 +89,10 @@ class FeatureLearner(ABC):
 class LearnedMethod:
     """A learner with what it has learned: a method like any other.
 
-    Attributes
-    ----------
-    learner
-        What extracts the features.
-    model
-        What estimates the light from them.
-    trained_on
-        Name of the data set, where it is to stand in the tables beside the method's name: a model from a file.
+    - `learner`: what extracts the features.
+    - `model`: what estimates the light from them.
+    - `trained_on`: name of the data set, where it is to stand in the tables beside the method's name: a model from a
+      file.
     """
 
     learner: FeatureLearner
@@ -139,21 +123,7 @@ def extract(
 ) -> tuple[list[Features | None], ...]:
     """Return the features of every scene for every learner; each image is read once.
 
-    Parameters
-    ----------
-    scenes
-        The images.
-    learners
-        What extracts their features.
-    workers
-        Threads, one image each; no number depends on it.
-    on_scene
-        Called after each scene, from the calling thread.
-
-    Returns
-    -------
-    tuple
-        For each learner, in their order, the features (...) of each scene, of the learner's dtype, or None.
+    Returns for each learner, in their order, the features (...) of each scene, of the learner's dtype, or None.
     """
 
     def of_one(scene: Scene) -> list[Features | None]:
@@ -173,21 +143,8 @@ def fit_extracted(
 ) -> LearnedMethod:
     """Return the method fitted to extracted features; images without a usable pixel are left out.
 
-    Parameters
-    ----------
-    learner
-        What extracted them.
-    features
-        N entries, each (...) of the learner's dtype, or None.
-    truths
-        (N, 3) float64, lights in linear camera RGB of any length.
-    seed
-        Of all that is random in the fit.
-
-    Raises
-    ------
-    InputError
-        No image has a usable pixel, or there is none.
+    `features`: N entries, each (...) of the learner's dtype, or None. `truths`: (N, 3) float64, lights in linear camera
+    RGB of any length.
     """
     usable = [place for place, given in enumerate(features) if given is not None]
     if not usable:
@@ -201,13 +158,7 @@ def fit_extracted(
 
 
 def require_installed(learner: object) -> None:
-    """Refuse a learner whose training needs a library that is not installed.
-
-    Raises
-    ------
-    InputError
-        It does; the message has the remedy.
-    """
+    """Refuse a learner whose training needs a library that is not installed."""
     reason = what_is_missing(learner)
     if reason:
         raise InputError(reason)
@@ -227,13 +178,7 @@ def what_is_missing(learner: object) -> str | None:
 
 
 def truths_of(scenes: Sequence[Scene]) -> npt.NDArray[np.float64]:
-    """Return the ground truths (N, 3) float64, linear camera RGB, of N scenes.
-
-    Raises
-    ------
-    InputError
-        One is no light, or there is no scene.
-    """
+    """Return the ground truths (N, 3) float64, linear camera RGB, of N scenes."""
     if not scenes:
         raise InputError("0 images: expected at least one to learn from")
     truths = np.stack([np.asarray(scene.truth, dtype=np.float64) for scene in scenes])

@@ -37,12 +37,8 @@ _IMAGES = 900
 class KernelRidge(FeatureLearner):
     """The method with its settings.
 
-    Attributes
-    ----------
-    working_size
-        Largest side of the image whose chromaticities are counted, px.
-    penalty
-        λ for 900 training images, above 0; it grows in proportion to their number.
+    - `working_size`: largest side of the image whose chromaticities are counted, px.
+    - `penalty`: λ for 900 training images, above 0; it grows in proportion to their number.
     """
 
     working_size: int = 64
@@ -106,14 +102,9 @@ class KernelRidge(FeatureLearner):
 class KernelRidgeModel:
     """What was learned.
 
-    Attributes
-    ----------
-    counts
-        (N, 4096) uint16, the counts of the training images.
-    weights
-        (N, 2) float64, of each training image for r and g.
-    centre
-        (2,) float64, mean r and g of the training lights: what an image that is like none would get.
+    - `counts`: (N, 4096) uint16, the counts of the training images.
+    - `weights`: (N, 2) float64, of each training image for r and g.
+    - `centre`: (2,) float64, mean r and g of the training lights: what an image that is like none would get.
     """
 
     counts: npt.NDArray[np.uint16]

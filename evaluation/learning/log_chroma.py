@@ -50,24 +50,15 @@ class LogChroma(FeatureLearner):
     `bias_smoothness` and the three sizes, which were chosen by cross-validation on thumbnails of a Canon 5DSR of
     INTEL-TAU (docs/reference/learned-methods.md).
 
-    Attributes
-    ----------
-    working_size
-        Largest side of the image whose colours are counted, px, up to 256.
-    least
-        Value below which a channel is not trusted, 1 = the image's brightest usable value.
-    crossentropy
-        Weight of the cross-entropy with which training begins.
-    likelihood
-        Weight of the von Mises likelihood with which it ends.
-    pixel_smoothness, edge_smoothness, bias_smoothness
-        Weight of the squared differences of neighbouring bins in the filter of each histogram and in the bias.
-    pixel_size, edge_size, bias_size
-        Weight of their squares.
-    spread
-        Variance that is added to the estimate's along each axis, bins².
-    pretraining, training
-        Iterations of L-BFGS with each loss.
+    - `working_size`: largest side of the image whose colours are counted, px, up to 256.
+    - `least`: value below which a channel is not trusted, 1 = the image's brightest usable value.
+    - `crossentropy`: weight of the cross-entropy with which training begins.
+    - `likelihood`: weight of the von Mises likelihood with which it ends.
+    - `pixel_smoothness`, `edge_smoothness`, `bias_smoothness`: weight of the squared differences of neighbouring bins
+      in the filter of each histogram and in the bias.
+    - `pixel_size`, `edge_size`, `bias_size`: weight of their squares.
+    - `spread`: variance that is added to the estimate's along each axis, bins².
+    - `pretraining`, `training`: iterations of L-BFGS with each loss.
     """
 
     working_size: int = 64
@@ -115,11 +106,6 @@ class LogChroma(FeatureLearner):
         """Return the model fitted to histograms (N, 2, 128, 128) uint16 and lights (N, 3) float64.
 
         Nothing in the fit is random.
-
-        Raises
-        ------
-        InputError
-            The lights differ more than the torus can tell.
         """
         logs = np.log(truths)
         chromas = logs[:, 1:2] - logs[:, [0, 2]]
@@ -163,16 +149,10 @@ class LogChroma(FeatureLearner):
 class LogChromaModel:
     """What was learned.
 
-    Attributes
-    ----------
-    filters
-        (2, 64, 33) complex128, Fourier transforms of the two filters, as `numpy.fft.rfft2` has them.
-    bias
-        (64, 64) float64.
-    centre
-        (2,) float64, u and v about which the torus is cut: the middle of the training lights' range.
-    grid
-        (2,) float64, the width of a bin and the chroma of the first one's centre.
+    - `filters`: (2, 64, 33) complex128, Fourier transforms of the two filters, as `numpy.fft.rfft2` has them.
+    - `bias`: (64, 64) float64.
+    - `centre`: (2,) float64, u and v about which the torus is cut: the middle of the training lights' range.
+    - `grid`: (2,) float64, the width of a bin and the chroma of the first one's centre.
     """
 
     filters: npt.NDArray[np.complex128]
@@ -203,12 +183,7 @@ class LogChromaModel:
 def fold(features: Features, wide: bool) -> npt.NDArray[np.float64]:
     """Return histograms (N, 2, 64, 64) float64 of sum 1, of counts (N, 2, 128, 128) uint16; an empty one stays empty.
 
-    Parameters
-    ----------
-    features
-        (N, 2, 128, 128) uint16, the counts on the fine torus.
-    wide
-        Whether neighbouring bins are joined, else bins that are half a turn apart.
+    `features`: (N, 2, 128, 128) uint16, the counts on the fine torus.
     """
     shape = (len(features), _CHANNELS, BINS, 2, BINS, 2) if wide else (len(features), _CHANNELS, 2, BINS, 2, BINS)
     counts = features.reshape(shape).sum(axis=(3, 5) if wide else (2, 4), dtype=np.float64)

@@ -36,14 +36,9 @@ _TINY = 1e-12
 class Penalties:
     """Weights of what keeps a model simple.
 
-    Attributes
-    ----------
-    smoothness
-        Of squared differences between neighbouring bins: pixel filter, edge filter, bias.
-    size
-        Of squares.
-    spread
-        Variance that is added to the distribution's along each axis, bins².
+    - `smoothness`: of squared differences between neighbouring bins: pixel filter, edge filter, bias.
+    - `size`: of squares.
+    - `spread`: variance that is added to the distribution's along each axis, bins².
     """
 
     smoothness: tuple[float, float, float]
@@ -55,18 +50,11 @@ class Penalties:
 class Moments:
     """Means and covariances of distributions (N, 64, 64) on the torus, in bins.
 
-    Attributes
-    ----------
-    mean
-        (N, 2), the circular means, 0 … 64.
-    covariance
-        (N, 3): of u and u, v and v, u and v, about the means on the unrolled torus.
-    slopes
-        (N, 2, 64), derivative of each mean by the marginal probability of a bin.
-    steps
-        (N, 2, 64), distance of each bin from the nearest bin to the mean, −32 … 31.
-    centre
-        (N, 2), means of the steps.
+    - `mean`: (N, 2), the circular means, 0 … 64.
+    - `covariance`: (N, 3): of u and u, v and v, u and v, about the means on the unrolled torus.
+    - `slopes`: (N, 2, 64), derivative of each mean by the marginal probability of a bin.
+    - `steps`: (N, 2, 64), distance of each bin from the nearest bin to the mean, −32 … 31.
+    - `centre`: (N, 2), means of the steps.
     """
 
     mean: npt.NDArray[Any]
@@ -102,16 +90,7 @@ def likelihood(
     The loss of an image is the negative log-likelihood less the least it can be, that of a hit with no spread but
     `spread`.
 
-    Parameters
-    ----------
-    likely
-        (N, 64, 64) of a float dtype, the distributions.
-    found
-        Their moments.
-    places
-        (N, 2) of a float dtype, the true lights, bins.
-    spread
-        Variance that is added along each axis, bins².
+    `likely`: (N, 64, 64) of a float dtype, the distributions. `places`: (N, 2) of a float dtype, the true lights, bins.
     """
     away = found.mean - places
     away = away - BINS * np.rint(away / BINS)
@@ -141,14 +120,8 @@ def crossentropy(
 ) -> tuple[float, npt.NDArray[Any]]:
     """Return the summed cross-entropy with the bins of true places, and its derivative (N, 64, 64), a float dtype.
 
-    Parameters
-    ----------
-    response
-        (N, 64, 64) of a float dtype, logarithms of the distributions up to a constant.
-    likely
-        (N, 64, 64) of a float dtype, the distributions.
-    places
-        (N, 2) of a float dtype, the true lights, bins.
+    `response`: (N, 64, 64) of a float dtype, logarithms of the distributions up to a constant. `likely`: (N, 64, 64) of
+    a float dtype, the distributions. `places`: (N, 2) of a float dtype, the true lights, bins.
     """
     u, v = (np.rint(places).astype(np.int64) % BINS).T
     image = np.arange(len(places))
@@ -166,16 +139,8 @@ def train(
 ) -> tuple[npt.NDArray[np.complex128], npt.NDArray[np.float64]]:
     """Return the fitted filters (2, 64, 33) complex128, in Fourier space, and the bias (64, 64) float64.
 
-    Parameters
-    ----------
-    histograms
-        (N, 2, 64, 64) float64, each of sum 1.
-    places
-        (N, 2) float64, the true lights in bins; they may lie outside 0 … 64.
-    penalties
-        What keeps the model simple.
-    stages
-        For each stage the iterations of L-BFGS and the weights of the cross-entropy and of the likelihood.
+    `histograms`: (N, 2, 64, 64) float64, each of sum 1. `places`: (N, 2) float64, the true lights in bins; they may lie
+    outside 0 … 64.
     """
     import scipy.fft
     import scipy.optimize

@@ -41,22 +41,13 @@ _AGREEING = 3
 class RegressionTrees(FeatureLearner):
     """The method with its settings; the defaults are OpenCV's.
 
-    Attributes
-    ----------
-    working_size
-        Largest side of the image whose colours are counted, px.
-    bins
-        Bins of the histogram along each channel.
-    palette
-        The most frequent colours that make the palette.
-    bandwidth
-        Radius of the kernel that finds the palette's mode, in chromaticity.
-    windows
-        Windows of the sorted training lights, one ensemble of trees each.
-    depth
-        Of each tree.
-    agreement
-        Distance in chromaticity within which features agree.
+    - `working_size`: largest side of the image whose colours are counted, px.
+    - `bins`: bins of the histogram along each channel.
+    - `palette`: the most frequent colours that make the palette.
+    - `bandwidth`: radius of the kernel that finds the palette's mode, in chromaticity.
+    - `windows`: windows of the sorted training lights, one ensemble of trees each.
+    - `depth`: of each tree.
+    - `agreement`: distance in chromaticity within which features agree.
     """
 
     working_size: int = 256
@@ -160,20 +151,12 @@ class RegressionTrees(FeatureLearner):
 class Forest:
     """Trees as arrays: estimating needs nothing but NumPy.
 
-    Attributes
-    ----------
-    split
-        (windows, 4, 2, nodes) int8, the feature's part, 0 or 1, that a node looks at; below 0 for a leaf.
-    threshold
-        The same shape, float64: parts up to it go left.
-    left, right
-        The same shape, int16: a node's children.
-    value
-        The same shape, float64: r or g at a leaf.
-    depth
-        Levels below the root, at most.
-    agreement
-        See `RegressionTrees`.
+    - `split`: (windows, 4, 2, nodes) int8, the feature's part, 0 or 1, that a node looks at; below 0 for a leaf.
+    - `threshold`: the same shape, float64: parts up to it go left.
+    - `left`, `right`: the same shape, int16: a node's children.
+    - `value`: the same shape, float64: r or g at a leaf.
+    - `depth`: levels below the root, at most.
+    - `agreement`: see `RegressionTrees`.
     """
 
     split: npt.NDArray[np.int8]
@@ -220,12 +203,7 @@ def _frequent_colours(pixels: npt.NDArray[np.float32], bins: int, most: int) -> 
 def consensus(estimates: npt.NDArray[np.float64], agreement: float) -> npt.NDArray[np.float64]:
     """Return the median (2,) float64 of the estimates on which three features agree; of all where none do.
 
-    Parameters
-    ----------
-    estimates
-        (windows, 4, 2) float64, r and g by each window's trees of each feature.
-    agreement
-        Distance in chromaticity within which two features agree.
+    `estimates`: (windows, 4, 2) float64, r and g by each window's trees of each feature.
 
     Examples
     --------

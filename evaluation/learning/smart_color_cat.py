@@ -39,12 +39,8 @@ _LEAST = 2 * _PARTS
 class SmartColorCat(FeatureLearner):
     """The method with its settings.
 
-    Attributes
-    ----------
-    working_size
-        Largest side of the image whose chromaticities are counted, px.
-    bins
-        Bins of the histogram, one of `CHOICES`; 0 to choose by the training images.
+    - `working_size`: largest side of the image whose chromaticities are counted, px.
+    - `bins`: bins of the histogram, one of `CHOICES`; 0 to choose by the training images.
     """
 
     working_size: int = 256
@@ -99,14 +95,9 @@ class SmartColorCat(FeatureLearner):
 class LightLine:
     """What was learned.
 
-    Attributes
-    ----------
-    weights
-        (K,) float64, the place on the line as a linear function of the shares of K bins.
-    centre, direction
-        (2,) float64, a point of the line in the plane of r and b, and its unit vector.
-    ends
-        (2,) float64, the least and greatest place of a training light.
+    - `weights`: (K,) float64, the place on the line as a linear function of the shares of K bins.
+    - `centre`, `direction`: (2,) float64, a point of the line in the plane of r and b, and its unit vector.
+    - `ends`: (2,) float64, the least and greatest place of a training light.
     """
 
     weights: npt.NDArray[np.float64]

@@ -22,23 +22,10 @@ def reduce(
     are usable as `methods.pixels.usable` has it, without a border. The largest usable value becomes 1, so that no
     feature depends on the exposure or on the unit of the image. Memory: a byte a pixel and some rows of the image.
 
-    Parameters
-    ----------
-    image
-        (H, W, 3) uint16, float32 or float64, linear camera RGB.
-    saturation
-        Value from which a channel is clipped; None if none is.
-    mask
-        (H, W) bool, True where a pixel must not be used.
-    longest
-        The most that height and width may be, px; a smaller image keeps its size.
-
-    Returns
-    -------
-    small : ndarray
-        (h, w, 3) float32, 0 … 1; 0 where it is not usable.
-    used : ndarray
-        (h, w) bool, True where it is.
+    `image`: (H, W, 3) uint16, float32 or float64, linear camera RGB. `saturation`: value from which a channel is
+    clipped; None if none is. `mask`: (H, W) bool, True where a pixel must not be used. `longest`: the most that height
+    and width may be, px; a smaller image keeps its size. Returns (h, w, 3) float32, 0 … 1; 0 where it is not usable.
+    Returns (h, w) bool, True where it is.
 
     Examples
     --------

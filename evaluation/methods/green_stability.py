@@ -33,16 +33,10 @@ _FEWEST_IMAGES = 2
 class Tuned:
     """What tuning found.
 
-    Attributes
-    ----------
-    best
-        The candidate with the least spread, the first of equals.
-    candidates
-        All of them.
-    spreads
-        Standard deviation of the green chromaticity of each one's estimates.
-    images
-        Number of images that count.
+    - `best`: the candidate with the least spread, the first of equals.
+    - `candidates`: all of them.
+    - `spreads`: standard deviation of the green chromaticity of each one's estimates.
+    - `images`: number of images that count.
     """
 
     best: Method
@@ -53,20 +47,6 @@ class Tuned:
 
 def tune(candidates: Sequence[Method], scenes: Sequence[Scene], on_scene: Callable[[], None] | None = None) -> Tuned:
     """Return the candidate whose estimates spread least in green chromaticity; ground truths are not looked at.
-
-    Parameters
-    ----------
-    candidates
-        One method with different parameters, at least two.
-    scenes
-        Images of one camera under many lights, at least two.
-    on_scene
-        Called after each.
-
-    Raises
-    ------
-    InputError
-        There are too few candidates or images, or too few images for which all candidates give a light.
 
     Examples
     --------
@@ -106,17 +86,7 @@ def lights_of(candidates: Sequence[Method], scene: Scene) -> npt.NDArray[np.floa
 def choose(candidates: Sequence[Method], lights: npt.NDArray[np.float64]) -> Tuned:
     """Return the candidate whose estimates spread least in green chromaticity.
 
-    Parameters
-    ----------
-    candidates
-        The methods, C ≥ 2.
-    lights
-        (N, C, 3) float64, camera RGB of any length: the estimates of `lights_of` for N images.
-
-    Raises
-    ------
-    InputError
-        There are too few candidates or images, or too few images for which all candidates give a light.
+    `lights`: (N, C, 3) float64, camera RGB of any length: the estimates of `lights_of` for N images.
 
     Examples
     --------
@@ -146,24 +116,13 @@ def counted(lights: npt.NDArray[np.float64]) -> npt.NDArray[np.bool_]:
 
 
 def require_enough(candidates: int, images: int) -> None:
-    """Raise where so many candidates and images are too few to choose by.
-
-    Raises
-    ------
-    InputError
-        There are fewer than two of one.
-    """
+    """Raise where so many candidates and images are too few to choose by."""
     if candidates < 2 or images < _FEWEST_IMAGES:
         raise InputError(f"{candidates} sets of parameters on {images} images; expected 2 or more of each")
 
 
 def family_names(name: str) -> tuple[str, ...]:
     """Return what `naming.find_method` takes for each candidate of a family, in the order of `family`.
-
-    Raises
-    ------
-    InputError
-        There is no family of that name.
 
     Examples
     --------
@@ -179,11 +138,6 @@ def family(name: str) -> tuple[GrayEdge, ...]:
     """Return the candidates of a family, each with its parameters in its name.
 
     Norms 1 to 15 without a scale; with scales of 1 to 9 px six norms up to 13.
-
-    Raises
-    ------
-    InputError
-        There is no family of that name.
 
     Examples
     --------

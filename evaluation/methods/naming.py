@@ -61,19 +61,6 @@ _FORMS = "a name of this suite, module:Class or path/file.py:Class"
 def find_method(text: str) -> Method | Learner:
     """Return the method or learner that a text names.
 
-    Parameters
-    ----------
-    text
-        A name of `standard_methods` or `local_methods`, "module:Class" or "path/file.py:Class", each of them with
-        "@PIXELS", "@patches" or "@patches=COUNT" behind it. A name of `green_stability.FAMILIES` may have ":p=NUMBER",
-        ":sigma=NUMBER" or both behind it; what is not given stays as in `standard_methods`.
-
-    Raises
-    ------
-    InputError
-        There is no such name, module, file or class; parameters make no method; it fails while it is loaded or made; it
-        has no `name`, or neither `estimate` nor `fit`. The message says which, and in which line of the user's file.
-
     Examples
     --------
     >>> find_method("gray-world").name
@@ -158,18 +145,6 @@ def _with_parameters(family: str, given: str) -> Method:
 
 def checked_method(found: object, place: str) -> Method | Learner:
     """Return an object that is a method or a learner.
-
-    Parameters
-    ----------
-    found
-        What may be one.
-    place
-        How messages call it.
-
-    Raises
-    ------
-    InputError
-        It has neither `estimate` nor `fit`, or no name.
 
     Examples
     --------

@@ -31,10 +31,7 @@ _ROWS = 256
 class OpenCvGrayWorld:
     """Gray-world of xphoto.
 
-    Attributes
-    ----------
-    name
-        Its name in tables.
+    `name`: its name in tables.
 
     Examples
     --------

@@ -31,17 +31,7 @@ A judgement; the paper's patches are of 5 to 20 px on images of 300.
 class PatchwiseMethod:
     """A global method that is asked for each patch of a grid; its `estimate` is that of the whole image.
 
-    Attributes
-    ----------
-    method
-        The global method.
-    patches
-        Patches along the shorter side; those along the longer side are as nearly square as can be.
-
-    Raises
-    ------
-    ValueError
-        There are no patches.
+    `patches`: patches along the shorter side; those along the longer side are as nearly square as can be.
 
     Examples
     --------

@@ -27,16 +27,9 @@ def usable(
     Left out are pixels of which a channel is saturated, with their eight neighbours; masked pixels; and `border` px
     along every edge (J. van de Weijer's reference program of the Gray-Edge framework, 2007).
 
-    Parameters
-    ----------
-    image
-        (H, W, 3) of any integer or float dtype, linear camera RGB.
-    saturation
-        Value from which a channel is saturated; None if none is.
-    mask
-        (H, W) bool, True where a pixel must not be used; None if every one may be.
-    border
-        Pixels left out along every edge, px.
+    `image`: (H, W, 3) of any integer or float dtype, linear camera RGB. `saturation`: value from which a channel is
+    saturated; None if none is. `mask`: (H, W) bool, True where a pixel must not be used; None if every one may be.
+    `border`: pixels left out along every edge, px.
 
     Examples
     --------

@@ -49,15 +49,9 @@ class PreparedMethod(Protocol):
 class PreparedImage:
     """An image whose shared parts are found when they are first asked for, and kept; for one thread at a time.
 
-    Parameters
-    ----------
-    image
-        (H, W, 3) uint16, float32 or float64, linear camera RGB ≥ 0; not to be changed as long as this is used. Other
-        dtypes are converted, uint8 to uint16 and all else to float64.
-    saturation
-        Value from which a channel is clipped; None if none is.
-    mask
-        (H, W) bool, True where a pixel must not be used; None if every one may be.
+    `image`: (H, W, 3) uint16, float32 or float64, linear camera RGB ≥ 0; not to be changed as long as this is used.
+    Other dtypes are converted, uint8 to uint16 and all else to float64. `saturation`: value from which a channel is
+    clipped; None if none is. `mask`: (H, W) bool, True where a pixel must not be used; None if every one may be.
 
     Examples
     --------
@@ -157,16 +151,7 @@ class PreparedImage:
     def norm(self, order: int, sigma: float, p: float, border: int) -> npt.NDArray[np.float64]:
         """Return (3,) float64, in an arbitrary unit: the Minkowski p-norm of each channel's Gaussian derivative.
 
-        Parameters
-        ----------
-        order
-            Of the derivative, 0 to 2.
-        sigma
-            Scale of the Gaussian, px; 0 for none.
-        p
-            Norm, from 1; infinity takes the maximum.
-        border
-            Pixels left out along every edge.
+        `sigma`: scale of the Gaussian, px; 0 for none.
         """
         if not sigma and p in (1, 2, math.inf):
             sums, squares, peaks, _ = self.moments(border)
@@ -269,14 +254,7 @@ def estimate_all(
 ) -> list[npt.NDArray[np.float64]]:
     """Return each method's estimate of one image, (3,) float64; the image is prepared once.
 
-    Parameters
-    ----------
-    methods
-        Any methods; those without `estimate_prepared` get the image as it is.
-    image
-        (H, W, 3) uint16, float32 or float64.
-    saturation, mask
-        See `Method.estimate`; the mask is (H, W) bool.
+    `image`: (H, W, 3) uint16, float32 or float64. `saturation`, `mask`: see `Method.estimate`; the mask is (H, W) bool.
     """
     prepared = PreparedImage(image, saturation, mask)
     return [

@@ -21,17 +21,7 @@ from evaluation.scene import Image
 class ResizedMethod:
     """A method that sees images no larger than a given size.
 
-    Attributes
-    ----------
-    method
-        The method.
-    longest
-        Longer side that images are shrunk to, px; smaller images are left as they are.
-
-    Raises
-    ------
-    ValueError
-        The side is below 1 px.
+    `longest`: longer side that images are shrunk to, px; smaller images are left as they are.
 
     Examples
     --------

@@ -20,14 +20,8 @@ _POINTS: Final = 3000
 def luminance_figure(names: Sequence[str], shares: Sequence[npt.NDArray[np.float64]], edges: Sequence[float]) -> bytes:
     """Return the distribution of luminance as SVG.
 
-    Parameters
-    ----------
-    names
-        Of the sets.
-    shares
-        For each (B,) float64, the share of cells in each bin.
-    edges
-        (B + 1,) float, the bins' edges: decimal logarithm of luminance over the 99th percentile.
+    `shares`: for each (B,) float64, the share of cells in each bin. `edges`: (B + 1,) float, the bins' edges: decimal
+    logarithm of luminance over the 99th percentile.
     """
 
     def draw(figure: Any) -> None:
@@ -48,14 +42,8 @@ def luminance_figure(names: Sequence[str], shares: Sequence[npt.NDArray[np.float
 def chroma_figure(names: Sequence[str], shares: Sequence[npt.NDArray[np.float64]], edges: Sequence[float]) -> bytes:
     """Return the histograms of chroma in the plane of ln(R/G) and ln(B/G) as SVG, side by side.
 
-    Parameters
-    ----------
-    names
-        Of the sets.
-    shares
-        For each (B, B) float64, the share of cells, by ln(R/G) and ln(B/G).
-    edges
-        (B + 1,) float, the bins' edges along both.
+    `shares`: for each (B, B) float64, the share of cells, by ln(R/G) and ln(B/G). `edges`: (B + 1,) float, the bins'
+    edges along both.
     """
 
     def draw(figure: Any) -> None:
@@ -84,12 +72,7 @@ def chroma_figure(names: Sequence[str], shares: Sequence[npt.NDArray[np.float64]
 def lights_figure(names: Sequence[str], lights: Sequence[npt.NDArray[np.float64]]) -> bytes:
     """Return the lights of sets in the plane of the chromaticities r and b as SVG.
 
-    Parameters
-    ----------
-    names
-        Of the sets.
-    lights
-        For each (L, 3) float64, linear camera RGB with r + g + b = 1.
+    `lights`: for each (L, 3) float64, linear camera RGB with r + g + b = 1.
     """
 
     def draw(figure: Any) -> None:
@@ -113,16 +96,8 @@ def noise_figure(
 ) -> bytes:
     """Return noise against signal as SVG, with the fitted photon-transfer curves.
 
-    Parameters
-    ----------
-    names
-        Of the sets.
-    measured
-        For each (N, 2) float64: signal and standard deviation of levels.
-    curves
-        For each the read noise and the gain of variance = read² + gain · signal, or None.
-    unit
-        Of both axes.
+    `measured`: for each (N, 2) float64: signal and standard deviation of levels. `curves`: for each the read noise and
+    the gain of variance = read² + gain · signal, or None.
     """
 
     def draw(figure: Any) -> None:

@@ -43,12 +43,7 @@ _LEAST_GAIN = 1e-6
 def developed(scene: Scene, estimates: Sequence[npt.NDArray[np.float64]]) -> list[bytes]:
     """Return a JPEG file for each estimate: the scene as recorded, corrected by the estimate, and by the truth.
 
-    Parameters
-    ----------
-    scene
-        Is read from its file, once; one under several lights is corrected by its map of lights where it is known.
-    estimates
-        (3,) float64 each, camera RGB of any length.
+    `estimates`: (3,) float64 each, camera RGB of any length.
     """
     image, mask = scene.read()
     linear = image.astype(np.float32)

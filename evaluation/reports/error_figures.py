@@ -56,14 +56,7 @@ def _draw_curves(figure: Any, results: Sequence[Result], kind: ErrorKind) -> Non
 def error_planes(results: Sequence[Result], truths: npt.NDArray[np.float64], kind: ErrorKind) -> bytes:
     """Return the errors over the chromaticity plane as SVG: a panel a method, the first twelve of them.
 
-    Parameters
-    ----------
-    results
-        Of N images each.
-    truths
-        (N, 3) float64, the true lights, camera RGB of any length.
-    kind
-        Which error gives the colour.
+    `truths`: (N, 3) float64, the true lights, camera RGB of any length.
     """
     shown = results[:_PANELS]
     columns = _columns(len(shown))

@@ -37,16 +37,10 @@ Interval = tuple[float, float, float]
 class ForestLine:
     """A line of a forest plot.
 
-    Attributes
-    ----------
-    label
-        What stands to the left.
-    ratios
-        For each panel; none for a line that heads those below it.
-    series
-        Number of its colour, counted from 0; lines that belong together share one.
-    whole
-        Whether it is of the whole, and not of a part.
+    - `label`: what stands to the left.
+    - `ratios`: for each panel; none for a line that heads those below it.
+    - `series`: number of its colour, counted from 0; lines that belong together share one.
+    - `whole`: whether it is of the whole, and not of a part.
     """
 
     label: str
@@ -56,15 +50,7 @@ class ForestLine:
 
 
 def forest_plot(lines: Sequence[ForestLine], panels: Sequence[str]) -> bytes:
-    """Return a forest plot as SVG.
-
-    Parameters
-    ----------
-    lines
-        From top to bottom; those with ratios have one for each panel.
-    panels
-        Titles of the panels, one for each statistic.
-    """
+    """Return a forest plot as SVG."""
     return svg_of(_draw, lines, panels, inches=(8.8, 0.9 + _LINE_INCHES * len(lines)))
 
 

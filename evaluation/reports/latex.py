@@ -83,20 +83,7 @@ def table_to_latex(table: Table) -> str:
 
 
 def tables_to_latex(caption: str, tables: Sequence[Table]) -> str:
-    r"""Return several tables of as many columns as one LaTeX float, as the paper's Table 1: each under its title.
-
-    Parameters
-    ----------
-    caption
-        Of the float.
-    tables
-        At least one; their columns' kinds are those of the first.
-
-    Raises
-    ------
-    ValueError
-        There is no table, or they differ in the number of their columns.
-    """
+    r"""Return several tables of as many columns as one LaTeX float, as the paper's Table 1: each under its title."""
     widths = sorted({len(table.columns) for table in tables})
     if len(widths) != 1:
         raise ValueError(

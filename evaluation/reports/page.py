@@ -53,10 +53,7 @@ summary {{ cursor: pointer; padding: .45rem 0; font-weight: 600 }}
 class Part:
     """A piece of a page, made by the functions of this module.
 
-    Attributes
-    ----------
-    html
-        Whole elements, every text in them escaped.
+    `html`: whole elements, every text in them escaped.
     """
 
     html: str
@@ -103,22 +100,7 @@ def _cell(text: str) -> str:
 
 
 def figure_part(picture: bytes, caption: str, alt: str | None = None) -> Part:
-    """Return a figure.
-
-    Parameters
-    ----------
-    picture
-        A whole PNG, JPEG or SVG file; see `style.svg_of`.
-    caption
-        Below it; what it shows and how to read it.
-    alt
-        What a reader gets who cannot see it; by default the caption.
-
-    Raises
-    ------
-    ValueError
-        The bytes are none of the three.
-    """
+    """Return a figure."""
     says = html.escape(caption if alt is None else alt, quote=True)
     below = f"<figcaption>{html.escape(caption)}</figcaption>" if caption else ""
     return Part(f"<figure>{_picture(picture, says)}{below}</figure>\n")

@@ -56,17 +56,7 @@ def chosen_images(result: Result, kind: ErrorKind) -> tuple[tuple[int, ...], tup
 
 
 def run_page(run: Run, kind: ErrorKind, pictures: Mapping[tuple[int, int], bytes]) -> str:
-    """Return the text of `report.html`.
-
-    Parameters
-    ----------
-    run
-        The results.
-    kind
-        The error that figures show and that images are chosen by; the summary has both.
-    pictures
-        By the method's number and the image's number: a JPEG file of `developed.developed`.
-    """
+    """Return the text of `report.html`."""
     kinds: tuple[ErrorKind, ErrorKind] = ("reproduction", "recovery")
     ordered = kinds if kind == "reproduction" else kinds[::-1]
     tables = [summary_table(run.subject, run.results, each, further=True) for each in ordered]

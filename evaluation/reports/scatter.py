@@ -21,14 +21,7 @@ def error_scatter(
 ) -> bytes:
     """Return a figure as SVG: the error of the other against that of the one, with the line where they are equal.
 
-    Parameters
-    ----------
-    one, other
-        (N,) float64 each, degrees, in the same order of images.
-    names
-        Of the two, for the axes.
-    marked
-        Names of the images to be labelled, by their places.
+    `one`, `other`: (N,) float64 each, degrees, in the same order of images.
     """
 
     def draw(figure: Any) -> None:

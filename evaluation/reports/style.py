@@ -67,15 +67,6 @@ def svg_of(draw: Callable[..., None], *arguments: Any, inches: tuple[float, floa
     `INK`, `FAINT`, `GRID` and `PAPER` in it become the page's colours of that name, which a dark screen exchanges, so
     the SVG is to stand in a page (`page.figure_part`). Text stays text, as it is written: "$" begins no mathematics.
     Logarithmic axes have plain numbers. No window is opened and no state left behind.
-
-    Parameters
-    ----------
-    draw
-        Fills a `matplotlib.figure.Figure`.
-    arguments
-        Given to `draw` after the figure.
-    inches
-        Width and height; a page is 11 inches wide, a column of two 5.
     """
     import matplotlib
     from matplotlib.backends.backend_svg import FigureCanvasSVG

@@ -45,17 +45,7 @@ def print_table(table: Table) -> None:
 
 
 def show_tables(told: JsonOutput, tables: Sequence[Table], between: str | None = None) -> None:
-    """Print tables, or add them to `tables` of the JSON object where one is asked for.
-
-    Parameters
-    ----------
-    told
-        The object.
-    tables
-        Tables with numbers as they are; in JSON each has title, columns, rows (an object each) and notes.
-    between
-        Line that is printed after each.
-    """
+    """Print tables, or add them to `tables` of the JSON object where one is asked for."""
     for table in tables:
         if told.asked:
             rows = [dict(zip(table.columns, row, strict=True)) for row in table.rows]

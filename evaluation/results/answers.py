@@ -22,14 +22,10 @@ NO_PIXEL = "no usable pixel"
 class SceneAnswer:
     """What one method answered for one image.
 
-    Attributes
-    ----------
-    light
-        The estimate, camera RGB of length 1; None where there is none, and grey is taken for it.
-    cause
-        Why there is none: "no usable pixel", or what was returned; empty where there is an estimate for every pixel.
-    by_pixel
-        The errors by pixel and region, where several lights fall on the image.
+    - `light`: the estimate, camera RGB of length 1; None where there is none, and grey is taken for it.
+    - `cause`: why there is none: "no usable pixel", or what was returned; empty where there is an estimate for every
+      pixel.
+    - `by_pixel`: the errors by pixel and region, where several lights fall on the image.
     """
 
     light: tuple[float, float, float] | None
@@ -40,18 +36,8 @@ class SceneAnswer:
 def read_light(given: object, grey: npt.NDArray[np.float64] = GREY) -> SceneAnswer:
     """Return the answer that a returned value is.
 
-    Parameters
-    ----------
-    given
-        What a method returned: (3,) numbers, or None.
-    grey
-        (3,) float64, the very array that methods return for an image without a usable pixel.
-
-    Raises
-    ------
-    ValueError
-        It is neither None nor three numbers: a mistake in the method, and not of one image. The message says what it
-        is.
+    `given`: what a method returned: (3,) numbers, or None. `grey`: (3,) float64, the very array that methods return for
+    an image without a usable pixel.
 
     Examples
     --------
@@ -85,14 +71,7 @@ def results_of(
 ) -> tuple[Result, ...]:
     """Return the results that answers make.
 
-    Parameters
-    ----------
-    methods
-        Their names.
-    truths
-        (N, 3) float64, the true lights of the scenes.
-    answers
-        One sequence a scene, in the scenes' order, of one answer a method.
+    `truths`: (N, 3) float64, the true lights of the scenes.
     """
     return tuple(_result(method, truths, [given[number] for given in answers]) for number, method in enumerate(methods))
 
@@ -138,11 +117,6 @@ def answer_to_json(answer: SceneAnswer) -> dict[str, Any]:
 
 def answer_from_json(stored: dict[str, Any]) -> SceneAnswer:
     """Return the answer that a JSON object is.
-
-    Raises
-    ------
-    KeyError, TypeError, ValueError
-        The object is no answer.
 
     Examples
     --------

@@ -32,20 +32,12 @@ _GUESSED = {"": False, "0": False, "no": False, "false": False, "1": True, "yes"
 class MethodErrors:
     """The errors of one method on the images of a data set.
 
-    Attributes
-    ----------
-    method
-        The method's name.
-    images
-        The images' names, N of them, each once.
-    truths
-        (N, 3) float64, linear camera RGB of any length; None where the file does not hold them.
-    errors
-        Kind of error to (N,) float64, degrees.
-    guessed
-        (N,) bool, True where no pixel was usable and the estimate is therefore grey.
-    estimates
-        (N, 3) float64, linear camera RGB of any length; None where the file does not hold them all.
+    - `method`: the method's name.
+    - `images`: the images' names, N of them, each once.
+    - `truths`: (N, 3) float64, linear camera RGB of any length; None where the file does not hold them.
+    - `errors`: kind of error to (N,) float64, degrees.
+    - `guessed`: (N,) bool, True where no pixel was usable and the estimate is therefore grey.
+    - `estimates`: (N, 3) float64, linear camera RGB of any length; None where the file does not hold them all.
     """
 
     method: str
@@ -57,20 +49,7 @@ class MethodErrors:
 
 
 def read_errors(place: Path | str) -> dict[str, MethodErrors]:
-    """Return the errors of every method of a results folder, by the methods' names and in the file's order.
-
-    Parameters
-    ----------
-    place
-        The folder, or a CSV file itself.
-
-    Raises
-    ------
-    InputError
-        There is no such file.
-    FormatError
-        It is no table of errors; the message names the line.
-    """
+    """Return the errors of every method of a results folder, by the methods' names and in the file's order."""
     path = Path(place)
     if path.is_dir():
         path = path / ERRORS_FILE

@@ -29,16 +29,10 @@ _COLUMNS = ("image", "r", "g", "b")
 class GivenEstimates:
     """Estimates from a file, in place of a method.
 
-    Attributes
-    ----------
-    name
-        What stands in the tables.
-    file
-        The file's name.
-    sha256
-        Of its bytes.
-    lights
-        (3,) float64 of each image by its name, as the file has them: not checked to be lights.
+    - `name`: what stands in the tables.
+    - `file`: the file's name.
+    - `sha256`: of its bytes.
+    - `lights`: (3,) float64 of each image by its name, as the file has them: not checked to be lights.
     """
 
     name: str
@@ -52,24 +46,7 @@ class GivenEstimates:
 
 
 def read_estimates(path: Path, images: Sequence[str], name: str | None = None) -> GivenEstimates:
-    """Return the estimates of a file for the images of a data set.
-
-    Parameters
-    ----------
-    path
-        The CSV file.
-    images
-        The names of the data set's images.
-    name
-        What stands in the tables; by default the file's name without its extension.
-
-    Raises
-    ------
-    InputError
-        The file cannot be read, or images are missing, unknown or there twice; the message names them.
-    FormatError
-        It is no such table; the message names the line.
-    """
+    """Return the estimates of a file for the images of a data set."""
     try:
         content = path.read_bytes()
         text = content.decode("utf-8-sig")

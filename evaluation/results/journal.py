@@ -21,22 +21,7 @@ JOURNAL_FILE = "answers.jsonl"
 
 
 def read_journal(path: Path, identity: dict[str, Any]) -> list[tuple[SceneAnswer, ...]]:
-    """Return the answers of the first images, and cut off what is not whole; begin the file where there is none.
-
-    Parameters
-    ----------
-    path
-        The file.
-    identity
-        What the answers are of: the data set, the methods, the software. JSON, the same for the same run.
-
-    Raises
-    ------
-    InputError
-        The file is another run's; the message says in what it differs.
-    StorageError
-        The file cannot be read or written.
-    """
+    """Return the answers of the first images, and cut off what is not whole; begin the file where there is none."""
     try:
         content = path.read_bytes() if path.exists() else b""
         whole, lines = _whole_lines(content)
@@ -69,17 +54,7 @@ def read_journal(path: Path, identity: dict[str, Any]) -> list[tuple[SceneAnswer
 
 
 class AnswerJournal:
-    """The file, open to be continued.
-
-    Parameters
-    ----------
-    stream
-        Opened for appending, unbuffered: a line is with the system when `append` returns, and survives a kill.
-    count
-        Images that it holds already.
-    folder
-        What is made, for the messages of errors.
-    """
+    """The file, open to be continued."""
 
     def __init__(self, stream: BinaryIO, count: int, folder: Path) -> None:
         self._stream = stream
@@ -87,13 +62,7 @@ class AnswerJournal:
         self._folder = folder
 
     def append(self, answers: Sequence[SceneAnswer]) -> None:
-        """Add the answers for the next image.
-
-        Raises
-        ------
-        StorageError
-            The disk is full, read-only or gone.
-        """
+        """Add the answers for the next image."""
         line = _line({"image": self._count, "answers": [answer_to_json(answer) for answer in answers]})
         try:
             self._stream.write(line)

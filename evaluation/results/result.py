@@ -20,21 +20,14 @@ COLUMNS = ("method", "mean", "median", "trimean", "best25", "worst25", "avg")
 class MapErrors:
     """The errors of one method on the images under several lights, by pixel and by region; see `metrics.maps`.
 
-    Attributes
-    ----------
-    images
-        (M,) int64, the numbers of those images among the scenes, rising.
-    pixel
-        Kind of error to (M,) float64, degrees: the mean over each image's pixels; the recovery error is LSMI's
-        MAE_illum. NaN where no pixel of an image is judged.
-    rgb
-        (M,) float64, degrees, LSMI's MAE_rgb; NaN likewise.
-    region_images, region_lights
-        (R,) int64 each: of each region, its image among the scenes and its light's number in that image.
-    region_shares
-        (R,) float64, the region's part of the image's judged pixels.
-    region
-        Kind of error to (R,) float64, degrees: the mean over each region's pixels.
+    - `images`: (M,) int64, the numbers of those images among the scenes, rising.
+    - `pixel`: kind of error to (M,) float64, degrees: the mean over each image's pixels; the recovery error is LSMI's
+      MAE_illum. NaN where no pixel of an image is judged.
+    - `rgb`: (M,) float64, degrees, LSMI's MAE_rgb; NaN likewise.
+    - `region_images`, `region_lights`: (R,) int64 each: of each region, its image among the scenes and its light's
+      number in that image.
+    - `region_shares`: (R,) float64, the region's part of the image's judged pixels.
+    - `region`: kind of error to (R,) float64, degrees: the mean over each region's pixels.
     """
 
     images: npt.NDArray[np.int64]
@@ -50,20 +43,14 @@ class MapErrors:
 class Result:
     """Estimates and errors of one method on one dataset.
 
-    Attributes
-    ----------
-    method
-        The method's name.
-    estimates
-        (N, 3) float64, camera RGB of length 1, in the order of the scenes.
-    errors
-        Kind of error to (N,) float64, degrees; of an image under several lights the error against their mean.
-    guessed
-        (N,) bool, True where the method gave no light and grey stands in for it.
-    causes
-        Why it gave none, or none for some pixels, by the image's number among the scenes; None where nobody asked.
-    maps
-        The errors on images under several lights by pixel and region; None where no image is, or none was measured.
+    - `method`: the method's name.
+    - `estimates`: (N, 3) float64, camera RGB of length 1, in the order of the scenes.
+    - `errors`: kind of error to (N,) float64, degrees; of an image under several lights the error against their mean.
+    - `guessed`: (N,) bool, True where the method gave no light and grey stands in for it.
+    - `causes`: why it gave none, or none for some pixels, by the image's number among the scenes; None where nobody
+      asked.
+    - `maps`: the errors on images under several lights by pixel and region; None where no image is, or none was
+      measured.
     """
 
     method: str
@@ -119,13 +106,6 @@ def images_csv(scenes: Sequence[Scene], results: Sequence[Result]) -> str:
     """Return every estimate and error as CSV text: `image,method,r,g,b,recovery,reproduction`.
 
     Estimates are scaled to r + g + b = 1, errors are degrees.
-
-    Parameters
-    ----------
-    scenes
-        N scenes, as they were given to `evaluate`.
-    results
-        The results of `evaluate`.
     """
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")

@@ -17,28 +17,16 @@ from evaluation.results.summary_tables import Subject
 class Run:
     """Methods on a data set, and their results.
 
-    Attributes
-    ----------
-    subject
-        The data set's name and its images.
-    layout, place, treatment
-        See `scene.SceneSet`.
-    data_sha256
-        Of the images' names and ground truths; see `learning.model_files.scenes_sha256`.
-    truths
-        (N, 3) float64, camera RGB of any length.
-    results
-        One a method.
-    methods
-        A JSON object each; see `method_records.describe_method`.
-    settings
-        What else the results depend on, such as a seed: JSON.
-    folds
-        (N,) int64, the fold of each image, where the methods were cross-validated; else None.
-    notes
-        Sentences that belong beside the results.
-    software
-        Name and version of what made them.
+    - `subject`: the data set's name and its images.
+    - `layout`, `place`, `treatment`: see `scene.SceneSet`.
+    - `data_sha256`: of the images' names and ground truths; see `learning.model_files.scenes_sha256`.
+    - `truths`: (N, 3) float64, camera RGB of any length.
+    - `results`: one a method.
+    - `methods`: A JSON object each; see `method_records.describe_method`.
+    - `settings`: what else the results depend on, such as a seed: JSON.
+    - `folds`: (N,) int64, the fold of each image, where the methods were cross-validated; else None.
+    - `notes`: sentences that belong beside the results.
+    - `software`: name and version of what made them.
     """
 
     subject: Subject

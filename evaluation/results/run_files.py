@@ -27,14 +27,7 @@ def errors_csv(images: Sequence[str], truths: npt.NDArray[np.float64], results: 
     have the sum 1, errors are degrees; `guessed` is 1 where the method gave no light and grey stands in for it, `cause`
     says why.
 
-    Parameters
-    ----------
-    images
-        The names of the N images.
-    truths
-        (N, 3) float64, camera RGB of any length.
-    results
-        Of those images.
+    `truths`: (N, 3) float64, camera RGB of any length.
     """
     shares = truths / truths.sum(axis=1, keepdims=True)
     given = [result.estimates / result.estimates.sum(axis=1, keepdims=True) for result in results]

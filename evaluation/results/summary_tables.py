@@ -34,14 +34,9 @@ _NAMED = 3
 class Subject:
     """What results are of.
 
-    Attributes
-    ----------
-    name
-        The data set's name.
-    images
-        The images' names.
-    mixed
-        Whether several lights fall on each image.
+    - `name`: the data set's name.
+    - `images`: the images' names.
+    - `mixed`: whether several lights fall on each image.
     """
 
     name: str
@@ -52,16 +47,7 @@ class Subject:
 def summary_table(subject: Subject, results: Sequence[Result], kind: ErrorKind, further: bool = False) -> Table:
     """Return the table of the paper for one kind of error, with notes on images for which a method gave no light.
 
-    Parameters
-    ----------
-    subject
-        The data set.
-    results
-        At least one.
-    kind
-        Which angular error.
-    further
-        Whether to add the 95th percentile, the maximum and the percentage below 3 degrees.
+    `further`: whether to add the 95th percentile, the maximum and the percentage below 3 degrees.
     """
     several = sum(subject.mixed)
     held = f" ({several} of them under several lights, held to the mean of these)" if several else ""

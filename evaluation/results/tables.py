@@ -21,23 +21,11 @@ MISSING = "–"
 class Table:
     """A table with a title.
 
-    Attributes
-    ----------
-    title
-        What it shows, with the unit of its numbers: "Cube+: reproduction angular error of 1707 images, degrees".
-    columns
-        Heads of the columns, at least one.
-    rows
-        As many cells as columns each. A column whose cells are numbers or None is set as numbers.
-    digits
-        Decimals of a float where people read; CSV has them all.
-    notes
-        Sentences below the table.
-
-    Raises
-    ------
-    ValueError
-        There is no column, or a row has another number of cells than there are columns.
+    - `title`: what it shows, with the unit of its numbers: "Cube+: reproduction angular error of 1707 images, degrees".
+    - `columns`: heads of the columns, at least one.
+    - `rows`: as many cells as columns each. A column whose cells are numbers or None is set as numbers.
+    - `digits`: decimals of a float where people read; CSV has them all.
+    - `notes`: sentences below the table.
 
     Examples
     --------

@@ -39,12 +39,7 @@ def observer_cie_1931() -> tuple[_Array, _Array]:
 def planck(wavelengths_nm: npt.ArrayLike, temperature_k: float) -> _Array:
     """Return the spectral radiance of a black body in vacuum, W sr⁻¹ m⁻² nm⁻¹, as the shape given, float64.
 
-    Parameters
-    ----------
-    wavelengths_nm
-        Of any shape, float64, above 0, nm.
-    temperature_k
-        Above 0, K.
+    `wavelengths_nm`: of any shape, float64, above 0, nm.
     """
     metres = np.asarray(wavelengths_nm, dtype=np.float64) * 1e-9
     return _C1_W_M2 * metres**-5 / np.pi / np.expm1(_C2_M_K / (metres * temperature_k)) * 1e-9

@@ -74,20 +74,7 @@ def _array_kind(name: str, array: npt.NDArray[Any]) -> str | None:
 def caller(address: int, kinds: Sequence[str], returned: str | Sequence[str] | None) -> Callable[..., Any]:
     """Return a Python function that calls machine code without the interpreter's lock.
 
-    Parameters
-    ----------
-    address
-        Where the code lies.
-    kinds
-        Of its arguments, as `kind_of` returns them.
-    returned
-        The kind of number that it returns, those of a tuple, or None where it returns nothing.
-
-    Returns
-    -------
-    callable
-        Takes positional arguments of those kinds. Raises MemoryError where memory is short, or an array in another
-        order than C's is given another shape: the faults that machine code without a `raise` of its own can have.
+    `returned`: the kind of number that it returns, those of a tuple, or None where it returns nothing.
     """
     taken: list[Any] = []
     arrays: list[bool] = []

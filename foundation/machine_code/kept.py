@@ -28,16 +28,9 @@ _VERSION: Final = 3
 class Origin:
     """What a function was made from.
 
-    Attributes
-    ----------
-    module, name
-        Where it stands, and what it is called there.
-    file
-        Its source file.
-    digest
-        Of all sources behind it; see `sources.digest_of`.
-    kinds
-        Of its arguments; see `arguments.kind_of`.
+    - `module`, `name`: where it stands, and what it is called there.
+    - `digest`: of all sources behind it; see `sources.digest_of`.
+    - `kinds`: of its arguments; see `arguments.kind_of`.
     """
 
     module: str
@@ -59,14 +52,9 @@ class Origin:
 class Code:
     """A function's machine code.
 
-    Attributes
-    ----------
-    bytes
-        An object file; None where the function needs numba to be called.
-    symbol
-        Its name in that file.
-    returned
-        What it returns; see `arguments.caller`.
+    - `bytes`: an object file; None where the function needs numba to be called.
+    - `symbol`: its name in that file.
+    - `returned`: what it returns; see `arguments.caller`.
     """
 
     bytes: bytes | None

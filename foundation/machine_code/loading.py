@@ -11,14 +11,9 @@ from typing import Any
 class Processor:
     """What code is compiled for.
 
-    Attributes
-    ----------
-    triple
-        The kind of machine, as LLVM names it.
-    name, features
-        The processor and its extensions, as LLVM names them.
-    llvmlite
-        Version of the library; a newer one brings another LLVM.
+    - `triple`: the kind of machine, as LLVM names it.
+    - `name`, `features`: the processor and its extensions, as LLVM names them.
+    - `llvmlite`: version of the library; a newer one brings another LLVM.
     """
 
     triple: str
@@ -70,12 +65,7 @@ class Loaded:
 def load(code: bytes, symbol: str) -> Loaded:
     """Return the function that an object file has under a name.
 
-    Parameters
-    ----------
-    code
-        The bytes of the object file, of the processor at hand. What it refers to must be in the C library.
-    symbol
-        The function's name in it.
+    `code`: the bytes of the object file, of the processor at hand. What it refers to must be in the C library.
     """
     from llvmlite import binding
 

@@ -122,18 +122,7 @@ _log: Final = logging.getLogger(__name__)
 
 
 def translated(function: FunctionType, ready: Callable[[Any], Any], digest: str) -> FunctionType:
-    """Return a function as numba takes it.
-
-    Parameters
-    ----------
-    function
-        A function of a module.
-    ready
-        Returns what stands for a thing that the function names: of compiled functions, numba's.
-    digest
-        Of all code that may be in it. numba knows kept machine code again by the function's own file and by what it
-        closes over, not by the functions of other files that were compiled into it; so it closes over this.
-    """
+    """Return a function as numba takes it."""
     code = function.__code__
     if code.co_freevars:
         raise ValueError(f"{function.__qualname__} closes over {code.co_freevars}; compile module functions only")

@@ -60,22 +60,7 @@ def is_inside_name(name: str) -> bool:
 
 @contextmanager
 def open_inside(root: Path, name: str) -> Generator[BinaryIO]:
-    """Open a file below a folder to be read.
-
-    Parameters
-    ----------
-    root
-        The folder; links on the way to it are followed, for the user named it.
-    name
-        Of the file, with forward slashes; it may come from a stranger.
-
-    Raises
-    ------
-    FormatError
-        The name leads out of the folder, by itself or by a link, or to what is no regular file.
-    OSError
-        The file is missing, or cannot be read.
-    """
+    """Open a file below a folder to be read."""
     if not is_inside_name(name):
         raise FormatError(f"{root}: {name!r} is no name of a file inside the folder; {_COPY_REMEDY}")
     handle = _opened_below(root, name)
@@ -105,24 +90,7 @@ def read_inside(root: Path, name: str, most_bytes: int) -> bytes:
 def require_plain_folder(
     folder: Path, most_bytes: Mapping[str, int] | None = None, below: tuple[str, ...] = ()
 ) -> None:
-    """Refuse a folder that holds anything but folders, regular files and links that stay inside.
-
-    Parameters
-    ----------
-    folder
-        What is to be read. One that is not there is left to its reader.
-    most_bytes
-        The largest size of files, by name.
-    below
-        Folders in it that are looked into as well; others are not read.
-
-    Raises
-    ------
-    FormatError
-        It does, or a file is larger than it may be.
-    StorageError
-        The disk fails.
-    """
+    """Refuse a folder that holds anything but folders, regular files and links that stay inside."""
     try:
         for inner in ("", *below):
             with suppress(FileNotFoundError, NotADirectoryError), os.scandir(folder / inner) as entries:
@@ -146,12 +114,9 @@ def _require_size(path: Path, most: int) -> None:
 
 
 def require_plain_tree(folder: Path) -> None:
-    """Refuse a folder that holds, at any depth, anything but folders and regular files; for folders of others' formats.
+    """Refuse a folder that holds, at any depth, anything but folders and regular files.
 
-    Raises
-    ------
-    FormatError
-        It does; links are refused wherever they lead.
+    For folders of others' formats.
     """
     for path, folders, files in os.walk(folder):
         for name in (*folders, *files):

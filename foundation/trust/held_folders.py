@@ -33,10 +33,7 @@ _log = logging.getLogger(__name__)
 class FolderLock:
     """The hold on a folder; given by `held_folder`.
 
-    Parameters
-    ----------
-    handle
-        Open file descriptor of what is locked; None where the file system has no locks.
+    `handle`: open file descriptor of what is locked; None where the file system has no locks.
     """
 
     def __init__(self, handle: int | None) -> None:
@@ -55,24 +52,9 @@ def held_folder(
 ) -> Generator[FolderLock]:
     """Hold a folder while the block runs; it is made if it is not there.
 
-    Parameters
-    ----------
-    folder
-        What to hold.
-    busy
-        The message where another program holds it.
-    share_if
-        Where given, another program's hold is waited for until it is shared (`FolderLock.share`), and joined if this
-        returns true then; if not, the attempt begins anew.
-    of
-        What is made in the folder, named in the messages of errors; the folder itself if None.
-
-    Raises
-    ------
-    InputError
-        Another program holds the folder, or its path cannot be one.
-    StorageError
-        The folder cannot be made or opened.
+    `share_if`: where given, another program's hold is waited for until it is shared (`FolderLock.share`), and joined if
+    this returns true then; if not, the attempt begins anew. `of`: what is made in the folder, named in the messages of
+    errors; the folder itself if None.
     """
     for _ in range(ATTEMPTS):
         make_folder(folder, of)
@@ -108,15 +90,7 @@ def _close(handle: int) -> None:
 
 
 def _locked(place: int, folder: Path, wait: bool, opened: ExitStack) -> tuple[int | None, bool]:
-    """Lock the open folder, else a file in it; return what is locked, and whether it is held together with others.
-
-    Raises
-    ------
-    BlockingIOError
-        Another program holds it, and it is not to be waited for.
-    OSError
-        The file cannot be made: the folder is read-only, or gone.
-    """
+    """Lock the open folder, else a file in it; return what is locked, and whether it is held together with others."""
     with _lockless_suppressed():
         return place, _lock(place, wait)
     while True:

@@ -31,19 +31,7 @@ BITS: Final = 4
 def table_folder(given: Path, cache: Path | None = None) -> Path:
     """Return the folder of a table: the one given, or that of the table to begin with, made if it is not there.
 
-    Parameters
-    ----------
-    given
-        What stands in place of LUT.
-    cache
-        Where the table is kept; None for `generator.rendering.kept_mixtures.cache_folder`.
-
-    Raises
-    ------
-    InputError
-        There is no place where it could be kept.
-    StorageError
-        It cannot be written there.
+    `cache`: where the table is kept; None for `generator.rendering.kept_mixtures.cache_folder`.
     """
     if str(given) != DEMO:
         return given

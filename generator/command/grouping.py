@@ -14,16 +14,8 @@ import typer
 def grouped(function: Callable[..., None]) -> Callable[..., None]:
     """Return a command for typer with one parameter for each field of the groups that `function` takes.
 
-    Parameters
-    ----------
-    function
-        Each of its parameters is annotated with a frozen dataclass, whose fields are ``Annotated`` with typer's
-        ``Option`` or ``Argument`` and have defaults. No two groups share a field's name.
-
-    Raises
-    ------
-    TypeError
-        Two groups have a field of one name.
+    `function`: each of its parameters is annotated with a frozen dataclass, whose fields are ``Annotated`` with typer's
+    ``Option`` or ``Argument`` and have defaults. No two groups share a field's name.
     """
     groups = {name: hint for name, hint in get_type_hints(function).items() if name != "return"}
     parameters: dict[str, inspect.Parameter] = {}

@@ -73,20 +73,12 @@ class LikenessOptions:
 class Chosen:
     """Sources and lights of a dataset, and what is recorded and told of how they were chosen.
 
-    Attributes
-    ----------
-    sources, choice
-        The sources and the lights.
-    reading
-        How sources were read, as plain values.
-    told
-        Lines to print.
-    crops
-        Crops of each picture.
-    weighted
-        Whether sources were drawn by weights.
-    exposure
-        How images are exposed; None as the table.
+    - `sources`, `choice`: the sources and the lights.
+    - `reading`: how sources were read, as plain values.
+    - `told`: lines to print.
+    - `crops`: crops of each picture.
+    - `weighted`: whether sources were drawn by weights.
+    - `exposure`: how images are exposed; None as the table.
     """
 
     sources: tuple[Source, ...]
@@ -108,15 +100,7 @@ def choose(
     seed: int,
     workers: int,
 ) -> Chosen:
-    """Return the sources and lights that the options ask for.
-
-    Raises
-    ------
-    InputError
-        Options exclude one another, or ask for what is not there.
-    FormatError
-        A file of statistics, or a dataset, cannot be read.
-    """
+    """Return the sources and lights that the options ask for."""
     parts = [] if likeness.like is None else _parts(likeness, pictures, light, variation)
     if rendered.black_point.kind == "like" and "pictures" not in parts:
         raise InputError(

@@ -110,13 +110,7 @@ class PictureOptions:
         return Preparation(self.max_side, crop, self.cover, self.crop_at, self.profiles, seed, self.crops)
 
     def find(self, seed: int) -> tuple[Source, ...]:
-        """Return the sources: pictures that are found, then random ones.
-
-        Raises
-        ------
-        InputError
-            There is none, or options do not go together.
-        """
+        """Return the sources: pictures that are found, then random ones."""
         from generator.pictures.sources import find_pictures, random_scenes
 
         preparation = self.preparation(seed)
@@ -393,13 +387,7 @@ class VariationOptions:
     ] = None
 
     def variation(self, lut: Lut, like: ExposureChoice | None = None) -> Variation:
-        """Return the variation of images of a table, exposed like a data set unless an option says how.
-
-        Raises
-        ------
-        InputError
-            An option cannot be used.
-        """
+        """Return the variation of images of a table, exposed like a data set unless an option says how."""
         from generator.variation.exposures import parse_exposure
         from generator.variation.gradients import parse_gradient
         from generator.variation.iso_speed import known_of_table, parse_iso

@@ -25,16 +25,6 @@ def shown_progress(images: int) -> Generator[Callbacks]:
     """Show how many images are made, how fast, and the time left while the block runs.
 
     On a terminal that is a bar; elsewhere, and where the work is done at once, one line at the end.
-
-    Parameters
-    ----------
-    images
-        How many are to be made.
-
-    Yields
-    ------
-    Callbacks
-        To be called while they are made.
     """
     if not shows_progress():
         yield SILENT
@@ -48,15 +38,7 @@ def shown_progress(images: int) -> Generator[Callbacks]:
 
 
 class _Images:
-    """How many images are made.
-
-    Parameters
-    ----------
-    total
-        Images that are to be made.
-    shown
-        Takes the bar, if there is to be one.
-    """
+    """How many images are made."""
 
     def __init__(self, total: int, shown: ExitStack) -> None:
         self._total = total

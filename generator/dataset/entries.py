@@ -41,11 +41,6 @@ def read_entries(store: Store, description: Description) -> Iterator[Entry]:
     """Yield the images of a dataset in the order of their numbers; reads no image.
 
     Both lists are in this order, and the rows of one image follow each other, so that a line of each is in memory.
-
-    Raises
-    ------
-    FormatError
-        A list is missing or damaged, or the two disagree.
     """
     name = f"{store.place}/{GROUND_TRUTH}"
     part_of: dict[int, Split] = {}

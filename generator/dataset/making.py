@@ -129,13 +129,6 @@ def made_before(plan: Plan, out: Path | str) -> Dataset | None:
 
     Pictures on this machine that were written to since are hashed again and compared; those on a store are compared by
     their names.
-
-    Raises
-    ------
-    InputError
-        The dataset is of another plan; the message says how the two differ.
-    FormatError
-        The dataset is damaged.
     """
     if not holds_dataset(out):
         return None
@@ -183,24 +176,7 @@ def make_share(
 ) -> tuple[int, int]:
     """Make one of several shares of a dataset, beside other programs that make theirs; then call `finish_dataset`.
 
-    Parameters
-    ----------
-    plan, out, workers, callbacks
-        As of `make_dataset`.
-    share
-        (i, n): the shards whose number leaves i when divided by n, i from 0.
-
-    Returns
-    -------
-    tuple
-        How many shards of the whole dataset are done now, and how many there are.
-
-    Raises
-    ------
-    InputError
-        There is no such share, or the place is taken or belongs to another plan.
-    StorageError
-        The disk is full, read-only or gone; the shards that are done are kept for the next call.
+    `share`: (i, n): the shards whose number leaves i when divided by n, i from 0.
     """
     index, count = share
     if not 0 <= index < count:
@@ -211,13 +187,7 @@ def make_share(
 
 
 def finish_dataset(out: Path | str) -> Dataset:
-    """Make a dataset of its shards when every share is done; a dataset that is complete stays as it is.
-
-    Raises
-    ------
-    InputError
-        No dataset is being made there, shards are missing, or another program is at it.
-    """
+    """Make a dataset of its shards when every share is done; a dataset that is complete stays as it is."""
     if holds_dataset(out):
         return open_dataset(out)
     identity = stored_identity(out)

@@ -63,14 +63,9 @@ __all__ = ["Dataset", "Description", "Entry", "open_dataset"]
 class Dataset:
     """A dataset on disk or in a store; images are read where they are used.
 
-    Attributes
-    ----------
-    store
-        Where its files are.
-    description
-        The content of `dataset.json`.
-    entries
-        Its images in the order of their numbers.
+    - `store`: where its files are.
+    - `description`: the content of `dataset.json`.
+    - `entries`: its images in the order of their numbers.
     """
 
     store: Store
@@ -81,11 +76,6 @@ class Dataset:
         """Return the image (H, W, 3) uint16, linear camera RGB, `description.table.white_level` = saturation.
 
         Counts that were stretched over 16 bits are as they were before.
-
-        Raises
-        ------
-        FormatError
-            The file is missing, damaged or no image of its format.
         """
         name = self._name(entry.image, entry.split, "images")
         image = decode_image(self._bytes(name), self._options.format, f"{self.store.place}/{name}")
@@ -100,28 +90,15 @@ class Dataset:
         return self._beside(entry, "previews", ".jpg")
 
     def read_weights(self, entry: Entry) -> npt.NDArray[np.float32]:
-        """Return how the lights of an image share its pixels: (H, W, K) float32, in the order of `entry.lights`, sum 1.
+        """Return how the lights of an image share its pixels: (H, W, K) float32.
 
-        Raises
-        ------
-        InputError
-            One light falls on the image.
-        FormatError
-            A file is missing or damaged.
+        In the order of `entry.lights`, sum 1.
         """
         masks = [self._map(entry, "masks", f"_{light}.png") for light in range(len(entry.lights))]
         return decode_weights(masks, self._of(entry, "masks"))
 
     def read_ground_truth_map(self, entry: Entry) -> npt.NDArray[np.float32]:
-        """Return the ground truth of every pixel of an image: (H, W, 3) float32, r + g + b = 1.
-
-        Raises
-        ------
-        InputError
-            One light falls on the image: `entry.truth` is that of every pixel.
-        FormatError
-            The file is missing or damaged.
-        """
+        """Return the ground truth of every pixel of an image: (H, W, 3) float32, r + g + b = 1."""
         return decode_ground_truth(self._map(entry, "ground_truth", ".png"), self._of(entry, "ground truth"))
 
     @property
@@ -135,13 +112,7 @@ class Dataset:
 
     @cached_property
     def sources(self) -> tuple[SourceRecord, ...]:
-        """The sources that were used, in their order.
-
-        Raises
-        ------
-        FormatError
-            Their list is damaged.
-        """
+        """The sources that were used, in their order."""
         rows: Iterable[dict[str, Any]]
         try:
             if self.store.has(SOURCES):
@@ -157,13 +128,7 @@ class Dataset:
 
     @cached_property
     def details(self) -> dict[str, dict[str, str]]:
-        """What options did to each image, as `images.csv` has it, by the image's name; empty if none did anything.
-
-        Raises
-        ------
-        FormatError
-            The list is damaged.
-        """
+        """What options did to each image, as `images.csv` has it, by the image's name; empty if none did anything."""
         if not self.store.has(IMAGES):
             return {}
         rows = csv.DictReader(io.StringIO(self._list(IMAGES)))

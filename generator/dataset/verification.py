@@ -27,20 +27,6 @@ def file_faults(
     """Yield each file of a dataset that is missing, changed or unknown, in words; reads every byte of it.
 
     Card, datasheet and Croissant metadata are completed by hand and not looked at, unless older software listed them.
-
-    Parameters
-    ----------
-    place
-        Path or URL of the dataset.
-    progress
-        Called after each file with how many were verified, and how many there are.
-    workers
-        Threads that read and hash.
-
-    Raises
-    ------
-    FormatError
-        There is no dataset, or it has no list of hashes.
     """
     store = open_store(place)
     sums = f"{store.place}/{SUMS}"

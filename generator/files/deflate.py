@@ -97,13 +97,7 @@ _LENGTH_BITS[_RUNS[:, 0]] = _RUNS[:, 1]
 
 @compiled
 def _split(image: Any, rows: Any) -> Any:
-    """Fill `rows` (h, 1 + 6 w) uint8 with the unfiltered bytes of `image` (h, w, 3), big-endian, a 0 before each row.
-
-    Returns
-    -------
-    int
-        The bits of all samples combined by or: no sample is larger.
-    """
+    """Fill `rows` (h, 1 + 6 w) uint8 with the bytes of `image` (h, w, 3), big-endian, a 0 before each row."""
     joined = uint16(0)
     for y in range(image.shape[0]):
         samples, row = image[y].reshape(-1), rows[y]
@@ -457,18 +451,9 @@ class Packer:
     def pack(self, image: npt.NDArray[np.uint16], *, last: bool) -> tuple[npt.NDArray[np.uint8], npt.NDArray[np.uint8]]:
         """Return a band of an image as deflate data, and the bytes that these unpack to.
 
-        Parameters
-        ----------
-        image
-            (h, w, 3) uint16, contiguous, w at most `WIDEST`.
-        last
-            Whether no band follows.
-
-        Returns
-        -------
-        tuple
-            (n,) uint8, the bytes of whole blocks, the final one among them if `last`; and (h, 1 + 6 w) uint8, the rows
-            of a PNG, each led by its filter. Both are views of memory that the next band overwrites.
+        `image`: (h, w, 3) uint16, contiguous, w at most `WIDEST`. Returns (n,) uint8, the bytes of whole blocks, the
+        final one among them if `last`; and (h, 1 + 6 w) uint8, the rows of a PNG, each led by its filter. Both are
+        views of memory that the next band overwrites.
         """
         height, width, _ = image.shape
         size = height * (1 + 6 * width)

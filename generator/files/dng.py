@@ -30,14 +30,7 @@ _SRGB: Matrix = ((3.2406, -1.5372, -0.4986), (-0.9689, 1.8758, 0.0415), (0.0557,
 
 
 def encode_dng(image: npt.NDArray[np.uint16], metadata: ImageMetadata) -> bytes:
-    """Return the file of `image` (H, W, 3) uint16, uncompressed.
-
-    Raises
-    ------
-    InputError
-        The image is smaller than raw programs open or larger than the format holds, or the metadata's white level or
-        white cannot be written.
-    """
+    """Return the file of `image` (H, W, 3) uint16, uncompressed."""
     height, width, _ = image.shape
     if min(height, width) < SMALLEST_SIDE:
         raise InputError(

@@ -37,13 +37,7 @@ _LEVEL: Final = 1
 
 
 def encode_exr(image: npt.NDArray[np.uint16], metadata: ImageMetadata) -> bytes:
-    """Return the file of `image` (H, W, 3) uint16.
-
-    Raises
-    ------
-    InputError
-        A row of the image is larger than the format holds.
-    """
+    """Return the file of `image` (H, W, 3) uint16."""
     height, width, _ = image.shape
     if 12 * width * _LINES > LARGEST_SIDE:
         raise InputError(f"an image of {width}x{height} px is too wide for EXR; choose png or tiff, or make it smaller")
@@ -56,13 +50,7 @@ def encode_exr(image: npt.NDArray[np.uint16], metadata: ImageMetadata) -> bytes:
 
 
 def decode_exr(data: bytes) -> npt.NDArray[np.uint16]:
-    """Return the image (H, W, 3) uint16 of a file's bytes.
-
-    Raises
-    ------
-    ValueError
-        It is no EXR of three channels of whole numbers 0 … 65535.
-    """
+    """Return the image (H, W, 3) uint16 of a file's bytes."""
     import OpenImageIO as oiio  # noqa: N813
 
     # OpenImageIO reads named files only.

@@ -74,13 +74,7 @@ def suffix_of(form: Format) -> str:
 
 
 def libraries_of(form: Format) -> tuple[str, ...]:
-    """Return the distributions whose version may change the bytes of a file of that format; none if CroP encodes it.
-
-    Raises
-    ------
-    InputError
-        The format needs one that a plain installation has not, and that is not there.
-    """
+    """Return the distributions whose version may change the bytes of a file of that format; none if CroP encodes it."""
     if form == "jxl":
         from generator.files.jxl import imagecodecs
 
@@ -100,19 +94,7 @@ def smallest_side(form: Format) -> int:
 def encode_image(image: npt.NDArray[np.uint16], form: Format, metadata: ImageMetadata) -> bytes:
     """Return `image` as the bytes of a file.
 
-    Parameters
-    ----------
-    image
-        (H, W, 3) uint16, linear camera RGB.
-    form
-        The format; `dng` keeps one channel of each pixel, the others every bit.
-    metadata
-        Light and camera of the image; written wherever the format has a place for it (not `jxl`), needed by `dng`.
-
-    Raises
-    ------
-    InputError
-        The image is not of that shape and type, or its size or the metadata do not fit the format.
+    `image`: (H, W, 3) uint16, linear camera RGB.
 
     Examples
     --------
@@ -150,11 +132,6 @@ def encode_pieces(image: npt.NDArray[np.uint16], form: Format, metadata: ImageMe
 
     Pieces of a PNG are encoded one after the other, so that a file of any size needs little memory. The parameters are
     those of `encode_image`.
-
-    Raises
-    ------
-    InputError
-        As `encode_image`.
     """
     _check(image)
     if form == "png":
@@ -172,25 +149,8 @@ def _check(image: npt.NDArray[np.uint16]) -> None:
 def decode_image(data: bytes, form: Format, what: str) -> npt.NDArray[np.uint16]:
     """Return the image that `encode_image` made a file of.
 
-    Parameters
-    ----------
-    data
-        The file's bytes.
-    form
-        Its format.
-    what
-        Name of the image in messages, such as its path.
-
-    Returns
-    -------
-    ndarray
-        (H, W, 3) uint16, as it was encoded; of `dng` (H // 2, W // 2, 3), the half-size linear RGB of its mosaic: red,
-        the mean of both greens, rounded up, and blue of each 2×2 block.
-
-    Raises
-    ------
-    FormatError
-        The bytes are damaged or not a 16-bit RGB image of that format.
+    `data`: the file's bytes. Returns (H, W, 3) uint16, as it was encoded; of `dng` (H // 2, W // 2, 3), the half-size
+    linear RGB of its mosaic: red, the mean of both greens, rounded up, and blue of each 2×2 block.
     """
     if form == "dng":
         from drivers.raw.rawfile import decode_raw
@@ -216,17 +176,7 @@ def require_plausible(data: bytes, what: str) -> None:
     Deflate makes at most 1032 bytes of one (zlib's "Maximum Compression Factor"): a decoder that believed the head
     would fill memory before it found that there is nothing (ISO/IEC 15948, 5.3 and 11.2.2).
 
-    Parameters
-    ----------
-    data
-        The file's bytes.
-    what
-        Name of the image in messages.
-
-    Raises
-    ------
-    FormatError
-        It does.
+    `data`: the file's bytes.
     """
     if len(data) < 26 or data[:8] != b"\x89PNG\r\n\x1a\n":
         return
@@ -245,15 +195,7 @@ def require_plausible(data: bytes, what: str) -> None:
 
 
 def decode_array(data: bytes, form: Format) -> npt.NDArray[np.generic]:
-    """Return the array in a file's bytes, (H, W) or (H, W, channels), uint8, uint16 or float32, as it stands there.
-
-    Raises
-    ------
-    InputError
-        The format needs a package that is not installed.
-    Exception
-        Whatever the decoder says of damaged bytes.
-    """
+    """Return the array in a file's bytes, (H, W) or (H, W, channels), uint8, uint16 or float32, as it stands there."""
     if form == "png":
         from generator.files.png import decode_png
 
@@ -279,13 +221,7 @@ def encode_map(values: npt.NDArray[np.uint16]) -> bytes:
 
 
 def encode_preview(picture: npt.NDArray[np.uint8]) -> bytes:
-    """Return `picture` (H, W, 3) uint8, RGB, as the bytes of a JPEG file.
-
-    Raises
-    ------
-    InputError
-        A side is longer than JPEG allows, 65 500 px.
-    """
+    """Return `picture` (H, W, 3) uint8, RGB, as the bytes of a JPEG file."""
     import simplejpeg
 
     if max(picture.shape) > _LONGEST_JPEG:

@@ -21,12 +21,7 @@ FULL: Final = 65535
 def to_full_scale(image: Image, white_level: int) -> Image:
     """Return an image (...) uint16 of counts with saturation at 65535; what is above the white level is cut at it.
 
-    Parameters
-    ----------
-    image
-        (...) uint16, counts, 0 at black.
-    white_level
-        Saturation, 1 … 65535.
+    `image`: (...) uint16, counts, 0 at black.
 
     Examples
     --------
@@ -41,12 +36,7 @@ def to_full_scale(image: Image, white_level: int) -> Image:
 def from_full_scale(image: Image, white_level: int) -> Image:
     """Return the counts (...) uint16 that `to_full_scale` stretched.
 
-    Parameters
-    ----------
-    image
-        (...) uint16, saturation at 65535.
-    white_level
-        Saturation of the counts, 1 … 65535.
+    `image`: (...) uint16, saturation at 65535. `white_level`: saturation of the counts, 1 … 65535.
     """
     stretched = image.astype(np.uint32) * np.uint32(white_level)
     return ((stretched + np.uint32(FULL // 2)) // np.uint32(FULL)).astype(np.uint16)

@@ -14,13 +14,7 @@ from foundation.errors import InputError
 
 
 def encode_jxl(image: npt.NDArray[np.uint16]) -> bytes:
-    """Return the file of `image` (H, W, 3) uint16, all 16 bits kept.
-
-    Raises
-    ------
-    InputError
-        libjxl cannot write the image, or imagecodecs is not installed.
-    """
+    """Return the file of `image` (H, W, 3) uint16, all 16 bits kept."""
     codecs = imagecodecs()
     try:
         return bytes(codecs.jpegxl_encode(np.ascontiguousarray(image), effort=1, lossless=True, numthreads=1))
@@ -31,26 +25,12 @@ def encode_jxl(image: npt.NDArray[np.uint16]) -> bytes:
 
 
 def decode_jxl(data: bytes) -> npt.NDArray[np.generic]:
-    """Return what a JPEG XL file holds, (H, W, channels) or (H, W), uint8, uint16 or float32 as it is stored.
-
-    Raises
-    ------
-    InputError
-        imagecodecs is not installed.
-    Exception
-        Whatever libjxl says of a file that it cannot read.
-    """
+    """Return what a JPEG XL file holds, (H, W, channels) or (H, W), uint8, uint16 or float32 as it is stored."""
     return np.asarray(imagecodecs().jpegxl_decode(data, numthreads=1))
 
 
 def imagecodecs() -> Any:
-    """Return the module that has libjxl; a plain installation does without its 90 MB.
-
-    Raises
-    ------
-    InputError
-        It is not installed.
-    """
+    """Return the module that has libjxl; a plain installation does without its 90 MB."""
     try:
         import imagecodecs as module
     except ImportError as error:

@@ -10,14 +10,9 @@ from dataclasses import dataclass
 class ImageMetadata:
     """Light and camera of one image.
 
-    Attributes
-    ----------
-    white_level
-        Value of saturation, 1 … 65535, in the units of the image.
-    white
-        Linear camera RGB of an achromatic surface under the image's light, of any length: the ground truth.
-    camera
-        Maker and model, as the table has it.
+    - `white_level`: value of saturation, 1 … 65535, in the units of the image.
+    - `white`: linear camera RGB of an achromatic surface under the image's light, of any length: the ground truth.
+    - `camera`: maker and model, as the table has it.
     """
 
     white_level: int

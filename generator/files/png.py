@@ -39,13 +39,7 @@ _threads = threading.local()
 
 
 def encode_png(image: npt.NDArray[np.uint16], metadata: ImageMetadata, threads: int = 1) -> bytes:
-    """Return the file of `image` (H, W, 3) uint16; no byte depends on the number of threads.
-
-    Raises
-    ------
-    InputError
-        The image is wider or higher than a PNG may be.
-    """
+    """Return the file of `image` (H, W, 3) uint16; no byte depends on the number of threads."""
     return b"".join([bytes(piece) for piece in png_pieces(image, metadata, threads)])
 
 
@@ -119,13 +113,7 @@ def chunk(kind: bytes, *parts: bytes | memoryview) -> Iterator[bytes | memoryvie
 
 
 def decode_png(data: bytes) -> npt.NDArray[np.generic]:
-    """Return what a PNG holds, (H, W) or (H, W, channels), RGB, uint8 or uint16, as it stands there.
-
-    Raises
-    ------
-    ValueError
-        It is no PNG, cut off, or damaged: every chunk has its checksum.
-    """
+    """Return what a PNG holds, (H, W) or (H, W, channels), RGB, uint8 or uint16, as it stands there."""
     import cv2
 
     # OpenCV would read other formats, too.

@@ -18,13 +18,7 @@ from generator.files.metadata import ImageMetadata
 
 
 def encode_tiff(image: npt.NDArray[np.uint16], metadata: ImageMetadata) -> bytes:
-    """Return the file of `image` (H, W, 3) uint16.
-
-    Raises
-    ------
-    InputError
-        The file would be larger than 4 GiB.
-    """
+    """Return the file of `image` (H, W, 3) uint16."""
     height, width, channels = image.shape
     tags: Tags = {
         TiffTag.NEW_SUBFILE_TYPE: (ValueType.LONG, [0]),  # the picture itself
@@ -52,11 +46,6 @@ def decode_tiff(data: bytes) -> npt.NDArray[np.generic]:
     """Return the first picture of a TIFF, (H, W) or (H, W, channels), uint8, uint16, float32 or whatever is stored.
 
     OpenCV's reader is not used: of pictures stored plane by plane, and of files that are cut off, it makes others.
-
-    Raises
-    ------
-    Exception
-        Whatever tifffile says: it is no TIFF, cut off, or compressed in a way that needs a package that is not here.
     """
     import tifffile
 

@@ -23,13 +23,7 @@ _OFFSETS: Final = 0xFFFFFFFF
 
 
 def check_samples(samples: Samples) -> int:
-    """Return the bits a channel of a light's samples; they must be uint16 (8**bits, S, 3), S ≥ 1.
-
-    Raises
-    ------
-    InputError
-        They are of another shape or type.
-    """
+    """Return the bits a channel of a light's samples; they must be uint16 (8**bits, S, 3), S ≥ 1."""
     if samples.dtype != np.uint16 or samples.ndim != 3 or samples.shape[2] != 3 or not samples.shape[1]:
         raise InputError(f"the samples are {samples.dtype} {samples.shape}, expected uint16 (8**bits, samples, 3)")
     if samples.nbytes > _OFFSETS:
@@ -38,13 +32,7 @@ def check_samples(samples: Samples) -> int:
 
 
 def check_tables(tables: Samples | Sequence[Samples]) -> list[Samples]:
-    """Return the samples of several lights as a list; they must be uint16 (8**bits, S, 3), all of one shape.
-
-    Raises
-    ------
-    InputError
-        There is none, or they are of another shape or type.
-    """
+    """Return the samples of several lights as a list; they must be uint16 (8**bits, S, 3), all of one shape."""
     checked = list(tables)
     if not checked:
         raise InputError("no light was given to mix; give at least one")
@@ -56,13 +44,7 @@ def check_tables(tables: Samples | Sequence[Samples]) -> list[Samples]:
 
 
 def check_picture(picture: Picture) -> None:
-    """Check that `picture` is uint8 (H, W, 3).
-
-    Raises
-    ------
-    InputError
-        It is of another shape or type.
-    """
+    """Check that `picture` is uint8 (H, W, 3)."""
     if picture.dtype != np.uint8 or picture.ndim != 3 or picture.shape[2] != 3:
         raise InputError(f"the picture is {picture.dtype} {picture.shape}, expected uint8 (height, width, 3)")
 
@@ -70,13 +52,7 @@ def check_picture(picture: Picture) -> None:
 def check_out(
     out: npt.NDArray[Any] | None, shape: tuple[int, ...], dtype: type[np.uint16] | type[np.float32]
 ) -> npt.NDArray[Any]:
-    """Return `out`, of that shape and that dtype, or a new array of them if it is None.
-
-    Raises
-    ------
-    InputError
-        `out` is of another shape or type, or read-only.
-    """
+    """Return `out`, of that shape and that dtype, or a new array of them if it is None."""
     if out is None:
         return np.empty(shape, dtype)
     if out.dtype != dtype or out.shape != shape:
@@ -87,13 +63,7 @@ def check_out(
 
 
 def check_seed(seed: int, image: int) -> np.uint64:
-    """Return the seed as uint64 after checking it and the image number.
-
-    Raises
-    ------
-    InputError
-        The seed is not 0 … 2⁶⁴ − 1 or the image number not 0 … 2³² − 1.
-    """
+    """Return the seed as uint64 after checking it and the image number."""
     key_of(seed)
     if not 0 <= image < 1 << 32:
         raise InputError(f"the image number is {image}, expected 0 to 2^32 - 1")
@@ -101,25 +71,13 @@ def check_seed(seed: int, image: int) -> np.uint64:
 
 
 def check_white_level(white_level: int) -> None:
-    """Check that `white_level` is 1 … 65535.
-
-    Raises
-    ------
-    InputError
-        It is not.
-    """
+    """Check that `white_level` is 1 … 65535."""
     if not 1 <= white_level <= 65535:
         raise InputError(f"the white level is {white_level}, expected 1 to 65535")
 
 
 def check_weights(weights: npt.ArrayLike, lights: int) -> npt.NDArray[np.float64]:
-    """Return the weights (K,) of `lights` lights as (K,) float64.
-
-    Raises
-    ------
-    InputError
-        They are not one finite number ≥ 0 a light.
-    """
+    """Return the weights (K,) of `lights` lights as (K,) float64."""
     checked = np.asarray(weights, dtype=np.float64)
     if checked.shape != (lights,) or not np.isfinite(checked).all() or (checked < 0).any():
         raise InputError(f"the weights are {np.asarray(weights).tolist()}, expected {lights} finite numbers from 0")

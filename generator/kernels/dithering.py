@@ -317,12 +317,8 @@ def _dither(
 class CellTable:
     """A table of cells as compiled code reads it, checked once.
 
-    Attributes
-    ----------
-    cells
-        (32768, 16) uint16, those of a node in half a line of the cache; read-only.
-    bits
-        Bits of a channel of the chart that has them.
+    - `cells`: (32768, 16) uint16, those of a node in half a line of the cache; read-only.
+    - `bits`: bits of a channel of the chart that has them.
     """
 
     cells: Cells
@@ -332,17 +328,7 @@ class CellTable:
 def checked_cells(cells: Cells | CellTable, bits: int) -> CellTable:
     """Return a table of cells to draw from: itself, if it was checked already.
 
-    Parameters
-    ----------
-    cells
-        (32768, 16) uint16, cells of a chart of `bits` bits a channel.
-    bits
-        1 … 5.
-
-    Raises
-    ------
-    InputError
-        They are of another shape or type, or a cell is not in the chart.
+    `cells`: (32768, 16) uint16, cells of a chart of `bits` bits a channel.
     """
     if isinstance(cells, CellTable):
         if cells.bits != bits:
@@ -377,30 +363,11 @@ def dither(
 
     The rule stands at the head of this file. Every kernel draws from a code picture as from any picture.
 
-    Parameters
-    ----------
-    picture
-        (H, W, 3) uint8, sRGB codes.
-    cells
-        (32768, 16) uint16: for each source node, (red << 10) | (green << 5) | blue, 16 equally likely cells of the
-        chart, ((r << 2n) | (g << n) | b) for n bits a channel; such as `CellMixtures.cells` of `generator.rendering`,
-        or what `checked_cells` made of them, which is quicker for many small pictures.
-    bits
-        n, 1 … 5.
-    seed, image, first_row, threads
-        As for `rendering.draw_samples`.
-    out
-        (H, W, 3) uint8 to fill instead of a new array.
-
-    Returns
-    -------
-    ndarray
-        (H, W, 3) uint8, the cells' codes in the upper n bits of each, 0 below.
-
-    Raises
-    ------
-    InputError
-        A shape, type or number is not as above.
+    `picture`: (H, W, 3) uint8, sRGB codes. `cells`: (32768, 16) uint16: for each source node, (red << 10) | (green <<
+    5) | blue, 16 equally likely cells of the chart, ((r << 2n) | (g << n) | b) for n bits a channel; such as
+    `CellMixtures.cells` of `generator.rendering`, or what `checked_cells` made of them, which is quicker for many small
+    pictures. `out`: (H, W, 3) uint8 to fill instead of a new array. Returns (H, W, 3) uint8, the cells' codes in the
+    upper n bits of each, 0 below.
 
     Examples
     --------
@@ -459,20 +426,7 @@ def _count_nodes(picture: Any, nearest: Any, counts: Any) -> None:
 def nearest_nodes(picture: Picture) -> npt.NDArray[np.int64]:
     """Return how many pixels of a picture are nearest to each source node.
 
-    Parameters
-    ----------
-    picture
-        (H, W, 3) uint8, sRGB codes.
-
-    Returns
-    -------
-    ndarray
-        (32768,) int64.
-
-    Raises
-    ------
-    InputError
-        The picture is of another shape or type.
+    `picture`: (H, W, 3) uint8, sRGB codes. Returns (32768,) int64.
 
     Examples
     --------

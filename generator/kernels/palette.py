@@ -25,11 +25,6 @@ if TYPE_CHECKING:
 def bits_of(colours: int) -> int:
     """Return the bits a channel of a table with `colours` = 8**bits colours.
 
-    Raises
-    ------
-    InputError
-        No table has that many colours.
-
     Examples
     --------
     >>> bits_of(32768)
@@ -61,22 +56,7 @@ def nearest_fit_colours(unfit: npt.ArrayLike, bits: int) -> npt.NDArray[np.int64
 
     Nearest by Euclidean distance of the codes; of several equally near the lowest index.
 
-    Parameters
-    ----------
-    unfit
-        (N,) int, distinct colour indices 0 … 8**bits − 1.
-    bits
-        Bits kept of each channel.
-
-    Returns
-    -------
-    ndarray
-        (N,) int64 colour indices, none of them unfit.
-
-    Raises
-    ------
-    QualityError
-        No colour is fit.
+    `unfit`: (N,) int, distinct colour indices 0 … 8**bits − 1. Returns (N,) int64 colour indices, none of them unfit.
 
     Examples
     --------
@@ -99,17 +79,8 @@ def nearest_fit_colours(unfit: npt.ArrayLike, bits: int) -> npt.NDArray[np.int64
 def replace_unfit_colours(picture: npt.NDArray[np.uint8], provenance: Provenance) -> tuple[npt.NDArray[np.uint8], int]:
     """Return `picture` with unfit colours replaced, and the number of pixels replaced.
 
-    Parameters
-    ----------
-    picture
-        (H, W, 3) uint8 sRGB codes.
-    provenance
-        The table's description with its unfit colours.
-
-    Returns
-    -------
-    tuple
-        (H, W, 3) uint8, the same array if nothing had to be replaced; and the count.
+    `picture`: (H, W, 3) uint8 sRGB codes. Returns (H, W, 3) uint8, the same array if nothing had to be replaced; and
+    the count.
 
     Examples
     --------

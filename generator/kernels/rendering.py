@@ -328,13 +328,6 @@ def read_light(lut: Lut, light: int, pixels: int = WHOLE_LIGHT_PIXELS) -> npt.ND
     """Return the samples (8**bits, S, 3) uint16 of light number `light`.
 
     For a picture of `WHOLE_LIGHT_PIXELS` or more they are copied to memory, else they stay on disk until they are used.
-
-    Raises
-    ------
-    InputError
-        The table has no such light, or it is no whole number.
-    FormatError
-        Its samples are not those that were measured.
     """
     try:
         number = operator.index(light)

@@ -106,16 +106,10 @@ class RandomLights:
 class SequentialLights:
     """The lights of a list of ground truths one after another, `each` for a picture, starting over when it ends.
 
-    Attributes
-    ----------
-    method
-        How a light was found for a ground truth: the ``nearest`` of the table, or a mixture to ``match`` it.
-    matches
-        For each ground truth the light, and its angle to it.
-    file
-        Name of the file that they come from.
-    each
-        Images for each picture.
+    - `method`: how a light was found for a ground truth: the ``nearest`` of the table, or a mixture to ``match`` it.
+    - `matches`: for each ground truth the light, and its angle to it.
+    - `file`: name of the file that they come from.
+    - `each`: images for each picture.
     """
 
     method: Literal["nearest", "match"]
@@ -151,11 +145,6 @@ class DrawnLights:
 
     Light j of the picture at position p is the first of the draws 0, 1, 2 … that lies in the gamut, draw i made of
     the words of place (i, j), number p.
-
-    Raises
-    ------
-    InputError
-        Fewer than one light is wanted, or hardly any of the distribution lies in the gamut.
     """
 
     gamut: Gamut
@@ -207,11 +196,6 @@ class SimultaneousLights:
 
     Image i of a picture gets the lights i · together … of the other choice, and the masks of number
     position · images + i.
-
-    Raises
-    ------
-    InputError
-        Fewer than two lights are to fall together, or the other choice has no whole number of such groups.
     """
 
     choice: LightChoice
@@ -254,11 +238,6 @@ class SimultaneousLights:
 def parse_lights(text: str, total: int) -> ListedLights:
     """Return the lights of a list such as `0,5,12-20`, or `all`; each once, in the order written.
 
-    Raises
-    ------
-    InputError
-        An entry is no number or range, or the table has no such light.
-
     Examples
     --------
     >>> parse_lights("0,5,12-14", total=707).lights
@@ -287,22 +266,6 @@ def parse_light(text: str, lut: Lut, gamut: Gamut | None = None, outside: Outsid
     ``12`` and ``12:0.25+40:0.75`` are lights of the table, as is a name (``D65``) where they have names, ``cct=4500``
     or ``4500K`` a black body in kelvin (`lights.gamut.black_body`), ``r=.3,b=.25`` a chromaticity in linear RGB of the
     table's camera.
-
-    Parameters
-    ----------
-    text
-        What was written.
-    lut
-        The table.
-    gamut
-        The table's gamut, if it is at hand.
-    outside
-        What to do about a chromaticity that the table cannot make.
-
-    Raises
-    ------
-    InputError
-        It names none, or one that the table cannot make.
     """
     named = {light.name: light.index for light in lut.illuminations if light.name is not None}
     if text.strip() in named:
@@ -330,16 +293,7 @@ def parse_light(text: str, lut: Lut, gamut: Gamut | None = None, outside: Outsid
 def nearest_lights(lut: Lut, truths: npt.NDArray[np.float64], file: str = "", each: int = 1) -> SequentialLights:
     """Return for each ground truth the table's light at the smallest angle; of several the lowest number.
 
-    Parameters
-    ----------
-    lut
-        The table.
-    truths
-        (N, 3) float64 ≥ 0, linear RGB of the table's camera, of any length.
-    file
-        Name of the file that they come from, for messages and the dataset's description.
-    each
-        Images for each picture.
+    `truths`: (N, 3) float64 ≥ 0, linear RGB of the table's camera, of any length.
     """
     table = lut.ground_truth / np.linalg.norm(lut.ground_truth, axis=1, keepdims=True)
     wanted = truths / np.linalg.norm(truths, axis=1, keepdims=True)
@@ -359,23 +313,7 @@ def matched_lights(
 ) -> SequentialLights:
     """Return for each ground truth the mixture of the table's lights that has it; see `gamut.Gamut.match`.
 
-    Parameters
-    ----------
-    gamut
-        What the table can make.
-    truths
-        (N, 3) float64 ≥ 0, linear RGB of the table's camera, of any length.
-    file
-        Name of the file that they come from, for messages and the dataset's description.
-    each
-        Images for each picture.
-    outside
-        What to do about ground truths that the table cannot make.
-
-    Raises
-    ------
-    InputError
-        The table cannot make some of them, and the nearest was not asked for.
+    `truths`: (N, 3) float64 ≥ 0, linear RGB of the table's camera, of any length.
     """
     matches: list[Match] = []
     outside_gamut: list[tuple[int, OutsideGamutError]] = []

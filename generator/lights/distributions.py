@@ -86,14 +86,9 @@ class Fitted:
     Kernels are Gaussians with the data's covariance, made small by Scott's factor n^(−1/6) (D. W. Scott, Multivariate
     Density Estimation, 1992; `scipy.stats.gaussian_kde`).
 
-    Attributes
-    ----------
-    rb
-        (N, 2) float64, the data's chromaticities.
-    root
-        (2, 2) float64, lower triangular, times its transpose the kernel's covariance.
-    file, sha256
-        Name of the file of the data, and the hash of the ground truths read from it.
+    - `rb`: (N, 2) float64, the data's chromaticities.
+    - `root`: (2, 2) float64, lower triangular, times its transpose the kernel's covariance.
+    - `file`, `sha256`: name of the file of the data, and the hash of the ground truths read from it.
     """
 
     rb: _Array
@@ -103,13 +98,7 @@ class Fitted:
 
     @classmethod
     def of(cls, truths: _Array, file: str = "") -> Fitted:
-        """Return the distribution of ground truths (N, 3) float64, linear RGB of the table's camera, of any length.
-
-        Raises
-        ------
-        FormatError
-            They are fewer than three, or lie on a line, so that no density can be fitted.
-        """
+        """Return the distribution of ground truths (N, 3) float64, linear RGB of the table's camera, of any length."""
         from scipy.stats import gaussian_kde
 
         rb = rb_of(truths)
@@ -155,13 +144,6 @@ def parse_distribution(text: str) -> Distribution:
     ``uniform``; ``gaussian:r=.3,b=.25,sd=.02`` or ``gaussian:r=.3,b=.25,sd_r=.03,sd_b=.02,corr=-.8``; ``fit:GT.csv``
     with a file as `ground_truths.load_ground_truths` reads it, or the file alone; of a `STATS.json` that
     `evaluate describe` wrote the lights are fitted in the plane of ln(R/G) and ln(B/G) (`log_kernels`).
-
-    Raises
-    ------
-    InputError
-        It names none.
-    FormatError
-        The file cannot be read or fitted.
 
     Examples
     --------

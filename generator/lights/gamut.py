@@ -46,12 +46,8 @@ makes of a line, far below the breadth of three lights of a projector."""
 class OutsideGamutError(InputError):
     """A light is wanted that no mixture of the table's lights makes.
 
-    Attributes
-    ----------
-    angle
-        Angle to the nearest light that can be made, degrees.
-    nearest
-        The mixture that makes the nearest.
+    - `angle`: angle to the nearest light that can be made, degrees.
+    - `nearest`: the mixture that makes the nearest.
     """
 
     def __init__(self, message: str, angle: float, nearest: Mixture) -> None:
@@ -72,12 +68,8 @@ class Match:
 class Gamut:
     """The mixtures of some lights.
 
-    Attributes
-    ----------
-    white
-        (L, 3) float64 > 0, the ground truths of the lights in linear camera RGB.
-    table
-        Name of the table in messages.
+    - `white`: (L, 3) float64 > 0, the ground truths of the lights in linear camera RGB.
+    - `table`: name of the table in messages.
     """
 
     white: _Array
@@ -124,19 +116,7 @@ class Gamut:
     def match(self, wanted: npt.ArrayLike, outside: OutsideGamut = "refuse") -> Match:
         """Return the mixture of the fewest near lights for a wanted light, by the rule at the head of this file.
 
-        Parameters
-        ----------
-        wanted
-            (3,) float64 ≥ 0, linear RGB of the table's camera, of any length.
-        outside
-            What to do if no mixture makes it.
-
-        Raises
-        ------
-        OutsideGamutError
-            No mixture makes it, and the nearest was not asked for.
-        InputError
-            It is no light.
+        `wanted`: (3,) float64 ≥ 0, linear RGB of the table's camera, of any length.
         """
         light = np.asarray(wanted, dtype=np.float64)
         if light.shape != (3,) or not np.isfinite(light).all() or light.min() < 0 or light.max() <= 0:
@@ -204,11 +184,8 @@ class Gamut:
     def _pairs(self, target: _Array) -> tuple[npt.NDArray[np.int64], _Array, _Array]:
         """Return the pairs of neighbours between whose lights the target falls.
 
-        Returns
-        -------
-        tuple
-            Their lights (P, 2) int64, the shares (P, 2) float64 that make the nearest to the target, and its angle to
-            the target (P,) float64, degrees.
+        Returns their lights (P, 2) int64, the shares (P, 2) float64 that make the nearest to the target, and its angle
+        to the target (P,) float64, degrees.
         """
         at_u, at_v = (self.directions @ target)[self.edges.T]
         cosine = self._cosines
@@ -259,18 +236,13 @@ def black_body(lut: Lut, cct_k: float) -> Mixture:
     """Return the light of a black body between those of the table: its two neighbours, in proportion by mired.
 
     The temperature says what was asked of the projector, which shows three primaries in the proportion that looks, to
-    the CIE 1931 standard observer, like the black body (`acquisition.lights.illuminations.blackbody_light`). The camera
+    the CIE 1931 standard observer, like the black body (`experiment.lights.illuminations.blackbody_light`). The camera
     is not that observer: its white under this light is what the ground truth says, and not what the black body's own
     spectrum would give. So a temperature names one of the table's lights, or one between, and is no measurement by the
     camera.
 
     Chromaticities along the black bodies are close to linear in mired (10⁶ / K). Between lights 200 K apart that is
     as good as a cubic spline and within what the projector's codes of 8 bits allow: 0.05° median, 0.2° worst.
-
-    Raises
-    ------
-    InputError
-        The table has no black bodies, or none as cold or as hot.
     """
     bodies = sorted((light.cct_k, light.index) for light in lut.illuminations if light.cct_k is not None)
     if not bodies:

@@ -30,15 +30,7 @@ def load_ground_truths(path: Path) -> npt.NDArray[np.float64]:
     Either a CSV file whose head names the columns `GT_R,GT_G,GT_B` or `r,g,b` (others are ignored), or lines of three
     numbers between blanks or commas, as in `gt.txt` and Cube+; or the lights of a `STATS.json` of `evaluate describe`.
 
-    Returns
-    -------
-    ndarray
-        (N, 3) float64 ≥ 0, linear camera RGB, not normalised.
-
-    Raises
-    ------
-    FormatError
-        The file cannot be read, is empty, or a line is not three numbers ≥ 0 with a sum above 0.
+    Returns (N, 3) float64 ≥ 0, linear camera RGB, not normalised.
     """
     if is_statistics(path):
         return read_lights(path)

@@ -34,17 +34,8 @@ _BILLION: Final = 10**9
 class Mixture:
     """Lights of a table shining together; one light of weight 1 is that light as it was photographed.
 
-    Attributes
-    ----------
-    lights
-        Numbers in the table, ascending.
-    weights
-        Above 0, sum 1; rounded to billionths when made.
-
-    Raises
-    ------
-    InputError
-        The lights do not ascend, or the weights are not above 0 or do not sum to 1 within a millionth.
+    - `lights`: numbers in the table, ascending.
+    - `weights`: above 0, sum 1; rounded to billionths when made.
 
     Examples
     --------
@@ -77,33 +68,15 @@ class Mixture:
         return "+".join(f"{light}:{weight:.9f}".rstrip("0") for light, weight in pairs)
 
     def white(self, lut: Lut) -> npt.NDArray[np.float64]:
-        """Return the ground truth (3,) float64: linear camera RGB of the achromatic reference, not normalised.
-
-        Raises
-        ------
-        InputError
-            The table has no such light.
-        """
+        """Return the ground truth (3,) float64: linear camera RGB of the achromatic reference, not normalised."""
         self._require(lut)
         return np.asarray(self.weights) @ lut.white[list(self.lights)]
 
     def samples(self, lut: Lut, seed: int = 0, picture: npt.NDArray[np.uint8] | None = None) -> npt.NDArray[np.uint16]:
         """Return the samples (8**bits, S, 3) uint16 of this light, as `kernels.rendering.draw_samples` takes them.
 
-        Parameters
-        ----------
-        lut
-            The table.
-        seed
-            Decides which samples of the mixed lights meet.
-        picture
-            (H, W, 3) uint8, the picture they are for: of a small one, samples of other colours may be 0, and a light
-            alone is not read whole. None: any pictures, of any size.
-
-        Raises
-        ------
-        InputError
-            The table has no such light.
+        `picture`: (H, W, 3) uint8, the picture they are for: of a small one, samples of other colours may be 0, and a
+        light alone is not read whole. None: any pictures, of any size.
         """
         from generator.kernels.mixed_table import mixed_table
         from generator.kernels.palette import colours_in
@@ -150,11 +123,6 @@ def mixture_of(parts: Mapping[int, float]) -> Mixture:
 def parse_mixture(label: str) -> Mixture:
     """Return the mixture that a `Mixture.label` names: ``12``, or ``12:0.25+40:0.75``.
 
-    Raises
-    ------
-    InputError
-        The text is no such label.
-
     Examples
     --------
     >>> parse_mixture("12:0.25+40:0.75")
@@ -174,12 +142,8 @@ def parse_mixture(label: str) -> Mixture:
 class Lighting:
     """The light of one image.
 
-    Attributes
-    ----------
-    mixtures
-        The lights in it.
-    masks
-        Where each falls; None where one light falls on everything.
+    - `mixtures`: the lights in it.
+    - `masks`: where each falls; None where one light falls on everything.
     """
 
     mixtures: tuple[Mixture, ...]
@@ -207,12 +171,7 @@ class Lighting:
 
         The one ground truth of an image of several lights, for methods that estimate one.
 
-        Parameters
-        ----------
-        lut
-            The table.
-        weights
-            (H, W, lights) float32 ≥ 0, as `weights_of` returns them.
+        `weights`: (H, W, lights) float32 ≥ 0, as `weights_of` returns them.
         """
         from generator.masks.whites import mean_weights
 
@@ -221,18 +180,8 @@ class Lighting:
     def ground_truth_map(self, lut: Lut, weights: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
         """Return the ground truth (H, W, 3) float32 of each pixel.
 
-        Parameters
-        ----------
-        lut
-            The table.
-        weights
-            (H, W, lights) float32 ≥ 0, as `weights_of` returns them.
-
-        Returns
-        -------
-        ndarray
-            (H, W, 3) float32, r + g + b = 1: the chromaticity of the sum of the lights' whites, each times its weight
-            in the pixel.
+        `weights`: (H, W, lights) float32 ≥ 0, as `weights_of` returns them. Returns (H, W, 3) float32, r + g + b = 1:
+        the chromaticity of the sum of the lights' whites, each times its weight in the pixel.
         """
         from generator.masks.whites import chromaticities
 

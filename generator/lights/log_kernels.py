@@ -36,16 +36,10 @@ class LogKernels:
     and the covariance of the density are those of the lights (B. W. Silverman, G. A. Young, "The bootstrap: to smooth
     or not to smooth?", Biometrika 74 (1987) 469-479).
 
-    Attributes
-    ----------
-    places
-        (N, 2) float64, the lights' ln(R/G) and ln(B/G).
-    root
-        (2, 2) float64, lower triangular, times its transpose the kernel's covariance.
-    factor
-        f.
-    file, sha256
-        Name of the file of the lights, and the hash of those read from it.
+    - `places`: (N, 2) float64, the lights' ln(R/G) and ln(B/G).
+    - `root`: (2, 2) float64, lower triangular, times its transpose the kernel's covariance.
+    - `factor`: f.
+    - `file`, `sha256`: name of the file of the lights, and the hash of those read from it.
     """
 
     places: _Array
@@ -56,13 +50,7 @@ class LogKernels:
 
     @classmethod
     def of(cls, lights: _Array, file: str = "") -> LogKernels:
-        """Return the density of lights (N, 3) float64 above 0, linear RGB of the table's camera, of any length.
-
-        Raises
-        ------
-        FormatError
-            They are fewer than three, or lie on a line, so that no density can be fitted.
-        """
+        """Return the density of lights (N, 3) float64 above 0, linear RGB of the table's camera, of any length."""
         places = log_chroma(lights)
         factor = _OF_SCOTT * len(places) ** (-1 / 6)
         try:
@@ -101,14 +89,9 @@ class LogKernels:
 def draw_kernels(places: _Array, root: _Array, words: tuple[Words, Words, Words, Words]) -> _Array:
     """Return draws from a density of Gaussian kernels, (N, 2) float64.
 
-    Parameters
-    ----------
-    places
-        (M, 2) float64, the kernels' centres, each as likely.
-    root
-        (2, 2) float64, lower triangular, times its transpose the kernels' covariance.
-    words
-        Four arrays (N,) uint32 of random words: two for the normal deviates, the third for the kernel.
+    `places`: (M, 2) float64, the kernels' centres, each as likely. `root`: (2, 2) float64, lower triangular, times its
+    transpose the kernels' covariance. `words`: four arrays (N,) uint32 of random words: two for the normal deviates,
+    the third for the kernel.
     """
     chosen = (words[2].astype(np.uint64) * np.uint64(len(places))) >> np.uint64(32)
     normal = standard_normal(words)

@@ -33,15 +33,10 @@ Truths = Mapping[str, npt.NDArray[np.float64]]
 class NamedLights:
     """Each picture under the lights that a file has for its name.
 
-    Attributes
-    ----------
-    matches
-        For each picture, by its place in the list of sources, the mixtures that have its ground truths, as many for
-        each, and their angles to them.
-    file
-        Name of the file that they come from.
-    crops
-        Crops of each picture: all of them are under the picture's lights.
+    - `matches`: for each picture, by its place in the list of sources, the mixtures that have its ground truths, as
+      many for each, and their angles to them.
+    - `file`: name of the file that they come from.
+    - `crops`: crops of each picture: all of them are under the picture's lights.
     """
 
     matches: tuple[tuple[Match, ...], ...]
@@ -73,15 +68,7 @@ def load_named_truths(path: Path) -> dict[str, npt.NDArray[np.float64]]:
     The head names a column `source`, `name`, `picture`, `image`, `file` or `filename`, and `r,g,b` or another triple of
     `ground_truths.load_ground_truths`; other columns are ignored. Several rows of one name are several lights.
 
-    Returns
-    -------
-    dict
-        For each name (K, 3) float64 ≥ 0, linear camera RGB, not normalised, K ≥ 1.
-
-    Raises
-    ------
-    FormatError
-        The file cannot be read, lacks such columns or rows, or a row is no name with three numbers ≥ 0, sum above 0.
+    Returns for each name (K, 3) float64 ≥ 0, linear camera RGB, not normalised, K ≥ 1.
     """
     try:
         text = path.read_text(encoding="utf-8-sig")
@@ -131,26 +118,7 @@ def named_lights(
     A picture's row is that of its name, path below its folder included, else the only one of its name without folders
     and suffix, so that `scene7.png` finds the light of `raw/scene7.cr2`; not where two pictures would share it.
 
-    Parameters
-    ----------
-    gamut
-        What the table can make.
-    truths
-        By name (K, 3) float64 ≥ 0, linear RGB of the table's camera.
-    names
-        Of the pictures, in the order of the sources.
-    file
-        Name of the file that they come from, for messages and the dataset's description.
-    outside
-        What to do about ground truths that the table cannot make.
-    crops
-        Crops of each picture.
-
-    Raises
-    ------
-    InputError
-        A picture has no light, or another number of lights than the others, or one that the table cannot make while
-        the nearest was not asked for.
+    `truths`: by name (K, 3) float64 ≥ 0, linear RGB of the table's camera.
     """
     stems: dict[str, list[str]] = {}
     for named in truths:

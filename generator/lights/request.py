@@ -36,26 +36,16 @@ MASKS: Final = "smooth"
 class LightRequest:
     """The options of light, each None or empty where it was not given; named as on the command line.
 
-    Attributes
-    ----------
-    illuminations
-        Lights of the table for every picture: ``0,5,12-20`` or ``all``.
-    light
-        Lights for every picture, each as `choices.parse_light` reads it.
-    random
-        Images of each picture under lights of its own: of the table, or of `distribution`. One if None.
-    distribution
-        Where those lights are drawn from; see `lights.distributions.parse_distribution`.
-    nearest, match
-        Files of ground truths, for which the table's nearest lights are taken, or mixtures that match them.
-    lights_by_name
-        File of ground truths of each picture by its name, which mixtures match.
-    outside
-        What to do about chromaticities that the table cannot make.
-    lights_per_image
-        Lights that fall on one image: that many, in the order of the lists, share each image.
-    masks
-        Where each falls; see `masks.request.parse_masks`.
+    - `illuminations`: lights of the table for every picture: ``0,5,12-20`` or ``all``.
+    - `light`: lights for every picture, each as `choices.parse_light` reads it.
+    - `random`: images of each picture under lights of its own: of the table, or of `distribution`. One if None.
+    - `distribution`: where those lights are drawn from; see `lights.distributions.parse_distribution`.
+    - `nearest`, `match`: files of ground truths, for which the table's nearest lights are taken, or mixtures that match
+      them.
+    - `lights_by_name`: file of ground truths of each picture by its name, which mixtures match.
+    - `outside`: what to do about chromaticities that the table cannot make.
+    - `lights_per_image`: lights that fall on one image: that many, in the order of the lists, share each image.
+    - `masks`: where each falls; see `masks.request.parse_masks`.
     """
 
     illuminations: str | None = None
@@ -70,24 +60,7 @@ class LightRequest:
     masks: str | None = None
 
     def choose(self, lut: Lut, seed: int, names: Sequence[str] = (), crops: int = 1) -> LightChoice:
-        """Return the choice of lights.
-
-        Parameters
-        ----------
-        lut
-            The table.
-        seed
-            Of lights and masks that are drawn.
-        names
-            Of the pictures, in the order of the sources, for lights that go by them.
-        crops
-            Of each picture.
-
-        Raises
-        ------
-        InputError
-            Options exclude one another, or one of them names what is not there.
-        """
+        """Return the choice of lights."""
         together = self.lights_per_image or (1 if self.masks is None else 2)
         if self.lights_per_image is not None and self.lights_per_image < 1:
             raise InputError(f"{self.lights_per_image} lights an image were asked for, expected 1 or more")

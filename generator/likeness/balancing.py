@@ -35,12 +35,8 @@ freely, down to 1 %, that is hardly."""
 class Balance:
     """Weights, and what they come to.
 
-    Attributes
-    ----------
-    weights
-        (N,) float64 above 0, sum 1.
-    bound
-        Bound of the multipliers; None where the floor of the effective sample size did not matter.
+    - `weights`: (N,) float64 above 0, sum 1.
+    - `bound`: bound of the multipliers; None where the floor of the effective sample size did not matter.
     """
 
     weights: _Array
@@ -68,18 +64,8 @@ def balance(
 ) -> Balance:
     """Return the weights of N images by which the means of their moments come near to the wanted ones.
 
-    Parameters
-    ----------
-    moments
-        (N, K) float64, the moments of each image.
-    wanted
-        (K,) float64, their wanted means.
-    real
-        M, of how many real images those are means; infinite where they are exact.
-    least_effective
-        Least effective sample size as a share of the images, 0 … 1.
-    variants
-        Of each image, one after the other among the N: the effective size is that of their sums.
+    `moments`: (N, K) float64, the moments of each image. `wanted`: (K,) float64, their wanted means. `least_effective`:
+    least effective sample size as a share of the images, 0 … 1.
 
     Examples
     --------

@@ -61,14 +61,9 @@ _TOLERANCE: Final = 0.25
 class Reached:
     """What became of one figure.
 
-    Attributes
-    ----------
-    name
-        As the figures of `evaluate describe` are called: "chroma_spread", "grey_offset_red", "grey_spread_red".
-    wanted, before, after
-        Of the real data set; of the pictures, each once; of those drawn.
-    scale
-        What a difference is measured by: the wanted spread for an offset, the wanted value for others.
+    - `name`: as the figures of `evaluate describe` are called: "chroma_spread", "grey_offset_red", "grey_spread_red".
+    - `wanted`, `before`, `after`: of the real data set; of the pictures, each once; of those drawn.
+    - `scale`: what a difference is measured by: the wanted spread for an offset, the wanted value for others.
     """
 
     name: str
@@ -95,16 +90,11 @@ class Reached:
 class DrawnPictures:
     """Which pictures are drawn.
 
-    Attributes
-    ----------
-    weights
-        (N,) float64 ≥ 0, sum 1, of all pictures.
-    places
-        (M,) int64 ascending, the pictures drawn, those of more than one draw repeated.
-    reached
-        What became of each figure.
-    blacks
-        (M,) float64, the share of the print's black, 0 … 1, that is taken out of each draw; None where options say it.
+    - `weights`: (N,) float64 ≥ 0, sum 1, of all pictures.
+    - `places`: (M,) int64 ascending, the pictures drawn, those of more than one draw repeated.
+    - `reached`: what became of each figure.
+    - `blacks`: (M,) float64, the share of the print's black, 0 … 1, that is taken out of each draw; None where options
+      say it.
     """
 
     weights: _Array
@@ -186,23 +176,8 @@ def draw_pictures(
 ) -> DrawnPictures:
     """Return which of N pictures are drawn to be like a real data set; purpose 15 of `philox`.
 
-    Parameters
-    ----------
-    measured
-        The pictures' numbers.
-    target
-        The real data set's.
-    count
-        How many are drawn; None for as many as can be used.
-    seed
-        0 … 2⁶⁴ − 1, of the one random number of the draws.
-    least_effective
-        Least effective share of the pictures.
-
-    Raises
-    ------
-    InputError
-        No picture can be used, none is to be drawn, or the real data set has too few images with the numbers needed.
+    `count`: how many are drawn; None for as many as can be used. `least_effective`: least effective share of the
+    pictures.
     """
     names = (*BY_QUANTILES, *BY_SPREAD)
     real = {name: target.known(name) for name in names}

@@ -19,10 +19,7 @@ _LEAST: Final = 0.001
 def like_exposure(target: RealStatistics) -> AutomaticExposure | None:
     """Return the exposure by which images reach the levels that those of a real data set reach.
 
-    Returns
-    -------
-    AutomaticExposure or None
-        The levels drawn by eleven quantiles; None where the real data set's saturation is not known.
+    Returns the levels drawn by eleven quantiles; None where the real data set's saturation is not known.
     """
     known = target.known("exposure")
     if not known.size:

@@ -30,15 +30,11 @@ Photograph = Callable[[npt.NDArray[np.uint8], int], npt.NDArray[np.uint16]]
 class MeasuredPictures:
     """Numbers of source pictures as the camera would see them.
 
-    Attributes
-    ----------
-    values
-        (N,) float64 each, by the names of `image_numbers.numbers_of_cells`; NaN of a picture that has no such number.
-    unreadable
-        (N,) bool, pictures that cannot be read or cut, of which every number is NaN.
-    shares
-        Shares of the print's black, 0 … 1, at which each picture was measured, or none: then N is the number of
-        pictures times shares, those of a picture one after the other.
+    - `values`: (N,) float64 each, by the names of `image_numbers.numbers_of_cells`; NaN of a picture that has no such
+      number.
+    - `unreadable`: (N,) bool, pictures that cannot be read or cut, of which every number is NaN.
+    - `shares`: shares of the print's black, 0 … 1, at which each picture was measured, or none: then N is the number of
+      pictures times shares, those of a picture one after the other.
     """
 
     values: Mapping[str, npt.NDArray[np.float64]]
@@ -55,12 +51,8 @@ class MeasuredPictures:
 class BlackShares:
     """Of a print's black, shares that are tried with each picture.
 
-    Attributes
-    ----------
-    black
-        (3,) what the camera sees of the print's black under the light of the measurement, counts.
-    shares
-        What is taken out of it, 0 … 1, at least one.
+    - `black`: (3,) what the camera sees of the print's black under the light of the measurement, counts.
+    - `shares`: what is taken out of it, 0 … 1, at least one.
     """
 
     black: tuple[float, float, float]
@@ -84,23 +76,9 @@ def measure_pictures(
 ) -> MeasuredPictures:
     """Return the numbers of source pictures, photographed one after the other.
 
-    Parameters
-    ----------
-    sources
-        N pictures.
-    photograph
-        How each, (H, W, 3) uint8, becomes a raw image (H, W, 3) uint16.
-    white
-        (3,) float64 above 0, the light of these images in linear camera RGB.
-    cells
-        Cells a side that images are reduced to, at most: as many as those of the data set that they are held to.
-    workers
-        Threads; no number depends on it.
-    on_picture
-        Called after each picture, from the calling thread, with how many are done and how many there are.
-    black
-        Shares of the print's black that are taken out of the cells of each photograph, which was taken with all of it;
-        None leaves photographs as they are.
+    `photograph`: how each, (H, W, 3) uint8, becomes a raw image (H, W, 3) uint16. `white`: (3,) float64 above 0, the
+    light of these images in linear camera RGB. `black`: shares of the print's black that are taken out of the cells of
+    each photograph, which was taken with all of it; None leaves photographs as they are.
     """
     found: list[dict[str, float] | None] = []
     measure = partial(_measure, photograph=photograph, white=white, cells=cells, black=black)

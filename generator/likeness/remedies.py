@@ -12,15 +12,7 @@ if TYPE_CHECKING:
 
 
 def remedies(drawn: DrawnPictures, options: DatasetOptions) -> list[str]:
-    """Return which options bring figures nearer that are not alike, a line each; none where all are.
-
-    Parameters
-    ----------
-    drawn
-        What became of the figures.
-    options
-        How images are rendered: what is on already is not named.
-    """
+    """Return which options bring figures nearer that are not alike, a line each; none where all are."""
     apart = {made.name: made for made in drawn.reached if not made.is_alike}
     if not apart:
         return []

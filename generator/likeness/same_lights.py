@@ -40,16 +40,10 @@ _Shown = tuple[tuple[int, int, int], str | None]
 class LightsOf:
     """The lights of each scene of a dataset; a `LightChoice`.
 
-    Attributes
-    ----------
-    dataset
-        Name of the dataset.
-    table_sha256, sha256
-        Of its table, and of its list of ground truths.
-    lights_each
-        Images for each scene: for each picture, or for each crop of it.
-    lightings
-        Those of every planned image; of an image that was not made, those of another.
+    - `dataset`: name of the dataset.
+    - `table_sha256`, `sha256`: of its table, and of its list of ground truths.
+    - `lights_each`: images for each scene: for each picture, or for each crop of it.
+    - `lightings`: those of every planned image; of an image that was not made, those of another.
     """
 
     dataset: str
@@ -85,13 +79,7 @@ class SamePicture:
         return self.source.name
 
     def read(self) -> SourcePicture:
-        """Return the picture.
-
-        Raises
-        ------
-        InputError
-            Its file is not the one of the other dataset.
-        """
+        """Return the picture."""
         read = self.source.read()
         if self.sha256 is not None and read.sha256 != self.sha256:
             raise InputError(
@@ -141,16 +129,7 @@ def open_scenes(place: str) -> Dataset:
 
 
 def lights_of(dataset: Dataset, lut: Lut) -> LightsOf:
-    """Return the lights of a dataset as lights of another table.
-
-    Raises
-    ------
-    InputError
-        The table lacks lights that the dataset used, it mixes lights whose proportion is not known, or its masks lie in
-        files of shards.
-    FormatError
-        The dataset's masks are missing or damaged.
-    """
+    """Return the lights of a dataset as lights of another table."""
     made = dataset.description
     numbers = _same_lights(made.lights, lut, dataset.store.place)
     tinted = _is_tinted(dataset)
@@ -175,20 +154,7 @@ def lights_of(dataset: Dataset, lut: Lut) -> LightsOf:
 
 
 def scenes_of(dataset: Dataset, found: Sequence[Source]) -> tuple[Source, ...]:
-    """Return the sources of a dataset in its order.
-
-    Parameters
-    ----------
-    dataset
-        The dataset.
-    found
-        Pictures, among which those of the dataset are found by their names; others are not used.
-
-    Raises
-    ------
-    InputError
-        A picture is missing.
-    """
+    """Return the sources of a dataset in its order."""
     by_name = {source.name: source for source in found}
     seed = dataset.description.seed
     sources: dict[int, Source] = {

@@ -26,12 +26,8 @@ _LEAST_SIDE: Final = 16
 class LikeSize:
     """A size of images.
 
-    Attributes
-    ----------
-    width, height
-        What pictures are cut to, px.
-    wanted
-        Width and height of most images of the real data set, px.
+    - `width`, `height`: what pictures are cut to, px.
+    - `wanted`: width and height of most images of the real data set, px.
     """
 
     width: int
@@ -52,22 +48,7 @@ class LikeSize:
 def like_size(target: RealStatistics, sources: Sequence[Source]) -> LikeSize | None:
     """Return the size of most real images, made smaller in that shape where pictures are smaller.
 
-    Parameters
-    ----------
-    target
-        The real data set.
-    sources
-        Pictures as they are, not cut.
-
-    Returns
-    -------
-    LikeSize or None
-        None for thumbnails, whose size and shape are not those of the photographs.
-
-    Raises
-    ------
-    InputError
-        No picture can be read, or pictures are too small.
+    Returns none for thumbnails, whose size and shape are not those of the photographs.
     """
     if target.layout == "thumbnails" or not target.sizes:
         return None

@@ -13,13 +13,7 @@ from generator.files.formats import require_plausible
 
 
 def decode_values(file: bytes, what: Path | str) -> npt.NDArray[Any]:
-    """Return the values (H, W) or (H, W, 3), RGB, of the file's type (uint8, uint16, float32 …), without transparency.
-
-    Raises
-    ------
-    FormatError
-        The bytes are no picture, or damaged; the message calls them `what`.
-    """
+    """Return the values (H, W) or (H, W, 3), RGB, of the file's dtype (uint8, uint16, float32), no transparency."""
     import cv2
 
     require_plausible(file, str(what))

@@ -45,13 +45,7 @@ class GivenMasks:
     files: tuple[Path, ...]
 
     def weights(self, height: int, width: int, lights: int) -> Weights:
-        """Return (height, width, lights) float32 from 0 to 1 in whole 65535ths that sum to 1 in every pixel.
-
-        Raises
-        ------
-        FormatError
-            A file cannot be read, or the files are not masks of that many lights.
-        """
+        """Return (height, width, lights) float32 from 0 to 1 in whole 65535ths that sum to 1 in every pixel."""
         masks = [_fitted(mask, height, width) for file in self.files for mask in _read(file)]
         names = ", ".join(file.name for file in self.files)
         if len(masks) not in (lights, lights - 1):
@@ -75,16 +69,10 @@ class GivenMasks:
 class GivenMaskPlan:
     """Sets of mask files for one image after another, starting over when they end; a `MaskPlan`.
 
-    Attributes
-    ----------
-    folder
-        Name of the folder.
-    sets
-        In the order of their names.
-    sha256
-        Over the names and bytes of all files in their order.
-    places
-        Which set belongs to the image of a number; empty where all are taken in turn.
+    - `folder`: name of the folder.
+    - `sets`: in the order of their names.
+    - `sha256`: over the names and bytes of all files in their order.
+    - `places`: which set belongs to the image of a number; empty where all are taken in turn.
     """
 
     folder: str
@@ -102,13 +90,7 @@ class GivenMaskPlan:
 
 
 def find_masks(folder: Path, lights: int) -> GivenMaskPlan:
-    """Return the sets of masks in a folder; the head of this file has the rules.
-
-    Raises
-    ------
-    FormatError
-        There is none, a file cannot be read, or a set is not of as many masks as `lights` need.
-    """
+    """Return the sets of masks in a folder; the head of this file has the rules."""
     try:
         files = sorted(path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES and path.is_file())
     except OSError as error:

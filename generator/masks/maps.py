@@ -21,12 +21,8 @@ from generator.masks.whites import quantised_chromaticities, quantised_weights
 def encode_maps(weights: Weights, whites: npt.NDArray[np.float64]) -> list[tuple[str, str, bytes]]:
     """Return what goes beside an image of several lights: folder, what follows the image's number, PNG file.
 
-    Parameters
-    ----------
-    weights
-        (H, W, K) float32 in whole 65535ths, what the image was made with.
-    whites
-        (K, 3) float64, the ground truth of each light, linear camera RGB, not normalised.
+    `weights`: (H, W, K) float32 in whole 65535ths, what the image was made with. `whites`: (K, 3) float64, the ground
+    truth of each light, linear camera RGB, not normalised.
     """
     shares = quantised_weights(weights, FULL)
     maps = [("masks", f"_{light}.png", encode_map(share)) for light, share in enumerate(shares)]
@@ -35,13 +31,7 @@ def encode_maps(weights: Weights, whites: npt.NDArray[np.float64]) -> list[tuple
 
 
 def decode_weights(files: Sequence[bytes], what: str) -> Weights:
-    """Return the weights (H, W, K) float32, sum 1, of the K mask files of an image of a dataset.
-
-    Raises
-    ------
-    FormatError
-        A file is damaged, or not of one size with the others.
-    """
+    """Return the weights (H, W, K) float32, sum 1, of the K mask files of an image of a dataset."""
     masks = [_from_16_bits(data, 2, what) for data in files]
     if len({mask.shape for mask in masks}) != 1:
         raise FormatError(f"the masks of {what} differ in size; make the dataset again")
@@ -49,13 +39,7 @@ def decode_weights(files: Sequence[bytes], what: str) -> Weights:
 
 
 def decode_ground_truth(data: bytes, what: str) -> npt.NDArray[np.float32]:
-    """Return the ground truth (H, W, 3) float32, r + g + b = 1, of every pixel of an image of a dataset.
-
-    Raises
-    ------
-    FormatError
-        The file is damaged.
-    """
+    """Return the ground truth (H, W, 3) float32, r + g + b = 1, of every pixel of an image of a dataset."""
     return _from_16_bits(data, 3, what)
 
 

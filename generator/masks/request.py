@@ -30,22 +30,6 @@ def parse_masks(text: str, lights: int, seed: int) -> MaskPlan:
     ``soft-edge:angle=30,width=.2``, ``spots:count=3,radius=.1,softness=.5``, ``smooth:scale=.3,contrast=8`` and
     ``window:columns=2,rows=3,softness=.05``; anything else is a folder of masks as `given.find_masks` reads it.
 
-    Parameters
-    ----------
-    text
-        What was written.
-    lights
-        Lights of an image, 2 or more.
-    seed
-        Of the masks that are made.
-
-    Raises
-    ------
-    InputError
-        It names none, or a number is out of range.
-    FormatError
-        The folder's files are no masks for that many lights.
-
     Examples
     --------
     >>> weights = parse_masks("half-plane:angle=0", lights=2, seed=1).maker(0).weights(2, 6, 2)
@@ -61,11 +45,6 @@ def parse_masks(text: str, lights: int, seed: int) -> MaskPlan:
 
 def parse_shape(text: str) -> Shape:
     """Return the shape of made masks that a text names, as of `parse_masks`.
-
-    Raises
-    ------
-    InputError
-        It names none, or a number is out of range.
 
     Examples
     --------

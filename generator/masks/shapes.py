@@ -52,18 +52,8 @@ class Shape(Protocol):
     def shares(self, streams: RandomStreams, half: tuple[float, float], lights: int, pixel: float, u: Array) -> Shares:
         """Return the function from rows v (h, 1) to the lights' shares (K, h, W) float32 of their pixels.
 
-        Parameters
-        ----------
-        streams
-            Of this image.
-        half
-            Half the picture's width and height, shares of the longer side.
-        lights
-            How many lights fall.
-        pixel
-            Size of a pixel, a share of the longer side.
-        u
-            (1, W) float32, the columns' distances from the picture's centre, shares of the longer side.
+        `pixel`: size of a pixel, a share of the longer side. `u`: (1, W) float32, the columns' distances from the
+        picture's centre, shares of the longer side.
         """
         ...
 
@@ -83,12 +73,8 @@ def stepped(x: Any) -> Any:
 class HalfPlanes:
     """Parallel strips, one for each light: for two lights a half plane each.
 
-    Attributes
-    ----------
-    angle
-        Direction in degrees from the first light to the last, clockwise from the right; None: any.
-    width
-        Breadth of the soft edge; 0 is as sharp as pixels allow. None: any from 0.1 to 0.6.
+    - `angle`: direction in degrees from the first light to the last, clockwise from the right; None: any.
+    - `width`: breadth of the soft edge; 0 is as sharp as pixels allow. None: any from 0.1 to 0.6.
     """
 
     angle: float | None = None
@@ -121,14 +107,9 @@ class HalfPlanes:
 class Spots:
     """Soft discs of every light but the first.
 
-    Attributes
-    ----------
-    count
-        Discs of each light; None: any from 1 to 4.
-    radius
-        Where a disc's light has fallen to a half; None: any from 0.08 to 0.3.
-    softness
-        Breadth of the edge over the radius, up to 2.
+    - `count`: discs of each light; None: any from 1 to 4.
+    - `radius`: where a disc's light has fallen to a half; None: any from 0.08 to 0.3.
+    - `softness`: breadth of the edge over the radius, up to 2.
     """
 
     count: int | None = None
@@ -167,12 +148,8 @@ class Spots:
 class SmoothFields:
     """Lights that pass into one another: a random field for each, smoothed by cubic B-splines (I. Schoenberg, 1946).
 
-    Attributes
-    ----------
-    scale
-        Distance over which a field changes, a share of the longer side.
-    contrast
-        How much one light prevails where its field is largest.
+    - `scale`: distance over which a field changes, a share of the longer side.
+    - `contrast`: how much one light prevails where its field is largest.
     """
 
     scale: float = 0.5
@@ -220,12 +197,8 @@ class SmoothFields:
 class Windows:
     """Daylight through a window on wall or floor: panes in perspective, a window for each light but the first.
 
-    Attributes
-    ----------
-    columns, rows
-        Panes across and down; None: 2 or 3.
-    softness
-        Breadth of the half shadow, a share of the window; None: any from 0.02 to 0.1.
+    - `columns`, `rows`: panes across and down; None: 2 or 3.
+    - `softness`: breadth of the half shadow, a share of the window; None: any from 0.02 to 0.1.
     """
 
     columns: int | None = None

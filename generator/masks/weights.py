@@ -81,12 +81,7 @@ def _quantise_shares(shares: Any, out: Any) -> None:
 def quantise_shares(shares: npt.NDArray[np.floating[Any]], out: Weights) -> None:
     """Fill `out` with shares in whole 65535ths that sum to 1; the largest takes up the rounding error.
 
-    Parameters
-    ----------
-    shares
-        (K, H, W) float32 ≥ 0, not all 0 in a pixel.
-    out
-        (H, W, K) float32, 0 to 1, contiguous.
+    `shares`: (K, H, W) float32 ≥ 0, not all 0 in a pixel. `out`: (H, W, K) float32, 0 to 1, contiguous.
 
     Examples
     --------

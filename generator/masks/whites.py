@@ -83,17 +83,8 @@ def _sums(weights: Any, out: Any) -> None:
 def chromaticities(weights: npt.NDArray[np.float32], whites: npt.NDArray[np.float64]) -> npt.NDArray[np.float32]:
     """Return the chromaticity of the sum of the lights' whites, each times its weight, in each pixel.
 
-    Parameters
-    ----------
-    weights
-        (H, W, K) float32 ≥ 0, not all 0 in a pixel.
-    whites
-        (K, 3) float64, linear camera RGB above 0.
-
-    Returns
-    -------
-    ndarray
-        (H, W, 3) float32, r + g + b = 1, computed in float32, lights added up in their order.
+    `weights`: (H, W, K) float32 ≥ 0, not all 0 in a pixel. `whites`: (K, 3) float64, linear camera RGB above 0. Returns
+    (H, W, 3) float32, r + g + b = 1, computed in float32, lights added up in their order.
 
     Examples
     --------
@@ -114,14 +105,7 @@ def quantised_chromaticities(
 
     Red and blue are rounded, green is the rest.
 
-    Parameters
-    ----------
-    weights
-        (H, W, K) float32 ≥ 0, not all 0 in a pixel.
-    whites
-        (K, 3) float64, linear camera RGB above 0.
-    full
-        What 1 becomes.
+    `weights`: (H, W, K) float32 ≥ 0, not all 0 in a pixel. `whites`: (K, 3) float64, linear camera RGB above 0.
 
     Examples
     --------

@@ -36,16 +36,10 @@ _HEAD: Final = 1 << 20
 class AvifPicture:
     """What a file holds.
 
-    Attributes
-    ----------
-    codes
-        (H, W, 3) uint8.
-    alpha
-        (H, W) float64, 0 … 1; None if it is opaque.
-    orientation
-        1 … 8, as the TIFF tag.
-    icc
-        Its colour profile, if it has one.
+    - `codes`: (H, W, 3) uint8.
+    - `alpha`: (H, W) float64, 0 … 1; None if it is opaque.
+    - `orientation`: 1 … 8, as the TIFF tag.
+    - `icc`: its colour profile, if it has one.
     """
 
     codes: npt.NDArray[np.uint8]
@@ -55,20 +49,7 @@ class AvifPicture:
 
 
 def read_avif(path: Path, most_pixels: int) -> AvifPicture:
-    """Return the picture in an AVIF file.
-
-    Parameters
-    ----------
-    path
-        The file.
-    most_pixels
-        More are refused.
-
-    Raises
-    ------
-    FormatError
-        It is damaged, too large, or not of colours that can be taken as sRGB.
-    """
+    """Return the picture in an AVIF file."""
     from PIL import Image
 
     try:

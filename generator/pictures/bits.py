@@ -11,11 +11,6 @@ from foundation.errors import InputError
 def clear_bits(codes: npt.NDArray[np.uint8], bits: int) -> npt.NDArray[np.uint8]:
     """Return codes (...) uint8 with their lowest `bits` bits, 0 … 8, set to zero.
 
-    Raises
-    ------
-    InputError
-        A code has no such number of bits.
-
     Examples
     --------
     >>> clear_bits(np.array([7, 8, 200, 255], np.uint8), 3)
@@ -27,11 +22,8 @@ def clear_bits(codes: npt.NDArray[np.uint8], bits: int) -> npt.NDArray[np.uint8]
 
 
 def keep_bits(codes: npt.NDArray[np.uint8], bits: int | None) -> npt.NDArray[np.uint8]:
-    """Return codes (...) uint8 of which the highest `bits` bits, 0 … 8, are kept; all of them, the same array, if None.
+    """Return codes (...) uint8 of which the highest `bits` bits, 0 … 8, are kept.
 
-    Raises
-    ------
-    InputError
-        A code has no such number of bits.
+    All of them, the same array, if None.
     """
     return codes if bits is None else clear_bits(codes, 8 - bits)

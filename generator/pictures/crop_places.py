@@ -29,25 +29,9 @@ def random_places(
     equals, as in best-candidate sampling (D. Mitchell, "Spectrally optimal sampling for distribution ray tracing",
     SIGGRAPH 1991), where its eight are all taken, at the first free place after them, row by row.
 
-    Parameters
-    ----------
-    free
-        Columns and rows at which a crop can begin, 1 or more; together `count` or more places.
-    size
-        Width and height of a crop, px.
-    count
-        Crops, 1 or more.
-    seed
-        0 … 2⁶⁴ − 1.
-    name
-        Of the picture.
-    first
-        Column and row of the first crop, px; None for a random place.
-
-    Returns
-    -------
-    list of tuple
-        Column and row of each, px.
+    `free`: columns and rows at which a crop can begin, 1 or more; together `count` or more places. `size`: width and
+    height of a crop, px. `first`: column and row of the first crop, px; None for a random place. Returns column and row
+    of each, px.
 
     Examples
     --------

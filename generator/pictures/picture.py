@@ -47,29 +47,16 @@ _MULTIPLIED: Final = frozenset({"dpx", "iff", "openexr", "rla", "tiff"})
 class Preparation:
     """How pictures are prepared on request: made smaller, cut, taken as sRGB.
 
-    Attributes
-    ----------
-    max_side
-        Longest side allowed, px; a larger picture is made smaller.
-    crop
-        (width, height), px, to cut every picture to.
-    cover
-        Whether a picture is first made as small as still covers the crop.
-    crop_at
-        Where to cut: ``"centre"``, or ``"random"``, a place that the seed and the picture's name choose; None for the
-        centre of one crop, and random places of several.
-    crops
-        How many different crops to cut. The first is where `crop_at` says, at random that of one; the others are at
-        random places far from it and from each other.
-    profiles
-        ``"honour"`` converts pictures of other colour spaces to sRGB; ``"ignore"`` takes all codes as they stand.
-    seed
-        0 … 2⁶⁴ − 1, of random crops.
-
-    Raises
-    ------
-    InputError
-        A side is out of range, or `cover` lacks a crop.
+    - `max_side`: longest side allowed, px; a larger picture is made smaller.
+    - `crop`: (width, height), px, to cut every picture to.
+    - `cover`: whether a picture is first made as small as still covers the crop.
+    - `crop_at`: where to cut: ``"centre"``, or ``"random"``, a place that the seed and the picture's name choose; None
+      for the centre of one crop, and random places of several.
+    - `crops`: how many different crops to cut. The first is where `crop_at` says, at random that of one; the others are
+      at random places far from it and from each other.
+    - `profiles`: ``"honour"`` converts pictures of other colour spaces to sRGB; ``"ignore"`` takes all codes as they
+      stand.
+    - `seed`: 0 … 2⁶⁴ − 1, of random crops.
     """
 
     max_side: int | None = None
@@ -128,14 +115,9 @@ class Cut:
 class Reading:
     """A picture as it was read.
 
-    Attributes
-    ----------
-    picture
-        (H, W, 3) uint8, sRGB codes; of several crops the first.
-    profile
-        How its colour profile was treated, in words, such as ``"Display P3, converted to sRGB"``.
-    cuts
-        The crops, where several were asked for.
+    - `picture`: (H, W, 3) uint8, sRGB codes; of several crops the first.
+    - `profile`: how its colour profile was treated, in words, such as ``"Display P3, converted to sRGB"``.
+    - `cuts`: the crops, where several were asked for.
     """
 
     picture: Picture
@@ -176,26 +158,8 @@ def open_picture(
 ) -> Reading:
     """Return the sRGB codes of a picture file and how its profile was treated; the head of this file lists the steps.
 
-    Parameters
-    ----------
-    path
-        Any file that OpenImageIO reads, or AVIF.
-    preparation
-        How the picture is prepared besides.
-    name
-        Name of the picture, which chooses the place of a random crop; its file's name if None.
-    data
-        The file's bytes, where they were read already.
-
-    Returns
-    -------
-    Reading
-        The codes (H, W, 3) uint8 and the treatment of its profile.
-
-    Raises
-    ------
-    FormatError
-        The file cannot be read as a picture, with OpenImageIO's reason, or is smaller than the crop.
+    `name`: name of the picture, which chooses the place of a random crop; its file's name if None. `data`: the file's
+    bytes, where they were read already. Returns the codes (H, W, 3) uint8 and the treatment of its profile.
 
     Examples
     --------

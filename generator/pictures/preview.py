@@ -128,20 +128,9 @@ def _tables(white_level: int) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.f
 def preview_of(image: npt.NDArray[np.uint16], white_level: int, side: int = PREVIEW_SIDE) -> npt.NDArray[np.uint8]:
     """Return the preview of a raw linear image: made small, then tone mapped, colours as the camera saw them.
 
-    Parameters
-    ----------
-    image
-        (H, W, 3) uint16, linear camera RGB.
-    white_level
-        Value of saturation, in the units of the image.
-    side
-        Longest side allowed, px. A pixel of the preview is the mean of k × k pixels, k the least whole number that
-        makes it fit.
-
-    Returns
-    -------
-    ndarray
-        (h, w, 3) uint8, codes for a display; h and w are H / k and W / k, rounded up.
+    `image`: (H, W, 3) uint16, linear camera RGB. `side`: longest side allowed, px. A pixel of the preview is the mean
+    of k × k pixels, k the least whole number that makes it fit. Returns (h, w, 3) uint8, codes for a display; h and w
+    are H / k and W / k, rounded up.
 
     Examples
     --------

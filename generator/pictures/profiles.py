@@ -44,17 +44,9 @@ _ROWS: Final = 256
 def to_srgb(codes: npt.NDArray[np.uint8], icc: bytes | None) -> tuple[npt.NDArray[np.uint8], str]:
     """Return the sRGB codes of a picture, and how its profile was treated.
 
-    Parameters
-    ----------
-    codes
-        (H, W, 3) uint8 in the space of the profile; a grey profile is applied where the channels are alike.
-    icc
-        The embedded profile; None where there is none.
-
-    Returns
-    -------
-    tuple
-        (H, W, 3) uint8, the same array if no code changes; and a remark, such as ``"Display P3, converted to sRGB"``.
+    `codes`: (H, W, 3) uint8 in the space of the profile; a grey profile is applied where the channels are alike. `icc`:
+    the embedded profile; None where there is none. Returns (H, W, 3) uint8, the same array if no code changes; and a
+    remark, such as ``"Display P3, converted to sRGB"``.
 
     Examples
     --------

@@ -48,20 +48,12 @@ _MACHINE_ERRORS: Final = frozenset(
 class SourcePicture:
     """A source picture as it was read.
 
-    Attributes
-    ----------
-    picture
-        (H, W, 3) uint8, sRGB codes; of several crops the first.
-    sha256
-        Hash of the file's bytes; None where there is no file.
-    profile
-        How its colour profile was treated, in words; None where there is no file.
-    cuts
-        The crops, where several were asked for.
-    weight
-        By which it was drawn; None where pictures were not drawn by weights.
-    black_taken
-        Share of the print's black, 0 … 1, that is taken out of its images; None where options say it.
+    - `picture`: (H, W, 3) uint8, sRGB codes; of several crops the first.
+    - `sha256`: hash of the file's bytes; None where there is no file.
+    - `profile`: how its colour profile was treated, in words; None where there is no file.
+    - `cuts`: the crops, where several were asked for.
+    - `weight`: by which it was drawn; None where pictures were not drawn by weights.
+    - `black_taken`: share of the print's black, 0 … 1, that is taken out of its images; None where options say it.
     """
 
     picture: Picture
@@ -93,14 +85,9 @@ class Source(Protocol):
 class PictureFile:
     """A file on this machine, or on a store that fsspec knows.
 
-    Attributes
-    ----------
-    root
-        Folder it was found in, as a path or URL; the file itself where it was named.
-    below
-        Path below the root with forward slashes; empty where the file was named itself.
-    preparation
-        How it is prepared.
+    - `root`: folder it was found in, as a path or URL; the file itself where it was named.
+    - `below`: path below the root with forward slashes; empty where the file was named itself.
+    - `preparation`: how it is prepared.
     """
 
     root: str
@@ -125,18 +112,7 @@ class PictureFile:
         return f"{self.root.rstrip('/')}/{self.below}" if self.below else self.root
 
     def read(self) -> SourcePicture:
-        """Return the picture, codes (H, W, 3) uint8; see `picture.open_picture`.
-
-        Raises
-        ------
-        FormatError
-            It is no picture, may not be read, or is missing from a folder that holds others.
-        InputError
-            There is not enough memory for it.
-        StorageError
-            Its bytes cannot be read for a reason that is not the file's own: a disk that is not mounted, a store that
-            does not answer. The picture must not be left out then as if it were damaged.
-        """
+        """Return the picture, codes (H, W, 3) uint8; see `picture.open_picture`."""
         with _local_file(self.location) as path:
             try:
                 sha256, data = _hashed(path)
@@ -155,17 +131,7 @@ class PictureFile:
 def hash_since(source: Source, moment: float) -> str | None:
     """Return the SHA-256 of a source's file if that is on this machine and was changed after a moment.
 
-    Parameters
-    ----------
-    source
-        Any; with a weight, or one that must be as it was, that which it is of.
-    moment
-        Seconds since 1970, as of `os.stat_result`.
-
-    Returns
-    -------
-    str or None
-        None where there is no such file, or it was not changed. A file that was removed has an empty hash.
+    Returns none where there is no such file, or it was not changed. A file that was removed has an empty hash.
     """
     file: object = getattr(source, "source", source)
     if not isinstance(file, PictureFile) or is_remote(file.location):
@@ -248,14 +214,9 @@ class RandomScene:
     Codes R, G, B of pixel (x, y) are the three high bytes, highest first, of word x mod 4 of Philox4x32-10 with counter
     (⌊x/4⌋, y, number, 2) and the seed as key.
 
-    Attributes
-    ----------
-    number
-        0 … 2³² − 1; scenes of different numbers are independent.
-    width, height
-        Size, px.
-    seed
-        0 … 2⁶⁴ − 1.
+    - `number`: 0 … 2³² − 1; scenes of different numbers are independent.
+    - `width`, `height`: size, px.
+    - `seed`: 0 … 2⁶⁴ − 1.
     """
 
     number: int
@@ -284,11 +245,6 @@ class RandomScene:
 
 def random_scenes(count: int, width: int, height: int, seed: int = 0) -> tuple[RandomScene, ...]:
     """Return `count` random scenes of `width` × `height` px, numbered from 0.
-
-    Raises
-    ------
-    InputError
-        A number is out of range.
 
     Examples
     --------
@@ -382,13 +338,7 @@ def _is_picture(name: str) -> bool:
 
 
 class _Search:
-    """What a search for pictures has followed and passed over.
-
-    Parameters
-    ----------
-    root
-        Folder that is searched.
-    """
+    """What a search for pictures has followed and passed over."""
 
     def __init__(self, root: str) -> None:
         self._searched = [root if is_remote(root) else os.path.realpath(root)]

@@ -26,14 +26,9 @@ _BLACK: Final = np.float32(1e-30)
 class Flash:
     """The operator with the parameters of one image, so that it can be undone.
 
-    Attributes
-    ----------
-    k
-        Semi-saturation: a · exp(mean ln V) of the image it was fitted to.
-    scale
-        Code that the brightest value became, divided by that value: undone before anything else.
-    gamma
-        Display exponent g of y ** (1 / g); 1 for none.
+    - `k`: semi-saturation: a · exp(mean ln V) of the image it was fitted to.
+    - `scale`: code that the brightest value became, divided by that value: undone before anything else.
+    - `gamma`: display exponent g of y ** (1 / g); 1 for none.
 
     Examples
     --------
@@ -68,19 +63,7 @@ class Flash:
 def fit_flash(linear: npt.NDArray[np.floating], a: float = 5.0, gamma: float = 2.2) -> Flash:
     """Return the operator fitted to an image.
 
-    Parameters
-    ----------
-    linear
-        (..., 3) float ≥ 0, linear RGB, 1 = saturation.
-    a
-        Strength, > 0; larger keeps the picture darker. 5 is the authors' value.
-    gamma
-        Display exponent, 1 for none.
-
-    Raises
-    ------
-    InputError
-        The image is empty, or a parameter not above 0.
+    `linear`: (..., 3) float ≥ 0, linear RGB, 1 = saturation.
 
     Examples
     --------

@@ -118,11 +118,6 @@ KEEP: Final = BlackPoint()
 def parse_black_point(text: str) -> BlackPoint:
     """Return what an option asks for: ``keep``, ``compensate``, ``random``, ``random:MAX``, or ``like``.
 
-    Raises
-    ------
-    InputError
-        The text is none of these.
-
     Examples
     --------
     >>> parse_black_point("random:0.8").label
@@ -143,12 +138,8 @@ def parse_black_point(text: str) -> BlackPoint:
 class Veil:
     """What is taken out of the samples of a light, and what the rest is multiplied by.
 
-    Attributes
-    ----------
-    taken
-        (3,) float64 ≥ 0, counts: v b.
-    stretch
-        (3,) float64 ≥ 1: 1 / (1 - v b / W).
+    - `taken`: (3,) float64 ≥ 0, counts: v b.
+    - `stretch`: (3,) float64 ≥ 1: 1 / (1 - v b / W).
     """
 
     taken: _Array
@@ -159,18 +150,6 @@ def black_of(lut: Lut, light: Mixture) -> _Array:
     """Return what the camera sees of the chart's black cell under a light: (3,) float64, counts, the samples' mean.
 
     Where the table lists black as unfit, it is that of the nearest fit cell.
-
-    Parameters
-    ----------
-    lut
-        The table.
-    light
-        The light.
-
-    Raises
-    ------
-    InputError
-        The table has no such light.
     """
     light.white(lut)
     unfit = sorted({cell.colour for cell in lut.provenance.unfit})
@@ -182,24 +161,8 @@ def black_of(lut: Lut, light: Mixture) -> _Array:
 def veil_of(lut: Lut, light: Mixture, share: float, grey: float | None = None) -> Veil:
     """Return what taking out a share of the print's black means under a light.
 
-    Parameters
-    ----------
-    lut
-        The table.
-    light
-        The light.
-    share
-        0 … 1.
-    grey
-        What black was mapped to, over the light's white, of images rendered by colour (`CellMixtures.black`); None for
-        the black cell.
-
-    Raises
-    ------
-    InputError
-        The table has no such light.
-    QualityError
-        Black is half as bright as white or brighter in a channel.
+    `share`: 0 … 1. `grey`: what black was mapped to, over the light's white, of images rendered by colour
+    (`CellMixtures.black`); None for the black cell.
     """
     black = black_of(lut, light) if grey is None else grey * light.white(lut)
     white = np.minimum(light.white(lut), lut.provenance.white_level)
@@ -221,21 +184,8 @@ def without_veil(
 ) -> npt.NDArray[np.uint16]:
     """Return the samples of a light without a share of the print's black; the rules stand at the head of this file.
 
-    Parameters
-    ----------
-    samples
-        (8**bits, S, 3) uint16, linear camera RGB of the light.
-    veil
-        What to take out.
-    white_level
-        Value of saturation.
-    colours
-        (8**bits,) bool, which colours are wanted; None for all. Samples of the others are 0.
-
-    Returns
-    -------
-    ndarray
-        (8**bits, S, 3) uint16.
+    `samples`: (8**bits, S, 3) uint16, linear camera RGB of the light. `colours`: (8**bits,) bool, which colours are
+    wanted; None for all. Samples of the others are 0. Returns (8**bits, S, 3) uint16.
 
     Examples
     --------

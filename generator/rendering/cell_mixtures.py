@@ -78,14 +78,10 @@ _AXES: Final = np.array([[1.0, 1.0, 1.0], [1.0, 0.0, -1.0], [1.0, -2.0, 1.0]]) /
 class CellMixtures:
     """For each of K wanted colours 16 equally likely cells whose mean shows it.
 
-    Attributes
-    ----------
-    cells
-        (K, 16) uint16, numbers of cells of the chart, ((r << 2n) | (g << n) | b) for n bits a channel; ascending.
-    colours
-        (K, 3) float32, what the camera sees of the 16 in the mean, over the white of the light.
-    wanted
-        (K, 3) float32, what it should see.
+    - `cells`: (K, 16) uint16, numbers of cells of the chart, ((r << 2n) | (g << n) | b) for n bits a channel;
+      ascending.
+    - `colours`: (K, 3) float32, what the camera sees of the 16 in the mean, over the white of the light.
+    - `wanted`: (K, 3) float32, what it should see.
     """
 
     cells: npt.NDArray[np.uint16]
@@ -111,12 +107,7 @@ class CellMixtures:
 def mix_cells(profile: PrintProfile, wanted: _Array) -> CellMixtures:
     """Return for each wanted colour the cells that together show it.
 
-    Parameters
-    ----------
-    profile
-        The print under a light.
-    wanted
-        (K, 3) float64 > 0, what the camera should see, over the white of the light.
+    `wanted`: (K, 3) float64 > 0, what the camera should see, over the white of the light.
 
     Examples
     --------
@@ -164,14 +155,8 @@ def mix_cells(profile: PrintProfile, wanted: _Array) -> CellMixtures:
 def mixtures_of(cells: npt.NDArray[np.uint16], profile: PrintProfile, wanted: _Array) -> CellMixtures:
     """Return mixtures of cells that were chosen, with what the camera sees of them.
 
-    Parameters
-    ----------
-    cells
-        (K, 16) uint16, numbers of cells.
-    profile
-        The print under a light.
-    wanted
-        (K, 3) float64 > 0, what the camera should see, over the white of the light.
+    `cells`: (K, 16) uint16, numbers of cells. `wanted`: (K, 3) float64 > 0, what the camera should see, over the white
+    of the light.
     """
     made = profile.colours[cells].mean(axis=1)
     return CellMixtures(cells, made.astype(np.float32), wanted.astype(np.float32))

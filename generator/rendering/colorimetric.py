@@ -61,12 +61,7 @@ _PROFILES_AT_HAND: Final = 64
 def wanted_colours(profile: PrintProfile, matrix: ColourMatrix) -> npt.NDArray[np.float64]:
     """Return what the camera should see of each source node on a print, (32768, 3) float64 over the white of the light.
 
-    Parameters
-    ----------
-    profile
-        The print: its black and white points.
-    matrix
-        Linear sRGB to the camera's RGB.
+    `matrix`: linear sRGB to the camera's RGB.
     """
     black = black_point(profile)
     return black + (profile.white - black) * source_colours.source_colours(matrix)
@@ -78,11 +73,6 @@ def black_point(profile: PrintProfile) -> float:
     At the very edge of the gamut cells of unlike colours would have to be mixed. So the darkest is taken, of greys from
     the print's own black to one a quarter brighter, that is off by no more than `BLACK_WITHIN_DEG`; if there is none,
     as on charts of few cells, the print's own black.
-
-    Parameters
-    ----------
-    profile
-        The print under a light.
 
     Examples
     --------
@@ -103,24 +93,9 @@ def colorimetric_mixtures(
 
     Those of a light of the table are kept on disk for the next time.
 
-    Parameters
-    ----------
-    lut
-        The table.
-    light
-        A light of the table by its number (int), a black body between those of the table by its temperature in kelvin
-        (float), or any mixture of lights.
-    matrix
-        Linear sRGB to the camera's RGB; None for what `matrix_for` gives.
-    folder
-        Where mixtures are kept; None for `kept_mixtures.cache_folder`.
-
-    Raises
-    ------
-    InputError
-        The table has no such light.
-    QualityError
-        No cell of the table can be trusted under that light, or black is half as bright as paper.
+    `light`: A light of the table by its number (int), a black body between those of the table by its temperature in
+    kelvin (float), or any mixture of lights. `matrix`: linear sRGB to the camera's RGB; None for what `matrix_for`
+    gives. `folder`: where mixtures are kept; None for `kept_mixtures.cache_folder`.
     """
     if not isinstance(light, Mixture):
         light = black_body(lut, light) if isinstance(light, float) else plain(int(light))
@@ -133,12 +108,7 @@ def colorimetric_mixtures(
 class ColorimetricRendering:
     """Rendering by colour with a table: which mixtures of cells an image is made of.
 
-    Attributes
-    ----------
-    lut
-        The table.
-    matrix
-        Linear sRGB to the camera's RGB.
+    `matrix`: linear sRGB to the camera's RGB.
     """
 
     lut: Lut
@@ -157,13 +127,7 @@ class ColorimetricRendering:
         return mixture_of(shares)
 
     def mixtures_for(self, lighting: Lighting) -> CellMixtures:
-        """Return the mixtures, 32768 of them, for an image.
-
-        Raises
-        ------
-        QualityError
-            No cell of the table can be trusted under its light.
-        """
+        """Return the mixtures, 32768 of them, for an image."""
         return colorimetric_mixtures(self.lut, self.light_of(lighting), self.matrix)
 
 
@@ -172,14 +136,7 @@ def lights_to_find(
 ) -> frozenset[int]:
     """Return the lights of the table whose cells images need and that are not kept: each takes a second or more.
 
-    Parameters
-    ----------
-    rendering
-        The rendering.
-    lightings
-        The lights of each image; of a mixture it is the light of the table that is nearest.
-    folder
-        Where mixtures are kept; None for `kept_mixtures.cache_folder`.
+    `folder`: where mixtures are kept; None for `kept_mixtures.cache_folder`.
     """
     lut, rows = rendering.lut, tuple(rendering.matrix.rows.ravel().tolist())
     mixtures = {rendering.light_of(lighting) for lighting in lightings}

@@ -14,12 +14,8 @@ from generator.rendering.cell_mixtures import CellMixtures
 class GamutSummary:
     """What a print makes of the colours of a picture.
 
-    Attributes
-    ----------
-    outside
-        Share of the pixels whose colour cells near to it cannot show, 0 … 1.
-    distance_deg
-        Mean angle between what the cells show and what the camera should see, degrees, over all pixels.
+    - `outside`: share of the pixels whose colour cells near to it cannot show, 0 … 1.
+    - `distance_deg`: mean angle between what the cells show and what the camera should see, degrees, over all pixels.
     """
 
     outside: float

@@ -21,15 +21,7 @@ def grey_tint_deg(lut: Lut) -> tuple[float, int] | None:
     Greys are the chart's cells with three equal codes between black and white, as the camera sees them under the light
     of the table that is brightest in its darkest channel; cells that are unfit or dark are left out.
 
-    Parameters
-    ----------
-    lut
-        The table.
-
-    Returns
-    -------
-    tuple or None
-        The angle in degrees, and the number of the light; None where the chart has no such grey.
+    Returns the angle in degrees, and the number of the light; None where the chart has no such grey.
 
     Examples
     --------

@@ -40,14 +40,7 @@ MOST_BYTES: Final = 1 << 30
 def load_mixtures(key: str, nodes: int, folder: Path | None = None) -> CellMixtures | None:
     """Return mixtures that were kept, or None if there are none or they are damaged.
 
-    Parameters
-    ----------
-    key
-        What they were kept under.
-    nodes
-        How many there are to be.
-    folder
-        Where they lie; None for `cache_folder`.
+    `folder`: where they lie; None for `cache_folder`.
     """
     folder = folder or cache_folder()
     if folder is None:
@@ -83,14 +76,7 @@ def keep_mixtures(key: str, mixtures: CellMixtures, folder: Path | None = None) 
 
     Where all that is kept takes more than `MOST_BYTES`, what was written first is removed.
 
-    Parameters
-    ----------
-    key
-        What to keep them under: hexadecimal digits.
-    mixtures
-        The mixtures.
-    folder
-        Where to; None for `cache_folder`.
+    `folder`: where to; None for `cache_folder`.
     """
     folder = folder or cache_folder()
     if folder is None:

@@ -46,14 +46,9 @@ _LARGEST: Final = 1e6
 class ColourMatrix:
     """A colour matrix and where it comes from.
 
-    Attributes
-    ----------
-    name
-        The camera, or the file.
-    rows
-        (3, 3) float64, linear sRGB to camera RGB; each row has sum 1.
-    source
-        Where the numbers come from, for notes below tables.
+    - `name`: the camera, or the file.
+    - `rows`: (3, 3) float64, linear sRGB to camera RGB; each row has sum 1.
+    - `source`: where the numbers come from, for notes below tables.
     """
 
     name: str
@@ -93,11 +88,6 @@ def read_matrix(path: Path) -> ColourMatrix:
 
     Blanks, commas and semicolons part numbers. Rows are scaled to sum 1.
 
-    Raises
-    ------
-    InputError
-        The file cannot be read, or does not hold nine finite numbers in rows whose sums are above 0.
-
     Examples
     --------
     >>> import tempfile
@@ -124,13 +114,7 @@ def read_matrix(path: Path) -> ColourMatrix:
 
 
 def choose_matrix(text: str) -> ColourMatrix | None:
-    """Return the matrix that an option names: a camera, a file, or None for the word `none`.
-
-    Raises
-    ------
-    InputError
-        It is neither a camera that is known nor a file with a matrix.
-    """
+    """Return the matrix that an option names: a camera, a file, or None for the word `none`."""
     if text.strip().lower() == "none":
         return None
     found = camera_matrix(text)

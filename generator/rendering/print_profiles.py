@@ -50,12 +50,9 @@ _Array = npt.NDArray[np.float64]
 class PrintProfile:
     """What a camera sees of each cell of a chart under one light.
 
-    Attributes
-    ----------
-    colours
-        (8**bits, 3) float64, mean of each cell's samples over the white of the light; 1 = what an ideal white shows.
-    usable
-        (8**bits,) bool, whether a cell's mean is to be trusted; see the head of this file. At least one is.
+    - `colours`: (8**bits, 3) float64, mean of each cell's samples over the white of the light; 1 = what an ideal white
+      shows.
+    - `usable`: (8**bits,) bool, whether a cell's mean is to be trusted; see the head of this file. At least one is.
     """
 
     colours: _Array
@@ -96,20 +93,6 @@ class PrintProfile:
 def profile_of(lut: Lut, light: int) -> PrintProfile:
     """Return what the camera of a table sees of each cell under one of its lights.
 
-    Parameters
-    ----------
-    lut
-        The table.
-    light
-        Number of the light.
-
-    Raises
-    ------
-    InputError
-        The table has no such light.
-    QualityError
-        No cell of the table can be trusted under that light.
-
     Examples
     --------
     >>> from pathlib import Path
@@ -138,12 +121,7 @@ def mixed_profile(profiles: Sequence[PrintProfile], whites: _Array) -> PrintProf
 
     A cell is usable that is so under each of them; where none is, all that are so under one of them.
 
-    Parameters
-    ----------
-    profiles
-        Of each light.
-    whites
-        (K, 3) float64 > 0, linear camera RGB of each light, as bright as it is in the mixture.
+    `whites`: (K, 3) float64 > 0, linear camera RGB of each light, as bright as it is in the mixture.
 
     Examples
     --------
@@ -163,17 +141,7 @@ def mixed_profile(profiles: Sequence[PrintProfile], whites: _Array) -> PrintProf
 def odd_cells(samples: npt.NDArray[np.uint16], means: _Array) -> npt.NDArray[np.bool_]:
     """Return which cells have means that a few odd samples have moved: hot photosites, dust.
 
-    Parameters
-    ----------
-    samples
-        (N, S, 3) uint16, the samples of a light.
-    means
-        (N, 3) float64, their means.
-
-    Returns
-    -------
-    ndarray
-        (N,) bool.
+    `samples`: (N, S, 3) uint16, the samples of a light. `means`: (N, 3) float64, their means. Returns (N,) bool.
 
     Examples
     --------
@@ -195,15 +163,8 @@ def neutral_ends(colours: _Array) -> tuple[float, float] | None:
 
     They are where the grey axis enters and leaves the convex hull of the colours.
 
-    Parameters
-    ----------
-    colours
-        (N, 3) float64, linear.
-
-    Returns
-    -------
-    tuple or None
-        The two values of g; None if no mixture is grey, or the colours lie in a plane.
+    `colours`: (N, 3) float64, linear. Returns the two values of g; None if no mixture is grey, or the colours lie in a
+    plane.
 
     Examples
     --------

@@ -37,15 +37,8 @@ def node_codes() -> npt.NDArray[np.float64]:
 def source_colours(matrix: ColourMatrix) -> npt.NDArray[np.float64]:
     """Return what the camera should see of each source node, over white: clip(C · linear sRGB, 0, 1).
 
-    Parameters
-    ----------
-    matrix
-        Linear sRGB to camera RGB, rows of sum 1, so that a grey is a grey to the camera, too.
-
-    Returns
-    -------
-    ndarray
-        (32768, 3) float64, 0 … 1.
+    `matrix`: linear sRGB to camera RGB, rows of sum 1, so that a grey is a grey to the camera, too. Returns (32768, 3)
+    float64, 0 … 1.
 
     Examples
     --------

@@ -32,20 +32,8 @@ TABLE: Final = "table"
 def matrix_for(lut: Lut, text: str | None = None) -> ColourMatrix:
     """Return the colour matrix that an option names, or the one for a table's camera.
 
-    Parameters
-    ----------
-    lut
-        The table.
-    text
-        A camera's name, a file, `table` for the one fitted from the table, or `none` for linear sRGB as it is. None:
-        that of the table's camera, or, where it is not known, the fitted one.
-
-    Raises
-    ------
-    InputError
-        It is neither, or the file is no matrix.
-    QualityError
-        No cell of the table can be trusted under the light of the fit.
+    `text`: A camera's name, a file, `table` for the one fitted from the table, or `none` for linear sRGB as it is.
+    None: that of the table's camera, or, where it is not known, the fitted one.
     """
     if text is None:
         return camera_matrix(lut.provenance.camera) or fitted_matrix(lut)
@@ -58,11 +46,6 @@ def fitted_matrix(lut: Lut) -> ColourMatrix:
     """Return the colour matrix that explains a table's colours best, under its light nearest to 6500 K.
 
     A table without black bodies is fitted under the light whose white has the most equal shares of brightness.
-
-    Raises
-    ------
-    QualityError
-        No cell of the table can be trusted under that light.
     """
     bodies = [(abs(light.cct_k - DAYLIGHT_K), light.index) for light in lut.illuminations if light.cct_k is not None]
     light = min(bodies)[1] if bodies else int(np.ptp(np.log(lut.white), axis=1).argmin())

@@ -42,17 +42,7 @@ def log_chroma(lights: npt.ArrayLike) -> npt.NDArray[np.float64]:
 def cell_borders(size: int, side: int = CELLS) -> npt.NDArray[np.int64]:
     """Return where cells begin along a side of `size` px, and where the last ends.
 
-    Parameters
-    ----------
-    size
-        Of the image, px.
-    side
-        Cells, at most; 0 for as many as pixels.
-
-    Returns
-    -------
-    ndarray
-        (N,) int64, px, from 0 to `size`, one more than cells.
+    `size`: of the image, px. Returns (N,) int64, px, from 0 to `size`, one more than cells.
 
     Examples
     --------
@@ -66,14 +56,8 @@ def cell_borders(size: int, side: int = CELLS) -> npt.NDArray[np.int64]:
 def cell_means(image: npt.NDArray[np.generic], light: npt.ArrayLike, side: int = CELLS) -> npt.NDArray[np.float64]:
     """Return an image of which every pixel is usable as cells (h, w, 3) float64, divided by its light.
 
-    Parameters
-    ----------
-    image
-        (H, W, 3) uint16 or float, linear camera RGB.
-    light
-        (3,) float above 0, linear camera RGB of any length; its mean over the channels counts as 1.
-    side
-        Cells a side, at most; 0 keeps every pixel.
+    `image`: (H, W, 3) uint16 or float, linear camera RGB. `light`: (3,) float above 0, linear camera RGB of any length;
+    its mean over the channels counts as 1.
 
     Examples
     --------
@@ -92,17 +76,10 @@ def numbers_of_cells(
 ) -> tuple[dict[str, float], npt.NDArray[np.float64], npt.NDArray[np.float64]]:
     """Return what the cells of an image give.
 
-    Parameters
-    ----------
-    colours
-        (h, w, 3) float64, linear camera RGB divided by the light; NaN where a cell has no colour.
-
-    Returns
-    -------
-    tuple
-        Numbers by their names, NaN where one is not known: `luminance_1` … `luminance_95`, `edges`, `edges_95`,
-        `chroma_spread`, `log_red_spread`, `log_blue_spread`, `near_grey`, `grey_red`, `grey_blue`; the histograms of
-        luminance (70,) and of chroma (64, 64) float64, each of sum 1, all 0 of an image without a usable cell.
+    `colours`: (h, w, 3) float64, linear camera RGB divided by the light; NaN where a cell has no colour. Returns
+    numbers by their names, NaN where one is not known: `luminance_1` … `luminance_95`, `edges`, `edges_95`,
+    `chroma_spread`, `log_red_spread`, `log_blue_spread`, `near_grey`, `grey_red`, `grey_blue`; the histograms of
+    luminance (70,) and of chroma (64, 64) float64, each of sum 1, all 0 of an image without a usable cell.
     """
     luminance = colours.mean(axis=2)
     known = luminance[np.isfinite(luminance)]

@@ -35,25 +35,15 @@ curve makes .42 to .48 of them."""
 class RealStatistics:
     """What generated data are to be like.
 
-    Attributes
-    ----------
-    name
-        Of the data set.
-    layout
-        How it lies; ``"thumbnails"`` where its images were made small, so that their size says nothing.
-    cells
-        Cells a side that its images were reduced to, at most; 0 if they were not.
-    sizes
-        Width and height, px, with the number of images of that size, the most frequent first.
-    images
-        How many it has.
-    lights
-        (L, 3) float64 above 0, linear camera RGB with r + g + b = 1.
-    values
-        (images,) float64 each: numbers of the images by their names, as `image_numbers.numbers_of_cells` and
-        `evaluate describe` call them; NaN where one is not known.
-    file, sha256
-        Name of the file, and the hash of its bytes.
+    - `name`: of the data set.
+    - `layout`: how it lies; ``"thumbnails"`` where its images were made small, so that their size says nothing.
+    - `cells`: cells a side that its images were reduced to, at most; 0 if they were not.
+    - `sizes`: width and height, px, with the number of images of that size, the most frequent first.
+    - `images`: how many it has.
+    - `lights`: (L, 3) float64 above 0, linear camera RGB with r + g + b = 1.
+    - `values`: (images,) float64 each: numbers of the images by their names, as `image_numbers.numbers_of_cells` and
+      `evaluate describe` call them; NaN where one is not known.
+    - `file`, `sha256`: name of the file, and the hash of its bytes.
     """
 
     name: str
@@ -79,13 +69,7 @@ class RealStatistics:
 
 
 def read_content(path: Path | str) -> tuple[dict[str, Any], str]:
-    """Return the JSON object of a `STATS.json` of a known version, and the SHA-256 of the file.
-
-    Raises
-    ------
-    FormatError
-        There is no such file, or it is damaged, of another format, or of another version.
-    """
+    """Return the JSON object of a `STATS.json` of a known version, and the SHA-256 of the file."""
     try:
         data = Path(path).read_bytes()
         content = json.loads(data.decode("utf-8"))
@@ -101,13 +85,7 @@ def read_content(path: Path | str) -> tuple[dict[str, Any], str]:
 
 
 def lights_of(content: Mapping[str, Any]) -> npt.NDArray[np.float64]:
-    """Return the lights (L, 3) float64 above 0 of a file's content.
-
-    Raises
-    ------
-    KeyError, TypeError, ValueError
-        It has none, or they are no lights.
-    """
+    """Return the lights (L, 3) float64 above 0 of a file's content."""
     lights = np.array(content["lights"], dtype=np.float64)
     if lights.ndim != 2 or lights.shape[1] != 3 or not (np.isfinite(lights) & (lights > 0)).all():
         raise ValueError(f"lights of shape {lights.shape}, expected (L, 3), all above 0")
@@ -115,13 +93,7 @@ def lights_of(content: Mapping[str, Any]) -> npt.NDArray[np.float64]:
 
 
 def read_lights(path: Path | str) -> npt.NDArray[np.float64]:
-    """Return the lights (L, 3) float64 above 0, r + g + b = 1, of a `STATS.json`; all else of it may be missing.
-
-    Raises
-    ------
-    FormatError
-        There is no such file, it is of another format or version, or has no lights.
-    """
+    """Return the lights (L, 3) float64 above 0, r + g + b = 1, of a `STATS.json`; all else of it may be missing."""
     content, _ = read_content(path)
     try:
         return lights_of(content)
@@ -130,13 +102,7 @@ def read_lights(path: Path | str) -> npt.NDArray[np.float64]:
 
 
 def read_statistics(path: Path | str) -> RealStatistics:
-    """Return what a `STATS.json` says of a data set; what a later version adds is ignored.
-
-    Raises
-    ------
-    FormatError
-        There is no such file, it is of another format or version, or a part of it is missing or no such part.
-    """
+    """Return what a `STATS.json` says of a data set; what a later version adds is ignored."""
     content, sha256 = read_content(path)
     try:
         images = len(content["images"])

@@ -29,11 +29,6 @@ def is_remote(place: str) -> bool:
 def local_path(place: str | Path) -> Path:
     """Return the path of a place of this machine, of which file:// may be the first part; it ends in a name.
 
-    Raises
-    ------
-    InputError
-        The place is empty, or the root of all folders.
-
     Examples
     --------
     >>> local_path("file:///data/dataset").as_posix()
@@ -51,13 +46,7 @@ def local_path(place: str | Path) -> Path:
 
 
 def filesystem(url: str) -> tuple[AbstractFileSystem, str]:
-    """Return the store of a URL, by fsspec, and the path in it.
-
-    Raises
-    ------
-    InputError
-        No such kind of store is known, or its library is not installed; the message has fsspec's reason.
-    """
+    """Return the store of a URL, by fsspec, and the path in it."""
     from fsspec.core import url_to_fs
 
     try:

@@ -206,13 +206,7 @@ def _sync_file(path: Path) -> None:
 
 @dataclass(frozen=True)
 class RemoteStore:
-    """A place of an object store.
-
-    Raises
-    ------
-    InputError
-        Its URL is of no kind that fsspec knows.
-    """
+    """A place of an object store."""
 
     url: str
 

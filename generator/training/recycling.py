@@ -29,15 +29,7 @@ class Recycled:
     def array(self, shape: tuple[int, ...]) -> npt.NDArray[np.float32]:
         """Return an array float32 of any content.
 
-        Parameters
-        ----------
-        shape
-            Its shape, of at least one value.
-
-        Returns
-        -------
-        ndarray
-            (...) float32, C order.
+        Returns (...) float32, C order.
         """
         size = 4 * int(np.prod(shape))
         memory = self._memory(size)

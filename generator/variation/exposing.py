@@ -138,19 +138,8 @@ def brightness_reached(
 ) -> float:
     """Return the largest channel that a share of an image's pixels reaches or exceeds.
 
-    Parameters
-    ----------
-    image
-        (H, W, 3) uint16.
-    share
-        0 … 1. Of share 0, what no pixel reaches: half a count above the largest.
-    weights, end
-        How its light falls off, (H, W, 2) float32 and three numbers, as of `expose`.
-
-    Returns
-    -------
-    float
-        Counts; with a gradient whole ones, rounded down.
+    `image`: (H, W, 3) uint16. `share`: 0 … 1. Of share 0, what no pixel reaches: half a count above the largest.
+    `weights`, `end`: how its light falls off, (H, W, 2) float32 and three numbers, as of `expose`.
 
     Examples
     --------
@@ -186,40 +175,11 @@ def expose(
 ) -> float:
     """Expose an image anew, in place unless `out` is given; the head of this file has the formulas.
 
-    Parameters
-    ----------
-    image
-        (H, W, 3) uint16, linear camera RGB, counts of a table.
-    factor
-        On the light, above 0.
-    noise
-        Of the table's samples.
-    wanted, ratio
-        Noise at the wanted ISO speed, and that speed over the table's, 1 or more; `noise` and 1 if not given. Where the
-        factor is larger, the noise is that of the factor as ISO speed.
-    weights, end
-        (H, W, 2) float32, how much of each pixel's light is that of the near and of the far end, and the light of the
-        far end over that of the near one, above 0 up to 1; None for the same light everywhere.
-    white_level
-        Saturation, 1 … 65535.
-    seed, number
-        Of the noise, 0 … 2⁶⁴ − 1, and 0 … 2³² − 1.
-    first_row
-        The image's first row in the whole image, where it is a part of one.
-    threads
-        That share the rows; no count depends on it.
-    out
-        (H, W, 3) uint16 to fill.
-
-    Returns
-    -------
-    float
-        Share of the pixels with a channel at the white level.
-
-    Raises
-    ------
-    InputError
-        A number is out of range, or an array of another shape or type.
+    `image`: (H, W, 3) uint16, linear camera RGB, counts of a table. `wanted`, `ratio`: noise at the wanted ISO speed,
+    and that speed over the table's, 1 or more; `noise` and 1 if not given. Where the factor is larger, the noise is
+    that of the factor as ISO speed. `weights`, `end`: (H, W, 2) float32, how much of each pixel's light is that of the
+    near and of the far end, and the light of the far end over that of the near one, above 0 up to 1; None for the same
+    light everywhere. `threads`: that share the rows; no count depends on it. `out`: (H, W, 3) uint16 to fill.
 
     Examples
     --------

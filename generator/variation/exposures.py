@@ -46,15 +46,8 @@ class ExposureChoice(Protocol):
     def factor(self, seed: int, number: int, brightness: float) -> float:
         """Return the factor > 0 of image `number`.
 
-        Parameters
-        ----------
-        seed
-            0 … 2⁶⁴ − 1.
-        number
-            Of the image.
-        brightness
-            Largest channel, over saturation, that the share `seen` of the pixels reaches; any number where that is
-            None.
+        `brightness`: largest channel, over saturation, that the share `seen` of the pixels reaches; any number where
+        that is None.
         """
         ...
 
@@ -127,15 +120,10 @@ class NormalExposure:
 class AutomaticExposure:
     """The factor with which a share of the pixels reaches a level: automatic exposure.
 
-    Attributes
-    ----------
-    share
-        Of the pixels, the brightest by their largest channel; 0 lets none reach the level.
-    levels
-        Over saturation, 0 … 1: quantiles that each image's level is drawn by, as of `DrawnExposure`, in the logarithm.
-        Level 1 clips that share.
-    most
-        Largest factor, so that a dark picture stays dark.
+    - `share`: of the pixels, the brightest by their largest channel; 0 lets none reach the level.
+    - `levels`: over saturation, 0 … 1: quantiles that each image's level is drawn by, as of `DrawnExposure`, in the
+      logarithm. Level 1 clips that share.
+    - `most`: largest factor, so that a dark picture stays dark.
 
     Examples
     --------
@@ -177,11 +165,6 @@ def parse_exposure(text: str) -> ExposureChoice:
     A number is a factor; ``stops:low=-2,high=1`` draws evenly in stops, ``normal:mean=-1,sd=.5`` normally;
     ``clip:share=.01`` clips that share of the pixels; ``level:share=.01,low=.3,high=.9`` lets that share of them reach
     a level between those, over saturation. ``most=4`` limits the factor of the last two.
-
-    Raises
-    ------
-    InputError
-        It names none, or a number is missing or out of range.
 
     Examples
     --------

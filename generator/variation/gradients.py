@@ -36,12 +36,8 @@ _OPTIONS: Final[dict[str, Range]] = {"stops": (0.0, 6.0), "least": (0.0, 6.0), "
 class Falloff:
     """The uneven light of one image.
 
-    Attributes
-    ----------
-    masks
-        (height, width, 2) weights of the light itself, and of its far end.
-    end
-        Red, green and blue light at the far end over that of the image, above 0 up to 1.
+    - `masks`: (height, width, 2) weights of the light itself, and of its far end.
+    - `end`: red, green and blue light at the far end over that of the image, above 0 up to 1.
     """
 
     masks: MadeMasks
@@ -56,19 +52,10 @@ class Falloff:
 class Gradient:
     """How light falls off on each image.
 
-    Attributes
-    ----------
-    shape
-        Where, as of the masks of two lights.
-    stops, least
-        The far end is darker by a number of stops between `least` and `stops`, each as likely.
-    colour
-        Most that ln(R/G) and ln(B/G) of the far end differ from those of the light, each drawn evenly and on its own.
-
-    Raises
-    ------
-    InputError
-        A number is below 0, or `least` above `stops`.
+    - `shape`: where, as of the masks of two lights.
+    - `stops`, `least`: the far end is darker by a number of stops between `least` and `stops`, each as likely.
+    - `colour`: most that ln(R/G) and ln(B/G) of the far end differ from those of the light, each drawn evenly and on
+      its own.
     """
 
     shape: Shape = SmoothFields()  # noqa: RUF009  frozen
@@ -100,16 +87,6 @@ class Gradient:
 def described_gradient(record: Mapping[str, Any]) -> Gradient:
     """Return the gradient that `Gradient.describe` described.
 
-    Parameters
-    ----------
-    record
-        Its plain values, such as those of `dataset.json`.
-
-    Raises
-    ------
-    InputError
-        It describes none.
-
     Examples
     --------
     >>> described_gradient(Gradient(stops=2.0).describe()) == Gradient(stops=2.0)
@@ -125,11 +102,6 @@ def described_gradient(record: Mapping[str, Any]) -> Gradient:
 
 def parse_gradient(text: str) -> Gradient:
     """Return the gradient that a text names: a kind of masks with its numbers, and ``stops``, ``least``, ``colour``.
-
-    Raises
-    ------
-    InputError
-        It names none, or a number is out of range.
 
     Examples
     --------

@@ -60,18 +60,6 @@ class IsoSpeed:
 def parse_iso(text: str, base: float | None = None, sensor_electrons: float = SENSOR_ELECTRONS) -> IsoSpeed:
     """Return the speed that a text names: ``1600/100``, wanted over the table's, with ``:read=2.8`` electrons.
 
-    Parameters
-    ----------
-    text
-        What was written; ``1600`` alone where the speed of the table is known.
-    base, sensor_electrons
-        What is known of the table, see `known_of_table`.
-
-    Raises
-    ------
-    InputError
-        It names none, or another speed of the table than is known.
-
     Examples
     --------
     >>> parse_iso("1600/100").ratio, parse_iso("1600", base=200).ratio

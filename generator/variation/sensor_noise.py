@@ -46,12 +46,8 @@ a table has so few cells that a level is known from eight."""
 class SensorNoise:
     """The noise of red, green and blue samples: variance = read² + shot · mean.
 
-    Attributes
-    ----------
-    read
-        Counts, from 0.
-    shot
-        Counts: variance for each count of the mean, from 0.
+    - `read`: counts, from 0.
+    - `shot`: counts: variance for each count of the mean, from 0.
 
     Examples
     --------
@@ -66,12 +62,7 @@ class SensorNoise:
     def at(self, ratio: float, sensor_electrons: float = SENSOR_ELECTRONS) -> SensorNoise:
         """Return the noise at `ratio` ≥ 1 times the ISO speed, for samples of the same mean.
 
-        Parameters
-        ----------
-        ratio
-            ISO speed over that of these samples.
-        sensor_electrons
-            Read noise of a photosite before the amplifier, electrons; no more than all read noise is taken for it.
+        `ratio`: ISO speed over that of these samples.
         """
         read: list[float] = []
         for counts, shot, photosites in zip(self.read, self.shot, _PHOTOSITES, strict=True):

@@ -60,29 +60,10 @@ def add_noise(
 ) -> None:
     """Give items, in place, the noise of the light that their gains stand for; see `exposing`.
 
-    Parameters
-    ----------
-    images
-        (N, 3, H, W) float32, 0 … 1 = saturation, gains applied; cut to 0 … 1 again.
-    gains
-        (N,) float64 > 0. Of a gain above the ratio nothing is added.
-    noise
-        Of the table's samples.
-    seeds
-        (N,) uint64, of each item.
-    white_level
-        Counts of saturation, 1 … 65535.
-    wanted, ratio
-        Noise at the wanted ISO speed, and that speed over the table's; `noise` and 1 if not given.
-    below_black
-        Whether values below 0 are kept instead of cut off: those of items without the print's black.
-    threads
-        That share the items; no value depends on it.
-
-    Raises
-    ------
-    InputError
-        An array is of another shape or type, or a number out of range.
+    `images`: (N, 3, H, W) float32, 0 … 1 = saturation, gains applied; cut to 0 … 1 again. `gains`: (N,) float64 > 0. Of
+    a gain above the ratio nothing is added. `seeds`: (N,) uint64, of each item. `wanted`, `ratio`: noise at the wanted
+    ISO speed, and that speed over the table's; `noise` and 1 if not given. `threads`: that share the items; no value
+    depends on it.
 
     Examples
     --------

@@ -38,14 +38,10 @@ _EVEN: Final[Three] = (1.0, 1.0, 1.0)
 class Varied:
     """What was done to an image.
 
-    Attributes
-    ----------
-    details
-        For `images.csv`.
-    weights
-        (H, W, 2) float32, how much of each pixel's light is that of the near and the far end; None if it is even.
-    end
-        Light of the far end over that of the near one, of each channel.
+    - `details`: for `images.csv`.
+    - `weights`: (H, W, 2) float32, how much of each pixel's light is that of the near and the far end; None if it is
+      even.
+    - `end`: light of the far end over that of the near one, of each channel.
     """
 
     details: dict[str, int | float | str] = field(default_factory=dict[str, int | float | str])
@@ -63,21 +59,10 @@ class Varied:
 class Variation:
     """What differs from image to image; without anything set, nothing.
 
-    Attributes
-    ----------
-    exposure
-        How much light; None as the table.
-    gradient
-        How it falls off over the image; None not at all.
-    iso
-        ISO speed whose noise images have; None the table's.
-    noise
-        Of the table's samples; needed with any of the others. See `varied_by`.
-
-    Raises
-    ------
-    InputError
-        The noise is missing.
+    - `exposure`: how much light; None as the table.
+    - `gradient`: how it falls off over the image; None not at all.
+    - `iso`: ISO speed whose noise images have; None the table's.
+    - `noise`: of the table's samples; needed with any of the others. See `varied_by`.
     """
 
     exposure: ExposureChoice | None = None
@@ -105,14 +90,7 @@ class Variation:
     def apply(self, image: npt.NDArray[np.uint16], white_level: int, seed: int, number: int) -> Varied:
         """Change an image in place and return what was done to it.
 
-        Parameters
-        ----------
-        image
-            (H, W, 3) uint16, contiguous; counts of the table, as drawn.
-        white_level
-            Saturation.
-        seed, number
-            Of the dataset and of the image.
+        `image`: (H, W, 3) uint16, contiguous; counts of the table, as drawn.
         """
         noise = self.noise
         if not self.is_on or noise is None:
@@ -175,13 +153,7 @@ NO_VARIATION: Final = Variation()
 def varied_by(
     lut: Lut, exposure: ExposureChoice | None = None, gradient: Gradient | None = None, iso: IsoSpeed | None = None
 ) -> Variation:
-    """Return the variation of images of a table, whose noise is measured if anything is set.
-
-    Raises
-    ------
-    InputError
-        The noise of the table's samples cannot be measured.
-    """
+    """Return the variation of images of a table, whose noise is measured if anything is set."""
     if exposure is None and gradient is None and iso is None:
         return NO_VARIATION
     return Variation(exposure, gradient, iso, measured_noise(lut))

@@ -68,11 +68,6 @@ def serve_ptpip(
     """Put a device on a TCP port; 0 picks a free one.
 
     Use the result in a ``with`` block; its `address` is host and port, both connections go there.
-
-    Raises
-    ------
-    LinkClosed
-        The port is taken.
     """
     return TcpServer(PtpIpService(responder, name, guid).handle, port, host)
 
@@ -89,13 +84,7 @@ class PtpIpService:
         self._initiator: _Initiator | None = None
 
     def handle(self, link: Link) -> None:
-        """Serve one connection, command or event, until it ends.
-
-        Raises
-        ------
-        LinkTimeout, LinkClosed
-            It has ended, the initiator takes no data, or sends what is no packet.
-        """
+        """Serve one connection, command or event, until it ends."""
         try:
             self._serve(link, _Incoming(link))
         except ProtocolError as error:

@@ -30,13 +30,7 @@ _PATIENCE_S: Final = 10.0
 
 
 class PseudoTerminal:
-    """A serial port at `path` whose far end is `peer`, until closed; use it in a `with` block.
-
-    Raises
-    ------
-    LinkClosed
-        The system has no pseudo-terminal left.
-    """
+    """A serial port at `path` whose far end is `peer`, until closed; use it in a `with` block."""
 
     def __init__(self, peer: Peer) -> None:
         self._peer = peer

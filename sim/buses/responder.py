@@ -32,13 +32,7 @@ class Responder(Protocol):
         ...
 
     def answer(self, request: PtpRequest, data: bytes | None) -> Answer:
-        """Carry out a request; `data` is the initiator's data phase.
-
-        Raises
-        ------
-        NoAnswer
-            The device has hung itself up.
-        """
+        """Carry out a request; `data` is the initiator's data phase."""
         ...
 
     def events(self) -> tuple[PtpEvent, ...]:

@@ -30,13 +30,7 @@ class SerialPeerLink(PeerLink):
 
 
 def serve_network(peer: Callable[[], Peer], port: int = 0) -> TcpServer:
-    """Return a running server that gives each connection a peer of its own; close it, or use it in a `with` block.
-
-    Raises
-    ------
-    LinkClosed
-        The port is taken.
-    """
+    """Return a running server that gives each connection a peer of its own; close it, or use it in a `with` block."""
 
     def handle(link: TcpLink) -> None:
         there = peer()

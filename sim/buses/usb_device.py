@@ -96,16 +96,10 @@ class Setup:
 class _Exchange:
     """What a device remembers of its pipes, until the host or a pulled cable makes it start over.
 
-    Attributes
-    ----------
-    reader
-        Cuts what the host sends into containers.
-    request, payload
-        The operation whose data phase comes in, and as much of it as has come.
-    complete
-        An operation that is whole but for the end of its transfer, with its data phase.
-    outgoing, events
-        Transfers to the host on the bulk and on the interrupt pipe.
+    - `reader`: cuts what the host sends into containers.
+    - `request`, `payload`: the operation whose data phase comes in, and as much of it as has come.
+    - `complete`: an operation that is whole but for the end of its transfer, with its data phase.
+    - `outgoing`, `events`: transfers to the host on the bulk and on the interrupt pipe.
     """
 
     reader: ContainerReader = field(default_factory=lambda: ContainerReader(PACKET))
@@ -145,13 +139,7 @@ class PtpUsbDevice:
         return struct.pack("<BBHBBBBB", 9, _CONFIGURATION, 9 + len(body), 1, 1, 0, 0xC0, 1) + body
 
     def control(self, setup: Setup, data: bytes = b"") -> bytes:
-        """Carry out a control request and return its data, if it goes to the host.
-
-        Raises
-        ------
-        Stalled
-            The device does not know it.
-        """
+        """Carry out a control request and return its data, if it goes to the host."""
         match setup.request_type & 0x60, setup.request_type & 0x1F:
             case 0x00, recipient:
                 answer = self._standard(setup, recipient)

@@ -53,11 +53,6 @@ def serve_usbip(devices: Sequence[PtpUsbDevice], port: int = PORT, *, host: str 
     """Lend devices under the bus ids 1-1, 1-2, …; port 0 picks a free one.
 
     Use the result in a ``with`` block; its `address` is host and port.
-
-    Raises
-    ------
-    LinkClosed
-        The port is taken.
     """
     return TcpServer(UsbIpService(devices).handle, port, host)
 
@@ -71,13 +66,7 @@ class UsbIpService:
         self._guard = threading.Lock()
 
     def handle(self, link: Link) -> None:
-        """Serve one connection until it ends.
-
-        Raises
-        ------
-        LinkTimeout, LinkClosed
-            It has ended, the client takes no data, or sends what is no USB/IP.
-        """
+        """Serve one connection until it ends."""
         reader = RequestReader()
         try:
             while not (requests := reader.feed(link.read(_READ, _PATIENCE_S))):

@@ -46,25 +46,8 @@ def write_dng(
 ) -> None:
     """Write one raw file.
 
-    Parameters
-    ----------
-    stream
-        Receives the whole file, from where it stands; need not seek.
-    counts
-        (rows, columns) uint16, the whole sensor's counts.
-    body
-        Whose file it is.
-    settings
-        How the frame was exposed.
-    taken_at
-        When, timezone-aware; written as UTC, to the second.
-    serial
-        Serial number of the body.
-
-    Raises
-    ------
-    ValueError
-        The counts do not have the body's shape, or the time has no timezone.
+    `counts`: (rows, columns) uint16, the whole sensor's counts. `taken_at`: when, timezone-aware; written as UTC, to
+    the second.
     """
     if counts.shape != body.sensor:
         raise ValueError(f"counts are {counts.shape}; the sensor of the {body.model} is {body.sensor}")

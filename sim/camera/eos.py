@@ -44,33 +44,11 @@ _SHUTDOWN_WARNING_S = 10.0
 class SimulatedEos(EosSettings, EosRelease):
     """An EOS body on a cable; a `sim.buses.responder.Responder`.
 
-    Parameters
-    ----------
-    body
-        Which body, see `sim.camera.eos_bodies`.
-    film
-        Where its pictures come from.
-    clock
-        The time by which it moves.
-    serial
-        Its serial number: 32 hexadecimal digits in DeviceInfo are made from it.
-    card_bytes
-        Capacity of the card; None for an empty slot.
-    auto_power_off_s
-        Idle seconds after which it goes to sleep; 0 for never, None for the body's own setting. Asking for events
-        keeps no body awake, KeepDeviceOn does.
-    battery
-        Charge, 0 … 1.
-    shutter_count
-        Releases before this one's first.
-    without
-        Operations that this specimen does not know, for instance `Operation.EOS_REMOTE_RELEASE_ON`.
-    forgetful
-        Whether frames in the camera's memory are lost with the session. Assumed to be kept: users report memories
-        that stay full after a host was killed.
-    executor
-        Where the film is developed. None does it while the release is answered, and is what tests want; a camera on
-        a real cable hands in an executor of one thread, so that a large frame does not hold up the answers.
+    `card_bytes`: capacity of the card; None for an empty slot. `auto_power_off_s`: idle seconds after which it goes to
+    sleep; 0 for never, None for the body's own setting. Asking for events keeps no body awake, KeepDeviceOn does.
+    `battery`: charge, 0 … 1. `executor`: where the film is developed. None does it while the release is answered, and
+    is what tests want; a camera on a real cable hands in an executor of one thread, so that a large frame does not hold
+    up the answers.
     """
 
     def __init__(
@@ -115,13 +93,7 @@ class SimulatedEos(EosSettings, EosRelease):
         )
 
     def answer(self, request: PtpRequest, data: bytes | None) -> Answer:
-        """Carry out a request.
-
-        Raises
-        ------
-        LinkClosed
-            The camera is asleep: nobody answers until `wake`.
-        """
+        """Carry out a request."""
         with self._guard:
             self._move()
             if self._asleep:

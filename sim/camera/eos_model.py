@@ -30,18 +30,11 @@ FREE = 7
 class PropertySpec:
     """A property as a body sends it when it is asked for everything.
 
-    Attributes
-    ----------
-    code
-        One of `drivers.ptp.codes.Property`, or a number without a name.
-    value
-        As it travels; None where it is sent on request only, `b""` where the state machine computes it.
-    kind
-        `NO_LIST`, `LIST` or `FREE`.
-    choices
-        What it can be set to, in the body's order.
-    formats
-        The same for image formats.
+    - `code`: one of `drivers.ptp.codes.Property`, or a number without a name.
+    - `value`: as it travels; None where it is sent on request only, `b""` where the state machine computes it.
+    - `kind`: `NO_LIST`, `LIST` or `FREE`.
+    - `choices`: what it can be set to, in the body's order.
+    - `formats`: the same for image formats.
     """
 
     code: int
@@ -55,30 +48,19 @@ class PropertySpec:
 class EosModel:
     """An EOS body as the wire shows it.
 
-    Attributes
-    ----------
-    info
-        Its DeviceInfo; the serial number is the state machine's to add.
-    usb
-        Vendor and product.
-    properties
-        Every property, as the body stands when it is switched on with its dial at M and the lens on manual focus.
-    shutter_codes, aperture_codes
-        What the lists of shutter times and apertures hold where the dial lets them be set.
-    burst
-        Raw frames that its memory holds.
-    frames_per_s
-        Pace of continuous drive.
-    frame_bytes
-        What it reckons with for one frame; sizes of real raw files vary.
-    write_s
-        Time from the end of an exposure until the file is ready.
-    shots_per_charge
-        Frames that a full battery lasts for.
-    wide_objects
-        Whether objects are announced by the records with sizes of 64 bits.
-    borrowed
-        What is not known of this very body, and where it was taken from.
+    - `info`: its DeviceInfo; the serial number is the state machine's to add.
+    - `usb`: vendor and product.
+    - `properties`: every property, as the body stands when it is switched on with its dial at M and the lens on manual
+      focus.
+    - `shutter_codes`, `aperture_codes`: what the lists of shutter times and apertures hold where the dial lets them be
+      set.
+    - `burst`: raw frames that its memory holds.
+    - `frames_per_s`: pace of continuous drive.
+    - `frame_bytes`: what it reckons with for one frame; sizes of real raw files vary.
+    - `write_s`: time from the end of an exposure until the file is ready.
+    - `shots_per_charge`: frames that a full battery lasts for.
+    - `wide_objects`: whether objects are announced by the records with sizes of 64 bits.
+    - `borrowed`: what is not known of this very body, and where it was taken from.
     """
 
     info: DeviceInfo

@@ -48,16 +48,9 @@ class Film(Protocol):
 class WatchedFilm:
     """Pictures of a `World` lit by what falls on it from outside while the shutter is open, in real time.
 
-    Parameters
-    ----------
-    gather
-        Called with the number of the exposure, from 0, and its seconds; waits for them and returns the light that fell
-        on the chart meanwhile: the projected picture (h, w, 3) float32, 0 … 1 of each primary's full light, and the
-        share of the lamp's light.
-    disturbances
-        What goes wrong besides, by the number of exposures and the time since `opened`.
-    opened
-        When the lamp was new.
+    `gather`: called with the number of the exposure, from 0, and its seconds; waits for them and returns the light that
+    fell on the chart meanwhile: the projected picture (h, w, 3) float32, 0 … 1 of each primary's full light, and the
+    share of the lamp's light.
     """
 
     suffix = ".dng"
@@ -99,19 +92,7 @@ class WatchedFilm:
 class WorldFilm:
     """Pictures of a `World` lit by what the projector shows.
 
-    Parameters
-    ----------
-    look
-        Holds the colour that is shown now.
-    light
-        Tells the share of its light that leaves the projector now, 0 … 1.
-    exposed
-        How many pictures of each colour have been taken before: with it a lab that is taken up again goes on with
-        the very noise it would have had.
-    disturbances
-        What goes wrong, by the number of exposures and the time since the lab opened.
-    before
-        Second since the lab opened, and colour, of each picture that has been taken before.
+    `light`: tells the share of its light that leaves the projector now, 0 … 1.
     """
 
     suffix = ".dng"

@@ -29,17 +29,7 @@ class RecordedFrame:
 
 
 class ReplayFilm:
-    """Pictures from a recording; see `sim.camera.film.Film`.
-
-    Parameters
-    ----------
-    frames
-        The recording in the order in which it was taken; at least one.
-    look
-        Holds the colour that is shown now.
-    exposed
-        How many frames of each colour have been handed out before.
-    """
+    """Pictures from a recording; see `sim.camera.film.Film`."""
 
     def __init__(
         self, frames: Sequence[RecordedFrame], look: Callable[[], Colour], exposed: Mapping[Colour, int]

@@ -11,17 +11,7 @@ from numpy.typing import NDArray
 
 
 def lens_falloff(axis: tuple[float, float], size: tuple[int, int], lost: float) -> NDArray[np.float64]:
-    """Return (3,) float64: x and y of the axis, photosites, and c, for a lens that loses a share at the corner.
-
-    Parameters
-    ----------
-    axis
-        Column and row of the frame where the optical axis meets it.
-    size
-        Columns and rows.
-    lost
-        Share of the light that is missing at the frame's corner, 0 … below 1.
-    """
+    """Return (3,) float64: x and y of the axis, photosites, and c, for a lens that loses a share at the corner."""
     corner2 = (size[0] ** 2 + size[1] ** 2) / 4
     return np.array([*axis, ((1 - lost) ** -0.5 - 1) / corner2])
 
@@ -29,19 +19,7 @@ def lens_falloff(axis: tuple[float, float], size: tuple[int, int], lost: float) 
 def projector_falloff(
     page_mm: tuple[float, float], lost: float, difference: float, random: np.random.Generator
 ) -> NDArray[np.float64]:
-    """Return (3, 4) float64: for each primary x and y of its brightest point, mm, c and a gain of 1.
-
-    Parameters
-    ----------
-    page_mm
-        Width and height of the page.
-    lost
-        Share of the light that is missing a page's half diagonal from the brightest point.
-    difference
-        How differently the primaries fall off, `sim.world.room.Room.primary_difference`.
-    random
-        Decides where the primaries are brightest.
-    """
+    """Return (3, 4) float64: for each primary x and y of its brightest point, mm, c and a gain of 1."""
     page = np.array(page_mm)
     half_diagonal = float(np.hypot(*page)) / 2
     shares = lost * (1 + difference * np.array([-1.0, 0.0, 1.0]))

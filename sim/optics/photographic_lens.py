@@ -57,16 +57,9 @@ APERTURE_VARIANCE: Final = 1 / 12
 def mtf(blur_px: float, shoulder_share: float, shoulder_px: float, lp_per_mm: float, photosite_mm: float) -> float:
     """Return the contrast that lens and photosite leave of a sine pattern on the sensor, 0 … 1, without veiling glare.
 
-    Parameters
-    ----------
-    blur_px
-        Standard deviation of the core without the photosite's aperture, half-size px.
-    shoulder_share, shoulder_px
-        Share and scale of the shoulders.
-    lp_per_mm
-        Frequency of the pattern, line pairs per millimetre on the sensor.
-    photosite_mm
-        Pitch of the photosites; 0.00429 mm on an EOS 550D.
+    `blur_px`: standard deviation of the core without the photosite's aperture, half-size px. `lp_per_mm`: frequency of
+    the pattern, line pairs per millimetre on the sensor. `photosite_mm`: pitch of the photosites; 0.00429 mm on an EOS
+    550D.
     """
     frequency = lp_per_mm * 2 * photosite_mm
     variance = blur_px**2 + APERTURE_VARIANCE / 4
@@ -79,16 +72,11 @@ def mtf(blur_px: float, shoulder_share: float, shoulder_px: float, lp_per_mm: fl
 class PhotographicLens:
     """A lens before a frame; its blur's core and its vignetting are drawn with the print.
 
-    Attributes
-    ----------
-    half_size
-        Rows and columns of the frame, half-size pixels; the optical axis meets its middle.
-    shoulder_share, shoulder_px
-        Share of the light in the shoulders, and their standard deviation along each axis.
-    veil
-        Share of the light in the veil.
-    lateral_red_px, lateral_blue_px
-        How far out the channel sees the frame's corner against green.
+    - `half_size`: rows and columns of the frame, half-size pixels; the optical axis meets its middle.
+    - `shoulder_share`, `shoulder_px`: share of the light in the shoulders, and their standard deviation along each
+      axis.
+    - `veil`: share of the light in the veil.
+    - `lateral_red_px`, `lateral_blue_px`: how far out the channel sees the frame's corner against green.
     """
 
     half_size: tuple[int, int]
@@ -162,10 +150,7 @@ class PhotographicLens:
     def kernel(self) -> NDArray[np.float32]:
         """Return the shoulder w on half-size pixels.
 
-        Returns
-        -------
-        ndarray
-            (n, n) float32, n odd, the light of a point at the middle; its sum is 1.
+        Returns (n, n) float32, n odd, the light of a point at the middle; its sum is 1.
         """
         length = self.shoulder_px / math.sqrt(3)
         reach = max(math.ceil(_REACH * length), 1)
@@ -177,17 +162,8 @@ class PhotographicLens:
     def veiled(self, light: NDArray[np.float32], pattern: str) -> NDArray[np.float32]:
         """Spread a share of each channel's light evenly over the frame, in place, and return what was added.
 
-        Parameters
-        ----------
-        light
-            (primaries, rows, columns) float32, of a Bayer mosaic's photosites.
-        pattern
-            Colour filters of the 2×2 block at its top-left, row by row, e.g. ``RGGB``.
-
-        Returns
-        -------
-        ndarray
-            (primaries, 2, 2) float32: by the parity of row and column, the veil's light.
+        `light`: (primaries, rows, columns) float32, of a Bayer mosaic's photosites. Returns (primaries, 2, 2) float32:
+        by the parity of row and column, the veil's light.
         """
         added = np.zeros((len(light), 2, 2), dtype=np.float32)
         if self.veil == 0:

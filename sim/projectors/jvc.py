@@ -93,13 +93,7 @@ class JvcPeer:
 
 
 def serve_jvc(peer: JvcPeer, port: int = 0) -> TcpServer:
-    """Return a running server on loopback that speaks for `peer`; close it, or use it in a `with` block.
-
-    Raises
-    ------
-    LinkClosed
-        The port is taken.
-    """
+    """Return a running server on loopback that speaks for `peer`; close it, or use it in a `with` block."""
 
     def handle(link: TcpLink) -> None:
         link.write(peer.connect(), _PATIENCE_S)

@@ -22,18 +22,11 @@ from sim.projectors.projector import SimulatedProjector
 class _Connection:
     """One connection.
 
-    Attributes
-    ----------
-    cutter
-        Cuts what comes into lines.
-    last_heard
-        When the last command came, by the projector's clock, seconds.
-    expected_digest
-        What proves the password by MD5; empty where none is wanted, or it has been proved.
-    challenge
-        What a proof by SHA-256 begins with; empty until the controller asks for one.
-    closed
-        Whether the projector has hung up.
+    - `cutter`: cuts what comes into lines.
+    - `last_heard`: when the last command came, by the projector's clock, seconds.
+    - `expected_digest`: what proves the password by MD5; empty where none is wanted, or it has been proved.
+    - `challenge`: what a proof by SHA-256 begins with; empty until the controller asks for one.
+    - `closed`: whether the projector has hung up.
     """
 
     cutter: LineCutter
@@ -46,12 +39,8 @@ class _Connection:
 class PjLinkPeer:
     """The far side of one PJLink connection to a `SimulatedProjector`: bytes in, bytes out.
 
-    Parameters
-    ----------
-    password
-        Asked of every connection; None for a projector without one.
-    seed
-        Eight characters for the greeting; None draws new ones for each connection.
+    `password`: asked of every connection; None for a projector without one. `seed`: eight characters for the greeting;
+    None draws new ones for each connection.
     """
 
     def __init__(self, projector: SimulatedProjector, password: str | None = None, seed: str | None = None) -> None:
@@ -245,19 +234,7 @@ def serve_pjlink(
 ) -> TcpServer:
     """Return a running server that speaks PJLink for `projector`; close it, or use it in a `with` block.
 
-    Parameters
-    ----------
-    port
-        0 picks a free one, which the server's `address` names.
-    host
-        Where to listen; loopback unless given.
-    answer_s
-        How long it takes to answer, seconds of its clock.
-
-    Raises
-    ------
-    LinkClosed
-        The port is taken.
+    `answer_s`: how long it takes to answer, seconds of its clock.
     """
 
     def handle(link: TcpLink) -> None:

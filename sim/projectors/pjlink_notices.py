@@ -51,17 +51,7 @@ class ProjectorDatagrams:
 
     An answer goes to the port from which the question came, not always to 4352: here both may share one computer.
 
-    Parameters
-    ----------
-    port
-        Where it hears searches; 0 picks a free one, which `address` names.
-    controller
-        To whom it sends notices, as a projector has it entered in its menu; None for nobody.
-
-    Raises
-    ------
-    LinkClosed
-        The port is taken.
+    `controller`: to whom it sends notices, as a projector has it entered in its menu; None for nobody.
     """
 
     def __init__(self, projector: SimulatedProjector, port: int = 0, controller: Address | None = None) -> None:

@@ -59,14 +59,9 @@ class ProjectorTraits:
 
 
 class SimulatedProjector:
-    """A lamp projector. It keeps the contract of `drivers.projector.Projector`, and may be used from several threads.
+    """A lamp projector.
 
-    Parameters
-    ----------
-    clock
-        The time by which the lamp warms up and cools down.
-    power
-        The state in which it is found, `Power.ON` or `Power.STANDBY`.
+    It keeps the contract of `drivers.projector.Projector`, and may be used from several threads.
     """
 
     def __init__(self, clock: Clock, power: Power = Power.STANDBY, traits: ProjectorTraits | None = None) -> None:

@@ -185,13 +185,7 @@ class BenqPeer(_Listener):
 
 
 class OptomaPeer(_Listener):
-    """An Optoma: it answers, and says unasked when its power state changes or a part fails.
-
-    Parameters
-    ----------
-    answers_mute
-        Whether its model can be asked if it is muted.
-    """
+    """An Optoma: it answers, and says unasked when its power state changes or a part fails."""
 
     MODEL = "1"
 

@@ -58,12 +58,8 @@ _PLACE = re.compile(r"(?P<display>[^,]*:\d+(?:\.\d+)?)?(?:,|^)?(?P<region>\d+x\d
 class ScreenPlace:
     """Which part of which X screen is projected.
 
-    Attributes
-    ----------
-    display
-        The server, such as ``:1``; None: what DISPLAY names.
-    region
-        x, y, width and height, px; None: the whole screen, whatever its size is.
+    - `display`: the server, such as ``:1``; None: what DISPLAY names.
+    - `region`: x, y, width and height, px; None: the whole screen, whatever its size is.
     """
 
     display: str | None = None
@@ -71,13 +67,7 @@ class ScreenPlace:
 
     @classmethod
     def parse(cls, text: str) -> ScreenPlace:
-        """Return the place that ``:1``, ``1920x1080+2560+0``, or both with a comma between them name.
-
-        Raises
-        ------
-        InputError
-            The text is none of these.
-        """
+        """Return the place that ``:1``, ``1920x1080+2560+0``, or both with a comma between them name."""
         found = _PLACE.fullmatch(text)
         if not text or found is None:
             raise InputError(
@@ -98,13 +88,7 @@ class Screenshots:
         self._screen: XScreen | None = None
 
     def take(self) -> NDArray[np.uint32]:
-        """Return what the screen shows: (height, width) uint32, 0xRRGGBB; the next call writes over it.
-
-        Raises
-        ------
-        DeviceError
-            The server is gone, or the region is not on its screen.
-        """
+        """Return what the screen shows: (height, width) uint32, 0xRRGGBB; the next call writes over it."""
         if self._screen is None:
             self._screen = XScreen(self._place.display, keep_awake=False)
         try:
@@ -189,12 +173,9 @@ def ask(projector: Asked) -> LampState:
 class ThrownLight:
     """What reached the chart while the shutter was open.
 
-    Attributes
-    ----------
-    picture
-        (h, w, 3) float32, mean light of each primary, 0 … 1 of the full; (1, 1, 3) where it was plain throughout.
-    lamp
-        Mean share of the lamp's light.
+    - `picture`: (h, w, 3) float32, mean light of each primary, 0 … 1 of the full; (1, 1, 3) where it was plain
+      throughout.
+    - `lamp`: mean share of the lamp's light.
     """
 
     picture: NDArray[np.float32]
@@ -210,16 +191,8 @@ class ThrownLight:
 class Beam:
     """A screen's picture, through a projector's lamp; use it in a `with` block, which asks the projector all the time.
 
-    Parameters
-    ----------
-    pictures
-        The screen.
-    projector
-        What is asked for the lamp; None: a lamp that always burns.
-    light_of
-        Returns the light (256,) float64, 0 … 1, of the codes 0 … 255.
-    clock
-        Measures exposures.
+    `projector`: what is asked for the lamp; None: a lamp that always burns. `light_of`: returns the light (256,)
+    float64, 0 … 1, of the codes 0 … 255.
     """
 
     def __init__(
@@ -257,15 +230,7 @@ class Beam:
         self._pictures.close()
 
     def gather(self, seconds: float, halfway: Callable[[], None] = lambda: None) -> ThrownLight:
-        """Return what reaches the chart from now on, for so many seconds; returns when they are over.
-
-        Parameters
-        ----------
-        seconds
-            More than 0.
-        halfway
-            Called once, when half of them are over.
-        """
+        """Return what reaches the chart from now on, for so many seconds; returns when they are over."""
         at = self._clock.monotonic()
         ends, half = at + seconds, at + seconds / 2
         total: NDArray[np.float64] = np.zeros((1, 1, 3))
@@ -325,17 +290,8 @@ _BLACK: Final[NDArray[np.float32]] = np.zeros((1, 1, 3), dtype=np.float32)
 def picture_light(pixels: NDArray[np.uint32], light: NDArray[np.float32]) -> NDArray[np.float32]:
     """Return the light of a screen's pixels, averaged to `FINEST_PX` across at most.
 
-    Parameters
-    ----------
-    pixels
-        (height, width) uint32, 0xRRGGBB.
-    light
-        (256,) float32, 0 … 1, of each code.
-
-    Returns
-    -------
-    ndarray
-        (h, w, 3) float32, 0 … 1; (1, 1, 3) where all pixels are alike.
+    `pixels`: (height, width) uint32, 0xRRGGBB. `light`: (256,) float32, 0 … 1, of each code. Returns (h, w, 3) float32,
+    0 … 1; (1, 1, 3) where all pixels are alike.
     """
     import cv2
 

@@ -26,17 +26,7 @@ _Array = npt.NDArray[np.float64]
 def require_grid(wavelengths_nm: _Array, where: str) -> None:
     """Refuse wavelengths (W,), ascending, that do not cover the visible range without gaps.
 
-    Parameters
-    ----------
-    wavelengths_nm
-        (W,) float64.
-    where
-        What they are of, for messages.
-
-    Raises
-    ------
-    FormatError
-        They do not reach from 400 to 700 nm, one stands there twice, or two neighbours are further apart than 20 nm.
+    `wavelengths_nm`: (W,) float64.
     """
     low, high = NEEDED_NM
     if len(wavelengths_nm) < 2 or wavelengths_nm[0] > low or wavelengths_nm[-1] < high:
@@ -60,21 +50,10 @@ def require_grid(wavelengths_nm: _Array, where: str) -> None:
 def regridded(wavelengths_nm: _Array, curves: _Array, onto_nm: _Array) -> _Array:
     """Return curves on another grid.
 
-    Parameters
-    ----------
-    wavelengths_nm
-        (W,) float64, ascending.
-    curves
-        (W, N) float64, per nanometre.
-    onto_nm
-        (M,) float64, ascending in even steps.
-
-    Returns
-    -------
-    ndarray
-        (M, N) float64; 0 beyond the given wavelengths. If some of these are nearer to each other than those of the new
-        grid, each of its values is the mean of the curve weighted by a triangle that reaches to the neighbouring
-        wavelengths, which leaves the curve's integral as it is; else the curve's own value.
+    `wavelengths_nm`: (W,) float64, ascending. `curves`: (W, N) float64, per nanometre. `onto_nm`: (M,) float64,
+    ascending in even steps. Returns (M, N) float64; 0 beyond the given wavelengths. If some of these are nearer to each
+    other than those of the new grid, each of its values is the mean of the curve weighted by a triangle that reaches to
+    the neighbouring wavelengths, which leaves the curve's integral as it is; else the curve's own value.
 
     Examples
     --------

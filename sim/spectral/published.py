@@ -22,12 +22,8 @@ _Array = npt.NDArray[np.float64]
 class PublishedSpectrum:
     """A spectrum as it was published.
 
-    Attributes
-    ----------
-    wavelengths_nm
-        (W,) float64, ascending in even steps.
-    power
-        (W,) float64, relative, per nm.
+    - `wavelengths_nm`: (W,) float64, ascending in even steps.
+    - `power`: (W,) float64, relative, per nm.
     """
 
     wavelengths_nm: _Array

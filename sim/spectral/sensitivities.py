@@ -63,18 +63,11 @@ class _Document(BaseModel):
 class Sensitivities:
     """A camera's spectral sensitivities.
 
-    Attributes
-    ----------
-    name
-        The file's, without its suffix.
-    maker, model
-        As the file names the camera; empty where it does not.
-    wavelengths_nm
-        (W,) float64, ascending.
-    curves
-        (W, 3) float64 ≥ 0, R, G, B, response to light of equal power per nm, relative.
-    sha256
-        Of the file.
+    - `name`: the file's, without its suffix.
+    - `maker`, `model`: as the file names the camera; empty where it does not.
+    - `wavelengths_nm`: (W,) float64, ascending.
+    - `curves`: (W, 3) float64 ≥ 0, R, G, B, response to light of equal power per nm, relative.
+    - `sha256`: of the file.
     """
 
     name: str
@@ -107,21 +100,7 @@ def known_sensitivities() -> tuple[str, ...]:
 
 
 def read_sensitivities(name: str) -> Sensitivities:
-    """Return the sensitivities that a name or a path stands for.
-
-    Parameters
-    ----------
-    name
-        One of `known_sensitivities`, or the path of a file.
-
-    Raises
-    ------
-    InputError
-        There is no such camera and no such file.
-    FormatError
-        The file is not in the layout, or its numbers cannot be a camera's: gaps, values below 0, no light at all, or
-        wavelengths that are not nanometres.
-    """
+    """Return the sensitivities that a name or a path stands for."""
     if name in known_sensitivities():
         data = resources.files("sim").joinpath("data", name + SUFFIX).read_bytes()
         return parse_sensitivities(data, name, name)
@@ -137,22 +116,7 @@ def read_sensitivities(name: str) -> Sensitivities:
 
 
 def parse_sensitivities(data: bytes, name: str, where: str) -> Sensitivities:
-    """Return the sensitivities in the bytes of a file.
-
-    Parameters
-    ----------
-    data
-        The file.
-    name
-        What to call them.
-    where
-        The file's name for messages.
-
-    Raises
-    ------
-    FormatError
-        See `read_sensitivities`.
-    """
+    """Return the sensitivities in the bytes of a file."""
     try:
         document = _Document.model_validate(json.loads(data, object_pairs_hook=_unlike))
     except (UnicodeDecodeError, json.JSONDecodeError, RecursionError) as error:

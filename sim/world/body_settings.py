@@ -60,28 +60,7 @@ FACTS: Final[Mapping[str, Body]] = MappingProxyType(
 def find_body(
     camera: str, changes: Mapping[str, Any] = MappingProxyType({}), where: str = "--settings", key: str = "camera"
 ) -> Body:
-    """Return the body that a name or a file of sensitivities stands for.
-
-    Parameters
-    ----------
-    camera
-        A body of the simulated lab (``EOS 550D``), a name of `sim.spectral.sensitivities.known_sensitivities`, or the
-        path of a file of sensitivities. For a file of an unknown camera the facts are those of the EOS 550D.
-    changes
-        Facts that differ, by the names of `sim.world.sensors.Body`; `sensor`, `visible` and `masked` may be left out
-        and `pixels` given instead, columns and rows that see light.
-    where
-        What the changes were read from, for messages.
-    key
-        Where they stand there.
-
-    Raises
-    ------
-    InputError, FormatError
-        The camera is unknown, or its file cannot be used (`sim.spectral.sensitivities.read_sensitivities`).
-    ConfigurationError
-        A fact is unknown, of the wrong type, or cannot be a body's.
-    """
+    """Return the body that a name or a file of sensitivities stands for."""
     body = BODIES.get(camera) or _of_sensitivities(camera, read_sensitivities(camera))
     given = dict(changes)
     known = [field.name for field in fields(Body)] + ["pixels"]

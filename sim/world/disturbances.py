@@ -42,16 +42,10 @@ _SLANTED_DEG: Final = 30.0
 class Moment:
     """When a frame is exposed, and what is ordered.
 
-    Attributes
-    ----------
-    frame
-        Exposures before it in this session.
-    at_s
-        Seconds since the lab opened for the session.
-    colour
-        What is to be shown.
-    before
-        Of each frame before it, in taking order: its second, and what was ordered.
+    - `frame`: exposures before it in this session.
+    - `at_s`: seconds since the lab opened for the session.
+    - `colour`: what is to be shown.
+    - `before`: of each frame before it, in taking order: its second, and what was ordered.
     """
 
     frame: int
@@ -64,12 +58,8 @@ class Moment:
 class Disturbance:
     """An event: when it is there. What it does is in the subclasses.
 
-    Attributes
-    ----------
-    from_frame, to_frame
-        First and last frame; None: no last one.
-    from_s, to_s
-        First and last second; None: no limit.
+    - `from_frame`, `to_frame`: first and last frame; None: no last one.
+    - `from_s`, `to_s`: first and last second; None: no limit.
     """
 
     __pydantic_config__: ClassVar[ConfigDict] = ConfigDict(extra="forbid")
@@ -375,13 +365,7 @@ class Disturbances:
         return next((event for event in self.at(moment) if isinstance(event, StaleFile)), None)
 
     def require_unshown(self, where: str) -> None:
-        """Refuse events that change what a screen shows or which file is sent: a screen that is real does so itself.
-
-        Raises
-        ------
-        ConfigurationError
-            There is such an event; `where` names the option.
-        """
+        """Refuse events that change what a screen shows or which file is sent: a screen that is real does so itself."""
         for event in self.events:
             if isinstance(event, FrozenScreen | HalfChanged | StaleFile):
                 raise ConfigurationError(
@@ -400,22 +384,7 @@ CALM: Final = Disturbances()
 
 
 def read_disturbances(listed: Sequence[Any], where: str, key: str = "simulated.events") -> Disturbances:
-    """Return the events of a settings file: tables with `what` (one of `KINDS`) and an event's own keys.
-
-    Parameters
-    ----------
-    listed
-        The tables.
-    where
-        The file, for messages.
-    key
-        Where they stand there.
-
-    Raises
-    ------
-    ConfigurationError
-        There is no such event, or it has no such key or value.
-    """
+    """Return the events of a settings file: tables with `what` (one of `KINDS`) and an event's own keys."""
     try:
         return Disturbances(_LISTED.validate_python(listed))
     except ValidationError as error:
@@ -452,19 +421,7 @@ _EXPECTED: Final = {
 
 
 def drawn(seed: int, frames: int, count: int, kinds: Iterable[str] = KINDS) -> Disturbances:
-    """Return so many events at random frames, each there for one frame, or from there on where it is of that kind.
-
-    Parameters
-    ----------
-    seed
-        The same seed draws the same events.
-    frames
-        Frames of the session, at least 2; none begins with the first frame, which everything is compared with.
-    count
-        How many events.
-    kinds
-        What may happen, of `KINDS`.
-    """
+    """Return so many events at random frames, each there for one frame, or from there on where it is of that kind."""
     random = np.random.Generator(np.random.PCG64(seed))
     by_name = {kind.what: kind for kind in get_args(AnyDisturbance)}
     some = sorted(kinds, key=KINDS.index)

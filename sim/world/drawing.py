@@ -25,14 +25,9 @@ _MOST_LINES: Final = 6000
 class Print:
     """A drawing on paper: rectangles of plain colour, each over those before it.
 
-    Attributes
-    ----------
-    page_mm
-        Width and height of the sheet; bare paper where no rectangle lies.
-    rectangles_mm
-        (N, 4) float64: left, top, right, bottom.
-    rgb
-        (N, 3) uint8, the code printed; (255, 255, 255) prints nothing.
+    - `page_mm`: width and height of the sheet; bare paper where no rectangle lies.
+    - `rectangles_mm`: (N, 4) float64: left, top, right, bottom.
+    - `rgb`: (N, 3) uint8, the code printed; (255, 255, 255) prints nothing.
     """
 
     page_mm: tuple[float, float]
@@ -53,14 +48,10 @@ class Print:
 class LabelMap:
     """A print as a map of labels between lines.
 
-    Attributes
-    ----------
-    x_lines, y_lines
-        (M,) float64, ascending, mm: every x and every y at which the print changes.
-    labels
-        (len(y_lines) + 1, len(x_lines) + 1) int32: row of `codes` between the lines; `len(codes)` beyond the page.
-    codes
-        (N, 3) int64, distinct codes of the print, ascending; bare paper is one of them.
+    - `x_lines`, `y_lines`: (M,) float64, ascending, mm: every x and every y at which the print changes.
+    - `labels`: (len(y_lines) + 1, len(x_lines) + 1) int32: row of `codes` between the lines; `len(codes)` beyond the
+      page.
+    - `codes`: (N, 3) int64, distinct codes of the print, ascending; bare paper is one of them.
     """
 
     x_lines: NDArray[np.float64]

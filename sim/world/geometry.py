@@ -38,16 +38,10 @@ rounding."""
 class Waviness:
     """A smooth paper surface: the sum of a few standing waves.
 
-    Attributes
-    ----------
-    cycles
-        (M, 2) float64, cycles along x and y over the whole page.
-    phases
-        (M,) float64, radians.
-    amplitudes_mm
-        (M,) float64.
-    page_mm
-        Width and height of the page.
+    - `cycles`: (M, 2) float64, cycles along x and y over the whole page.
+    - `phases`: (M,) float64, radians.
+    - `amplitudes_mm`: (M,) float64.
+    - `page_mm`: width and height of the page.
     """
 
     cycles: NDArray[np.float64]
@@ -61,18 +55,8 @@ class Waviness:
     ) -> Waviness:
         """Draw a surface whose highest and lowest points lie `peak_to_valley_mm` apart.
 
-        Parameters
-        ----------
-        seed
-            The same seed gives the same surface.
-        peak_to_valley_mm
-            0 gives a plane.
-        page_mm
-            Width and height of the page.
-        modes
-            Number of waves; up to 3 cycles along the longer side of the page, weaker the shorter they are.
-        wave_mm
-            The waves' length, within 15 %; 0 for those long ones. One wave in any direction, and weak ones across it.
+        `wave_mm`: the waves' length, within 15 %; 0 for those long ones. One wave in any direction, and weak ones
+        across it.
         """
         random = np.random.default_rng([seed, 0x77617679])
         longer = max(page_mm)
@@ -131,12 +115,8 @@ class Folded:
 class Curled:
     """A surface whose left and right edges stand off its middle: a cylinder, to second order a parabola.
 
-    Attributes
-    ----------
-    surface
-        What it is without the curl.
-    curl_mm
-        Height of both edges above the middle, towards the camera.
+    - `surface`: what it is without the curl.
+    - `curl_mm`: height of both edges above the middle, towards the camera.
     """
 
     surface: Surface
@@ -166,20 +146,12 @@ def surface_of(room: Room, page_mm: tuple[float, float], fold: Fold | None) -> S
 class View:
     """A camera in front of a print.
 
-    Attributes
-    ----------
-    surface
-        The print's surface and size.
-    rotation
-        (3, 3) float64, from the print's axes (x right, y down, z away from the camera) to the camera's.
-    distance_mm
-        From the pinhole to the print's centre.
-    focal_px
-        Focal length.
-    centre_px
-        Where the optical axis meets the picture.
-    distortion
-        k1, k2, p1, p2.
+    - `surface`: the print's surface and size.
+    - `rotation`: (3, 3) float64, from the print's axes (x right, y down, z away from the camera) to the camera's.
+    - `distance_mm`: from the pinhole to the print's centre.
+    - `focal_px`: focal length.
+    - `centre_px`: where the optical axis meets the picture.
+    - `distortion`: k1, k2, p1, p2.
     """
 
     surface: Surface
@@ -202,20 +174,7 @@ class View:
     ) -> View:
         """Stand so far off that the print, were it not turned, fills a share of the frame.
 
-        Parameters
-        ----------
-        surface
-            The print.
-        frame_px
-            Width and height of the frame.
-        fill
-            The print's extent over the frame's, along whichever axis is the tighter.
-        focal_diagonals
-            Focal length over the frame's diagonal.
-        turn_deg
-            Tilt (about the horizontal axis), pan (about the vertical), roll (about the optical axis), degrees.
-        distortion
-            k1, k2, p1, p2.
+        `turn_deg`: tilt (about the horizontal axis), pan (about the vertical), roll (about the optical axis), degrees.
         """
         width, height = frame_px
         focal = focal_diagonals * float(np.hypot(width, height))
@@ -226,15 +185,8 @@ class View:
     def project(self, points_mm: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the half-size pixels where points of the print are seen.
 
-        Parameters
-        ----------
-        points_mm
-            (..., 2) float64, millimetres; may lie off the page, where the surface goes on.
-
-        Returns
-        -------
-        ndarray
-            (..., 2) float64, x then y.
+        `points_mm`: (..., 2) float64, millimetres; may lie off the page, where the surface goes on. Returns (..., 2)
+        float64, x then y.
         """
         page = np.array(self.surface.page_mm)
         flat = points_mm - page / 2
@@ -255,15 +207,8 @@ class View:
         Newton's method with central differences; the error is below a millionth of a pixel wherever the surface is
         seen without a fold, which is everywhere for sheets that lie within a few millimetres.
 
-        Parameters
-        ----------
-        pixels
-            (..., 2) float64.
-
-        Returns
-        -------
-        ndarray
-            (..., 2) float64, millimetres; off the page where the picture shows what lies beyond it.
+        `pixels`: (..., 2) float64. Returns (..., 2) float64, millimetres; off the page where the picture shows what
+        lies beyond it.
         """
         page = np.array(self.surface.page_mm)
         points = (pixels - np.array(self.centre_px)) * (self.distance_mm / self.focal_px) + page / 2

@@ -55,24 +55,8 @@ def printed_reflectance(
 ) -> NDArray[np.float64]:
     """Return the reflectance of an sRGB file's codes as printed.
 
-    Parameters
-    ----------
-    rgb
-        (N, 3) float or int codes 0 … 255 of the file.
-    profile
-        ``unmanaged`` or ``managed``.
-    on
-        The paper.
-
-    Returns
-    -------
-    ndarray
-        (N, 81) float64, 0 … 1, at `sim.world.spectra.WAVELENGTHS_NM`; (255, 255, 255) is bare paper.
-
-    Raises
-    ------
-    ValueError
-        There is no such profile or paper.
+    `rgb`: (N, 3) float or int codes 0 … 255 of the file. Returns (N, 81) float64, 0 … 1, at
+    `sim.world.spectra.WAVELENGTHS_NM`; (255, 255, 255) is bare paper.
     """
     if profile not in get_args(ProfileName):
         raise ValueError(f"profile {profile!r}: known are {', '.join(get_args(ProfileName))}")

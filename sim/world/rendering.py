@@ -108,31 +108,15 @@ def light(
     drawing is rectangles, so its integral over each is a product of two differences of normal distributions: exact,
     however an edge lies to the photosites.
 
-    Parameters
-    ----------
-    first_row
-        Row of the visible frame that `out` begins with.
-    nodes
-        (1 or 3, ny, nx, 2) float64, the place on the print in mm, of photosite (16 (i − 1), 16 (j − 1)) at [j, i]: one
-        for all camera channels, or one for each.
-    sigma_px
-        Blur and aperture, photosites.
-    x_lines, y_lines
-        (A,) and (B,) float64, every x and every y, ascending, at which the drawing changes, mm.
-    labels
-        (B + 1, A + 1) int32, row of `signals` between the lines.
-    signals
-        (n, 3, 3) float32, signal of a colour [label, camera channel, primary] in full light, DN.
-    channels
-        (2, 2) int64, camera channel of a photosite by the parity of its row and column.
-    vignetting
-        (3,) float64: x, y and c; the lens passes 1 / (1 + c r²)² at r photosites from there.
-    falloff
-        (3, 4) float64, for each primary x, y, c and g: the projector gives g / (1 + c d²) at d mm from there.
-    response
-        (rows, columns) float32, response of each photosite, about 1.
-    out
-        (3, rows, columns) float32, written: signal under each primary, DN.
+    `nodes`: (1 or 3, ny, nx, 2) float64, the place on the print in mm, of photosite (16 (i − 1), 16 (j − 1)) at [j, i]:
+    one for all camera channels, or one for each. `sigma_px`: blur and aperture, photosites. `x_lines`, `y_lines`: (A,)
+    and (B,) float64, every x and every y, ascending, at which the drawing changes, mm. `labels`: (B + 1, A + 1) int32,
+    row of `signals` between the lines. `signals`: (n, 3, 3) float32, signal of a colour [label, camera channel,
+    primary] in full light, DN. `channels`: (2, 2) int64, camera channel of a photosite by the parity of its row and
+    column. `vignetting`: (3,) float64: x, y and c; the lens passes 1 / (1 + c r²)² at r photosites from there.
+    `falloff`: (3, 4) float64, for each primary x, y, c and g: the projector gives g / (1 + c d²) at d mm from there.
+    `response`: (rows, columns) float32, response of each photosite, about 1. `out`: (3, rows, columns) float32,
+    written: signal under each primary, DN.
     """
     rows, columns = out.shape[1], out.shape[2]
     views, node_columns = nodes.shape[0], nodes.shape[2]
@@ -226,24 +210,10 @@ def counts(
     Shot noise is taken as normal, of variance signal / gain; with the read noise that makes one normal deviate of
     variance signal / gain + read noise²: the photon transfer of EMVA 1288 (release 4.0 linear, section 2.2).
 
-    Parameters
-    ----------
-    light
-        (3, rows, visible columns) float32, from `light`; no columns at all for rows of the masked border.
-    weights
-        (3,) float32, drive of each primary.
-    noise
-        (rows, sensor columns) float32, standard normal deviates.
-    left
-        Column of the sensor that `light` begins at.
-    black, read_noise
-        Mean and standard deviation of a dark count, DN.
-    gain_e
-        Electrons per DN.
-    saturation
-        Largest count.
-    out
-        (rows, sensor columns) uint16, written.
+    `light`: (3, rows, visible columns) float32, from `light`; no columns at all for rows of the masked border.
+    `weights`: (3,) float32, drive of each primary. `noise`: (rows, sensor columns) float32, standard normal deviates.
+    `black`, `read_noise`: mean and standard deviation of a dark count, DN. `gain_e`: electrons per DN. `saturation`:
+    largest count. `out`: (rows, sensor columns) uint16, written.
     """
     rows, columns = out.shape
     right = left + light.shape[2]

@@ -25,83 +25,58 @@ REFERENCE_EXPOSURE: Final = ExposureSettings(iso=100, aperture=8.0, shutter_s=0.
 class Room:
     """Everything about the lab that is not the chart's drawing and not the camera's body.
 
-    Attributes
-    ----------
-    seed
-        Of the paper's shape, the photosites' response and the noise; 0 or more.
-    fill
-        The print's extent over the frame's, along whichever axis is the tighter.
-    focal_diagonals
-        Focal length over the frame's diagonal; 1.3 is 35 mm on APS-C. With `fill` it gives the distance.
-    tilt_deg, pan_deg, roll_deg
-        How the print is turned against the camera.
-    k1, k2, p1, p2
-        Brown's distortion in normalised coordinates, as OpenCV has it.
-    waviness_mm
-        Peak-to-valley height of the paper's surface on an A0 sheet; on another in proportion to its diagonal, so that
-        small charts look like large ones.
-    wave_mm
-        Wavelength of the paper's waves on an A0 sheet, in proportion as above: short ones, as paper gets in damp air;
-        150 is plausible. 0: long ones, up to three over the sheet's longer side.
-    curl_mm
-        How far the sheet's left and right edges stand off its middle, towards the camera, as paper from a roll does; on
-        an A0 sheet, in proportion as above. Negative: away from the camera.
-    blur_px
-        Standard deviation of the lens's blur, half-size pixels; the photosite's aperture is added to it.
-    shoulder_share, shoulder_px
-        Share of the light that lies in the wide part of the lens's point spread, and that part's standard deviation
-        along each axis, half-size pixels: an exponential (`sim.optics.photographic_lens`, with the MTF and two lenses).
-    veil
-        Veiling glare: share of the frame's mean light, backdrop included, that lies evenly on all of it.
-    lateral_red_px, lateral_blue_px
-        Lateral chromatic aberration: how far out the channel sees the frame's corner against green, half-size pixels;
-        towards the axis it falls off as `sim.optics.photographic_lens` says. Negative: inwards.
-    vignetting
-        Share of the light that the lens loses at the frame's corner.
-    projector_falloff
-        Share of the projector's light that is missing a page's half diagonal from its brightest point.
-    primary_difference
-        How differently the primaries fall off: their `projector_falloff` spreads by this share of itself, and their
-        brightest points by as much of the page's half diagonal.
-    lamp_spectrum
-        ``uhp`` (mercury lamp and colour wheel) or ``led``.
-    transfer
-        From code to light: ``srgb`` (IEC 61966-2-1) or the exponent of a power law.
-    black_leak
-        Share of a primary's full light that is there at code 0: 1 / contrast.
-    ambient
-        Light from elsewhere, as a share of the projector's white; of its colour, for it is taken to be stray light.
-    white_level_share
-        Signal of bare paper in full white at `REFERENCE_EXPOSURE`, strongest channel, over saturation − black.
-    lamp_drift_per_hour
-        Share of its light that the lamp loses in an hour; the room has no time, so whoever does applies it as `lamp`.
-    response_spread
-        Standard deviation of the photosites' response (PRNU).
-    wheel_hz
-        Turns of the projector's colour wheel per second, each a third red, green and blue; 0 for steady light. With a
-        wheel, an exposure that is no whole number of turns, or starts and ends unsteadily, gets more of one primary
-        than of another, and frames differ from `signal` and `white` by that.
-    shutter_jitter_s
-        Standard deviation of the exposure time; matters with a wheel only.
-    stain_mm, stain_depth
-        Diameter of a stain somewhere on the print, 0 for none, and the share of blue light that it takes; of green it
-        takes six tenths of that, of red three. A thumb's is 25 mm across.
-    fold_mm
-        How far a crease across the print stands off its plane, 0 for none.
-    hot_per_million
-        Photosites of a million whose dark current is out of proportion, the same in all frames, 0 for none. 20 is
-        plausible for an EOS 550D of ten years, 2 for an EOS 6D Mark II of three (chosen: several times what
-        `sim.world.sensors.HotPattern` has from the literature, as bodies are not delivered without any). Where a
-        session has dark frames, `build-lut` lists the cells in which one stands out by 30 counts and more as unfit, and
-        `generate` replaces their colours; a table computed by `sim table` has none, and keeps them in its images.
-    hot_dn_per_s
-        Mean excess of such a photosite, DN per second at ISO 100; exponentially distributed. Chosen: at half a second
-        the hottest of a hundred is nearly saturated.
-    profile
-        ``unmanaged``: the file's codes are ink codes. ``managed``: a print shop's profile makes ink codes of them, so
-        that greys are grey (`sim.world.profile`).
-    paper
-        ``poster``, ``matt`` or ``glossy`` (`sim.world.spectra.paper`).
+    - `seed`: of the paper's shape, the photosites' response and the noise; 0 or more.
+    - `fill`: the print's extent over the frame's, along whichever axis is the tighter.
+    - `focal_diagonals`: focal length over the frame's diagonal; 1.3 is 35 mm on APS-C. With `fill` it gives the
+      distance.
+    - `tilt_deg`, `pan_deg`, `roll_deg`: how the print is turned against the camera.
+    - `k1`, `k2`, `p1`, `p2`: brown's distortion in normalised coordinates, as OpenCV has it.
+    - `waviness_mm`: peak-to-valley height of the paper's surface on an A0 sheet; on another in proportion to its
+      diagonal, so that small charts look like large ones.
+    - `wave_mm`: wavelength of the paper's waves on an A0 sheet, in proportion as above: short ones, as paper gets in
+      damp air; 150 is plausible. 0: long ones, up to three over the sheet's longer side.
+    - `curl_mm`: how far the sheet's left and right edges stand off its middle, towards the camera, as paper from a roll
+      does; on an A0 sheet, in proportion as above. Negative: away from the camera.
+    - `blur_px`: standard deviation of the lens's blur, half-size pixels; the photosite's aperture is added to it.
+    - `shoulder_share`, `shoulder_px`: share of the light that lies in the wide part of the lens's point spread, and
+      that part's standard deviation along each axis, half-size pixels: an exponential (`sim.optics.photographic_lens`,
+      with the MTF and two lenses).
+    - `veil`: veiling glare: share of the frame's mean light, backdrop included, that lies evenly on all of it.
+    - `lateral_red_px`, `lateral_blue_px`: lateral chromatic aberration: how far out the channel sees the frame's corner
+      against green, half-size pixels; towards the axis it falls off as `sim.optics.photographic_lens` says. Negative:
+      inwards.
+    - `vignetting`: share of the light that the lens loses at the frame's corner.
+    - `projector_falloff`: share of the projector's light that is missing a page's half diagonal from its brightest
+      point.
+    - `primary_difference`: how differently the primaries fall off: their `projector_falloff` spreads by this share of
+      itself, and their brightest points by as much of the page's half diagonal.
+    - `lamp_spectrum`: ``uhp`` (mercury lamp and colour wheel) or ``led``.
+    - `transfer`: from code to light: ``srgb`` (IEC 61966-2-1) or the exponent of a power law.
+    - `black_leak`: share of a primary's full light that is there at code 0: 1 / contrast.
+    - `ambient`: light from elsewhere, as a share of the projector's white; of its colour, for it is taken to be stray
+      light.
+    - `white_level_share`: signal of bare paper in full white at `REFERENCE_EXPOSURE`, strongest channel, over
+      saturation − black.
+    - `lamp_drift_per_hour`: share of its light that the lamp loses in an hour; the room has no time, so whoever does
+      applies it as `lamp`.
+    - `response_spread`: standard deviation of the photosites' response (PRNU).
+    - `wheel_hz`: turns of the projector's colour wheel per second, each a third red, green and blue; 0 for steady
+      light. With a wheel, an exposure that is no whole number of turns, or starts and ends unsteadily, gets more of one
+      primary than of another, and frames differ from `signal` and `white` by that.
+    - `shutter_jitter_s`: standard deviation of the exposure time; matters with a wheel only.
+    - `stain_mm`, `stain_depth`: diameter of a stain somewhere on the print, 0 for none, and the share of blue light
+      that it takes; of green it takes six tenths of that, of red three. A thumb's is 25 mm across.
+    - `fold_mm`: how far a crease across the print stands off its plane, 0 for none.
+    - `hot_per_million`: photosites of a million whose dark current is out of proportion, the same in all frames, 0 for
+      none. 20 is plausible for an EOS 550D of ten years, 2 for an EOS 6D Mark II of three (chosen: several times what
+      `sim.world.sensors.HotPattern` has from the literature, as bodies are not delivered without any). Where a session
+      has dark frames, `build-lut` lists the cells in which one stands out by 30 counts and more as unfit, and
+      `generate` replaces their colours; a table computed by `sim table` has none, and keeps them in its images.
+    - `hot_dn_per_s`: mean excess of such a photosite, DN per second at ISO 100; exponentially distributed. Chosen: at
+      half a second the hottest of a hundred is nearly saturated.
+    - `profile`: ``unmanaged``: the file's codes are ink codes. ``managed``: a print shop's profile makes ink codes of
+      them, so that greys are grey (`sim.world.profile`).
+    - `paper`: ``poster``, ``matt`` or ``glossy`` (`sim.world.spectra.paper`).
     """
 
     seed: int = 0
@@ -151,12 +126,7 @@ class Room:
     def wheel_light(self, shutter_s: float, random: np.random.Generator) -> NDArray[np.float64]:
         """Return (3,) float64, the light of each primary that the wheel lets through over that of steady light.
 
-        Parameters
-        ----------
-        shutter_s
-            Exposure time, seconds.
-        random
-            Decides where the wheel stands when the shutter opens, and the shutter's jitter.
+        `shutter_s`: exposure time, seconds.
         """
         if self.wheel_hz == 0:
             return np.ones(3)
@@ -187,22 +157,7 @@ class Room:
 
 
 def read_room(seed: int, changes: Mapping[str, Any], where: str, key: str) -> Room:
-    """Return the default room with a seed and the changes of a settings file or a command line.
-
-    Parameters
-    ----------
-    seed
-        Of the room.
-    changes
-        What differs, by the names of `Room`, without its seed.
-    where, key
-        What they were read from, and where they stand there, for messages.
-
-    Raises
-    ------
-    ConfigurationError
-        A parameter is unknown, of the wrong type or out of its range.
-    """
+    """Return the default room with a seed and the changes of a settings file or a command line."""
     known = sorted(field.name for field in fields(Room) if field.name != "seed")
     for name in changes:
         if name not in known:

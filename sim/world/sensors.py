@@ -32,33 +32,19 @@ class Rectangle(NamedTuple):
 class Body:
     """A camera body.
 
-    Attributes
-    ----------
-    maker, model
-        As the body writes them into its files, e.g. ``Canon`` and ``Canon EOS 550D``.
-    sensor
-        Rows and columns of the raw frame, masked borders included.
-    visible
-        The photosites that see light, as the raw converters have them.
-    pattern
-        Colour filters of the 2×2 block at the top-left of `visible`, row by row, e.g. ``RGGB``.
-    black
-        Count of a photosite without light, DN.
-    saturation
-        Count that no photosite exceeds, DN.
-    bits
-        Bits of a count.
-    electrons_per_dn
-        Electrons that raise the count by one at ISO 100; at another speed ×100/ISO.
-    read_noise_dn
-        Standard deviation of a dark count at ISO 100, DN.
-    sensor_noise_e
-        The share of the read noise that arises before the amplifier, electrons: it grows with the ISO speed in DN, the
-        rest does not.
-    sensitivities
-        Name of the spectral sensitivities in `sim.data`, see `sim.world.spectra.sensitivities`.
-    masked
-        Rectangles of the sensor that are covered and measure black.
+    - `maker`, `model`: as the body writes them into its files, e.g. ``Canon`` and ``Canon EOS 550D``.
+    - `sensor`: rows and columns of the raw frame, masked borders included.
+    - `visible`: the photosites that see light, as the raw converters have them.
+    - `pattern`: colour filters of the 2×2 block at the top-left of `visible`, row by row, e.g. ``RGGB``.
+    - `black`: count of a photosite without light, DN.
+    - `saturation`: count that no photosite exceeds, DN.
+    - `bits`: bits of a count.
+    - `electrons_per_dn`: electrons that raise the count by one at ISO 100; at another speed ×100/ISO.
+    - `read_noise_dn`: standard deviation of a dark count at ISO 100, DN.
+    - `sensor_noise_e`: the share of the read noise that arises before the amplifier, electrons: it grows with the ISO
+      speed in DN, the rest does not.
+    - `sensitivities`: name of the spectral sensitivities in `sim.data`, see `sim.world.spectra.sensitivities`.
+    - `masked`: rectangles of the sensor that are covered and measure black.
     """
 
     maker: str
@@ -116,12 +102,8 @@ class HotPattern:
     an EOS 550D (4.3 µm) of ten years and 0.4 on an EOS 6D Mark II (5.7 µm) of three, besides those that a body is
     delivered with, which we did not find counted. Exponential distribution: chosen.
 
-    Attributes
-    ----------
-    rows, columns
-        (H,) int64, photosites of the sensor, by rising row.
-    dn_per_s
-        (H,) float64, excess at ISO 100, DN per second.
+    - `rows`, `columns`: (H,) int64, photosites of the sensor, by rising row.
+    - `dn_per_s`: (H,) float64, excess at ISO 100, DN per second.
     """
 
     rows: NDArray[np.int64]
@@ -132,16 +114,8 @@ class HotPattern:
     def drawn(cls, random: np.random.Generator, sensor: tuple[int, int], per_million: float, dn_per_s: float) -> Self:
         """Return hot photosites anywhere on a sensor, their excess exponentially distributed about a mean.
 
-        Parameters
-        ----------
-        random
-            Decides which.
-        sensor
-            Rows and columns.
-        per_million
-            How many of a million photosites; rounded to whole photosites on the sensor.
-        dn_per_s
-            Mean excess at ISO 100, DN per second.
+        `per_million`: how many of a million photosites; rounded to whole photosites on the sensor. `dn_per_s`: mean
+        excess at ISO 100, DN per second.
         """
         count = round(per_million * sensor[0] * sensor[1] / 1e6)
         place = np.sort(random.choice(sensor[0] * sensor[1], count, replace=False))
@@ -163,18 +137,9 @@ class HotPattern:
     ) -> None:
         """Write the counts of hot photosites into a frame, by the photon transfer that ordinary ones have.
 
-        Parameters
-        ----------
-        frame
-            (rows, columns) uint16 counts, changed where a photosite is hot.
-        noise
-            (rows, columns) float32, the standard normal deviates that the frame was made with.
-        light_dn
-            (H,) float64, what light alone gives each of them, DN above black.
-        body
-            Gives black, gain, read noise and saturation.
-        iso, shutter_s
-            ISO speed, and exposure time in seconds.
+        `frame`: (rows, columns) uint16 counts, changed where a photosite is hot. `noise`: (rows, columns) float32, the
+        standard normal deviates that the frame was made with. `light_dn`: (H,) float64, what light alone gives each of
+        them, DN above black. `iso`, `shutter_s`: ISO speed, and exposure time in seconds.
         """
         signal = light_dn + self.excess_dn(iso, shutter_s)
         spread = np.sqrt(signal / body.gain_e(iso) + body.noise_dn(iso) ** 2)

@@ -31,14 +31,8 @@ _BLOB_RIM: Final = 0.15
 class Patch:
     """A rectangle of another colour in the projected picture.
 
-    Attributes
-    ----------
-    place
-        Where it falls.
-    colour
-        Its codes.
-    share
-        Of the exposure's time that it is there, 0 … 1.
+    - `place`: where it falls.
+    - `share`: of the exposure's time that it is there, 0 … 1.
     """
 
     place: Place
@@ -56,12 +50,8 @@ class Patch:
 class Blob:
     """Something dark between the chart and the camera, with a soft edge: an ellipse that touches its place's sides.
 
-    Attributes
-    ----------
-    place
-        Where it is seen.
-    left
-        Light that comes from there, over that of the chart behind it, 0 … 1.
+    - `place`: where it is seen.
+    - `left`: light that comes from there, over that of the chart behind it, 0 … 1.
     """
 
     place: Place
@@ -80,12 +70,9 @@ class Blob:
 class Glare:
     """Light that the print's surface mirrors into the camera, unlike what ink and paper scatter: a broad, soft spot.
 
-    Attributes
-    ----------
-    place
-        Where it is seen: an ellipse that touches the sides of its place at 1 / e² of its light in the middle.
-    share
-        Of the light that bare paper sends there; it has the colour of the projector's light, ambient light included.
+    - `place`: where it is seen: an ellipse that touches the sides of its place at 1 / e² of its light in the middle.
+    - `share`: of the light that bare paper sends there; it has the colour of the projector's light, ambient light
+      included.
     """
 
     place: Place
@@ -103,30 +90,19 @@ class Glare:
 class Situation:
     """What is otherwise than in the undisturbed room while one frame is exposed.
 
-    Attributes
-    ----------
-    lamp
-        Light of each primary over the undisturbed.
-    ambient
-        Light from elsewhere, of each primary's colour, as a share of its full light; added to the room's own.
-    picture
-        (h, w, 3) float32, what the projector shows during the exposure: the mean over its time of each primary's light,
-        0 … 1 of the full (the codes decoded, not the codes). None: one plain colour. `projected_mm` is where it falls.
-    patches
-        Of other colours in the picture, each over those before it.
-    blobs
-        What stands before the chart.
-    glares
-        What the print mirrors into the camera.
-    bump_px, bump_mm
-        How far the chart has moved in its plane, right and down, in half-size pixels at its middle and in millimetres;
-        both count.
-    turn_deg
-        How far it has turned about its middle, clockwise as seen.
-    defocus_px
-        Standard deviation of further blur, half-size pixels.
-    black_dn
-        How far the black level lies above the body's, DN.
+    - `lamp`: light of each primary over the undisturbed.
+    - `ambient`: light from elsewhere, of each primary's colour, as a share of its full light; added to the room's own.
+    - `picture`: (h, w, 3) float32, what the projector shows during the exposure: the mean over its time of each
+      primary's light, 0 … 1 of the full (the codes decoded, not the codes). None: one plain colour. `projected_mm` is
+      where it falls.
+    - `patches`: of other colours in the picture, each over those before it.
+    - `blobs`: what stands before the chart.
+    - `glares`: what the print mirrors into the camera.
+    - `bump_px`, `bump_mm`: how far the chart has moved in its plane, right and down, in half-size pixels at its middle
+      and in millimetres; both count.
+    - `turn_deg`: how far it has turned about its middle, clockwise as seen.
+    - `defocus_px`: standard deviation of further blur, half-size pixels.
+    - `black_dn`: how far the black level lies above the body's, DN.
     """
 
     lamp: tuple[float, float, float] = (1.0, 1.0, 1.0)
@@ -161,21 +137,8 @@ class Situation:
     ) -> NDArray[np.float64]:
         """Return how much of each primary the projected picture has at points of the print.
 
-        Parameters
-        ----------
-        points_mm
-            (..., 2) float64.
-        page_mm
-            Width and height of the page.
-        plain
-            (3,) float64, 0 … 1, the plain colour, where there is no `picture`.
-        decoded
-            Returns (3,) float64, 0 … 1, the light of a colour's codes.
-
-        Returns
-        -------
-        ndarray
-            (..., 3) float64, 0 … 1.
+        `points_mm`: (..., 2) float64. `plain`: (3,) float64, 0 … 1, the plain colour, where there is no `picture`.
+        `decoded`: returns (3,) float64, 0 … 1, the light of a colour's codes. Returns (..., 3) float64, 0 … 1.
         """
         if self.picture is None:
             light = np.broadcast_to(plain, (*points_mm.shape[:-1], 3)).copy()
@@ -211,15 +174,7 @@ UNDISTURBED: Final = Situation()
 
 
 def projected_mm(page_mm: tuple[float, float], aspect: float) -> Place:
-    """Return where the projected picture falls, mm on the print: centred, as large as covers the page and `OVERSCAN`.
-
-    Parameters
-    ----------
-    page_mm
-        Width and height of the page.
-    aspect
-        The picture's width over its height.
-    """
+    """Return where the projected picture falls, mm on the print: centred, covering the page and `OVERSCAN`."""
     width, height = (side * (1 + 2 * OVERSCAN) for side in page_mm)
     width, height = max(width, height * aspect), max(height, width / aspect)
     x, y = page_mm[0] / 2, page_mm[1] / 2
@@ -229,19 +184,8 @@ def projected_mm(page_mm: tuple[float, float], aspect: float) -> Place:
 def sampled(picture: NDArray[np.float32], place_mm: Place, points_mm: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return a picture's values at points of the print, interpolated linearly; its edge goes on beyond it.
 
-    Parameters
-    ----------
-    picture
-        (h, w, 3) float32.
-    place_mm
-        Where its corners fall, mm.
-    points_mm
-        (..., 2) float64.
-
-    Returns
-    -------
-    ndarray
-        (..., 3) float64.
+    `picture`: (h, w, 3) float32. `place_mm`: where its corners fall, mm. `points_mm`: (..., 2) float64. Returns (...,
+    3) float64.
     """
     from scipy.ndimage import map_coordinates
 
@@ -259,19 +203,8 @@ def moved(
 ) -> NDArray[np.float64]:
     """Return where points of the chart are after it was turned about its middle and then pushed.
 
-    Parameters
-    ----------
-    points_mm
-        (..., 2) float64.
-    middle_mm, by_mm
-        (2,) float64, where it turns, and how far it is pushed.
-    turn_deg
-        Clockwise with y down.
-
-    Returns
-    -------
-    ndarray
-        (..., 2) float64, mm in the room's own coordinates, which are those of the chart before.
+    `points_mm`: (..., 2) float64. `middle_mm`, `by_mm`: (2,) float64, where it turns, and how far it is pushed. Returns
+    (..., 2) float64, mm in the room's own coordinates, which are those of the chart before.
     """
     return (points_mm - np.asarray(middle_mm)) @ _turned(turn_deg).T + np.asarray(middle_mm) + np.asarray(by_mm)
 

@@ -91,15 +91,7 @@ def _rise(centre_nm: float, width_nm: float) -> NDArray[np.float64]:
 def projector_primaries(lamp: LampSpectrum = "uhp") -> NDArray[np.float64]:
     """Return the light of each primary at full drive.
 
-    Parameters
-    ----------
-    lamp
-        ``uhp`` (mercury lamp and colour wheel) or ``led``.
-
-    Returns
-    -------
-    ndarray
-        (3, 81) float64, red, green, blue; relative power per nm. White is near D65: CIE 1931 x, y within 0.02.
+    Returns (3, 81) float64, red, green, blue; relative power per nm. White is near D65: CIE 1931 x, y within 0.02.
     """
     if lamp == "led":
         power = np.stack([_gauss(633, 8.5, 7.5), _gauss(515, 13, 16), _gauss(451, 9, 10)])
@@ -118,18 +110,11 @@ def projector_primaries(lamp: LampSpectrum = "uhp") -> NDArray[np.float64]:
 class InkedPaper:
     """A paper and the inks on it.
 
-    Attributes
-    ----------
-    white
-        (81,) float64, reflectance of the bare paper.
-    inks
-        (4, 81) float64, optical density of solid cyan, magenta, yellow and black over white, surface left out.
-    surface
-        Share of the incident light that the surface sends to the camera before it meets ink.
-    black_generation
-        Coverage of black where all three inks are full.
-    undercolour_removal
-        Share of the black by which each of the three inks is reduced.
+    - `white`: (81,) float64, reflectance of the bare paper.
+    - `inks`: (4, 81) float64, optical density of solid cyan, magenta, yellow and black over white, surface left out.
+    - `surface`: share of the incident light that the surface sends to the camera before it meets ink.
+    - `black_generation`: coverage of black where all three inks are full.
+    - `undercolour_removal`: share of the black by which each of the three inks is reduced.
     """
 
     white: NDArray[np.float64]
@@ -184,20 +169,7 @@ def _photo_inks(black: float) -> NDArray[np.float64]:
 
 @cache
 def paper(name: PaperName) -> InkedPaper:
-    """Return a paper with its inks.
-
-    Parameters
-    ----------
-    name
-        ``poster``: plain matt paper with little ink, density of black 1.5 absolute, 1.43 over white.
-        ``matt``: coated matt photo paper, 1.7 absolute. ``glossy``: resin-coated photo paper, 2.3 absolute. The head of
-        this file names the measurements.
-
-    Raises
-    ------
-    ValueError
-        There is no such paper.
-    """
+    """Return a paper with its inks."""
     if name == "poster":
         return InkedPaper(paper_white(), _poster_inks(), SURFACE_REFLECTANCE, _BLACK_GENERATION, _UNDERCOLOUR_REMOVAL)
     if name == "matt":
@@ -211,18 +183,8 @@ def paper(name: PaperName) -> InkedPaper:
 def ink_coverage(rgb: ArrayLike, on: PaperName = "poster") -> NDArray[np.float64]:
     """Return the share of the paper that each ink is set to cover.
 
-    Parameters
-    ----------
-    rgb
-        (..., 3) float or int codes 0 … 255.
-    on
-        The paper; poster paper limits black to 0.9 and reduces the inks by 0.4 of it, the others to 1 and by 0.5.
-
-    Returns
-    -------
-    ndarray
-        (..., 4) float64 in 0 … 1, cyan, magenta, yellow, black: the complement of the code, with grey component
-        replacement: black grows with the square of the least of the three, which lose a share of it.
+    Returns (..., 4) float64 in 0 … 1, cyan, magenta, yellow, black: the complement of the code, with grey component
+    replacement: black grows with the square of the least of the three, which lose a share of it.
     """
     chosen = paper(on)
     cmy = 1 - np.asarray(rgb, dtype=np.float64) / 255
@@ -233,17 +195,8 @@ def ink_coverage(rgb: ArrayLike, on: PaperName = "poster") -> NDArray[np.float64
 def print_reflectance(rgb: ArrayLike, on: PaperName = "poster") -> NDArray[np.float64]:
     """Return the reflectance of printed ink codes; (255, 255, 255) is bare paper.
 
-    Parameters
-    ----------
-    rgb
-        (N, 3) float or int codes 0 … 255.
-    on
-        The paper.
-
-    Returns
-    -------
-    ndarray
-        (N, 81) float64, 0 … 1, never below the reflectance of the paper's surface.
+    `rgb`: (N, 3) float or int codes 0 … 255. Returns (N, 81) float64, 0 … 1, never below the reflectance of the paper's
+    surface.
     """
     chosen = paper(on)
     weights = chosen.shares(ink_coverage(rgb, on))
@@ -255,21 +208,7 @@ def print_reflectance(rgb: ArrayLike, on: PaperName = "poster") -> NDArray[np.fl
 def sensitivities(name: str) -> NDArray[np.float64]:
     """Return a camera's measured spectral sensitivities.
 
-    Parameters
-    ----------
-    name
-        ``Canon_EOS_600D`` (the sensor generation of the EOS 550D), ``Canon_EOS_200D`` (that of the EOS 6D Mark II),
-        another of `sim.spectral.sensitivities.known_sensitivities`, or the path of a file.
-
-    Returns
-    -------
-    ndarray
-        (81, 3) float64, R, G, B, relative; read-only. Those of `sim.data` are relative to the peak of G.
-
-    Raises
-    ------
-    InputError, FormatError
-        See `sim.spectral.sensitivities.read_sensitivities`.
+    Returns (81, 3) float64, R, G, B, relative; read-only. Those of `sim.data` are relative to the peak of G.
     """
     curves = read_sensitivities(name).at(WAVELENGTHS_NM)
     curves.setflags(write=False)

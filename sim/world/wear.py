@@ -33,14 +33,8 @@ FLANK_MM = 40.0
 class Stain:
     """A round stain.
 
-    Attributes
-    ----------
-    centre_mm
-        Its middle on the print.
-    diameter_mm
-        Its size.
-    transmittance
-        Share of red, green and blue light that comes back through it, over that of clean paper.
+    - `centre_mm`: its middle on the print.
+    - `transmittance`: share of red, green and blue light that comes back through it, over that of clean paper.
     """
 
     centre_mm: tuple[float, float]
@@ -58,16 +52,10 @@ class Stain:
 class Fold:
     """A crease across the sheet, from its upper to its lower edge.
 
-    Attributes
-    ----------
-    at_mm
-        A point of the crease.
-    along
-        Its direction, a unit vector.
-    height_mm
-        How far the crease stands off the plane, towards the camera.
-    slant
-        Change of the light with a flank's slope: the tangent of the angle under which the light falls in.
+    - `at_mm`: A point of the crease.
+    - `along`: its direction, a unit vector.
+    - `height_mm`: how far the crease stands off the plane, towards the camera.
+    - `slant`: change of the light with a flank's slope: the tangent of the angle under which the light falls in.
     """
 
     at_mm: tuple[float, float]

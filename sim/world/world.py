@@ -94,23 +94,8 @@ class World:
     ) -> NDArray[np.uint16]:
         """Return a frame.
 
-        Parameters
-        ----------
-        colour
-            What the projector shows.
-        settings
-            Light grows with shutter time and ISO speed and falls with the square of the f-number.
-        key
-            Names the frame; integers 0 or more. The same key has the same noise.
-        lamp
-            The lamp's light over its light when new; 0 is dark.
-        situation
-            What is otherwise in this frame; where it has a picture, that is shown instead of `colour`.
-
-        Returns
-        -------
-        ndarray
-            (rows, columns) uint16, the whole sensor's counts, masked borders included; never above saturation.
+        `settings`: light grows with shutter time and ISO speed and falls with the square of the f-number. Returns
+        (rows, columns) uint16, the whole sensor's counts, masked borders included; never above saturation.
         """
         from sim.world.rendering import counts
 
@@ -197,15 +182,7 @@ class World:
     ) -> NDArray[np.float32]:
         """Return what a frame would be without noise, black, hot photosites and clipping, by a wheel's mean light.
 
-        Parameters
-        ----------
-        colour, settings, lamp, situation
-            As for `expose`.
-
-        Returns
-        -------
-        ndarray
-            (rows, columns) float32, DN above black, of the body's visible photosites, their response included.
+        Returns (rows, columns) float32, DN above black, of the body's visible photosites, their response included.
         """
         light, drive = self._lighting(colour, settings, lamp * np.array(situation.lamp), situation)
         return np.tensordot(drive, light, 1)
@@ -215,19 +192,7 @@ class World:
     ) -> NDArray[np.float64]:
         """Return the half-size pixels where points of the print are seen.
 
-        Parameters
-        ----------
-        points_mm
-            (..., 2) float64, millimetres.
-        channel
-            ``R``, ``G`` or ``B``: of the camera; they differ where the lens has lateral chromatic aberration.
-        situation
-            Where the chart has been moved to.
-
-        Returns
-        -------
-        ndarray
-            (..., 2) float64, x then y.
+        `points_mm`: (..., 2) float64, millimetres. Returns (..., 2) float64, x then y.
         """
         points = np.asarray(points_mm, dtype=np.float64)
         if any(situation.view):
@@ -243,17 +208,8 @@ class World:
     ) -> NDArray[np.float64]:
         """Return the true linear camera RGB of printed codes.
 
-        Parameters
-        ----------
-        rgb
-            (N, 3) float or int codes 0 … 255.
-        colour, settings, lamp
-            As for `expose`.
-
-        Returns
-        -------
-        ndarray
-            (N, 3) float64, DN above black where `field` is 1, leak and ambient light included, without clipping.
+        `rgb`: (N, 3) float or int codes 0 … 255. Returns (N, 3) float64, DN above black where `field` is 1, leak and
+        ambient light included, without clipping.
         """
         return self._signals(self._reflectance(rgb)) @ self.drive(colour, settings, lamp)
 
@@ -267,20 +223,8 @@ class World:
     ) -> NDArray[np.float64]:
         """Return the true linear camera RGB of printed codes at points of the print, in the light that falls there.
 
-        Parameters
-        ----------
-        rgb
-            (N, 3) float or int codes 0 … 255.
-        points_mm
-            (N, 2) float64.
-        colour, settings, lamp
-            As for `expose`.
-
-        Returns
-        -------
-        ndarray
-            (N, 3) float64, DN above black, without clipping: what the photosites there get where nothing is blurred,
-            stain and fold included.
+        `rgb`: (N, 3) float or int codes 0 … 255. `points_mm`: (N, 2) float64. Returns (N, 3) float64, DN above black,
+        without clipping: what the photosites there get where nothing is blurred, stain and fold included.
         """
         light = self.field(points_mm) * self.drive(colour, settings, lamp)
         return np.einsum("ncp,np->nc", self._signals(self._reflectance(rgb)), light) * self.worn(points_mm)
@@ -288,18 +232,9 @@ class World:
     def of_primaries(self, rgb: ArrayLike, points_mm: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return what printed codes at points of a clean flat print give under each primary alone, at full drive.
 
-        Parameters
-        ----------
-        rgb
-            (N, 3) float or int codes 0 … 255.
-        points_mm
-            (N, 2) float64.
-
-        Returns
-        -------
-        ndarray
-            (N, 3, 3) float64, DN above black at the reference exposure, [point, channel, primary], where nothing is
-            blurred. Its product with `drive` is `seen`, without stain and fold.
+        `rgb`: (N, 3) float or int codes 0 … 255. `points_mm`: (N, 2) float64. Returns (N, 3, 3) float64, DN above black
+        at the reference exposure, [point, channel, primary], where nothing is blurred. Its product with `drive` is
+        `seen`, without stain and fold.
         """
         return self._signals(self._reflectance(rgb)) * self.field(points_mm)[:, None]
 
@@ -333,15 +268,8 @@ class World:
     def worn(self, points_mm: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return what stain and fold leave of the light of a clean flat print.
 
-        Parameters
-        ----------
-        points_mm
-            (..., 2) float64.
-
-        Returns
-        -------
-        ndarray
-            (..., 3) float64 for red, green and blue of the camera; 1 where the print is clean and flat.
+        `points_mm`: (..., 2) float64. Returns (..., 3) float64 for red, green and blue of the camera; 1 where the print
+        is clean and flat.
         """
         points = np.asarray(points_mm, dtype=np.float64)
         left = np.ones((*points.shape[:-1], 3))
@@ -354,18 +282,10 @@ class World:
     def field(self, points_mm: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the light at points of the print: lens vignetting times the projector's falloff.
 
-        Parameters
-        ----------
-        points_mm
-            (..., 2) float64.
-
-        Returns
-        -------
-        ndarray
-            (..., 3) float64, for each primary of the projector (red, green, blue). The lens is 1 on its axis and green
-            1 at its brightest point; red and blue are balanced so that the three have one mean over the sheet. So
-            `white` has the chromaticity of the light that the sheet receives on the whole. A camera channel sees the
-            mean of the three weighted by what it receives of each.
+        `points_mm`: (..., 2) float64. Returns (..., 3) float64, for each primary of the projector (red, green, blue).
+        The lens is 1 on its axis and green 1 at its brightest point; red and blue are balanced so that the three have
+        one mean over the sheet. So `white` has the chromaticity of the light that the sheet receives on the whole. A
+        camera channel sees the mean of the three weighted by what it receives of each.
         """
         points = np.asarray(points_mm, dtype=np.float64)
         photosites = 2 * self.project(points) + 0.5

@@ -1,27 +1,5 @@
-"""What the tests of the acquisition share: the paper's chart and lights, made once, and a small chart."""
+"""The charts and lights of the experiment's tests are the acquisition's as well."""
 
-from __future__ import annotations
+from tests.experiment.conftest import a0, a7, plan
 
-import pytest
-
-from acquisition.chart.layout import design_chart
-from acquisition.chart.model import Chart
-from acquisition.lights.illuminations import Illumination, plan_illuminations
-
-
-@pytest.fixture(scope="session")
-def plan() -> tuple[Illumination, ...]:
-    """Plan the 707 lights once: colour-science takes seconds to import."""
-    return plan_illuminations()
-
-
-@pytest.fixture(scope="session")
-def a0() -> Chart:
-    """Design the paper's chart: 32 768 colours on A0."""
-    return design_chart()
-
-
-@pytest.fixture(scope="session")
-def a7() -> Chart:
-    """Design a chart of 64 colours on A7."""
-    return design_chart(2)
+__all__ = ["a0", "a7", "plan"]

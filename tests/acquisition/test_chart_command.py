@@ -10,9 +10,11 @@ import pytest
 import tifffile
 from pyapriltags import Detector
 
-from acquisition.chart.layout import design_chart
-from acquisition.chart.model import load_chart
 from acquisition.cli import main
+from experiment.chart.layout import design_chart
+from experiment.chart.model import load_chart
+
+pytestmark = pytest.mark.slow
 
 Run = Callable[..., int]
 

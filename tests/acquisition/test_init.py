@@ -6,10 +6,10 @@ from pathlib import Path
 
 import pytest
 
-from acquisition.chart.layout import design_chart
 from acquisition.cli import main
-from acquisition.config import load_lab
-from acquisition.lights.illuminations import load_illuminations, plan_illuminations, save_illuminations
+from experiment.chart.layout import design_chart
+from experiment.config import load_lab
+from experiment.lights.illuminations import load_illuminations, plan_illuminations, save_illuminations
 
 
 def begun(folder: Path) -> Path:

@@ -11,14 +11,14 @@ from pathlib import Path
 import pytest
 
 from acquisition.cli import main
-from acquisition.session.judgement import Check
+from experiment.session.judgement import Check
 from tests.acquisition.monitor.made_up import MadeUpRun
 
 ENDED = """
 import sys
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
-from acquisition.session.journal import Journal
+from experiment.session.journal import Journal
 journal = Journal.open_for_run(Path(sys.argv[1]) / "journal.sqlite")
 journal.beat("running", "taking frames", datetime.now(UTC) + timedelta(hours=1))
 """

@@ -6,7 +6,7 @@ from collections.abc import Generator
 
 import pytest
 
-from acquisition.session.folder import Session
+from experiment.session.folder import Session
 from tests.calibration.lab import LIGHTS, Lab, hang, take
 
 

@@ -12,17 +12,17 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from acquisition.chart.layout import A_SERIES_MM, design_chart
-from acquisition.chart.model import Chart
-from acquisition.chart.printing import drawing
-from acquisition.lights.illuminations import Illumination, plan_illuminations
-from acquisition.session.folder import Session
-from acquisition.session.plan import SessionStep
-from acquisition.session.records import ACCEPTED
 from benchmarks.sessions import record_session
 from drivers.camera import ExposureSettings
 from drivers.presenter import WHITE, Colour
 from drivers.raw.rawfile import Mosaic, read_raw
+from experiment.chart.layout import A_SERIES_MM, design_chart
+from experiment.chart.model import Chart
+from experiment.chart.printing import drawing
+from experiment.lights.illuminations import Illumination, plan_illuminations
+from experiment.session.folder import Session
+from experiment.session.plan import SessionStep
+from experiment.session.records import ACCEPTED
 from sim.camera.dng import write_dng
 from sim.world.drawing import Print
 from sim.world.room import Room

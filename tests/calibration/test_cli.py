@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from acquisition.session.folder import Session
 from calibration.cli import main
 from calibration.pipeline.build import build
+from experiment.session.folder import Session
 from tests.calibration.lab import LIGHTS
 
 VERSION_1 = Path(__file__).parent / "table" / "table_v1"

@@ -9,9 +9,9 @@ from pathlib import Path
 
 import pytest
 
-from acquisition.chart.layout import design_chart
-from acquisition.lights.illuminations import Illumination, save_illuminations
 from drivers.presenter import Colour
+from experiment.chart.layout import design_chart
+from experiment.lights.illuminations import Illumination, save_illuminations
 
 LIGHTS = (
     Illumination(0, "uniform", None, Colour(255, 0, 0)),

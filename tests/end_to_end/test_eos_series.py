@@ -24,6 +24,8 @@ from sim.camera.eos_bodies import EOS_550D
 from tests.contracts.camera import SETTINGS
 from tests.drivers.canon.eos_lab import Lab
 
+pytestmark = pytest.mark.slow
+
 FRAMES = 707
 ATTEMPTS = 6
 """Tries at a frame; the sequencer's default is three, in a better lab."""

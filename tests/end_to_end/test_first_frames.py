@@ -11,12 +11,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from acquisition.chart.layout import design_chart
-from acquisition.config import load_lab
-from acquisition.lights.illuminations import plan_illuminations, save_illuminations
 from acquisition.run.run import run_session
-from acquisition.session.folder import Session
-from acquisition.session.records import ACCEPTED, Attempt
+from experiment.chart.layout import design_chart
+from experiment.config import load_lab
+from experiment.lights.illuminations import plan_illuminations, save_illuminations
+from experiment.session.folder import Session
+from experiment.session.records import ACCEPTED, Attempt
 from foundation.errors import InputError, QualityError
 
 pytestmark = pytest.mark.slow

@@ -9,6 +9,8 @@ import pytest
 from tests.fuzz.foreign.seeds import Seed, make_seeds
 from tests.fuzz.foreign.trial import READERS, Trials
 
+pytestmark = pytest.mark.slow
+
 COUNT = 40
 """Mutated folders of each kind: some seconds; what they found once stands in KNOWN."""
 

@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from acquisition.session.plan import SessionStep
 from benchmarks.cases import BY_NAME, CASES, FAILURES, Outcome, chart_of, outcome_of, try_case
 from benchmarks.rooms import calm_case, is_silent, natural_vignetting, random_case
 from benchmarks.sessions import (
@@ -25,10 +24,13 @@ from benchmarks.sessions import (
 from calibration.pipeline.build import build
 from calibration.table.lut import open_lut
 from drivers.raw.rawfile import read_raw
+from experiment.session.plan import SessionStep
 from sim.world.room import Room
 from sim.world.sensors import BODIES
 from sim.world.situation import Blob, Glare, Situation
 from sim.world.world import World
+
+pytestmark = pytest.mark.slow
 
 
 @pytest.fixture(scope="module")

@@ -38,6 +38,8 @@ from sim.world.room import Room
 from sim.world.sensors import BODIES
 from sim.world.world import World
 
+pytestmark = pytest.mark.slow
+
 SIM = [sys.executable, "-c", "from sim.cli import main; raise SystemExit(main())"]
 LIMIT_S = 60
 

@@ -20,6 +20,8 @@ import pytest
 from tests.house.test_documented_commands import FOUND
 from tests.house_commands import COMMANDS
 
+pytestmark = pytest.mark.slow
+
 HOW_TO = "docs/how-to/"
 ELSEWHERE = {"rehearsal.md"}
 """Pages whose commands have a test of their own."""

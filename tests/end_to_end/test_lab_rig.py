@@ -18,17 +18,17 @@ from types import ModuleType
 import numpy as np
 import pytest
 
-from acquisition.chart.model import load_chart
 from acquisition.cli import main
-from acquisition.config import load_lab
 from acquisition.run.rig.opening import open_rig
 from acquisition.run.rig.simulated import sheet, simulated_body, simulated_room
 from acquisition.run.run import run_session
-from acquisition.session.folder import Session
 from drivers.links.usb import open_usb
 from drivers.presenter import Colour
 from drivers.projector import Power
 from drivers.raw.rawfile import read_raw
+from experiment.chart.model import load_chart
+from experiment.config import load_lab
+from experiment.session.folder import Session
 from foundation.clock import Clock, SystemClock
 from sim.buses.ptpip_server import serve_ptpip
 from sim.buses.pty import PseudoTerminal
@@ -45,6 +45,8 @@ from sim.projectors.screen import Screen, SimulatedPresenter
 from sim.projectors.serial import PEERS, BenqPeer, EpsonPeer
 from sim.world.world import World
 from tests.found_texts import files_with
+
+pytestmark = pytest.mark.slow
 
 FRAMES = 10
 PASSWORD = "pj-5ecret-word"

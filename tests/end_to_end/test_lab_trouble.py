@@ -37,6 +37,8 @@ from sim.projectors.screen import Screen, SimulatedPresenter
 from sim.projectors.serial import EpsonPeer
 from tests.contracts.camera import SeededFilm
 
+pytestmark = pytest.mark.slow
+
 DESK = Display(1, "DP-1", 0, 0, 2560, 1440, 60)
 BEAMER = Display(2, "HDMI-1", 2560, 0, 1920, 1080, 60)
 TWIN = Display(3, "HDMI-1", 4480, 0, 1920, 1080, 60)

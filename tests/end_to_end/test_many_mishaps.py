@@ -8,7 +8,11 @@ from __future__ import annotations
 from collections import Counter
 from pathlib import Path
 
+import pytest
+
 from tests.acquisition.run.mishaps import MISHAPS, TroubledLab, take_all
+
+pytestmark = pytest.mark.slow
 
 SEEDS = range(10, 60)
 

@@ -8,6 +8,9 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import pytest
+
+pytestmark = pytest.mark.slow
 
 WARNING = "this file system has no locks; see to it that no other program works there"
 COMMAND = """

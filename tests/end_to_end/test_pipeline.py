@@ -13,14 +13,16 @@ import cv2
 import numpy as np
 import pytest
 
-from acquisition.chart.model import load_chart
-from acquisition.config import load_lab
-from acquisition.lights.illuminations import load_illuminations
 from acquisition.run.rig.simulated import sheet, simulated_body, simulated_room
-from acquisition.session.folder import Session
 from calibration.table.lut import Lut, open_lut
+from experiment.chart.model import load_chart
+from experiment.config import load_lab
+from experiment.lights.illuminations import load_illuminations
+from experiment.session.folder import Session
 from foundation.errors import FormatError
 from sim.world.world import World
+
+pytestmark = pytest.mark.slow
 
 Run = Callable[..., int]
 

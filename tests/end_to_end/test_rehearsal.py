@@ -21,12 +21,15 @@ from typing import Any
 
 import pytest
 
-from acquisition.session.folder import Session
 from drivers.links.tcp import TcpLink
 from drivers.pjlink.projector import PjLinkProjector
+from experiment.session.folder import Session
 from tests.drivers.display.x_servers import notification, two_outputs, virtual_screen
 
-pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="the screen is an X server's")
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(sys.platform != "linux", reason="the screen is an X server's"),
+]
 
 HOW_TO = (Path(__file__).parents[2] / "docs" / "how-to" / "rehearsal.md").read_text(encoding="utf-8")
 SIZE = "320x240"

@@ -9,14 +9,16 @@ from pathlib import Path
 
 import pytest
 
-from acquisition.chart.model import Chart, load_chart
-from acquisition.config import load_lab
-from acquisition.lights.illuminations import Illumination, load_illuminations
 from acquisition.monitor.server import open_monitor
 from acquisition.run.run import run_session
-from acquisition.session.folder import Session
-from acquisition.session.mending.redaction import held_secrets
+from experiment.chart.model import Chart, load_chart
+from experiment.config import load_lab
+from experiment.lights.illuminations import Illumination, load_illuminations
+from experiment.session.folder import Session
+from experiment.session.mending.redaction import held_secrets
 from tests.found_texts import files_with
+
+pytestmark = pytest.mark.slow
 
 PASSWORD = "pj-5ecret-word"
 TOKEN = "ntfy-t0ken-path"

@@ -13,12 +13,14 @@ from typing import Any
 import pytest
 
 from acquisition.cli import main
-from acquisition.config import load_lab
 from acquisition.run import run as runs
 from acquisition.run.run import run_session
-from acquisition.session.folder import Session
-from acquisition.session.journal import Journal
+from experiment.config import load_lab
+from experiment.session.folder import Session
+from experiment.session.journal import Journal
 from foundation.errors import InputError, StorageError
+
+pytestmark = pytest.mark.slow
 
 Hashes = Callable[[Path], dict[tuple[str, str], list[str]]]
 

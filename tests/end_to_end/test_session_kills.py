@@ -11,7 +11,10 @@ from benchmarks.session_kills import KilledSessions
 
 KILLS = 100
 
-pytestmark = pytest.mark.skipif(not hasattr(os, "fork"), reason="a run is killed in a process of its own")
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(not hasattr(os, "fork"), reason="a run is killed in a process of its own"),
+]
 
 
 def test_killed_sessions_end_in_the_same_frames(tmp_path: Path) -> None:

@@ -16,27 +16,29 @@ from typing import Any
 import pytest
 
 from acquisition.cli import main
-from acquisition.config import load_lab
 from acquisition.run.run import run_session
-from acquisition.session.folder import Session
 from drivers.canon.camera import CanonEos
 from drivers.pjlink.projector import PjLinkProjector
 from drivers.raw.rawfile import read_raw
+from experiment.config import load_lab
+from experiment.session.folder import Session
 from foundation.errors import StorageError
+
+pytestmark = pytest.mark.slow
 
 Hashes = Callable[[Path], dict[tuple[str, str], list[str]]]
 
 KILLER = """
 import os, signal, sys
 from acquisition.cli import main
-import acquisition.session.folder, acquisition.session.journal, foundation.files
+import experiment.session.folder, experiment.session.journal, foundation.files
 
 place, count = sys.argv[1], int(sys.argv[2])
 owner, name = {
     "renaming": (foundation.files.Path, "replace"),
-    "committing": (acquisition.session.folder.Session, "commit"),
-    "deriving": (acquisition.session.folder.Session, "write_frames_csv"),
-    "beginning": (acquisition.session.journal.Journal, "begin"),
+    "committing": (experiment.session.folder.Session, "commit"),
+    "deriving": (experiment.session.folder.Session, "write_frames_csv"),
+    "beginning": (experiment.session.journal.Journal, "begin"),
 }[place]
 real = getattr(owner, name)
 
@@ -301,9 +303,9 @@ def test_a_replay_with_another_exposure_is_told_the_recordings(lab: Path, capsys
 
 
 def test_a_series_longer_than_a_battery_lasts(lab: Path) -> None:
-    from acquisition.chart.model import load_chart
     from acquisition.run.rig.opening import open_rig
     from drivers.camera import capture
+    from experiment.chart.model import load_chart
 
     settings = load_lab(lab)
     with open_rig(settings, load_chart(settings.chart)) as devices:

@@ -14,8 +14,6 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from acquisition.session.folder import Session
-from acquisition.session.plan import SessionStep
 from benchmarks.accuracy import TableErrors, beyond_noise, repeated_variance, table_errors
 from benchmarks.rooms import random_case
 from calibration.pipeline.build import build
@@ -23,10 +21,14 @@ from calibration.table.lut import open_lut
 from calibration.verdict.result import BuildResult
 from drivers.camera import ExposureSettings
 from drivers.presenter import WHITE, Colour
+from experiment.session.folder import Session
+from experiment.session.plan import SessionStep
 from foundation.angles import angles_deg
 from foundation.errors import CropError, QualityError
 from sim.world.room import Room
 from tests.calibration.lab import LIGHTS, SETTINGS, Lab, hang, renumbered, take
+
+pytestmark = pytest.mark.slow
 
 FEW = renumbered([LIGHTS[4], LIGHTS[5], LIGHTS[0]])
 WRONG = 0.02

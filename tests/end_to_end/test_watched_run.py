@@ -7,9 +7,13 @@ import sys
 import time
 from pathlib import Path
 
+import pytest
+
 from acquisition.cli import main
 from acquisition.monitor.head import Head
 from acquisition.monitor.watching import SessionWatch
+
+pytestmark = pytest.mark.slow
 
 LIMIT_S = 120.0
 """How long a frame of the simulated lab may take on a machine that does other things."""

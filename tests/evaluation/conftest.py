@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from acquisition.lights.illuminations import Illumination
 from calibration.table.lut import open_lut
 from calibration.table.provenance import Provenance
 from calibration.table.writer import LutWriter
 from drivers.presenter import Colour
+from experiment.lights.illuminations import Illumination
 from generator.dataset.making import DatasetOptions, generate_dataset
 from generator.pictures.sources import random_scenes
 from tests.evaluation.real_images import Collection, collections

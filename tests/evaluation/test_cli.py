@@ -13,6 +13,8 @@ from evaluation.cli import main
 from evaluation.experiments import run_folder
 from evaluation.methods import standard_methods
 
+pytestmark = pytest.mark.slow
+
 
 def test_a_dataset_on_a_store(dataset: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main([str(dataset), "--methods", "white-patch"]) == 0

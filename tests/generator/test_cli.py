@@ -16,6 +16,8 @@ from generator.cli import main
 from generator.dataset import contact_sheet as contact
 from generator.dataset.reader import open_dataset
 
+pytestmark = pytest.mark.slow
+
 if TYPE_CHECKING:
     from collections.abc import Callable
 

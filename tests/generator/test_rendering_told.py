@@ -13,6 +13,8 @@ from generator.command.rendering_told import matrix_sentence
 from generator.rendering.matrices import SOURCE, camera_matrix
 from tests.generator.conftest import MakeLut
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture
 def place(make_lut: MakeLut, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:

@@ -15,7 +15,9 @@ from typer.main import get_command
 
 from tests.house_commands import COMMANDS
 
-ROOMS = ("drivers", "sim", "acquisition", "calibration", "synthesis", "generator", "evaluation")
+pytestmark = pytest.mark.slow
+
+ROOMS = ("drivers", "sim", "experiment", "calibration", "acquisition", "synthesis", "generator", "evaluation")
 HEAVY = (
     *("numba", "matplotlib", "colour", "rawpy", "cv2", "scipy", "tifffile", "OpenImageIO"),
     *("distributed", "pyarrow", "torch", "zarr"),

@@ -16,7 +16,17 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[2]
-PACKAGES = ("foundation", "drivers", "sim", "acquisition", "calibration", "synthesis", "generator", "evaluation")
+PACKAGES = (
+    "foundation",
+    "drivers",
+    "sim",
+    "experiment",
+    "calibration",
+    "acquisition",
+    "synthesis",
+    "generator",
+    "evaluation",
+)
 
 Function = ast.FunctionDef | ast.AsyncFunctionDef
 

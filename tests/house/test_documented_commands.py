@@ -18,9 +18,9 @@ from typing import Any
 import pytest
 from typer.main import get_command
 
-from acquisition.config import load_lab
-from acquisition.lights.illuminations import plan_illuminations
 from acquisition.run.planning.work import planned_steps
+from experiment.config import load_lab
+from experiment.lights.illuminations import plan_illuminations
 from tests.house_commands import COMMANDS
 
 ROOT = Path(__file__).parents[2]

@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 from typer.main import get_command
 
-from acquisition.config import LabSettings, load_lab
+from experiment.config import LabSettings, load_lab
 
 ROOMS = ("acquisition", "calibration", "generator", "evaluation", "synthesis")
 COLOUR = re.compile(r"\x1b\[(?:\d+;)*(?:3[0-7]|4[0-7]|9[0-7]|10[0-7])(?:;\d+)*m")

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from acquisition.lights.illuminations import load_illuminations
 from calibration.table.lut import Lut, open_lut
 from calibration.table.verification import find_faults
 from evaluation.datasets.generated import open_generated
+from experiment.lights.illuminations import load_illuminations
 from foundation.errors import FormatError, InputError
 from generator.cli import main as generate
 from generator.lights.choices import parse_light
@@ -23,6 +23,8 @@ from synthesis.light_spectra import LightSpectra, read_lights
 from synthesis.settings import parse_settings
 from synthesis.table import compute_table
 from synthesis.tasks import table_task
+
+pytestmark = pytest.mark.slow
 
 CAMERA = "Canon_EOS_5D_Mark_II"
 SMALL = parse_settings({"chart": {"bits": 2}}, "here")

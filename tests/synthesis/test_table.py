@@ -13,10 +13,10 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from acquisition.lights.illuminations import plan_illuminations
 from calibration.pipeline.build import build
 from calibration.table.lut import Lut, open_lut
 from calibration.table.verification import find_faults
+from experiment.lights.illuminations import plan_illuminations
 from foundation.errors import InputError, QualityError, StorageError
 from sim.world.room import Room
 from sim.world.sensors import BODIES
@@ -24,6 +24,8 @@ from synthesis.settings import TableSettings, parse_settings
 from synthesis.table import TableTask, compute_table
 from synthesis.tasks import table_task
 from tests.calibration.lab import LIGHTS, SETTINGS, designed, hang, take
+
+pytestmark = pytest.mark.slow
 
 ROOM = Room(waviness_mm=0.5, vignetting=0.08, projector_falloff=0.05)
 """A small page has large cells, across which light that falls off as in the default room has a slope of its own."""

@@ -13,18 +13,18 @@ from dataclasses import dataclass, field
 import numpy as np
 import numpy.typing as npt
 
-from acquisition.chart.model import Chart
 from acquisition.check.looking import PlacedChart, mean_levels, points_of
 from acquisition.check.places import Levels
 from acquisition.check.taking import Shot
-from acquisition.framing.planes import frame_black
-from acquisition.framing.sharpness import blur_px
-from acquisition.lights.illuminations import Illumination
-from acquisition.limits.bleed import bleed
-from acquisition.limits.table import ONLY_OF_A_SESSION, TABLE_LIMITS, TableOutcome
-from acquisition.measures.paper import Paper, PaperReader
-from acquisition.measures.reflections import added_light
-from acquisition.measures.stains import Stains, find_stains
+from experiment.chart.model import Chart
+from experiment.framing.planes import frame_black
+from experiment.framing.sharpness import blur_px
+from experiment.lights.illuminations import Illumination
+from experiment.limits.bleed import bleed
+from experiment.limits.table import ONLY_OF_A_SESSION, TABLE_LIMITS, TableOutcome
+from experiment.measures.paper import Paper, PaperReader
+from experiment.measures.reflections import added_light
+from experiment.measures.stains import Stains, find_stains
 from foundation.angles import angles_deg
 from foundation.errors import QualityError
 from foundation.srgb import decode_srgb
@@ -40,12 +40,8 @@ OUTCOMES: tuple[TableOutcome, ...] = ("accept", "accept with remarks", "refuse")
 class ForetoldTable:
     """What can be said of a table before its session.
 
-    Attributes
-    ----------
-    figures
-        By their names in `report.json`, in the units of `acquisition.limits.table`.
-    causes
-        Share of the cells that would be unfit, by cause: ``outside``, ``clipped``, ``stained``.
+    - `figures`: by their names in `report.json`, in the units of `experiment.limits.table`.
+    - `causes`: share of the cells that would be unfit, by cause: ``outside``, ``clipped``, ``stained``.
     """
 
     figures: Mapping[str, float] = field(default_factory=dict[str, float])
@@ -72,14 +68,8 @@ def foretell(
 ) -> ForetoldTable:
     """Return the figures that white frames, and a dark one, show of a table.
 
-    Parameters
-    ----------
-    chart, placed
-        The chart, and where it lies.
-    whites, dark
-        Frames of one exposure; None where there is no dark one.
-    saturation
-        Raw count at which the sensor saturates.
+    `whites`, `dark`: frames of one exposure; None where there is no dark one. `saturation`: raw count at which the
+    sensor saturates.
     """
     framing = placed.framing
     levels = mean_levels(whites, placed, points_of(chart), saturation)
@@ -124,14 +114,7 @@ def foretell_lights(
 ) -> dict[str, float]:
     """Return the darkest light of a plan, as its primaries and sRGB's curve foretell it.
 
-    Parameters
-    ----------
-    lights
-        The plan's.
-    primaries
-        (3,) counts above black of paper under "red", "green", "blue" and "black", at one exposure.
-    exposure_ratio
-        The session's exposure over that one.
+    `primaries`: (3,) counts above black of paper under "red", "green", "blue" and "black", at one exposure.
     """
     if not lights:
         return {}

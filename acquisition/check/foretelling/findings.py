@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from acquisition.chart.model import Chart
 from acquisition.check.findings import LIMITS, Finding, judged, not_checked, percent
 from acquisition.check.foretelling.figures import ForetoldTable
 from acquisition.check.light import no_light
+from experiment.chart.model import Chart
 
 _HELPS = {
     "outside": "bring all of the chart into the picture",
@@ -18,14 +18,7 @@ _HELPS = {
 def foretold_findings(table: ForetoldTable, chart: Chart, why_not: str = "") -> list[Finding]:
     """Return the findings on the figures of a table that no other finding judges.
 
-    Parameters
-    ----------
-    table
-        What frames show of it.
-    chart
-        The chart.
-    why_not
-        Why the frames show nothing; "" where they do.
+    `why_not`: why the frames show nothing; "" where they do.
     """
     return [_references(table, chart, why_not), _unfit(table, why_not), _tint(table, why_not), _darkest(table, why_not)]
 

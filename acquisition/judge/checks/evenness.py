@@ -11,7 +11,7 @@ from acquisition.judge import limits
 from acquisition.judge.known.basis import Basis, FrameLight, Residuals
 from acquisition.judge.known.knowledge import Seen
 from acquisition.judge.measured.measuring import SEGMENTS, TILE_COLUMNS, TILE_ROWS, Measured
-from acquisition.session.judgement import Check
+from experiment.session.judgement import Check
 from foundation.robust import sigma_of
 
 _DARKER = -0.1
@@ -64,14 +64,8 @@ def judge_evenness(
 ) -> Evenness:
     """Return whether a lit frame shows one light everywhere.
 
-    Parameters
-    ----------
-    basis, light, frame
-        The frame, and its light as it is fitted to all of it.
-    moved_px
-        (2,) how far the chart lies from its place in the basis.
-    before
-        The frame before, whose light may still be seen in a part; None where there is none.
+    `moved_px`: (2,) how far the chart lies from its place in the basis. `before`: the frame before, whose light may
+    still be seen in a part; None where there is none.
     """
     rest = light.tiles
     systematic = limits.UNEVEN if basis.of_primaries else limits.UNEVEN_WHITE

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 
-from acquisition.config import LabSettings
 from acquisition.judge import limits
 from acquisition.judge.exposure import Exposure, disagreement, refusal
 from acquisition.judge.known.knowledge import Knowledge
 from acquisition.judge.measured.measuring import Measured
-from acquisition.session.judgement import Check
-from acquisition.session.plan import SessionStep
 from drivers.raw.rawfile import Mosaic
+from experiment.config import LabSettings
+from experiment.session.judgement import Check
+from experiment.session.plan import SessionStep
 
 
 def judge_file(

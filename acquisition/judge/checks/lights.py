@@ -17,8 +17,8 @@ from acquisition.judge import limits
 from acquisition.judge.known.basis import FrameLight
 from acquisition.judge.known.knowledge import Knowledge, Leaning, Seen, combined
 from acquisition.judge.known.response import Codes, Fit, ProjectorModel
-from acquisition.session.judgement import Check
-from acquisition.session.plan import SessionStep
+from experiment.session.judgement import Check
+from experiment.session.plan import SessionStep
 from foundation.angles import angles_deg
 from foundation.srgb import decode_srgb
 
@@ -49,21 +49,7 @@ def judge_light(
     angle_deg: float,
     drift_percent: float,
 ) -> LightVerdict:
-    """Return whether a lit frame shows what its step asks for.
-
-    Parameters
-    ----------
-    known
-        Before this frame, with a basis.
-    light
-        The frame's.
-    plan
-        Codes of all lights of the plan, among which another one is looked for.
-    angle_deg
-        Angle that the light may always be off by (`[judge] light_deg`).
-    drift_percent
-        Change of brightness that is always allowed (`[judge] drift_percent`).
-    """
+    """Return whether a lit frame shows what its step asks for."""
     codes = step.colour.codes
     before = known.recent[-1] if known.recent else None
     if not known.modelled:
@@ -101,12 +87,7 @@ def judge_light(
 def crept(leaning: Leaning, drift: float) -> tuple[str, float]:
     """Return the reason against the lamp, or how much light is added, of white, that the last lights together show.
 
-    Parameters
-    ----------
-    leaning
-        By how much the lights were off, the newest first; each alone is too little to be told.
-    drift
-        Change of brightness that is always allowed, 0 … 1.
+    `drift`: change of brightness that is always allowed, 0 … 1.
     """
     for count in range(2, len(leaning.lamp) + 1):
         added, sd = combined(leaning.added[:count])

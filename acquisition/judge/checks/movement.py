@@ -5,15 +5,15 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from acquisition.config import JudgeSettings
-from acquisition.framing.planes import CHANNELS, Channel
 from acquisition.judge import limits
 from acquisition.judge.known.knowledge import Knowledge
 from acquisition.judge.measured.anchor import Anchor
 from acquisition.judge.measured.frame import Frame
 from acquisition.judge.measured.measuring import Measured
-from acquisition.session.judgement import Check
 from drivers.raw.rawfile import Mosaic
+from experiment.config import JudgeSettings
+from experiment.framing.planes import CHANNELS, Channel
+from experiment.session.judgement import Check
 
 UNTOLD_PX: npt.NDArray[np.float64] = np.full(2, np.nan)
 """Place of a chart in a frame that is too dark to tell."""
@@ -51,21 +51,8 @@ def judge_movement(
 ) -> tuple[list[Check], npt.NDArray[np.float64]]:
     """Return whether the chart has moved or is softer than in the anchor's frame, and where it lies from there.
 
-    Parameters
-    ----------
-    known, anchor
-        What it is held against.
-    mosaic, black, frame
-        The frame, its black level (2, 2) float64 counts, and what was measured of it.
-    judge
-        The limits.
-
-    Returns
-    -------
-    list of Check
-        Movement and blur.
-    numpy.ndarray
-        (2,) float64 px right and down from the anchor's frame; NaN where that is not told.
+    `mosaic`, `black`, `frame`: the frame, its black level (2, 2) float64 counts, and what was measured of it. Returns
+    (2,) float64 px right and down from the anchor's frame; NaN where that is not told.
     """
     channel, _ = best_channel(frame.measured)
     paper = _paper_in(frame, channel)

@@ -8,15 +8,15 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from acquisition.config import JudgeSettings
 from acquisition.judge import limits
 from acquisition.judge.checks.lights import same_light
 from acquisition.judge.known.basis import BLACK_DN
 from acquisition.judge.known.knowledge import Knowledge
 from acquisition.judge.measured.frame import Frame
 from acquisition.judge.measured.measuring import TILE_COLUMNS, TILE_ROWS, Measured
-from acquisition.session.judgement import Check
-from acquisition.session.plan import SessionStep
+from experiment.config import JudgeSettings
+from experiment.session.judgement import Check
+from experiment.session.plan import SessionStep
 
 _SIGMAS = 6.0
 """Standard deviations of a mean's noise that no change is made of."""
@@ -139,14 +139,7 @@ def judge_first_frames(known: Knowledge, step: SessionStep, cause: Check | None,
     What they show is learnt, and only later frames tell that one of them was the odd one: a step whose frame is refused
     twice contradicts them, and before the first light white is held against what all others foretell.
 
-    Parameters
-    ----------
-    known
-        Before the frame of this step, everything learnt from the others.
-    cause
-        The check that refuses the frame; None where it is accepted.
-    judge
-        What is always allowed.
+    `cause`: the check that refuses the frame; None where it is accepted.
     """
     if not known.founding or all(not any(one.codes) for one in known.first_frames):
         return None

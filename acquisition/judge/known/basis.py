@@ -45,14 +45,10 @@ _Array = npt.NDArray[np.float64]
 class Residuals:
     """What a fit of the light leaves at tiles or strips.
 
-    Attributes
-    ----------
-    relative
-        (N,) float64, length of the deviation (R, G, B) over that of the signal expected; NaN where nothing is lit.
-    noise
-        (N,) float64, its standard deviation by noise alone.
-    signed
-        (N,) float64, relative deviation of the sum of the channels: negative where it is too dark.
+    - `relative`: (N,) float64, length of the deviation (R, G, B) over that of the signal expected; NaN where nothing is
+      lit.
+    - `noise`: (N,) float64, its standard deviation by noise alone.
+    - `signed`: (N,) float64, relative deviation of the sum of the channels: negative where it is too dark.
     """
 
     relative: _Array
@@ -73,18 +69,12 @@ class FrameLight:
 class Basis:
     """The pictures that a frame is a sum of.
 
-    Attributes
-    ----------
-    dark
-        (T, 3) float64, counts above black where the projector shows black.
-    maps
-        (3, T, 3) float64, what each primary adds, of channel R, G, B.
-    dark_strips, strip_maps
-        (S, 3) and (3, S, 3), likewise of the strips; None where they are not known.
-    of_primaries
-        Whether the maps are of the projector's primaries; else of the camera's colours under white.
-    spread, strip_spread
-        (4, T, 3) and (4, S, 3), variance of the darkness and of each map by noise: in dim light as much as the frame's.
+    - `dark`: (T, 3) float64, counts above black where the projector shows black.
+    - `maps`: (3, T, 3) float64, what each primary adds, of channel R, G, B.
+    - `dark_strips`, `strip_maps`: (S, 3) and (3, S, 3), likewise of the strips; None where they are not known.
+    - `of_primaries`: whether the maps are of the projector's primaries; else of the camera's colours under white.
+    - `spread`, `strip_spread`: (4, T, 3) and (4, S, 3), variance of the darkness and of each map by noise: in dim light
+      as much as the frame's.
     """
 
     dark: _Array

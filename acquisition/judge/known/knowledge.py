@@ -23,7 +23,7 @@ from acquisition.judge.known.response import Codes, ProjectorModel
 from acquisition.judge.measured.anchor import Anchor
 from acquisition.judge.measured.frame import Frame
 from acquisition.judge.measured.measuring import Measured
-from acquisition.session.plan import PRIMARIES, REFERENCES, TOP, SessionStep
+from experiment.session.plan import PRIMARIES, REFERENCES, TOP, SessionStep
 
 RECENT = 6
 """Frames whose noise is compared with the next one's: a camera's memory card hands out none older."""
@@ -51,11 +51,8 @@ class Seen:
 class Leaning:
     """By how much lights were off that were accepted: deviations too small for one frame show in two or three.
 
-    Attributes
-    ----------
-    lamp, added
-        Level of the lamp over the one expected (logarithm), and neutral light added (of white), of the newest frame
-        first, each with its standard deviation; at most `LEANING` frames.
+    `lamp`, `added`: level of the lamp over the one expected (logarithm), and neutral light added (of white), of the
+    newest frame first, each with its standard deviation; at most `LEANING` frames.
     """
 
     lamp: tuple[tuple[float, float], ...] = ()
@@ -79,22 +76,13 @@ def combined(values: Sequence[tuple[float, float]]) -> tuple[float, float]:
 class Examined:
     """What was found of a frame, and said of it.
 
-    Attributes
-    ----------
-    frame
-        What was measured.
-    light
-        Its light, where a basis is known.
-    accepted
-        Whether it may be used.
-    cause
-        Name of the check that refused it; empty if none did.
-    brightness
-        Level of the lamp over the one expected (logarithm); NaN where that is not known.
-    stepped
-        Whether it was accepted at another level of the lamp than expected.
-    leaning
-        How its light was off, however little.
+    - `frame`: what was measured.
+    - `light`: its light, where a basis is known.
+    - `accepted`: whether it may be used.
+    - `cause`: name of the check that refused it; empty if none did.
+    - `brightness`: level of the lamp over the one expected (logarithm); NaN where that is not known.
+    - `stepped`: whether it was accepted at another level of the lamp than expected.
+    - `leaning`: how its light was off, however little.
     """
 
     frame: Frame
@@ -110,56 +98,31 @@ class Examined:
 class Knowledge:
     """All that is known.
 
-    Attributes
-    ----------
-    anchor
-        The chart's place.
-    first
-        The session's first accepted frame: camera, size, serial number.
-    first_white, white, first_dark, dark
-        Accepted references.
-    first_grey
-        The first frame of the brightest grey, whose paper that of a run taken up again is held against.
-    primaries
-        Frames of the three primaries at `acquisition.session.plan.TOP`.
-    basis, model
-        How a frame is a sum of primaries, and which amounts codes give.
-    moved_px
-        (2,) where the chart lies at rest, from its place in the anchor: (0, 0), or where a bump has left it.
-    recent
-        The last frames, the newest last.
-    digests
-        Of all frames.
-    untold
-        Names of checks that some accepted frame since the last good reference was too dark for.
-    refused
-        Cause, and number, of the refusals in a row.
-    leaning
-        By how much the last lights were off.
-    candidate
-        Level of the lamp (logarithm) and place of the chart (px) of the frame refused last; NaN where it was not that.
-    rested
-        Whether the run was taken up again and no lit frame has been accepted since.
-    moved_on
-        Whether the chart lies elsewhere than in the white frame that is known.
-    asked
-        Whether this run has shown a primary alone, whatever the frame was like.
-    witness
-        The newest white or grey frame from before the primaries were known, by which they are held against it.
-    lost
-        Whether a reference of an earlier run is accepted and its measurement cannot be read.
-    founding
-        Whether no light was accepted yet in this session, or since the run was taken up again or paused.
-    first_frames
-        Frames that were accepted meanwhile.
-    doubted
-        Numbers of the steps whose frames these contradicted once.
-    restarts
-        How often these were taken again for that.
-    begun_with
-        Number of the step of the first of them; None before it.
-    expected
-        The step that comes next unless a frame was under way when that was found; None once it is there.
+    - `anchor`: the chart's place.
+    - `first`: the session's first accepted frame: camera, size, serial number.
+    - `first_white`, `white`, `first_dark`, `dark`: accepted references.
+    - `first_grey`: the first frame of the brightest grey, whose paper that of a run taken up again is held against.
+    - `primaries`: frames of the three primaries at `experiment.session.plan.TOP`.
+    - `basis`, `model`: how a frame is a sum of primaries, and which amounts codes give.
+    - `moved_px`: (2,) where the chart lies at rest, from its place in the anchor: (0, 0), or where a bump has left it.
+    - `recent`: the last frames, the newest last.
+    - `digests`: of all frames.
+    - `untold`: names of checks that some accepted frame since the last good reference was too dark for.
+    - `refused`: cause, and number, of the refusals in a row.
+    - `leaning`: by how much the last lights were off.
+    - `candidate`: level of the lamp (logarithm) and place of the chart (px) of the frame refused last; NaN where it was
+      not that.
+    - `rested`: whether the run was taken up again and no lit frame has been accepted since.
+    - `moved_on`: whether the chart lies elsewhere than in the white frame that is known.
+    - `asked`: whether this run has shown a primary alone, whatever the frame was like.
+    - `witness`: the newest white or grey frame from before the primaries were known, by which they are held against it.
+    - `lost`: whether a reference of an earlier run is accepted and its measurement cannot be read.
+    - `founding`: whether no light was accepted yet in this session, or since the run was taken up again or paused.
+    - `first_frames`: frames that were accepted meanwhile.
+    - `doubted`: numbers of the steps whose frames these contradicted once.
+    - `restarts`: how often these were taken again for that.
+    - `begun_with`: number of the step of the first of them; None before it.
+    - `expected`: the step that comes next unless a frame was under way when that was found; None once it is there.
     """
 
     anchor: Anchor | None = None
@@ -342,7 +305,7 @@ def is_brightest_grey(step: SessionStep) -> bool:
 
 
 def primary_codes(primary: int) -> Codes:
-    """Return the codes that show primary 0, 1 or 2 alone at `TOP` (`acquisition.session.plan`)."""
+    """Return the codes that show primary 0, 1 or 2 alone at `TOP` (`experiment.session.plan`)."""
     return PRIMARIES[primary].codes
 
 

@@ -19,7 +19,7 @@ from functools import cache
 import numpy as np
 import numpy.typing as npt
 
-from acquisition.session.plan import TOP
+from experiment.session.plan import TOP
 
 _NODES = np.array([4, 8, 16, 24, 32, 44, 56, 72, 88, 104, 120, 136, 152, 168, 184, 200, 216, 232, 255.0])
 """Codes at which tone curves are known; between them a curve bends by less than a thousandth."""
@@ -132,17 +132,11 @@ class Prediction:
 class Fit:
     """How well amounts agree with codes.
 
-    Attributes
-    ----------
-    distance
-        Of the amounts from the prediction, the lamp's level free, in standard deviations (Mahalanobis, two degrees of
-        freedom).
-    angle_deg
-        Between the two.
-    brightness
-        Level of the lamp over the one expected (logarithm).
-    brightness_sd
-        Standard deviation expected of it.
+    - `distance`: of the amounts from the prediction, the lamp's level free, in standard deviations (Mahalanobis, two
+      degrees of freedom).
+    - `angle_deg`: between the two.
+    - `brightness`: level of the lamp over the one expected (logarithm).
+    - `brightness_sd`: standard deviation expected of it.
     """
 
     distance: float
@@ -159,13 +153,10 @@ class Fit:
 class ProjectorModel:
     """Tone curves, overlaps and lamp of a projector as known so far.
 
-    Attributes
-    ----------
-    state, covariance
-        (K,) and (K, K) float64: deviations of the curves at the nodes, one primary after another; logarithms of the
-        primaries' levels; overlaps; logarithm of the lamp's level.
-    chroma, brightness
-        Sum of squares, and number, of the scatter seen of amounts against each other, and of all together.
+    - `state`, `covariance`: (K,) and (K, K) float64: deviations of the curves at the nodes, one primary after another;
+      logarithms of the primaries' levels; overlaps; logarithm of the lamp's level.
+    - `chroma`, `brightness`: sum of squares, and number, of the scatter seen of amounts against each other, and of all
+      together.
     """
 
     state: _Array

@@ -1,7 +1,7 @@
 """Where the chart lay in the first white frame, and how far it has moved, and blurred, since.
 
 The gauges are the chart's tags, or the outline of its field, or, where no chart is looked for, the places of most
-texture (`acquisition.framing.movement`); the frame is kept around them alone. Half-size pixels.
+texture (`experiment.framing.movement`); the frame is kept around them alone. Half-size pixels.
 """
 
 from __future__ import annotations
@@ -11,13 +11,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from acquisition.chart.model import Chart
-from acquisition.framing.finding import Framing, find_chart
-from acquisition.framing.homography import project
-from acquisition.framing.movement import Shift, gauge_boxes, gauges_of, shift_between
-from acquisition.framing.planes import CHANNELS, Channel, Plane, plane_of, strongest_plane
-from acquisition.framing.tags import FoundTag, find_tags
 from drivers.raw.rawfile import Mosaic
+from experiment.chart.model import Chart
+from experiment.framing.finding import Framing, find_chart
+from experiment.framing.homography import project
+from experiment.framing.movement import Shift, gauge_boxes, gauges_of, shift_between
+from experiment.framing.planes import CHANNELS, Channel, Plane, plane_of, strongest_plane
+from experiment.framing.tags import FoundTag, find_tags
 
 _TEXTURE_PX = 32
 """Side of a textured place that stands for a tag."""
@@ -41,16 +41,10 @@ _Array = npt.NDArray[np.float64]
 class Anchor:
     """The chart's place in a white frame.
 
-    Attributes
-    ----------
-    framing
-        Its tags, or its field, or places of texture that stand for tags.
-    gauges
-        The frame around them, of each channel, counts above black; 0 elsewhere.
-    paper
-        (N, 2) int64, columns and rows of blocks in the middle of bare paper.
-    of_chart
-        Whether the chart was found; else the places are just textured ones.
+    - `framing`: its tags, or its field, or places of texture that stand for tags.
+    - `gauges`: the frame around them, of each channel, counts above black; 0 elsewhere.
+    - `paper`: (N, 2) int64, columns and rows of blocks in the middle of bare paper.
+    - `of_chart`: whether the chart was found; else the places are just textured ones.
     """
 
     framing: Framing
@@ -60,13 +54,7 @@ class Anchor:
 
     @classmethod
     def of(cls, mosaic: Mosaic, black: _Array, chart: Chart | None) -> Anchor:
-        """Return the anchor of a white frame; `black` (2, 2) float64 counts, `chart` None if none is looked for.
-
-        Raises
-        ------
-        RegistrationError
-            The chart is not found; see `acquisition.framing.finding.find_chart`.
-        """
+        """Return the anchor of a white frame; `black` (2, 2) float64 counts, `chart` None if none is looked for."""
         if chart is None:
             plane = strongest_plane(mosaic, black)
             framing = _textures(plane)

@@ -17,12 +17,12 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from acquisition.framing.finding import Framing
-from acquisition.framing.planes import CHANNELS, Channel, Plane
-from acquisition.framing.tagless_field import FoundField
-from acquisition.framing.tags import FoundTag
 from acquisition.judge.measured.anchor import Anchor
 from acquisition.judge.measured.measuring import FramePlaces, Measured, Noise
+from experiment.framing.finding import Framing
+from experiment.framing.planes import CHANNELS, Channel, Plane
+from experiment.framing.tagless_field import FoundField
+from experiment.framing.tags import FoundTag
 
 VERSION = 1
 """Of the format of the bytes."""
@@ -34,16 +34,10 @@ _Array = npt.NDArray[np.float64]
 class Frame:
     """A frame that was measured.
 
-    Attributes
-    ----------
-    measured
-        Its light; `strips` may be empty where they were not kept.
-    paper
-        (3,) float64, camera RGB of bare paper above black; NaN where no paper is known.
-    moved_px
-        (2,) how far the chart lay from the anchor, right and down; NaN where it could not be told.
-    anchor
-        The chart's place, if this frame is the one to compare with from now on.
+    - `measured`: its light; `strips` may be empty where they were not kept.
+    - `paper`: (3,) float64, camera RGB of bare paper above black; NaN where no paper is known.
+    - `moved_px`: (2,) how far the chart lay from the anchor, right and down; NaN where it could not be told.
+    - `anchor`: the chart's place, if this frame is the one to compare with from now on.
     """
 
     measured: Measured

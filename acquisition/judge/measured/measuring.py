@@ -20,9 +20,9 @@ from itertools import pairwise
 import numpy as np
 import numpy.typing as npt
 
-from acquisition.framing.planes import CHANNELS, CLIPPING_SHARE, Channel, frame_black, phases
 from acquisition.judge.exposure import BRIGHTEST_PERCENTILE
 from drivers.raw.rawfile import Mosaic
+from experiment.framing.planes import CHANNELS, CLIPPING_SHARE, Channel, frame_black, phases
 from foundation.compiled import compiled
 
 TILE_COLUMNS, TILE_ROWS = 24, 16
@@ -93,14 +93,9 @@ class FramePlaces:
 class Sums:
     """Mean counts at the places of a frame.
 
-    Attributes
-    ----------
-    tiles
-        (384, 4) float64, mean count of each tile, row by row, for the four positions of the block, row by row.
-    strips
-        (rows, 4, 4) float64, of each row of blocks and segment, likewise.
-    clipped, empty
-        Photosites at or above the clipping level, and those that no light and no darkness gives.
+    - `tiles`: (384, 4) float64, mean count of each tile, row by row, for the four positions of the block, row by row.
+    - `strips`: (rows, 4, 4) float64, of each row of blocks and segment, likewise.
+    - `clipped`, `empty`: photosites at or above the clipping level, and those that no light and no darkness gives.
     """
 
     tiles: npt.NDArray[np.float64]
@@ -112,16 +107,7 @@ class Sums:
 def sum_counts(counts: npt.NDArray[np.uint16], places: FramePlaces, clipping: float, floor: float) -> Sums:
     """Return the mean counts at all places, in one pass.
 
-    Parameters
-    ----------
-    counts
-        (H, W) uint16, the visible area.
-    places
-        Of a frame of H // 2 × W // 2 blocks.
-    clipping
-        Counts from here on are clipped.
-    floor
-        Counts below are none that a sensor gives: a frame's missing part is filled with zeros.
+    `counts`: (H, W) uint16, the visible area.
     """
     sums = np.zeros((places.rows, TILE_COLUMNS, 4), dtype=np.int64)
     top = min(int(np.ceil(clipping)), 65535)
@@ -150,30 +136,17 @@ class Noise:
 class Measured:
     """A frame as it was measured.
 
-    Attributes
-    ----------
-    tiles
-        (T, 3) float64, mean R, G, B of each tile, counts above black.
-    strips
-        (S, 3) float64, of each strip, likewise.
-    samples
-        (M, 2) uint16, counts of both greens of the sampled blocks.
-    digest
-        Of the counts of all sampled blocks: equal for no two frames that a sensor took.
-    noise
-        Photon transfer, by the differences of the greens; it contains the photosites' own differences.
-    black
-        Mean black level of the frame, counts.
-    black_measured
-        Whether the frame has a masked border to measure it in.
-    range_dn
-        Saturation minus black.
-    brightest_dn
-        Brightest counts above black, of the brightest channel.
-    clipped, empty
-        Shares of photosites 0 … 1: near saturation, and without any count.
-    camera, serial
-        As the file states them; empty where it does not.
+    - `tiles`: (T, 3) float64, mean R, G, B of each tile, counts above black.
+    - `strips`: (S, 3) float64, of each strip, likewise.
+    - `samples`: (M, 2) uint16, counts of both greens of the sampled blocks.
+    - `digest`: of the counts of all sampled blocks: equal for no two frames that a sensor took.
+    - `noise`: photon transfer, by the differences of the greens; it contains the photosites' own differences.
+    - `black`: mean black level of the frame, counts.
+    - `black_measured`: whether the frame has a masked border to measure it in.
+    - `range_dn`: saturation minus black.
+    - `brightest_dn`: brightest counts above black, of the brightest channel.
+    - `clipped`, `empty`: shares of photosites 0 … 1: near saturation, and without any count.
+    - `camera`, `serial`: as the file states them; empty where it does not.
     """
 
     tiles: _Array

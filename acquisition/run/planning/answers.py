@@ -20,24 +20,14 @@ _Answer = TypeVar("_Answer")
 class Answers:
     """What the devices said.
 
-    Attributes
-    ----------
-    camera
-        Who it is; None if it could not be asked.
-    offered_s
-        Shutter times that it offers, seconds; empty if it lists none.
-    supplies
-        Its battery and card; None if it does not tell.
-    projector
-        Its name and state, in words; empty where there is none under control.
-    lit
-        Whether its lamp burns; None if that is not known.
-    warnings
-        What changes the light behind the codes, each with its remedy.
-    unasked
-        What could not be asked, and why.
-    faults
-        What would end the run.
+    - `camera`: who it is; None if it could not be asked.
+    - `offered_s`: shutter times that it offers, seconds; empty if it lists none.
+    - `supplies`: its battery and card; None if it does not tell.
+    - `projector`: its name and state, in words; empty where there is none under control.
+    - `lit`: whether its lamp burns; None if that is not known.
+    - `warnings`: what changes the light behind the codes, each with its remedy.
+    - `unasked`: what could not be asked, and why.
+    - `faults`: what would end the run.
     """
 
     camera: CameraIdentity | None = None

@@ -5,27 +5,19 @@ from __future__ import annotations
 from contextlib import ExitStack
 from pathlib import Path
 
-from acquisition.config import LabSettings
 from acquisition.run.devices import Devices
 from acquisition.run.planning.answers import Answers, ask
 from acquisition.run.planning.plan import RunPlan, make_plan
 from acquisition.run.planning.sizes import free_bytes_at
 from acquisition.run.planning.work import outline, work_left
 from acquisition.run.rig.opening import known_frame_bytes, open_rig
-from acquisition.session.folder import Session
+from experiment.config import LabSettings
+from experiment.session.folder import Session
 from foundation.errors import CropError
 
 
 def dry_run(settings: LabSettings, folder: Path) -> RunPlan:
-    """Return the plan of the run that `settings` and `folder` would begin; devices that cannot be opened are faults.
-
-    Raises
-    ------
-    InputError
-        A file is missing or damaged, or the session was begun otherwise.
-    StorageError
-        The disk cannot be written.
-    """
+    """Return the plan of the run that `settings` and `folder` would begin; devices that cannot be opened are faults."""
     with ExitStack() as opened:
         work, session = outline(settings, folder), None
         if not work.new:
@@ -40,15 +32,7 @@ def dry_run(settings: LabSettings, folder: Path) -> RunPlan:
 def checked_plan(settings: LabSettings, folder: Path, session: Session | None, devices: Devices) -> RunPlan:
     """Return the plan of a run whose devices are open and have not moved.
 
-    Parameters
-    ----------
-    session
-        What is taken up; None where a new one is to be made in `folder`.
-
-    Raises
-    ------
-    CropError
-        The run could not be brought to its end; the message has the remedy.
+    `session`: what is taken up; None where a new one is to be made in `folder`.
     """
     work = outline(settings, folder) if session is None else work_left(session, settings)
     plan = make_plan(settings, work, ask(devices), free_bytes_at(folder), known_frame_bytes(settings))

@@ -10,10 +10,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
-from acquisition.config import LabSettings
 from acquisition.run.planning.answers import Answers
 from acquisition.run.planning.sizes import RETAKEN_SHARE, Estimate, bytes_text, frame_bytes, needed_bytes
 from acquisition.run.planning.work import Work
+from experiment.config import LabSettings
 from foundation.errors import CropError, DeviceFault, DeviceRefused, InputError, StorageError, counted
 
 DOWNLOAD_BYTES_PER_S: Final = 25e6
@@ -35,26 +35,15 @@ OFFERED_WITHIN: Final = 0.01
 class RunPlan:
     """What a run will take, need and find.
 
-    Attributes
-    ----------
-    settings
-        As given.
-    work
-        What is to be done.
-    answers
-        What the devices said.
-    frame_bytes
-        A raw file, bytes.
-    frame_s
-        A frame's time, seconds.
-    warm_up_s
-        Of the lamp before the first frame, seconds.
-    free_bytes
-        On the disk of the session.
-    faults
-        What would end the run, each with its remedy.
-    doubts
-        What may; a sentence each.
+    - `settings`: as given.
+    - `work`: what is to be done.
+    - `answers`: what the devices said.
+    - `frame_bytes`: A raw file, bytes.
+    - `frame_s`: A frame's time, seconds.
+    - `warm_up_s`: of the lamp before the first frame, seconds.
+    - `free_bytes`: on the disk of the session.
+    - `faults`: what would end the run, each with its remedy.
+    - `doubts`: what may; a sentence each.
     """
 
     settings: LabSettings
@@ -78,13 +67,7 @@ class RunPlan:
         return self.work.left * self.frame_s.value + (self.warm_up_s if self.work.left else 0)
 
     def require(self) -> None:
-        """Refuse a run that could not be brought to its end.
-
-        Raises
-        ------
-        CropError
-            The first fault; further ones are named in its message.
-        """
+        """Refuse a run that could not be brought to its end."""
         if self.faults:
             first, *others = self.faults
             raise type(first)("; moreover, ".join([str(first), *map(str, others)]))
@@ -93,15 +76,7 @@ class RunPlan:
 def make_plan(
     settings: LabSettings, work: Work, answers: Answers, free_bytes: int, given_bytes: int | None = None
 ) -> RunPlan:
-    """Return the plan of a run, with all that would end it.
-
-    Parameters
-    ----------
-    free_bytes
-        On the disk of the session.
-    given_bytes
-        Of a raw file, where the rig knows it; see `frame_bytes`.
-    """
+    """Return the plan of a run, with all that would end it."""
     size = frame_bytes(work.frame_bytes, answers.camera.model if answers.camera is not None else "", given_bytes)
     cold = answers.lit is False and settings.sequence.warm_up_s > 0
     warm_up_s = LIGHTING_S + settings.sequence.warm_up_s if cold else 0.0

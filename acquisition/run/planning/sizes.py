@@ -60,14 +60,8 @@ class Estimate:
 def frame_bytes(largest: int | None, model: str, given: int | None = None) -> Estimate:
     """Return the size of a raw file, bytes.
 
-    Parameters
-    ----------
-    largest
-        Of the session so far; None if nothing was taken.
-    model
-        As the body names itself; empty if it could not be asked.
-    given
-        Where the rig knows it: that of a simulated body, or of a recording.
+    `largest`: of the session so far; None if nothing was taken. `model`: as the body names itself; empty if it could
+    not be asked.
     """
     if largest is not None:
         return Estimate(largest, "the largest of the session so far", True)
@@ -89,13 +83,7 @@ def needed_bytes(frames: int, frame_bytes: float) -> int:
 
 
 def free_bytes_at(folder: Path) -> int:
-    """Return the free space where `folder` is or would be made, bytes.
-
-    Raises
-    ------
-    StorageError
-        The disk can only be read, may not be written, or cannot be asked.
-    """
+    """Return the free space where `folder` is or would be made, bytes."""
     place = folder.absolute()
     try:
         while not place.is_dir() and place != place.parent:

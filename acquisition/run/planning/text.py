@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections import Counter
 
-from acquisition.config import LabSettings
 from acquisition.run.planning.answers import Answers
 from acquisition.run.planning.plan import RunPlan, is_offered
 from acquisition.run.planning.sizes import RETAKEN_SHARE, bytes_text
 from acquisition.run.planning.work import Work
 from acquisition.run.shutter import holds_whole_turns, period_s, wheel_of
-from acquisition.session.plan import KINDS
-from acquisition.session.progress import duration_text
+from experiment.config import LabSettings
+from experiment.session.plan import KINDS
+from experiment.session.progress import duration_text
 from foundation.errors import counted
 from foundation.trust.secret_texts import target_label
 

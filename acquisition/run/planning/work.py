@@ -12,12 +12,12 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any, Final
 
-from acquisition.chart.model import Chart, load_chart
-from acquisition.config import LabSettings, parse_lab
-from acquisition.lights.illuminations import Illumination, load_illuminations
-from acquisition.session.folder import Session, session_exists
-from acquisition.session.plan import RESPONSE, SessionStep, plan_steps
 from drivers.presenter import BLACK
+from experiment.chart.model import Chart, load_chart
+from experiment.config import LabSettings, parse_lab
+from experiment.lights.illuminations import Illumination, load_illuminations
+from experiment.session.folder import Session, session_exists
+from experiment.session.plan import RESPONSE, SessionStep, plan_steps
 from foundation.errors import ConfigurationError
 from foundation.hashing import file_sha256
 
@@ -35,22 +35,14 @@ KNOWN_AFTER: Final = 5
 class Work:
     """What a run has to do, known from files alone.
 
-    Attributes
-    ----------
-    folder
-        Of the session.
-    new
-        Whether the session is yet to be made.
-    steps, done
-        The plan, and the numbers of its steps that have their frame.
-    order
-        Of the lights, in words.
-    chart, lights
-        What hangs on the wall, and what is shown.
-    lights_sha256
-        SHA-256 of the file of the lights, hexadecimal.
-    frame_bytes, frame_s
-        Largest raw file of the session, and median seconds from one frame to the next; None where too few were taken.
+    - `folder`: of the session.
+    - `new`: whether the session is yet to be made.
+    - `steps`, `done`: the plan, and the numbers of its steps that have their frame.
+    - `order`: of the lights, in words.
+    - `chart`, `lights`: what hangs on the wall, and what is shown.
+    - `lights_sha256`: SHA-256 of the file of the lights, hexadecimal.
+    - `frame_bytes`, `frame_s`: largest raw file of the session, and median seconds from one frame to the next; None
+      where too few were taken.
     """
 
     folder: Path
@@ -78,13 +70,7 @@ def planned_steps(settings: LabSettings, lights: Sequence[Illumination]) -> tupl
 
 
 def outline(settings: LabSettings, folder: Path) -> Work:
-    """Return what a run has to do, from the files that the settings name and the session that is there.
-
-    Raises
-    ------
-    InputError
-        A file is missing or damaged, the folder holds something else, or a session that was begun otherwise.
-    """
+    """Return what a run has to do, from the files that the settings name and the session that is there."""
     chart, lights = load_chart(settings.chart), load_illuminations(settings.illuminations)
     lights_sha256 = file_sha256(settings.illuminations)
     if not session_exists(folder):
@@ -95,13 +81,7 @@ def outline(settings: LabSettings, folder: Path) -> Work:
 
 
 def work_left(session: Session, settings: LabSettings) -> Work:
-    """Return what a run has to do that takes up an open session; its own frames tell their times and sizes.
-
-    Raises
-    ------
-    InputError
-        A file that the settings name is missing, or the session was begun otherwise.
-    """
+    """Return what a run has to do that takes up an open session; its own frames tell their times and sizes."""
     require_same(session, settings)
     taken = [frame.taken_at for frame in sorted(session.frames(), key=lambda frame: frame.attempt)]
     gaps = [(after - before).total_seconds() for before, after in pairwise(taken) if after >= before]
@@ -121,13 +101,7 @@ def work_left(session: Session, settings: LabSettings) -> Work:
 
 
 def require_same(session: Session, settings: LabSettings) -> None:
-    """Require that a session is taken up as it was begun: what decides what its frames show is the same.
-
-    Raises
-    ------
-    ConfigurationError
-        Settings, chart or lights differ.
-    """
+    """Require that a session is taken up as it was begun: what decides what its frames show is the same."""
     try:
         before = parse_lab(session.settings_text(), str(session.folder / "session.toml"))
     except ConfigurationError as error:

@@ -25,13 +25,7 @@ class Attached:
 
 
 def attached_devices(search_s: float) -> Generator[Attached]:
-    """Yield what is attached and reachable, kind by kind; a kind that cannot be asked says why.
-
-    Parameters
-    ----------
-    search_s
-        Seconds to collect the answers of PJLink projectors on the network; 0 does not ask.
-    """
+    """Yield what is attached and reachable, kind by kind; a kind that cannot be asked says why."""
     yield _attached("cameras on USB", lambda: [str(device) for device in list_devices()])
     yield _attached("serial ports", list_serial_ports)
     yield _attached("displays", lambda: [str(display) for display in list_displays()])

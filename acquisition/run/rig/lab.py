@@ -5,12 +5,9 @@ from __future__ import annotations
 import uuid
 from contextlib import ExitStack
 
-from acquisition.config import CameraCable, LabSettings, LightSource, ProjectorCable
 from acquisition.run.asking import ask_all
 from acquisition.run.devices import Devices
 from acquisition.run.shutter import require_whole_turns
-from acquisition.session.folder import Session
-from acquisition.session.records import last_moment
 from drivers.camera import Camera
 from drivers.canon.camera import CanonEos
 from drivers.display.fullscreen import FullScreen
@@ -30,6 +27,9 @@ from drivers.ptp.codes import VENDOR_CANON_USB
 from drivers.ptp.ip_transport import IpTransport
 from drivers.ptp.usb_transport import UsbTransport
 from drivers.serial_projectors import language
+from experiment.config import CameraCable, LabSettings, LightSource, ProjectorCable
+from experiment.session.folder import Session
+from experiment.session.records import last_moment
 from foundation.clock import Clock, SteadyClock, SystemClock
 from foundation.errors import ConfigurationError
 
@@ -40,21 +40,7 @@ CONNECT_S = 5.0
 def open_lab(settings: LabSettings, session: Session | None, opened: ExitStack) -> Devices:
     """Open the camera, the projector and its light that LAB.toml names.
 
-    Parameters
-    ----------
-    settings
-        As `acquisition.config.load_lab` returns them.
-    session
-        The session that is taken up: time goes on behind its last frame; None for a new one, and for a check.
-    opened
-        Closes what was opened, in the opposite order.
-
-    Raises
-    ------
-    ConfigurationError
-        The settings name something that does not exist, or lack a name.
-    DeviceError
-        A device does not answer.
+    `session`: the session that is taken up: time goes on behind its last frame; None for a new one, and for a check.
     """
     clock = session_clock(session)
     require_whole_turns(settings.camera, settings.lab.projector)

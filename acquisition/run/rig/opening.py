@@ -9,10 +9,10 @@ from __future__ import annotations
 from collections.abc import Generator
 from contextlib import ExitStack, contextmanager
 
-from acquisition.chart.model import Chart
-from acquisition.config import LabSettings
 from acquisition.run.devices import Devices
-from acquisition.session.folder import Session
+from experiment.chart.model import Chart
+from experiment.config import LabSettings
+from experiment.session.folder import Session
 from foundation.errors import ConfigurationError
 
 
@@ -24,21 +24,7 @@ def open_rig(
 ) -> Generator[Devices]:
     """Open every device that the settings name; close them all at the end, whatever the end.
 
-    Parameters
-    ----------
-    settings
-        As `acquisition.config.load_lab` returns them.
-    chart
-        What hangs on the wall, for the simulated lab.
-    session
-        The session that is taken up; None for a new one, and for a check, which records nothing.
-
-    Raises
-    ------
-    ConfigurationError
-        The settings name something that does not exist.
-    DeviceError
-        A device does not answer.
+    `session`: the session that is taken up; None for a new one, and for a check, which records nothing.
     """
     if settings.rig == "imported":
         raise ConfigurationError(

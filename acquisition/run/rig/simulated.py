@@ -11,16 +11,16 @@ from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 
-from acquisition.chart.model import Chart
-from acquisition.chart.printing import drawing
-from acquisition.config import LabSettings
 from acquisition.run.devices import Devices
-from acquisition.session.folder import Session
-from acquisition.session.records import last_moment
 from drivers.canon.camera import CanonEos
 from drivers.pjlink.projector import PjLinkProjector
 from drivers.presenter import Colour
 from drivers.projector import Power
+from experiment.chart.model import Chart
+from experiment.chart.printing import drawing
+from experiment.config import LabSettings
+from experiment.session.folder import Session
+from experiment.session.records import last_moment
 from foundation.errors import ConfigurationError, FormatError
 from sim.buses.ptp_memory import MemoryTransport
 from sim.camera.eos import SimulatedEos
@@ -46,23 +46,7 @@ SERIAL = "0000000001"
 def open_simulated(settings: LabSettings, chart: Chart, session: Session | None, opened: ExitStack) -> Devices:
     """Build the simulated lab, or put a recorded session into its camera.
 
-    Parameters
-    ----------
-    settings
-        As `acquisition.config.load_lab` returns them.
-    chart
-        What hangs on the wall.
-    session
-        The session that is taken up; None for a check that records nothing.
-    opened
-        Closes what was opened, in the opposite order.
-
-    Raises
-    ------
-    ConfigurationError
-        The settings name a body, a room or an exposure that does not exist.
-    FormatError
-        The recorded session holds no frames.
+    `session`: the session that is taken up; None for a check that records nothing.
     """
     exposed = _exposed(session)
     last = None if session is None else last_moment(session.journal.attempts())
@@ -102,13 +86,7 @@ def sheet(chart: Chart) -> Print:
 
 
 def simulated_body(settings: LabSettings) -> Body:
-    """Return the simulated camera body that the settings name.
-
-    Raises
-    ------
-    ConfigurationError
-        There is no such body.
-    """
+    """Return the simulated camera body that the settings name."""
     name, changes = settings.simulated.body, settings.simulated.camera or {}
     if name not in BODIES and name not in known_sensitivities() and not Path(name).is_file():
         known = ", ".join([*sorted(BODIES), *known_sensitivities()])
@@ -117,15 +95,7 @@ def simulated_body(settings: LabSettings) -> Body:
 
 
 def simulated_frame_bytes(settings: LabSettings) -> int:
-    """Return the size of a raw file that the simulated camera writes: 16 bits a photosite, or the largest recorded.
-
-    Raises
-    ------
-    ConfigurationError
-        There is no such body.
-    FormatError
-        The recorded session holds no frames.
-    """
+    """Return the size of a raw file that the simulated camera writes: 16 bits a photosite, or the largest recorded."""
     if settings.replay is not None and settings.rig == "replay":
         return max(frame.path.stat().st_size for frame in _recording(settings.replay.session))
     rows, columns = simulated_body(settings).sensor
@@ -133,13 +103,7 @@ def simulated_frame_bytes(settings: LabSettings) -> int:
 
 
 def simulated_room(settings: LabSettings) -> Room:
-    """Return the default room with the seed and the changes of the settings.
-
-    Raises
-    ------
-    ConfigurationError
-        A parameter is unknown or of the wrong type.
-    """
+    """Return the default room with the seed and the changes of the settings."""
     return read_room(settings.simulated.seed, settings.simulated.room, settings.file, "simulated.room")
 
 

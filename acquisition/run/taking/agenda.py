@@ -18,7 +18,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Sequence
 
-from acquisition.session.plan import REFERENCES, FrameKind, SessionStep
+from experiment.session.plan import REFERENCES, FrameKind, SessionStep
 
 GIVEN_UP_IN_A_ROW = 3
 """Steps given up one after another after which going on makes no sense: something lasting is wrong. One may be chance,
@@ -28,22 +28,8 @@ and two neighbours may share a cause that passes."""
 class Agenda:
     """The steps of a session that are still to be taken in this run.
 
-    Parameters
-    ----------
-    steps
-        The whole plan, in taking order.
-    done
-        Numbers of the steps that have an accepted frame.
-    attempts
-        Tries that a step has in this run, ≥ 1.
-    first
-        Numbers of the steps that are taken before all others, in their order, done or not.
-    unclosed
-        Kinds of references that must still follow lights that were taken in earlier runs; see `unclosed_kinds`.
-    append
-        Given a reference's kind, puts one behind the plan and returns it; None: nothing is put there.
-    reference_every
-        Lights that are taken in a row without references between them; None: as many as the plan has.
+    `append`: given a reference's kind, puts one behind the plan and returns it; None: nothing is put there.
+    `reference_every`: lights that are taken in a row without references between them; None: as many as the plan has.
     """
 
     def __init__(
@@ -134,13 +120,7 @@ class Agenda:
             self._in_a_row = 0
 
     def refuse(self, step: SessionStep, reason: str, *, before_others: bool = False) -> bool:
-        """Note that the attempt under way gave no frame that can be used; return whether the step is tried again.
-
-        Parameters
-        ----------
-        before_others
-            Whether it is tried before all other steps.
-        """
+        """Note that the attempt under way gave no frame that can be used; return whether the step is tried again."""
         self._under_way.discard(step.number)
         self._open.add(step.number)
         if before_others and step.number not in self._first:

@@ -4,26 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from acquisition.config import JudgeSettings
 from acquisition.run.taking.agenda import step_name
-from acquisition.session.judgement import Check, Judgement
-from acquisition.session.plan import SessionStep
+from experiment.config import JudgeSettings
+from experiment.session.judgement import Check, Judgement
+from experiment.session.plan import SessionStep
 
 
 def followed_changes(
     step: SessionStep, judgement: Judgement, steps: Sequence[SessionStep], judge: JudgeSettings
 ) -> list[tuple[str, str]]:
-    """Return what is said of an accepted frame: words of a run's reports (``moved``, ``level``), each with a sentence.
-
-    Parameters
-    ----------
-    step, judgement
-        Of the frame.
-    steps
-        The whole plan, with what was put behind it.
-    judge
-        What changes are always allowed.
-    """
+    """Return what a run's reports say of an accepted frame: words (``moved``, ``level``), each with a sentence."""
     found = {check.name: check for check in judgement.checks if check.value is not None}
     said: list[tuple[str, str]] = []
     moved = found.get("movement")

@@ -26,7 +26,6 @@ from concurrent.futures import Future
 from dataclasses import dataclass, replace
 from datetime import datetime
 
-from acquisition.config import LabSettings
 from acquisition.run.devices import Devices
 from acquisition.run.lamp import HealthWatch, await_health
 from acquisition.run.patience import Patience, Pause, is_curable
@@ -34,11 +33,12 @@ from acquisition.run.taking.agenda import Agenda, step_name
 from acquisition.run.taking.following import followed_changes
 from acquisition.run.taking.resuming import tie
 from acquisition.run.taking.saving import FilledFile, Saved, Saver, download
-from acquisition.session.folder import Session
-from acquisition.session.judgement import Check, Judgement
-from acquisition.session.plan import REFERENCES, SessionStep
-from acquisition.session.records import ACCEPTED
 from drivers.presenter import ReadsBack
+from experiment.config import LabSettings
+from experiment.session.folder import Session
+from experiment.session.judgement import Check, Judgement
+from experiment.session.plan import REFERENCES, SessionStep
+from experiment.session.records import ACCEPTED
 from foundation.console import Ending
 from foundation.errors import CropError, DeviceError, QualityError, StorageError, counted
 
@@ -106,19 +106,7 @@ class _Pending:
 
 
 class Pipeline:
-    """Takes what an agenda lists, and journals it.
-
-    Parameters
-    ----------
-    agenda
-        What is to be taken; told how each attempt ended.
-    patience
-        Waits for what fails, and tells it.
-    observe
-        Called with every frame that was judged, in the order of taking.
-    ending
-        Whether somebody asked for the end; seen between two frames.
-    """
+    """Takes what an agenda lists, and journals it."""
 
     def __init__(
         self,
@@ -154,13 +142,6 @@ class Pipeline:
         """Take frames until the agenda is empty or the end was asked for.
 
         Whatever ends it, frames that the camera has given are completed, judged and journalled first.
-
-        Raises
-        ------
-        DeviceError, StorageError
-            A device or the disk failed for longer than the run waits.
-        QualityError
-            Frames were refused for that long, and the cause lasts.
         """
         try:
             with self._ending.finishing(PROMISE):

@@ -13,14 +13,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
-from acquisition.config import LabSettings
 from acquisition.run.devices import Devices
-from acquisition.session.folder import Session
-from acquisition.session.plan import SessionStep, tie_steps
-from acquisition.session.progress import duration_text
-from acquisition.session.records import ACCEPTED, Attempt
 from drivers.camera import CameraIdentity
 from drivers.projector import ProjectorIdentity
+from experiment.config import LabSettings
+from experiment.session.folder import Session
+from experiment.session.plan import SessionStep, tie_steps
+from experiment.session.progress import duration_text
+from experiment.session.records import ACCEPTED, Attempt
 from foundation.clock import Clock, SteadyClock
 from foundation.errors import DeviceRefused, first_of
 from foundation.version import software
@@ -31,20 +31,7 @@ def check_frames(
     observe: Callable[[int, int], None] = lambda done, total: None,
     announce: Callable[[str], object] = lambda sentence: None,
 ) -> None:
-    """Hold every accepted frame against its hash; what is damaged is voided, and said.
-
-    Parameters
-    ----------
-    observe
-        Called with files done and in all.
-    announce
-        Called with a sentence where frames are to be taken again.
-
-    Raises
-    ------
-    FormatError, StorageError
-        As `Session.verify`.
-    """
+    """Hold every accepted frame against its hash; what is damaged is voided, and said."""
     if not session.journal.accepted_files():
         return
     damaged = session.verify(observe)
@@ -53,15 +40,7 @@ def check_frames(
 
 
 def require_same_devices(session: Session, devices: Devices, settings: LabSettings) -> None:
-    """Require that camera and projector are those that the session was begun with; note those of a new one.
-
-    Raises
-    ------
-    DeviceRefused
-        Another one is connected.
-    DeviceError
-        One cannot be asked who it is.
-    """
+    """Require that camera and projector are those that the session was begun with; note those of a new one."""
     known = session.journal.records()
     names = {"camera": _camera_name(devices.camera.identity())}
     if devices.projector is not None:
@@ -84,12 +63,9 @@ def require_same_devices(session: Session, devices: Devices, settings: LabSettin
 
 
 def clock_note(session: Session, clock: Clock) -> str:
-    """Return what to say where the machine's clock is behind the session's last frame, with the remedy; else nothing.
+    """Return what to say where the machine's clock is behind the session's last frame, with the remedy.
 
-    Parameters
-    ----------
-    clock
-        The run's; it goes on behind that frame.
+    Else nothing.
     """
     if not isinstance(clock, SteadyClock) or not clock.behind_s:
         return ""
@@ -115,11 +91,6 @@ def tie(session: Session) -> tuple[int, ...]:
 
     A set that an earlier run left unfinished is taken again: the chart may have been moved since. Nothing is added
     where nothing was taken yet, or the session does not know its projector by frames of its primaries.
-
-    Raises
-    ------
-    StorageError
-        The journal cannot be written.
     """
     taken = [attempt for attempt in session.journal.attempts() if attempt.verdict == ACCEPTED]
     if not taken or all(step.kind != "response" for step in session.steps):
@@ -134,11 +105,6 @@ def white_first(session: Session) -> tuple[int, ...]:
 
     The frames of journals of version 1 were not measured: the judge would have nothing to hold the first lights
     against. Nothing is added where nothing was taken yet.
-
-    Raises
-    ------
-    StorageError
-        The journal cannot be written.
     """
     measured = any(step.kind == "white" and accepted for step, _, _, accepted in session.journal.measurements())
     if measured or not session.journal.accepted_files():

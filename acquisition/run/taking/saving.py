@@ -12,12 +12,12 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import Self
 
-from acquisition.session.folder import Session
-from acquisition.session.incoming import IncomingFile, ReceivedFile
-from acquisition.session.judgement import Check, FrameJudge, Judgement, OutlastsPauses
-from acquisition.session.plan import SessionStep
-from acquisition.session.records import preview_path
 from drivers.camera import Camera, CapturedFrame
+from experiment.session.folder import Session
+from experiment.session.incoming import IncomingFile, ReceivedFile
+from experiment.session.judgement import Check, FrameJudge, Judgement, OutlastsPauses
+from experiment.session.plan import SessionStep
+from experiment.session.records import preview_path
 from foundation.errors import CropError, DeviceError
 from foundation.files import write_whole
 
@@ -34,12 +34,8 @@ class FilledFile:
 class Saved:
     """A raw file that is complete on the disk, and what was seen in it.
 
-    Attributes
-    ----------
-    save_s, judge_s
-        Seconds of this machine's time that hashing, flushing and renaming took, and judging.
-    preview_fault
-        Why its preview could not be written; empty where it was, or there is none.
+    - `save_s`, `judge_s`: seconds of this machine's time that hashing, flushing and renaming took, and judging.
+    - `preview_fault`: why its preview could not be written; empty where it was, or there is none.
     """
 
     received: ReceivedFile
@@ -50,20 +46,7 @@ class Saved:
 
 
 def download(session: Session, stem: str, camera: Camera) -> FilledFile:
-    """Let the camera write the frame exposed last into `frames/`, under a hidden name.
-
-    Parameters
-    ----------
-    stem
-        Name without suffix; the suffix is that of the camera's own file name.
-
-    Raises
-    ------
-    DeviceError
-        The camera failed, or wrote another number of bytes than it says. Nothing is left behind.
-    StorageError
-        The disk is full, read-only or gone. Nothing is left behind.
-    """
+    """Let the camera write the frame exposed last into `frames/`, under a hidden name."""
     incoming = session.incoming(stem)
     try:
         captured = camera.download(incoming.stream)
@@ -95,14 +78,7 @@ class Saver:
         self._thread.shutdown(wait=True)
 
     def submit(self, filled: FilledFile, step: SessionStep, device_checks: tuple[Check, ...]) -> Future[Saved]:
-        """Hand over a file; the result comes when all before it have.
-
-        Parameters
-        ----------
-        device_checks
-            What the devices said of the frame. One of them that names a cause refuses it, and the judge does not see
-            it: what it would learn from a frame of something else would spoil its judgement of those that follow.
-        """
+        """Hand over a file; the result comes when all before it have."""
         return self._thread.submit(self._save, filled, step, device_checks)
 
     def after_pause(self) -> None:

@@ -38,13 +38,7 @@ class CubePlusScene(PeakScene):
     """An image of Cube or Cube+."""
 
     def mask(self, image: Image) -> Mask:
-        """Return (H, W) bool, True in the rectangle of the cube, of an image (H, W, 3).
-
-        Raises
-        ------
-        FormatError
-            The image ends before that rectangle begins, as a reduced copy does.
-        """
+        """Return (H, W) bool, True in the rectangle of the cube, of an image (H, W, 3)."""
         height, width = image.shape[:2]
         if height <= CUBE_ROW or width <= CUBE_COLUMN:
             raise FormatError(
@@ -60,13 +54,7 @@ def is_cube_plus(folder: Folder) -> bool:
 
 
 def open_cube_plus(place: str, options: DataOptions, listed: Folder | None = None) -> SceneSet:
-    """Return Cube+ or Cube; images are read when they are used.
-
-    Raises
-    ------
-    FormatError
-        The ground truth is missing or damaged, or images are missing or too many.
-    """
+    """Return Cube+ or Cube; images are read when they are used."""
     folder = listed or Folder(Path(place))
     file = next((name for name in _OWN if folder.has(name)), None)
     if file is None:

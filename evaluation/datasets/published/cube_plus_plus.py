@@ -46,22 +46,13 @@ _SPLITS = ("train", "test")
 class CubePlusPlusScene(PeakScene):
     """An image of Cube++ or SimpleCube++.
 
-    Attributes
-    ----------
-    scale
-        How often it is reduced, 1 or 4.
+    `scale`: how often it is reduced, 1 or 4.
     """
 
     scale: int = 1
 
     def mask(self, image: Image) -> Mask:
-        """Return (H, W) bool, True in the rectangle of the SpyderCube, of an image (H, W, 3).
-
-        Raises
-        ------
-        FormatError
-            The image is not of the data set's size, so that the rectangle cannot be placed.
-        """
+        """Return (H, W) bool, True in the rectangle of the SpyderCube, of an image (H, W, 3)."""
         height, width = (side // self.scale for side in SIZE)
         if image.shape[:2] != (height, width):
             raise FormatError(
@@ -85,15 +76,7 @@ def is_simple_cube(folder: Folder) -> bool:
 
 
 def open_cube_plus_plus(place: str, options: DataOptions, listed: Folder | None = None) -> SceneSet:
-    """Return Cube++; images are read when they are used.
-
-    Raises
-    ------
-    InputError
-        There is no such ground truth.
-    FormatError
-        A table is missing or damaged, or images are missing or too many.
-    """
+    """Return Cube++; images are read when they are used."""
     folder = listed or Folder(Path(place))
     truth = choose(options.truth, _TRUTHS, "truth", place) or "mean"
     lights: dict[str, Light] = {}
@@ -142,15 +125,7 @@ def open_cube_plus_plus(place: str, options: DataOptions, listed: Folder | None 
 
 
 def open_simple_cube(place: str, options: DataOptions, listed: Folder | None = None) -> SceneSet:
-    """Return SimpleCube++, or its part `train` or `test`; images are read when they are used.
-
-    Raises
-    ------
-    InputError
-        There is no such part.
-    FormatError
-        A table is missing or damaged, or images are missing or too many.
-    """
+    """Return SimpleCube++, or its part `train` or `test`; images are read when they are used."""
     folder = listed or Folder(Path(place))
     splits = [folder.folders[name] for name in _SPLITS if name in folder.folders and _is_part(folder.folders[name])]
     if _is_part(folder):

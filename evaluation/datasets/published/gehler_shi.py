@@ -74,22 +74,13 @@ _KNOWN = frozenset(NAMES)
 class MacbethScene(RawScene):
     """An image with its ColorChecker.
 
-    Attributes
-    ----------
-    corners_path
-        The text file with the chart's corners.
+    `corners_path`: the text file with the chart's corners.
     """
 
     corners_path: str = ""
 
     def mask(self, image: Image) -> Mask:
-        """Return (H, W) bool, True on the chart, of an image (H, W, 3).
-
-        Raises
-        ------
-        FormatError
-            The file of its corners cannot be read or holds something else.
-        """
+        """Return (H, W) bool, True on the chart, of an image (H, W, 3)."""
         text = read_text(self.corners_path)
         lines = [numbers_in(line, self.corners_path) for line in text.strip().splitlines()[:5]]
         if len(lines) < 5 or any(len(line) != 2 for line in lines) or min(lines[0]) <= 0:
@@ -112,15 +103,7 @@ def is_gehler_shi(folder: Folder) -> bool:
 
 
 def open_gehler_shi(place: str, options: DataOptions, listed: Folder | None = None) -> SceneSet:
-    """Return the data set, or one camera of it; images are read when they are used.
-
-    Raises
-    ------
-    InputError
-        The ground truth asked for is not there.
-    FormatError
-        A file is damaged, or images or corners are missing or too many.
-    """
+    """Return the data set, or one camera of it; images are read when they are used."""
     folder = listed or Folder(Path(place))
     places = list(folder.within(_DEPTH))
     truth = choose(options.truth, _TRUTHS, "truth", place) or "recommended"

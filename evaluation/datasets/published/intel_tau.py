@@ -41,15 +41,7 @@ def is_intel_tau(folder: Folder) -> bool:
 
 
 def open_intel_tau(place: str, options: DataOptions, listed: Folder | None = None) -> SceneSet:
-    """Return the images, or those of a camera or a part; images and lights are read when they are used.
-
-    Raises
-    ------
-    InputError
-        There is no such camera or part.
-    FormatError
-        Images or lights are missing or too many.
-    """
+    """Return the images, or those of a camera or a part; images and lights are read when they are used."""
     folder = listed or Folder(Path(place))
     cameras = _cameras(folder)
     if not cameras:

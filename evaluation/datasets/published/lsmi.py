@@ -54,25 +54,15 @@ _RAW = (".dng", ".nef", ".arw")
 class LsmiScene(RawScene):
     """An image under one light.
 
-    Attributes
-    ----------
-    charts
-        Corners of each chart, x and y, px of the image; empty where `mask_path` is given.
-    mask_path
-        A picture that is 0 on the charts; "" for none.
+    - `charts`: corners of each chart, x and y, px of the image; empty where `mask_path` is given.
+    - `mask_path`: A picture that is 0 on the charts; "" for none.
     """
 
     charts: tuple[tuple[tuple[float, float], ...], ...] = ()
     mask_path: str = ""
 
     def mask(self, image: Image) -> Mask:
-        """Return (H, W) bool, True on the charts, of an image (H, W, 3).
-
-        Raises
-        ------
-        FormatError
-            The picture of the mask cannot be read or is of another size.
-        """
+        """Return (H, W) bool, True on the charts, of an image (H, W, 3)."""
         height, width = image.shape[:2]
         if self.mask_path:
             return _read_mask(self.mask_path, (height, width))
@@ -86,12 +76,8 @@ class LsmiScene(RawScene):
 class LsmiMixedScene(LsmiScene):
     """An image under two or three lights; `light` is not used.
 
-    Attributes
-    ----------
-    several
-        The lights (K of them), linear camera RGB with green 1.
-    shares_path
-        The file with the share of each light in each pixel.
+    - `several`: the lights (K of them), linear camera RGB with green 1.
+    - `shares_path`: the file with the share of each light in each pixel.
     """
 
     several: tuple[Light, ...] = ()
@@ -115,13 +101,7 @@ class LsmiMixedScene(LsmiScene):
         return np.array(self.several)
 
     def read_weights(self) -> npt.NDArray[np.float32]:
-        """Return the share of each light in each pixel: (H, W, K) float32, 0 … 1, sum 1; NaN where it is not known.
-
-        Raises
-        ------
-        FormatError
-            The file is missing, damaged or not such a map.
-        """
+        """Return the share of each light in each pixel: (H, W, K) float32, 0 … 1, sum 1; NaN where it is not known."""
         try:
             shares = np.load(self.shares_path, allow_pickle=False)
         except Exception as error:  # NumPy evaluates the head of a file, whose damage shows as any error.
@@ -156,13 +136,6 @@ def open_lsmi(place: str, options: DataOptions, listed: Folder | None = None) ->
 
     `options.subset` is a part, "train", "val" or "test", or a number of lights, "single" or "mixed", or both:
     "test-mixed".
-
-    Raises
-    ------
-    InputError
-        There is no such camera or part, or the levels of a camera are not known.
-    FormatError
-        A file is missing, or meta.json or split.json is damaged.
     """
     folder = listed or Folder(Path(place))
     cameras = _cameras(folder)

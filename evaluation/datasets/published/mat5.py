@@ -45,16 +45,6 @@ class _Element:
 def check_mat5(data: bytes) -> None:
     """Check the structure of a MATLAB file of version 5 to 7; files of version 4 pass unseen.
 
-    Parameters
-    ----------
-    data
-        The whole file.
-
-    Raises
-    ------
-    ValueError
-        It is damaged, or holds objects or functions, which no data set's ground truth does; says at which byte.
-
     Examples
     --------
     >>> header = b"MATLAB 5.0 MAT-file".ljust(126) + b"IM"

@@ -14,13 +14,7 @@ from foundation.errors import FormatError
 
 
 def read_mat(path: Path) -> Mapping[str, Any]:
-    """Return the variables of a MATLAB file up to version 7 by name.
-
-    Raises
-    ------
-    FormatError
-        It cannot be read.
-    """
+    """Return the variables of a MATLAB file up to version 7 by name."""
     from scipy.io import loadmat
 
     try:
@@ -34,13 +28,7 @@ def read_mat(path: Path) -> Mapping[str, Any]:
 
 
 def table(content: Mapping[str, Any], name: str, path: Path, columns: int) -> npt.NDArray[np.float64]:
-    """Return a variable as an array (N, columns) float64.
-
-    Raises
-    ------
-    FormatError
-        It is missing, of another shape, or has values that are not finite.
-    """
+    """Return a variable as an array (N, columns) float64."""
     try:
         values = np.asarray(_get(content, name, path), dtype=np.float64)
     except (TypeError, ValueError) as error:
@@ -53,13 +41,7 @@ def table(content: Mapping[str, Any], name: str, path: Path, columns: int) -> np
 
 
 def scalar(content: Mapping[str, Any], name: str, path: Path) -> float:
-    """Return a variable that is one number.
-
-    Raises
-    ------
-    FormatError
-        It is missing, or not one finite number from 0.
-    """
+    """Return a variable that is one number."""
     values = np.asarray(_get(content, name, path))
     if values.size != 1 or values.dtype.kind not in "iuf" or not np.isfinite(values).all() or values.min() < 0:
         raise FormatError(f"{path}: {name} is {values.tolist()}, expected one number from 0; restore the file")
@@ -67,13 +49,7 @@ def scalar(content: Mapping[str, Any], name: str, path: Path) -> float:
 
 
 def strings(content: Mapping[str, Any], name: str, path: Path) -> list[str] | None:
-    """Return a variable that is a cell array of names, or None if there is none.
-
-    Raises
-    ------
-    FormatError
-        It holds something else.
-    """
+    """Return a variable that is a cell array of names, or None if there is none."""
     if name not in content:
         return None
     found: list[str] = []

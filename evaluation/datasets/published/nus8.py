@@ -51,22 +51,13 @@ _PUBLISHED: Final = {
 class ChartScene(RawScene):
     """An image with the box of its chart.
 
-    Attributes
-    ----------
-    box
-        First and last row, first and last column of the chart, counted from 1.
+    `box`: first and last row, first and last column of the chart, counted from 1.
     """
 
     box: Box = (1, 1, 1, 1)
 
     def mask(self, image: Image) -> Mask:
-        """Return (H, W) bool, True in the box of the chart, of an image (H, W, 3).
-
-        Raises
-        ------
-        FormatError
-            The chart is not in the image, as in a reduced copy.
-        """
+        """Return (H, W) bool, True in the box of the chart, of an image (H, W, 3)."""
         top, bottom, left, right = self.box
         height, width = image.shape[:2]
         over = max(-top, -left, bottom - height, right - width)
@@ -84,15 +75,7 @@ def is_nus8(folder: Folder) -> bool:
 
 
 def open_nus8(place: str, options: DataOptions, listed: Folder | None = None) -> SceneSet:
-    """Return the images of all cameras in a folder, or of one; they are read when they are used.
-
-    Raises
-    ------
-    InputError
-        There is no such camera.
-    FormatError
-        A .mat file is missing or damaged, or images are missing or too many.
-    """
+    """Return the images of all cameras in a folder, or of one; they are read when they are used."""
     folder = listed or Folder(Path(place))
     tables = {path.name[: -len(_ENDING)]: path for path in _tables(folder)}
     if not tables:

@@ -36,26 +36,7 @@ rows and columns in each other's place meet less.
 def charts(
     content: Mapping[str, Any], path: Path, names: Sequence[str], kept: Sequence[int], root: Folder
 ) -> tuple[dict[int, Box], str]:
-    """Return the chart's box in each of the images that are kept, and a sentence on where it was found.
-
-    Parameters
-    ----------
-    content
-        The variables of the camera's .mat.
-    path
-        That file, for messages.
-    names
-        The images of the camera, without ending, in the order of the .mat.
-    kept
-        Positions in it of those that are there.
-    root
-        The folder of all cameras, or of the one.
-
-    Raises
-    ------
-    FormatError
-        Neither source has an image's chart, a file is damaged, or both have it and disagree.
-    """
+    """Return the chart's box in each of the images that are kept, and a sentence on where it was found."""
     masks = _mask_files(path, root)
     if _COORDS not in content:
         missing = [names[number] for number in kept if names[number] not in masks]
@@ -94,13 +75,7 @@ def charts(
 
 
 def read_mask(path: Path) -> Box:
-    """Return the chart's box of a text file.
-
-    Raises
-    ------
-    FormatError
-        Its first line is not a rectangle: x, y, width and height above 0.
-    """
+    """Return the chart's box of a text file."""
     lines = [line for line in read_text(path).splitlines() if line.strip()]
     values = numbers_in(lines[0], f"{path}, line 1") if lines else []
     if len(values) != 4 or not math.isfinite(sum(map(abs, values))) or min(values[2:]) <= 0:

@@ -46,10 +46,7 @@ class Peaks:
 class PeakScene(RawScene):
     """An image whose saturation is taken from its own largest value unless `white` is given.
 
-    Attributes
-    ----------
-    peaks
-        Of all images of the data set.
+    `peaks`: of all images of the data set.
     """
 
     peaks: Peaks = field(default_factory=Peaks)

@@ -32,21 +32,11 @@ Verdict = Literal["yes", "yes?", "no?", "no"]
 class FigureCompared:
     """A figure of a data set beside that of another.
 
-    Attributes
-    ----------
-    quantity
-        The figure.
-    one, other
-        Its values.
-    change
-        one / other, or one - other of a figure with a sign, and its interval of 95 %; NaN where `other` is 0.
-    scale
-        What a difference is measured by: the other's spread over its images; 1 for a ratio.
-    distance, p
-        Two-sample Kolmogorov-Smirnov statistic of the images' numbers, 0 … 1, and the probability of such a one where
-        both sets are of one kind.
-    verdict
-        Whether the change is within `TOLERANCE`; None where it is not known.
+    - `change`: one / other, or one - other of a figure with a sign, and its interval of 95 %; NaN where `other` is 0.
+    - `scale`: what a difference is measured by: the other's spread over its images; 1 for a ratio.
+    - `distance`, `p`: two-sample Kolmogorov-Smirnov statistic of the images' numbers, 0 … 1, and the probability of
+      such a one where both sets are of one kind.
+    - `verdict`: whether the change is within `TOLERANCE`; None where it is not known.
     """
 
     quantity: Quantity
@@ -60,15 +50,7 @@ class FigureCompared:
 
 
 def compare_figures(one: DataDescription, other: DataDescription, seed: int = 0) -> tuple[FigureCompared, ...]:
-    """Return every figure that is known of both sets, of at least three images each.
-
-    Parameters
-    ----------
-    one, other
-        The set that is asked about, and the set that it is held to.
-    seed
-        Of the bootstrap.
-    """
+    """Return every figure that is known of both sets, of at least three images each."""
     compared: list[FigureCompared] = []
     for quantity in QUANTITIES:
         values = [known_values(described, quantity.value) for described in (one, other)]

@@ -32,16 +32,11 @@ _USABLE: Final = 0.5
 class Cells:
     """An image, reduced.
 
-    Attributes
-    ----------
-    colours
-        (h, w, 3) float64, camera RGB divided by the light at equal mean over the channels, in the image's unit; NaN
-        where less than half of the cell's pixels are usable.
-    pixels, masked, clipped
-        Numbers of pixels: of the image, masked, and clipped of those not masked.
-    levels
-        (`LEVELS`,) int64: pixels not masked, counted by their largest channel as a share of saturation; empty where no
-        saturation is known.
+    - `colours`: (h, w, 3) float64, camera RGB divided by the light at equal mean over the channels, in the image's
+      unit; NaN where less than half of the cell's pixels are usable.
+    - `pixels`, `masked`, `clipped`: numbers of pixels: of the image, masked, and clipped of those not masked.
+    - `levels`: (`LEVELS`,) int64: pixels not masked, counted by their largest channel as a share of saturation; empty
+      where no saturation is known.
     """
 
     colours: npt.NDArray[np.float64]
@@ -56,14 +51,8 @@ def usable_pixels(
 ) -> tuple[npt.NDArray[np.bool_], npt.NDArray[np.bool_]]:
     """Return which pixels are usable and which are clipped, both (H, W) bool; masked ones are neither.
 
-    Parameters
-    ----------
-    image
-        (H, W, 3), linear camera RGB with black subtracted.
-    saturation
-        Value from which a pixel is clipped, in any channel; None if none is.
-    mask
-        (H, W) bool, True where a pixel must not be used; or None.
+    `image`: (H, W, 3), linear camera RGB with black subtracted. `saturation`: value from which a pixel is clipped, in
+    any channel; None if none is. `mask`: (H, W) bool, True where a pixel must not be used; or None.
     """
     free = np.ones(image.shape[:2], np.bool_) if mask is None else ~mask
     # Channel by channel: a reduction over the three of each pixel takes ten times as long.
@@ -82,21 +71,7 @@ def usable_pixels(
 def reduce_scene(scene: Scene, image: Image, mask: npt.NDArray[np.bool_] | None, side: int = CELLS) -> Cells:
     """Return a scene's image as cells; of a mixture, each pixel is divided by its own light.
 
-    Parameters
-    ----------
-    scene
-        For its light and saturation.
-    image
-        (H, W, 3), as `scene.read` gave it.
-    mask
-        (H, W) bool or None, as `scene.read` gave it.
-    side
-        Cells a side, at most; 0 keeps every pixel.
-
-    Raises
-    ------
-    FormatError
-        The scene's ground truth is no light.
+    `image`: (H, W, 3), as `scene.read` gave it. `mask`: (H, W) bool or None, as `scene.read` gave it.
     """
     height, width = image.shape[:2]
     rows, columns = cell_borders(height, side), cell_borders(width, side)

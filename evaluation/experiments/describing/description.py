@@ -28,35 +28,21 @@ OF_LIGHTS: Final = {"light_red": 0, "light_blue": 1}
 class DataDescription:
     """What is to be known of a data set.
 
-    Attributes
-    ----------
-    name, layout, place, treatment
-        As the `SceneSet` has them.
-    side
-        Cells a side that images were reduced to; 0 if they were not.
-    images
-        N names.
-    mixed
-        Images that several lights fall on.
-    sizes
-        Width and height, px, with the number of images of that size, the most frequent first.
-    masked
-        Mean share of the pixels that are masked.
-    values
-        (N,) float64 each, by the names that `QUANTITIES` makes its figures of, but those of lights; NaN where an image
-        has no such number.
-    lights
-        (L, 3) float64, linear camera RGB with r + g + b = 1: of every image the light, or each of its lights.
-    luminance
-        (70,) float64, sum 1: mean histogram of the images, by `LUMINANCE_EDGES`.
-    chroma
-        (64, 64) float64, sum 1: mean histogram of ln(R/G) and ln(B/G), by `CHROMA_EDGES`.
-    noise_unit
-        Unit of the photon-transfer curves: "saturation" or "99th percentile of green".
-    noise
-        The curves of red, green and blue.
-    groups
-        Pictures, places or whatever else several images share, with those that share nothing; None if not known.
+    - `name`, `layout`, `place`, `treatment`: as the `SceneSet` has them.
+    - `side`: cells a side that images were reduced to; 0 if they were not.
+    - `images`: N names.
+    - `mixed`: images that several lights fall on.
+    - `sizes`: width and height, px, with the number of images of that size, the most frequent first.
+    - `masked`: mean share of the pixels that are masked.
+    - `values`: (N,) float64 each, by the names that `QUANTITIES` makes its figures of, but those of lights; NaN where
+      an image has no such number.
+    - `lights`: (L, 3) float64, linear camera RGB with r + g + b = 1: of every image the light, or each of its lights.
+    - `luminance`: (70,) float64, sum 1: mean histogram of the images, by `LUMINANCE_EDGES`.
+    - `chroma`: (64, 64) float64, sum 1: mean histogram of ln(R/G) and ln(B/G), by `CHROMA_EDGES`.
+    - `noise_unit`: unit of the photon-transfer curves: "saturation" or "99th percentile of green".
+    - `noise`: the curves of red, green and blue.
+    - `groups`: pictures, places or whatever else several images share, with those that share nothing; None if not
+      known.
     """
 
     name: str
@@ -80,26 +66,7 @@ class DataDescription:
 def describe(
     data: SceneSet, side: int = CELLS, workers: int = 1, on_scene: Callable[[], None] | None = None
 ) -> DataDescription:
-    """Return the description of a data set; each image is read once and let go.
-
-    Parameters
-    ----------
-    data
-        The data set.
-    side
-        Cells a side that images are reduced to, at most; 0 keeps every pixel.
-    workers
-        Threads, one image each; no number depends on it.
-    on_scene
-        Called after each image, from the calling thread.
-
-    Raises
-    ------
-    InputError
-        The data set has no image.
-    FormatError
-        An image cannot be read, or its ground truth is no light.
-    """
+    """Return the description of a data set; each image is read once and let go."""
     if not data.scenes:
         raise InputError(f"{data.place} holds no image; name a data set with one at least")
     values: list[Mapping[str, float]] = []

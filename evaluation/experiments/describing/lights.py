@@ -21,21 +21,13 @@ _SHUFFLES: Final = 199
 class LightDistribution:
     """Where lights lie in the plane of ln(R/G) and ln(B/G).
 
-    Attributes
-    ----------
-    count
-        Lights.
-    mean
-        Of ln(R/G) and ln(B/G).
-    covariance
-        The two variances and the covariance between them: red, both, blue.
-    axis_deg
-        Direction of the principal axis, -90 … 90 degrees from the axis of ln(R/G); daylight and incandescent lamps lie
-        along a line that falls.
-    along, across
-        Standard deviations along the principal axis and across it.
-    hull_area
-        Area of the convex hull; 0 of lights on a line.
+    - `count`: lights.
+    - `mean`: of ln(R/G) and ln(B/G).
+    - `covariance`: the two variances and the covariance between them: red, both, blue.
+    - `axis_deg`: direction of the principal axis, -90 … 90 degrees from the axis of ln(R/G); daylight and incandescent
+      lamps lie along a line that falls.
+    - `along`, `across`: standard deviations along the principal axis and across it.
+    - `hull_area`: area of the convex hull; 0 of lights on a line.
     """
 
     count: int
@@ -86,17 +78,8 @@ def energy_distance(one: npt.ArrayLike, other: npt.ArrayLike, seed: int = 0) -> 
     G. J. Székely, M. L. Rizzo, "Energy statistics", J. Statistical Planning and Inference 143 (2013) 1249-1272: the
     coefficient of inhomogeneity, 0 of equal distributions and 1 of two single points.
 
-    Parameters
-    ----------
-    one, other
-        (N, D) and (M, D) float; of more than 1000 points a random 1000 are taken.
-    seed
-        Of that choice and of the permutations.
-
-    Returns
-    -------
-    tuple of float
-        The share, 0 … 1, and the share of 200 random divisions of all points into two such sets that lie as far apart.
+    `one`, `other`: (N, D) and (M, D) float; of more than 1000 points a random 1000 are taken. Returns the share, 0 … 1,
+    and the share of 200 random divisions of all points into two such sets that lie as far apart.
 
     Examples
     --------

@@ -22,23 +22,16 @@ _NOISE_FROM: Final = 0.1
 class ImageNumbers:
     """What one image gives.
 
-    Attributes
-    ----------
-    name
-        The image's name.
-    size
-        Width and height, px.
-    values
-        By the names that `quantities.QUANTITIES` makes its figures of, but those of lights; NaN where one is not known.
-    lights
-        (K, 3) float64: the light, or the lights, linear camera RGB with r + g + b = 1.
-    luminance, chroma
-        (70,) and (64, 64) float64: histograms of the cells, each of sum 1; all 0 of an image without a usable cell.
-    blocks
-        (M, 2, 3) float64: signal and noise of blocks, over saturation, or over the 99th percentile of green where no
-        saturation is known.
-    masked
-        Share of the pixels that are masked.
+    - `name`: the image's name.
+    - `size`: width and height, px.
+    - `values`: by the names that `quantities.QUANTITIES` makes its figures of, but those of lights; NaN where one is
+      not known.
+    - `lights`: (K, 3) float64: the light, or the lights, linear camera RGB with r + g + b = 1.
+    - `luminance`, `chroma`: (70,) and (64, 64) float64: histograms of the cells, each of sum 1; all 0 of an image
+      without a usable cell.
+    - `blocks`: (M, 2, 3) float64: signal and noise of blocks, over saturation, or over the 99th percentile of green
+      where no saturation is known.
+    - `masked`: share of the pixels that are masked.
     """
 
     name: str
@@ -52,20 +45,7 @@ class ImageNumbers:
 
 
 def measure_scene(scene: Scene, side: int = CELLS) -> ImageNumbers:
-    """Return the numbers of a scene; its image is read, and let go.
-
-    Parameters
-    ----------
-    scene
-        An image with its light or lights.
-    side
-        Cells a side to reduce it to, at most; 0 keeps every pixel.
-
-    Raises
-    ------
-    FormatError
-        The image cannot be read, or its ground truth is no light.
-    """
+    """Return the numbers of a scene; its image is read, and let go."""
     image, mask = scene.read()
     cells = reduce_scene(scene, image, mask, side)
     lights = np.asarray(scene.lights if isinstance(scene, MixedScene) else [scene.truth], dtype=np.float64)

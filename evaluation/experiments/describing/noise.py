@@ -54,12 +54,8 @@ _LAPLACIAN: Final = ((1, -2, 1), (-2, 4, -2), (1, -2, 1))
 class NoiseLevel:
     """The noise at one level of signal.
 
-    Attributes
-    ----------
-    signal, sigma
-        Mean and standard deviation of a pixel in the flattest blocks, in the unit of the curve.
-    blocks
-        Blocks of that level.
+    - `signal`, `sigma`: mean and standard deviation of a pixel in the flattest blocks, in the unit of the curve.
+    - `blocks`: blocks of that level.
     """
 
     signal: float
@@ -71,15 +67,10 @@ class NoiseLevel:
 class NoiseCurve:
     """Noise against signal of one channel: variance = read² + gain · signal.
 
-    Attributes
-    ----------
-    levels
-        What was measured.
-    read, gain
-        The fitted curve, in the unit of the signal; None where the levels are too few, span too little, or do not lie
-        on it.
-    misfit
-        Root mean square of ln(fitted / measured standard deviation); None where nothing was fitted.
+    - `levels`: what was measured.
+    - `read`, `gain`: the fitted curve, in the unit of the signal; None where the levels are too few, span too little,
+      or do not lie on it.
+    - `misfit`: root mean square of ln(fitted / measured standard deviation); None where nothing was fitted.
     """
 
     levels: tuple[NoiseLevel, ...]
@@ -96,21 +87,9 @@ def measure_blocks(
 ) -> npt.NDArray[np.float64]:
     """Return mean and noise of blocks of an image whose pixels are all usable.
 
-    Parameters
-    ----------
-    image
-        (H, W, 3), linear camera RGB with black subtracted.
-    saturation
-        Value from which a pixel is clipped; None if none is.
-    mask
-        (H, W) bool, True where a pixel must not be used; or None.
-    limit
-        Blocks looked at, at most; they lie on an even grid.
-
-    Returns
-    -------
-    ndarray
-        (M, 2, 3) float64: mean, and standard deviation by the Laplacian, of each channel. M may be 0.
+    `image`: (H, W, 3), linear camera RGB with black subtracted. `saturation`: value from which a pixel is clipped; None
+    if none is. `mask`: (H, W) bool, True where a pixel must not be used; or None. Returns (M, 2, 3) float64: mean, and
+    standard deviation by the Laplacian, of each channel. M may be 0.
     """
     down, across = (size // BLOCK for size in image.shape[:2])
     step = max(1, int(np.ceil(np.sqrt(down * across / limit))))
@@ -138,12 +117,8 @@ def measure_blocks(
 def relative_noise(blocks: npt.NDArray[np.float64], least: float) -> float:
     """Return the noise of green over its signal in the flattest blocks of an image; NaN of fewer than ten blocks.
 
-    Parameters
-    ----------
-    blocks
-        (M, 2, 3) float64, of `measure_blocks`.
-    least
-        Signal from which a block counts, in the image's unit: in the dark the ratio is the read noise's.
+    `blocks`: (M, 2, 3) float64, of `measure_blocks`. `least`: signal from which a block counts, in the image's unit: in
+    the dark the ratio is the read noise's.
     """
     signal, sigma = blocks[:, 0, 1], blocks[:, 1, 1]
     bright = signal > max(least, 0)
@@ -155,10 +130,7 @@ def relative_noise(blocks: npt.NDArray[np.float64], least: float) -> float:
 def photon_transfer(blocks: Sequence[npt.NDArray[np.float64]]) -> tuple[NoiseCurve, ...]:
     """Return the photon-transfer curves of red, green and blue.
 
-    Parameters
-    ----------
-    blocks
-        For each image (M, 2, 3) float64, of `measure_blocks`, in a unit that the images share.
+    `blocks`: for each image (M, 2, 3) float64, of `measure_blocks`, in a unit that the images share.
     """
     together = np.concatenate([np.empty((0, 2, 3)), *blocks])
     return tuple(_curve(together[:, 0, channel], together[:, 1, channel]) for channel in range(3))

@@ -19,21 +19,13 @@ Summed = Literal["median", "mean", "spread"]
 class Quantity:
     """A figure of a data set.
 
-    Attributes
-    ----------
-    name
-        In files: `chroma_spread`.
-    value
-        The number of an image that it is made of; several quantities may be of one.
-    title
-        In tables: "Chroma spread".
-    definition
-        What it is, in one sentence.
-    summed
-        How it is made of the images' numbers.
-    signed
-        Whether it has a sign or its zero is a place like any other, so that two sets are told apart by their difference
-        and not by their ratio.
+    - `name`: in files: `chroma_spread`.
+    - `value`: the number of an image that it is made of; several quantities may be of one.
+    - `title`: in tables: "Chroma spread".
+    - `definition`: what it is, in one sentence.
+    - `summed`: how it is made of the images' numbers.
+    - `signed`: whether it has a sign or its zero is a place like any other, so that two sets are told apart by their
+      difference and not by their ratio.
     """
 
     name: str

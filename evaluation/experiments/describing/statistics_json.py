@@ -80,13 +80,7 @@ def statistics_to_json(description: DataDescription) -> str:
 
 
 def read_statistics(path: Path | str) -> DataDescription:
-    """Return the description that a `STATS.json` holds.
-
-    Raises
-    ------
-    FormatError
-        There is no such file, it is of another format or version, or a part of it is missing.
-    """
+    """Return the description that a `STATS.json` holds."""
     known, _ = read_content(path)
     try:
         return _description(known)

@@ -41,19 +41,9 @@ def reduce_colours(
 ) -> list[npt.NDArray[np.float32]]:
     """Return a linear image after `bits` bits of its tone-mapped codes were set to zero, for each of these numbers.
 
-    Parameters
-    ----------
-    image
-        (H, W, 3) uint16, float32 or float64, linear camera RGB ≥ 0, any unit.
-    bits
-        How many, 0 … 8; or several such numbers.
-    mask
-        (H, W) bool, True where a pixel has no say in the operator.
-
-    Returns
-    -------
-    list
-        For each number (H, W, 3) float32, in units of the image's largest unmasked value.
+    `image`: (H, W, 3) uint16, float32 or float64, linear camera RGB ≥ 0, any unit. `mask`: (H, W) bool, True where a
+    pixel has no say in the operator. Returns for each number (H, W, 3) float32, in units of the image's largest
+    unmasked value.
 
     Examples
     --------
@@ -75,14 +65,9 @@ def reduce_colours(
 class FittedCodes:
     """A linear image after Flash.
 
-    Attributes
-    ----------
-    codes
-        (H, W, 3) uint8.
-    operator
-        That made them, of values relative to `largest`.
-    largest
-        Largest value that is not masked, in the image's unit; 0 of a black image.
+    - `codes`: (H, W, 3) uint8.
+    - `operator`: that made them, of values relative to `largest`.
+    - `largest`: largest value that is not masked, in the image's unit; 0 of a black image.
     """
 
     codes: npt.NDArray[np.uint8]
@@ -93,12 +78,8 @@ class FittedCodes:
 def fitted_codes(image: Image, mask: npt.NDArray[np.bool_] | None = None) -> FittedCodes:
     """Return the codes of 8 bits of a linear image, by the operator that is fitted to it.
 
-    Parameters
-    ----------
-    image
-        (H, W, 3) uint16, float32 or float64, linear camera RGB ≥ 0, any unit.
-    mask
-        (H, W) bool, True where a pixel has no say in the operator.
+    `image`: (H, W, 3) uint16, float32 or float64, linear camera RGB ≥ 0, any unit. `mask`: (H, W) bool, True where a
+    pixel has no say in the operator.
     """
     values = np.asarray(image, dtype=np.float64)
     seen = values.reshape(-1, 3) if mask is None else values[~mask]
@@ -125,12 +106,8 @@ def bits_methods(sigma: float = GRAY_EDGE_SIGMA) -> tuple[Method, ...]:
 class BitsResult:
     """What methods made of a data set's images, as they are and after bits were set to zero.
 
-    Attributes
-    ----------
-    raw
-        One result a method, on the images as they are.
-    reduced
-        The same by the number of bits set to zero.
+    - `raw`: one result a method, on the images as they are.
+    - `reduced`: the same by the number of bits set to zero.
     """
 
     raw: tuple[Result, ...]
@@ -146,23 +123,7 @@ def bits_removed(
 ) -> BitsResult:
     """Return errors of methods on images with bits set to zero; each image is read once.
 
-    Parameters
-    ----------
-    scenes
-        Real linear images with their ground truths, at least one.
-    methods
-        At least one.
-    bits
-        Numbers of bits to set to zero, 0 … 8.
-    workers
-        Threads, one image each; no number depends on it.
-    on_scene
-        Called after each image, from the calling thread.
-
-    Raises
-    ------
-    InputError
-        There is no scene or no method.
+    `scenes`: real linear images with their ground truths, at least one.
     """
     truths = truths_of(scenes, methods)
 

@@ -24,14 +24,9 @@ if TYPE_CHECKING:
 class TableLights:
     """The lights of a table.
 
-    Attributes
-    ----------
-    camera
-        Of the table.
-    rb
-        (L, 2) float64, r = R / (R + G + B) and b = B / (R + G + B) of linear camera RGB.
-    black_body
-        (L,) bool, True for a black body of the plan.
+    - `camera`: of the table.
+    - `rb`: (L, 2) float64, r = R / (R + G + B) and b = B / (R + G + B) of linear camera RGB.
+    - `black_body`: (L,) bool, True for a black body of the plan.
     """
 
     camera: str
@@ -69,12 +64,7 @@ def chromaticity_rows(luts: Sequence[Lut]) -> Table:
 def coverage_table(luts: Sequence[Lut], sets: Mapping[str, npt.NDArray[np.float64]]) -> Table:
     """Return how near the lights of tables come to the ground truths of data sets.
 
-    Parameters
-    ----------
-    luts
-        The tables.
-    sets
-        Name of a data set to its ground truths, (N, 3) float64, linear camera RGB of any length.
+    `sets`: name of a data set to its ground truths, (N, 3) float64, linear camera RGB of any length.
     """
     rows: list[tuple[str | float | None, ...]] = []
     for lut in luts:

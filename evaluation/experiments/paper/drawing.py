@@ -79,12 +79,7 @@ def chromaticities_figure(
 ) -> bytes:
     """Return the paper's figures of lights in camera RGB side by side, over the ground truths of data sets.
 
-    Parameters
-    ----------
-    tables
-        The lights of each table.
-    sets
-        Name of a data set to its ground truths, (N, 3) float64, linear camera RGB of any length.
+    `sets`: name of a data set to its ground truths, (N, 3) float64, linear camera RGB of any length.
     """
     return svg_of(_draw_chromaticities, tables, sets or {}, inches=(4.6 * len(tables), 4.7))
 

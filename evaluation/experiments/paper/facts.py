@@ -22,18 +22,11 @@ DAYLIGHT_K: Final = 5600.0
 class TableNoise:
     """How bright and how noisy the print's white is in a table.
 
-    Attributes
-    ----------
-    camera
-        The table's camera.
-    lights
-        Its lights.
-    level
-        Median over the lights of the white cell's brightest channel, share of saturation.
-    spread
-        Median over the lights of the standard deviation of the white cell's samples over their mean, R, G and B.
-    largest
-        Median over the lights of the largest of its samples over their mean, less 1; R, G and B.
+    - `camera`: the table's camera.
+    - `level`: median over the lights of the white cell's brightest channel, share of saturation.
+    - `spread`: median over the lights of the standard deviation of the white cell's samples over their mean, R, G and
+      B.
+    - `largest`: median over the lights of the largest of its samples over their mean, less 1; R, G and B.
     """
 
     camera: str
@@ -75,14 +68,9 @@ def noise_table(found: Sequence[TableNoise]) -> Table:
 class PrintColours:
     """What all colours of a table's print are together: the scene in which every code is as likely.
 
-    Attributes
-    ----------
-    camera
-        The table's camera.
-    light
-        The light they are looked at under: the black body nearest to `DAYLIGHT_K`, or the table's first light.
-    mean, rms
-        Mean and root mean square of all colours over the light's white, R, G and B.
+    - `camera`: the table's camera.
+    - `light`: the light they are looked at under: the black body nearest to `DAYLIGHT_K`, or the table's first light.
+    - `mean`, `rms`: mean and root mean square of all colours over the light's white, R, G and B.
     """
 
     camera: str

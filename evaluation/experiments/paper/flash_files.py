@@ -46,18 +46,11 @@ _ENDINGS: Final = (".png", ".jpg", ".jpeg", ".tif", ".tiff")
 class CodedImage:
     """A row of the table.
 
-    Attributes
-    ----------
-    image
-        The image's name in its data set.
-    codes, mask
-        Names of the files below the folder; an empty mask where every pixel may be used.
-    operator
-        That made its codes, of values relative to `largest`.
-    largest
-        Largest value that is not masked, in the units of the data set.
-    light
-        Ground truth, linear camera RGB of sum 1.
+    - `image`: the image's name in its data set.
+    - `codes`, `mask`: names of the files below the folder; an empty mask where every pixel may be used.
+    - `operator`: that made its codes, of values relative to `largest`.
+    - `largest`: largest value that is not masked, in the units of the data set.
+    - `light`: ground truth, linear camera RGB of sum 1.
     """
 
     image: str
@@ -71,26 +64,7 @@ class CodedImage:
 def write_codes(
     data: SceneSet, out: Path, cleared: int = 0, workers: int = 1, on_scene: Callable[[], None] | None = None
 ) -> None:
-    """Write the codes of a data set's linear images into a new folder.
-
-    Parameters
-    ----------
-    data
-        Linear images with their ground truths.
-    out
-        The folder; must be free.
-    cleared
-        How many of the lowest bits of each code are set to zero, 0 … 8.
-    workers
-        Threads, one image each; no byte depends on it.
-    on_scene
-        Called after each image, from the calling thread.
-
-    Raises
-    ------
-    InputError
-        The folder is taken, names of images make no names of files, or a code has no such number of bits.
-    """
+    """Write the codes of a data set's linear images into a new folder."""
     names = [_file_name(scene.name) for scene in data.scenes]
     if len(set(names)) != len(names):
         raise InputError(f"images of {data.name} have names that differ in their endings only; name a part of it")
@@ -119,26 +93,7 @@ def write_codes(
 
 
 def write_linear(folder: Path, out: Path, workers: int = 1, on_image: Callable[[int, int], None] | None = None) -> int:
-    """Write the linear images that a folder of codes stands for into a new folder, and return how many.
-
-    Parameters
-    ----------
-    folder
-        Made by `write_codes`; its codes may have been changed.
-    out
-        The folder; must be free.
-    workers
-        Threads, one image each; no byte depends on it.
-    on_image
-        Takes how many are done, and how many there are.
-
-    Raises
-    ------
-    FormatError
-        The table or a picture is missing, damaged or no 8-bit RGB.
-    InputError
-        The place is taken.
-    """
+    """Write the linear images that a folder of codes stands for into a new folder, and return how many."""
     coded = list(read_table(folder))
     with whole_folder(out, "the linear images") as made:
         rows = ["image,r,g,b,mask"]
@@ -162,13 +117,7 @@ def write_linear(folder: Path, out: Path, workers: int = 1, on_image: Callable[[
 
 
 def read_table(folder: Path) -> Iterator[CodedImage]:
-    """Yield the rows of a folder of codes.
-
-    Raises
-    ------
-    FormatError
-        The table is missing or damaged.
-    """
+    """Yield the rows of a folder of codes."""
     place = folder / TABLE
     try:
         text = _read(folder, TABLE).decode("utf-8-sig")

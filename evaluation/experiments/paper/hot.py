@@ -39,12 +39,8 @@ if TYPE_CHECKING:
 class HotPhotosites:
     """Values of a table that are raised.
 
-    Attributes
-    ----------
-    places
-        (M,) int64, places in a light's samples, flattened from (colours, samples, 3).
-    signals
-        (M,) float64, dark signal of each, in units of the samples.
+    - `places`: (M,) int64, places in a light's samples, flattened from (colours, samples, 3).
+    - `signals`: (M,) float64, dark signal of each, in units of the samples.
     """
 
     places: npt.NDArray[np.int64]
@@ -60,13 +56,7 @@ class HotPhotosites:
 
 
 def hot_photosites(lut: Lut, per_million: float, seed: int = 0) -> HotPhotosites:
-    """Return hot photosites of a table: so many in a million of a light's values, rounded to a whole number.
-
-    Raises
-    ------
-    InputError
-        The share is below 0 or above all.
-    """
+    """Return hot photosites of a table: so many in a million of a light's values, rounded to a whole number."""
     values = int(np.prod(lut.samples.shape[1:]))
     if not 0 <= per_million <= 1e6:
         raise InputError(f"{per_million:g} hot photosites in a million were asked for, expected 0 to a million")
@@ -109,16 +99,10 @@ class HotScene:
 class HotRow:
     """White-Patch on one data set with one share of hot photosites.
 
-    Attributes
-    ----------
-    title
-        The data set's.
-    per_million
-        Hot photosites in a million.
-    count
-        How many that are in the table.
-    result
-        White-Patch's.
+    - `title`: the data set's.
+    - `per_million`: hot photosites in a million.
+    - `count`: how many that are in the table.
+    - `result`: white-Patch's.
     """
 
     title: str
@@ -130,16 +114,7 @@ class HotRow:
 def hot_rows(chosen: Sequence[Setting], shares: Sequence[float], seed: int = 0, workers: int = 1) -> tuple[HotRow, ...]:
     """Return White-Patch's results on data sets whose tables have hot photosites.
 
-    Parameters
-    ----------
-    chosen
-        The data sets; see `table1.settings`. At most `table1.STUDIED` images of each are used.
-    shares
-        Hot photosites in a million of a light's values.
-    seed
-        Chooses them; a table has the same ones in each of its data sets.
-    workers
-        Threads.
+    `shares`: hot photosites in a million of a light's values.
     """
     method = standard_methods()["white-patch"]
     rows: list[HotRow] = []

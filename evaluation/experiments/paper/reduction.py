@@ -24,17 +24,8 @@ _COLUMNS: Final = 4
 def reduction_strip(picture: npt.NDArray[np.uint8], bits: Sequence[int] = BITS) -> npt.NDArray[np.uint8]:
     """Return the panels of a picture with bits set to zero, four in a row, white between them.
 
-    Parameters
-    ----------
-    picture
-        (H, W, 3) uint8, sRGB codes; made smaller first if a side is above `PANEL`.
-    bits
-        For each panel the number of bits set to zero.
-
-    Returns
-    -------
-    ndarray
-        (h, w, 3) uint8, sRGB codes.
+    `picture`: (H, W, 3) uint8, sRGB codes; made smaller first if a side is above `PANEL`. Returns (h, w, 3) uint8, sRGB
+    codes.
     """
     import cv2
 

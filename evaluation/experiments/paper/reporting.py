@@ -39,16 +39,9 @@ _TABLE1 = (
 class PaperReport:
     """What an experiment leaves.
 
-    Attributes
-    ----------
-    title
-        Of the page.
-    tables
-        What is printed, in order.
-    parts
-        The page.
-    files
-        Beside the page: name to content.
+    - `title`: of the page.
+    - `tables`: what is printed, in order.
+    - `files`: beside the page: name to content.
     """
 
     title: str
@@ -58,15 +51,7 @@ class PaperReport:
 
 
 def write_report(report: PaperReport, folder: Path) -> None:
-    """Write a report to a new folder, whole or not at all; its page is `report.html`.
-
-    Raises
-    ------
-    InputError
-        The folder is taken.
-    StorageError
-        The disk is full, read-only or gone.
-    """
+    """Write a report to a new folder, whole or not at all; its page is `report.html`."""
     with whole_folder(folder, "the report") as partial:
         (partial / "report.html").write_text(page(report.title, report.parts), encoding="utf-8")
         for name, content in report.files.items():
@@ -83,20 +68,8 @@ def table1_report(
 ) -> PaperReport:
     """Return the report of table 1, first with one kind of error, then with the other.
 
-    Parameters
-    ----------
-    blocks
-        The data sets' results.
-    luts
-        The tables.
-    conditions
-        Sentences that say what was given and chosen.
-    kind
-        The kind of error that is printed and stands first.
-    sizes
-        The errors for other sizes of images; may be empty.
-    hot
-        White-Patch's errors with hot photosites; may be empty.
+    `sizes`: the errors for other sizes of images; may be empty. `hot`: white-Patch's errors with hot photosites; may be
+    empty.
     """
     other: ErrorKind = "recovery" if kind == "reproduction" else "reproduction"
     first = [block_table(block, kind) for block in blocks]

@@ -65,17 +65,11 @@ _HEAD: Final = ("scenes", "sensor", "illuminations", "images", "method", "error"
 class Block:
     """One of the eight data sets and what the methods made of it.
 
-    Attributes
-    ----------
-    cell
-        Scenes, sensor and illuminations, as the paper names them: ``("C1", "6D", "Random")``; the paper's numbers are
-        found by it, so other scenes and lights have names of their own.
-    images
-        Number of images.
-    lights
-        How their lights were chosen, in words.
-    results
-        One a method, in the order of `METHODS`.
+    - `cell`: scenes, sensor and illuminations, as the paper names them: ``("C1", "6D", "Random")``; the paper's numbers
+      are found by it, so other scenes and lights have names of their own.
+    - `images`: number of images.
+    - `lights`: how their lights were chosen, in words.
+    - `results`: one a method, in the order of `METHODS`.
     """
 
     cell: Cell
@@ -108,26 +102,9 @@ def settings(
 ) -> tuple[Setting, ...]:
     """Return the data sets of the table in the paper's order: scenes, then tables, then lights.
 
-    Parameters
-    ----------
-    luts
-        The tables, in the paper 6D and 550D.
-    pictures
-        The given pictures, at least one.
-    truths
-        (N, 3) float64 ≥ 0, the ground truths that the first choice of lights is to be like; linear camera RGB of any
-        length, taken as they are although another camera saw them, as in the paper.
-    side
-        Longest side of every image, px.
-    seed
-        0 … 2⁶⁴ − 1; chooses random codes, random lights and samples.
-    names
-        Of the pictures and of the ground truths, see `published.cell_name`.
-
-    Raises
-    ------
-    InputError
-        There is no picture, or the side is no size.
+    `truths`: (N, 3) float64 ≥ 0, the ground truths that the first choice of lights is to be like; linear camera RGB of
+    any length, taken as they are although another camera saw them, as in the paper. `side`: longest side of every
+    image, px.
     """
     count = len(pictures)
     if not count:
@@ -165,17 +142,7 @@ def thinned(things: Sequence[_Thing], most: int = STUDIED) -> Sequence[_Thing]:
 def table1(
     chosen: Sequence[Setting], workers: int = 1, on_scene: Callable[[], None] | None = None
 ) -> tuple[Block, ...]:
-    """Return what the methods make of each data set.
-
-    Parameters
-    ----------
-    chosen
-        The data sets; see `settings`.
-    workers
-        Threads; no number depends on it.
-    on_scene
-        Called after each image.
-    """
+    """Return what the methods make of each data set."""
     methods = [standard_methods()[name] for name in METHODS]
     return tuple(
         Block(part.cell, len(part.scenes), part.lights, evaluate(part.scenes, methods, workers, on_scene))
@@ -236,14 +203,8 @@ def joint_table(blocks: Sequence[Block]) -> Table:
 class SizeRow:
     """Median errors of the methods on one data set whose images have one side.
 
-    Attributes
-    ----------
-    cell
-        The data set.
-    side
-        Longest side of the images, px.
-    medians
-        Median reproduction errors, degrees, by method.
+    - `side`: longest side of the images, px.
+    - `medians`: median reproduction errors, degrees, by method.
     """
 
     cell: Cell
@@ -262,16 +223,7 @@ def size_dependence(
 ) -> tuple[SizeRow, ...]:
     """Return the methods' median reproduction errors for images of several sizes, of `STUDIED` pictures at most.
 
-    Parameters
-    ----------
-    luts, pictures, seed, names
-        As of `settings`.
-    truths
-        (N, 3) float64, as of `settings`.
-    sides
-        Longest sides of the images, px.
-    workers
-        Threads.
+    `truths`: (N, 3) float64, as of `settings`. `sides`: longest sides of the images, px.
     """
     rows: list[SizeRow] = []
     for side in sides:

@@ -40,12 +40,7 @@ LEARNERS: Final[Mapping[str, str]] = {
 class Trained:
     """What one learner reaches, trained on real and on generated images.
 
-    Attributes
-    ----------
-    learner
-        Its short name.
-    real, generated
-        Its results on the real images.
+    `real`, `generated`: its results on the real images.
     """
 
     learner: str
@@ -64,27 +59,7 @@ def table2(
 ) -> tuple[Trained, ...]:
     """Return the results of each learner, trained on real and on generated images.
 
-    Parameters
-    ----------
-    real
-        The real images, in the paper Cube+.
-    generated
-        Generated images.
-    learners
-        By short names, at least one.
-    folds
-        (N,) int64, the fold of each real image.
-    seed
-        Of all that is random in the fits.
-    workers
-        Threads.
-    on_scene
-        Called after each real image of each test.
-
-    Raises
-    ------
-    InputError
-        There are no images to train on, or no learner.
+    `folds`: (N,) int64, the fold of each real image.
     """
     if not generated or not learners:
         raise InputError(f"{len(learners)} learners and {len(generated)} generated images: name at least one of each")
@@ -96,19 +71,7 @@ def table2(
 
 
 def table2_tables(found: Sequence[Trained], kind: ErrorKind, name: str, with_published: bool = True) -> list[Table]:
-    """Return the two halves of the paper's table, and the ratios of their medians.
-
-    Parameters
-    ----------
-    found
-        What `table2` returns.
-    kind
-        Kind of error.
-    name
-        Of the real data set.
-    with_published
-        Whether the paper's numbers, which are of Cube+, stand below ours.
-    """
+    """Return the two halves of the paper's table, and the ratios of their medians."""
     heads: Mapping[str, str] = {
         "real": f"Trained and tested on {name} (through cross-validation)",
         "generated": f"Trained on the generated data set and tested on {name}",

@@ -28,21 +28,7 @@ def pool_page(
     single: Mapping[str, TransferFigures],
     places: Sequence[str],
 ) -> str:
-    """Return the report of a pool as the text of one HTML file.
-
-    Parameters
-    ----------
-    pool
-        The pool.
-    shown
-        Its tables, as they are to stand in the page.
-    whole
-        What its rows come to over all images.
-    single
-        The same of each test set by itself, by its name, its rows in the same order.
-    places
-        The folders that it was made of, as they were named.
-    """
+    """Return the report of a pool as the text of one HTML file."""
     counts = {test: pool.tests.count(test) for test in single}
     told = ", ".join(f"{test} ({counted(count, 'image')})" for test, count in counts.items())
     images = counted(len(pool.images), "image")

@@ -25,18 +25,11 @@ from foundation.errors import InputError, first_of
 class Pool:
     """Several results as one.
 
-    Attributes
-    ----------
-    images
-        Folder and name of each of the N images, `folder/image`.
-    truths
-        (N, 3) float64.
-    tests
-        (N,) str, the test set of each image.
-    rows
-        The rows that all folders have.
-    notes
-        Sentences for the reader: rows left out, conditions that differ.
+    - `images`: folder and name of each of the N images, `folder/image`.
+    - `truths`: (N, 3) float64.
+    - `tests`: (N,) str, the test set of each image.
+    - `rows`: the rows that all folders have.
+    - `notes`: sentences for the reader: rows left out, conditions that differ.
     """
 
     images: tuple[str, ...]
@@ -52,11 +45,6 @@ def pool_transfers(parts: Sequence[TransferResults]) -> Pool:
     A row is found again by its method, by how it was trained, and by the name of its training set; where each of the
     folders has a single training set, whatever its name. Seed k of the pool is seed k of each. A row's training images
     are those of the folder with the fewest.
-
-    Raises
-    ------
-    InputError
-        There is no folder, an image is in two of them, they have no row in common, or different numbers of seeds.
     """
     if not parts:
         raise InputError("no results to pool: name folders that evaluate transfer --out has written")

@@ -25,24 +25,14 @@ _KINDS: tuple[Kind, ...] = get_args(Kind)
 class TransferResults:
     """A results folder of `evaluate transfer`, read back.
 
-    Attributes
-    ----------
-    place
-        The folder as it was named.
-    test
-        Name of the test set.
-    images
-        The names of the N test images.
-    truths
-        (N, 3) float64, linear camera RGB of their lights.
-    rows
-        Its rows, the images in that order.
-    error
-        The kind of error that it was summed up by.
-    conditions
-        What of its settings would make its rows other ones, each as JSON text by its name.
-    generated
-        Whether the test images were generated.
+    - `place`: the folder as it was named.
+    - `test`: name of the test set.
+    - `images`: the names of the N test images.
+    - `truths`: (N, 3) float64, linear camera RGB of their lights.
+    - `rows`: its rows, the images in that order.
+    - `error`: the kind of error that it was summed up by.
+    - `conditions`: what of its settings would make its rows other ones, each as JSON text by its name.
+    - `generated`: whether the test images were generated.
     """
 
     place: str
@@ -56,15 +46,7 @@ class TransferResults:
 
 
 def read_transfer(place: Path | str) -> TransferResults:
-    """Return what a results folder of `evaluate transfer` holds.
-
-    Raises
-    ------
-    InputError
-        There is no such folder, or it was not written by `evaluate transfer`.
-    FormatError
-        A file in it is damaged, or the files do not belong together.
-    """
+    """Return what a results folder of `evaluate transfer` holds."""
     folder = Path(place)
     about = _about(folder)
     errors = read_errors(folder)

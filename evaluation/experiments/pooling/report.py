@@ -35,20 +35,12 @@ from foundation.version import software
 class PoolTables:
     """What a pool comes to: tables, and what they were made of.
 
-    Attributes
-    ----------
-    shown
-        In the order in which they are shown.
-    pooled
-        All numbers of the pool for other programs, see `transfer.tables.long_table`.
-    single
-        The same of each test set by itself, its name and images before them.
-    figures
-        What the rows come to over all images.
-    figures_of_tests
-        The same of each test set by itself, by its name.
-    base
-        What the rows are trained on that every other one is held to, as it was asked for; None if none was.
+    - `shown`: in the order in which they are shown.
+    - `pooled`: all numbers of the pool for other programs, see `transfer.tables.long_table`.
+    - `single`: the same of each test set by itself, its name and images before them.
+    - `figures`: what the rows come to over all images.
+    - `figures_of_tests`: the same of each test set by itself, by its name.
+    - `base`: what the rows are trained on that every other one is held to, as it was asked for; None if none was.
     """
 
     shown: tuple[Table, ...]
@@ -60,22 +52,7 @@ class PoolTables:
 
 
 def make_tables(pool: Pool, error: ErrorKind, base: str | None = None) -> PoolTables:
-    """Return the tables of a pool, summed up by one kind of error.
-
-    Parameters
-    ----------
-    pool
-        The pool.
-    error
-        The kind of error.
-    base
-        What rows are trained on that every other one is held to, see `transfer.figures.figures_of`.
-
-    Raises
-    ------
-    InputError
-        As `transfer.figures.figures_of`.
-    """
+    """Return the tables of a pool, summed up by one kind of error."""
     tests = list(dict.fromkeys(pool.tests))
     name = " + ".join(tests)
     every = figures_of(pool.rows, error, base=base)
@@ -104,28 +81,7 @@ def make_tables(pool: Pool, error: ErrorKind, base: str | None = None) -> PoolTa
 
 
 def save_pool(pool: Pool, tables: PoolTables, places: Sequence[str], error: ErrorKind, folder: Path) -> None:
-    """Write the folder of a pool: three CSV files of results and errors, `tables.tex`, `report.html`, `run.json`.
-
-    Parameters
-    ----------
-    pool
-        The pool.
-    tables
-        Its tables.
-    places
-        The folders that it was made of, as they were named.
-    error
-        The kind of error that the tables sum up.
-    folder
-        Where it goes.
-
-    Raises
-    ------
-    InputError
-        The folder is not free.
-    StorageError
-        The disk is full, read-only or gone; nothing is left behind.
-    """
+    """Write the folder of a pool: three CSV files of results and errors, `tables.tex`, `report.html`, `run.json`."""
     about = {
         "format": "crop.pool",
         "version": 1,

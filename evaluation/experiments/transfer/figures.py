@@ -41,14 +41,8 @@ class Figure:
 class RowFigures:
     """What one row comes to.
 
-    Attributes
-    ----------
-    row
-        The row.
-    statistics
-        In the order of `bootstrap.STATISTICS`, degrees.
-    spread
-        Standard deviation of each statistic over the seeds, degrees; None with a single one.
+    - `statistics`: in the order of `bootstrap.STATISTICS`, degrees.
+    - `spread`: standard deviation of each statistic over the seeds, degrees; None with a single one.
     """
 
     row: TransferRow
@@ -60,12 +54,8 @@ class RowFigures:
 class RowRatio:
     """What a row comes to in parts of another with the same method, image by image on the same resamples.
 
-    Attributes
-    ----------
-    row, base
-        The row, and what it is held to.
-    ratios
-        In the order of `bootstrap.STATISTICS`.
+    - `row`, `base`: the row, and what it is held to.
+    - `ratios`: in the order of `bootstrap.STATISTICS`.
     """
 
     row: TransferRow
@@ -77,18 +67,11 @@ class RowRatio:
 class TransferFigures:
     """All that is told of the rows.
 
-    Attributes
-    ----------
-    error
-        The kind of error.
-    rows
-        Every row with its statistics.
-    to_real
-        Every row that was trained elsewhere against the same method's real cross-validation.
-    to_naive
-        Every generated row against the naive rows of the same pictures and lights.
-    to_base
-        Every other row against those that were asked for, of the same method.
+    - `error`: the kind of error.
+    - `rows`: every row with its statistics.
+    - `to_real`: every row that was trained elsewhere against the same method's real cross-validation.
+    - `to_naive`: every generated row against the naive rows of the same pictures and lights.
+    - `to_base`: every other row against those that were asked for, of the same method.
     """
 
     error: ErrorKind
@@ -112,22 +95,8 @@ def figures_of(
 ) -> TransferFigures:
     """Return statistics, intervals and ratios of rows on the same test images.
 
-    Parameters
-    ----------
-    rows
-        All of the same images.
-    error
-        The kind of error that is summed up.
-    seed
-        Of the resamples.
-    base
-        `TransferRow.training` of rows that every other one is held to as well, with x for × and in any case; None for
-        no such ratios.
-
-    Raises
-    ------
-    InputError
-        An error is not finite, no row was trained like `base`, or no other row has the method of one that was.
+    `base`: `TransferRow.training` of rows that every other one is held to as well, with x for × and in any case; None
+    for no such ratios.
     """
     bases = _named(rows, base)
     samples = [[ErrorSample.of(result.errors[error]) for result in row.results] for row in rows]

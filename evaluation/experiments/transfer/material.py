@@ -34,15 +34,10 @@ AnyLearner = Learner | FeatureLearner
 class Material:
     """Scenes with all that some learners take from them.
 
-    Attributes
-    ----------
-    scenes
-        N scenes.
-    truths
-        (N, 3) float64, linear camera RGB of any length.
-    features
-        For each learner its features of each scene, (...) of its own dtype or None where no pixel is usable; None for a
-        learner that reads the scenes itself.
+    - `scenes`: N scenes.
+    - `truths`: (N, 3) float64, linear camera RGB of any length.
+    - `features`: for each learner its features of each scene, (...) of its own dtype or None where no pixel is usable;
+      None for a learner that reads the scenes itself.
     """
 
     scenes: tuple[Scene, ...]
@@ -64,25 +59,7 @@ def gather(
 ) -> Material:
     """Return the material of scenes for learners; each image is read once for all that extract features.
 
-    Parameters
-    ----------
-    scenes
-        The scenes, at least one.
-    learners
-        What learns from them, or is tested on them.
-    side
-        Longest side that images are made small to first, px, in memory; None leaves them as they are.
-    workers
-        Threads that read images; no number depends on it.
-    on_scene
-        Called after each scene that is read, from the calling thread.
-
-    Raises
-    ------
-    InputError
-        A ground truth is no light to learn from, or there is no scene.
-    FormatError
-        An image cannot be read.
+    `side`: longest side that images are made small to first, px, in memory; None leaves them as they are.
     """
     truths = truths_of(scenes)
     if side is not None:
@@ -97,13 +74,7 @@ def gather(
 
 
 def fit_on(learner: AnyLearner, number: int, material: Material, places: Places, seed: int) -> Method:
-    """Return the learner fitted to the scenes at `places` (P,) int64; `number` is its place among the learners.
-
-    Raises
-    ------
-    InputError
-        No image has a usable pixel, or a class of the user's own fails.
-    """
+    """Return the learner fitted to the scenes at `places` (P,) int64; `number` is its place among the learners."""
     features = material.features[number]
     if isinstance(learner, FeatureLearner) and features is not None:
         return fit_extracted(learner, [features[place] for place in _list(places)], material.truths[places], seed)
@@ -112,13 +83,7 @@ def fit_on(learner: AnyLearner, number: int, material: Material, places: Places,
 
 
 def estimate_on(method: Method, number: int, material: Material, places: Places) -> list[SceneAnswer]:
-    """Return what a fitted method answers for the scenes at `places` (P,) int64, P answers.
-
-    Raises
-    ------
-    InputError
-        A class of the user's own fails.
-    """
+    """Return what a fitted method answers for the scenes at `places` (P,) int64, P answers."""
     features = material.features[number]
     if not isinstance(method, LearnedMethod) or features is None:
         scenes = [material.scenes[place] for place in _list(places)]

@@ -38,21 +38,9 @@ def naive_image(
 ) -> npt.NDArray[np.uint16]:
     """Return the naive raw image of a picture under a light.
 
-    Parameters
-    ----------
-    codes
-        (H, W, 3) uint8, sRGB codes.
-    light
-        (3,) or (H, W, 3) float, linear camera RGB that code 255, 255, 255 is to have, in counts.
-    saturation
-        Counts at which the image is clipped, below 2¹⁶.
-    matrix
-        (3, 3) float64, linear sRGB to camera RGB with rows of sum 1; None leaves colours as they are.
-
-    Returns
-    -------
-    ndarray
-        (H, W, 3) uint16, rounded to whole counts, 0 … `saturation`.
+    `codes`: (H, W, 3) uint8, sRGB codes. `light`: (3,) or (H, W, 3) float, linear camera RGB that code 255, 255, 255 is
+    to have, in counts. `matrix`: (3, 3) float64, linear sRGB to camera RGB with rows of sum 1; None leaves colours as
+    they are. Returns (H, W, 3) uint16, rounded to whole counts, 0 … `saturation`.
 
     Examples
     --------
@@ -72,14 +60,8 @@ def naive_image(
 class NaiveScene:
     """The naive counterpart of an image of a generated data set; made when it is read.
 
-    Attributes
-    ----------
-    generated
-        The image whose counterpart it is.
-    picture
-        Its source.
-    matrix
-        The camera's colour matrix, or None.
+    - `generated`: the image whose counterpart it is.
+    - `matrix`: the camera's colour matrix, or None.
     """
 
     generated: GeneratedScene
@@ -103,13 +85,7 @@ class NaiveScene:
 
     @cached_property
     def whites(self) -> npt.NDArray[np.float64]:
-        """The lights (K, 3) float64 of the image, counts of the table's white reference.
-
-        Raises
-        ------
-        FormatError
-            The data set does not say how bright a light was.
-        """
+        """The lights (K, 3) float64 of the image, counts of the table's white reference."""
         entry, description = self.generated.entry, self.generated.dataset.description
         levels = {light.illumination: sum(light.white) for light in description.lights}
         whites: list[npt.NDArray[np.float64]] = []
@@ -129,13 +105,7 @@ class NaiveScene:
 
     @cached_property
     def _falloff(self) -> Falloff | None:
-        """How the image's light falls off without a tint, which is not among its lights; None if it does not.
-
-        Raises
-        ------
-        FormatError
-            The data set describes a gradient that is none.
-        """
+        """How the image's light falls off without a tint, which is not among its lights; None if it does not."""
         description = self.generated.dataset.description
         variation: Any = description.options.get("variation", {})
         try:
@@ -190,14 +160,7 @@ def naive_scenes(
 ) -> tuple[NaiveScene, ...]:
     """Return the naive counterparts of generated images, in their order; images without a picture must be left out.
 
-    Parameters
-    ----------
-    scenes
-        Images of one generated data set.
-    found
-        Its source pictures by name; see `pictures.find_sources`.
-    matrix
-        The camera's colour matrix, or None.
+    `matrix`: the camera's colour matrix, or None.
     """
     return tuple(
         (NaiveScene if len(scene.entry.lights) == 1 else NaiveMixedScene)(scene, found[scene.entry.source], matrix)

@@ -38,20 +38,12 @@ from foundation.version import software
 class TransferOutcome:
     """Everything that a transfer came to.
 
-    Attributes
-    ----------
-    test
-        The test set, N images: of `crossed` those that count.
-    crossed
-        The test set as it was opened, M images, on which methods were cross-validated.
-    plan
-        What was trained on.
-    rows, figures
-        The results and what they come to.
-    folds
-        For each seed the fold of each image of `crossed`, (M,) int64.
-    settings
-        What was asked for, as JSON has it.
+    - `test`: the test set, N images: of `crossed` those that count.
+    - `crossed`: the test set as it was opened, M images, on which methods were cross-validated.
+    - `plan`: what was trained on.
+    - `rows`, `figures`: the results and what they come to.
+    - `folds`: for each seed the fold of each image of `crossed`, (M,) int64.
+    - `settings`: what was asked for, as JSON has it.
     """
 
     test: SceneSet
@@ -84,15 +76,7 @@ def labelled_results(rows: Sequence[TransferRow]) -> tuple[Result, ...]:
 
 
 def save_outcome(outcome: TransferOutcome, folder: Path) -> None:
-    """Write the result folder: `results.csv`, `errors.csv`, `folds.csv`, `tables.tex`, `report.html`, `run.json`.
-
-    Raises
-    ------
-    InputError
-        The folder is not free.
-    StorageError
-        The disk is full, read-only or gone; nothing is left behind.
-    """
+    """Write the result folder: `results.csv`, `errors.csv`, `folds.csv`, `tables.tex`, `report.html`, `run.json`."""
     names = [scene.name for scene in outcome.test.scenes]
     every = [scene.name for scene in outcome.crossed.scenes]
     truths = np.stack([scene.truth for scene in outcome.test.scenes])

@@ -26,16 +26,10 @@ Shared = Literal["refuse", "leave-out", "keep"]
 class SharedImage:
     """A training image that shows what a test image shows.
 
-    Attributes
-    ----------
-    position
-        Its place in the training set, from 0.
-    name
-        Its name there, or that of its source picture.
-    test
-        The test image's name, or that of its source picture.
-    by
-        How it was found out: by "name" or by "content".
+    - `position`: its place in the training set, from 0.
+    - `name`: its name there, or that of its source picture.
+    - `test`: the test image's name, or that of its source picture.
+    - `by`: how it was found out: by "name" or by "content".
     """
 
     position: int
@@ -48,11 +42,6 @@ def shared_images(training: SceneSet, test: SceneSet) -> tuple[SharedImage, ...]
     """Return the training images that test images share a picture or a scene with.
 
     Pixels are read where both sets are real ones.
-
-    Raises
-    ------
-    InputError
-        The two are one data set.
     """
     if _place(training) == _place(test):
         raise InputError(
@@ -73,24 +62,7 @@ def shared_images(training: SceneSet, test: SceneSet) -> tuple[SharedImage, ...]
 def trainable_images(
     training: SceneSet, test: SceneSet, shared: Shared, called: str = "the test set", *, copies: bool = True
 ) -> tuple[tuple[Scene, ...], str]:
-    """Return the images of a set that may be trained on, and in words what it shares with the test, "" for nothing.
-
-    Parameters
-    ----------
-    training, test
-        The two sets.
-    shared
-        What is to be done about shared images.
-    called
-        What the test set is called in those words.
-    copies
-        Whether `keep` keeps also what was found by content; else it is refused as by `refuse`.
-
-    Raises
-    ------
-    InputError
-        Images are shared and not to be trained on, or the two are one data set.
-    """
+    """Return the images of a set that may be trained on, and in words what it shares with the test, "" for nothing."""
     common = shared_images(training, test)
     if not common:
         return training.scenes, ""

@@ -22,16 +22,10 @@ from generator.pictures.sources import PictureFile, RandomScene, find_pictures
 class FoundPicture:
     """A source picture of a data set that was found again.
 
-    Attributes
-    ----------
-    name
-        Its name in the data set.
-    path
-        Its file; None for a picture of random colours, which is made again.
-    height, width
-        Its size in the data set, px.
-    preparation
-        How it was prepared.
+    - `name`: its name in the data set.
+    - `path`: its file; None for a picture of random colours, which is made again.
+    - `height`, `width`: its size in the data set, px.
+    - `preparation`: how it was prepared.
     """
 
     name: str
@@ -41,13 +35,7 @@ class FoundPicture:
     preparation: Preparation
 
     def codes(self, crop: int = 0) -> npt.NDArray[np.uint8]:
-        """Return the sRGB codes (H, W, 3) uint8 that images of the data set were made of: those of one of its crops.
-
-        Raises
-        ------
-        FormatError
-            The file is no longer there, or no longer of the size that it had.
-        """
+        """Return the sRGB codes (H, W, 3) uint8 that images of the data set were made of: those of one of its crops."""
         if self.path is None:
             number = int(self.name.rpartition("-")[2])
             return RandomScene(number, self.width, self.height, self.preparation.seed).read().picture
@@ -66,18 +54,6 @@ def find_sources(dataset: Dataset, place: Path | str) -> tuple[Mapping[str, Foun
 
     A picture is the one that is meant if its bytes have the hash that the data set records; a file of that name is
     tried first, then files of other names. Pictures of random colours need no file.
-
-    Parameters
-    ----------
-    dataset
-        A data set made by `generate`.
-    place
-        A folder on this machine.
-
-    Raises
-    ------
-    InputError
-        There is no such folder, or no picture in it.
     """
     preparation = preparation_of(dataset)
     # A set of random colours needs no folder, but one that is named must be there.

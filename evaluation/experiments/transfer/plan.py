@@ -20,15 +20,10 @@ from generator.rendering.matrices import ColourMatrix, camera_matrix, choose_mat
 class TransferPlan:
     """Training sets that may be trained on, and what was done to make them so.
 
-    Attributes
-    ----------
-    training
-        For each set itself and, where it was generated and there are pictures, its naive counterparts; images that
-        were left out are in none of them.
-    sets
-        The data sets as they were opened.
-    notes
-        Sentences for the reader: images left out, matrices used, cautions.
+    - `training`: for each set itself and, where it was generated and there are pictures, its naive counterparts; images
+      that were left out are in none of them.
+    - `sets`: the data sets as they were opened.
+    - `notes`: sentences for the reader: images left out, matrices used, cautions.
     """
 
     training: tuple[TrainingSet, ...]
@@ -50,26 +45,9 @@ def plan_transfer(
 ) -> TransferPlan:
     """Return the training sets of a transfer.
 
-    Parameters
-    ----------
-    test
-        The test set.
-    sets
-        Data sets to train on, usually generated; of one that is divided into train, validation and test the images of
-        `train`.
-    pictures
-        Folder of the source pictures of the generated sets, for the naive baseline; None for no such baseline.
-    matrix
-        A camera, a file or `none`, see `matrices.choose_matrix`; None for the matrix of the camera of each generated
-        set's table, if it is known.
-    shared
-        What to do about training images that show what test images show.
-
-    Raises
-    ------
-    InputError
-        There is nothing to train on; a training set is the test set, or shares images with it that are neither left out
-        nor kept on purpose; two training sets have one name; or a naive baseline cannot be made.
+    `pictures`: folder of the source pictures of the generated sets, for the naive baseline; None for no such baseline.
+    `matrix`: A camera, a file or `none`, see `matrices.choose_matrix`; None for the matrix of the camera of each
+    generated set's table, if it is known.
     """
     if not sets:
         raise InputError("no data set to train on: name at least one with --train")

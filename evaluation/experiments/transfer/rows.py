@@ -39,14 +39,9 @@ NAIVE: Final[tuple[Kind, ...]] = ("naive", "naive with matrix")
 class TrainingSet:
     """Images to train on.
 
-    Attributes
-    ----------
-    data
-        Name of the data set that they are, or are the counterparts of.
-    kind
-        What they are.
-    scenes
-        The images; counterparts in the order of the generated ones.
+    - `data`: name of the data set that they are, or are the counterparts of.
+    - `kind`: what they are.
+    - `scenes`: the images; counterparts in the order of the generated ones.
     """
 
     data: str
@@ -58,18 +53,11 @@ class TrainingSet:
 class TransferRow:
     """Results of one method, trained in one way, on the test images.
 
-    Attributes
-    ----------
-    method
-        The method's name.
-    kind
-        How it was trained.
-    data
-        Name of the data set that it was trained on; of cross-validation only where the test set was generated.
-    images
-        Training images: of cross-validation those of the smallest training part; 0 where nothing is learned.
-    results
-        One a seed, or one where nothing depends on it; rows in the order of the test images.
+    - `method`: the method's name.
+    - `kind`: how it was trained.
+    - `data`: name of the data set that it was trained on; of cross-validation only where the test set was generated.
+    - `images`: training images: of cross-validation those of the smallest training part; 0 where nothing is learned.
+    - `results`: one a seed, or one where nothing depends on it; rows in the order of the test images.
     """
 
     method: str
@@ -113,11 +101,6 @@ def draw_images(count: int, wanted: int, seed: int) -> Places:
     Data sets of equal counts get the same places, so that a generated set and its naive counterpart, or one under
     another table, are trained on the same pictures under the same lights.
 
-    Raises
-    ------
-    InputError
-        Fewer than one image is wanted, or more than there are.
-
     Examples
     --------
     >>> draw_images(5, 5, seed=3).tolist()
@@ -129,13 +112,7 @@ def draw_images(count: int, wanted: int, seed: int) -> Places:
 
 
 def count_images(test: Sequence[Scene], training: Sequence[TrainingSet], seeds: int, images: int) -> int:
-    """Return how many images `transfer` reads for its learners, all seeds together: each image once.
-
-    Raises
-    ------
-    InputError
-        A training set has fewer images than are to be drawn.
-    """
+    """Return how many images `transfer` reads for its learners, all seeds together: each image once."""
     return len(test) + sum(len(_used(_drawn(some, seeds, images))) for some in training)
 
 
@@ -155,42 +132,9 @@ def transfer(
 
     Of the learner `ConstantLight` no row is made for naive counterparts, whose lights are those of the generated set.
 
-    Parameters
-    ----------
-    test
-        N images with their ground truths, none of them among the training images.
-    training
-        Training sets.
-    learners
-        At least one.
-    folds
-        One entry for each seed, (N,) int64: the folds of the test images. Seed k is k, from 0: it is handed to every
-        fit and draws the training images.
-    images
-        Training images of each training set, drawn anew by each seed.
-    methods
-        Methods that learn nothing, for reference.
-    side
-        Longest side that images are made small to first, px; None leaves all as they are.
-    workers
-        Threads that read images; no number depends on it.
-    on_scene
-        Called after each image that is read, test and training images alike, once for all learners and seeds.
-    generated
-        Name of the test set if it was generated, so that no row calls it real; else empty.
-
-    Returns
-    -------
-    tuple of TransferRow
-        Method by method in their order; of each first cross-validation, then the training sets in their order. The
-        methods that learn nothing come last.
-
-    Raises
-    ------
-    InputError
-        There is no learner or seed, a training set has fewer images, or a ground truth is no light.
-    FormatError
-        An image cannot be read.
+    `folds`: one entry for each seed, (N,) int64: the folds of the test images. Seed k is k, from 0: it is handed to
+    every fit and draws the training images. `side`: longest side that images are made small to first, px; None leaves
+    all as they are. `generated`: name of the test set if it was generated, so that no row calls it real; else empty.
     """
     if not learners or not folds:
         raise InputError(f"{len(learners)} learned methods and {len(folds)} seeds: expected at least one of each")

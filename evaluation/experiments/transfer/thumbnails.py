@@ -21,18 +21,11 @@ _COVERED: Final = 1e-3
 class SmallScene:
     """A scene made small, in memory.
 
-    Attributes
-    ----------
-    name
-        The image's name.
-    truth
-        (3,) float64, linear camera RGB of the light, of any length.
-    image
-        (H, W, 3) float32, linear camera RGB, in the unit of the image that it was.
-    mask
-        (H, W) bool, True where no pixel was usable; None if every one was.
-    saturation
-        None where clipped pixels were left out; that of the image where it was small already.
+    - `name`: the image's name.
+    - `truth`: (3,) float64, linear camera RGB of the light, of any length.
+    - `image`: (H, W, 3) float32, linear camera RGB, in the unit of the image that it was.
+    - `mask`: (H, W) bool, True where no pixel was usable; None if every one was.
+    - `saturation`: none where clipped pixels were left out; that of the image where it was small already.
     """
 
     name: str
@@ -51,16 +44,7 @@ def make_small(
 ) -> tuple[SmallScene, ...]:
     """Return scenes of which no side is longer than `side`, px; see `shrink_image`.
 
-    Parameters
-    ----------
-    scenes
-        The scenes; each is read once.
-    side
-        Longest side allowed, px.
-    workers
-        Threads.
-    on_scene
-        Called after each scene, from the calling thread.
+    `side`: longest side allowed, px.
     """
 
     def small(scene: Scene) -> SmallScene:
@@ -82,21 +66,10 @@ def shrink_image(
 ) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.bool_]]:
     """Return an image made small by averaging areas, without clipped and masked pixels.
 
-    Parameters
-    ----------
-    image
-        (H, W, 3) uint16, float32 or float64, linear camera RGB.
-    side
-        Longest side of the result, px.
-    saturation
-        Value from which a channel is clipped; None if none is.
-    mask
-        (H, W) bool, True where a pixel must not be used, or None.
-
-    Returns
-    -------
-    tuple of ndarray
-        The image (h, w, 3) float32, and (h, w) bool, True where no pixel was usable; the image is 0 there.
+    `image`: (H, W, 3) uint16, float32 or float64, linear camera RGB. `side`: longest side of the result, px.
+    `saturation`: value from which a channel is clipped; None if none is. `mask`: (H, W) bool, True where a pixel must
+    not be used, or None. Returns the image (h, w, 3) float32, and (h, w) bool, True where no pixel was usable; the
+    image is 0 there.
 
     Examples
     --------

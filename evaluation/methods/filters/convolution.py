@@ -143,32 +143,13 @@ def filter_rows(
 
     Returns the first row of the image that is not filtered, `done` of the tile below.
 
-    Parameters
-    ----------
-    image
-        (H, 3 W) uint16, float32 or float64, rows of interleaved pixels.
-    scale
-        Factor for values that float32 does not hold.
-    top, left
-        First row and pixel of the tile.
-    rows
-        Of a tile, a multiple of 16; the tile above began so many rows before.
-    done
-        What the call for the tile above returned; 0 where there is none.
-    weights
-        (3, reach + 1) float32: the halves of the kernels of order 0, 1 and 2 from their centres on.
-    order
-        Of the derivative: order + 1 filters are applied, of order 0 on.
-    lines
-        (16, STRETCH) float32, scratch.
-    turned
-        (Q + 6 reach + 16, 16) float32, scratch, its first number at a cache line; Q, numbers of a row of the tile, is
-        a multiple of 48.
-    chunk
-        (order + 1, 48, 16) float32, scratch, its first number at a cache line.
-    columns
-        (order + 1, Q / 16, rows + 2 reach + 16, 16) float32: the filtered rows in columns of 16 numbers, from row
-        top - reach on; its first number at a cache line. What stands there of the tile above is used.
+    `image`: (H, 3 W) uint16, float32 or float64, rows of interleaved pixels. `scale`: factor for values that float32
+    does not hold. `weights`: (3, reach + 1) float32: the halves of the kernels of order 0, 1 and 2 from their centres
+    on. `lines`: (16, STRETCH) float32, scratch. `turned`: (Q + 6 reach + 16, 16) float32, scratch, its first number at
+    a cache line; Q, numbers of a row of the tile, is a multiple of 48. `chunk`: (order + 1, 48, 16) float32, scratch,
+    its first number at a cache line. `columns`: (order + 1, Q / 16, rows + 2 reach + 16, 16) float32: the filtered rows
+    in columns of 16 numbers, from row top - reach on; its first number at a cache line. What stands there of the tile
+    above is used.
     """
     reach = weights.shape[1] - 1
     height = image.shape[0]
@@ -230,18 +211,9 @@ def filter_columns(
 ) -> None:
     """Write the size of the Gaussian derivative of rows that are filtered along x to `out`.
 
-    Parameters
-    ----------
-    columns
-        (order + 1, Q / 16, R, 16) float32, what `filter_rows` wrote: R ≥ rows + 2 reach, rows rounded up to fours.
-    weights
-        (3, reach + 1) float32: the halves of the kernels of order 0, 1 and 2 from their centres on.
-    order
-        0: smoothed, 1: length of the gradient, 2: √(f_xx² + 4 f_xy² + f_yy²).
-    rows
-        Rows to write, rounded up to fours.
-    out
-        (rows, Q) or longer float32, its first number at a cache line.
+    `columns`: (order + 1, Q / 16, R, 16) float32, what `filter_rows` wrote: R ≥ rows + 2 reach, rows rounded up to
+    fours. `weights`: (3, reach + 1) float32: the halves of the kernels of order 0, 1 and 2 from their centres on.
+    `out`: (rows, Q) or longer float32, its first number at a cache line.
     """
     reach = weights.shape[1] - 1
     even = weights.ctypes.data

@@ -31,12 +31,7 @@ def gaussian_kernel(sigma: float, order: int) -> npt.NDArray[np.float64]:
     Normalised on the grid of pixels: order 0 sums to 1; order 1 gives 1 for the ramp x; order 2 gives 1 for x²/2 and 0
     for a constant.
 
-    Parameters
-    ----------
-    sigma
-        Standard deviation of the Gaussian, px, above 0.
-    order
-        Order of the derivative, 0, 1 or 2.
+    `sigma`: standard deviation of the Gaussian, px, above 0.
 
     Examples
     --------
@@ -61,14 +56,8 @@ def differentiate(image: Image, order: int, sigma: float) -> npt.NDArray[np.floa
 
     Order 0 is the smoothed image, order 1 the gradient's length, order 2 √(f_xx² + 4 f_xy² + f_yy²).
 
-    Parameters
-    ----------
-    image
-        (H, W, 3) uint16, float32 or float64, not below 0.
-    order
-        0, 1 or 2.
-    sigma
-        Scale of the Gaussian, px; 0 for none, which only order 0 allows.
+    `image`: (H, W, 3) uint16, float32 or float64, not below 0. `sigma`: scale of the Gaussian, px; 0 for none, which
+    only order 0 allows.
 
     Examples
     --------
@@ -96,20 +85,10 @@ def differentiated_tiles(
 ) -> Iterator[tuple[int, int, npt.NDArray[np.float32]]]:
     """Yield the Gaussian derivative of an image times `scale` in tiles, from top to bottom and then from left to right.
 
-    Parameters
-    ----------
-    image
-        (H, W, 3) uint16, float32 or float64, not below 0.
-    order, sigma
-        Of the derivative, 0 to 2, and its scale, px, above 0.
-    scale
-        Factor for values that float32 does not hold.
-
-    Yields
-    ------
-    tuple of int, int and ndarray
-        The tile's first row and pixel; (rows, Q) float32, interleaved pixels, of which those within the image count.
-        The array is written anew for the next tile.
+    `image`: (H, W, 3) uint16, float32 or float64, not below 0. `order`, `sigma`: of the derivative, 0 to 2, and its
+    scale, px, above 0. `scale`: factor for values that float32 does not hold. Yields the tile's first row and pixel;
+    (rows, Q) float32, interleaved pixels, of which those within the image count. The array is written anew for the next
+    tile.
     """
     from evaluation.methods.filters.convolution import CHUNK, GROUP, LANES, STRETCH, filter_columns, filter_rows
 

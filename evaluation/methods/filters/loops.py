@@ -241,25 +241,9 @@ def sum_powers(
 ) -> None:
     """Add to `sums` (3,) float64 the powers p of the values times `scale` of some rows of an image.
 
-    Parameters
-    ----------
-    values
-        (rows, Q) uint16, float32 or float64, not below 0: rows of interleaved pixels, or parts of them. What lies
-        beyond the image does not count.
-    free
-        (H, W) or (0, 0) bool, see above; that of the whole image.
-    border
-        Pixels left out along every edge.
-    top, first
-        Row and pixel of the image that `values` begin with.
-    height, width
-        Of the image, px.
-    p
-        Power, above 0; infinity takes the maximum.
-    scale
-        Factor that keeps powers from over- and underflowing: 1 over the largest value.
-    sums
-        (3,) float64.
+    `values`: (rows, Q) uint16, float32 or float64, not below 0: rows of interleaved pixels, or parts of them. What lies
+    beyond the image does not count. `free`: (H, W) or (0, 0) bool, see above; that of the whole image. `height`,
+    `width`: of the image, px. `sums`: (3,) float64.
     """
     factors = np.empty(3 * CHUNK, np.float64)
     powers = np.empty(3 * CHUNK, np.float64)

@@ -56,22 +56,12 @@ def sum_outer_bins(
 ) -> tuple[npt.NDArray[np.float64], int, int, int]:
     """Sum and count the pixels of bins outside of two brackets, and collect those of bins within.
 
-    Parameters
-    ----------
-    image, free
-        (H, W, 3) uint16, float32 or float64; (H, W) or (0, 0) bool, see above.
-    direction, step
-        (3,) float64, and bins a unit of projection; as for `count_projections`.
-    brackets
-        (4,) int64: the first and the last bin of the lower bracket, then of the upper one; they may overlap.
-    bordering
-        (N, 4) float64, written: red, green, blue and the projection of pixels of the brackets, in reading order.
-
-    Returns
-    -------
-    tuple
-        (3, 3) float64, the sum of x xᵀ over the pixels below the lower bracket and above the upper one; how many these
-        are below and above; how many lie within the brackets, of which the first N are written.
+    `image`, `free`: (H, W, 3) uint16, float32 or float64; (H, W) or (0, 0) bool, see above. `direction`, `step`: (3,)
+    float64, and bins a unit of projection; as for `count_projections`. `brackets`: (4,) int64: the first and the last
+    bin of the lower bracket, then of the upper one; they may overlap. `bordering`: (N, 4) float64, written: red, green,
+    blue and the projection of pixels of the brackets, in reading order. Returns (3, 3) float64, the sum of x xᵀ over
+    the pixels below the lower bracket and above the upper one; how many these are below and above; how many lie within
+    the brackets, of which the first N are written.
     """
     total = np.zeros((3, 3), np.float64)
     bins, kept = np.empty(CHUNK, np.int32), np.empty(CHUNK, np.int32)

@@ -15,21 +15,10 @@ def shrink(
 
     A pixel is the mean, weighted by area, of the usable pixels that it stands for.
 
-    Parameters
-    ----------
-    image
-        (H, W, 3) uint16, float32 or float64.
-    usable
-        (H, W) bool, True where a pixel may be used.
-    longest
-        px, below the longer side.
-    least
-        Share of a pixel's area, 0 … 1, that must be exceeded by what is usable of it.
-
-    Returns
-    -------
-    tuple of ndarray
-        (h, w, 3) float32, 0 where nothing is usable; (h, w) bool, True where no more of a pixel is usable than `least`.
+    `image`: (H, W, 3) uint16, float32 or float64. `usable`: (H, W) bool, True where a pixel may be used. `longest`: px,
+    below the longer side. `least`: share of a pixel's area, 0 … 1, that must be exceeded by what is usable of it.
+    Returns (h, w, 3) float32, 0 where nothing is usable; (h, w) bool, True where no more of a pixel is usable than
+    `least`.
     """
     import cv2
 

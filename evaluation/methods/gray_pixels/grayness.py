@@ -25,10 +25,7 @@ LEAST_CONTRAST = 1e-4
 def grayness(strip: npt.NDArray[np.float32]) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.bool_]]:
     """Return the grayness index of a strip (H, W, 3) float32, parts of white.
 
-    Returns
-    -------
-    tuple of ndarray
-        The index (H, W) float32; and (H, W) bool, True where it says nothing: flat or with a channel of zero.
+    Returns the index (H, W) float32; and (H, W) bool, True where it says nothing: flat or with a channel of zero.
     """
     mean = smooth(strip)
     missing = (mean <= 0).any(axis=2) | (slope(mean) <= LEAST_CONTRAST).all(axis=2)
@@ -41,12 +38,8 @@ def grayness(strip: npt.NDArray[np.float32]) -> tuple[npt.NDArray[np.float32], n
 class GraynessIndex:
     """Mean colour of the pixels with the lowest grayness index.
 
-    Attributes
-    ----------
-    name
-        Its name in tables.
-    share
-        Part of the pixels that are taken, 0 … 1; 0.001 is the authors' choice.
+    - `name`: its name in tables.
+    - `share`: part of the pixels that are taken, 0 … 1; 0.001 is the authors' choice.
 
     Examples
     --------

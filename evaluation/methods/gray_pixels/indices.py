@@ -82,14 +82,8 @@ def index_map(prepared: PreparedImage, index: Index) -> tuple[npt.NDArray[np.flo
 def greyest(index: npt.NDArray[np.float32], usable: npt.NDArray[np.bool_], share: float) -> npt.NDArray[np.bool_]:
     """Return (H, W) bool, True at the pixels with the lowest index.
 
-    Parameters
-    ----------
-    index
-        (H, W) float32.
-    usable
-        (H, W) bool, True where a pixel may be chosen.
-    share
-        Part of all pixels of the image that are chosen, 0 … 1; at least one.
+    `index`: (H, W) float32. `usable`: (H, W) bool, True where a pixel may be chosen. `share`: part of all pixels of the
+    image that are chosen, 0 … 1; at least one.
     """
     count = min(max(1, int(index.size * share)), int(usable.sum()))
     if not count:

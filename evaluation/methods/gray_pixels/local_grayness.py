@@ -27,14 +27,9 @@ _ROUNDS = 50
 class LocalGraynessIndex(GraynessIndex):
     """The grayness index with a map of lights; `estimate` is that of the global method with the same share.
 
-    Attributes
-    ----------
-    name
-        Its name in tables.
-    share
-        Part of the pixels that are taken, 0 … 1; for several lights the authors take 10 %.
-    lights
-        Number of clusters.
+    - `name`: its name in tables.
+    - `share`: part of the pixels that are taken, 0 … 1; for several lights the authors take 10 %.
+    - `lights`: number of clusters.
     """
 
     name: str = "Grayness Index, local"

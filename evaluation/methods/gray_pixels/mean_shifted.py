@@ -37,10 +37,7 @@ _MOST_STEPS = 100
 def angle_to_grey(strip: npt.NDArray[np.float32]) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.bool_]]:
     """Return the angle of the log derivatives of a strip (H, W, 3) float32 to grey.
 
-    Returns
-    -------
-    tuple of ndarray
-        The angle (H, W) float32, radians; and (H, W) bool, True where no channel changes.
+    Returns the angle (H, W) float32, radians; and (H, W) bool, True where no channel changes.
     """
     slopes = slope(logarithm(strip))
     missing = (slopes <= np.finfo(np.float64).eps).all(axis=2)
@@ -53,12 +50,8 @@ def angle_to_grey(strip: npt.NDArray[np.float32]) -> tuple[npt.NDArray[np.float3
 class MeanShiftedGrayPixel:
     """Mean colour of the largest cluster of gray pixels.
 
-    Attributes
-    ----------
-    name
-        Its name in tables.
-    share
-        Part of the pixels that are candidates, 0 … 1; 0.01 is the authors' choice.
+    - `name`: its name in tables.
+    - `share`: part of the pixels that are candidates, 0 … 1; 0.01 is the authors' choice.
     """
 
     name: str = "Mean-shifted Gray Pixel"
@@ -88,12 +81,8 @@ class MeanShiftedGrayPixel:
 def largest_cluster(colours: npt.NDArray[np.float64], order: npt.NDArray[np.float32]) -> npt.NDArray[np.bool_]:
     """Return (N,) bool, True for the colours of the largest cluster that mean shift finds.
 
-    Parameters
-    ----------
-    colours
-        (N, 3) float64, the largest number 1.
-    order
-        (N,) float32; means start from the colours in this order that no mean has met yet.
+    `colours`: (N, 3) float64, the largest number 1. `order`: (N,) float32; means start from the colours in this order
+    that no mean has met yet.
 
     Examples
     --------

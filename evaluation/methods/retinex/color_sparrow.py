@@ -29,18 +29,11 @@ SPRAYS = 1000
 class ColorSparrow:
     """Mean of local lights by random sprays.
 
-    Attributes
-    ----------
-    name
-        Its name in tables.
-    spray
-        n, pixels of a spray.
-    step
-        r and c, px between points of the grid.
-    kernel
-        k, side of the mean filter over the grid, points.
-    seed
-        Of the sprays; the same image gives the same estimate.
+    - `name`: its name in tables.
+    - `spray`: n, pixels of a spray.
+    - `step`: r and c, px between points of the grid.
+    - `kernel`: k, side of the mean filter over the grid, points.
+    - `seed`: of the sprays; the same image gives the same estimate.
 
     Examples
     --------

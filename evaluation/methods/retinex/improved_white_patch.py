@@ -21,16 +21,10 @@ from evaluation.scene import Image
 class ImprovedWhitePatch:
     """Mean of the maxima of each channel over random samples of pixels.
 
-    Attributes
-    ----------
-    name
-        Its name in tables.
-    pixels
-        N, pixels of a sample, drawn with repetition from the usable ones.
-    samples
-        M, samples.
-    seed
-        Of the draws; the same image gives the same estimate.
+    - `name`: its name in tables.
+    - `pixels`: N, pixels of a sample, drawn with repetition from the usable ones.
+    - `samples`: M, samples.
+    - `seed`: of the draws; the same image gives the same estimate.
 
     Examples
     --------

@@ -23,18 +23,9 @@ def spray_maxima(
 ) -> npt.NDArray[np.float64]:
     """Return the maxima of each channel over the spray around each point of a grid, (R, C, 3) float64.
 
-    Parameters
-    ----------
-    image
-        (H, W, 3) uint16, float32 or float64.
-    free
-        (H, W) bool, True where a pixel may be used, or (0, 0) where every one may be.
-    step
-        Pixels between points.
-    offsets
-        (sprays, N, 2) int64, rows and columns from the point; those that lead out of the image are left out.
-    chosen
-        (R, C) int64, the spray of each point.
+    `image`: (H, W, 3) uint16, float32 or float64. `free`: (H, W) bool, True where a pixel may be used, or (0, 0) where
+    every one may be. `offsets`: (sprays, N, 2) int64, rows and columns from the point; those that lead out of the image
+    are left out. `chosen`: (R, C) int64, the spray of each point.
     """
     height, width = image.shape[:2]
     maxima = np.zeros((chosen.shape[0], chosen.shape[1], 3), np.float64)
@@ -56,14 +47,8 @@ def patch_sums(
 ) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
     """Return the sums and the maxima of each channel over the usable pixels of patches, (R, C, 3) float64 each.
 
-    Parameters
-    ----------
-    image
-        (H, W, 3) uint16, float32 or float64.
-    free
-        (H, W) bool, True where a pixel may be used, or (0, 0) where every one may be.
-    rows, columns
-        (R + 1,) and (C + 1,) int64, where the patches begin, and the end of the last.
+    `image`: (H, W, 3) uint16, float32 or float64. `free`: (H, W) bool, True where a pixel may be used, or (0, 0) where
+    every one may be. `rows`, `columns`: (R + 1,) and (C + 1,) int64, where the patches begin, and the end of the last.
     """
     shape = (rows.size - 1, columns.size - 1, 3)
     sums, maxima = np.zeros(shape, np.float64), np.zeros(shape, np.float64)

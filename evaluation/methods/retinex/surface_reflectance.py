@@ -23,12 +23,8 @@ from evaluation.scene import Image
 class SurfaceReflectance:
     """Ratio of the sum of values to the sum of locally normalised values.
 
-    Attributes
-    ----------
-    name
-        Its name in tables.
-    patches
-        Patches along either side of the image; at least one pixel each.
+    - `name`: its name in tables.
+    - `patches`: patches along either side of the image; at least one pixel each.
 
     Examples
     --------

@@ -102,24 +102,7 @@ class _ListedFile:
 
 
 def assemble(place: Workplace, identity: Mapping[str, Any]) -> None:
-    """Write what a dataset has beside its images, and give the dataset its name.
-
-    Parameters
-    ----------
-    place
-        Where it was made; every shard is done.
-    identity
-        Of its plan.
-
-    Raises
-    ------
-    NothingMadeError
-        None of the sources could be read.
-    FormatError
-        A source has changed while the dataset was made.
-    StorageError
-        The disk is full, read-only or gone.
-    """
+    """Write what a dataset has beside its images, and give the dataset its name."""
     options = identity["options"]
     suffix = suffix_of(options["format"])
     counts: Counter[str] = Counter()

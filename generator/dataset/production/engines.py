@@ -37,28 +37,7 @@ _Event = Callable[[], None]
 def make_shards(
     plan: Plan, shards: Sequence[int], place: Workplace, workers: Workers, callbacks: Callbacks = SILENT
 ) -> None:
-    """Make shards of a plan that are not done.
-
-    Parameters
-    ----------
-    plan, shards
-        The dataset, and the numbers of the shards to make.
-    place
-        Where the dataset is being made.
-    workers
-        Who makes them.
-    callbacks
-        What is called meanwhile, from the calling thread.
-
-    Raises
-    ------
-    InputError
-        The engine cannot be reached, or its workers have another table or other libraries.
-    DeviceError
-        A shard has killed its workers time and again, or the cluster was lost.
-    StorageError
-        The disk is full, read-only or gone.
-    """
+    """Make shards of a plan that are not done."""
     if not shards:
         return
     if workers.address is None:

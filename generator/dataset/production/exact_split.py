@@ -23,22 +23,7 @@ if TYPE_CHECKING:
 
 
 def exact_parts(sources: Sequence[Source], shares: tuple[float, float, float], seed: int) -> tuple[Split, ...]:
-    """Return the part of each source; parts have the sizes of `sizes_of`.
-
-    Parameters
-    ----------
-    sources
-        All of the dataset.
-    shares
-        Of train, validation and test; sum 1.
-    seed
-        0 … 2⁶⁴ − 1.
-
-    Raises
-    ------
-    InputError
-        Copies that stay together make these sizes impossible.
-    """
+    """Return the part of each source; parts have the sizes of `sizes_of`."""
     wanted: dict[Split, int] = dict(zip(SPLITS, sizes_of(len(sources), shares), strict=True))
     groups: dict[str, list[int]] = defaultdict(list)
     copies = _copies(sources)

@@ -25,14 +25,8 @@ if TYPE_CHECKING:
 class ImageLight:
     """The light of one image.
 
-    Attributes
-    ----------
-    truth
-        Chromaticity, sum 1, of the light averaged over the pixels.
-    rows
-        Its lights.
-    maps
-        Kind, what follows the image's number in the file's name, and the bytes of each map beside the image.
+    - `truth`: chromaticity, sum 1, of the light averaged over the pixels.
+    - `maps`: kind, what follows the image's number in the file's name, and the bytes of each map beside the image.
     """
 
     truth: Triple
@@ -45,18 +39,7 @@ def image_light(
 ) -> ImageLight:
     """Return the light of an image.
 
-    Parameters
-    ----------
-    lut
-        The table.
-    lighting
-        Its lights.
-    weights
-        (H, W, K) float32, of each of K lights in each pixel; None of one light.
-    varied
-        What was done to the image.
-    tints
-        Whether its light falls off with a tint; then it is one light.
+    `weights`: (H, W, K) float32, of each of K lights in each pixel; None of one light.
     """
     from generator.masks.maps import encode_maps
     from generator.masks.whites import mean_weights

@@ -159,11 +159,6 @@ def parse_split(text: str) -> tuple[float, float, float]:
 
     Two numbers are train and test.
 
-    Raises
-    ------
-    InputError
-        The text is no such list.
-
     Examples
     --------
     >>> parse_split("80,10,10"), parse_split("3,1")

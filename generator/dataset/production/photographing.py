@@ -37,35 +37,10 @@ def photograph(
 ) -> tuple[npt.NDArray[np.uint16], npt.NDArray[np.float32] | None, Details]:
     """Return the raw image of a picture's print.
 
-    Parameters
-    ----------
-    lut
-        The table.
-    picture
-        (H, W, 3) uint8, sRGB codes; where they are those of the print, of colours that the table has samples of.
-    lighting
-        Its light.
-    options
-        How it is rendered.
-    seed, number
-        The dataset's seed, and the image's number in it.
-    white_level
-        What mixtures of several lights on a pixel are cut at.
-    black_taken
-        Share of the print's black that is taken out, 0 … 1; None for what the options say.
-
-    Returns
-    -------
-    tuple
-        (H, W, 3) uint16, linear camera RGB; of several lights the weights (H, W, K) float32 of each in each pixel, else
-        None; and what is recorded of the rendering.
-
-    Raises
-    ------
-    FormatError
-        Samples of the table have changed.
-    QualityError
-        The table cannot render the picture so under that light.
+    `picture`: (H, W, 3) uint8, sRGB codes; where they are those of the print, of colours that the table has samples of.
+    `black_taken`: share of the print's black that is taken out, 0 … 1; None for what the options say. Returns (H, W, 3)
+    uint16, linear camera RGB; of several lights the weights (H, W, K) float32 of each in each pixel, else None; and
+    what is recorded of the rendering.
     """
     from generator.kernels.dithering import dither, nearest_nodes
     from generator.kernels.mixing import mix_samples
@@ -134,13 +109,7 @@ def _rendering(lut: Lut, name: str, rows: tuple[float, ...], source: str) -> Col
 
 
 def rendering_of(lut: Lut, options: DatasetOptions) -> ColorimetricRendering:
-    """Return the rendering by colour that the options ask for; it keeps what it has found out of a table.
-
-    Raises
-    ------
-    QualityError
-        No matrix is known, and none can be had from the table.
-    """
+    """Return the rendering by colour that the options ask for; it keeps what it has found out of a table."""
     from generator.rendering.table_matrix import matrix_for
 
     matrix = options.matrix or matrix_for(lut)

@@ -39,22 +39,13 @@ _WORD: Final = 1 << 64
 class ShardJob:
     """Everything that a worker on any machine needs to make one shard.
 
-    Attributes
-    ----------
-    table, table_sha256
-        The table's folder, and its hash to compare with what is found there.
-    shard, first, stop
-        Its number, its first image number and the one after its last.
-    position
-        Place of the first of `sources` in the whole list.
-    sources
-        The sources that its images show.
-    choice, seed, options
-        Those of the plan.
-    versions
-        Versions of the libraries that the bytes depend on; a worker must have the same.
-    parts
-        The part of each of `sources`, where they were decided together; empty where each is by itself.
+    - `table`, `table_sha256`: the table's folder, and its hash to compare with what is found there.
+    - `shard`, `first`, `stop`: its number, its first image number and the one after its last.
+    - `position`: place of the first of `sources` in the whole list.
+    - `sources`: the sources that its images show.
+    - `choice`, `seed`, `options`: those of the plan.
+    - `versions`: versions of the libraries that the bytes depend on; a worker must have the same.
+    - `parts`: the part of each of `sources`, where they were decided together; empty where each is by itself.
     """
 
     table: Path
@@ -73,13 +64,7 @@ class ShardJob:
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """A dataset to be made.
-
-    Raises
-    ------
-    InputError
-        There is nothing to make, or a number is out of range.
-    """
+    """A dataset to be made."""
 
     lut: Lut
     sources: Sequence[Source]
@@ -212,16 +197,7 @@ def split_of(shares: tuple[float, float, float] | None, seed: int, sha256: str |
     Decided by the seed and the source's content, or its name where it has no file, and by no other source, so that two
     copies of one file, whatever their names, are in the same part. The shares hold on average.
 
-    Parameters
-    ----------
-    shares
-        Of train, validation and test; sum 1. None leaves it undivided.
-    seed
-        0 … 2⁶⁴ − 1.
-    sha256
-        Of the source's file.
-    name
-        Its name.
+    `shares`: of train, validation and test; sum 1. None leaves it undivided.
     """
     if shares is None:
         return None

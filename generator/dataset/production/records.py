@@ -107,22 +107,14 @@ class Light(_RecordWithOptional):
 class SourceRecord(_Record):
     """A source picture that was used.
 
-    Attributes
-    ----------
-    position
-        Place in the list of sources, from 0; the choice of its lights depends on it.
-    name, sha256
-        Its name, and the hash of its file; no hash where it was made and not read.
-    profile
-        How its colour profile was used, in words; None where it was made and not read.
-    width, height
-        Size of its images, px.
-    replaced_pixels
-        Pixels of colours that the table lists as unfit, which took the nearest fit colour.
-    split
-        The part of the dataset that its images belong to; None where it was not divided.
-    weight
-        By which it was drawn, 1 that of a picture neither favoured nor disfavoured; None where pictures were not drawn.
+    - `position`: place in the list of sources, from 0; the choice of its lights depends on it.
+    - `name`, `sha256`: its name, and the hash of its file; no hash where it was made and not read.
+    - `profile`: how its colour profile was used, in words; None where it was made and not read.
+    - `width`, `height`: size of its images, px.
+    - `replaced_pixels`: pixels of colours that the table lists as unfit, which took the nearest fit colour.
+    - `split`: the part of the dataset that its images belong to; None where it was not divided.
+    - `weight`: by which it was drawn, 1 that of a picture neither favoured nor disfavoured; None where pictures were
+      not drawn.
     """
 
     position: int
@@ -170,13 +162,9 @@ class FileSum(_Record):
 class RenderingSummary(_Record):
     """How the images of a dataset were rendered, where that is not by codes with the print's black kept.
 
-    Attributes
-    ----------
-    outside, distance
-        Means over all pixels of the columns of `images.csv`: the share of colours that the print cannot show, and by
-        how many degrees they are missed. None where images were rendered by codes.
-    black_taken
-        Mean over all images of the share of the print's black that was taken out.
+    - `outside`, `distance`: means over all pixels of the columns of `images.csv`: the share of colours that the print
+      cannot show, and by how many degrees they are missed. None where images were rendered by codes.
+    - `black_taken`: mean over all images of the share of the print's black that was taken out.
     """
 
     outside: float | None = None
@@ -201,22 +189,14 @@ class ShardRecord(_Record):
 class Description(_Record):
     """The content of `dataset.json`.
 
-    Attributes
-    ----------
-    seed, options
-        What the dataset is; with the table and the sources, enough to make every byte again.
-    planned, images
-        Images planned and made; the numbers of the rest are free.
-    sources, pixels, replaced_pixels
-        Sources used, their pixels together, and those of them whose colour was replaced.
-    splits
-        Images in each part, where the dataset was divided.
-    lights
-        The lights of the table that were used, alone or mixed.
-    skipped
-        Sources that could not be read.
-    rendering
-        How images were rendered; None by codes with the print's black kept.
+    - `seed`, `options`: what the dataset is; with the table and the sources, enough to make every byte again.
+    - `planned`, `images`: images planned and made; the numbers of the rest are free.
+    - `sources`, `pixels`, `replaced_pixels`: sources used, their pixels together, and those of them whose colour was
+      replaced.
+    - `splits`: images in each part, where the dataset was divided.
+    - `lights`: the lights of the table that were used, alone or mixed.
+    - `skipped`: sources that could not be read.
+    - `rendering`: how images were rendered; None by codes with the print's black kept.
     """
 
     format: Literal["crop.dataset"] = FORMAT
@@ -246,20 +226,12 @@ class Description(_Record):
 class Entry:
     """One image.
 
-    Attributes
-    ----------
-    image
-        Its file name; in shards the name it would have as a file.
-    source
-        Its source's name.
-    lights
-        Number in the table, or name of the mixture, of each light in it.
-    truths
-        Ground truth (r, g, b) of sum 1 of each light.
-    truth
-        Mean of its lights over its pixels, of sum 1: the ground truth where there is one light.
-    split
-        The part of the dataset it belongs to.
+    - `image`: its file name; in shards the name it would have as a file.
+    - `source`: its source's name.
+    - `lights`: number in the table, or name of the mixture, of each light in it.
+    - `truths`: ground truth (r, g, b) of sum 1 of each light.
+    - `truth`: mean of its lights over its pixels, of sum 1: the ground truth where there is one light.
+    - `split`: the part of the dataset it belongs to.
     """
 
     image: str

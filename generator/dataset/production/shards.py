@@ -73,30 +73,7 @@ def make_shard(
     callbacks: Callbacks = SILENT,
     cancelled: threading.Event | None = None,
 ) -> ShardRecord:
-    """Make a shard and commit its record.
-
-    Parameters
-    ----------
-    job
-        What to make.
-    lut
-        The table.
-    place
-        Where the dataset is being made.
-    pool, workers
-        Threads that read, render, encode and write, and how many pieces of work to keep them busy with.
-    callbacks
-        What is called after each image and for each source that cannot be read, from the calling thread.
-    cancelled
-        When set, the shard is given up.
-
-    Raises
-    ------
-    StorageError
-        The disk is full, read-only or gone.
-    ShardCancelled
-        `cancelled` was set.
-    """
+    """Make a shard and commit its record."""
     sources: list[SourceRecord] = []
     skipped: list[Skipped] = []
     images: list[ImageRecord] = []
@@ -176,11 +153,6 @@ def make_elsewhere(job: ShardJob, place: Workplace) -> ShardDone:
     """Make a shard in a program of its own, which opens the table itself: the task of an engine's worker.
 
     A shard that is done already is not made again.
-
-    Raises
-    ------
-    InputError
-        The table or a library is not that of the plan.
     """
     if place.has(job.shard):
         return ShardDone(len(place.load(job.shard).images), ())

@@ -90,15 +90,7 @@ SILENT: Final = Callbacks()
 def parse_engine(text: str) -> str | None:
     """Return the address of the Dask scheduler that an engine's name asks for.
 
-    Returns
-    -------
-    str or None
-        `tcp://HOST:PORT`; empty for a cluster on this machine; None for threads of this program.
-
-    Raises
-    ------
-    InputError
-        It is none of `local`, `dask`, `dask://HOST:PORT`.
+    Returns `tcp://HOST:PORT`; empty for a cluster on this machine; None for threads of this program.
     """
     if text == "local":
         return None
@@ -112,11 +104,6 @@ def parse_engine(text: str) -> str | None:
 
 def parse_share(text: str) -> tuple[int, int]:
     """Return (i, n) of a text such as `3/16`: share i of n, i from 0.
-
-    Raises
-    ------
-    InputError
-        The text is no such share.
 
     Examples
     --------

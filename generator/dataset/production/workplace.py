@@ -44,16 +44,10 @@ PlanIdentity = Mapping[str, Any]
 class Workplace:
     """Where a dataset is being made.
 
-    Attributes
-    ----------
-    files
-        What will be the dataset.
-    notes
-        The plan and the shards' records, which are removed at the end.
-    out
-        The dataset's place.
-    plan_id
-        Identifier of the plan; see `_plan_id`.
+    - `files`: what will be the dataset.
+    - `notes`: the plan and the shards' records, which are removed at the end.
+    - `out`: the dataset's place.
+    - `plan_id`: identifier of the plan; see `_plan_id`.
     """
 
     files: Store
@@ -72,13 +66,7 @@ class Workplace:
         return self.notes.has(self._record_name(shard))
 
     def load(self, shard: int) -> ShardRecord:
-        """Return the record of a shard that is done.
-
-        Raises
-        ------
-        FormatError
-            There is none, or it is damaged.
-        """
+        """Return the record of a shard that is done."""
         name = self._record_name(shard)
         try:
             return ShardRecord.model_validate_json(self.notes.get(name))
@@ -98,15 +86,7 @@ class Workplace:
         self.notes.remove(RECORDS)
 
     def publish(self) -> None:
-        """Make a dataset of the files; all of them, the description last, are there.
-
-        Raises
-        ------
-        InputError
-            The place was taken meanwhile.
-        StorageError
-            The disk is full, read-only or gone.
-        """
+        """Make a dataset of the files; all of them, the description last, are there."""
         if isinstance(self.files, LocalStore):
             out = Path(self.out)
             require_free(out, "the dataset")
@@ -162,24 +142,7 @@ def differences(stored: Any, wanted: Any) -> list[str]:
 
 @contextmanager
 def workplace(out: str | Path, identity: PlanIdentity, alone: bool = True) -> Generator[Workplace]:
-    """Open the place where the dataset `out` is being made, or begin one.
-
-    Parameters
-    ----------
-    out
-        Path or URL of the dataset.
-    identity
-        Of the plan; see `plan.Plan.identity`.
-    alone
-        Whether no other program may work on the same dataset.
-
-    Raises
-    ------
-    InputError
-        The place is taken, belongs to another plan, or another program works on it.
-    StorageError
-        The disk is full, read-only or gone.
-    """
+    """Open the place where the dataset `out` is being made, or begin one."""
     if isinstance(out, str) and is_remote(out):
         yield from _remote(out, identity)
         return
@@ -210,13 +173,7 @@ def workplace(out: str | Path, identity: PlanIdentity, alone: bool = True) -> Ge
 
 
 def stored_identity(out: str | Path) -> PlanIdentity:
-    """Return the identity of the plan of a dataset that is being made.
-
-    Raises
-    ------
-    InputError
-        No dataset is being made there.
-    """
+    """Return the identity of the plan of a dataset that is being made."""
     notes = _notes(out)
     if not notes.has(PLAN):
         raise InputError(f"no dataset is being made at {out}; begin one with generate")
@@ -250,13 +207,7 @@ def _remote(out: str, identity: PlanIdentity) -> Generator[Workplace]:
 
 
 def _require_still_free(path: Path, folder: Path) -> None:
-    """Refuse when another program finished the dataset while its hold was waited for; `folder` is new and empty then.
-
-    Raises
-    ------
-    InputError
-        The dataset is there.
-    """
+    """Refuse when another program finished the dataset while its hold was waited for; `folder` is then new."""
     try:
         require_free(path, "the dataset")
     except InputError:

@@ -9,11 +9,11 @@ from typing import Any
 
 import pytest
 
-from acquisition.chart.layout import design_chart
 from acquisition.check.check import CheckOptions, check_lab
 from acquisition.check.findings import CheckReport
-from acquisition.config import load_lab
-from acquisition.lights.illuminations import plan_illuminations, save_illuminations
+from experiment.chart.layout import design_chart
+from experiment.config import load_lab
+from experiment.lights.illuminations import plan_illuminations, save_illuminations
 
 Check = Callable[..., CheckReport]
 

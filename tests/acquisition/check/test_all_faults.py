@@ -12,10 +12,10 @@ from typing import Any
 import pytest
 
 from acquisition.check import check as module
-from acquisition.config import LabSettings, load_lab, parse_lab
 from acquisition.run.devices import Devices
 from acquisition.run.rig import lab as rig
 from acquisition.run.rig.opening import open_rig
+from experiment.config import LabSettings, load_lab, parse_lab
 from foundation.errors import ConfigurationError, DeviceError, LinkClosed
 from tests.acquisition.check.conftest import lab_toml
 

@@ -15,26 +15,28 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from acquisition.chart.layout import paper_chart
 from acquisition.check.foretelling.figures import ForetoldTable, foretell, foretell_lights
 from acquisition.check.looking import PRIMARIES, PlacedChart
 from acquisition.check.places import place_chart, window_px
 from acquisition.check.taking import Shot
-from acquisition.framing.finding import find_chart
-from acquisition.lights.illuminations import plan_illuminations
-from acquisition.limits.table import ONLY_OF_A_SESSION, TABLE_LIMITS
-from acquisition.measures.sensor_range import saturation
-from acquisition.session.folder import Session
-from acquisition.session.plan import SessionStep
 from calibration.pipeline.build import check as build_check
 from calibration.verdict.thresholds import THRESHOLDS
 from calibration.verdict.values import judged_values
 from calibration.verdict.verdict import OUTCOMES, judge
 from drivers.presenter import BLACK, WHITE
 from drivers.raw.rawfile import Mosaic, read_raw
+from experiment.chart.layout import paper_chart
+from experiment.framing.finding import find_chart
+from experiment.lights.illuminations import plan_illuminations
+from experiment.limits.table import ONLY_OF_A_SESSION, TABLE_LIMITS
+from experiment.measures.sensor_range import saturation
+from experiment.session.folder import Session
+from experiment.session.plan import SessionStep
 from foundation.errors import QualityError, RegistrationError
 from sim.world.room import Room
 from tests.calibration.lab import LIGHTS, SETTINGS, Lab, Paint, hang, hang_chart, take
+
+pytestmark = pytest.mark.slow
 
 Counts = npt.NDArray[np.uint16]
 

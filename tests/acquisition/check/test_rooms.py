@@ -10,16 +10,18 @@ from typing import Any
 import numpy as np
 import pytest
 
-from acquisition.chart.layout import paper_chart
-from acquisition.chart.model import load_chart
 from acquisition.check.check import CheckOptions, check_lab
 from acquisition.check.findings import CheckReport, Finding
 from acquisition.cli import main
-from acquisition.config import load_lab
+from experiment.chart.layout import paper_chart
+from experiment.chart.model import load_chart
+from experiment.config import load_lab
 from sim.world import world
 from sim.world.room import Room
 from sim.world.wear import Stain, worn
 from tests.acquisition.check.conftest import Check, lab_toml
+
+pytestmark = pytest.mark.slow
 
 UNTOLD = {"battery", "card", "noise reduction"}
 """What a body may keep to itself."""

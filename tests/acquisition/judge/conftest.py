@@ -13,16 +13,16 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from acquisition.chart.layout import design_chart
-from acquisition.chart.model import Chart
-from acquisition.config import LabSettings, parse_lab
 from acquisition.judge.judge import LiveJudge
-from acquisition.lights.illuminations import Illumination, plan_illuminations
 from acquisition.run.rig.simulated import sheet
-from acquisition.session.judgement import Judgement
-from acquisition.session.plan import RESPONSE, SessionStep, plan_steps
 from drivers.camera import ExposureSettings
 from drivers.presenter import BLACK, Colour
+from experiment.chart.layout import design_chart
+from experiment.chart.model import Chart
+from experiment.config import LabSettings, parse_lab
+from experiment.lights.illuminations import Illumination, plan_illuminations
+from experiment.session.judgement import Judgement
+from experiment.session.plan import RESPONSE, SessionStep, plan_steps
 from sim.camera.dng import write_dng
 from sim.world.disturbances import AnyDisturbance, Disturbances, Moment
 from sim.world.room import Room

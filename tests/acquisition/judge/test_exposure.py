@@ -10,10 +10,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from acquisition.config import LimitSettings
 from acquisition.judge.exposure import Exposure, disagreement, measure_exposure, refusal
 from drivers.camera import ExposureSettings
 from drivers.raw.rawfile import Mosaic, read_raw
+from experiment.config import LimitSettings
 from sim.camera.dng import write_dng
 from sim.world.sensors import BODIES
 

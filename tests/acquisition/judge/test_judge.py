@@ -11,10 +11,10 @@ import pytest
 from acquisition.judge.checks.lights import crept
 from acquisition.judge.judge import LiveJudge
 from acquisition.judge.known.knowledge import Leaning
-from acquisition.session.judgement import Check, Judgement
-from acquisition.session.plan import SessionStep, tie_steps
 from drivers.camera import ExposureSettings
 from drivers.presenter import BLACK, WHITE, Colour
+from experiment.session.judgement import Check, Judgement
+from experiment.session.plan import SessionStep, tie_steps
 from sim.world.disturbances import (
     AmbientStep,
     Bump,
@@ -30,6 +30,8 @@ from sim.world.room import Room
 from sim.world.sensors import BODIES
 from sim.world.situation import Situation
 from tests.acquisition.judge.conftest import EXPOSURE, FRAMES, LAB, Bench, bench
+
+pytestmark = pytest.mark.slow
 
 ORANGE, SKY, DEEP_BLUE = (255, 197, 126), (113, 188, 255), (0, 0, 255)
 WHITE_STEP = SessionStep(901, "white", None, WHITE)

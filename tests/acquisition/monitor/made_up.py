@@ -12,11 +12,11 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from acquisition.lights.illuminations import Illumination, plan_illuminations, save_illuminations
-from acquisition.session.journal import JOURNAL_FILE, Journal
-from acquisition.session.judgement import Check, Judgement
-from acquisition.session.plan import RESPONSE, SessionStep, plan_steps
 from drivers.presenter import Colour
+from experiment.lights.illuminations import Illumination, plan_illuminations, save_illuminations
+from experiment.session.journal import JOURNAL_FILE, Journal
+from experiment.session.judgement import Check, Judgement
+from experiment.session.plan import RESPONSE, SessionStep, plan_steps
 from foundation.srgb import decode_srgb
 
 BEGUN = datetime(2026, 3, 1, 22, 0, tzinfo=UTC)

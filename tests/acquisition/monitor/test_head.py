@@ -12,8 +12,8 @@ import pytest
 
 from acquisition.monitor.head import Head, head_of
 from acquisition.monitor.rows import AttemptView, with_seconds
-from acquisition.session.heartbeat import Heartbeat, Process, RunState, SessionPlace
-from acquisition.session.plan import plan_steps
+from experiment.session.heartbeat import Heartbeat, Process, RunState, SessionPlace
+from experiment.session.plan import plan_steps
 from tests.acquisition.monitor.made_up import LIGHTS
 
 NOW = datetime(2026, 3, 1, 23, 0, tzinfo=UTC)
@@ -99,7 +99,7 @@ def test_elsewhere_a_missing_sign_of_life_is_waited_for(late_s: float, state: st
 
 def test_the_process_itself_is_looked_for() -> None:
     child = subprocess.run(
-        [sys.executable, "-c", "from acquisition.session.heartbeat import Process; print(repr(Process.own()))"],
+        [sys.executable, "-c", "from experiment.session.heartbeat import Process; print(repr(Process.own()))"],
         capture_output=True,
         text=True,
         check=True,

@@ -12,14 +12,14 @@ from pathlib import Path
 
 import pytest
 
-from acquisition.lights.illuminations import plan_illuminations
 from acquisition.monitor.report import save_report
 from acquisition.monitor.server import MonitorServer, open_monitor
+from experiment.lights.illuminations import plan_illuminations
 from tests.acquisition.monitor.browser import Tab, browser_tab, needs_chromium
 from tests.acquisition.monitor.made_up import LIGHTS, MadeUpRun
 from tests.acquisition.monitor.page_checks import NAMELESS, OUTSIDE, POOR_CONTRAST, TOO_WIDE
 
-pytestmark = needs_chromium
+pytestmark = [pytest.mark.slow, needs_chromium]
 ROOT = Path(__file__).parents[3]
 WEB = ROOT / "acquisition" / "monitor" / "web"
 HOSTILE = '<img src=x onerror="window.hacked=1"><script>window.hacked=1</script>\'"&{data}'

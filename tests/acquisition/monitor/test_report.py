@@ -14,7 +14,7 @@ import pytest
 from acquisition.cli import main
 from acquisition.monitor import report
 from acquisition.monitor.report import save_report, write_session_report
-from acquisition.session.journal import Journal
+from experiment.session.journal import Journal
 from foundation.errors import FormatError, StorageError
 from tests.acquisition.monitor.made_up import MadeUpRun
 

@@ -13,8 +13,8 @@ import pytest
 
 from acquisition.monitor.encoding import place_of, planned_places
 from acquisition.monitor.watching import SessionWatch
-from acquisition.session.journal import Journal
-from acquisition.session.plan import tie_steps
+from experiment.session.journal import Journal
+from experiment.session.plan import tie_steps
 from tests.acquisition.monitor.made_up import LIGHTS, MadeUpRun
 
 

@@ -16,15 +16,8 @@ from pathlib import Path
 from typing import Any, BinaryIO
 from unittest.mock import patch
 
-from acquisition.chart.layout import design_chart
-from acquisition.config import LabSettings
-from acquisition.lights.illuminations import Illumination
 from acquisition.run.devices import Devices
 from acquisition.run.sequencer import RunOutcome, take_session
-from acquisition.session.folder import Session
-from acquisition.session.journal import Journal
-from acquisition.session.judgement import Judgement
-from acquisition.session.plan import SessionStep, plan_steps
 from drivers.camera import ExposureSettings
 from drivers.canon.camera import CanonEos
 from drivers.links.link import Link
@@ -35,6 +28,13 @@ from drivers.projector import Power, Severity
 from drivers.ptp.codes import ResponseCode
 from drivers.ptp.transport import Transport
 from drivers.ptp.usb_transport import UsbTransport
+from experiment.chart.layout import design_chart
+from experiment.config import LabSettings
+from experiment.lights.illuminations import Illumination
+from experiment.session.folder import Session
+from experiment.session.journal import Journal
+from experiment.session.judgement import Judgement
+from experiment.session.plan import SessionStep, plan_steps
 from foundation.errors import CropError, DeviceError, LinkClosed, StorageError
 from sim.buses import faults
 from sim.buses.faults import Occasion

@@ -11,15 +11,15 @@ from typing import BinaryIO
 
 import numpy as np
 
-from acquisition.chart.layout import design_chart
-from acquisition.config import LabSettings
-from acquisition.lights.illuminations import Illumination
 from acquisition.run.devices import Devices
-from acquisition.session.folder import Session
-from acquisition.session.plan import plan_steps
 from drivers.camera import CameraIdentity, CapturedFrame, ExposureSettings
 from drivers.presenter import BLACK, Colour
 from drivers.projector import Power
+from experiment.chart.layout import design_chart
+from experiment.config import LabSettings
+from experiment.lights.illuminations import Illumination
+from experiment.session.folder import Session
+from experiment.session.plan import plan_steps
 from foundation.errors import DeviceError
 from sim.camera.dng import write_dng
 from sim.clock import SimulatedClock

@@ -7,10 +7,10 @@ from typing import Any
 
 import pytest
 
-from acquisition.lights.illuminations import Illumination
 from acquisition.run.taking.agenda import GIVEN_UP_IN_A_ROW, Agenda, unclosed_kinds
-from acquisition.session.plan import FrameKind, SessionStep, plan_steps
 from drivers.presenter import BLACK, WHITE, Colour
+from experiment.lights.illuminations import Illumination
+from experiment.session.plan import FrameKind, SessionStep, plan_steps
 
 STEPS = plan_steps([Illumination(n, "uniform", None, Colour(255, n, 0)) for n in range(4)], 2)
 """white 0, dark 1, light 2, 3, white 4, dark 5, light 6, 7, white 8, dark 9."""

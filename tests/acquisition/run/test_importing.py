@@ -9,12 +9,12 @@ from pathlib import Path
 
 import pytest
 
-from acquisition.chart.layout import design_chart
 from acquisition.cli import main
-from acquisition.lights.illuminations import Illumination, save_illuminations
 from acquisition.run.importing import Imported, import_session
-from acquisition.session.folder import FRAME_COLUMNS, Session
 from drivers.presenter import Colour
+from experiment.chart.layout import design_chart
+from experiment.lights.illuminations import Illumination, save_illuminations
+from experiment.session.folder import FRAME_COLUMNS, Session
 from foundation.errors import FormatError
 from tests.json_of import json_of
 

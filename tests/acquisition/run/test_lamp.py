@@ -9,7 +9,6 @@ from typing import cast
 
 import pytest
 
-from acquisition.config import SequenceSettings
 from acquisition.run.lamp import POWER_LIMIT_S, RELIGHT_S, HealthWatch, await_health, make_ready, require_healthy
 from acquisition.run.patience import PAUSE_S, Patience
 from drivers.links.link import Link
@@ -17,6 +16,7 @@ from drivers.pjlink.projector import PjLinkProjector
 from drivers.pjlink.wire import NoResolution
 from drivers.projector import Fault, Lamp, Power, Projector, Severity
 from drivers.serial_projectors.optoma import OptomaProjector
+from experiment.config import SequenceSettings
 from foundation.errors import DeviceFault, LinkClosed, LinkTimeout
 from sim.buses.serial_cable import SerialPeerLink
 from sim.clock import SimulatedClock

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import pytest
 
-from acquisition.config import SequenceSettings
 from acquisition.run.devices import Devices
 from acquisition.run.leaving import OBEYS_S, RunEnd, end_of, lamp_fate, leave_lab
 from drivers.presenter import BLACK, Colour
 from drivers.projector import Power
+from experiment.config import SequenceSettings
 from foundation.errors import DeviceError, LinkClosed, StorageError
 from sim.clock import SimulatedClock
 from sim.projectors.projector import SimulatedProjector

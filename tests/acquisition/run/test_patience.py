@@ -12,18 +12,18 @@ from pathlib import Path
 
 import pytest
 
-from acquisition.chart.layout import design_chart
-from acquisition.config import LabSettings
-from acquisition.lights.illuminations import Illumination
 from acquisition.run.patience import PAUSE_S, RETRY_S, Patience
 from acquisition.run.rig.opening import open_rig
-from acquisition.session.folder import Session
-from acquisition.session.journal_file import HeldJournalError
-from acquisition.session.plan import plan_steps
 from drivers.camera import keep_awake
 from drivers.presenter import WHITE
 from drivers.ptp.session import OperationDeclined
 from drivers.raw.rawfile import read_raw
+from experiment.chart.layout import design_chart
+from experiment.config import LabSettings
+from experiment.lights.illuminations import Illumination
+from experiment.session.folder import Session
+from experiment.session.journal_file import HeldJournalError
+from experiment.session.plan import plan_steps
 from foundation.errors import (
     ConfigurationError,
     CropError,

@@ -11,15 +11,15 @@ from typing import Any
 
 import pytest
 
-from acquisition.lights.illuminations import Illumination
 from acquisition.run.patience import PAUSE_S
 from acquisition.run.sequencer import RunOutcome, take_session
 from acquisition.run.taking.pipeline import Taken
-from acquisition.session.folder import Session
-from acquisition.session.judgement import Check, Judgement
-from acquisition.session.plan import SessionStep, tie_steps
 from drivers.presenter import BLACK, WHITE, Colour
 from drivers.projector import Power
+from experiment.lights.illuminations import Illumination
+from experiment.session.folder import Session
+from experiment.session.judgement import Check, Judgement
+from experiment.session.plan import SessionStep, tie_steps
 from foundation.console import Ending
 from foundation.errors import DeviceError, DeviceFault, LinkTimeout, QualityError, StorageError
 from tests.acquisition.run.scripted import DOWNLOAD_S, EXPOSE_S, GLARE, LIGHTS, NIGHT, SETTINGS, TURNED, WELL, Lab
@@ -343,7 +343,7 @@ class TestFaults:
         if place == "download":
             monkeypatch.setattr(Session, "incoming", full(Session.incoming))
         elif place == "save":
-            from acquisition.session.incoming import IncomingFile
+            from experiment.session.incoming import IncomingFile
 
             monkeypatch.setattr(IncomingFile, "complete", full(IncomingFile.complete, IncomingFile.abandon))
         elif place == "commit":
@@ -362,7 +362,7 @@ class TestFaults:
             assert lab.camera.captures == 7, "the frame in the camera was not lost"
 
     def test_a_disk_that_never_saves_ends_the_run(self, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-        from acquisition.session.incoming import IncomingFile
+        from experiment.session.incoming import IncomingFile
 
         lab = Lab(folder)
         broken = failing(StorageError("Input/output error"), calls=range(100_000))

@@ -13,10 +13,7 @@ from typing import Any
 
 import pytest
 
-from acquisition.chart.layout import design_chart
 from acquisition.cli import main
-from acquisition.config import LabSettings, load_lab
-from acquisition.lights.illuminations import Illumination, save_illuminations
 from acquisition.run.devices import Devices
 from acquisition.run.planning.answers import Answers, ask
 from acquisition.run.planning.dry_run import dry_run
@@ -24,15 +21,20 @@ from acquisition.run.planning.plan import RunPlan, make_plan
 from acquisition.run.planning.sizes import MEGAPIXELS, SPARE_BYTES, free_bytes_at, needed_bytes
 from acquisition.run.planning.text import plan_lines
 from acquisition.run.planning.work import Work, order_of, outline
-from acquisition.session.folder import Session
-from acquisition.session.plan import plan_steps
 from drivers.camera import CameraIdentity, ExposureSettings, Supplies
 from drivers.presenter import Colour
 from drivers.projector import Power, Severity
+from experiment.chart.layout import design_chart
+from experiment.config import LabSettings, load_lab
+from experiment.lights.illuminations import Illumination, save_illuminations
+from experiment.session.folder import Session
+from experiment.session.plan import plan_steps
 from foundation.errors import ConfigurationError, CropError, DeviceError, DeviceFault, DeviceRefused, StorageError
 from sim.clock import SimulatedClock
 from sim.projectors.projector import SimulatedProjector
 from tests.json_of import json_of
+
+pytestmark = pytest.mark.slow
 
 GB = 10**9
 LIGHTS = tuple(Illumination(index, "uniform", None, Colour(255, index, 0)) for index in range(100))

@@ -8,18 +8,18 @@ from pathlib import Path
 
 import pytest
 
-from acquisition.config import LabSettings
-from acquisition.lights.illuminations import Illumination
 from acquisition.run.rig.lab import session_clock
 from acquisition.run.sequencer import take_session
 from acquisition.run.taking.resuming import check_frames, clock_note, require_same_devices, tie
-from acquisition.session.folder import Session
-from acquisition.session.journal import Journal
-from acquisition.session.judgement import Judgement
-from acquisition.session.plan import plan_steps, tie_steps
 from drivers.camera import CameraIdentity, CapturedFrame
 from drivers.presenter import Colour
 from drivers.projector import ProjectorIdentity
+from experiment.config import LabSettings
+from experiment.lights.illuminations import Illumination
+from experiment.session.folder import Session
+from experiment.session.journal import Journal
+from experiment.session.judgement import Judgement
+from experiment.session.plan import plan_steps, tie_steps
 from foundation.console import Ending
 from foundation.errors import DeviceRefused
 from tests.acquisition.run.scripted import LIGHTS, SETTINGS, Lab

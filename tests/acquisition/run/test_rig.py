@@ -7,15 +7,15 @@ from unittest.mock import Mock
 
 import pytest
 
-from acquisition.chart.layout import design_chart
-from acquisition.config import LabSettings, SimulatedSettings, load_lab, parse_lab
-from acquisition.lights.illuminations import plan_illuminations, save_illuminations
 from acquisition.run.rig.attached import attached_devices
 from acquisition.run.rig.opening import open_rig
 from acquisition.run.rig.simulated import simulated_body, simulated_room
 from acquisition.run.run import run_session
-from acquisition.session.folder import Session
 from drivers.raw.rawfile import read_raw
+from experiment.chart.layout import design_chart
+from experiment.config import LabSettings, SimulatedSettings, load_lab, parse_lab
+from experiment.lights.illuminations import plan_illuminations, save_illuminations
+from experiment.session.folder import Session
 from foundation.clock import Clock
 from foundation.errors import ConfigurationError
 from sim.projectors.screen import Screen, SimulatedPresenter

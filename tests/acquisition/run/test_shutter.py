@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import pytest
 
-from acquisition.config import CameraSettings, ProjectorCable
 from acquisition.run.shutter import (
     ENGRAVED_S,
     holds_whole_turns,
     require_whole_turns,
 )
 from drivers.canon.apex import SHUTTER
+from experiment.config import CameraSettings, ProjectorCable
 from foundation.errors import ConfigurationError
 
 WHEEL = ProjectorCable()

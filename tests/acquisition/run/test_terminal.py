@@ -6,9 +6,9 @@ import pytest
 
 from acquisition.run.taking.pipeline import Taken
 from acquisition.run.terminal import Terminal, TimeLeft, verdict_line
-from acquisition.session.judgement import Check, Judgement
-from acquisition.session.plan import SessionStep
 from drivers.presenter import Colour
+from experiment.session.judgement import Check, Judgement
+from experiment.session.plan import SessionStep
 
 STEP = SessionStep(7, "light", 5, Colour(1, 2, 3))
 

@@ -10,11 +10,11 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from acquisition.lights.illuminations import Illumination
-from acquisition.session.folder import Session
-from acquisition.session.plan import SessionStep
 from drivers.camera import ExposureSettings
 from drivers.presenter import Colour
+from experiment.lights.illuminations import Illumination
+from experiment.session.folder import Session
+from experiment.session.plan import SessionStep
 from sim.camera.dng import write_dng
 from sim.world.situation import UNDISTURBED, Blob, Situation
 from tests.calibration.lab import LIGHTS, SETTINGS, TAKEN_AT, Lab, renumbered, take

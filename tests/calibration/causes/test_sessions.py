@@ -11,8 +11,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from acquisition.session.folder import Session
-from acquisition.session.plan import SessionStep
 from calibration.causes.cause import (
     DEFOCUS,
     OBJECT_IN_FRAME,
@@ -31,10 +29,14 @@ from calibration.verdict.retaking import findings, retaken_frames
 from calibration.verdict.thresholds import THRESHOLDS
 from calibration.verdict.wording import remark
 from drivers.presenter import Colour
+from experiment.session.folder import Session
+from experiment.session.plan import SessionStep
 from sim.world.room import Room
 from sim.world.situation import Blob, Situation
 from tests.calibration.causes.rooms import BRIGHT, HAND, Counts, glare, half, nth_white, taken
 from tests.calibration.lab import Lab, hang
+
+pytestmark = pytest.mark.slow
 
 REMARKING = tuple(replace(limit, refuse=None) for limit in THRESHOLDS)
 """The limits, none of which refuses: a table is made, and all that is wrong is a remark."""

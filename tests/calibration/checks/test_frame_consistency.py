@@ -16,6 +16,8 @@ from scipy.spatial import cKDTree
 from calibration.checks.frame_consistency import ConsistencyCheck, FrameConsistency, has_enough_cells
 from calibration.verdict.thresholds import THRESHOLDS
 
+pytestmark = pytest.mark.slow
+
 LIMITS = {limit.name: limit for limit in THRESHOLDS}
 _Array = npt.NDArray[np.float64]
 

@@ -10,18 +10,20 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from acquisition.lights.illuminations import plan_illuminations
-from acquisition.session.plan import SessionStep
 from calibration.checks.light_codes import CodeAgreement, code_agreement
 from calibration.pipeline.build import build
 from calibration.verdict.thresholds import THRESHOLDS
 from calibration.verdict.verdict import judge
+from experiment.lights.illuminations import plan_illuminations
+from experiment.session.plan import SessionStep
 from foundation.angles import angles_deg
 from foundation.errors import FormatError
 from foundation.srgb import decode_srgb
 from sim.world.room import Room
 from sim.world.spectra import projector_primaries, sensitivities
 from tests.calibration.lab import LIGHTS, SETTINGS, Lab, hang, take
+
+pytestmark = pytest.mark.slow
 
 _Array = npt.NDArray[np.float64]
 Codes = Sequence[tuple[int, int, int]]

@@ -11,13 +11,15 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from acquisition.framing.planes import frame_black
-from acquisition.measures.paper import PaperReader
-from acquisition.measures.stains import Stains, find_stains
 from calibration.registration.register import register
 from calibration.sampling.samples import gather, sites_at
+from experiment.framing.planes import frame_black
+from experiment.measures.paper import PaperReader
+from experiment.measures.stains import Stains, find_stains
 from sim.world.room import Room
 from tests.calibration.lab import Lab, hang
+
+pytestmark = pytest.mark.slow
 
 
 def cells_mm(lab: Lab) -> npt.NDArray[np.float64]:

@@ -10,8 +10,6 @@ from pathlib import Path
 
 import pytest
 
-from acquisition.config import CameraSettings, CitationSettings, parse_lab
-from acquisition.session.records import FrameRecord
 from calibration.citation.citing import bibtex, tex_text
 from calibration.citation.record import NOT_RECORDED, OriginRecord, origin_lines
 from calibration.citation.serial_numbers import serial_hash, with_told_serials
@@ -20,6 +18,8 @@ from calibration.cli import main
 from calibration.table.lut import open_lut
 from calibration.table.provenance import parse_provenance
 from drivers.raw.origin import FrameOrigin
+from experiment.config import CameraSettings, CitationSettings, parse_lab
+from experiment.session.records import FrameRecord
 from foundation.errors import ConfigurationError, InputError
 from tests.calibration.table.tables import write
 

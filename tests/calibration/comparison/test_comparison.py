@@ -12,7 +12,6 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from acquisition.lights.illuminations import Illumination
 from calibration.cli import main
 from calibration.comparison.comparing import compare, recorded_drift
 from calibration.comparison.geometry import geometry_difference
@@ -25,6 +24,7 @@ from calibration.table.lut import Lut, open_lut
 from calibration.table.provenance import Provenance
 from calibration.table.writer import LutWriter
 from drivers.presenter import Colour
+from experiment.lights.illuminations import Illumination
 from foundation.errors import FormatError
 from tests.calibration.lab import LIGHTS
 

@@ -12,11 +12,6 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from acquisition.chart.layout import A_SERIES_MM, design_chart
-from acquisition.chart.model import Chart
-from acquisition.measures.polynomials import order_of, page_polynomial
-from acquisition.session.folder import Session
-from acquisition.session.plan import SessionStep, plan_steps
 from calibration.citation.record import exposure_text
 from calibration.cli import main
 from calibration.pipeline.build import build, check
@@ -29,11 +24,18 @@ from calibration.table.lut import Lut, open_lut
 from calibration.verdict.result import BuildResult
 from drivers.camera import ExposureSettings
 from drivers.presenter import BLACK, WHITE
+from experiment.chart.layout import A_SERIES_MM, design_chart
+from experiment.chart.model import Chart
+from experiment.measures.polynomials import order_of, page_polynomial
+from experiment.session.folder import Session
+from experiment.session.plan import SessionStep, plan_steps
 from foundation.errors import FormatError, InputError, QualityError, RegistrationError
 from sim.camera.dng import write_dng
 from sim.world.room import Room
 from tests.calibration.lab import LIGHTS, SETTINGS, TAKEN_AT, Lab, hang, renumbered, take
 from tests.json_of import json_of
+
+pytestmark = pytest.mark.slow
 
 
 def angle_deg(one: npt.NDArray[np.float64], other: npt.NDArray[np.float64]) -> float:

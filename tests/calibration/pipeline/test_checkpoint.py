@@ -17,17 +17,19 @@ import numpy as np
 import pytest
 
 import calibration.pipeline.build as building
-from acquisition.session.folder import Session
-from acquisition.session.plan import SessionStep
 from calibration.pipeline.build import TableProgress, append, build
 from calibration.pipeline.checkpoint import CHECKPOINT, Checkpoint, unfinished_table
 from calibration.pipeline.frames import frame_faults
 from calibration.table.lut import open_lut
 from calibration.table.verification import find_faults
 from calibration.verdict.result import BuildResult
+from experiment.session.folder import Session
+from experiment.session.plan import SessionStep
 from foundation.errors import FormatError, InputError
 from sim.world.room import Room
 from tests.calibration.lab import LIGHTS, Lab, hang, renumbered, take
+
+pytestmark = pytest.mark.slow
 
 KILLER = """
 import os, signal, sys

@@ -10,8 +10,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from acquisition.session.folder import Session
-from acquisition.session.plan import SessionStep
 from calibration.cli import main
 from calibration.comparison.comparing import compare
 from calibration.pipeline.build import BuildResult, build
@@ -19,9 +17,13 @@ from calibration.pipeline.options import BuildOptions
 from calibration.radiometry.drift import as_measured
 from calibration.table.lut import Lut, open_lut
 from calibration.table.verification import find_faults
+from experiment.session.folder import Session
+from experiment.session.plan import SessionStep
 from foundation.errors import FormatError, QualityError
 from sim.camera.dng import write_dng
 from tests.calibration.lab import LIGHTS, SETTINGS, TAKEN_AT, Lab, take
+
+pytestmark = pytest.mark.slow
 
 CORRECTED = BuildOptions(correct_drift=True)
 

@@ -11,21 +11,23 @@ from pathlib import Path
 
 import pytest
 
-from acquisition.lights.illuminations import Illumination
-from acquisition.session.folder import Session
-from acquisition.session.mending.retaking import lights_text
-from acquisition.session.plan import SessionStep
 from calibration.pipeline.build import build
 from calibration.report.report_json import report_json
 from calibration.report.summary import summary
 from calibration.verdict.result import BuildResult
 from drivers.presenter import WHITE, Colour
+from experiment.lights.illuminations import Illumination
+from experiment.session.folder import Session
+from experiment.session.mending.retaking import lights_text
+from experiment.session.plan import SessionStep
 from foundation.errors import QualityError
 from sim.camera.dng import write_dng
 from sim.world.room import Room
 from sim.world.sensors import BODIES
 from sim.world.world import World
 from tests.calibration.lab import SETTINGS, TAKEN_AT, Lab, hang, renumbered, take
+
+pytestmark = pytest.mark.slow
 
 CODES = (
     Colour(255, 255, 255),

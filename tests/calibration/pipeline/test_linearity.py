@@ -10,8 +10,6 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from acquisition.measures.linearity import deviations
-from acquisition.session.folder import Session
 from calibration.cli import main
 from calibration.pipeline.build import build, check
 from calibration.report.report import write_report
@@ -21,9 +19,13 @@ from calibration.table.verification import find_faults
 from calibration.verdict.result import BuildResult
 from drivers.camera import ExposureSettings
 from drivers.presenter import WHITE
+from experiment.measures.linearity import deviations
+from experiment.session.folder import Session
 from foundation.errors import FormatError, InputError
 from sim.world.room import Room
 from tests.calibration.lab import Lab, hang
+
+pytestmark = pytest.mark.slow
 
 TIMES = (0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7)
 _Array = npt.NDArray[np.float64]

@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from acquisition.session.folder import Session
 from calibration.cli import main
 from calibration.pipeline.build import build, check
 from calibration.pipeline.options import BuildOptions
@@ -21,7 +20,10 @@ from calibration.table.verification import find_faults
 from calibration.verdict.values import judged_values
 from calibration.verdict.verdict import judge
 from calibration.verdict.wording import remark
+from experiment.session.folder import Session
 from foundation.errors import InputError
+
+pytestmark = pytest.mark.slow
 
 
 @pytest.mark.parametrize("window", [1, 2, 4, 11, -5])

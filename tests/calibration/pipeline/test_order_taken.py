@@ -10,15 +10,15 @@ from pathlib import Path
 
 import pytest
 
-from acquisition.chart.layout import design_chart
-from acquisition.lights.illuminations import Illumination
-from acquisition.session.folder import Session
-from acquisition.session.incoming import ReceivedFile
-from acquisition.session.judgement import Judgement
-from acquisition.session.plan import plan_steps
 from calibration.pipeline.frames import select_frames
 from drivers.camera import CapturedFrame
 from drivers.presenter import Colour
+from experiment.chart.layout import design_chart
+from experiment.lights.illuminations import Illumination
+from experiment.session.folder import Session
+from experiment.session.incoming import ReceivedFile
+from experiment.session.judgement import Judgement
+from experiment.session.plan import plan_steps
 
 AT = datetime(2024, 3, 1, 23, 0, tzinfo=UTC)
 LIGHTS = tuple(Illumination(n, "uniform", None, Colour(255, 20 * n, 255 - n)) for n in range(5))

@@ -9,18 +9,20 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from acquisition.chart.layout import A_SERIES_MM, design_chart, paper_chart
-from acquisition.framing.tagless_field import field_mm
-from acquisition.lights.illuminations import Illumination
-from acquisition.session.plan import SessionStep
-from acquisition.session.records import ACCEPTED
 from calibration.cli import main
 from calibration.pipeline.build import build
 from calibration.report.report import write_report
 from calibration.table.lut import open_lut
 from drivers.presenter import Colour
+from experiment.chart.layout import A_SERIES_MM, design_chart, paper_chart
+from experiment.framing.tagless_field import field_mm
+from experiment.lights.illuminations import Illumination
+from experiment.session.plan import SessionStep
+from experiment.session.records import ACCEPTED
 from sim.world.room import Room
 from tests.calibration.lab import LIGHTS, SETTINGS, Lab, hang_chart, renumbered, take
+
+pytestmark = pytest.mark.slow
 
 SMALL = paper_chart("A6", 3)
 ROOM = Room(waviness_mm=0.5)

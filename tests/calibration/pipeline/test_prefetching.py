@@ -8,11 +8,13 @@ from pathlib import Path
 
 import pytest
 
-from acquisition.session.folder import Session
-from acquisition.session.records import FrameRecord
 from calibration.pipeline import prefetching
 from calibration.pipeline.build import build
 from calibration.pipeline.prefetching import prefetched
+from experiment.session.folder import Session
+from experiment.session.records import FrameRecord
+
+pytestmark = pytest.mark.slow
 
 AT = datetime(2024, 3, 1, tzinfo=UTC)
 

@@ -19,6 +19,8 @@ from sim.world.spectra import PaperName
 from tests.calibration.causes.rooms import BRIGHT, Counts, taken
 from tests.calibration.lab import LIGHTS, SETTINGS, hang, renumbered, take
 
+pytestmark = pytest.mark.slow
+
 LIGHT = renumbered(LIGHTS[5:6])
 
 

@@ -10,15 +10,17 @@ from pathlib import Path
 
 import pytest
 
-from acquisition.session.folder import Session
 from calibration.cli import main
 from calibration.pipeline.build import build, check, refused_folder
 from calibration.report.report import write_report
 from calibration.verdict.thresholds import THRESHOLDS
 from calibration.verdict.values import judged_values
+from experiment.session.folder import Session
 from foundation.errors import QualityError
 from tests.calibration.lab import LIGHTS, Lab, take
 from tests.json_of import json_of
+
+pytestmark = pytest.mark.slow
 
 STRICT = (replace(next(limit for limit in THRESHOLDS if limit.name == "darkest_counts"), refuse=60_000.0),)
 

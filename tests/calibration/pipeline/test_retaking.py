@@ -11,15 +11,17 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from acquisition.session.folder import Session
-from acquisition.session.incoming import ReceivedFile
-from acquisition.session.judgement import Judgement
-from acquisition.session.plan import SessionStep, plan_steps
 from calibration.pipeline.build import build
 from calibration.report.report import write_report
 from drivers.camera import CapturedFrame
+from experiment.session.folder import Session
+from experiment.session.incoming import ReceivedFile
+from experiment.session.judgement import Judgement
+from experiment.session.plan import SessionStep, plan_steps
 from foundation.errors import FormatError, InputError, QualityError
 from tests.calibration.lab import LIGHTS, SETTINGS, TAKEN_AT, Lab, Paint, take
+
+pytestmark = pytest.mark.slow
 
 SHORT = LIGHTS[:3]
 COMMAND = "acquire run LAB.toml SESSION --retake bad"

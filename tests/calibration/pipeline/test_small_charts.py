@@ -7,14 +7,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from acquisition.chart.layout import design_chart
 from calibration.pipeline.build import build
 from calibration.registration.register import register
 from calibration.report.report import write_report
 from calibration.table.lut import open_lut
 from calibration.verdict.values import judged_values
+from experiment.chart.layout import design_chart
 from sim.world.room import Room
 from tests.calibration.lab import LIGHTS, SETTINGS, hang_chart, renumbered, take
+
+pytestmark = pytest.mark.slow
 
 LIGHT = renumbered(LIGHTS[5:6])
 

@@ -7,7 +7,6 @@ from pathlib import Path
 
 import pytest
 
-from acquisition.session.plan import SessionStep
 from benchmarks.cases import chart_of
 from benchmarks.sessions import AS_PLANNED, FrameChange, light_named, short_plan, short_session, world_of
 from calibration.pipeline.build import build
@@ -19,9 +18,12 @@ from calibration.verdict.values import judged_values
 from calibration.verdict.verdict import judge
 from calibration.verdict.wording import remark
 from drivers.presenter import Colour
+from experiment.session.plan import SessionStep
 from sim.world.room import Room
 from sim.world.sensors import BODIES
 from sim.world.situation import Situation
+
+pytestmark = pytest.mark.slow
 
 LIGHTS = {
     "red": Colour(255, 0, 0), "green": Colour(0, 255, 0), "blue": Colour(0, 0, 255), "white": Colour(255, 255, 255),

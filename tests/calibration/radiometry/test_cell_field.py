@@ -6,16 +6,18 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from acquisition.chart.layout import paper_chart
-from acquisition.chart.printing import drawing
-from acquisition.measures.paper import PaperReader
 from calibration.radiometry.cell_field import field_of_cells
 from drivers.presenter import WHITE, Colour
+from experiment.chart.layout import paper_chart
+from experiment.chart.printing import drawing
+from experiment.measures.paper import PaperReader
 from sim.world.drawing import Print
 from sim.world.room import Room
 from sim.world.sensors import BODIES
 from sim.world.world import World
 from tests.calibration.lab import SETTINGS
+
+pytestmark = pytest.mark.slow
 
 CHART = paper_chart("A1", 4)
 WHITES_MM = np.array([reference.centre_mm for reference in CHART.references])

@@ -8,13 +8,13 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from acquisition.session.records import FrameRecord
 from calibration.radiometry.dark_frames import (
     DarkFrameFigures,
     HotPixels,
     dark_summary,
     measure_dark_frame,
 )
+from experiment.session.records import FrameRecord
 
 
 def samples(count: int, level: tuple[float, float, float], seed: int) -> npt.NDArray[np.float32]:

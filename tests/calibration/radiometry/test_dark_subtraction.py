@@ -10,10 +10,6 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from acquisition.measures.flat_field import FlatField
-from acquisition.measures.paper import Paper
-from acquisition.session.folder import Session
-from acquisition.session.plan import SessionStep
 from calibration.cli import main
 from calibration.pipeline.build import TableProgress, append, build, check
 from calibration.pipeline.options import BuildOptions
@@ -22,9 +18,15 @@ from calibration.report.summary import summary
 from calibration.table.lut import open_lut
 from calibration.verdict.result import BuildResult
 from drivers.presenter import BLACK
+from experiment.measures.flat_field import FlatField
+from experiment.measures.paper import Paper
+from experiment.session.folder import Session
+from experiment.session.plan import SessionStep
 from foundation.errors import FormatError
 from sim.world.room import Room
 from tests.calibration.lab import LIGHTS, SETTINGS, Lab, hang, renumbered, take
+
+pytestmark = pytest.mark.slow
 
 PATCHES = 4000
 NOISE = np.array([6.0, 4.2, 6.0])

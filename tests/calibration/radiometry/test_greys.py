@@ -8,8 +8,8 @@ import io
 import numpy as np
 import pytest
 
-from acquisition.chart.model import Reference
 from calibration.radiometry.greys import GreyLevels, references_csv, tint_deg
+from experiment.chart.model import Reference
 
 GREYS = [
     Reference(f"grey {code}", (code, code, code), (float(n), 0.0), (5.0, 5.0)) for n, code in enumerate([71, 188] * 20)

@@ -9,12 +9,12 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from acquisition.lights.illuminations import plan_illuminations
-from acquisition.measures.flat_field import FlatField
-from acquisition.measures.paper import Paper, PaperReader
 from calibration.pipeline.build import build
 from calibration.radiometry.primaries import Primaries, pure_lights
 from calibration.table.lut import open_lut
+from experiment.lights.illuminations import plan_illuminations
+from experiment.measures.flat_field import FlatField
+from experiment.measures.paper import Paper, PaperReader
 from sim.world.room import Room
 from tests.calibration.lab import SETTINGS, hang, renumbered, take
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from acquisition.lights.illuminations import Illumination
 from calibration.radiometry.projector import additivity, drift_gains
 from drivers.presenter import Colour
+from experiment.lights.illuminations import Illumination
 
 PRIMARIES = ((255, 0, 0), (0, 255, 0), (0, 0, 255))
 

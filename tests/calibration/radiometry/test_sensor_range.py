@@ -8,9 +8,9 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from acquisition.measures.sensor_range import black_drift, saturation
 from drivers.camera import ExposureSettings
 from drivers.presenter import WHITE
+from experiment.measures.sensor_range import black_drift, saturation
 from tests.calibration.lab import Lab
 
 

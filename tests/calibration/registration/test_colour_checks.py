@@ -6,8 +6,8 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from acquisition.chart.layout import A_SERIES_MM, design_chart
 from calibration.registration.colour_checks import agreement, mismatched, slipped_parts
+from experiment.chart.layout import A_SERIES_MM, design_chart
 
 PAPER = np.array([8000.0, 9000.0, 7000.0])
 ROWS, COLUMNS = 32, 48

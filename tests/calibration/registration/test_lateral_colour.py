@@ -8,11 +8,11 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from acquisition.framing.planes import CHANNELS
 from calibration.registration.lateral_colour import LateralColour
 from calibration.registration.register import register
 from calibration.registration.registration import Registration
 from drivers.raw.rawfile import Mosaic
+from experiment.framing.planes import CHANNELS
 from sim.world.room import Room
 from tests.calibration.lab import Lab, hang
 

@@ -9,15 +9,17 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from acquisition.chart.layout import A_SERIES_MM, design_chart
 from benchmarks import rooms
 from calibration.registration.register import register
 from drivers.presenter import WHITE, Colour
 from drivers.raw.rawfile import Mosaic, read_raw
+from experiment.chart.layout import A_SERIES_MM, design_chart
 from foundation.errors import RegistrationError
 from sim.world.room import Room
 from tests.calibration.lab import Lab, hang
 from tests.data_files import shipped
+
+pytestmark = pytest.mark.slow
 
 
 def miss(lab: Lab, mosaic: Mosaic) -> npt.NDArray[np.float64]:

@@ -9,17 +9,19 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from acquisition.chart.layout import paper_chart
-from acquisition.chart.model import Chart
-from acquisition.framing.planes import CHANNELS
-from acquisition.framing.tagless_field import field_mm
-from acquisition.limits.table import TABLE_LIMITS
 from calibration.registration.register import register
 from drivers.presenter import WHITE, Colour
 from drivers.raw.rawfile import Mosaic
+from experiment.chart.layout import paper_chart
+from experiment.chart.model import Chart
+from experiment.framing.planes import CHANNELS
+from experiment.framing.tagless_field import field_mm
+from experiment.limits.table import TABLE_LIMITS
 from foundation.errors import RegistrationError
 from sim.world.room import Room
 from tests.calibration.lab import Lab, hang_chart
+
+pytestmark = pytest.mark.slow
 
 SMALL = paper_chart("A6", 3)
 

@@ -19,6 +19,8 @@ from drivers.raw.rawfile import read_raw
 from tests.calibration.causes.rooms import HAND, nth_white, taken
 from tests.calibration.lab import Lab
 
+pytestmark = pytest.mark.slow
+
 
 def test_the_report_names_and_circles_a_hand(lab: Lab, tmp_path: Path) -> None:
     out = tmp_path / "lut"

@@ -6,6 +6,8 @@ import pytest
 
 from calibration.sampling.windows import WINDOWS, bleed, largest_window
 
+pytestmark = pytest.mark.slow
+
 
 def test_the_bleed_is_that_of_the_table_of_arrangements() -> None:
     """Rendered pixel by pixel: 8.6 px cells and 0.7 px blur give 1.3 %, 0.5 px blur 0.1 %; 10.2 px cells 0.07 %."""

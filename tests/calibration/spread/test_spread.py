@@ -10,9 +10,6 @@ import numpy.typing as npt
 import pytest
 from scipy import ndimage
 
-from acquisition.chart.layout import A_SERIES_MM, design_chart, paper_chart
-from acquisition.chart.model import Chart
-from acquisition.measures.flat_field import FlatField
 from calibration.radiometry.greys import GreyLevels
 from calibration.registration.registration import Registration
 from calibration.sampling.samples import sites_at
@@ -27,7 +24,12 @@ from calibration.spread.fitting import LEAST_COUNTS, MOST_VEIL, USUAL_UNEVENNESS
 from calibration.spread.point_spread import PointSpread
 from calibration.spread.printed_grid import PAD, PARTS, printed_grid, unsuitable
 from calibration.spread.surroundings import FrameLevels, Surroundings, UsualLight, far_taps
+from experiment.chart.layout import A_SERIES_MM, design_chart, paper_chart
+from experiment.chart.model import Chart
+from experiment.measures.flat_field import FlatField
 from foundation.angles import angles_deg
+
+pytestmark = pytest.mark.slow
 
 _Array = npt.NDArray[np.float64]
 PX_MM = 0.5

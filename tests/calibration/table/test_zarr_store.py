@@ -16,7 +16,6 @@ import numpy.typing as npt
 import pytest
 from fsspec.implementations.memory import MemoryFileSystem
 
-from acquisition.lights.illuminations import Illumination
 from calibration.cli import main
 from calibration.table.lut import Lut, open_lut
 from calibration.table.provenance import Provenance
@@ -24,6 +23,7 @@ from calibration.table.source_frames import SourceFrame
 from calibration.table.writer import LutWriter
 from calibration.table.zarr_store import SHARD_LIGHTS, fetch, publish
 from drivers.presenter import Colour
+from experiment.lights.illuminations import Illumination
 from foundation.errors import FormatError, InputError, StorageError
 
 LIGHTS = SHARD_LIGHTS + 3

@@ -19,16 +19,18 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
-from acquisition.lights.illuminations import plan_illuminations
 from drivers.display import fullscreen
 from drivers.display.displays import Display, choose_display, list_displays
 from drivers.display.fullscreen import FullScreen, identify_displays
 from drivers.display.x11 import XScreen, is_dark
 from drivers.presenter import BLACK, WHITE, Colour
+from experiment.lights.illuminations import plan_illuminations
 from foundation.errors import ConfigurationError, DeviceError
 from sim.clock import SimulatedClock
 from tests.contracts.presenter import Bench, PresenterContract
 from tests.drivers.display.x_servers import Picture, VirtualScreen, screenshot, two_outputs, virtual_screen
+
+pytestmark = pytest.mark.slow
 
 PATIENCE_S = 20.0
 """For what must come; nothing waits this long unless it fails."""

@@ -20,6 +20,8 @@ from foundation.errors import ConfigurationError, DeviceError, DeviceRefused, Li
 from tests.contracts.camera import SETTINGS, Bench, CameraContract, SeededFilm
 from tests.drivers.gphoto2_server import FILM_BYTES
 
+pytestmark = pytest.mark.slow
+
 pytest.importorskip("gphoto2", reason="the extra `gphoto2` is not installed")
 
 MODEL = "PTP/IP Camera"

@@ -12,6 +12,8 @@ from hypothesis import strategies as st
 from foundation.errors import ProtocolError
 from tests.drivers.ptp.examples import READERS, STREAMS
 
+pytestmark = pytest.mark.slow
+
 Read = Callable[[bytes], object]
 ALL = READERS + STREAMS
 EVERY = pytest.mark.parametrize(

@@ -27,6 +27,8 @@ from sim.world.sensors import BODIES, Rectangle
 from tests.data_files import available, shipped
 from tests.drivers.raw.raw_files import Tags, longs, lossless_jpeg, ratios, shorts, text, write_cr2, write_dng
 
+pytestmark = pytest.mark.slow
+
 EOS_550D = shipped("raw/canon_eos_550d_colorchart.dng")
 G2 = shipped("raw/canon_powershot_g2.crw")
 REAL = (EOS_550D, G2, *available("raw/blackmagic.dng"))

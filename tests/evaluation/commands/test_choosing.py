@@ -14,6 +14,8 @@ from evaluation.methods import standard_methods
 from evaluation.methods.standard import STANDARD
 from foundation.errors import FormatError, InputError
 
+pytestmark = pytest.mark.slow
+
 
 def test_all_are_all_and_each_is_chosen_once() -> None:
     names = [method.name for method in choose_methods(["pca", "all", "evaluation.methods.pca:BrightDark"])]

@@ -11,6 +11,8 @@ import pytest
 
 from evaluation.cli import main
 
+pytestmark = pytest.mark.slow
+
 HEAD = "image,method,truth_r,truth_g,truth_b,recovery,reproduction,guessed\n"
 
 

@@ -11,6 +11,8 @@ import pytest
 from evaluation.cli import main
 from tests.evaluation.datasets.made_up import nus8
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture
 def thumbnails(tmp_path: Path) -> str:

@@ -16,6 +16,8 @@ from evaluation.experiments.folds import group_of
 from evaluation.learning.model_files import load_model
 from tests.evaluation.learning.made_up_world import world
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture
 def data(tmp_path: Path) -> Path:

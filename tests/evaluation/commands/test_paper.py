@@ -17,6 +17,8 @@ from generator.pictures.sources import random_scenes
 from tests.evaluation.experiments.paper.conftest import LIGHTS, TableMaker, make_table
 from tests.json_of import json_of
 
+pytestmark = pytest.mark.slow
+
 __all__ = ["make_table"]
 
 NUMBER = re.compile(r"\d+\.\d\d\b")

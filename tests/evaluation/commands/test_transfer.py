@@ -17,6 +17,8 @@ from evaluation.results.errors_file import read_errors
 from tests.evaluation.experiments.transfer.conftest import Maker, save_pictures, write_table
 from tests.json_of import json_of
 
+pytestmark = pytest.mark.slow
+
 OWN = """
 import numpy as np
 

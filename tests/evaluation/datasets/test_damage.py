@@ -14,6 +14,8 @@ from evaluation.scene import MixedScene
 from foundation.errors import InputError
 from tests.evaluation.datasets.made_up import COPIES
 
+pytestmark = pytest.mark.slow
+
 FILES = {
     "nus8": ("SonyA57/SonyA57_gt.mat", "SonyA57/SonyA57_0001.PNG"),
     "gehler-shi": ("ColorCheckerData.mat", "coordinates/8D5U5524_macbeth.txt", "Canon1D/png/8D5U5524.png"),

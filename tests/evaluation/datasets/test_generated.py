@@ -18,6 +18,8 @@ from generator.masks.request import parse_masks
 from generator.pictures.sources import random_scenes
 from tests.evaluation.datasets import contract
 
+pytestmark = pytest.mark.slow
+
 Layout = Literal["folder", "webdataset", "parquet"]
 
 

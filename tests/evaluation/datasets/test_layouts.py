@@ -19,6 +19,8 @@ from foundation.errors import FormatError, InputError
 from tests.evaluation.datasets import contract
 from tests.evaluation.datasets.made_up import COPIES, MadeUp
 
+pytestmark = pytest.mark.slow
+
 Place = Callable[[str], Path]
 
 

@@ -20,6 +20,8 @@ from evaluation.experiments.resampling import ErrorSample, resamples
 from evaluation.metrics import summarise
 from foundation.errors import InputError
 
+pytestmark = pytest.mark.slow
+
 WORLDS = 250
 """Data sets drawn from one population: a share of .95 of them has a standard error of .014."""
 

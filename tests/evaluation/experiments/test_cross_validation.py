@@ -18,6 +18,8 @@ from evaluation.scene import Scene
 from foundation.errors import InputError
 from tests.evaluation.learning.made_up_world import MadeUp, world
 
+pytestmark = pytest.mark.slow
+
 
 @dataclass(frozen=True)
 class Memory:

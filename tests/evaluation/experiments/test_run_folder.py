@@ -26,6 +26,8 @@ from foundation.files import partial_path
 from foundation.trust.held_folders import held_folder
 from tests.evaluation.made_up import MixedWall, Wall, as_set, walls
 
+pytestmark = pytest.mark.slow
+
 METHODS = [GrayEdge("Gray-world", 0, 1, 0, 0), GrayEdge("White-Patch", 0, np.inf, 0, 0)]
 LIGHTS = np.array([[2.0, 1, 1], [1, 1, 1]])
 COUNT = 5

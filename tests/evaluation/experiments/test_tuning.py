@@ -14,6 +14,8 @@ from evaluation.methods.green_stability import family
 from evaluation.scene import Image
 from foundation.errors import InputError
 
+pytestmark = pytest.mark.slow
+
 
 @dataclass(frozen=True, eq=False)
 class Shop:

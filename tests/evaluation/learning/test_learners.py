@@ -18,6 +18,8 @@ from foundation.errors import InputError
 from tests.evaluation.learning.made_up_world import constant_light, world
 from tests.evaluation.learning.stories import story
 
+pytestmark = pytest.mark.slow
+
 TRAIN, TEST = world(90), world(40, seed=1)
 LEARNERS = {key: learner for key, learner in standard_learners().items() if key != "constant-light"}
 """All that look at images; the constant light has tests of its own."""

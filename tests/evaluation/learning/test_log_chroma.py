@@ -15,6 +15,8 @@ from evaluation.metrics import recovery_error
 from foundation.errors import InputError
 from tests.evaluation.learning.made_up_world import world
 
+pytestmark = pytest.mark.slow
+
 LEARNER = LogChroma()
 
 

@@ -16,6 +16,8 @@ from evaluation.methods.pixels import GREY
 from evaluation.methods.prepared import PreparedImage
 from evaluation.metrics import recovery_error
 
+pytestmark = pytest.mark.slow
+
 
 def test_minkowski_means_by_hand() -> None:
     image = np.array([[[3, 4, 0], [4, 3, 1]]], dtype=np.float64)

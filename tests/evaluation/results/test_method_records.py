@@ -14,6 +14,8 @@ from evaluation.methods import GrayEdge
 from evaluation.methods.naming import find_method
 from evaluation.results.method_records import describe_method
 
+pytestmark = pytest.mark.slow
+
 
 @dataclass(frozen=True)
 class Inner:

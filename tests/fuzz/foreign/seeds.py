@@ -9,12 +9,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from acquisition.chart.layout import design_chart
-from acquisition.config import LabSettings
-from acquisition.lights.illuminations import Illumination
-from acquisition.session.folder import Session
-from acquisition.session.judgement import Check, Judgement
-from acquisition.session.plan import plan_steps
 from calibration.table.lut import Lut, open_lut
 from calibration.table.provenance import Provenance, Unfit
 from calibration.table.source_frames import SourceFrame, frames_sha256
@@ -22,6 +16,12 @@ from calibration.table.writer import LutWriter
 from calibration.table.zarr_store import publish
 from drivers.camera import CapturedFrame
 from drivers.presenter import Colour
+from experiment.chart.layout import design_chart
+from experiment.config import LabSettings
+from experiment.lights.illuminations import Illumination
+from experiment.session.folder import Session
+from experiment.session.judgement import Check, Judgement
+from experiment.session.plan import plan_steps
 from generator.dataset.making import DatasetOptions, generate_dataset
 from generator.lights.choices import ListedLights, SimultaneousLights
 from generator.masks.request import parse_masks

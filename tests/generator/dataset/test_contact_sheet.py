@@ -16,6 +16,8 @@ from generator.dataset.reader import Dataset, Entry
 from generator.lights.choices import RandomLights
 from generator.pictures.sources import random_scenes
 
+pytestmark = pytest.mark.slow
+
 if TYPE_CHECKING:
     from collections.abc import Callable
 

@@ -23,6 +23,8 @@ from generator.lights.lighting import mixture_of
 from generator.pictures.picture import read_picture
 from generator.pictures.sources import find_pictures, random_scenes
 
+pytestmark = pytest.mark.slow
+
 if TYPE_CHECKING:
     from collections.abc import Callable
 

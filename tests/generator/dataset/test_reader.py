@@ -14,6 +14,8 @@ from generator.lights.choices import ListedLights, SimultaneousLights
 from generator.masks.request import parse_masks
 from generator.pictures.sources import random_scenes
 
+pytestmark = pytest.mark.slow
+
 if TYPE_CHECKING:
     from collections.abc import Callable
 

@@ -33,6 +33,8 @@ from generator.rendering.black_points import BlackPoint, veil_of, without_veil
 from generator.rendering.colorimetric import ColorimetricRendering
 from generator.rendering.matrices import ColourMatrix
 
+pytestmark = pytest.mark.slow
+
 if TYPE_CHECKING:
     from calibration.table.lut import Lut
     from tests.generator.conftest import MakeLut

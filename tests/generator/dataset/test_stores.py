@@ -36,6 +36,8 @@ from generator.pictures.sources import find_pictures, random_scenes
 from generator.stores.store import LocalStore, RemoteStore, open_store
 from tests.generator.groups import grouped
 
+pytestmark = pytest.mark.slow
+
 if TYPE_CHECKING:
     from calibration.table.lut import Lut
 

@@ -30,6 +30,8 @@ from generator.variation.gradients import parse_gradient
 from generator.variation.iso_speed import parse_iso
 from generator.variation.variation import Variation, varied_by
 
+pytestmark = pytest.mark.slow
+
 Make = Callable[..., Dataset]
 
 

@@ -7,6 +7,8 @@ import pytest
 
 from benchmarks import choices
 
+pytestmark = pytest.mark.slow
+
 DRAWS = 2 * choices.WIDTH * choices.HEIGHT
 
 

@@ -16,6 +16,8 @@ from generator.kernels.dithering import dither
 from generator.kernels.planar import draw_batch
 from generator.kernels.rendering import draw_mosaic, draw_samples
 
+pytestmark = pytest.mark.slow
+
 U = np.uint64
 WORD = U(0xFFFFFFFF)
 GOLDEN = "855b59c1dfc62a281539284d555a1a0e25d59db077a0ecc9db0d40f12c510361"

@@ -21,6 +21,8 @@ from generator.kernels.rendering import draw_samples
 from generator.lights.lighting import Lighting, Mixture, plain
 from generator.masks.request import parse_masks
 
+pytestmark = pytest.mark.slow
+
 if TYPE_CHECKING:
     from calibration.table.lut import Lut
 

@@ -11,15 +11,17 @@ import numpy.typing as npt
 import pytest
 from scipy.stats import f as f_distribution
 
-from acquisition.lights.illuminations import Illumination
 from calibration.pipeline.build import build
 from calibration.table.lut import Lut, open_lut
 from drivers.presenter import Colour
+from experiment.lights.illuminations import Illumination
 from foundation.angles import angles_deg
 from generator.lights.gamut import Gamut
 from generator.lights.lighting import Mixture, plain
 from sim.world.room import Room
 from tests.calibration.lab import SETTINGS, Lab, hang, take
+
+pytestmark = pytest.mark.slow
 
 CODES = (
     Colour(255, 100, 40),

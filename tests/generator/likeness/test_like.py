@@ -19,6 +19,8 @@ from generator.statistics.image_numbers import cell_means, numbers_of_cells
 from tests.generator.likeness.tables import make_table
 from tests.generator.statistics.stats_files import write_stats
 
+pytestmark = pytest.mark.slow
+
 if TYPE_CHECKING:
     from calibration.table.lut import Lut
 

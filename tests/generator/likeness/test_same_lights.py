@@ -14,6 +14,8 @@ from generator.cli import main
 from generator.dataset.reader import Dataset, open_dataset
 from tests.generator.likeness.tables import CAMERAS, SPECTRA, make_table
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture
 def lab(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:

@@ -27,6 +27,8 @@ from generator.rendering.table_matrix import fitted_matrix, matrix_for
 from tests.generator.rendering.conftest import MakeTable
 from tests.generator.rendering.prints import MATRIX
 
+pytestmark = pytest.mark.slow
+
 GREYS = np.arange(32) * 1057
 """Nodes of equal codes of red, green and blue."""
 

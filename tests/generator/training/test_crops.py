@@ -24,6 +24,8 @@ from generator.training.crops import Crops
 from generator.training.gallery import Gallery, gallery_of, open_gallery, save_gallery
 from tests.generator.conftest import MakeLut
 
+pytestmark = pytest.mark.slow
+
 BITS = 2
 MATRIX = ColourMatrix("mine", np.array([[0.6, 0.3, 0.1], [0.1, 0.7, 0.2], [0.05, 0.25, 0.7]]), "a test")
 

@@ -22,6 +22,8 @@ from drivers.raw.rawfile import read_raw
 from sim.camera.dng import write_dng
 from sim.world.sensors import BODIES, Body
 
+pytestmark = pytest.mark.slow
+
 TAKEN_AT = datetime(2021, 3, 14, 15, 9, 26, tzinfo=UTC)
 SETTINGS = ExposureSettings(iso=400, aperture=5.6, shutter_s=0.5)
 

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from sim.world.geometry import View, Waviness
+
+pytestmark = pytest.mark.slow
 
 PAGE_MM = (1189.0, 841.0)
 FRAME_PX = (2601, 1732)

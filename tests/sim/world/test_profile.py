@@ -13,6 +13,8 @@ from numpy.typing import NDArray
 from sim.world.profile import ProfileName, ink_codes, intended_lab, printed_reflectance, relative_lab
 from sim.world.spectra import PaperName, paper, print_reflectance
 
+pytestmark = pytest.mark.slow
+
 PAPERS: tuple[PaperName, ...] = ("poster", "matt", "glossy")
 GREYS = np.repeat(np.arange(256)[:, None], 3, axis=1)
 CODES = np.array(list(product(range(0, 256, 17), repeat=3)))

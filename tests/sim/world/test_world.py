@@ -21,6 +21,8 @@ from sim.world.room import REFERENCE_EXPOSURE, Room
 from sim.world.sensors import BODIES, Body, Rectangle
 from sim.world.world import World
 
+pytestmark = pytest.mark.slow
+
 SIX_SIGMA = 5.0
 PRIMARIES = (Colour(255, 0, 0), Colour(0, 255, 0), Colour(0, 0, 255))
 

@@ -41,28 +41,11 @@ def develop(
 ) -> npt.NDArray[np.uint8]:
     """Return the sRGB picture of a raw image; the steps stand at the head of this file.
 
-    Parameters
-    ----------
-    image
-        (H, W, 3) uint16, float32 or float64, linear camera RGB ≥ 0, black subtracted, any unit.
-    light
-        (3,) float64 > 0, linear camera RGB of any length: the ground truth.
-    mask
-        (H, W) bool, True where a pixel has no say in the white level; None if all have.
-    matrix
-        Of the camera; None takes balanced camera RGB for linear sRGB.
-    saturation
-        Value of the image from which a channel is clipped; None if none is.
-
-    Returns
-    -------
-    ndarray
-        (H, W, 3) uint8, sRGB codes.
-
-    Raises
-    ------
-    InputError
-        The light has a channel that is not above 0.
+    `image`: (H, W, 3) uint16, float32 or float64, linear camera RGB ≥ 0, black subtracted, any unit. `light`: (3,)
+    float64 > 0, linear camera RGB of any length: the ground truth. `mask`: (H, W) bool, True where a pixel has no say
+    in the white level; None if all have. `matrix`: of the camera; None takes balanced camera RGB for linear sRGB.
+    `saturation`: value of the image from which a channel is clipped; None if none is. Returns (H, W, 3) uint8, sRGB
+    codes.
 
     Examples
     --------
@@ -93,12 +76,7 @@ def develop(
 class DevelopedSource:
     """A real image as a source picture of the generator, developed with its ground truth.
 
-    Attributes
-    ----------
-    scene
-        The image.
-    matrix
-        Of its camera; None for none.
+    `matrix`: of its camera; None for none.
     """
 
     scene: Scene

@@ -25,18 +25,9 @@ if TYPE_CHECKING:
 class RenderedScene:
     """A picture printed, lit by a light of a table, and photographed.
 
-    Attributes
-    ----------
-    lut
-        The table.
-    source
-        The picture.
-    light
-        Number of the light in the table.
-    number
-        The image's number in its set.
-    seed
-        0 … 2⁶⁴ − 1; chooses the samples.
+    - `light`: number of the light in the table.
+    - `number`: the image's number in its set.
+    - `seed`: 0 … 2⁶⁴ − 1; chooses the samples.
     """
 
     lut: Lut
@@ -71,12 +62,7 @@ class RenderedScene:
 class ScaledSource:
     """A picture scaled to a longest side, up or down.
 
-    Attributes
-    ----------
-    source
-        The picture.
-    side
-        Longest side, px.
+    `side`: longest side, px.
     """
 
     source: Source
@@ -107,12 +93,8 @@ class ScaledSource:
 class ChosenLights:
     """A light of a table for each image.
 
-    Attributes
-    ----------
-    numbers
-        The light of each image.
-    how
-        How they were chosen, in words.
+    - `numbers`: the light of each image.
+    - `how`: how they were chosen, in words.
     """
 
     numbers: tuple[int, ...]
@@ -122,14 +104,7 @@ class ChosenLights:
 def lights_like(lut: Lut, truths: npt.NDArray[np.float64], count: int) -> ChosenLights:
     """Return for each of `count` images the light nearest to its ground truth, of another camera or not.
 
-    Parameters
-    ----------
-    lut
-        The table.
-    truths
-        (N, 3) float64 ≥ 0, linear camera RGB of any length; image i has truth i mod N.
-    count
-        Images, ≥ 1.
+    `truths`: (N, 3) float64 ≥ 0, linear camera RGB of any length; image i has truth i mod N.
     """
     matches = nearest_lights(lut, truths).matches
     numbers = tuple(matches[image % len(matches)].mixture.lights[0] for image in range(count))
@@ -144,17 +119,7 @@ def lights_like(lut: Lut, truths: npt.NDArray[np.float64], count: int) -> Chosen
 
 
 def lights_at_random(lut: Lut, count: int, seed: int) -> ChosenLights:
-    """Return for each of `count` images a light drawn from all of the table, each as likely; as `generate --random 1`.
-
-    Parameters
-    ----------
-    lut
-        The table.
-    count
-        Images, ≥ 1.
-    seed
-        0 … 2⁶⁴ − 1.
-    """
+    """Return for each of `count` images a light drawn from all of the table, as `generate --random 1` does."""
     choice = RandomLights(1, len(lut.white), seed)
     numbers = tuple(choice.lightings_of(image)[0].mixtures[0].lights[0] for image in range(count))
     return ChosenLights(
@@ -163,13 +128,7 @@ def lights_at_random(lut: Lut, count: int, seed: int) -> ChosenLights:
 
 
 def rendered(lut: Lut, sources: Sequence[Source], lights: ChosenLights, seed: int = 0) -> tuple[RenderedScene, ...]:
-    """Return the scenes of pictures under the lights chosen for them.
-
-    Raises
-    ------
-    InputError
-        There are not as many lights as pictures.
-    """
+    """Return the scenes of pictures under the lights chosen for them."""
     if len(sources) != len(lights.numbers):
         raise InputError(f"{len(sources)} pictures have {len(lights.numbers)} lights, expected one each")
     pairs = zip(sources, lights.numbers, strict=True)

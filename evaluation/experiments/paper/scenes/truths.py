@@ -21,14 +21,9 @@ _TEXTS = (".csv", ".txt")
 class Truths:
     """Ground truths with a name for tables and legends.
 
-    Attributes
-    ----------
-    name
-        Where they come from.
-    lights
-        (N, 3) float64 ≥ 0, linear camera RGB of any length.
-    images
-        The names of their N images; empty where they have none.
+    - `name`: where they come from.
+    - `lights`: (N, 3) float64 ≥ 0, linear camera RGB of any length.
+    - `images`: the names of their N images; empty where they have none.
     """
 
     name: str
@@ -37,21 +32,7 @@ class Truths:
 
 
 def read_truths(place: str) -> Truths:
-    """Return the ground truths at a place.
-
-    Parameters
-    ----------
-    place
-        A file of text (`.csv`, `.txt`; see `generator.lights.ground_truths`), or a data set that `evaluate` reads.
-        ``FILE.csv#START`` keeps the rows whose first column begins with START: a file may hold several cameras.
-
-    Raises
-    ------
-    InputError
-        No row begins so, or the file has no column of names.
-    FormatError
-        The file or data set cannot be read.
-    """
+    """Return the ground truths at a place."""
     file, _, start = place.partition("#")
     if not file.lower().endswith(_TEXTS):
         data = open_scenes(place)

@@ -75,15 +75,7 @@ _TRUTH_COLUMNS: Final = (
 
 
 def croissant(description: Description, sums: Mapping[str, str]) -> str:
-    """Return the text of croissant.json.
-
-    Parameters
-    ----------
-    description
-        The content of `dataset.json`.
-    sums
-        SHA-256 of the dataset's text files by name, those of `GROUND_TRUTH` and `SOURCES`.
-    """
+    """Return the text of croissant.json."""
     document: dict[str, Any] = {
         "@context": _CONTEXT,
         "@type": "sc:Dataset",

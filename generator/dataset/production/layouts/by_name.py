@@ -9,13 +9,7 @@ from generator.stores.store import Store
 
 
 def require_libraries(layout: Layout) -> None:
-    """Refuse a layout whose library is not installed.
-
-    Raises
-    ------
-    InputError
-        It is not; the message says how to install it.
-    """
+    """Refuse a layout whose library is not installed."""
     if layout == "parquet":
         from generator.dataset.production.layouts.parquet import require_pyarrow
 
@@ -23,21 +17,7 @@ def require_libraries(layout: Layout) -> None:
 
 
 def open_writer(layout: Layout, store: Store, shard: int, *, previews: bool, maps: bool, details: bool) -> ShardWriter:
-    """Return the writer of a shard.
-
-    Parameters
-    ----------
-    layout
-        How its images lie.
-    store
-        Where its files are to be.
-    shard
-        Its number.
-    previews, maps
-        Whether its images have previews, and masks with maps of the ground truth.
-    details
-        Whether its images have details (`records.Details`).
-    """
+    """Return the writer of a shard."""
     match layout:
         case "folder":
             return FolderWriter(store)
@@ -52,22 +32,7 @@ def open_writer(layout: Layout, store: Store, shard: int, *, previews: bool, map
 
 
 def read_member(layout: str, store: Store, container: str, file: str) -> bytes:
-    """Return the bytes of a file of an image that lies with others in one file of a shard.
-
-    Parameters
-    ----------
-    layout
-        ``webdataset`` or ``parquet``.
-    store, container
-        Where the dataset is, and the name of the shard's file in it.
-    file
-        As `samples.member_name` returns it.
-
-    Raises
-    ------
-    FormatError
-        The shard's file is missing or damaged, or there is no such image in it.
-    """
+    """Return the bytes of a file of an image that lies with others in one file of a shard."""
     if layout == "webdataset":
         from generator.dataset.production.layouts import webdataset
 

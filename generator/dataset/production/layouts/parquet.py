@@ -52,13 +52,7 @@ _TRUTH = {"feature": {"dtype": "float64", "_type": "Value"}, "length": 3, "_type
 
 
 def require_pyarrow() -> None:
-    """Refuse where pyarrow is not installed.
-
-    Raises
-    ------
-    InputError
-        It is not.
-    """
+    """Refuse where pyarrow is not installed."""
     if find_spec("pyarrow") is None:
         raise InputError("the layout parquet needs pyarrow; install it with: pip install pyarrow")
 
@@ -193,13 +187,7 @@ def _cell_of(file: str) -> tuple[str, int | None]:
 
 
 def read_member(store: Store, container: str, file: str) -> bytes:
-    """Return the bytes of a file, named as in a tar file, of the Parquet file called `container`.
-
-    Raises
-    ------
-    FormatError
-        The Parquet file is missing or damaged, or there is no such file in it.
-    """
+    """Return the bytes of a file, named as in a tar file, of the Parquet file called `container`."""
     require_pyarrow()
     import pyarrow.parquet as pq
 

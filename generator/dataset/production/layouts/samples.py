@@ -21,19 +21,12 @@ def member_name(kind: str, key: str, ending: str) -> str:
 class Sample:
     """An image with all that goes with it, ready to be written.
 
-    Attributes
-    ----------
-    record
-        Its number, source and ground truth.
-    source, split
-        Its source's name, and the part of the dataset it belongs to.
-    width, height
-        px.
-    files
-        Kind (`images`, `previews`, `masks`, `ground_truth`), what follows the number in the file's name, and the
-        bytes, which can be iterated over once; the image first.
-    stored
-        Files of it that are written already.
+    - `record`: its number, source and ground truth.
+    - `source`, `split`: its source's name, and the part of the dataset it belongs to.
+    - `width`, `height`: px.
+    - `files`: kind (`images`, `previews`, `masks`, `ground_truth`), what follows the number in the file's name, and the
+      bytes, which can be iterated over once; the image first.
+    - `stored`: files of it that are written already.
     """
 
     record: ImageRecord

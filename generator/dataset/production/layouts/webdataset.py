@@ -74,11 +74,6 @@ def read_member(store: Store, container: str, file: str) -> bytes:
 
     Only members that are plain files are looked at: a tar file may also hold links and sparse files, and claim sizes
     that it does not have.
-
-    Raises
-    ------
-    FormatError
-        The tar file is missing or damaged, or there is no such file in it.
     """
     with store.open(container) as stream:
         try:
@@ -92,13 +87,7 @@ def read_member(store: Store, container: str, file: str) -> bytes:
 
 
 def _members(stream: BinaryIO) -> Iterator[tuple[str, int, int]]:
-    """Yield name, offset and size of the plain files of a tar file (POSIX.1-1988, ustar), as they follow each other.
-
-    Raises
-    ------
-    tarfile.TarError
-        A header is damaged, or its member is longer than the file.
-    """
+    """Yield name, offset and size of the plain files of a tar file (POSIX.1-1988, ustar), as they follow each other."""
     end = stream.seek(0, io.SEEK_END)
     offset = 0
     while offset < end:

@@ -11,6 +11,8 @@ from evaluation.datasets import DataOptions, open_scenes
 from foundation.errors import FormatError, InputError
 from tests.evaluation.datasets.made_up import cube_plus, image_of, write_png
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture
 def copy(tmp_path: Path) -> Path:

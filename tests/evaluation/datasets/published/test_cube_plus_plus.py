@@ -10,6 +10,8 @@ from evaluation.datasets import DataOptions, open_scenes
 from foundation.errors import FormatError, InputError
 from tests.evaluation.datasets.made_up import cube_plus_plus, image_of, simple_cube, write_png
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture
 def whole(tmp_path: Path) -> Path:

@@ -18,6 +18,8 @@ from scipy.sparse import csc_array
 
 from evaluation.datasets.published.mat5 import check_mat5
 
+pytestmark = pytest.mark.slow
+
 _CELLS = np.empty((1, 2), dtype=object)
 _CELLS[0, 0], _CELLS[0, 1] = np.eye(2), np.array(["x", "yz"])
 

@@ -13,6 +13,8 @@ from evaluation.experiments.describing.quantities import QUANTITIES
 from generator.likeness.drawing import TITLES
 from tests.evaluation.experiments.describing.scenes import random_set
 
+pytestmark = pytest.mark.slow
+
 
 def compared(one: DataDescription, other: DataDescription) -> dict[str, FigureCompared]:
     return {made.quantity.name: made for made in compare_figures(one, other)}

@@ -16,6 +16,8 @@ from foundation.errors import FormatError, InputError
 from tests.data_files import available
 from tests.evaluation.experiments.describing.scenes import Made, MadeMixture, made_set, random_set
 
+pytestmark = pytest.mark.slow
+
 
 def test_threads_change_nothing_and_every_image_is_counted() -> None:
     seen: list[None] = []

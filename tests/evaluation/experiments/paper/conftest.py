@@ -9,11 +9,11 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from acquisition.lights.illuminations import Illumination
 from calibration.table.lut import Lut, open_lut
 from calibration.table.provenance import Provenance
 from calibration.table.writer import LutWriter
 from drivers.presenter import Colour
+from experiment.lights.illuminations import Illumination
 
 BITS = 3
 """Bits a channel of the tables: 512 colours."""

@@ -11,13 +11,13 @@ import numpy.typing as npt
 import pytest
 from PIL import Image
 
-from acquisition.lights.illuminations import Illumination
 from calibration.table.lut import Lut, open_lut
 from calibration.table.provenance import Provenance
 from calibration.table.writer import LutWriter
 from drivers.presenter import Colour
 from evaluation.datasets.generated import open_generated
 from evaluation.scene import SceneSet
+from experiment.lights.illuminations import Illumination
 from foundation.srgb import decode_srgb
 from generator.dataset.making import DatasetOptions, generate_dataset
 from generator.lights.choices import LightChoice, ListedLights

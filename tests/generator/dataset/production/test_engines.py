@@ -20,6 +20,8 @@ from generator.dataset.production.workers import SILENT, parse_engine
 from generator.lights.choices import RandomLights
 from generator.pictures.sources import find_pictures, random_scenes
 
+pytestmark = pytest.mark.slow
+
 if TYPE_CHECKING:
     from distributed import LocalCluster
 

@@ -31,6 +31,8 @@ from generator.masks.request import parse_masks
 from generator.pictures.sources import SourcePicture, random_scenes
 from tests.generator.groups import grouped
 
+pytestmark = pytest.mark.slow
+
 if TYPE_CHECKING:
     from calibration.table.lut import Lut
 

@@ -33,6 +33,8 @@ from generator.lights.choices import ListedLights, RandomLights
 from generator.pictures.sources import random_scenes
 from tests.generator.groups import grouped
 
+pytestmark = pytest.mark.slow
+
 if TYPE_CHECKING:
     from calibration.table.lut import Lut
 

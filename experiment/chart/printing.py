@@ -1,0 +1,323 @@
+"""The chart as a print: a list of rectangles, field and marks, and from it a TIFF, a PDF and a preview.
+
+Laws that hold here:
+
+- Everything is made of filled rectangles on bare paper; the three files show the same list.
+- A file is at true size: print it at 100 %, never "fit to page".
+- The codes name inks rather than colours: what they look like is measured. They stand untagged on the page of the PDF
+  and in the TIFF; the PDF's output intent, which PDF/X asks for, and the tagged TIFF say what they are taken for where
+  colours are managed all the same. The same code must be the same ink everywhere, and the paper matte.
+- In the TIFF every cell and every tag module is the same whole number of pixels; a resolution at which they are not
+  is refused (300 dpi, for one), because modules of unequal size move the corners that detectors find.
+- Cells do not only touch in the PDF: each reaches a fifth of a pixel below its right and lower neighbours, because
+  renderers leave hairlines of paper between parts that meet in one line.
+- An A0 sheet at 600 dpi has 1.7 GB of pixels; it is never held: rows that look alike are drawn once and packed strip
+  by strip.
+"""
+
+from __future__ import annotations
+
+import math
+import zlib
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from experiment.chart.margins import margin_marks
+from experiment.chart.model import PAPER_WHITE, TAG_FAMILY, TAG_MODULES, Chart, Tag
+from experiment.chart.pdf_x import filled, save_page
+from experiment.chart.pixels import DESIGN_DPI, MM_PER_INCH, PX_MM, Boxes, whole_px
+from experiment.chart.rgb_profiles import srgb_display_profile
+from foundation.errors import InputError
+from foundation.files import whole_file, write_whole
+
+POINTS_PER_MM = 72 / MM_PER_INCH
+"""Points of a PDF's user space, 72 to the inch (ISO 32000-1, 8.3.2.3)."""
+
+_STRIP_ROWS = 64
+"""Rows of a strip of the TIFF: 5 MB of an A0 sheet at 600 dpi, little to hold and long enough to compress."""
+
+_SUPERSAMPLING = 8
+"""Pixels along each side of a preview's pixel: edges are then good to 1/8 of it."""
+
+_LAP_PX, _INSET_PX = 0.2, 0.01
+"""How far a cell of the PDF reaches below its neighbours, so that no hairline of paper shows between them, and how much
+smaller than its box each part is drawn, so that rounding does not paint the next pixel."""
+
+
+@dataclass(frozen=True, eq=False)
+class Drawing:
+    """What is printed on bare paper, in painter's order: a later rectangle covers an earlier one.
+
+    - `page_mm`: width and height of the sheet.
+    - `rectangles_mm`: (N, 4) float64, left, top, right, bottom; origin at the sheet's top-left corner, x right, y down.
+    - `rgb`: (N, 3) uint8, printed code of each rectangle; (255, 255, 255) is bare paper.
+    - `tiles`: how many of the last rectangles are cells and references, side by side, row by row.
+    """
+
+    page_mm: tuple[float, float]
+    rectangles_mm: npt.NDArray[np.float64]
+    rgb: npt.NDArray[np.uint8]
+    tiles: int = 0
+
+
+def drawing(chart: Chart) -> Drawing:
+    """Return the whole sheet: the marks in its margins (`experiment.chart.margins`), then the field.
+
+    The field's rectangles are in the order tags (white rim, black square, white modules), cells and references row by
+    row.
+    """
+    field = field_drawing(chart)
+    marks = _marks_px(chart).astype(np.float64) * PX_MM
+    return Drawing(
+        chart.page_mm,
+        np.concatenate([marks, field.rectangles_mm]),
+        np.concatenate([np.zeros((len(marks), 3), dtype=np.uint8), field.rgb]),
+        field.tiles,
+    )
+
+
+def field_drawing(chart: Chart, within_mm: tuple[float, float, float, float] | None = None) -> Drawing:
+    """Return the rectangles of tags, cells and references."""
+    left, top, right, bottom = (-math.inf, -math.inf, math.inf, math.inf) if within_mm is None else within_mm
+    boxes = _part_boxes(chart)
+    codes = np.array([reference.rgb for reference in chart.references], dtype=np.uint8).reshape(-1, 3)
+    # A thousandth of a millimetre is nothing on paper and more than what numbers in a file are rounded by.
+    near = np.array([left, top, -right, -bottom]) - 1e-3
+    inside = np.asarray((boxes * [1, 1, -1, -1] >= near).all(axis=1))
+    rectangles, rgb = [np.empty((0, 4))], [np.empty((0, 3), dtype=np.uint8)]
+    for number, tag in enumerate(chart.tags):
+        if inside[number]:
+            parts, shades = _tag_rectangles(tag)
+            rectangles.append(parts)
+            rgb.append(shades)
+    rest = np.flatnonzero(inside[len(chart.tags) :])
+    tiles, colours = boxes[len(chart.tags) :][rest], np.concatenate([chart.rgb, codes])[rest]
+    order = np.lexsort(tiles[:, :2].round(3).T)
+    return Drawing(
+        chart.page_mm,
+        np.concatenate([*rectangles, tiles[order]]),
+        np.concatenate([*rgb, colours[order]]),
+        len(order),
+    )
+
+
+def _part_boxes(chart: Chart) -> npt.NDArray[np.float64]:
+    """Return the boxes (N, 4) float64 mm of tags with their white rims, then cells, then references."""
+    rims = [_tag_rectangles(tag)[0][:1] for tag in chart.tags]
+    half = np.array(chart.cell_mm) / 2
+    cells = np.concatenate([chart.centres_mm - half, chart.centres_mm + half], axis=1)
+    centres = np.array([reference.centre_mm for reference in chart.references]).reshape(-1, 2)
+    halves = np.array([reference.size_mm for reference in chart.references]).reshape(-1, 2) / 2
+    return np.concatenate([*rims, cells, np.concatenate([centres - halves, centres + halves], axis=1)])
+
+
+def field_px(chart: Chart) -> Boxes:
+    """Return the box of all tags and cells, (4,) int64 px at 600 dpi: left, top, right, bottom."""
+    boxes = whole_px(_part_boxes(chart)[: len(chart.tags) + len(chart.centres_mm)])
+    return np.concatenate([boxes[:, :2].min(axis=0), boxes[:, 2:].max(axis=0)])
+
+
+def _marks_px(chart: Chart) -> Boxes:
+    field = field_px(chart)
+    references = whole_px(_part_boxes(chart)[len(chart.tags) + len(chart.centres_mm) :])
+    outside = ((references[:, :2] < field[:2]) | (references[:, 2:] > field[2:])).any(axis=1)
+    width, height = (int(side / PX_MM) for side in chart.page_mm)
+    return margin_marks(field, (width, height), references[outside], label_lines(chart))
+
+
+def tag_modules(tag: Tag) -> npt.NDArray[np.bool_]:
+    """Return the modules of a tag's black square, (8, 8) bool, true where white, as the print is seen upright.
+
+    The picture is OpenCV's of `DICT_APRILTAG_36h11`, which is the picture of the AprilTag authors turned by half a
+    turn; their detectors give the same ids and the corners in the order [1, 0, 3, 2] of `corners_mm`.
+    """
+    import cv2
+
+    if tag.family != TAG_FAMILY:
+        raise InputError(f"tag {tag.id} is of family {tag.family}; only {TAG_FAMILY} can be printed")
+    dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_APRILTAG_36h11)
+    if not 0 <= tag.id < len(dictionary.bytesList):
+        raise InputError(
+            f"tag {tag.id} does not exist; family {TAG_FAMILY} has the numbers 0 to {len(dictionary.bytesList) - 1}"
+        )
+    return np.asarray(cv2.aruco.generateImageMarker(dictionary, tag.id, TAG_MODULES)) > 127
+
+
+def _tag_rectangles(tag: Tag) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.uint8]]:
+    left, top = tag.corners_mm[0]
+    right, bottom = tag.corners_mm[2]
+    upright = np.array([[left, top], [right, top], [right, bottom], [left, bottom]])
+    if not (right > left and bottom > top and np.allclose(tag.corners_mm, upright, atol=1e-3)):
+        raise InputError(f"tag {tag.id} does not stand upright on the chart; only upright tags can be printed")
+    size = np.array([right - left, bottom - top]) / TAG_MODULES
+    rim = np.array([left, top, right, bottom]) + np.concatenate([-size, size])
+    rows, columns = np.nonzero(tag_modules(tag))
+    corner = np.array([left, top]) + np.stack([columns, rows], axis=1) * size
+    rectangles = np.concatenate([[rim], [[left, top, right, bottom]], np.concatenate([corner, corner + size], axis=1)])
+    rgb = np.full((len(rectangles), 3), PAPER_WHITE, dtype=np.uint8)
+    rgb[1] = 0
+    return rectangles, rgb
+
+
+def label_lines(chart: Chart) -> tuple[str, str]:
+    """Return the two lines printed in the margin: what distinguishes this sheet from others, and how to print it."""
+    width, height = chart.page_mm
+    bits = "1 bit" if chart.bits == 1 else f"{chart.bits} bits"
+    parts = [f"CroP chart, {bits}, {width:g} x {height:g} mm", f"chart.json {chart.sha256[:16]}"]
+    parts += [] if chart.seed is None else [f"seed {chart.seed}"]
+    parts += [] if chart.software is None else [chart.software.encode("ascii", "replace").decode()]
+    return ", ".join(parts), "Print at 100 %, colour management off, on matte paper; the rulers are in millimetres."
+
+
+def label(chart: Chart) -> str:
+    """Return what the margin says (`label_lines`) as one line."""
+    return ". ".join(label_lines(chart))
+
+
+@dataclass(frozen=True)
+class _Band:
+    """Pixel rows `top` … `bottom` − 1, which all look like `row`, (width, 3) uint8."""
+
+    top: int
+    bottom: int
+    row: npt.NDArray[np.uint8]
+
+
+def _bands(drawn: Drawing, pixels_per_mm: float, size: tuple[int, int]) -> Iterator[_Band]:
+    """Yield the picture from top to bottom; `size` is its width and height in pixels, edges go to the nearest pixel."""
+    width, height = size
+    edges = np.rint(drawn.rectangles_mm * pixels_per_mm).astype(np.int64)
+    edges = np.clip(edges, 0, [width, height, width, height])
+    cuts = np.unique(np.concatenate([edges[:, 1], edges[:, 3], [0, height]])).tolist()
+    for top, bottom in pairwise(cuts):
+        row = np.full((width, 3), PAPER_WHITE, dtype=np.uint8)
+        inside = (edges[:, 1] <= top) & (edges[:, 3] > top)
+        for (left, _, right, _), rgb in zip(edges[inside].tolist(), drawn.rgb[inside], strict=True):
+            row[left:right] = rgb
+        yield _Band(top, bottom, row)
+
+
+def _packed_strips(bands: Iterator[_Band], height: int) -> Iterator[bytes]:
+    """Yield the picture as deflated strips of `_STRIP_ROWS` rows, the last one shorter."""
+    rows: list[npt.NDArray[np.uint8]] = []
+    for band in bands:
+        for y in range(band.top, band.bottom):
+            rows.append(band.row)
+            if len(rows) == _STRIP_ROWS or y == height - 1:
+                # Rows repeat so much that a harder setting saves a quarter of the size for three times the time.
+                yield zlib.compress(np.stack(rows).tobytes(), 1)
+                rows = []
+
+
+def _require_whole_pixels(chart: Chart, dpi: int) -> None:
+    lengths = [*chart.cell_mm, *(float(np.ptp(tag.corners_mm[:, 0])) / TAG_MODULES for tag in chart.tags)]
+    for length in lengths:
+        pixels = length * dpi / MM_PER_INCH
+        if dpi < 1 or round(pixels) < 1 or abs(pixels - round(pixels)) > 1e-3:
+            raise InputError(
+                f"at {dpi} dpi a part of {length:.3f} mm would be {pixels:.2f} pixels, and only whole ones print "
+                f"evenly; choose {_even_resolutions(lengths)} dpi, or print the PDF"
+            )
+
+
+def _even_resolutions(lengths: list[float]) -> str:
+    """Return the names of the usual resolutions, dpi, at which all lengths (mm) are whole pixels."""
+    pixels = {dpi: [length * dpi / MM_PER_INCH for length in lengths] for dpi in (1200, 600, 360)}
+    even = [f"{dpi}" for dpi, sizes in pixels.items() if all(abs(size - round(size)) <= 1e-3 for size in sizes)]
+    return " or ".join(even) or "another number of"
+
+
+def save_tiff(chart: Chart, path: Path, dpi: int = DESIGN_DPI, tagged: bool = False) -> None:
+    """Write the sheet as an RGB TIFF at true size: 8 bits, deflate.
+
+    An A0 sheet at 600 dpi is 28 087 × 19 866 pixels.
+
+    `dpi`: dots per inch; one at which cells and tag modules are whole pixels: 600, 360, or another multiple of 24 for
+    charts of `experiment.chart.layout`. `tagged`: whether the codes are tagged as sRGB, for a shop that prints through
+    its printer's profile.
+    """
+    import tifffile
+
+    _require_whole_pixels(chart, dpi)
+    sheet = drawing(chart)
+    width, height = (round(side * dpi / MM_PER_INCH) for side in chart.page_mm)
+    bands = _bands(sheet, dpi / MM_PER_INCH, (width, height))
+    with whole_file(path) as stream, tifffile.TiffWriter(stream) as writer:
+        writer.write(
+            _packed_strips(bands, height),
+            shape=(height, width, 3),
+            dtype=np.uint8,
+            photometric="rgb",
+            compression="adobe_deflate",
+            rowsperstrip=_STRIP_ROWS,
+            resolution=(dpi, dpi),
+            resolutionunit="inch",
+            description=label(chart),
+            software="CroP",
+            metadata=None,
+            iccprofile=srgb_display_profile() if tagged else None,
+        )
+
+
+def save_pdf(chart: Chart, path: Path) -> None:
+    """Write the sheet as a PDF/X-4 of one page of exactly its size: filled rectangles of plain codes in DeviceRGB.
+
+    The same chart gives the same bytes.
+    """
+    save_drawing(drawing(chart), path, label(chart), f"chart.json has SHA-256 {chart.sha256}")
+
+
+def save_drawing(sheet: Drawing, path: Path, title: str, subject: str, more: bytes = b"") -> None:
+    """Write any drawing as a PDF/X-4 of one page of exactly its size: filled rectangles of plain codes."""
+    width, height = (side * POINTS_PER_MM for side in sheet.page_mm)
+    corners = sheet.rectangles_mm * POINTS_PER_MM
+    # Renderers paint every pixel that a part touches: a hair less on each side keeps rounding out of the next pixel.
+    hair, lap = _INSET_PX * PX_MM * POINTS_PER_MM, _LAP_PX * PX_MM * POINTS_PER_MM
+    corners += np.array([hair, hair, -hair, -hair])
+    corners[len(corners) - sheet.tiles :, 2:] += lap
+    left, top, right, bottom = corners.T
+    boxes = np.stack([left, height - bottom, right - left, bottom - top], axis=1)
+    changes = np.flatnonzero((np.diff(sheet.rgb.astype(np.int64), axis=0) != 0).any(axis=1)) + 1
+    # Neighbours of one colour share a path: it keeps the painter's order and saves bytes.
+    parts: list[bytes] = []
+    for first, last in zip([0, *changes.tolist()], [*changes.tolist(), len(corners)], strict=True):
+        red, green, blue = (int(code) for code in sheet.rgb[first])
+        rows = ((box[0], box[1], box[2], box[3]) for box in boxes[first:last].tolist())
+        parts.append(filled(rows, (red, green, blue)))
+    save_page(path, (width, height), b"".join([*parts, more]), title, subject)
+
+
+def preview(chart: Chart, width_px: int) -> npt.NDArray[np.uint8]:
+    """Return a small picture of the sheet, (height, width_px, 3) uint8 RGB, each pixel the mean of what it covers."""
+    import cv2
+
+    if width_px < 1:
+        raise InputError(f"a preview of {width_px} pixels has no width; give 1 or more")
+    height_px = max(1, round(width_px * chart.page_mm[1] / chart.page_mm[0]))
+    fine = (width_px * _SUPERSAMPLING, height_px * _SUPERSAMPLING)
+    bands = list(_bands(drawing(chart), fine[0] / chart.page_mm[0], fine))
+    # A mean by whole numbers of pixels; OpenCV takes it a good deal faster than numpy.
+    means = np.stack(
+        [
+            cv2.resize(band.row[None].astype(np.float32), (width_px, 1), interpolation=cv2.INTER_AREA)[0]
+            for band in bands
+        ]
+    )
+    tops = np.arange(height_px)[:, None] * _SUPERSAMPLING
+    band_tops, band_bottoms = np.array([[band.top, band.bottom] for band in bands]).T
+    shared = np.minimum(band_bottoms, tops + _SUPERSAMPLING) - np.maximum(band_tops, tops)
+    weights = np.maximum(shared, 0) / _SUPERSAMPLING
+    return np.rint(np.tensordot(weights, means, axes=1)).astype(np.uint8)
+
+
+def save_preview(chart: Chart, path: Path, width_px: int = 2400) -> None:
+    """Write `preview` as a PNG; see there."""
+    import cv2
+
+    _, png = cv2.imencode(".png", np.ascontiguousarray(preview(chart, width_px)[:, :, ::-1]))
+    write_whole(path, png.tobytes())

@@ -1,0 +1,197 @@
+"""Where the chart is in a picture: its tags, or the field of a chart without tags, found and its pose measured.
+
+Rules that hold inside:
+
+- One linear colour plane at a time, the strongest of the frame: a square root moves a tag's corner by a quarter pixel,
+  a sum of planes under deep red or blue by a fifth.
+- Places are half-size pixels (`experiment.framing.planes`).
+- Faults of the picture are a `RegistrationError` that says what was looked for, what was found, and what helps.
+
+Knows the chart and a mosaic of counts; nothing of sessions, cells' colours or lenses
+(`calibration.registration.register`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from drivers.raw.rawfile import Mosaic
+from experiment.chart.model import TAG_MODULES, Chart
+from experiment.framing.corners import corners_text
+from experiment.framing.homography import project, rms, robust_homography
+from experiment.framing.planes import CHANNELS, MIN_SIGNAL, Plane, frame_black, paper_level, plane_of, strongest_plane
+from experiment.framing.tagless_field import FoundField, find_field
+from experiment.framing.tags import MIN_MODULE_PX, FoundTag, find_tags
+from foundation.errors import InputError, RegistrationError
+
+MIN_TAGS = 2
+"""Tags without which no homography is looked for: two give eight points, twice as many as one needs."""
+
+MIN_TAG_SHARE = 0.8
+"""Share of the chart's tags that must be found; fewer mean that part of the chart is covered, dark or outside."""
+
+_Points = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Framing:
+    """The place and the pose of the chart in a picture.
+
+    - `plane`: the colour plane that was searched.
+    - `tags`: tags of the chart that were found, by id.
+    - `missing`: ids of the chart's tags that were not found.
+    - `homography`: (3, 3) float64, millimetres on the print to half-size px, lens distortion not included.
+    - `residual_px`: RMS distance of the tags' corners, or the field's outline, from the homography: distortion and
+      waviness included, some pixels.
+    - `module_px`: half-size pixels per tag module, the smallest tag's; NaN without tags.
+    - `fill`: share of the picture's height or width that the page takes, the larger of the two; 1 is full.
+    - `inside`: whether all four corners of the page lie in the picture.
+    - `rotation_deg`: of the page's x axis against the picture's, clockwise as seen.
+    - `field`: outline of the field of cells, by which a chart without tags is found; None for one with tags.
+    """
+
+    plane: Plane
+    tags: tuple[FoundTag, ...]
+    missing: tuple[int, ...]
+    homography: npt.NDArray[np.float64]
+    residual_px: float
+    module_px: float
+    fill: float
+    inside: bool
+    rotation_deg: float
+    field: FoundField | None = None
+
+    @property
+    def complete(self) -> bool:
+        """Whether every tag of the chart was found."""
+        return not self.missing
+
+
+def find_chart(
+    frame: Mosaic | Plane,
+    chart: Chart,
+    what: str = "the frame",
+    corners: npt.ArrayLike | None = None,
+    near: Framing | None = None,
+) -> Framing:
+    """Return the place and the pose of `chart` in a picture.
+
+    `corners`: (4, 2) float half-size px, corners of the field of cells, clockwise from the printed top-left, for a
+    chart without tags; found automatically if not given.
+    """
+    if chart.tags and corners is not None:
+        raise InputError(
+            f"corners are given ({corners_text(corners)}), and this chart has {len(chart.tags)} tags by which it is "
+            "found; leave the corners out, or name the chart.json of the print that hangs before the camera"
+        )
+    if not chart.tags and isinstance(frame, Mosaic):
+        return _find_field(frame, chart, what, corners, near)
+    if len(chart.tags) < MIN_TAGS:
+        raise RegistrationError(
+            f"{what}: the chart has {len(chart.tags)} tags, and it is found by its tags, at least {MIN_TAGS}; "
+            "print a chart made by acquire chart"
+        )
+    plane = strongest_plane(frame) if isinstance(frame, Mosaic) else frame
+    found = find_tags(plane)
+    expected = {tag.id: tag for tag in chart.tags}
+    ids = sorted(expected)
+    looked_for = f"{len(ids)} tags 36h11 with ids {ids[0]}–{ids[-1]}"
+    tags = tuple(tag for tag in found if tag.id in expected)
+    missing = tuple(number for number in ids if number not in {tag.id for tag in tags})
+    if len(tags) < max(MIN_TAGS, len(ids) // 4):
+        raise _not_found(plane, found, tags, looked_for, what)
+    chart_points = np.concatenate([expected[tag.id].corners_mm for tag in tags])
+    frame_points = np.concatenate([tag.corners_px for tag in tags])
+    homography, fits = robust_homography(chart_points, frame_points, 0.01 * plane.values.shape[1])
+    misplaced = [tag.id for number, tag in enumerate(tags) if not fits[4 * number : 4 * number + 4].all()]
+    if len(misplaced) > 0.2 * len(tags):
+        raise RegistrationError(
+            f"{what}: {len(tags)} tags carry ids of the chart, but the places of {len(misplaced)} do not fit it; "
+            "this is another chart: name the chart.json of the print that hangs before the camera"
+        )
+    tags = tuple(tag for tag in tags if tag.id not in misplaced)
+    missing = tuple(sorted({*missing, *misplaced}))
+    module = min(tag.side_px for tag in tags) / TAG_MODULES
+    if len(tags) < MIN_TAG_SHARE * len(ids):
+        small = module < MIN_MODULE_PX
+        raise RegistrationError(
+            f"{what}: {len(tags)} of {looked_for} found, at least {int(np.ceil(MIN_TAG_SHARE * len(ids)))} expected; "
+            f"missing: {_some(missing)}; "
+            + (
+                f"a module is {module:.1f} px, at least {MIN_MODULE_PX:g} expected: bring the camera nearer"
+                if small
+                else "uncover the chart, light all of it, and bring all of it into the picture and into focus"
+            )
+        )
+    residual = project(homography, chart_points[fits]) - frame_points[fits]
+    return Framing(plane, tags, missing, homography, rms(residual), module, *_pose(homography, chart, plane))
+
+
+def _pose(homography: npt.NDArray[np.float64], chart: Chart, plane: Plane) -> tuple[float, bool, float]:
+    """Return how much of the picture the page fills, whether it lies inside, and how it is turned, degrees."""
+    height, width = plane.values.shape
+    page_w, page_h = chart.page_mm
+    corners = project(homography, [(0, 0), (page_w, 0), (page_w, page_h), (0, page_h)])
+    axis = project(homography, [(0.4 * page_w, page_h / 2), (0.6 * page_w, page_h / 2)])
+    spans = np.ptp(corners, axis=0) / (width, height)
+    inside = bool((corners >= -0.5).all() and (corners <= (width - 0.5, height - 0.5)).all())
+    return float(spans.max()), inside, float(np.degrees(np.arctan2(*(axis[1] - axis[0])[::-1])))
+
+
+def _find_field(
+    mosaic: Mosaic, chart: Chart, what: str, corners: npt.ArrayLike | None, near: Framing | None
+) -> Framing:
+    black = frame_black(mosaic)
+    planes = [plane_of(mosaic, channel, black) for channel in CHANNELS]
+    before = None if near is None or near.field is None else near.field.corners_px
+    field = find_field(planes, chart, what, corners, before)
+    off = ((project(field.homography, field.outline_mm) - field.outline_px) * field.normals).sum(axis=1)
+    plane = max(planes, key=paper_level)
+    pose = _pose(field.homography, chart, plane)
+    return Framing(plane, (), (), field.homography, float(np.sqrt((off**2).mean())), float("nan"), *pose, field=field)
+
+
+def _not_found(
+    plane: Plane, found: tuple[FoundTag, ...], tags: tuple[FoundTag, ...], looked_for: str, what: str
+) -> RegistrationError:
+    """Return the likeliest reason, from what the picture shows, why too few of the chart's tags were found."""
+    white = paper_level(plane)
+    if white < MIN_SIGNAL:
+        return RegistrationError(
+            f"{what} is dark: its brightest parts are {max(white, 0.0):.0f} counts above black, at least "
+            f"{MIN_SIGNAL:.0f} expected; switch the projector on, open its shutter, expose longer"
+        )
+    turned = np.ascontiguousarray(plane.values[:, ::-1])
+    if len(find_tags(Plane(plane.channel, turned, (0.0, 0.0)))) > max(1, len(found)):
+        return RegistrationError(
+            f"{what} is mirrored: none of {looked_for} is found, but mirrored they are; "
+            "take the frame without a mirror, or print the chart unmirrored"
+        )
+    larger = cv2.resize(plane.values, None, fx=2, fy=2, interpolation=cv2.INTER_CUBIC)
+    magnified = find_tags(Plane(plane.channel, np.asarray(larger, dtype=np.float32), (0.0, 0.0)))
+    if len(magnified) > max(1, len(found)):
+        module = min(tag.side_px for tag in magnified) / 2 / TAG_MODULES
+        return RegistrationError(
+            f"{what}: the tags are too small: {module:.1f} px a module, at least {MIN_MODULE_PX:g} expected; "
+            "bring the camera nearer or take a longer lens"
+        )
+    if found and not tags:
+        return RegistrationError(
+            f"{what}: {looked_for} were looked for, but the tags found are {_some([tag.id for tag in found])}; "
+            "this is another chart: name the chart.json of the print that hangs before the camera"
+        )
+    count = f"only {len(tags)} of them found" if tags else "none found"
+    return RegistrationError(
+        f"{what}: {looked_for} were looked for, {count}; "
+        "point the camera at the chart, focus it, and see that all of it is lit"
+    )
+
+
+def _some(ids: Sequence[int]) -> str:
+    text = ", ".join(str(number) for number in ids[:8])
+    return text + (f" and {len(ids) - 8} more" if len(ids) > 8 else "")

@@ -1,0 +1,188 @@
+"""The lights of an experiment, as many as the paper's 707, and their file `illuminations.csv`.
+
+The paper (section 3.1) asks for chromaticities spread uniformly and for black bodies but gives no recipe. Ours: the
+points of a triangular grid r = i/n, b = j/n, g = 1 − r − b in linear light, and black bodies from 2000 K to 10 000 K;
+each scaled to its brightest channel and encoded with the projector's transfer function (sRGB unless measured).
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import numpy.typing as npt
+
+from drivers.presenter import Colour
+from foundation.colorimetry.observer import linear_srgb, planck, xyz_of
+from foundation.errors import FormatError, InputError
+from foundation.files import reading_error, write_whole
+from foundation.srgb import encode_srgb
+
+Kind = Literal["uniform", "blackbody", "spectrum"]
+COLUMNS = ("index", "kind", "cct_k", "red", "green", "blue")
+"""Columns of `illuminations.csv` (docs/formats.md)."""
+
+NAME = "name"
+"""A further column where lights have names: those of computed tables under spectra of their own."""
+
+GRID = 35
+"""Steps along an edge of the chromaticity triangle: 666 points, which with 41 black bodies are the paper's 707."""
+
+CCTS_K = tuple(range(2000, 10001, 200))
+"""Black bodies of the plan, kelvin: from candle light to blue sky."""
+
+MOST_CCTS = 10_000
+"""Most temperatures that a text may name: more are a mistake in the step."""
+
+
+@dataclass(frozen=True)
+class Illumination:
+    """One light of the plan: its number, its kind, its temperature if a black body, and the codes shown.
+
+    Where light has a spectrum of its own (`kind` ``spectrum``, or a black body that was computed and not shown by a
+    projector), the codes are those that would show its colour, and it has a `name`, such as ``D65``.
+    """
+
+    index: int
+    kind: Kind
+    cct_k: float | None
+    colour: Colour
+    name: str | None = None
+
+    @property
+    def codes(self) -> tuple[int, int, int]:
+        """Codes of red, green and blue that the projector shows, 0 … 255."""
+        return self.colour.codes
+
+
+def shown_colour(linear: npt.ArrayLike) -> Colour:
+    """Return the codes that show a linear RGB light (3,) float ≥ 0 at the brightest that its chromaticity allows."""
+    linear = np.maximum(np.asarray(linear, dtype=np.float64), 0.0)
+    codes = np.rint(255 * encode_srgb(linear / linear.max())).astype(int)
+    return Colour(*(int(code) for code in codes))
+
+
+def uniform_lights(grid: int = GRID) -> list[npt.NDArray[np.float64]]:
+    """Return the (grid+1)(grid+2)/2 points of the triangular grid as linear (r, g, b), (3,) float64 of sum 1."""
+    return [
+        np.array([i, grid - i - j, j], dtype=np.float64) / grid for i in range(grid + 1) for j in range(grid + 1 - i)
+    ]
+
+
+def blackbody_light(cct_k: float) -> npt.NDArray[np.float64]:
+    """Return the linear sRGB of a black body, (3,) float64, its brightest channel 1.
+
+    Planck's law at `cct_k` kelvin, CIE 1931 2° observer, sRGB primaries (IEC 61966-2-1); what lies outside the
+    gamut is clipped to it.
+    """
+    wavelengths = np.arange(360.0, 781.0)
+    linear = np.maximum(linear_srgb(xyz_of(wavelengths, planck(wavelengths, cct_k))), 0.0)
+    return linear / linear.max()
+
+
+def plan_illuminations(grid: int = GRID, ccts_k: Sequence[float] = CCTS_K) -> tuple[Illumination, ...]:
+    """Return the lights of an experiment: the triangular grid first, then the black bodies."""
+    lights: list[Illumination] = []
+    for linear in uniform_lights(grid) if grid else ():
+        lights.append(Illumination(len(lights), "uniform", None, shown_colour(linear)))
+    for cct_k in ccts_k:
+        lights.append(Illumination(len(lights), "blackbody", float(cct_k), shown_colour(blackbody_light(cct_k))))
+    return tuple(lights)
+
+
+def illuminations_to_csv(illuminations: Sequence[Illumination]) -> str:
+    """Return the text of `illuminations.csv`."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(COLUMNS)
+    for light in illuminations:
+        # Whole kelvin without a point, anything else with all its digits.
+        cct = "" if light.cct_k is None else repr(light.cct_k).removesuffix(".0")
+        writer.writerow([light.index, light.kind, cct, *light.codes])
+    return text.getvalue()
+
+
+def save_illuminations(illuminations: Sequence[Illumination], path: Path) -> None:
+    """Write `illuminations.csv`."""
+    write_whole(path, illuminations_to_csv(illuminations))
+
+
+def load_illuminations(path: Path, *, computed: bool = False) -> tuple[Illumination, ...]:
+    """Read `illuminations.csv`; further columns are ignored."""
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+        rows = list(csv.DictReader(io.StringIO(text)))
+    except OSError as error:
+        raise reading_error(path, error, "make one with: acquire illuminations", "illuminations") from error
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise FormatError(f"cannot read illuminations {path}: {error}; make one with: acquire illuminations") from error
+    if not rows or any(column not in rows[0] for column in COLUMNS):
+        raise FormatError(f"{path}: expected lights under the columns {','.join(COLUMNS)}")
+    lights: list[Illumination] = []
+    for number, row in enumerate(rows):
+        try:
+            kind = row["kind"]
+            if kind not in ("uniform", "blackbody", "spectrum") or (kind == "spectrum" and not computed):
+                raise ValueError(f"kind is {kind!r}, expected uniform or blackbody")
+            if _whole(row, "index") != number:
+                raise ValueError(f"index is {row['index']}, expected {number}")
+            cct_k = _kelvin(row) if kind == "blackbody" else None
+            codes = Colour(_whole(row, "red"), _whole(row, "green"), _whole(row, "blue"))
+        except ValueError as error:
+            raise FormatError(f"{path}, light {number}: {error}") from error
+        lights.append(Illumination(number, kind, cct_k, codes, (row.get(NAME) or None) if computed else None))
+    return tuple(lights)
+
+
+def _whole(row: Mapping[str, str | None], column: str) -> int:
+    text = row[column]
+    # A short row holds None where its cells are missing.
+    if text is None or not text.strip().lstrip("-").isdecimal():
+        raise ValueError(f"{column} is {text or 'missing'}, expected a whole number")
+    return int(text)
+
+
+def _kelvin(row: Mapping[str, str | None]) -> float:
+    text = row["cct_k"]
+    try:
+        cct_k = float(text or "nan")
+    except ValueError:
+        cct_k = float("nan")
+    if not 0 < cct_k < float("inf"):
+        raise ValueError(f"cct_k is {text or 'missing'}, expected kelvin above 0")
+    return cct_k
+
+
+def parse_ccts(text: str) -> tuple[float, ...]:
+    """Return the temperatures in ``FIRST:LAST:STEP`` or ``K,K,…``, kelvin; empty text gives none."""
+    given = f"black bodies {text!r}"
+    try:
+        named = [float(part) for part in text.split(":" if ":" in text else ",") if part.strip()]
+    except ValueError as error:
+        raise InputError(f"{given}: expected FIRST:LAST:STEP or K,K,… in kelvin") from error
+    if ":" in text:
+        if len(named) != 3:
+            raise InputError(f"{given}: expected FIRST:LAST:STEP or K,K,… in kelvin")
+        first, last, step = named
+        _require_kelvin((first, last), given)
+        steps = (last - first) / step if step else math.nan
+        if not 0 <= steps < MOST_CCTS:
+            raise InputError(
+                f"{given}: steps of {step:g} K do not lead from {first:g} to {last:g} K in at most {MOST_CCTS} "
+                "temperatures; a falling range has a step below 0"
+            )
+        return tuple(first + step * number for number in range(int(steps + 1e-9) + 1))
+    _require_kelvin(named, given)
+    return tuple(named)
+
+
+def _require_kelvin(ccts: Sequence[float], given: str) -> None:
+    for cct_k in ccts:
+        if not 1000 <= cct_k <= 100_000:
+            raise InputError(f"{given}: {cct_k:g} K is not within 1000 … 100 000 K")

@@ -1,0 +1,282 @@
+"""What bare paper shows in a frame: the shape of the light over the print, and the ground truth.
+
+- The flat field is fitted to the frame's white references, channel by channel. The ground truth of a light is what is
+  left of them when it is divided out, and comes from the very frame of the light's samples.
+- Which terms it has is decided by references held out: each as the fit to all others predicts it, so that a term stays
+  that foretells references which it has not seen, and none that describes their noise. A criterion on the fit's own
+  residuals (BIC) did worse where it matters: a corner at half of the centre's light is shown by few references, and
+  their misfit is outvoted by the price of the terms that it needs.
+- What the terms may be is what lenses and projectors do (`experiment.measures.polynomials.light_terms`).
+- A lens darkens its corners in all channels alike, so that in a frame without a base the channels first have one shape,
+  from their sum, and then each its own on it. Other frames have that frame's shape as base, and one too dark to show a
+  shape of its own keeps it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import astuple, dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from experiment.measures.flat_field import LEAST_FIELD, FlatField
+from experiment.measures.least_squares import held_out_squares, linear_combinations, robust_least_squares
+from experiment.measures.polynomials import light_terms, order_of, page_polynomial, page_powers
+from foundation.errors import QualityError
+from foundation.robust import sigma_of
+
+MAX_ORDER = 8
+"""Highest order of a frame's flat field: light whose corners have 42 to 52 % of the centre's needs the sixth power of
+the distance from its centre, and where the mount shades the rim the eighth, on simulated frames."""
+
+MAX_ORDER_AROUND = 3
+"""The same where references lie around the cells and not among them: from order 4 on there are shapes that vanish in
+all the margin."""
+
+MIN_REFERENCES = 6
+"""White references that a frame must show (judgement): with fewer, their mean has no error that means anything."""
+
+REFERENCES_A_TERM = 3
+"""With fewer references for each term, a fit foretells none of them."""
+
+JUDGING_A_TERM = 12
+"""References for each term of the fit that tells which are covered or dirty: with three, the terms describe a stain of
+a tenth of the references."""
+
+_PLAIN = 6
+"""Terms of a slope and a bend."""
+
+TERM_PRICE = 1.0
+"""By how much a term must lower N log(mean squared error of the N references held out), chosen: 0 takes a shape for one
+in four frames that have none, and at 60 counts adds .2 % of noise to the field; 4 misses shapes of .3 % at 300."""
+
+READ_COUNTS = 65.0
+"""Signal whose photon noise is as large as the read noise, counts: 6 counts at 1.8 electrons a count. The variance of a
+reference is taken to be that of the light there and of this, so that dim corners count as they are known."""
+
+_ROUNDS = 4
+"""Solutions in a row of the robust fit; of references few are covered or dirty, and the weights settle at once."""
+
+_RINGS = 10
+"""Rings of equally many references about the page's middle, by which a fall-off that is left over is recognised."""
+
+_NEAR = 4
+"""References, one and its neighbours, whose mean deviation is the worst: a tenth of a page's side on A0."""
+
+_USUAL = 5.0
+"""Usual deviations beyond which a reference is off: by chance one in two million."""
+
+_EXACT = 1e-9
+"""Coefficients of terms below this are rounding errors of their computation."""
+
+_Array = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class FieldResidual:
+    """What the field leaves of the references, so that the cause of a large residual can be told.
+
+    - `at_mm`: where the references deviate most, on the print.
+    - `deviation`: how far the references there are off in R, G and B, as shares with their signs.
+    - `share`: share of the references that are off by more than five usual deviations.
+    - `rim`: mean residual of the tenth of the references that lie farthest from the page's middle, as a share with its
+      sign.
+    - `radial`: share of the residuals' variance that their distance from the page's middle explains, 0 … 1.
+    """
+
+    at_mm: tuple[float, float] = (0.0, 0.0)
+    deviation: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    share: float = 0.0
+    rim: float = 0.0
+    radial: float = 0.0
+
+    def to_json(self) -> list[Any]:
+        """Return the values as JSON can hold them; `from_json` restores them to the last bit."""
+        return list(astuple(self))
+
+    @staticmethod
+    def from_json(stored: list[Any]) -> FieldResidual:
+        """Return the values of what `to_json` returned."""
+        (x_mm, y_mm), (red, green, blue), share, rim, radial = stored
+        return FieldResidual((x_mm, y_mm), (red, green, blue), share, rim, radial)
+
+
+@dataclass(frozen=True, eq=False)
+class Paper:
+    """What the white references of a frame show.
+
+    - `field`: the frame's field.
+    - `white`: (3,) float64, counts above black of bare paper after the field is divided out: the ground truth.
+    - `error`: (3,) float64, standard error of `white`.
+    - `references`: white references used.
+    - `spread`: (3,) float64, RMS of all references about the field, stained ones included, relative to `white`.
+    - `left`: what the field leaves of them, and where.
+    """
+
+    field: FlatField
+    white: _Array
+    error: _Array
+    references: int
+    spread: _Array
+    left: FieldResidual = FieldResidual()
+
+
+class PaperReader:
+    """Reads field and white of frames in which paper is seen at the same places; threads may share one.
+
+    `places_mm`: (N, 2) white references on the print. `centres_mm`: (C, 2) the chart's cells, over which the field's
+    mean is 1.
+    """
+
+    def __init__(
+        self,
+        places_mm: _Array,
+        centres_mm: _Array,
+        page_mm: tuple[float, float],
+        base: FlatField | None = None,
+        order: int = MAX_ORDER,
+    ) -> None:
+        self.base = FlatField.uniform(page_mm) if base is None else base
+        self._page_mm, self._places_mm = page_mm, places_mm
+        self._terms, self._counts = light_terms(page_mm, order <= MAX_ORDER_AROUND)
+        self._base_at_places, self._base_at_centres = self.base.at(places_mm), self.base.at(centres_mm)
+        self._at_places = page_polynomial(places_mm, page_mm, MAX_ORDER) @ self._terms
+        # Term by term, so that the compiled loop runs along the cells.
+        self._at_centres = np.ascontiguousarray((page_polynomial(centres_mm, page_mm, MAX_ORDER) @ self._terms).T)
+
+    def read(self, seen: _Array, what: str = "the frame") -> tuple[Paper, _Array]:
+        """Return what a frame's paper shows, and the frame's field (C, 3) float64 at the cells' centres.
+
+        `seen`: (N, 3) float64, the references' mean counts above black; NaN where one cannot be used.
+        """
+        there = np.isfinite(seen).all(axis=1)
+        if there.sum() < MIN_REFERENCES:
+            raise QualityError(
+                f"{what}: {int(there.sum())} white references can be used, at least {MIN_REFERENCES} expected; uncover "
+                "the chart, bring all of it into the picture, and expose so that bare paper stays below saturation"
+            )
+        basis, values, known = self._at_places[there], seen[there], self._base_at_places[there]
+        shape = self._base_at_centres.copy()
+        factors: list[tuple[_Array, ...]] = list(self.base.coefficients)
+        if not any(factors):
+            shared = self._shared_shape(basis, values)
+            if shared is not None:
+                known = known * shared[0][:, None]
+                shape *= shared[1][:, None]
+                factors = [(shared[2],), (shared[2],), (shared[2],)]
+        # On a base that is known, what is left of the light is plain: the frame's references are judged by a bend.
+        judging = self._counts[-1] if not any(self.base.coefficients) else _PLAIN
+        fits = [_best_fit(basis, known[:, channel], values[:, channel], self._counts, judging) for channel in range(3)]
+        solutions = np.zeros((3, basis.shape[1]))
+        for channel, (solution, _) in enumerate(fits):
+            solutions[channel, : len(solution)] = solution
+        local, before = linear_combinations(self._at_centres, solutions), shape.copy()
+        white, error, spread = np.zeros(3), np.zeros(3), np.zeros(3)
+        left = np.zeros_like(values)
+        for channel, (solution, weights) in enumerate(fits):
+            level = float((local[channel] * before[:, channel]).mean())
+            # Light too weak to show a shape of its own, or none at all.
+            own = solution / level if level > 0 and local[channel].min() > LEAST_FIELD * level else np.ones(1)
+            if len(own) > 1:
+                shape[:, channel] *= local[channel] / level
+                factors[channel] = (*factors[channel], self._factor(own))
+            flat = values[:, channel] / (known[:, channel] * (basis[:, : len(own)] @ own))
+            white[channel] = float((weights * flat).sum() / weights.sum())
+            residual = flat - white[channel]
+            scatter = float(np.sqrt((weights * residual**2).sum() / weights.sum()))
+            error[channel] = scatter / np.sqrt(float(weights.sum()))
+            # All references count here: a stain that the fit rightly ignores must still be seen.
+            left[:, channel] = residual / max(abs(white[channel]), 1e-9)
+            spread[channel] = float(np.sqrt((left[:, channel] ** 2).mean()))
+        field = FlatField(self._page_mm, (factors[0], factors[1], factors[2]))
+        residual = _residual(left, self._places_mm[there], self._page_mm, int(np.argmax(white)))
+        return Paper(field, white, error, int(there.sum()), spread, residual), np.maximum(shape, LEAST_FIELD)
+
+    def _shared_shape(self, basis: _Array, values: _Array) -> tuple[_Array, _Array, _Array] | None:
+        """Return the shape of all channels' light at references (N,) and centres (C,), and its factor; None if even.
+
+        The channels are added as they are, so that each counts by its light, as photon noise asks for.
+        """
+        total, even = values.sum(axis=1), np.ones(len(values))
+        first = self._shape(basis, _best_fit(basis, even, total, self._counts, self._counts[-1])[0])
+        if first is None:
+            return None
+        # Once more, with the references weighted by the light that the first fit shows.
+        return self._shape(basis, _best_fit(basis, even, total, self._counts, self._counts[-1], first[0])[0])
+
+    def _shape(self, basis: _Array, solution: _Array) -> tuple[_Array, _Array, _Array] | None:
+        """Return a solution's shape at references and at centres, mean 1 there, and its factor; None if it is even."""
+        count = len(solution)
+        level = float((solution @ self._at_centres[:count]).mean())
+        if count == 1 or level <= 0:
+            return None
+        own = solution / level
+        at_centres = own @ self._at_centres[:count]
+        if at_centres.min() <= LEAST_FIELD:
+            return None
+        return np.maximum(basis[:, :count] @ own, LEAST_FIELD), at_centres, self._factor(own)
+
+    def _factor(self, own: _Array) -> _Array:
+        """Return the coefficients, as `page_powers` has them, of terms (K,); of the lowest order that holds them."""
+        factor = self._terms[:, : len(own)] @ own
+        order = order_of(len(factor))
+        while order > 0 and np.abs(self._terms[len(page_powers(order - 1)) :, : len(own)]).max() < _EXACT:
+            order -= 1
+        return factor[: len(page_powers(order))]
+
+
+def _best_fit(
+    basis: _Array,
+    known: _Array,
+    values: _Array,
+    counts: tuple[int, ...],
+    judging: int,
+    light: _Array | None = None,
+) -> tuple[_Array, _Array]:
+    """Return solution (terms,) and weights (N,), 0 … 1, of the fit that foretells references best.
+
+    `basis`: (N, T) float64, the terms. `known`: (N,) float64, the base's shape. `values`: (N,) float64 counts above
+    black. `light`: (N,) float64, relative light by which the references' noise is known; the base's shape if not given.
+    """
+    light = known if light is None else light
+    level = max(float(np.median(values / light)), 0.0)
+    trust = 1 / np.sqrt(level * light + READ_COUNTS)
+    trust /= trust.max()
+    design, trusted = basis * (known * trust)[:, None], values * trust
+    allowed = tuple(count for count in counts if REFERENCES_A_TERM * count <= len(values)) or counts[:1]
+    # Judged by a large fit dim corners are no outliers; one larger than references allow would follow a stain.
+    enough = [count for count in allowed if count <= judging and JUDGING_A_TERM * count <= len(values)]
+    weights = robust_least_squares(design[:, : max(enough, default=allowed[0])], trusted, _ROUNDS)[1]
+    held_out = held_out_squares(design[:, : allowed[-1]], trusted, weights, allowed)
+    used = int((weights > 0).sum())
+    best = allowed[int(np.argmin(used * np.log(np.maximum(held_out, 1e-12)) + TERM_PRICE * np.array(allowed)))]
+    # Begun with these weights, so that terms which a hand in a corner seems to ask for do not take it in again.
+    root = np.sqrt(weights)
+    solution, again, _ = robust_least_squares(design[:, :best] * root[:, None], trusted * root, _ROUNDS)
+    return solution, weights * again
+
+
+def _residual(left: _Array, places_mm: _Array, page_mm: tuple[float, float], channel: int) -> FieldResidual:
+    """Return where and how residuals (N, 3), shares, are large, judged in one channel."""
+    here = left[:, channel]
+    usual = max(sigma_of(here), 1e-9)
+    worst = int(np.argmax(np.abs(here)))
+    away = ((places_mm - places_mm[worst]) ** 2).sum(axis=1)
+    near = np.argsort(away)[:_NEAR]
+    # The worst reference's neighbours tell how far it is off there, where it is not alone.
+    alike = near[np.sign(here[near]) == np.sign(here[worst])]
+    red, green, blue = left[alike].mean(axis=0).tolist()
+    x, y = places_mm[worst].tolist()
+    from_middle = np.linalg.norm(places_mm - np.asarray(page_mm) / 2, axis=1)
+    order = np.argsort(from_middle)
+    rings = [here[part] for part in np.array_split(order, min(_RINGS, len(here)))]
+    explained = sum(len(ring) * (ring.mean() - here.mean()) ** 2 for ring in rings)
+    total = float(((here - here.mean()) ** 2).sum())
+    return FieldResidual(
+        at_mm=(x, y),
+        deviation=(red, green, blue),
+        share=float((np.abs(here) > _USUAL * usual).mean()),
+        rim=float(rings[-1].mean()),
+        radial=float(explained / total) if total > 0 else 0.0,
+    )

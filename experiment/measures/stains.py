@@ -1,0 +1,217 @@
+"""Stains, folds and shadows on the print: cells whose colour is not that of their code.
+
+A stain leaves its cells of one colour each, so that neither rim nor noise of a cell shows it, and the table would hold
+the colours of a dirty print. It is recognised by a whole neighbourhood that deviates at once, while the same codes,
+which lie at random over the sheet, are right everywhere else.
+
+Rules that hold inside:
+
+- What a code gives is predicted from the codes next to it in colour, which lie elsewhere on the sheet: no model of ink
+  or paper, and next to nothing in common with the cell's own place.
+- A cell is judged by its neighbourhood: one deviating cell is the prediction's error or noise. Next to a stain it is
+  judged alone as well, for only half of the neighbourhood of a cell at a stain's rim is stained; that half must show.
+- Charts of less than `LEAST_BITS` cannot be judged: between four levels of a code curvature does not change slowly.
+- A deviation must be significant and large enough to matter. What is found is listed, never corrected.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial import cKDTree
+
+from foundation.robust import sigma_of
+
+NEIGHBOURS = 13
+"""A cell and the twelve within two cells of it: a tenth of a thumb's stain at 5 mm a cell."""
+
+STAINED = 0.02
+"""Deviation of a neighbourhood from its codes, a share, from which its cells are listed as unfit."""
+
+DOUBTFUL = 0.01
+"""Deviation from which cells are counted and shown. Clean prints in the simulated room stay below, to one cell."""
+
+SIGNIFICANT = 6.0
+"""Standard errors that it must be, too; by chance one neighbourhood in 5·10⁸."""
+
+RIM_SIGMA = 4.0
+"""Usual deviations of single cells that a cell next to a stain must deviate by to belong to it."""
+
+LEAST_COUNTS = 30.0
+"""Darker cells are not judged: a count of stray light is 3 % of them."""
+
+LEAST_BITS = 3
+"""Bits of a channel: with 2, curvature changes too fast between the four levels of a code to be predicted."""
+
+_ROUNDS = 3
+"""Repetitions at most, each without the stained cells of the one before in the predictions."""
+
+_LEAST_KNOWN = 9
+"""Codes of the 25 across an axis that must be known for their median to be a curvature."""
+
+_LEAST_NEIGHBOURS = 5
+"""Cells of a neighbourhood that must be known for its mean to count."""
+
+_MANY_BESIDE = 3
+"""Stained cells of a neighbourhood from which on it need not deviate itself for a cell to belong to the stain."""
+
+_Array = npt.NDArray[np.float64]
+_Mask = npt.NDArray[np.bool_]
+
+
+@dataclass(frozen=True, eq=False)
+class Stains:
+    """How cells differ from what their codes give elsewhere.
+
+    - `deviation`: (C, 3) float64, of each cell's neighbourhood, seen over expected less 1; NaN where it is not known.
+    - `error`: (C, 3) float64, its standard error.
+    - `alone`: (C, 3) float64, deviation of each cell by itself, noise and the prediction's error included; NaN
+      likewise.
+    - `stained`: (C,) bool, cells to be listed.
+    - `level`: (C, 3) float64, mean counts above black that were judged.
+    - `places_mm`: (C, 2) where the cells lie on the sheet.
+    """
+
+    deviation: _Array
+    error: _Array
+    alone: _Array
+    stained: _Mask
+    level: _Array
+    places_mm: _Array
+
+    @property
+    def doubtful(self) -> _Mask:
+        """(C,) bool, cells in neighbourhoods that deviate by 1 % or more: a fold's flanks, a faint stain, a shadow."""
+        return _beyond(self.deviation, self.error, DOUBTFUL)
+
+    @property
+    def known(self) -> bool:
+        """Whether anything is known of the print."""
+        return bool(np.isfinite(self.deviation).any())
+
+    def largest_deviation(self) -> _Array:
+        """Return (C,) float64 the signed deviation of the channel that deviates most; 0 where it is not known."""
+        return _largest(self.deviation)
+
+    def deviation_of(self, cell: int) -> float:
+        """Return a stained cell's deviation, with its sign: of its neighbourhood, or its own where that is larger."""
+        both = np.array([_largest(self.deviation[[cell]])[0], _largest(self.alone[[cell]])[0]])
+        return float(both[np.abs(both).argmax()])
+
+
+def _largest(deviation: _Array) -> _Array:
+    """Return (N,) the deviation (N, 3), with its sign, of the channel that deviates most; 0 where none is known."""
+    known = np.nan_to_num(deviation)
+    return np.take_along_axis(known, np.abs(known).argmax(axis=1)[:, None], axis=1)[:, 0]
+
+
+def find_stains(level: _Array, centres_mm: _Array, bits: int, usable: _Mask | None = None) -> Stains:
+    """Return which cells lie in neighbourhoods that are not of their codes' colours.
+
+    `level`: (8**bits, 3) float64, mean counts above black of each colour under even light, in the order of colour
+    indices, the field divided out; best the mean of all white frames. `centres_mm`: (8**bits, 2) mm, where each colour
+    lies on the sheet. `usable`: (8**bits,) bool, cells whose level means anything: not covered, cut off or clipped; all
+    if not given.
+    """
+    if bits < LEAST_BITS:
+        unknown = np.full(level.shape, np.nan)
+        return Stains(unknown, unknown, unknown, np.zeros(len(level), dtype=np.bool_), level, centres_mm)
+    usable = np.ones(len(level), dtype=np.bool_) if usable is None else usable
+    near = np.asarray(cKDTree(centres_mm).query(centres_mm, k=min(NEIGHBOURS, len(level)))[1])
+    near = near.reshape(len(level), -1)
+    trusted = usable.copy()
+    deviation, error, log_ratios = (np.full(level.shape, np.nan) for _ in range(3))
+    stained = np.zeros(len(level), dtype=np.bool_)
+    # A stain spoils the predictions that rest on its cells, too; without them, its rim and depth are sharper.
+    for _ in range(_ROUNDS):
+        log_ratios = _log_ratios(np.where(trusted[:, None], level, np.nan), level, usable, bits)
+        deviation, error = _of_neighbourhoods(log_ratios, near)
+        found = _beyond(deviation, error, STAINED)
+        if (found == stained).all():
+            break
+        stained = found
+        trusted = usable & ~stained
+    with np.errstate(invalid="ignore"):
+        off = (np.abs(np.expm1(log_ratios)) > np.maximum(RIM_SIGMA * _usual(log_ratios), STAINED)).any(axis=1)
+    # Part of a neighbourhood that a stain reaches deviates, too; a cell that does so alone is its prediction's error.
+    beside = stained[near].sum(axis=1)
+    reached = (np.abs(np.nan_to_num(deviation)) >= DOUBTFUL).any(axis=1) | (beside >= _MANY_BESIDE)
+    rim = off & reached & (beside > 0)
+    return Stains(deviation, error, np.expm1(log_ratios), stained | rim, level, centres_mm)
+
+
+def _usual(log_ratios: _Array) -> _Array:
+    """Return (3,) the standard deviation of single cells, by the median of their sizes."""
+    there = np.isfinite(log_ratios)
+    return np.array([sigma_of(log_ratios[there[:, c], c]) if there[:, c].any() else 0 for c in range(3)])
+
+
+def _beyond(deviation: _Array, error: _Array, least: float) -> _Mask:
+    """Return (C,) where a deviation is both significant and at least `least`; NaN is not."""
+    return np.asarray((np.abs(deviation) > np.maximum(SIGNIFICANT * error, least)).any(axis=1))
+
+
+def _log_ratios(trusted: _Array, level: _Array, usable: _Mask, bits: int) -> _Array:
+    """Return (C, 3) log of each cell over what its neighbours in colour predict, NaN where they cannot.
+
+    Along each axis of the code the mean of both neighbours' logarithms predicts the cell's, but for the curvature,
+    which changes slowly across the axis and is taken out as the median over the codes beside.
+    """
+    side = 1 << bits
+    with np.errstate(invalid="ignore", divide="ignore"):
+        logs = np.log(np.where(trusted > LEAST_COUNTS, trusted, np.nan)).reshape(side, side, side, 3)
+        own = np.log(np.where((level > LEAST_COUNTS) & usable[:, None], level, np.nan)).reshape(side, side, side, 3)
+    total, count = np.zeros_like(own), np.zeros_like(own)
+    for axis in range(3):
+        before, after = (np.roll(logs, step, axis=axis) for step in (1, -1))
+        second = own - 0.5 * (before + after)
+        edge: list[slice | list[int]] = [slice(None)] * 3
+        edge[axis] = [0, side - 1]
+        second[tuple(edge)] = np.nan
+        second -= _beside(second, axis)
+        there = np.isfinite(second)
+        total += np.where(there, second, 0)
+        count += there
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return (total / np.where(count > 0, count, np.nan)).reshape(-1, 3)
+
+
+def _beside(cube: _Array, axis: int) -> _Array:
+    """Return the median (n, n, n, 3) over the 25 codes of one value along an axis, up to two steps away across it."""
+    across = [other for other in range(3) if other != axis]
+    reach = [(2, 2) if other in across else (0, 0) for other in range(3)]
+    padded = np.pad(cube, (*reach, (0, 0)), constant_values=np.nan)
+    n = cube.shape[0]
+    shifted: list[_Array] = []
+    for one in range(5):
+        for other in range(5):
+            window = [slice(None)] * 3
+            window[across[0]], window[across[1]] = slice(one, one + n), slice(other, other + n)
+            shifted.append(padded[tuple(window)])
+    around = np.stack(shifted)
+    # NaN sorts last, so the middle of what is known stands at half their number.
+    known = np.isfinite(around).sum(axis=0)
+    ranked = np.sort(around, axis=0)
+    low, high = (np.maximum(known - 1, 0) // 2)[None], (known // 2)[None]
+    middle = 0.5 * (np.take_along_axis(ranked, low, axis=0) + np.take_along_axis(ranked, high, axis=0))[0]
+    return np.where(known >= _LEAST_KNOWN, middle, np.nan)
+
+
+def _of_neighbourhoods(log_ratios: _Array, near: npt.NDArray[np.intp]) -> tuple[_Array, _Array]:
+    """Return the mean (C, 3) over each neighbourhood and its standard error; NaN where too few cells are known."""
+    there = np.isfinite(log_ratios)
+    spread = _usual(log_ratios)
+    # A single cell may be far off; in a neighbourhood it weighs no more than four usual deviations beyond the median.
+    values = log_ratios[near]
+    with np.errstate(invalid="ignore"):
+        known = there[near]
+        count = known.sum(axis=1)
+        middle = np.nanmedian(np.where(known.any(axis=1, keepdims=True), values, 0.0), axis=1)
+        bounded = np.clip(values, (middle - 4 * spread)[:, None], (middle + 4 * spread)[:, None])
+        mean = np.where(known, bounded, 0).sum(axis=1) / np.maximum(count, 1)
+        inside = np.where(known, (bounded - mean[:, None]) ** 2, 0).sum(axis=1) / np.maximum(count - 1, 1)
+        error = np.sqrt(np.maximum(inside, spread**2) / np.maximum(count, 1))
+    enough = count >= _LEAST_NEIGHBOURS
+    return np.where(enough, np.expm1(mean), np.nan), np.where(enough, error, np.nan)

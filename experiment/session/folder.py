@@ -1,0 +1,328 @@
+"""A session: the folder in which an experiment is taken.
+
+Rules that hold inside:
+
+- A frame counts as taken when its raw file is complete on disk (written, flushed, renamed) *and* its journal row is
+  committed, in that order. Whatever a crash leaves between the two is set aside, never counted, never deleted.
+- The journal (`experiment.session.journal`) is the truth; `frames.csv` is derived from it.
+- Nothing here touches a device; readers of a session need nothing else from this package than its folder, plan and
+  journal, the chart and the illuminations.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import BinaryIO
+
+from drivers.camera import CapturedFrame
+from drivers.presenter import Colour
+from experiment.chart.model import Chart, load_chart
+from experiment.lights.illuminations import Illumination, load_illuminations, save_illuminations
+from experiment.session.incoming import IncomingFile, ReceivedFile
+from experiment.session.journal import JOURNAL_FILE, PATIENCE_S, Journal, time_text
+from experiment.session.journal_schema import MOST_BYTES
+from experiment.session.judgement import Judgement
+from experiment.session.mending.retaking import BAD, lights_text, newest_report, parse_lights
+from experiment.session.mending.verification import require_frames_folder, unsound_files
+from experiment.session.plan import SessionStep
+from experiment.session.records import FrameRecord
+from foundation.errors import FormatError, InputError
+from foundation.files import is_partial, reading_error, require_free, storage_error, whole_folder, write_whole
+from foundation.trust.foreign_folders import require_plain_folder
+from foundation.trust.held_folders import held_folder
+
+FRAME_COLUMNS = ("kind", "illumination", "file", "sha256", "taken_at", "exposure_s", "verdict")
+"""Columns of `frames.csv` (docs/formats.md)."""
+
+
+class Session:
+    """An open session folder; close it, or use it in a `with` block.
+
+    `hold`: what holds the folder against other runs, released at the end; None for a reader.
+    """
+
+    def __init__(self, folder: Path, journal: Journal, hold: ExitStack | None = None) -> None:
+        self.folder = folder
+        self.journal = journal
+        self._hold = hold
+        require_plain_folder(folder, MOST_BYTES, ("frames", "previews"))
+        self.chart: Chart = load_chart(folder / "chart.json")
+        self.illuminations: tuple[Illumination, ...] = load_illuminations(folder / "illuminations.csv")
+        self.steps: tuple[SessionStep, ...] = journal.steps()
+        self._require_planned_lights()
+
+    def _require_planned_lights(self) -> None:
+        """Refuse lights that are not those of the plan: what was shown would bear other codes."""
+        for step in self.steps:
+            if step.illumination is None:
+                continue
+            known = self.illuminations[step.illumination : step.illumination + 1]
+            if not known or known[0].colour != step.colour:
+                says = "has no such light" if not known else f"says {_codes(known[0].colour)}"
+                raise FormatError(
+                    f"{self.folder / 'illuminations.csv'} is not what the session was taken with: light "
+                    f"{step.illumination} was planned as {_codes(step.colour)}, the file {says}; "
+                    "restore it from a copy"
+                )
+
+    @property
+    def frames_folder(self) -> Path:
+        """Where the raw files are, exactly as the camera wrote them."""
+        return self.folder / "frames"
+
+    @classmethod
+    def create(
+        cls,
+        folder: Path,
+        settings: str,
+        chart: Chart,
+        illuminations: Sequence[Illumination],
+        steps: Sequence[SessionStep] = (),
+    ) -> Session:
+        """Make a new session folder, whole or not at all, and open it.
+
+        `steps`: the plan: every frame to take, in order.
+        """
+        with whole_folder(folder, "the session") as new:
+            (new / "frames").mkdir()
+            write_whole(new / "session.toml", settings)
+            chart.save(new / "chart.json")
+            save_illuminations(illuminations, new / "illuminations.csv")
+            Journal.create(new / JOURNAL_FILE, steps)
+        return cls.open_for_run(folder)
+
+    @classmethod
+    def open(cls, folder: Path) -> Session:
+        """Open a session folder to read it, also while it is being taken; nothing in it is created or changed."""
+        journal = Journal.open(journal_path(folder))
+        try:
+            return cls(folder, journal)
+        except BaseException:
+            journal.close()
+            raise
+
+    @classmethod
+    def open_for_run(
+        cls,
+        folder: Path,
+        patience_s: float = PATIENCE_S,
+        announce: Callable[[str], object] = lambda sentence: None,
+    ) -> Session:
+        """Open a session folder to take frames into it.
+
+        It is held until it is closed, and `frames.csv` is made anew.
+        """
+        path = journal_path(folder)
+        with ExitStack() as opened:
+            opened.enter_context(held_folder(folder, busy_sentence(folder)))
+            journal = Journal.open_for_run(path, patience_s, announce)
+            opened.callback(journal.close)
+            session = cls(folder, journal, opened)
+            session.write_frames_csv()
+            session._hold = opened.pop_all()
+        return session
+
+    def __enter__(self) -> Session:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Release journal and folder; a second call does nothing."""
+        if self._hold is None:
+            self.journal.close()
+        else:
+            self._hold.close()
+
+    def settings_text(self) -> str:
+        """Return the text of `session.toml`."""
+        path = self.folder / "session.toml"
+        try:
+            return path.read_text(encoding="utf-8")
+        except OSError as error:
+            raise reading_error(path, error, "restore it from a copy", "the session's settings") from error
+        except UnicodeDecodeError as error:
+            raise FormatError(
+                f"cannot read {path}, the settings of the session: {error}; restore it from a copy"
+            ) from error
+
+    def receive(self, stem: str, fill: Callable[[BinaryIO], CapturedFrame]) -> ReceivedFile:
+        """Let a raw file be written into `frames/`; it is complete and on the disk when this returns."""
+        with self.incoming(stem) as incoming:
+            return incoming.complete(fill(incoming.stream))
+
+    def incoming(self, stem: str) -> IncomingFile:
+        """Return a raw file to be filled, for which `receive` is too simple; see `IncomingFile`."""
+        return IncomingFile(self.frames_folder / stem)
+
+    def commit(
+        self,
+        attempt: int,
+        received: ReceivedFile,
+        judgement: Judgement,
+        timings: Mapping[str, float] | None = None,
+        *,
+        exposure_s: float,
+        ended_at: datetime,
+    ) -> None:
+        """Note that an attempt's raw file is complete and how it was judged; only now does the frame count.
+
+        `exposure_s`: the exposure asked for, seconds.
+        """
+        self.journal.commit(
+            attempt,
+            file=received.path.relative_to(self.folder).as_posix(),
+            size=received.size,
+            sha256=received.sha256,
+            taken_at=received.captured.released_at,
+            exposure_s=exposure_s,
+            ended_at=ended_at,
+            judgement=judgement,
+            timings=timings,
+        )
+
+    def add_steps(self, steps: Sequence[SessionStep]) -> None:
+        """Put steps at the end of the plan; their numbers must be free."""
+        self.journal.add_steps(steps)
+        self.steps = self.journal.steps()
+
+    def verify(
+        self, observe: Callable[[int, int], None] = lambda done, total: None, at: datetime | None = None
+    ) -> tuple[str, ...]:
+        """Void the accepted frames whose files are gone or changed, so that they are taken again; return why, each.
+
+        Where older software left a step with several accepted frames, all but the newest sound one are voided too.
+
+        `at`: when this happens, for the journal; now by the machine's clock if None.
+        """
+        unsound = unsound_files(self.folder, self.journal.accepted_files(), observe)
+        for attempt, reason in unsound.items():
+            self.journal.void([attempt], at or datetime.now(UTC), reason)
+        return tuple(unsound.values())
+
+    def retake(self, selection: str, at: datetime | None = None) -> tuple[int, ...]:
+        """Void accepted frames so that they are taken again; return the lights that this is about.
+
+        `at`: when this happens, for the journal; now by the machine's clock if None.
+        """
+        at = at or datetime.now(UTC)
+        accepted = self.journal.accepted_files()
+        known = range(len(self.illuminations))
+        if selection.strip() == BAD:
+            refused = newest_report(self.folder, {frame.sha256: frame.attempt for frame in self.frames()})
+            if not refused.sha256:
+                raise InputError(
+                    f"--retake bad: {refused.report}, the newest report on {self.folder}, names no frame to be taken "
+                    "again; leave --retake out, or name the lights, as in --retake 12,40-44"
+                )
+            chosen = [frame.attempt for frame in accepted if frame.sha256 in refused.sha256]
+            self.journal.void(chosen, at, f"refused by build-lut, as {refused.report} says")
+            return parse_lights(refused.lights, known) if refused.lights else ()
+        lights = parse_lights(selection, known)
+        chosen = [frame.attempt for frame in accepted if frame.illumination in lights]
+        done = {frame.illumination for frame in accepted}
+        asked = lights_text(lights)
+        if self.journal.records().get("retake") != asked or done.issuperset(lights):
+            self.journal.record("retake", asked)
+            self.journal.void(chosen, at, f"to be taken again, as asked for with --retake {asked}")
+        return lights
+
+    def done_steps(self) -> set[int]:
+        """Return the numbers of the steps whose frame was taken, accepted, and is still there in full size."""
+        return {
+            frame.step for frame in self.journal.accepted_files() if _has_size(self.folder / frame.file, frame.size)
+        }
+
+    def frames(self) -> list[FrameRecord]:
+        """Return every frame that was taken and judged, in the order of the plan, refused ones included."""
+        return self.journal.frames()
+
+    def write_frames_csv(self) -> None:
+        """Derive `frames.csv` anew from the journal."""
+        text = io.StringIO()
+        writer = csv.writer(text, lineterminator="\n")
+        writer.writerow(FRAME_COLUMNS)
+        for frame in self.frames():
+            writer.writerow(
+                [
+                    frame.kind,
+                    "" if frame.illumination is None else frame.illumination,
+                    frame.file,
+                    frame.sha256,
+                    time_text(frame.taken_at),
+                    f"{frame.exposure_s:.9g}",
+                    frame.verdict,
+                ]
+            )
+        write_whole(self.folder / "frames.csv", text.getvalue())
+
+    def set_aside_strays(self) -> list[Path]:
+        """Clear what a crash left: hidden partial files go, complete files that no row counts are renamed."""
+        try:
+            return self._set_aside_strays()
+        except OSError as error:
+            raise storage_error(self.frames_folder, error, "clear") from error
+
+    def _set_aside_strays(self) -> list[Path]:
+        require_frames_folder(self.folder)
+        counted = {frame.file for frame in self.frames()}
+        moved: list[Path] = []
+        for path in sorted(self.frames_folder.iterdir()):
+            if is_partial(path.name):
+                path.unlink()
+            elif f"frames/{path.name}" not in counted and not path.name.endswith(".stray"):
+                target = path.with_name(path.name + ".stray")
+                number = 1
+                while target.exists():
+                    number += 1
+                    target = path.with_name(f"{path.name}.{number}.stray")
+                path.rename(target)
+                moved.append(target)
+        return moved
+
+
+def session_exists(folder: Path) -> bool:
+    """Return whether `folder` is a session; refuse when it holds something else."""
+    if _is_file(folder / JOURNAL_FILE):
+        return True
+    require_free(folder, "the session")
+    return False
+
+
+def busy_sentence(folder: Path) -> str:
+    """Return what is said where another program takes a session."""
+    return f"{folder} is being taken by another program; wait for it, or look with acquire status"
+
+
+def journal_path(folder: Path) -> Path:
+    """Return the path of a session's journal."""
+    path = folder / JOURNAL_FILE
+    if not _is_file(path):
+        raise FormatError(
+            f"{folder} is no session: it holds no {JOURNAL_FILE}; name a folder made by acquire run or import"
+        )
+    return path
+
+
+def _is_file(path: Path) -> bool:
+    try:
+        return path.is_file()
+    except OSError as error:
+        raise reading_error(path, error, "check its permissions") from error
+
+
+def _codes(colour: Colour) -> str:
+    return f"{colour.red} {colour.green} {colour.blue}"
+
+
+def _has_size(path: Path, size: int) -> bool:
+    try:
+        return path.stat().st_size == size
+    except OSError:
+        return False

@@ -1,0 +1,383 @@
+"""The journal of a session, `journal.sqlite`: the plan, every attempt at its frames, their verdicts, and events.
+
+Rules that hold inside:
+
+- The journal is written before and after each frame; every write is a transaction of its own and on the disk when the
+  call returns, since a committed row is what makes a frame count.
+- Rows are never deleted; a frame that was accepted can be voided. Times are ISO 8601 text with microseconds and zone,
+  files are named relative to the session's folder.
+- A reader changes nothing, and never stops a run.
+
+Knows one file (`experiment.session.journal_file`: how it is opened); `experiment.session.folder` knows which raw
+files are really there.
+"""
+
+from __future__ import annotations
+
+import json
+import sqlite3
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
+from contextlib import closing, contextmanager, suppress
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from drivers.presenter import Colour
+from experiment.session.heartbeat import Heartbeat, Process, RunState, SessionPlace
+from experiment.session.journal_file import (
+    JOURNAL_VERSION,
+    LockPatience,
+    close_after_run,
+    create_file,
+    open_for_run,
+    open_to_read,
+    reading_error,
+    writing_error,
+)
+from experiment.session.judgement import AttemptDetails, Check, Judgement
+from experiment.session.plan import KINDS, FrameKind, SessionStep
+from experiment.session.records import (
+    ACCEPTED,
+    FAILED,
+    REFUSED,
+    VOIDED,
+    AcceptedFile,
+    Attempt,
+    FrameRecord,
+    SessionEvent,
+)
+from foundation.errors import FormatError, counted
+
+JOURNAL_FILE = "journal.sqlite"
+"""Name of the journal in a session's folder."""
+
+AMONG = "IN (SELECT value FROM json_each(?))"
+"""Condition on numbers that are given as a JSON list, however many there are."""
+
+PLACE = "place"
+"""Key of the record that says which folder the signs of life are given for."""
+
+PATIENCE_S = 600.0
+"""How long a write waits for another program's unless the caller says otherwise: as long as a run waits for a device by
+default (`sequence.patience_s`)."""
+
+
+class Journal:
+    """An open journal; close it after use. Used from one thread.
+
+    `patience`: with which other programs are waited for; None for a reader, for whom SQLite waits.
+    """
+
+    def __init__(
+        self, path: Path, connection: sqlite3.Connection, version: int, patience: LockPatience | None = None
+    ) -> None:
+        self._path = path
+        self._connection = connection
+        self._version = version
+        self._writes = patience is not None
+        self._patience = patience or LockPatience(path, 0, lambda sentence: None)
+
+    @staticmethod
+    def create(path: Path, steps: Sequence[SessionStep]) -> None:
+        """Write a new journal with the plan and nothing else."""
+        alone = LockPatience(path, 0, lambda sentence: None)
+        with closing(Journal(path, create_file(path), JOURNAL_VERSION, alone)) as journal:
+            journal.add_steps(steps)
+
+    @classmethod
+    def open(cls, path: Path) -> Journal:
+        """Open a journal to read it, also while a run writes it; nothing is created or changed."""
+        return cls(path, *open_to_read(path))
+
+    @classmethod
+    def open_for_run(
+        cls,
+        path: Path,
+        patience_s: float = PATIENCE_S,
+        announce: Callable[[str], object] = lambda sentence: None,
+    ) -> Journal:
+        """Open a journal to write it; one of an older version gets what it lacks."""
+        patience = LockPatience(path, patience_s, announce)
+        return cls(path, open_for_run(path, patience), JOURNAL_VERSION, patience)
+
+    def close(self) -> None:
+        """Release the file; a second call does nothing."""
+        if self._writes:
+            close_after_run(self._connection)
+        else:
+            self._connection.close()
+
+    def be_patient(self, patience_s: float, announce: Callable[[str], object]) -> None:
+        """Change how long a write waits and who is told; see `open_for_run`."""
+        self._patience = LockPatience(self._path, patience_s, announce)
+
+    def steps(self) -> tuple[SessionStep, ...]:
+        """Return the plan, in taking order."""
+        rows = self._rows("SELECT step, kind, illumination, red, green, blue FROM plan ORDER BY step")
+        return tuple(SessionStep(row[0], self._kind(row[1]), row[2], Colour(*row[3:])) for row in rows)
+
+    def add_steps(self, steps: Sequence[SessionStep]) -> None:
+        """Put steps at the end of the plan; their numbers must be free."""
+        with self._writing():
+            self._connection.executemany(
+                "INSERT INTO plan VALUES (?, ?, ?, ?, ?, ?)",
+                [(step.number, step.kind, step.illumination, *step.colour.codes) for step in steps],
+            )
+
+    def begin(self, step: SessionStep, file: str, at: datetime) -> int:
+        """Note that an attempt at `step` begins, to be saved as `file`; return the attempt's id."""
+        with self._writing():
+            cursor = self._connection.execute(
+                "INSERT INTO attempts (step, kind, illumination, file, started_at) VALUES (?, ?, ?, ?, ?)",
+                (step.number, step.kind, step.illumination, file, time_text(at)),
+            )
+        assert cursor.lastrowid is not None
+        return cursor.lastrowid
+
+    def commit(
+        self,
+        attempt: int,
+        *,
+        file: str,
+        size: int,
+        sha256: str,
+        taken_at: datetime,
+        exposure_s: float,
+        ended_at: datetime,
+        judgement: Judgement,
+        timings: Mapping[str, float] | None = None,
+    ) -> None:
+        """Note that an attempt's raw file is complete and how it was judged; only now does the frame count.
+
+        `file`, `size`, `sha256`: the raw file, relative to the session's folder, its bytes and their hash.
+        `exposure_s`: the exposure asked for, seconds.
+        """
+        verdict = ACCEPTED if judgement.accepted else REFUSED
+        row = (file, size, sha256, time_text(taken_at), exposure_s, time_text(ended_at), verdict, judgement.reason)
+        checks = [
+            (attempt, position, check.name, check.value, check.low, check.high, check.unit, check.reason)
+            for position, check in enumerate(judgement.checks)
+        ]
+        seen = judgement.seen or (None, None, None)
+        with self._writing():
+            self._connection.execute(
+                "UPDATE attempts SET file=?, size=?, sha256=?, taken_at=?, exposure_s=?, ended_at=?, verdict=?,"
+                " reason=? WHERE id=?",
+                (*row, attempt),
+            )
+            self._connection.executemany("INSERT INTO checks VALUES (?, ?, ?, ?, ?, ?, ?, ?)", checks)
+            self._connection.execute(
+                "INSERT INTO measurements VALUES (?, ?, ?, ?, ?, ?, ?)",
+                (attempt, *seen, judgement.measurement, judgement.voids, judgement.lasting),
+            )
+            self._connection.executemany(
+                "INSERT INTO timings VALUES (?, ?, ?)",
+                [(attempt, name, seconds) for name, seconds in (timings or {}).items()],
+            )
+
+    def fail(self, attempt: int, at: datetime, reason: str) -> None:
+        """Note that an attempt gave no frame."""
+        with self._writing():
+            self._connection.execute(
+                "UPDATE attempts SET ended_at=?, verdict=?, reason=? WHERE id=?",
+                (time_text(at), FAILED, reason, attempt),
+            )
+
+    def void(self, attempts: Iterable[int], at: datetime, reason: str) -> None:
+        """Note that frames that were accepted must not be used after all; their rows and files stay."""
+        with self._writing():
+            changed = self._connection.executemany(
+                "UPDATE attempts SET verdict=?, reason=? WHERE id=? AND verdict=?",
+                [(VOIDED, reason, attempt, ACCEPTED) for attempt in attempts],
+            ).rowcount
+            if changed > 0:
+                self._connection.execute(
+                    "INSERT INTO events (at, what, detail) VALUES (?, ?, ?)",
+                    (time_text(at), VOIDED, f"{counted(changed, 'frame')}: {reason}"),
+                )
+
+    def note(self, at: datetime, what: str, detail: str = "") -> None:
+        """Note an event."""
+        with self._writing():
+            self._connection.execute(
+                "INSERT INTO events (at, what, detail) VALUES (?, ?, ?)", (time_text(at), what, detail)
+            )
+
+    def beat(self, state: RunState, sentence: str, until: datetime) -> None:
+        """Give a sign of life, in place of the one before."""
+        own, at, place = Process.own(), datetime.now(UTC), SessionPlace.of(self._path)
+        with self._writing():
+            if place is not None:
+                self._connection.execute("INSERT OR REPLACE INTO records VALUES (?, ?)", (PLACE, place.to_text()))
+            self._connection.execute(
+                "INSERT OR REPLACE INTO heartbeat VALUES (1, ?, ?, ?, ?, ?, ?, ?, ?)",
+                (time_text(at), own.pid, own.started, own.host, own.boot, state, sentence, time_text(until)),
+            )
+
+    def record(self, key: str, text: str) -> None:
+        """Note what a session is taken with, such as a device's identity, in place of what stood under `key`."""
+        with self._writing():
+            self._connection.execute("INSERT OR REPLACE INTO records VALUES (?, ?)", (key, text))
+
+    def records(self) -> dict[str, str]:
+        """Return what the session was taken with, by key."""
+        return dict(self._newer_rows(f"SELECT key, text FROM records WHERE key <> '{PLACE}' ORDER BY key"))
+
+    def heartbeat(self) -> Heartbeat | None:
+        """Return the newest sign of life; None if none was ever given."""
+        rows = self._newer_rows("SELECT at, pid, started, host, boot, state, sentence, until FROM heartbeat")
+        if not rows:
+            return None
+        at, *process, state, sentence, until = rows[0]
+        said = self._newer_rows(f"SELECT text FROM records WHERE key = '{PLACE}'")
+        place = SessionPlace.from_text(said[0][0]) if said else None
+        begun, due = datetime.fromisoformat(at), datetime.fromisoformat(until)
+        return Heartbeat(begun, Process(*process), state, sentence, due, place)
+
+    def attempts(self) -> list[Attempt]:
+        """Return every attempt, oldest first."""
+        rows = self._rows(
+            "SELECT id, step, kind, illumination, file, started_at, ended_at, verdict, reason, sha256 IS NOT NULL"
+            " FROM attempts ORDER BY id"
+        )
+        return [
+            Attempt(
+                row[0],
+                row[1],
+                self._kind(row[2]),
+                row[3],
+                row[4],
+                datetime.fromisoformat(row[5]),
+                datetime.fromisoformat(row[6]) if row[6] else None,
+                row[7],
+                row[8],
+                bool(row[9]),
+            )
+            for row in rows
+        ]
+
+    def events(self) -> list[SessionEvent]:
+        """Return every event, oldest first."""
+        rows = self._rows("SELECT at, what, detail FROM events ORDER BY id")
+        return [SessionEvent(datetime.fromisoformat(row[0]), row[1], row[2]) for row in rows]
+
+    def details(self, attempts: Sequence[int] | None = None) -> dict[int, AttemptDetails]:
+        """Return what is kept of attempts, those of these numbers or all, by number, oldest first; see `begin`.
+
+        Those of which nothing is kept, as in journals of version 1, are not there.
+        """
+        among, numbers = "", tuple[str, ...]()
+        if attempts is not None:
+            among, numbers = f"AND attempt {AMONG}", (json.dumps(list(attempts)),)
+        seen: dict[int, tuple[float, float, float]] = {
+            attempt: (red, green, blue)
+            for attempt, red, green, blue in self._newer_rows(
+                f"SELECT attempt, red, green, blue FROM measurements WHERE red IS NOT NULL {among}", numbers
+            )
+        }
+        checks: dict[int, list[Check]] = {}
+        for attempt, *check in self._newer_rows(
+            "SELECT attempt, name, value, low, high, unit, reason FROM checks"
+            f" WHERE TRUE {among} ORDER BY attempt, position",
+            numbers,
+        ):
+            checks.setdefault(attempt, []).append(Check(*check))
+        timings: dict[int, dict[str, float]] = {}
+        for attempt, name, seconds in self._newer_rows(
+            f"SELECT attempt, name, seconds FROM timings WHERE TRUE {among} ORDER BY rowid", numbers
+        ):
+            timings.setdefault(attempt, {})[name] = seconds
+        return {
+            number: AttemptDetails(seen.get(number), tuple(checks.get(number, ())), timings.get(number, {}))
+            for number in sorted(seen.keys() | checks.keys() | timings.keys())
+        }
+
+    def measurements(self) -> Iterator[tuple[SessionStep, int, bytes, bool]]:
+        """Return what the judge keeps of each frame, in taking order: step, attempt, bytes, and whether it counts."""
+        plan = {step.number: step for step in self.steps()}
+        for attempt, step, data, verdict in self._newer_rows(
+            "SELECT id, step, data, verdict FROM attempts JOIN measurements ON attempt = id ORDER BY id"
+        ):
+            if step in plan and data:
+                yield plan[step], attempt, data, verdict == ACCEPTED
+
+    def accepted_files(self) -> list[AcceptedFile]:
+        """Return every frame that was accepted, oldest first."""
+        rows = self._rows(
+            "SELECT id, step, illumination, file, size, sha256 FROM attempts WHERE verdict=? ORDER BY id", (ACCEPTED,)
+        )
+        return [AcceptedFile(*row) for row in rows]
+
+    def kept_files(self, step: SessionStep) -> int:
+        """Return how many raw files, accepted or refused, `step` has already."""
+        query = "SELECT COUNT(*) FROM attempts WHERE step=? AND sha256 IS NOT NULL"
+        return int(self._rows(query, (step.number,))[0][0])
+
+    def frames(self) -> list[FrameRecord]:
+        """Return every frame that was taken and judged, in the order of the plan, refused ones included.
+
+        Of a step with several accepted frames, as older software could leave them, the newest counts.
+        """
+        rows = self._rows(
+            "SELECT step, kind, illumination, file, sha256, taken_at, exposure_s, verdict, reason, id FROM attempts"
+            " WHERE sha256 IS NOT NULL ORDER BY step, id"
+        )
+        newest = {row[0]: row[3] for row in rows if row[7] == ACCEPTED}
+        return [
+            FrameRecord(
+                self._kind(row[1]),
+                row[2],
+                row[3],
+                row[4],
+                datetime.fromisoformat(row[5]),
+                row[6],
+                _verdict_text(row[7], row[8], newest.get(row[0], row[3]) == row[3]),
+                row[9],
+            )
+            for row in rows
+        ]
+
+    def _kind(self, kind: str) -> FrameKind:
+        if kind not in KINDS:
+            raise FormatError(
+                f"{self._path} holds a frame of the kind {kind!r}, this software knows {', '.join(KINDS)}; use the "
+                "software that took the session"
+            )
+        return kind
+
+    def _newer_rows(self, query: str, values: tuple[Any, ...] = ()) -> list[Any]:
+        """Return rows of a table that journals of version 1 do not have."""
+        return [] if self._version < JOURNAL_VERSION else self._rows(query, values)
+
+    def _rows(self, query: str, values: tuple[Any, ...] = ()) -> list[Any]:
+        """Return all rows at once, so that nothing is held once they are read."""
+        try:
+            return self._patience.insist(lambda: self._connection.execute(query, values).fetchall())
+        except sqlite3.DatabaseError as error:
+            raise reading_error(self._path, error) from error
+
+    @contextmanager
+    def _writing(self) -> Generator[None]:
+        """Make what is written inside one transaction, which is on the disk when the block ends."""
+        try:
+            self._patience.insist(lambda: self._connection.execute("BEGIN IMMEDIATE"))
+            yield
+            self._patience.insist(lambda: self._connection.execute("COMMIT"))
+        except sqlite3.DatabaseError as error:
+            raise writing_error(self._path, error) from error
+        finally:
+            with suppress(sqlite3.Error):
+                if self._connection.in_transaction:
+                    self._connection.execute("ROLLBACK")
+
+
+def time_text(at: datetime) -> str:
+    """Return a time as journal and `frames.csv` have it: ISO 8601 with microseconds and zone."""
+    return at.isoformat(timespec="microseconds")
+
+
+def _verdict_text(verdict: str, reason: str, newest: bool) -> str:
+    """Return a verdict as readers of frames know it: accepted, or refused with the reason."""
+    if verdict == ACCEPTED:
+        return ACCEPTED if newest else f"{REFUSED}: taken again since"
+    return f"{REFUSED}: {reason}" if reason else REFUSED

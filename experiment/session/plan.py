@@ -1,0 +1,109 @@
+"""The plan of a session as data: every frame to take, in order, before any device is touched."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+from drivers.presenter import BLACK, WHITE, Colour
+from experiment.lights.illuminations import Illumination
+
+FrameKind = Literal["light", "white", "dark", "response"]
+"""What a frame shows: one of the planned lights, full white, the picture's black, or a colour by which the projector is
+known. Frames of the last kind are looked at while a session is taken, and never part of a table."""
+
+KINDS: tuple[FrameKind, ...] = get_args(FrameKind)
+"""Every kind, as journals name them."""
+
+REFERENCES: tuple[FrameKind, ...] = ("white", "dark")
+"""Kinds of frames that lights are held against."""
+
+TOP = 250
+"""Highest code of a response frame; 255 is left to white and to the lights, so that none is taken for one of them."""
+
+PRIMARIES = (Colour(TOP, 0, 0), Colour(0, TOP, 0), Colour(0, 0, TOP))
+"""The projector's red, green and blue, each alone."""
+
+MIDDLE = 136
+"""Code of a quarter of the light, at which each primary's own curve is compared with that of grey."""
+
+RESPONSE = (
+    *PRIMARIES,
+    *(Colour(code, code, code) for code in (TOP, 232, 208, 184, 160, 136, 112, 88, 64, 48, 32, 16)),
+    *(Colour(TOP, TOP, 0), Colour(TOP, 0, TOP), Colour(0, TOP, TOP)),
+    *(Colour(MIDDLE, 0, 0), Colour(0, MIDDLE, 0), Colour(0, 0, MIDDLE)),
+)
+"""What a session shows first so that the light of any codes can be foretold: the primaries; greys that give the curve
+from codes to light; pairs of primaries, for what light is added where they overlap; and each primary at half code, for
+what its curve has of its own. The steps are chosen: even in code, and closer where the curve is steep in proportion."""
+
+
+@dataclass(frozen=True)
+class SessionStep:
+    """One frame of the plan.
+
+    - `number`: its place in taking order, from 0.
+    - `kind`: what it shows.
+    - `illumination`: index of its light in `illuminations.csv`; None for frames of other kinds.
+    - `colour`: codes that the projector shows, 0 … 255.
+    """
+
+    number: int
+    kind: FrameKind
+    illumination: int | None
+    colour: Colour
+
+    @property
+    def stem(self) -> str:
+        """The file name without suffix, e.g. ``0007_light_005``; sorts in taking order."""
+        tail = "" if self.illumination is None else f"_{self.illumination:03d}"
+        return f"{self.number:04d}_{self.kind}{tail}"
+
+
+def plan_steps(
+    illuminations: Sequence[Illumination],
+    reference_every: int,
+    *,
+    seed: int | None = None,
+    response: Sequence[Colour] = (),
+) -> tuple[SessionStep, ...]:
+    """Return the whole session as data: a white and a dark frame first, every `reference_every` lights, and last.
+
+    `seed`: shuffles the lights, so that neither time nor a frame that is repeated runs along with colour; the same seed
+    gives the same order (numpy's PCG64). None keeps their order.
+    """
+    steps: list[SessionStep] = []
+
+    def add(kind: FrameKind, illumination: int | None, colour: Colour) -> None:
+        steps.append(SessionStep(len(steps), kind, illumination, colour))
+
+    for position, light in enumerate(illuminations if seed is None else _shuffled(illuminations, seed)):
+        if position % reference_every == 0:
+            add("white", None, WHITE)
+            add("dark", None, BLACK)
+        if position == 0:
+            for colour in response:
+                add("response", None, colour)
+        add("light", light.index, light.colour)
+    add("white", None, WHITE)
+    add("dark", None, BLACK)
+    return tuple(steps)
+
+
+def tie_steps(first_number: int, *, response: bool = True) -> tuple[SessionStep, ...]:
+    """Return what a run that is taken up again shows first, to tie it to what was taken before.
+
+    A grey and the primaries, by which the projector is known again, and a white and a dark frame, so that lights lie
+    between references of one level of the lamp.
+    """
+    colours = (Colour(TOP, TOP, TOP), *PRIMARIES) if response else ()
+    shown: list[tuple[FrameKind, Colour]] = [*(("response", colour) for colour in colours), ("white", WHITE)]
+    shown.append(("dark", BLACK))
+    return tuple(SessionStep(number, kind, None, colour) for number, (kind, colour) in enumerate(shown, first_number))
+
+
+def _shuffled(illuminations: Sequence[Illumination], seed: int) -> list[Illumination]:
+    from numpy.random import PCG64, Generator
+
+    return [illuminations[position] for position in Generator(PCG64(seed)).permutation(len(illuminations))]

@@ -1,0 +1,94 @@
+"""What is written as JSON or TOML and read again: typed, frozen records, made and checked by pydantic.
+
+A record's fields are the file's keys. Files of later versions may have more keys, those of earlier ones fewer: what was
+added has a default. Arrays are lists in the file, numbers that are not finite are null.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from typing import Annotated, Any, TypeVar, cast
+
+import numpy as np
+import numpy.typing as npt
+from pydantic import BaseModel, ConfigDict, PlainSerializer, PlainValidator, TypeAdapter, ValidationError
+
+from foundation.errors import FormatError
+
+T = TypeVar("T")
+
+
+def _as_lists(values: npt.NDArray[Any]) -> Any:
+    return _finite(values.tolist())
+
+
+def _finite(value: Any) -> Any:
+    """Return lists and numbers with None in place of what JSON cannot say."""
+    if isinstance(value, list):
+        return [_finite(item) for item in cast("list[Any]", value)]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def _as_floats(value: Any) -> npt.NDArray[np.float64]:
+    return np.asarray(value, dtype=np.float64)
+
+
+FloatArray = Annotated[npt.NDArray[np.float64], PlainValidator(_as_floats), PlainSerializer(_as_lists)]
+"""A float64 array of any shape as nested lists; NaN is null in the file."""
+
+
+class Record(BaseModel):
+    """A frozen record; a key that is not known is passed over, as later versions may have more."""
+
+    model_config = ConfigDict(frozen=True, extra="ignore", arbitrary_types_allowed=True, use_attribute_docstrings=True)
+
+
+def to_plain(record: Any, kind: Any = None) -> Any:
+    """Return a record, or a dataclass with typed fields, as JSON's objects, lists and numbers.
+
+    `kind` is its type, where it is not that of the object alone (`tuple[Frame, ...]`).
+    """
+    adapter: TypeAdapter[Any] = TypeAdapter(cast("Any", type(record) if kind is None else kind))
+    return adapter.dump_python(record, mode="json")
+
+
+def to_json(record: Any, kind: Any = None) -> str:
+    """Return a record as the text of a JSON file, two spaces a level and a newline at the end."""
+    return json.dumps(to_plain(record, kind), indent=2, ensure_ascii=False, allow_nan=False) + "\n"
+
+
+def from_plain(kind: type[T], value: Any, about: object, remedy: str) -> T:
+    """Return the record of a type, or a dataclass, from JSON's or TOML's objects.
+
+    Raises
+    ------
+    FormatError
+        A key is missing or its value is none of its type; `about` is the file, `remedy` what helps.
+    """
+    try:
+        return TypeAdapter(kind).validate_python(value)
+    except ValidationError as error:
+        raise damaged(error, about, remedy) from error
+
+
+def from_json(kind: type[T], text: bytes | str, about: object, remedy: str) -> T:
+    """Return the record of a type, or a dataclass, from the text of a JSON file; errors as of `from_plain`."""
+    try:
+        return TypeAdapter(kind).validate_json(text)
+    except ValidationError as error:
+        raise damaged(error, about, remedy) from error
+
+
+def damaged(error: ValidationError, about: object, remedy: str) -> FormatError:
+    """Return what to tell a user of a file that pydantic refused: the first key that is wrong, its value, and why."""
+    first = error.errors(include_url=False)[0]
+    key = ".".join(map(str, first["loc"]))
+    reason = first["msg"].removeprefix("Value error, ")
+    return FormatError(
+        f"damaged: {f'{key}: ' if key else ''}{reason}",
+        about=about,
+        remedy=remedy,
+        value=first["input"],
+        expected=reason,
+    )

@@ -1,0 +1,323 @@
+"""The layout's laws: nothing overlaps, every colour stands once, tags and references are where they serve best."""
+
+from __future__ import annotations
+
+from collections import Counter
+from functools import cache
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from experiment.chart.layout import (
+    A_SERIES_MM,
+    GREY_CODES,
+    LEAST_WHITES,
+    design_chart,
+    paper_chart,
+    smallest_page,
+    spread,
+)
+from experiment.chart.model import Chart
+from experiment.chart.printing import field_drawing
+from foundation.errors import InputError
+
+pytestmark = pytest.mark.slow
+
+PX_MM = 25.4 / 600
+MARGIN_MM = 8.0
+
+# bits 4 and 5 are large: a few seeds say as much.
+charts = st.builds(
+    cache(design_chart),
+    bits=st.sampled_from([1, 2, 3]),
+    page=st.just(None),
+    seed=st.integers(0, 2**32),
+) | st.builds(cache(design_chart), bits=st.sampled_from([4, 5]), page=st.just(None), seed=st.integers(0, 2))
+
+
+def slots_px(chart: Chart) -> npt.NDArray[np.int64]:
+    """(N, 4) left, top, right, bottom of cells, references and whole tags with their rims, pixels at 600 dpi."""
+    boxes = [np.concatenate([chart.centres_mm - 125 / 2 * PX_MM, chart.centres_mm + 125 / 2 * PX_MM], axis=1)]
+    for reference in chart.references:
+        centre, half = np.array(reference.centre_mm), np.array(reference.size_mm) / 2
+        boxes.append(np.concatenate([centre - half, centre + half])[None])
+    rim = 50 * PX_MM
+    boxes += [np.concatenate([tag.corners_mm[0] - rim, tag.corners_mm[2] + rim])[None] for tag in chart.tags]
+    exact = np.concatenate(boxes) / PX_MM
+    assert np.abs(exact - np.rint(exact)).max() < 1e-6, "every edge is a whole pixel at 600 dpi"
+    return np.rint(exact).astype(np.int64)
+
+
+@settings(deadline=None, max_examples=40)
+@given(charts)
+def test_slots_tile_the_field_without_overlap_or_gap_inside_the_margin(chart: Chart) -> None:
+    boxes = slots_px(chart)
+    (x0, y0), (x1, y1) = boxes[:, :2].min(axis=0), boxes[:, 2:].max(axis=0)
+    covered = np.zeros((int(y1 - y0) // 125, int(x1 - x0) // 125), dtype=np.int64)
+    for left, top, right, bottom in (boxes - [x0, y0, x0, y0]).tolist():
+        assert left % 125 == top % 125 == right % 125 == bottom % 125 == 0
+        covered[top // 125 : bottom // 125, left // 125 : right // 125] += 1
+    assert (covered == 1).all()
+    page = np.array(chart.page_mm)
+    assert (np.array([x0, y0]) * PX_MM >= MARGIN_MM).all()
+    assert (np.array([x1, y1]) * PX_MM <= page - MARGIN_MM).all()
+    centre = np.array([x0 + x1, y0 + y1]) / 2 * PX_MM
+    assert np.abs(centre - page / 2).max() <= PX_MM, "the field is centred to a pixel"
+
+
+@settings(deadline=None, max_examples=40)
+@given(charts)
+def test_every_colour_stands_once_and_every_quarter_has_every_level(chart: Chart) -> None:
+    """But where there are fewer than four of a grey."""
+    assert sorted(chart.colours.tolist()) == list(range(8**chart.bits))
+    levels = Counter(reference.rgb for reference in chart.references)
+    assert set(levels) == {(code, code, code) for code in (*GREY_CODES, 255)}
+    assert abs(levels[(255, 255, 255)] - len(chart.references) / 2) < 5
+    middle = np.array(chart.page_mm) / 2
+    quarters = Counter(
+        (reference.rgb, reference.centre_mm[0] > middle[0], reference.centre_mm[1] > middle[1])
+        for reference in chart.references
+    )
+    assert levels[(255, 255, 255)] >= LEAST_WHITES
+    scarce = [level for level in levels if levels[level] < 4]
+    assert len(quarters) == 4 * len(levels) - len(scarce)
+    assert not scarce or chart.bits == 2
+
+
+@settings(deadline=None, max_examples=40)
+@given(charts)
+def test_tags_are_numbered_row_by_row_reach_the_edges_and_stand_close_enough(chart: Chart) -> None:
+    corners = np.array([tag.corners_mm for tag in chart.tags])
+    assert [tag.id for tag in chart.tags] == list(range(len(chart.tags)))
+    assert len(chart.tags) >= 4
+    side = 8 * 50 * PX_MM
+    np.testing.assert_allclose(
+        corners - corners[:, :1],
+        np.tile([[[0, 0], [side, 0], [side, side], [0, side]]], (len(corners), 1, 1)),
+        atol=1e-9,
+    )
+    places = corners[:, 0]
+    assert (np.lexsort((places[:, 0], places[:, 1])) == np.arange(len(places))).all()
+    boxes = slots_px(chart)
+    tags = boxes[-len(chart.tags) :]
+    assert (tags[:, :2].min(axis=0) == boxes[:, :2].min(axis=0)).all()
+    assert (tags[:, 2:].max(axis=0) == boxes[:, 2:].max(axis=0)).all()
+    for axis in (0, 1):
+        steps = np.diff(np.unique(tags[:, axis]))
+        assert steps.min() >= 4 * 125
+        assert steps.max() <= 38 * 125
+
+
+def test_the_paper_s_chart_on_a0() -> None:
+    chart = design_chart()
+    boxes = slots_px(chart)
+    assert ((boxes[:, 2:].max(axis=0) - boxes[:, :2].min(axis=0)) / 125).tolist() == [221, 155]
+    assert chart.page_mm == (1189, 841)
+    assert (chart.colour_count, len(chart.tags), len(chart.references)) == (32768, 35, 927)
+    assert len(np.unique([tag.corners_mm[0, 0] for tag in chart.tags])) == 7
+    assert Counter(reference.name for reference in chart.references) == {
+        "white": 467,
+        **{f"grey {code}": 115 for code in GREY_CODES},
+    }
+
+
+def test_references_on_a0_are_even_and_no_lattice() -> None:
+    chart = design_chart()
+    places = np.array([reference.centre_mm for reference in chart.references]) / chart.cell_mm[0]
+    apart = np.linalg.norm(places[:, None] - places[None], axis=2)
+    np.fill_diagonal(apart, np.inf)
+    # 36.3 slots a reference: a square lattice would stand 6.02 apart, a random choice has pairs side by side.
+    assert apart.min() >= 4
+    holes = np.array(
+        [np.linalg.norm(places - centre, axis=1).min() for centre in chart.centres_mm[::7] / chart.cell_mm[0]]
+    )
+    assert holes.max() <= 6
+    # A lattice has peaks as high as the number of its points; noise has 1 everywhere.
+    picture = np.zeros((155, 221))
+    column, row = np.rint(places - places.min(axis=0)).astype(int).T
+    picture[row, column] = 1
+    power = np.abs(np.fft.fft2(picture - picture.mean())) ** 2 / len(places)
+    assert power.max() < len(places) / 20
+
+
+def test_the_greys_halve_the_light_of_srgb_and_are_no_colours_of_the_chart() -> None:
+    # IEC 61966-2-1: code 188 is linear 0.5029, and so on by hand.
+    for code, linear in zip(GREY_CODES, (0.5, 0.25, 0.125, 0.0625), strict=True):
+        assert ((code / 255 + 0.055) / 1.055) ** 2.4 == pytest.approx(linear, rel=0.01)
+        assert code % 8 != 0
+
+
+def test_the_same_seed_gives_the_same_chart_and_another_seed_another() -> None:
+    assert design_chart(3, seed=5).to_json() == design_chart(3, seed=5).to_json()
+    assert design_chart(3, seed=5).sha256 != design_chart(3, seed=6).sha256
+    assert not np.array_equal(design_chart(3, seed=5).colours, np.sort(design_chart(3, seed=5).colours))
+
+
+@pytest.mark.parametrize(("bits", "name"), [(1, "A7"), (2, "A7"), (3, "A5"), (4, "A2"), (5, "A0")])
+def test_the_smallest_page(bits: int, name: str) -> None:
+    assert smallest_page(bits) == name
+    assert design_chart(bits).page_mm == A_SERIES_MM[name]
+
+
+def test_a_page_can_be_larger_named_or_measured() -> None:
+    assert design_chart(2, "a4").page_mm == (297, 210)
+    portrait = design_chart(3, (148, 210))
+    assert portrait.page_mm == (148, 210)
+    assert len(portrait.references) == len(design_chart(3).references)
+
+
+@pytest.mark.parametrize(
+    ("bits", "page", "seed", "message"),
+    [
+        (0, None, 1, "1 to 5 bits"),
+        (6, None, 1, "1 to 5 bits"),
+        (5, None, -1, "seed is -1"),
+        (
+            5,
+            "A5",
+            1,
+            r"210 × 148 mm is too small for the 32768 colours .* even with cells of 1.06 mm.* A4 .* best .* A0",
+        ),
+        (4, "A8", 1, r"A7 \(105 × 74 mm\).* A2"),
+        (2, (18.0, 500.0), 1, "A8"),
+        (2, (0.0, 500.0), 1, "above 0"),
+        (2, (float("nan"), 500.0), 1, "above 0"),
+        (2, (float("inf"), 500.0), 1, "above 0"),
+        (2, "Letter", 1, "'Letter' is not known; name one of A0"),
+        (5, (6000.0, 6000.0), 1, "family 36h11 has 587"),
+    ],
+)
+def test_what_cannot_be_designed_says_what_can(
+    bits: int, page: str | tuple[float, float] | None, seed: int, message: str
+) -> None:
+    with pytest.raises(InputError, match=message):
+        design_chart(bits, page, seed)
+
+
+@settings(deadline=None, max_examples=40)
+@given(st.integers(2, 20), st.integers(2, 20), st.floats(0, 1), st.floats(0.1, 1), st.integers(0, 99))
+def test_spread_chooses_as_many_as_asked_among_the_allowed(
+    rows: int, columns: int, share: float, density: float, seed: int
+) -> None:
+    rng = np.random.default_rng(seed)
+    allowed = rng.random((rows, columns)) < density
+    allowed[0, 0] = True
+    count = round(share * int(allowed.sum()))
+    chosen = spread(allowed, count, rng)
+    assert chosen.sum() == count
+    assert not (chosen & ~allowed).any()
+
+
+def test_the_drawing_covers_every_tag_cell_and_reference() -> None:
+    chart = design_chart(2)
+    drawn = field_drawing(chart)
+    assert drawn.rectangles_mm.dtype == np.float64
+    assert drawn.rgb.dtype == np.uint8
+    assert len(drawn.rectangles_mm) == len(drawn.rgb)
+    assert drawn.tiles == len(chart.centres_mm) + len(chart.references)
+    tiles, shades = drawn.rectangles_mm[-drawn.tiles :], drawn.rgb[-drawn.tiles :]
+    centres = {tuple(centre) for centre in ((tiles[:, :2] + tiles[:, 2:]) / 2).round(6).tolist()}
+    places = [*chart.centres_mm.tolist(), *(reference.centre_mm for reference in chart.references)]
+    assert centres == {(round(x, 6), round(y, 6)) for x, y in places}
+    codes = Counter(tuple(shade) for shade in shades.tolist())
+    assert codes == Counter([tuple(rgb) for rgb in chart.rgb.tolist()] + [item.rgb for item in chart.references])
+    area = np.prod(drawn.rectangles_mm[:, 2:] - drawn.rectangles_mm[:, :2], axis=1)
+    assert area[-1] == pytest.approx(chart.cell_mm[0] * chart.cell_mm[1])
+    rims = (drawn.rgb == 255).all(axis=1) & (area > 15 * area[-1])
+    assert rims.sum() == len(chart.tags)
+
+
+@pytest.mark.parametrize(
+    ("bits", "page", "pixels"), [(5, "A1", 85), (5, "A2", 60), (4, "A3", 120), (3, (100.0, 500.0), 125), (5, "A3", 40)]
+)
+def test_cells_shrink_to_whole_pixels_on_a_page_too_small(
+    bits: int, page: str | tuple[float, float], pixels: int
+) -> None:
+    chart = design_chart(bits, page)
+    assert chart.cell_mm == pytest.approx((pixels * PX_MM, pixels * PX_MM))
+    assert sorted(chart.colours.tolist()) == list(range(8**bits))
+    module = np.ptp(chart.tags[0].corners_mm[:, 0]) / 8 / PX_MM
+    assert module == pytest.approx(0.4 * pixels)
+    assert module == pytest.approx(round(module)), "a module is whole pixels"
+    for edges in (chart.centres_mm - np.array(chart.cell_mm) / 2, np.array([tag.corners_mm for tag in chart.tags])):
+        assert np.abs(edges / PX_MM - np.rint(edges / PX_MM)).max() < 1e-6
+    # One size larger does not fit: there is no room for as many slots within the margins.
+    larger = pixels + 5
+    room = [int((side / PX_MM - 2 * 189) // larger) for side in chart.page_mm]
+    assert pixels == 125 or room[0] * room[1] < 8**bits * 41 / 40 + 16 * len(chart.tags)
+
+
+def test_the_cell_s_size_can_be_chosen() -> None:
+    assert design_chart(2, "A4", cell_mm=7.0).cell_mm[0] == pytest.approx(165 * PX_MM)
+    assert design_chart(2, cell_mm=2.54).page_mm == A_SERIES_MM["A8"]
+    with pytest.raises(InputError, match=r"in cells of 5\.29 mm; 3\.60 mm fit"):
+        design_chart(5, "A1", cell_mm=5.3)
+    for wrong in (0.9, 0.0, -1.0, float("nan")):
+        with pytest.raises(InputError, match=r"1\.06 mm"):
+            design_chart(2, cell_mm=wrong)
+    with pytest.raises(InputError, match="no A page holds"):
+        design_chart(5, cell_mm=20.0)
+
+
+def test_the_seed_and_the_software_are_kept() -> None:
+    assert design_chart(1, seed=7).seed == 7
+    assert str(design_chart(1).software).startswith("croplab ")
+
+
+def test_the_paper_s_arrangement_is_a_plain_grid_of_every_colour_once() -> None:
+    chart = paper_chart()
+    assert chart.page_mm == (1189, 841)
+    assert chart.cell_mm == pytest.approx((4.58, 6.45), abs=0.02)
+    assert chart.tags == ()
+    assert sorted(chart.colours.tolist()) == list(range(32768))
+    corner = (chart.centres_mm - np.array(chart.cell_mm) / 2) / PX_MM
+    assert np.abs(corner - np.rint(corner)).max() < 1e-6
+    xs, ys = (np.unique(chart.centres_mm[:, axis].round(6)) for axis in (0, 1))
+    assert (len(xs), len(ys)) == (256, 128)
+    assert np.diff(xs) == pytest.approx(chart.cell_mm[0])
+    assert np.diff(ys) == pytest.approx(chart.cell_mm[1])
+    assert min(xs[0] - chart.cell_mm[0] / 2, ys[0] - chart.cell_mm[1] / 2) >= MARGIN_MM
+    # The documented order: neighbours in a row differ by one step, as do those in a column but for blue between blocks.
+    codes = chart.rgb.reshape(128, 256, 3).astype(int)
+    across, down = np.abs(np.diff(codes, axis=1)), np.abs(np.diff(codes, axis=0))
+    assert (across.sum(axis=2) == 8).all()
+    assert (np.delete(down, [31, 63, 95], axis=0).sum(axis=2) == 8).all()
+    assert (down[:, :, :2].sum(axis=2)[[31, 63, 95]] == 0).all()
+    assert codes[0, 0].tolist() == [0, 0, 0]
+    assert codes[0, 31].tolist() == [248, 0, 0]
+    assert codes[31, 0].tolist() == [0, 248, 0]
+    assert codes[0, 255].tolist() == [0, 0, 56]
+
+
+@pytest.mark.parametrize("bits", [1, 2, 3, 4])
+def test_a_small_paper_s_arrangement_is_of_the_same_kind(bits: int) -> None:
+    chart = paper_chart("A4", bits)
+    assert sorted(chart.colours.tolist()) == list(range(8**bits))
+    assert len(chart.white_references) >= 6
+    columns = len(np.unique(chart.centres_mm[:, 0].round(3)))
+    codes = chart.rgb.astype(np.int64).reshape(-1, columns, 3) >> (8 - bits)
+    # Along a row neighbours differ by one step in one channel.
+    assert np.abs(np.diff(codes, axis=1)).sum(axis=2).max() == 1
+
+
+def test_a_paper_s_arrangement_of_six_bits_does_not_exist() -> None:
+    with pytest.raises(InputError, match="1 to 5 bits"):
+        paper_chart(bits=6)
+
+
+def test_the_paper_s_references_are_bare_margin() -> None:
+    chart = paper_chart()
+    places = np.array([reference.centre_mm for reference in chart.references])
+    half = np.array([reference.size_mm for reference in chart.references]) / 2
+    low, high = chart.centres_mm.min(axis=0), chart.centres_mm.max(axis=0)
+    edge = np.array(chart.cell_mm) / 2 + 1.4
+    assert all(reference.is_white for reference in chart.references)
+    assert len(places) >= 20
+    assert (((places + half <= low - edge) | (places - half >= high + edge)).any(axis=1)).all()
+    assert (places - half > 0).all()
+    assert (places + half < chart.page_mm).all()
+    with pytest.raises(InputError, match="256 × 128 cells"):
+        paper_chart("A5")

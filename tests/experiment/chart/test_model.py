@@ -1,0 +1,200 @@
+"""`chart.json`: what is written is read again, and a bad file is refused in one sentence."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from experiment.chart.layout import design_chart, paper_chart
+from experiment.chart.model import Chart, colour_of_index, load_chart
+from foundation.errors import FormatError
+
+pytestmark = pytest.mark.slow
+
+# Written by hand from the format's description, with keys that this version does not know.
+BY_HAND = """{"format": "crop.chart", "version": 1, "page_mm": [60, 40.5], "bits": 1, "cell_mm": [5, 4],
+"made by": "hand",
+"cells": {"centre_mm": [[1,2],[3,4],[5,6],[7,8],[9,10],[11,12],[13,14],[15,16.25]], "colour": [7,6,5,4,3,2,1,0]},
+"tags": [{"family": "36h11", "id": 3, "corners_mm": [[20,20],[28,20],[28,28],[20,28]], "note": "x"}],
+"references": [{"name": "white", "rgb": [255,255,255], "centre_mm": [30,30], "size_mm": [5,4]},
+               {"name": "grey", "rgb": [99,99,99], "centre_mm": [40,30], "size_mm": [6,4]}]}"""
+
+
+def test_a_file_written_by_hand(tmp_path: Path) -> None:
+    path = tmp_path / "chart.json"
+    path.write_text(BY_HAND)
+    chart = load_chart(path)
+    assert chart.page_mm == (60, 40.5)
+    assert (chart.bits, chart.colour_count, chart.cell_mm) == (1, 8, (5, 4))
+    assert chart.centres_mm.dtype == np.float64
+    assert chart.centres_mm[7].tolist() == [15, 16.25]
+    assert chart.colours.tolist() == [7, 6, 5, 4, 3, 2, 1, 0]
+    assert chart.cell_of_colour.tolist() == [7, 6, 5, 4, 3, 2, 1, 0]
+    # Index 6 is binary 110: red and green, no blue.
+    assert chart.rgb[1].tolist() == [128, 128, 0]
+    assert (chart.tags[0].family, chart.tags[0].id) == ("36h11", 3)
+    assert chart.tags[0].corners_mm.tolist() == [[20, 20], [28, 20], [28, 28], [20, 28]]
+    assert [reference.is_white for reference in chart.references] == [True, False]
+    assert chart.white_references == (chart.references[0],)
+    assert chart.references[1].size_mm == (6, 4)
+
+
+@pytest.mark.parametrize("bits", [1, 2, 3, 4])
+def test_what_is_saved_is_read_again(bits: int, tmp_path: Path) -> None:
+    chart = design_chart(bits, seed=bits)
+    chart.save(tmp_path / "chart.json")
+    again = load_chart(tmp_path / "chart.json")
+    assert (again.page_mm, again.bits, again.cell_mm) == (chart.page_mm, chart.bits, chart.cell_mm)
+    np.testing.assert_array_equal(again.colours, chart.colours)
+    np.testing.assert_allclose(again.centres_mm, chart.centres_mm, rtol=0, atol=1e-6)
+    for one, other in zip(again.tags, chart.tags, strict=True):
+        assert (one.family, one.id) == (other.family, other.id)
+        np.testing.assert_allclose(one.corners_mm, other.corners_mm, rtol=0, atol=1e-6)
+    for one, other in zip(again.references, chart.references, strict=True):
+        assert (one.name, one.rgb, one.size_mm) == (other.name, other.rgb, other.size_mm)
+        assert one.centre_mm == pytest.approx(other.centre_mm, abs=1e-6)
+    assert again.to_json() == chart.to_json()
+    assert again.sha256 == chart.sha256
+
+
+def test_seed_and_software_are_kept_and_an_old_file_keeps_its_hash(tmp_path: Path) -> None:
+    chart = design_chart(1, seed=3)
+    document = json.loads(chart.to_json())
+    assert document["seed"] == 3
+    assert document["software"] == chart.software
+    # The text of version 1 before the keys were there: those of the design, in that order, and nothing else.
+    for key in ("seed", "software"):
+        del document[key]
+    old = json.dumps(document, separators=(",", ":")) + "\n"
+    path = tmp_path / "chart.json"
+    path.write_text(old)
+    again = load_chart(path)
+    assert (again.seed, again.software) == (None, None)
+    assert again.to_json() == old
+    assert again.sha256 == hashlib.sha256(old.encode()).hexdigest()
+
+
+def test_a_chart_without_tags_is_read_again(tmp_path: Path) -> None:
+    chart = paper_chart()
+    chart.save(tmp_path / "chart.json")
+    again = load_chart(tmp_path / "chart.json")
+    assert again.tags == ()
+    assert again.sha256 == chart.sha256
+
+
+def test_the_paper_s_chart_is_read_again(a0: Chart, tmp_path: Path) -> None:
+    a0.save(tmp_path / "chart.json")
+    assert load_chart(tmp_path / "chart.json").sha256 == a0.sha256
+
+
+@given(st.integers(1, 5), st.data())
+def test_the_colour_of_an_index(bits: int, data: st.DataObject) -> None:
+    index = data.draw(st.integers(0, 8**bits - 1))
+    red, green, blue = (int(code) for code in colour_of_index(index, bits))
+    low = 8 - bits
+    assert ((red >> low) << 2 * bits) | ((green >> low) << bits) | (blue >> low) == index
+    assert all(code % (1 << low) == 0 for code in (red, green, blue))
+
+
+def test_colours_of_the_paper() -> None:
+    # DESIGN: index = (r5 << 10) | (g5 << 5) | b5 with r5 = R8 >> 3.
+    assert colour_of_index([0, 31, 31 << 5, 31 << 10, 32767], 5).tolist() == [
+        [0, 0, 0],
+        [0, 0, 248],
+        [0, 248, 0],
+        [248, 0, 0],
+        [248, 248, 248],
+    ]
+    assert colour_of_index(np.arange(32768), 5).dtype == np.uint8
+    assert len(np.unique(colour_of_index(np.arange(32768), 5), axis=0)) == 32768
+
+
+def set_(*keys: str | int, to: object) -> Callable[[dict[str, Any]], None]:
+    def change(document: dict[str, Any]) -> None:
+        part: Any = document
+        for key in keys[:-1]:
+            part = part[key]
+        part[keys[-1]] = to
+
+    return change
+
+
+def drop(key: str) -> Callable[[dict[str, Any]], None]:
+    def change(document: dict[str, Any]) -> None:
+        del document[key]
+
+    return change
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (set_("format", to="crop.lut"), "format"),
+        (set_("version", to=2), "version"),
+        (drop("page_mm"), "page_mm"),
+        (drop("cells"), "cells"),
+        (drop("tags"), "tags"),
+        (set_("page_mm", to=[60]), "page_mm"),
+        (set_("page_mm", 0, to=-60), "page_mm"),
+        (set_("page_mm", 0, to=float("nan")), "page_mm"),
+        (set_("cell_mm", 0, to=0), "cell_mm"),
+        (set_("bits", to=6), "bits"),
+        (set_("bits", to="1"), "bits"),
+        (set_("bits", to=2), "64 colours"),
+        (set_("cells", "colour", 0, to=0), "one cell for each of its 8 colours"),
+        (set_("cells", "colour", 0, to=8), "one cell for each of its 8 colours"),
+        (set_("cells", "colour", to=[]), "0 colours"),
+        (set_("cells", "centre_mm", to=[[1, 2]]), "1 centres and 8 colours"),
+        (set_("cells", "centre_mm", 3, to=["a", 2]), "cells.centre_mm.3"),
+        (set_("tags", 0, "corners_mm", to=[[1, 2], [3, 4], [5, 6]]), "tags.0.corners_mm"),
+        (set_("tags", 0, "id", to=-1), "tags.0.id"),
+        (set_("references", 1, "rgb", to=[99, 99, 256]), "references.1.rgb"),
+        (set_("references", 1, "size_mm", to=[0, 1]), "references.1.size_mm"),
+        (set_("seed", to=-1), "seed"),
+        (set_("software", to=3), "software"),
+    ],
+)
+def test_a_bad_chart_is_refused_in_one_sentence(
+    change: Callable[[dict[str, Any]], None], message: str, tmp_path: Path
+) -> None:
+    document = json.loads(BY_HAND)
+    change(document)
+    path = tmp_path / "chart.json"
+    path.write_text(json.dumps(document))
+    with pytest.raises(FormatError) as refused:
+        load_chart(path)
+    assert message in str(refused.value)
+    assert str(path) in str(refused.value)
+    assert "\n" not in str(refused.value)
+
+
+def test_tags_of_one_number_are_refused(tmp_path: Path) -> None:
+    document = json.loads(BY_HAND)
+    document["tags"] *= 2
+    path = tmp_path / "chart.json"
+    path.write_text(json.dumps(document))
+    with pytest.raises(FormatError, match="its own number"):
+        load_chart(path)
+
+
+@pytest.mark.parametrize("content", [b"", b"{", b"[]", b"\xff\xfe\x00", b'"crop.chart"', b"II*\0" + bytes(100)])
+def test_what_is_no_json_object_is_refused(content: bytes, tmp_path: Path) -> None:
+    path = tmp_path / "chart.json"
+    path.write_bytes(content)
+    with pytest.raises(FormatError, match="is no chart that this version reads") as refused:
+        load_chart(path)
+    assert "\n" not in str(refused.value)
+
+
+def test_a_missing_chart_or_a_folder_is_refused(tmp_path: Path) -> None:
+    for path in (tmp_path / "none.json", tmp_path):
+        with pytest.raises(FormatError, match=r"cannot read chart .*; name the chart.json"):
+            load_chart(path)

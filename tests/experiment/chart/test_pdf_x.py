@@ -1,0 +1,212 @@
+"""A preflight of the PDFs that go to print shops, and the profiles that they name.
+
+No kept library checks PDF/X (veraPDF checks PDF/A and PDF/UA). So the file is read here by a small reader of its own,
+which follows the cross-reference table and not the writer's order, and held against what PDF/X-4 (ISO 15930-7:2010)
+asks of a page, by the clauses of ISO 32000-1 that define it. Where pikepdf is installed it reads the file as well.
+"""
+
+from __future__ import annotations
+
+import io
+import re
+import shutil
+import subprocess
+import zlib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, cast
+from xml.etree import ElementTree
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+import tifffile
+from PIL import Image, ImageCms
+
+from experiment.chart.layout import design_chart
+from experiment.chart.printing import save_pdf, save_tiff
+from experiment.chart.proof import save_proof
+from experiment.chart.rgb_profiles import srgb_display_profile, srgb_output_profile
+
+NAMESPACES = {
+    "rdf": "http://www.w3.org/1999/02/22-rdf-syntax-ns#",
+    "dc": "http://purl.org/dc/elements/1.1/",
+    "xmp": "http://ns.adobe.com/xap/1.0/",
+    "xmpMM": "http://ns.adobe.com/xap/1.0/mm/",
+    "pdf": "http://ns.adobe.com/pdf/1.3/",
+    "pdfxid": "http://www.npes.org/pdfx/ns/id/",
+}
+
+FORBIDDEN = (
+    *(b"/Encrypt", b"/JavaScript", b"/JS", b"/AA", b"/OpenAction", b"/Annots", b"/EmbeddedFile", b"/Font"),
+    *(b"/TR", b"/HTP", b"/OPI", b"/PS", b"/LZWDecode", b"/SMask", b"/Group", b"/ExtGState", b"/Alternates"),
+)
+"""Keys of what PDF/X does not allow, or what this page has no need of: encryption, actions, files, fonts, transfer
+functions, halftones, OPI, PostScript, LZW, transparency."""
+
+
+class Pdf:
+    """The objects of a file without compressed cross-references."""
+
+    def __init__(self, data: bytes) -> None:
+        self.data = data
+        start = int(re.findall(rb"startxref\n(\d+)\n%%EOF", data)[-1])
+        head = re.match(rb"xref\n0 (\d+)\n", data[start:])
+        assert head is not None
+        self.objects: dict[int, bytes] = {}
+        lines = data[start + head.end() :][: 20 * int(head[1])]
+        for number in range(1, int(head[1])):
+            offset, kind = int(lines[20 * number :][:10]), lines[20 * number + 17 :][:1]
+            assert kind == b"n"
+            begun = re.match(rb"%d 0 obj\n" % number, data[offset:])
+            assert begun is not None, f"object {number} is not at its offset"
+            self.objects[number] = data[offset + begun.end() : data.index(b"\nendobj", offset)]
+        self.trailer = data[data.index(b"trailer", start) :]
+
+    def of(self, text: bytes, key: str) -> bytes:
+        """Return the object that a key of another refers to."""
+        found = re.search(rb"/%s \[?(\d+) 0 R" % key.encode(), text)
+        assert found is not None, f"{key} is missing"
+        return self.objects[int(found[1])]
+
+    @staticmethod
+    def stream(text: bytes) -> bytes:
+        """Return what a stream holds, after its length is found to be right."""
+        length = re.search(rb"/Length (\d+)", text)
+        assert length is not None
+        body = text[text.index(b"stream\n") + 7 : text.rindex(b"\nendstream")]
+        assert len(body) == int(length[1])
+        return zlib.decompress(body) if b"/FlateDecode" in text else body
+
+
+def box_of(page: bytes, name: str) -> list[float]:
+    found = re.search(rb"/%s \[([-\d. ]+)\]" % name.encode(), page)
+    assert found is not None, f"{name} is missing"
+    return [float(value) for value in found[1].split()]
+
+
+@pytest.fixture(scope="module", params=["chart", "proof"])
+def pdf(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("pdf") / f"{request.param}.pdf"
+    (save_pdf if request.param == "chart" else save_proof)(design_chart(2), path)
+    return path
+
+
+def test_preflight(pdf: Path) -> None:
+    data = pdf.read_bytes()
+    # ISO 32000-1, 7.5.2: version, and a comment of at least four bytes above 127; PDF/X-4 is based on PDF 1.6.
+    assert data.startswith(b"%PDF-1.6\n%")
+    assert all(byte > 127 for byte in data[10:14])
+    read = Pdf(data)
+    # 14.4: two file identifiers, present in PDF/X; no encryption.
+    assert re.search(rb"/ID \[<[0-9a-f]{32}> ?<[0-9a-f]{32}>\]", read.trailer)
+    structure = b"".join(text.split(b"stream\n")[0] for text in read.objects.values()) + read.trailer
+    for key in FORBIDDEN:
+        assert not re.search(re.escape(key) + rb"\b", structure), key
+    catalog = read.of(read.trailer, "Root")
+    page = read.of(read.of(catalog, "Pages"), "Kids")
+    # 14.11.2: trim within bleed within media; PDF/X wants a TrimBox or an ArtBox, not both.
+    media, bleed, trim = (box_of(page, name) for name in ("MediaBox", "BleedBox", "TrimBox"))
+    assert b"/ArtBox" not in page
+    assert media[0] <= bleed[0] <= trim[0] < trim[2] <= bleed[2] <= media[2]
+    assert media[1] <= bleed[1] <= trim[1] < trim[3] <= bleed[3] <= media[3]
+    # 14.11.5: one output intent of PDF/X, whose profile is of an output device (class prtr) and of RGB.
+    intent = read.of(catalog, "OutputIntents")
+    assert re.search(rb"/S /GTS_PDFX\b", intent)
+    assert re.search(rb"/OutputConditionIdentifier \(.+?\)", intent)
+    assert re.search(rb"/Info \(.+?\)", intent)
+    profile = read.stream(read.of(intent, "DestOutputProfile"))
+    assert profile == srgb_output_profile()
+    # Colours of the page are of the kind of the intent: DeviceRGB alone (rg; /RGB of the image inside the page).
+    content = read.stream(read.of(page, "Contents"))
+    operators = set(re.findall(rb"(?<![\w/])([a-zA-Z*]+)(?=\n|$)", re.sub(rb"BI.*?EI", b"", content, flags=re.DOTALL)))
+    assert operators <= {b"rg", b"re", b"f", b"q", b"Q", b"cm"}
+    # 8.4.5, 7.8.3: nothing is drawn with a resource, so that none is named and no font is there unused.
+    assert re.search(rb"/Resources << >>", page)
+    # 14.3.3 and 14.11.6: title, and whether it is trapped, which may not be unknown.
+    information = read.of(read.trailer, "Info")
+    assert re.search(rb"/Trapped /(True|False)\b", information)
+    assert b"/GTS_PDFXVersion (PDF/X-4)" in information
+    # 14.3.2: XMP, readable without PDF, with version, dates and identifiers; it agrees with the information.
+    metadata = read.of(catalog, "Metadata")
+    assert b"/Filter" not in metadata
+    found = ElementTree.fromstring(read.stream(metadata).decode("utf-8").split("?>", 1)[1].rsplit("<?", 1)[0])
+    for name in ("xmp:CreateDate", "xmp:ModifyDate", "xmp:MetadataDate", "xmpMM:DocumentID", "xmpMM:VersionID"):
+        assert found.findtext(f".//{name}", namespaces=NAMESPACES), name
+    assert found.findtext(".//xmpMM:RenditionClass", namespaces=NAMESPACES) == "default"
+    assert found.findtext(".//pdf:Trapped", namespaces=NAMESPACES) == "False"
+    assert found.findtext(".//pdfxid:GTS_PDFXVersion", namespaces=NAMESPACES) == "PDF/X-4"
+    title = found.findtext(".//dc:title//rdf:li", namespaces=NAMESPACES)
+    assert title is not None
+    assert f"/Title ({title})".encode() in information
+
+
+def test_the_preflight_sees_what_is_missing(pdf: Path, tmp_path: Path) -> None:
+    whole = pdf.read_bytes()
+    for key in (b"/TrimBox", b"/GTS_PDFX ", b"/Trapped", b"/DestOutputProfile"):
+        broken = tmp_path / "broken.pdf"
+        broken.write_bytes(whole.replace(key, b"/" + b"X" * (len(key) - 1)))
+        with pytest.raises(AssertionError):
+            test_preflight(broken)
+
+
+def test_an_independent_reader_finds_no_font_and_the_boxes(pdf: Path) -> None:
+    if shutil.which("pdfinfo") is None or shutil.which("pdffonts") is None:
+        pytest.skip("poppler is not installed")
+    told = subprocess.run(["pdfinfo", "-box", pdf], capture_output=True, text=True, check=True)
+    assert told.stderr == ""
+    boxes = dict(re.findall(r"^(\w+Box): +(.+)$", told.stdout, re.MULTILINE))
+    assert boxes["TrimBox"] == boxes["MediaBox"]
+    assert "PDF version:     1.6" in told.stdout
+    fonts = subprocess.run(["pdffonts", pdf], capture_output=True, text=True, check=True).stdout
+    assert len(fonts.splitlines()) == 2
+
+
+def test_another_library_opens_it(pdf: Path) -> None:
+    library: Any = pytest.importorskip("pikepdf", reason="pikepdf is not installed")
+    with library.open(pdf) as opened:
+        assert opened.check_pdf_syntax() == []
+        assert opened.Root.OutputIntents[0].S == "/GTS_PDFX"
+        assert "/Font" not in opened.pages[0].Resources
+
+
+@pytest.mark.parametrize("make", [srgb_output_profile, srgb_display_profile])
+def test_a_profile_is_srgb_to_little_cms(make: Callable[[], bytes]) -> None:
+    # Pillow's stubs leave most of its colour management unknown.
+    cms: Any = ImageCms
+    profile = cms.ImageCmsProfile(io.BytesIO(make()))
+    reference, lab = cms.createProfile("sRGB"), cms.createProfile("LAB")
+    codes = np.random.default_rng(1).integers(0, 256, (64, 64, 3)).astype(np.uint8)
+    picture, intent = Image.fromarray(codes), cms.Intent.RELATIVE_COLORIMETRIC
+
+    def through(one: Any, other: Any, mode: str) -> npt.NDArray[np.int64]:
+        seen = cms.applyTransform(picture, cms.buildTransform(one, other, "RGB", mode, intent))
+        return np.asarray(seen).astype(np.int64)
+
+    # Hue channels of an 8-bit LAB picture are signed and wrap at 128.
+    difference = through(profile, lab, "LAB") - through(reference, lab, "LAB")
+    assert np.abs((difference + 128) % 256 - 128).max() <= 1
+    assert np.abs(through(reference, profile, "RGB") - codes).max() <= 1
+
+
+def test_the_output_profile_is_of_an_output_device() -> None:
+    profile = srgb_output_profile()
+    # ICC.1:2001-04, 6.1: size, class, spaces; 6.3: the tags that a table-based output profile has.
+    assert int.from_bytes(profile[:4], "big") == len(profile)
+    assert profile[12:24] == b"prtrRGB XYZ "
+    count = int.from_bytes(profile[128:132], "big")
+    tags = {profile[132 + 12 * k : 136 + 12 * k] for k in range(count)}
+    needed = "desc cprt wtpt A2B0 A2B1 A2B2 B2A0 B2A1 B2A2 gamt"
+    assert tags == {name.encode() for name in needed.split()}
+    assert srgb_output_profile() == profile
+
+
+def test_the_tagged_tiff_has_the_codes_of_the_untagged_one(tmp_path: Path) -> None:
+    chart = design_chart(1)
+    save_tiff(chart, tmp_path / "plain.tif")
+    save_tiff(chart, tmp_path / "tagged.tif", tagged=True)
+    np.testing.assert_array_equal(tifffile.imread(tmp_path / "plain.tif"), tifffile.imread(tmp_path / "tagged.tif"))
+    with tifffile.TiffFile(tmp_path / "plain.tif") as plain, tifffile.TiffFile(tmp_path / "tagged.tif") as tagged:
+        before, after = cast("Any", plain.pages[0]), cast("Any", tagged.pages[0])
+        assert 34675 not in before.tags
+        assert bytes(after.tags[34675].value) == srgb_display_profile()

@@ -1,0 +1,286 @@
+"""The print: every edge on its pixel, every colour exact, true size, and tags that an independent library reads."""
+
+from __future__ import annotations
+
+import errno
+import os
+import re
+import shutil
+import subprocess
+import zlib
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+import pytest
+import tifffile
+from pyapriltags import Detector
+
+from experiment.chart.layout import design_chart, paper_chart
+from experiment.chart.model import Chart, Tag
+from experiment.chart.printing import drawing, label, preview, save_pdf, save_preview, save_tiff, tag_modules
+from foundation.errors import InputError, StorageError
+
+pytestmark = pytest.mark.slow
+
+
+def detect(picture: npt.NDArray[np.uint8]) -> dict[int, npt.NDArray[np.float64]]:
+    """Corners of the tags that the AprilTag authors' library finds, clockwise from the print's top-left, px.
+
+    Its pixel corners stand at integers, as they do when millimetres are multiplied by pixels a millimetre.
+    """
+    detector = Detector(families="tag36h11", nthreads=1, quad_decimate=1.0)
+    grey = picture.mean(axis=2).astype(np.uint8)
+    return {found.tag_id: found.corners[[1, 0, 3, 2]] for found in detector.detect(grey)}
+
+
+def painted(chart: Chart, dpi: int) -> npt.NDArray[np.uint8]:
+    """Cells and references painted one by one; the tags' squares stay as they are for `detect` to judge."""
+    width, height = (round(side * dpi / 25.4) for side in chart.page_mm)
+    picture = np.full((height, width, 3), 255, dtype=np.uint8)
+    side = dpi * 125 // 600
+    places = [*chart.centres_mm.tolist(), *(reference.centre_mm for reference in chart.references)]
+    codes = [*chart.rgb.tolist(), *(reference.rgb for reference in chart.references)]
+    for (x, y), code in zip(places, codes, strict=True):
+        left, top = round(x * dpi / 25.4 - side / 2), round(y * dpi / 25.4 - side / 2)
+        picture[top : top + side, left : left + side] = code
+    return picture
+
+
+def field_of(chart: Chart, dpi: int) -> tuple[slice, slice]:
+    """Rows and columns from the first to the last tag, rims included."""
+    rim = 50 * 25.4 / 600
+    low = (chart.tags[0].corners_mm[0] - rim) * dpi / 25.4
+    high = (chart.tags[-1].corners_mm[2] + rim) * dpi / 25.4
+    return slice(round(low[1]), round(high[1])), slice(round(low[0]), round(high[0]))
+
+
+@pytest.fixture(scope="module")
+def tiff(a7: Chart, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("print") / "chart.tif"
+    save_tiff(a7, path)
+    return path
+
+
+def test_the_tiff_is_the_chart_pixel_by_pixel(a7: Chart, tiff: Path) -> None:
+    picture = tifffile.imread(tiff)
+    expected = painted(a7, 600)
+    # A7 is 105 × 74 mm: 2480.3 × 1748.0 pixels.
+    assert picture.shape == expected.shape == (1748, 2480, 3)
+    assert picture.dtype == np.uint8
+    for tag in a7.tags:
+        (left, top), (right, bottom) = np.rint(tag.corners_mm[[0, 2]] * 600 / 25.4).astype(int)
+        assert right - left == bottom - top == 400
+        modules = picture[top - 50 : bottom + 50, left - 50 : right + 50].reshape(10, 50, 10, 50, 3)
+        assert (modules == modules[:, :1, :, :1]).all(), "each module is one colour, 50 × 50 pixels"
+        assert (modules[[0, -1]] == 255).all()
+        assert (modules[:, :, [0, -1]] == 255).all()
+        assert (modules[[1, -2], :, 1:-1] == 0).all()
+        assert (modules[1:-1, :, [1, -2]] == 0).all()
+        picture[top - 50 : bottom + 50, left - 50 : right + 50] = 255
+    rows, columns = field_of(a7, 600)
+    np.testing.assert_array_equal(picture[rows, columns], expected[rows, columns])
+    near = picture[rows.start - 34 : rows.stop + 34, columns.start - 34 : columns.stop + 34].copy()
+    near[34:-34, 34:-34] = 255
+    assert (near == 255).all(), "around the field the paper is bare"
+    for margin in (
+        picture[: rows.start],
+        picture[rows.stop :],
+        picture[:, : columns.start],
+        picture[:, columns.stop :],
+    ):
+        assert (margin == 0).any(), "every margin has marks"
+        assert ((margin == 0) | (margin == 255)).all(), "in black"
+
+
+def test_the_tiff_says_its_size_and_no_profile(a7: Chart, tiff: Path) -> None:
+    with tifffile.TiffFile(tiff) as file:
+        (page,) = file.pages
+        assert isinstance(page, tifffile.TiffPage)
+        assert page.tags["XResolution"].value == page.tags["YResolution"].value == (600, 1)
+        assert page.tags["ResolutionUnit"].value == 2
+        assert page.tags["Compression"].value == 8
+        assert page.tags["PhotometricInterpretation"].value == 2
+        assert page.tags["ImageDescription"].value == label(a7)
+        assert "InterColorProfile" not in page.tags
+    assert tiff.stat().st_size < 400_000
+
+
+def test_an_independent_library_reads_the_tags_of_the_tiff(a7: Chart, tiff: Path) -> None:
+    found = detect(tifffile.imread(tiff))
+    assert sorted(found) == [0, 1, 2, 3]
+    for tag in a7.tags:
+        np.testing.assert_allclose(found[tag.id], tag.corners_mm * 600 / 25.4, atol=0.5)
+
+
+@pytest.mark.parametrize("dpi", [360, 1200])
+def test_other_resolutions_that_divide_the_cells(dpi: int, a7: Chart, tmp_path: Path) -> None:
+    save_tiff(a7, tmp_path / "chart.tif", dpi)
+    picture = tifffile.imread(tmp_path / "chart.tif")
+    rows, columns = field_of(a7, dpi)
+    expected = painted(a7, dpi)
+    for tag in a7.tags:
+        (left, top), (right, bottom) = np.rint(tag.corners_mm[[0, 2]] * dpi / 25.4).astype(int)
+        assert right - left == bottom - top == dpi * 400 // 600
+        rim = dpi // 12
+        picture[top - rim : bottom + rim, left - rim : right + rim] = 255
+    np.testing.assert_array_equal(picture[rows, columns], expected[rows, columns])
+
+
+@pytest.mark.parametrize("dpi", [300, 100, 0, -600])
+def test_a_resolution_of_broken_modules_is_refused(dpi: int, a7: Chart, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=f"at {dpi} dpi .* choose 1200 or 600 or 360 dpi"):
+        save_tiff(a7, tmp_path / "chart.tif", dpi)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_paper_s_print(a0: Chart, tmp_path: Path) -> None:
+    path = tmp_path / "chart.tif"
+    save_tiff(a0, path)
+    assert path.stat().st_size < 30_000_000
+    codes = np.concatenate([a0.rgb, np.array([reference.rgb for reference in a0.references], dtype=np.uint8)])
+    centres = np.concatenate([a0.centres_mm, np.array([reference.centre_mm for reference in a0.references])])
+    left, top = np.rint(centres * 600 / 25.4 - 62.5).astype(np.int64).T
+    with tifffile.TiffFile(path) as file:
+        (page,) = file.pages
+        assert isinstance(page, tifffile.TiffPage)
+        # 1189 × 841 mm at 600 dpi.
+        assert page.shape == (19866, 28087, 3)
+        seen = 0
+        for strip in range(0, len(page.dataoffsets), 12):
+            file.filehandle.seek(page.dataoffsets[strip])
+            packed = file.filehandle.read(page.databytecounts[strip])
+            rows = np.frombuffer(zlib.decompress(packed), dtype=np.uint8).reshape(-1, 28087, 3)
+            for y in (64 * strip, 64 * strip + len(rows) - 1):
+                crossed = (top <= y) & (y < top + 125)
+                row = rows[y - 64 * strip]
+                for x, code in zip(left[crossed], codes[crossed], strict=True):
+                    assert (row[x : x + 125] == code).all()
+                seen += int(crossed.sum())
+        assert seen > 8000
+
+
+def test_an_independent_library_reads_all_tags_of_the_paper_s_chart(a0: Chart) -> None:
+    picture = preview(a0, 2400)
+    assert picture.shape == (1698, 2400, 3)
+    found = detect(picture)
+    assert sorted(found) == list(range(35))
+    for tag in a0.tags:
+        np.testing.assert_allclose(found[tag.id], tag.corners_mm * 2400 / 1189, atol=0.12)
+
+
+def test_a_preview_is_the_mean_of_what_it_covers(a7: Chart, tmp_path: Path) -> None:
+    # 248 pixels across 105 mm: ten pixels of the 600 dpi print to one, all but 1 in 7000.
+    small, large = preview(a7, 248), painted(a7, 600)
+    means = large[:1740].reshape(174, 10, 248, 10, 3).mean(axis=(1, 3))
+    rows, columns = field_of(a7, 60)
+    middle = slice(rows.start + 51, rows.stop - 51), slice(columns.start + 51, columns.stop - 51)
+    assert small[middle].size > 5000
+    assert np.abs(small[middle] - means[middle]).max() < 25
+    assert np.abs(small[middle] - means[middle]).mean() < 2
+    save_preview(a7, tmp_path / "preview.png", 248)
+    written = cv2.imread(str(tmp_path / "preview.png"))
+    assert written is not None
+    np.testing.assert_array_equal(written[:, :, ::-1], small)
+    assert preview(a7, 1).shape == (1, 1, 3)
+    with pytest.raises(InputError, match="0 pixels"):
+        preview(a7, 0)
+
+
+def test_the_pdf_has_the_page_s_size_and_no_profile(a7: Chart, tmp_path: Path) -> None:
+    save_pdf(a7, tmp_path / "chart.pdf")
+    content = (tmp_path / "chart.pdf").read_bytes()
+    box = re.search(rb"/MediaBox \[([\d. ]+)\]", content)
+    assert box is not None
+    assert [float(value) for value in box[1].split()] == pytest.approx(
+        [0, 0, 105 * 72 / 25.4, 74 * 72 / 25.4], abs=1e-3
+    )
+    assert len(re.findall(rb"/Type /Page\b", content)) == 1
+    assert b"/FlateDecode" in content
+    assert b"/ICCBased" not in content
+    save_pdf(a7, tmp_path / "again.pdf")
+    assert (tmp_path / "again.pdf").read_bytes() == content
+
+
+def test_the_pdf_shows_what_the_tiff_shows(a7: Chart, tiff: Path, tmp_path: Path) -> None:
+    renderer = shutil.which("pdftoppm")
+    if renderer is None:
+        pytest.skip("pdftoppm (poppler) is not installed, and nothing else here draws a PDF")
+    save_pdf(a7, tmp_path / "chart.pdf")
+    subprocess.run(
+        [renderer, "-r", "600", "-aa", "no", "-aaVector", "no", "-png", tmp_path / "chart.pdf", tmp_path / "drawn"],
+        check=True,
+    )
+    (path,) = tmp_path.glob("drawn*.png")
+    drawn = cv2.imread(str(path))
+    assert drawn is not None
+    expected = tifffile.imread(tiff)
+    # Every pixel, marks too: nothing is shifted, and no hairline of paper shows between cells.
+    np.testing.assert_array_equal(drawn[: expected.shape[0], : expected.shape[1], ::-1], expected)
+    assert sorted(detect(drawn.astype(np.uint8))) == [0, 1, 2, 3]
+
+
+def test_the_label_tells_charts_apart(a7: Chart) -> None:
+    assert label(a7).startswith("CroP chart, 2 bits, 105 x 74 mm, ")
+    assert a7.sha256[:16] in label(a7)
+    assert "seed 1, croplab " in label(a7)
+    assert "seed" not in label(replace(a7, seed=None, software=None))
+    assert label(design_chart(1)).startswith("CroP chart, 1 bit, ")
+    assert label(a7) != label(design_chart(2, seed=2))
+    assert label(a7).isascii()
+
+
+def test_no_hairline_between_cells_at_a_coarse_resolution(tmp_path: Path) -> None:
+    renderer = shutil.which("pdftoppm")
+    if renderer is None:
+        pytest.skip("pdftoppm (poppler) is not installed, and nothing else here draws a PDF")
+    # Cells of 108 × 152 pixels whose edges fall on pixels of the rendering: here hairlines of bare paper showed.
+    chart = paper_chart()
+    save_pdf(chart, tmp_path / "chart.pdf")
+    subprocess.run(
+        [renderer, "-r", "100", "-png", "-singlefile", tmp_path / "chart.pdf", tmp_path / "drawn"], check=True
+    )
+    drawn = cv2.imread(str(tmp_path / "drawn.png"))
+    assert drawn is not None
+    low = np.ceil(chart.centres_mm.min(axis=0) * 100 / 25.4).astype(int)
+    high = np.floor(chart.centres_mm.max(axis=0) * 100 / 25.4).astype(int)
+    assert not (drawn[low[1] : high[1], low[0] : high[0]] == 255).all(axis=2).any()
+
+
+@pytest.mark.parametrize(("number", "word"), [(0, 0xD5D628584), (1, 0xD97F18B49), (2, 0xDD280910E)])
+def test_modules_are_the_published_code_words_turned_by_half_a_turn(number: int, word: int) -> None:
+    # The first words of the AprilTag authors' table of the family 36h11: 36 bits row by row, 1 is white.
+    published = np.array([bit == "1" for bit in f"{word:036b}"]).reshape(6, 6)
+    modules = tag_modules(Tag("36h11", number, np.zeros((4, 2))))
+    np.testing.assert_array_equal(modules[1:-1, 1:-1], published[::-1, ::-1])
+    assert modules.shape == (8, 8)
+    assert modules.sum() == published.sum(), "the border is black"
+
+
+@pytest.mark.parametrize(("family", "number"), [("25h9", 0), ("36h11", 587), ("36h11", -1)])
+def test_a_tag_that_does_not_exist_cannot_be_printed(family: str, number: int) -> None:
+    with pytest.raises(InputError, match="36h11"):
+        tag_modules(Tag(family, number, np.zeros((4, 2))))
+
+
+def test_a_tag_that_leans_cannot_be_printed(a7: Chart) -> None:
+    corners = a7.tags[0].corners_mm
+    for wrong in (np.roll(corners, 1, axis=0), corners + np.array([[0, 0], [0, 0.1], [0, 0], [0, 0]])):
+        leaning = replace(a7, tags=(Tag("36h11", 0, wrong),))
+        with pytest.raises(InputError, match="does not stand upright"):
+            drawing(leaning)
+
+
+def test_a_full_disk_leaves_what_was_there(a7: Chart, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(_: int) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    path = tmp_path / "chart"
+    path.write_text("the print of before")
+    monkeypatch.setattr(os, "fsync", full)
+    for save in (save_tiff, save_pdf, save_preview):
+        with pytest.raises(StorageError, match="free space"):
+            save(a7, path)
+    assert [(one.name, one.read_text()) for one in tmp_path.iterdir()] == [("chart", "the print of before")]

@@ -1,0 +1,240 @@
+"""Tags found, pose judged, sharpness and movement measured, on frames of the simulated room and on real ones."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from datetime import UTC, datetime
+from functools import cache
+from io import BytesIO
+from pathlib import Path
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+import pytest
+
+from drivers.camera import ExposureSettings
+from drivers.presenter import BLACK, WHITE, Colour
+from drivers.raw.rawfile import Mosaic, read_raw
+from experiment.chart.layout import A_SERIES_MM, design_chart
+from experiment.chart.model import Chart
+from experiment.chart.printing import drawing
+from experiment.framing.finding import find_chart
+from experiment.framing.movement import shift_between
+from experiment.framing.planes import CHANNELS, Plane, channel_offset_px, phases, plane_of, strongest_plane
+from experiment.framing.sharpness import blur_px
+from experiment.framing.tags import find_tags
+from foundation.errors import RegistrationError
+from sim.camera.dng import write_dng
+from sim.world.drawing import Print
+from sim.world.room import Room
+from sim.world.sensors import BODIES
+from sim.world.world import World
+from tests.data_files import available
+
+pytestmark = pytest.mark.slow
+
+SETTINGS = ExposureSettings(iso=100, aperture=8.0, shutter_s=0.5)
+FLAT = Room(waviness_mm=0.0, tilt_deg=0, pan_deg=0, k1=0, k2=0, p1=0, p2=0)
+
+
+CHART = design_chart(3, A_SERIES_MM["A5"], 1)
+
+
+@cache
+def sheet() -> Print:
+    picture = drawing(CHART)
+    return Print(picture.page_mm, picture.rectangles_mm, picture.rgb)
+
+
+def world_of(room: Room) -> World:
+    return World(sheet(), BODIES["Test"], room)
+
+
+def frame_of(world: World, folder: Path, colour: Colour = WHITE, key: int = 1) -> Mosaic:
+    stream = BytesIO()
+    write_dng(
+        stream,
+        world.expose(colour, SETTINGS, key=(key,)),
+        world.body,
+        settings=SETTINGS,
+        taken_at=datetime(2024, 3, 1, tzinfo=UTC),
+    )
+    path = folder / f"{key}.dng"
+    path.write_bytes(stream.getvalue())
+    return read_raw(path)
+
+
+def truth(world: World, mosaic: Mosaic, points_mm: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    visible = world.body.visible
+    aside = np.array([mosaic.visible.left - visible.left, mosaic.visible.top - visible.top]) / 2
+    return world.project(points_mm) - aside
+
+
+@pytest.fixture(scope="module")
+def chart() -> Chart:
+    return CHART
+
+
+@pytest.fixture(scope="module")
+def world() -> World:
+    return world_of(Room(waviness_mm=0.5))
+
+
+@pytest.fixture(scope="module")
+def white(world: World, tmp_path_factory: pytest.TempPathFactory) -> Mosaic:
+    return frame_of(world, tmp_path_factory.mktemp("white"))
+
+
+@pytest.mark.parametrize(
+    ("pattern", "red", "blue"),
+    [
+        ("RGGB", (-0.25, -0.25), (0.25, 0.25)),
+        ("BGGR", (0.25, 0.25), (-0.25, -0.25)),
+        ("GRBG", (0.25, -0.25), (-0.25, 0.25)),
+        ("GBRG", (-0.25, 0.25), (0.25, -0.25)),
+    ],
+)
+def test_red_and_blue_lie_a_quarter_pixel_aside(
+    white: Mosaic, pattern: str, red: tuple[float, float], blue: tuple[float, float]
+) -> None:
+    found = phases(replace(white, pattern=pattern))
+    assert channel_offset_px(found["R"]) == red
+    assert channel_offset_px(found["B"]) == blue
+    assert channel_offset_px(found["G"]) == (0.0, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("colour", "channel"), [(Colour(255, 0, 0), "R"), (Colour(0, 255, 0), "G"), (Colour(0, 0, 255), "B")]
+)
+def test_corners_are_true_in_every_colour(
+    chart: Chart, world: World, tmp_path: Path, colour: Colour, channel: str
+) -> None:
+    mosaic = frame_of(world, tmp_path, colour)
+    framing = find_chart(mosaic, chart)
+    assert framing.plane.channel == channel
+    assert framing.complete
+    corners_mm = {tag.id: tag.corners_mm for tag in chart.tags}
+    error = np.concatenate([tag.corners_px - truth(world, mosaic, corners_mm[tag.id]) for tag in framing.tags])
+    # A wrong corner order is tens of pixels off, a forgotten half or quarter pixel shows in the mean.
+    assert np.abs(error.mean(axis=0)).max() < 0.1
+    assert np.sqrt((error**2).sum(axis=1).mean()) < 0.3
+
+
+def test_pose_is_told(chart: Chart, tmp_path: Path) -> None:
+    mosaic = frame_of(world_of(replace(FLAT, fill=0.8, roll_deg=180.0)), tmp_path)
+    framing = find_chart(mosaic, chart)
+    assert framing.fill == pytest.approx(0.8, abs=0.01)
+    assert abs(framing.rotation_deg) == pytest.approx(180, abs=0.5)
+    assert framing.inside
+    assert framing.residual_px < 0.3
+
+
+@pytest.mark.parametrize(
+    ("blur", "roll_deg", "good_to"), [(0.4, 0.0, 0.02), (0.6, 1.7, 0.02), (0.9, 180.6, 0.02), (1.2, 0.0, 0.06)]
+)
+def test_blur_is_measured(chart: Chart, tmp_path: Path, blur: float, roll_deg: float, good_to: float) -> None:
+    mosaic = frame_of(world_of(replace(FLAT, blur_px=blur, roll_deg=roll_deg)), tmp_path)
+    # A photosite is half a pixel wide (σ = 0.5/√12) and the two greens lie 0.25 px to either side.
+    expected = float(np.sqrt(blur**2 + 0.25 / 12 + 0.25**2))
+    assert blur_px(find_chart(mosaic, chart)) == pytest.approx(expected, abs=good_to)
+
+
+def test_blur_of_red_lacks_the_greens_spacing(chart: Chart, tmp_path: Path) -> None:
+    mosaic = frame_of(world_of(replace(FLAT, blur_px=0.6)), tmp_path, Colour(255, 0, 0))
+    expected = float(np.sqrt(0.6**2 + 0.25 / 12))
+    assert blur_px(find_chart(mosaic, chart)) == pytest.approx(expected, abs=0.02)
+
+
+@pytest.mark.parametrize("colour", [WHITE, Colour(255, 0, 0), Colour(0, 0, 255), Colour(60, 60, 60)])
+def test_a_still_chart_does_not_move(chart: Chart, world: World, white: Mosaic, tmp_path: Path, colour: Colour) -> None:
+    framing = find_chart(white, chart)
+    later = strongest_plane(frame_of(world, tmp_path, colour, key=2))
+    shift = shift_between(plane_of(white, later.channel), framing, later)
+    assert shift.gauges == len(chart.tags)
+    assert shift.largest_px < 0.02
+
+
+@pytest.mark.parametrize("moved", [(0.3, -0.2), (1.0, 0.6), (-2.2, 1.7)])
+def test_a_movement_is_measured(chart: Chart, white: Mosaic, moved: tuple[float, float]) -> None:
+    framing = find_chart(white, chart)
+    plane = plane_of(white, "G")
+    matrix = np.array([[1, 0, moved[0]], [0, 1, moved[1]]])
+    values = cv2.warpAffine(plane.values, matrix, plane.values.shape[::-1], flags=cv2.INTER_CUBIC)
+    shift = shift_between(plane, framing, Plane("G", np.asarray(values, dtype=np.float32), plane.offset_px))
+    assert (shift.dx, shift.dy) == pytest.approx(moved, abs=0.03)
+
+
+def test_a_leap_is_not_measured_as_a_step(chart: Chart, white: Mosaic) -> None:
+    plane = plane_of(white, "G")
+    values = np.roll(plane.values, 40, axis=1)
+    assert shift_between(plane, find_chart(white, chart), Plane("G", values, plane.offset_px)).gauges == 0
+
+
+def test_a_dark_frame_is_called_dark(chart: Chart, world: World, tmp_path: Path) -> None:
+    mosaic = frame_of(world, tmp_path, BLACK)
+    with pytest.raises(RegistrationError, match=r"frame 7 is dark: .* expose longer"):
+        find_chart(mosaic, chart, "frame 7")
+
+
+def test_a_mirror_is_called_a_mirror(chart: Chart, white: Mosaic) -> None:
+    plane = plane_of(white, "G")
+    mirrored = Plane("G", np.ascontiguousarray(plane.values[:, ::-1]), plane.offset_px)
+    with pytest.raises(RegistrationError, match="mirrored"):
+        find_chart(mirrored, chart)
+
+
+def test_too_small_is_called_too_small(chart: Chart, white: Mosaic) -> None:
+    plane = plane_of(white, "G")
+    small = np.full_like(plane.values, 100)
+    inner = cv2.resize(plane.values, None, fx=0.33, fy=0.33, interpolation=cv2.INTER_AREA)
+    small[20 : 20 + inner.shape[0], 30 : 30 + inner.shape[1]] = inner
+    with pytest.raises(RegistrationError, match=r"too small|nearer"):
+        find_chart(Plane("G", small, plane.offset_px), chart)
+
+
+def test_another_chart_is_told_by_its_tags(chart: Chart, white: Mosaic) -> None:
+    other = replace(chart, tags=tuple(replace(tag, id=tag.id + 100) for tag in chart.tags))
+    with pytest.raises(RegistrationError, match=r"this is another chart: name the chart\.json"):
+        find_chart(white, other)
+    # The right ids in places that no picture of the chart could show.
+    ids = [tag.id for tag in chart.tags]
+    shuffled = [tag.corners_mm for tag in chart.tags[1:] + chart.tags[:1]]
+    places = tuple(replace(chart.tags[i], id=ids[i], corners_mm=shuffled[i][[2, 0, 3, 1]]) for i in range(len(ids)))
+    with pytest.raises(RegistrationError, match="do not fit it"):
+        find_chart(white, replace(chart, tags=places))
+
+
+def test_a_chart_of_one_tag_is_refused(chart: Chart, white: Mosaic) -> None:
+    with pytest.raises(RegistrationError, match=r"the chart has 1 tags, and it is found by its tags"):
+        find_chart(white, replace(chart, tags=chart.tags[:1]))
+
+
+def test_covered_tags_are_named(chart: Chart, white: Mosaic) -> None:
+    plane = plane_of(white, "G")
+    values = plane.values.copy()
+    framing = find_chart(plane, chart)
+    for tag in framing.tags[:2]:
+        x, y = tag.centre_px.astype(int)
+        values[y - 20 : y + 20, x - 20 : x + 20] = 500
+    hidden = ", ".join(str(tag.id) for tag in framing.tags[:2])
+    with pytest.raises(RegistrationError, match=rf"2 of 4 tags .* missing: {hidden}; uncover the chart"):
+        find_chart(Plane("G", values, plane.offset_px), chart)
+
+
+@pytest.mark.parametrize(
+    "path", available("raw/canon_eos_550d_colorchart.dng", "raw/blackmagic.dng"), ids=lambda path: path.name
+)
+def test_a_photograph_without_the_chart_has_no_chart(chart: Chart, path: Path) -> None:
+    with pytest.raises(RegistrationError, match=r"tags 36h11 with ids .* were looked for") as caught:
+        find_chart(read_raw(path), chart, path.name)
+    assert "\n" not in str(caught.value)
+
+
+def test_noise_alone_has_no_tags() -> None:
+    noise = np.random.default_rng(0).normal(300, 40, (300, 400)).astype(np.float32)
+    assert find_tags(Plane("G", noise, (0.0, 0.0))) == ()
+
+
+def test_channels_are_in_the_order_of_samples() -> None:
+    assert CHANNELS == ("R", "G", "B")

@@ -1,0 +1,262 @@
+"""A chart without tags: its field found by outline and colours, on frames of the simulated room and on real ones."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from datetime import UTC, datetime
+from functools import cache
+from io import BytesIO
+from pathlib import Path
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+import pytest
+
+from drivers.camera import ExposureSettings
+from drivers.presenter import BLACK, WHITE, Colour
+from drivers.raw.rawfile import Mosaic, read_raw
+from experiment.chart.layout import design_chart, paper_chart
+from experiment.chart.model import Chart
+from experiment.chart.printing import drawing
+from experiment.framing.finding import find_chart
+from experiment.framing.outline import refine_edges
+from experiment.framing.planes import CHANNELS, Plane, plane_of
+from experiment.framing.sharpness import blur_px
+from experiment.framing.tagless_field import FoundField, field_mm, find_field
+from foundation.errors import CropError, InputError, RegistrationError
+from sim.camera.dng import write_dng
+from sim.world.drawing import Print
+from sim.world.room import Room
+from sim.world.sensors import BODIES
+from sim.world.world import World
+from tests.data_files import available
+
+pytestmark = pytest.mark.slow
+
+SETTINGS = ExposureSettings(iso=100, aperture=8.0, shutter_s=0.5)
+CHART = paper_chart("A6", 3)
+
+
+@cache
+def world_of(room: Room) -> World:
+    picture = drawing(CHART)
+    return World(Print(picture.page_mm, picture.rectangles_mm, picture.rgb), BODIES["Test"], room)
+
+
+def frame_of(folder: Path, room: Room, colour: Colour = WHITE) -> Mosaic:
+    stream = BytesIO()
+    world = world_of(room)
+    counts = world.expose(colour, SETTINGS, key=(1,))
+    write_dng(stream, counts, world.body, settings=SETTINGS, taken_at=datetime(2024, 3, 1, tzinfo=UTC))
+    path = folder / "frame.dng"
+    path.write_bytes(stream.getvalue())
+    return read_raw(path)
+
+
+def planes_of(mosaic: Mosaic) -> list[Plane]:
+    return [plane_of(mosaic, channel) for channel in CHANNELS]
+
+
+def truth(room: Room, mosaic: Mosaic, points_mm: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    world = world_of(room)
+    visible = world.body.visible
+    aside = np.array([mosaic.visible.left - visible.left, mosaic.visible.top - visible.top]) / 2
+    return world.project(points_mm) - aside
+
+
+def across(room: Room, mosaic: Mosaic, chart: Chart = CHART) -> npt.NDArray[np.float64]:
+    """Return how far the outline found lies outside the true one, px."""
+    field = find_field(planes_of(mosaic), chart, "the frame")
+    return ((field.outline_px - truth(room, mosaic, field.outline_mm)) * field.normals).sum(axis=1)
+
+
+UPRIGHT = Room(waviness_mm=0.5)
+
+
+@pytest.fixture(scope="module")
+def white(tmp_path_factory: pytest.TempPathFactory) -> Mosaic:
+    return frame_of(tmp_path_factory.mktemp("white"), UPRIGHT)
+
+
+@pytest.mark.parametrize("colour", [WHITE, Colour(110, 70, 20), Colour(0, 0, 255), Colour(0, 255, 0)])
+def test_the_outline_is_where_the_cells_end(tmp_path: Path, colour: Colour) -> None:
+    off = across(UPRIGHT, frame_of(tmp_path, UPRIGHT, colour))
+    assert len(off) > 300
+    assert np.abs(np.median(off)) < 0.1
+    # A tenth may be drawn to the rulers and targets in the margin, a third of a pixel from the field here.
+    assert np.percentile(np.abs(off), 90) < 0.3
+
+
+@pytest.mark.parametrize("roll", [0.0, 180.0, 90.0, -90.0, 30.0])
+def test_which_way_up_is_told_by_the_colours(tmp_path: Path, roll: float) -> None:
+    room = Room(waviness_mm=0.5, roll_deg=roll, fill=0.6)
+    mosaic = frame_of(tmp_path, room)
+    framing = find_chart(mosaic, CHART)
+    assert framing.field is not None
+    assert framing.field.corners_px == pytest.approx(truth(room, mosaic, field_mm(CHART)), abs=0.7)
+    assert abs((framing.rotation_deg - roll + 180) % 360 - 180) < 3
+    assert framing.inside
+    assert framing.complete
+
+
+def test_blur_is_measured_on_the_outline(tmp_path: Path) -> None:
+    room = Room(waviness_mm=0, tilt_deg=0, pan_deg=0, k1=0, k2=0, p1=0, p2=0, blur_px=0.8)
+    # A photosite is half a pixel wide (σ = 0.5/√12) and the two greens lie 0.25 px to either side.
+    expected = float(np.sqrt(0.8**2 + 0.25 / 12 + 0.25**2))
+    assert blur_px(find_chart(frame_of(tmp_path, room), CHART)) == pytest.approx(expected, abs=0.06)
+
+
+def test_a_mirror_is_called_a_mirror(white: Mosaic) -> None:
+    mirrored = [replace(plane, values=np.ascontiguousarray(plane.values[:, ::-1])) for plane in planes_of(white)]
+    with pytest.raises(RegistrationError, match=r"frame 7 is mirrored: .* without a mirror"):
+        find_field(mirrored, CHART, "frame 7")
+
+
+def test_a_light_that_does_not_tell_which_way_up_is_not_guessed_at(tmp_path: Path) -> None:
+    mosaic = frame_of(tmp_path, UPRIGHT, Colour(255, 0, 0))
+    with pytest.raises(RegistrationError, match="it is not certain which way up it hangs; take a white frame"):
+        find_chart(mosaic, CHART)
+    # Known from another frame of the session, or given.
+    corners = truth(UPRIGHT, mosaic, field_mm(CHART))
+    for hint in ({"near_px": corners + 30.0}, {"corners_px": corners + 4.0}):
+        field = find_field(planes_of(mosaic), CHART, "the frame", **hint)
+        assert field.corners_px == pytest.approx(corners, abs=0.7)
+
+
+def test_another_order_of_colours_is_told_apart(white: Mosaic) -> None:
+    shuffled = np.random.default_rng(1).permutation(CHART.colours)
+    with pytest.raises(RegistrationError, match=r"most similar rectangle .* name the chart\.json of this print"):
+        find_chart(white, replace(CHART, colours=shuffled))
+
+
+def test_a_dark_frame_is_called_dark(tmp_path: Path) -> None:
+    with pytest.raises(RegistrationError, match="frame 3 is dark"):
+        find_chart(frame_of(tmp_path, UPRIGHT, BLACK), CHART, "frame 3")
+
+
+def test_half_a_chart_is_not_a_chart(white: Mosaic) -> None:
+    planes = [replace(plane, values=plane.values[:, plane.values.shape[1] // 3 :]) for plane in planes_of(white)]
+    with pytest.raises(RegistrationError, match="looked for"):
+        find_field(planes, CHART, "the frame")
+
+
+def test_told_corners_are_drawn_onto_the_outline(white: Mosaic) -> None:
+    true = truth(UPRIGHT, white, field_mm(CHART))
+    given = true + np.array([(9, -7), (-8, 6), (5, 8), (-9, -6)])
+    found = find_chart(white, CHART, corners=given).field
+    assert found is not None
+    assert found.corners_px == pytest.approx(true, abs=0.7)
+
+
+@pytest.mark.parametrize(
+    ("given", "fault", "message"),
+    [
+        ([(10, 10), (120, 120), (230, 230), (340, 340)], InputError, "no convex quadrilateral"),
+        ([(10, 10), (300, 10), (300, 200)], InputError, "no convex quadrilateral"),
+        ([(10, 10), (2000, 10), (2000, 1200), (10, 1200)], InputError, r"do not lie in the picture of \d+×\d+ pixels"),
+        ([(36, 25), (34, 247), (358, 248), (361, 30)], InputError, "counter-clockwise"),
+        ([(100, 80), (180, 80), (180, 180), (100, 180)], InputError, "too close together: 160 pixels"),
+        ([(361, 30), (358, 248), (34, 247), (36, 25)], InputError, "fit if they are 72,50 722,60 716,496 68,494"),
+        ([(100, 60), (260, 60), (260, 200), (100, 200)], RegistrationError, "corners of the field of cells"),
+    ],
+)
+def test_wrong_corners_are_refused(
+    white: Mosaic, given: Sequence[tuple[float, float]], fault: type[CropError], message: str
+) -> None:
+    with pytest.raises(fault, match=message) as caught:
+        find_chart(white, CHART, corners=np.array(given, dtype=np.float64))
+    assert "\n" not in str(caught.value)
+
+
+def test_corners_of_a_mirrored_chart_say_so(white: Mosaic) -> None:
+    mirrored = [replace(plane, values=np.ascontiguousarray(plane.values[:, ::-1])) for plane in planes_of(white)]
+    width = mirrored[0].values.shape[1]
+    corners = truth(UPRIGHT, white, field_mm(CHART))
+    given = np.column_stack([width - 1 - corners[:, 0], corners[:, 1]])[[1, 0, 3, 2]]
+    with pytest.raises(RegistrationError, match="fit only in a mirror"):
+        find_field(mirrored, CHART, "the frame", given)
+
+
+def test_a_chart_with_tags_needs_no_corners(white: Mosaic) -> None:
+    with pytest.raises(InputError, match="tags by which it is found"):
+        find_chart(white, design_chart(1), corners=truth(UPRIGHT, white, field_mm(CHART)))
+
+
+def test_a_bright_sheet_of_something_else_is_no_chart() -> None:
+    random = np.random.default_rng(0)
+    sheet = np.full((300, 400), 60.0, dtype=np.float32)
+    cv2.rectangle(sheet, (40, 30), (360, 270), 4000, -1)
+    cv2.rectangle(sheet, (60, 50), (340, 250), 1500, -1)
+    planes = [
+        Plane(channel, sheet + random.normal(0, 20, sheet.shape).astype(np.float32), (0.0, 0.0)) for channel in CHANNELS
+    ]
+    with pytest.raises(RegistrationError, match="looked for"):
+        find_field(planes, CHART, "the frame")
+
+
+@pytest.mark.parametrize(
+    "path",
+    available("raw/canon_eos_550d_colorchart.dng", "raw/blackmagic.dng", "raw/canon_powershot_g2.crw"),
+    ids=lambda path: path.name,
+)
+def test_a_photograph_without_the_chart_has_no_chart(path: Path) -> None:
+    with pytest.raises(RegistrationError, match=r"the field of 32768 cells, .* looked for") as caught:
+        find_chart(read_raw(path), paper_chart(), path.name)
+    assert "\n" not in str(caught.value)
+
+
+def test_marks_in_the_margin_do_not_draw_the_refined_edge(white: Mosaic) -> None:
+    field = find_field(planes_of(white), CHART, "the frame")
+    places, heights = refine_edges(planes_of(white), field.outline_px, field.normals, 0.58)
+    off = ((places - truth(UPRIGHT, white, field.outline_mm)) * field.normals).sum(axis=2)
+    assert (heights > 0).any(axis=0).mean() > 0.7
+    for side in ((0, -1), (1, 0), (0, 1), (-1, 0)):
+        of_side = (heights > 0) & (field.normals @ np.array(side) > 0.9)
+        assert abs(np.median(off[of_side])) < 0.05
+        assert np.percentile(np.abs(off[of_side]), 80) < 0.12
+
+
+def test_each_colour_s_edge_is_where_the_lens_shows_it(tmp_path: Path) -> None:
+    room = Room(waviness_mm=0.5, lateral_red_px=1.0, lateral_blue_px=-1.0)
+    mosaic = frame_of(tmp_path, room)
+    field = find_field(planes_of(mosaic), CHART, "the frame")
+    places, heights = refine_edges(planes_of(mosaic), field.outline_px, field.normals, 0.58)
+    green = truth(room, mosaic, field.outline_mm)
+    for of_channel, height, channel in zip(places, heights, CHANNELS, strict=True):
+        shift = world_of(room).project(field.outline_mm, channel) - world_of(room).project(field.outline_mm)
+        assert channel == "G" or np.abs((shift * field.normals).sum(axis=1)).max() > 0.3
+        off = ((of_channel - green - shift) * field.normals).sum(axis=1)[height > 0]
+        assert len(off) > 300
+        assert np.sqrt((off**2).mean()) < 0.1
+
+
+def test_an_edge_that_is_not_clear_is_not_refined(white: Mosaic) -> None:
+    field = find_field(planes_of(white), CHART, "the frame")
+    random = np.random.default_rng(0)
+    faint = [
+        replace(
+            plane, values=(4000 + 0.02 * plane.values + random.normal(0, 30, plane.values.shape)).astype(np.float32)
+        )
+        for plane in planes_of(white)
+    ]
+    places, heights = refine_edges(faint, field.outline_px, field.normals, 0.58)
+    assert not heights.any()
+    assert (places == field.outline_px).all()
+
+
+def test_a_curled_corner_is_of_the_outline_and_marks_in_the_margin_are_not() -> None:
+    along = (np.arange(160) + 0.5) / 160
+    top = np.stack([along * 1170, np.zeros(160)], axis=-1)
+    bottom = np.stack([along * 1170, np.full(160, 824.0)], axis=-1)
+    normals = np.repeat([(0.0, -1.0), (0.0, 1.0)], 160, axis=0)
+    outline = np.concatenate([top, bottom])
+    field = FoundField(np.zeros((4, 2)), np.eye(3), outline, outline, normals, 1.0)
+    across = np.concatenate([6 * (2 * along - 1) ** 6, np.random.default_rng(1).normal(0, 0.02, 160)])
+    marks = np.zeros(320, dtype=bool)
+    marks[[*range(60, 72), *range(200, 212)]] = True
+    across[marks] += 3
+    off = field.off_run_px(across[:, None] * normals)
+    assert off[~marks].max() < 0.2
+    assert off[marks].min() > 2.5

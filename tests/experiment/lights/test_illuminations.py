@@ -1,0 +1,248 @@
+"""The 707 lights against published black bodies and the sRGB standard, and their file."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from acquisition.cli import main
+from drivers.presenter import Colour
+from experiment.lights.illuminations import (
+    Illumination,
+    encode_srgb,
+    illuminations_to_csv,
+    load_illuminations,
+    parse_ccts,
+    plan_illuminations,
+    save_illuminations,
+    shown_colour,
+    uniform_lights,
+)
+from experiment.lights.plots import plot_illuminations
+from foundation.errors import FormatError, InputError
+from foundation.srgb import decode_srgb
+
+HEADER = "index,kind,cct_k,red,green,blue\n"
+
+
+def codes(lights: tuple[Illumination, ...]) -> list[tuple[int, int, int]]:
+    return [light.codes for light in lights]
+
+
+def test_the_plan_is_666_uniform_lights_and_41_black_bodies(plan: tuple[Illumination, ...]) -> None:
+    assert len(plan) == 707
+    assert [light.index for light in plan] == list(range(707))
+    assert [light.kind for light in plan] == ["uniform"] * 666 + ["blackbody"] * 41
+    assert [light.cct_k for light in plan[:666]] == [None] * 666
+    assert [light.cct_k for light in plan[666:]] == list(range(2000, 10001, 200))
+    assert len(set(codes(plan))) == 707
+    assert all(max(code) == 255 for code in codes(plan))
+
+
+def test_uniform_lights_hold_the_primaries_and_stand_on_the_grid(plan: tuple[Illumination, ...]) -> None:
+    shown = set(codes(plan[:666]))
+    assert {(255, 0, 0), (0, 255, 0), (0, 0, 255)} <= shown
+    linear = np.array(uniform_lights())
+    np.testing.assert_allclose(linear.sum(axis=1), 1)
+    assert linear.min() == 0
+    np.testing.assert_allclose(35 * linear, np.rint(35 * linear), atol=1e-9)
+    # What is shown has the chromaticity of its grid point but for the rounding of the codes.
+    light = decode_srgb(np.array(codes(plan[:666])) / 255)
+    np.testing.assert_allclose(light / light.sum(axis=1, keepdims=True), linear, atol=0.002)
+
+
+# CIE 1931 xy of Planckian radiators, c2 = 1.4388e-2 m K, as tables of the Planckian locus give them.
+@pytest.mark.parametrize(
+    ("cct_k", "x", "y"),
+    [(2000, 0.5267, 0.4133), (4000, 0.3805, 0.3768), (10000, 0.2807, 0.2884)],
+)
+def test_black_bodies_have_the_published_chromaticities(
+    cct_k: int, x: float, y: float, plan: tuple[Illumination, ...]
+) -> None:
+    # XYZ to linear sRGB and the transfer function, IEC 61966-2-1, spelt out here.
+    red = 3.2406 * x - 1.5372 * y - 0.4986 * (1 - x - y)
+    green = -0.9689 * x + 1.8758 * y + 0.0415 * (1 - x - y)
+    blue = 0.0557 * x - 0.2040 * y + 1.0570 * (1 - x - y)
+    brightest = max(red, green, blue)
+    expected: list[float] = []
+    for value in (red, green, blue):
+        linear = value / brightest
+        expected.append(255 * (1.055 * linear ** (1 / 2.4) - 0.055) if linear > 0.0031308 else 255 * 12.92 * linear)
+    (light,) = (light for light in plan if light.cct_k == cct_k)
+    assert codes((light,))[0] == pytest.approx(expected, abs=1.0)
+
+
+def test_black_bodies_grow_bluer(plan: tuple[Illumination, ...]) -> None:
+    light = decode_srgb(np.array(codes(plan[666:])) / 255)
+    assert (np.diff(light[:, 2] / light[:, 0]) > 0).all()
+
+
+def test_temperatures_are_read() -> None:
+    assert parse_ccts("2000:3000:250") == (2000, 2250, 2500, 2750, 3000)
+    assert parse_ccts("2000:2999:500") == (2000, 2500)
+    assert parse_ccts("3000:2000:-500") == (3000, 2500, 2000)
+    assert parse_ccts("6500:6500:1") == (6500,)
+    assert parse_ccts("2856, 6504") == (2856, 6504)
+    assert parse_ccts("") == ()
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("10000:2000:200", "steps of 200 K do not lead from 10000 to 2000 K"),
+        ("2000:10000:0", "steps of 0 K do not lead"),
+        ("2000:10000:nan", "steps of nan K do not lead"),
+        ("2000:10000:1e-6", "in at most 10000 temperatures"),
+        ("1:1e12:1", "1 K is not within 1000"),
+        ("2000:inf:200", "inf K is not within"),
+        ("2000:3000", "expected FIRST:LAST:STEP"),
+        ("warm", "expected FIRST:LAST:STEP"),
+        ("500", "500 K is not within"),
+    ],
+)
+def test_temperatures_that_are_none_are_refused(text: str, said: str) -> None:
+    with pytest.raises(InputError, match=said):
+        parse_ccts(text)
+
+
+def test_lights_do_not_overwrite_their_plot(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["illuminations", str(tmp_path / "a.png"), "--grid", "1"]) == 2
+    assert "a.png is where the plot of the lights goes; name the lights" in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_smaller_plan() -> None:
+    few = plan_illuminations(2, (3000, 6500))
+    assert [light.kind for light in few] == ["uniform"] * 6 + ["blackbody"] * 2
+    # 6500 K of the table (0.3135, 0.3237) is all but sRGB's white (0.3127, 0.3290), a little more magenta.
+    assert codes(few[-1:])[0] == pytest.approx((255, 248, 254), abs=1.5)
+    assert [light.kind for light in plan_illuminations(0, (5000,))] == ["blackbody"]
+    assert codes(plan_illuminations(1, ())) == [(0, 255, 0), (0, 0, 255), (255, 0, 0)]
+
+
+@pytest.mark.parametrize(
+    ("code", "linear"),
+    # Golden points of IEC 61966-2-1, worked out by hand from its two branches.
+    [(0, 0.0), (1, 1 / 255 / 12.92), (10, 10 / 255 / 12.92), (128, 0.215861), (188, 0.502886), (255, 1.0)],
+)
+def test_srgb_by_the_standard(code: int, linear: float) -> None:
+    assert float(decode_srgb(code / 255)) == pytest.approx(linear, abs=1e-6)
+    assert float(encode_srgb(linear)) * 255 == pytest.approx(code, abs=1e-3)
+
+
+@given(st.floats(0, 1))
+def test_srgb_there_and_back(linear: float) -> None:
+    assert float(decode_srgb(encode_srgb(linear))) == pytest.approx(linear, abs=1e-6)
+
+
+def test_a_light_is_shown_at_its_brightest() -> None:
+    assert shown_colour([0.2, 0.1, 0.0]) == Colour(255, 188, 0)
+    assert shown_colour([7, 7, 7]) == Colour(255, 255, 255)
+    assert shown_colour([1, -0.1, 0]) == Colour(255, 0, 0)
+
+
+def test_the_plan_is_read_again(plan: tuple[Illumination, ...], tmp_path: Path) -> None:
+    path = tmp_path / "illuminations.csv"
+    save_illuminations(plan, path)
+    assert load_illuminations(path) == plan
+    assert path.read_text().splitlines()[666 + 1].startswith("666,blackbody,2000,255,")
+
+
+ccts_k = st.none() | st.floats(1, 1e6)
+colours = st.builds(Colour, st.integers(0, 255), st.integers(0, 255), st.integers(0, 255))
+
+
+@settings(deadline=None)
+@given(st.lists(st.tuples(ccts_k, colours), min_size=1, max_size=8))
+def test_any_lights_are_read_again(
+    tmp_path_factory: pytest.TempPathFactory, drawn: list[tuple[float | None, Colour]]
+) -> None:
+    made = tuple(
+        Illumination(number, "uniform" if cct_k is None else "blackbody", cct_k, colour)
+        for number, (cct_k, colour) in enumerate(drawn)
+    )
+    path = tmp_path_factory.mktemp("lights") / "illuminations.csv"
+    path.write_text(illuminations_to_csv(made))
+    assert load_illuminations(path) == made
+
+
+def test_a_file_of_other_hands(tmp_path: Path) -> None:
+    path = tmp_path / "illuminations.csv"
+    path.write_bytes(
+        b"\xef\xbb\xbfkind,index,cct_k,red,green,blue,white_r\r\nuniform,0,,1,2,3,9.5\r\nblackbody,1,2856.5,255,9,0,1\r\n"
+    )
+    assert load_illuminations(path) == (
+        Illumination(0, "uniform", None, Colour(1, 2, 3)),
+        Illumination(1, "blackbody", 2856.5, Colour(255, 9, 0)),
+    )
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "expected lights under the columns"),
+        (HEADER, "expected lights under the columns"),
+        (HEADER.replace(",", ";") + "0;uniform;;1;2;3\n", "expected lights under the columns"),
+        ("index,kind,red,green,blue\n0,uniform,1,2,3\n", "expected lights under the columns"),
+        (HEADER + "0,uniform,,1,2\n", "light 0: blue is missing, expected a whole number"),
+        (HEADER + "0,uniform,,1,2,\n", "light 0: blue is missing"),
+        (HEADER + "0,uniform,,1.5,2,3\n", "light 0: red is 1.5, expected a whole number"),
+        (HEADER + "0,uniform,,1,256,3\n", "light 0: green is 256; a code is 0 … 255"),
+        (HEADER + "0,uniform,,-1,2,3\n", "light 0: red is -1; a code"),
+        (HEADER + "0,sun,,1,2,3\n", "light 0: kind is 'sun', expected uniform or blackbody"),
+        (HEADER + "0,uniform,,1,2,3\n2,uniform,,1,2,3\n", "light 1: index is 2, expected 1"),
+        (HEADER + "0,blackbody,,1,2,3\n", "light 0: cct_k is missing, expected kelvin above 0"),
+        (HEADER + "0,blackbody,warm,1,2,3\n", "light 0: cct_k is warm"),
+        (HEADER + "0,blackbody,-5,1,2,3\n", "light 0: cct_k is -5"),
+        (HEADER + "0,blackbody,inf,1,2,3\n", "light 0: cct_k is inf"),
+        (HEADER + "0," + "u" * 200_000 + ",,1,2,3\n", "field larger than field limit"),
+    ],
+)
+def test_a_bad_file_is_refused_in_one_sentence(text: str, message: str, tmp_path: Path) -> None:
+    path = tmp_path / "illuminations.csv"
+    path.write_text(text, encoding="utf-8")
+    with pytest.raises(FormatError) as refused:
+        load_illuminations(path)
+    assert message in str(refused.value)
+    assert str(path) in str(refused.value)
+    assert "\n" not in str(refused.value)
+
+
+def test_what_is_missing_or_no_text_is_refused(tmp_path: Path) -> None:
+    binary = tmp_path / "picture.csv"
+    binary.write_bytes(b"\x89PNG\xff\xfe")
+    for path in (tmp_path / "none.csv", tmp_path, binary):
+        with pytest.raises(FormatError, match=r"cannot read illuminations .*make one with: acquire illuminations"):
+            load_illuminations(path)
+
+
+def test_the_figure_shows_each_light_at_its_chromaticity(plan: tuple[Illumination, ...], tmp_path: Path) -> None:
+    path = tmp_path / "lights.png"
+    plot_illuminations(plan, path)
+    picture = cv2.imread(str(path))
+    assert picture is not None
+    assert min(picture.shape[:2]) > 600
+    # The corners of the triangle are pure green, blue and red: each stands in the picture, left or right, up or down.
+    height, width = picture.shape[:2]
+    for code, left, top in (((0, 255, 0), True, False), ((255, 0, 0), True, True), ((0, 0, 255), False, False)):
+        ys, xs = np.nonzero((picture == code).all(axis=2))
+        near = (xs < 0.2 * width if left else xs > 0.8 * width) & (ys < 0.2 * height if top else ys > 0.8 * height)
+        assert near.any(), f"the light of BGR {code} is not in its corner"
+    first = path.read_bytes()
+    plot_illuminations(plan, path)
+    assert path.read_bytes() == first
+
+
+def test_figures_of_other_kinds(tmp_path: Path) -> None:
+    few = (Illumination(0, "uniform", None, Colour(0, 0, 0)), Illumination(1, "uniform", None, Colour(255, 9, 1)))
+    for name, head in (("a.pdf", b"%PDF"), ("a.SVG", b"<?xml")):
+        plot_illuminations(few, tmp_path / name)
+        assert (tmp_path / name).read_bytes().startswith(head)
+    plot_illuminations((), tmp_path / "none.png")
+    with pytest.raises(InputError, match=r"end its name with \.png, \.pdf, \.svg"):
+        plot_illuminations(few, tmp_path / "lights.txt")

@@ -1,0 +1,64 @@
+"""Light added to a place of the print, against what else makes a place unlike its codes."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+
+from experiment.measures.reflections import added_light, light_of_spot, spots_of
+from experiment.measures.stains import Stains, find_stains
+
+_Array = npt.NDArray[np.float64]
+SIDE = 16
+
+
+def print_with(radius: float, added: float = 0.0, kept: float = 1.0, *, broad: bool = False) -> Stains:
+    """Return what is found of 4096 cells in random order with a place, round or broad, in which light is added."""
+    random = np.random.default_rng(3)
+    codes = np.stack(np.meshgrid(*[np.linspace(0, 1, SIDE)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+    level = 6000 * (0.03 + 0.87 * codes**2.2)
+    x, y = np.divmod(random.permutation(SIDE**3), SIDE**2 // 4)
+    places = np.column_stack([x, y]) * 5.0
+    away = np.linalg.norm(places - places.mean(axis=0), axis=1) / max(radius, 1e-9)
+    share = (np.exp(-(away**2)) if broad else away < 1)[:, None]
+    level = (1 - (1 - kept) * share) * level + added * 5400 * share
+    level = np.asarray(level * random.normal(1, 0.003, level.shape), dtype=np.float64)
+    return find_stains(level, places, 4)
+
+
+@pytest.mark.parametrize(("added", "least"), [(0.03, 0.003), (0.1, 0.003)])
+def test_a_broad_reflection_goes_on_around_the_cells_that_are_listed(added: float, least: float) -> None:
+    found = added_light(print_with(60, added, broad=True))
+    assert least < found < added
+
+
+@pytest.mark.parametrize(
+    "stains",
+    [
+        print_with(0),
+        print_with(40, 0, 0.9),
+        print_with(40, 0.02, 0.6),
+        print_with(40, 0, 1.1),
+        print_with(9, 0.05),
+        print_with(40, 0.03),
+        print_with(40, 0.1),
+    ],
+    ids=["clean", "shadow", "hand", "brighter in proportion", "few cells", "sharp rim", "bright, sharp rim"],
+)
+def test_nothing_else_adds_light_to_cells_that_are_kept(stains: Stains) -> None:
+    assert added_light(stains) < 0.002
+
+
+def test_the_spots_are_the_places_that_deviate() -> None:
+    assert not spots_of(print_with(0))
+    (spot, *_) = spots_of(print_with(40, 0.03))
+    assert 100 < len(spot) < 400
+
+
+@pytest.mark.parametrize("added", [0.008, 0.03, 0.1])
+def test_light_and_what_is_kept_are_told_apart(added: float) -> None:
+    stains = print_with(40, added, 0.95)
+    found, kept = light_of_spot(stains, spots_of(stains)[0], 1)
+    assert found == pytest.approx(added, rel=0.15)
+    assert kept == pytest.approx(0.95, abs=0.02)

@@ -1,0 +1,146 @@
+"""The session folder: what counts, what is set aside, what is refused."""
+
+from __future__ import annotations
+
+import errno
+from dataclasses import replace
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from drivers.camera import CapturedFrame
+from drivers.presenter import Colour
+from experiment.chart.layout import design_chart
+from experiment.lights.illuminations import Illumination, save_illuminations
+from experiment.session.folder import Session, session_exists
+from experiment.session.judgement import Judgement
+from experiment.session.plan import plan_steps
+from foundation.errors import FormatError, InputError, StorageError
+
+LIGHTS = tuple(Illumination(number, "uniform", None, Colour(255, number, 0)) for number in range(5))
+NOW = datetime(2026, 1, 1, 9, 30, tzinfo=UTC)
+# printf white | sha256sum, printf light | sha256sum
+WHITE_SHA = "018fa96a44715c90bf93be148069cb28dd45d398f2cc75aa1565311f6e55d174"
+LIGHT_SHA = "99a7026172d42714d0293e5598ec1c8e8260d7d0c4b8582ad002c1883494e216"
+
+
+@pytest.fixture
+def session(tmp_path: Path) -> Session:
+    return Session.create(tmp_path / "s", "", design_chart(bits=1), LIGHTS, plan_steps(LIGHTS, 2))
+
+
+def test_the_plan_survives_the_disk(session: Session) -> None:
+    with Session.open(session.folder) as again:
+        assert again.steps == session.steps
+        assert again.illuminations == LIGHTS
+        assert again.chart.sha256 == session.chart.sha256
+
+
+def take(session: Session, number: int, content: bytes, reason: str = "") -> None:
+    step = session.steps[number]
+    attempt = session.journal.begin(step, f"frames/{step.stem}", NOW)
+    received = session.receive(step.stem, lambda into: CapturedFrame("IMG_1.CR2", into.write(content), NOW))
+    judgement = Judgement.of_reason("exposure", reason or None)
+    session.commit(attempt, received, judgement, exposure_s=0.5, ended_at=NOW)
+
+
+def test_frames_csv_is_as_the_format_says(session: Session) -> None:
+    take(session, 0, b"white")
+    take(session, 2, b"light", "too dark")
+    session.write_frames_csv()
+    lines = (session.folder / "frames.csv").read_text().splitlines()
+    assert lines[0] == "kind,illumination,file,sha256,taken_at,exposure_s,verdict"
+    assert lines[1:] == [
+        f"white,,frames/0000_white.cr2,{WHITE_SHA},2026-01-01T09:30:00.000000+00:00,0.5,accepted",
+        f"light,0,frames/0002_light_000.cr2,{LIGHT_SHA},2026-01-01T09:30:00.000000+00:00,0.5,refused: too dark",
+    ]
+
+
+def test_what_counts_is_on_disk_and_in_the_journal(session: Session) -> None:
+    take(session, 0, b"frame")
+    take(session, 1, b"frame", "dark")
+    assert session.done_steps() == {0}
+    (session.frames_folder / "0000_white.cr2").write_bytes(b"fra")
+    assert session.done_steps() == set(), "a file that lost bytes is no frame"
+
+
+def test_strays_are_kept_aside_and_leftovers_removed(session: Session) -> None:
+    take(session, 0, b"frame")
+    stray = session.frames_folder / "0001_dark.cr2"
+    stray.write_bytes(b"complete, but no row counts it")
+    leftover = session.frames_folder / ".0002_light_000.partial"
+    leftover.write_bytes(b"half")
+    moved = session.set_aside_strays()
+    assert [path.read_bytes() for path in moved] == [b"complete, but no row counts it"]
+    assert sorted(path.name for path in session.frames_folder.iterdir()) == ["0000_white.cr2", "0001_dark.cr2.stray"]
+    assert session.set_aside_strays() == []
+    stray.write_bytes(b"again")
+    session.set_aside_strays()
+    assert len(list(session.frames_folder.glob("*.stray"))) == 2, "an earlier stray is never overwritten"
+
+
+def test_a_session_is_never_made_over_something(tmp_path: Path, session: Session) -> None:
+    with pytest.raises(InputError, match="already exists"):
+        Session.create(session.folder, "", design_chart(bits=1), LIGHTS)
+
+
+def test_no_session(tmp_path: Path) -> None:
+    with pytest.raises(FormatError, match=r"holds no journal\.sqlite"):
+        Session.open(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("lights", "said"),
+    [
+        ((LIGHTS[0], replace(LIGHTS[1], colour=LIGHTS[2].colour), *LIGHTS[2:]), "planned as 255 1 0, the file says"),
+        (LIGHTS[:4], "light 4 was planned as 255 4 0, the file has no such light"),
+    ],
+)
+def test_lights_edited_since_are_refused(session: Session, lights: tuple[Illumination, ...], said: str) -> None:
+    session.close()
+    save_illuminations(lights, session.folder / "illuminations.csv")
+    with pytest.raises(FormatError, match=rf"illuminations\.csv is not what .*{said}.*; restore it from a copy"):
+        Session.open(session.folder)
+
+
+def test_a_session_without_its_settings(session: Session) -> None:
+    (session.folder / "session.toml").unlink()
+    with pytest.raises(FormatError, match=r"the session.s settings .*session\.toml: No such file .*; restore it"):
+        session.settings_text()
+
+
+def test_a_session_without_its_frames(session: Session) -> None:
+    session.frames_folder.rmdir()
+    with pytest.raises(FormatError, match=r"frames is missing, .*; restore it from a copy"):
+        session.set_aside_strays()
+
+
+@pytest.mark.parametrize("call", ["stat", "iterdir", "unlink", "rename"])
+def test_a_disk_that_fails_is_no_traceback(session: Session, call: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    (session.frames_folder / "stray.cr2").write_bytes(b"stray")
+    (session.frames_folder / ".0002_light_000.partial").write_bytes(b"half")
+    real = getattr(Path, call)
+
+    def fail(path: Path, *given: Any, **named: Any) -> Any:
+        if path.is_relative_to(session.frames_folder):
+            raise OSError(errno.EIO, "Input/output error", str(path))
+        return real(path, *given, **named)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(Path, call, fail)
+        with pytest.raises(StorageError, match=r"frames: Input/output error; .*run the same command again"):
+            session.set_aside_strays()
+    assert len(session.set_aside_strays()) == 1, "when the disk is back the same goes through"
+
+
+def test_a_journal_that_cannot_be_looked_for_is_not_missing(session: Session, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(path: Path, **_: object) -> None:
+        raise OSError(errno.EIO, "Input/output error", str(path))
+
+    monkeypatch.setattr(Path, "stat", fail)
+    with pytest.raises(StorageError, match=r"cannot read .*journal\.sqlite: Input/output error; the disk fails"):
+        session_exists(session.folder)
+    with pytest.raises(StorageError, match=r"cannot read .*journal\.sqlite: Input/output error; the disk fails"):
+        Session.open(session.folder)

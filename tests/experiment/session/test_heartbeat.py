@@ -1,0 +1,298 @@
+"""Signs of life: whose they are, and when a run is given up."""
+
+from __future__ import annotations
+
+import contextlib
+import itertools
+import os
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import closing
+from dataclasses import replace
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from types import SimpleNamespace
+
+import pytest
+
+from experiment.session import heartbeat
+from experiment.session.heartbeat import Heartbeat, Process, SessionPlace, signs_of_life
+from experiment.session.journal import Journal
+from foundation.errors import DeviceError, StorageError
+
+NOW = datetime(2026, 1, 1, 23, 30, tzinfo=UTC)
+SELF = Process.own()
+
+
+def beat(state: heartbeat.RunState = "running", until_s: float = 10) -> Heartbeat:
+    return Heartbeat(NOW, SELF, state, "taking 8 frames", NOW + timedelta(seconds=until_s))
+
+
+def test_this_process_lives() -> None:
+    assert SELF.is_alive() is True
+    assert SELF.pid == os.getpid()
+    assert SELF.host == socket.gethostname()
+
+
+def test_a_number_that_another_process_bears_now_is_not_the_run() -> None:
+    assert replace(SELF, started="1").is_alive() is False
+    assert replace(SELF, started="").is_alive() is False
+
+
+def test_a_process_that_is_gone_is_dead_and_so_is_what_is_left_of_it() -> None:
+    program = "from experiment.session.heartbeat import *\nprint(Process.own().started, flush=True)\ninput()"
+    other = subprocess.Popen([sys.executable, "-c", program], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+    with other:
+        assert other.stdout is not None
+        process = replace(SELF, pid=other.pid, started=other.stdout.readline().strip())
+        assert process.is_alive() is True
+        other.send_signal(signal.SIGKILL)
+        os.waitid(os.P_PID, other.pid, os.WEXITED | os.WNOWAIT)
+        assert process.is_alive() is False, "killed, and its parent has not looked yet"
+    assert process.is_alive() is False
+
+
+@pytest.mark.parametrize("elsewhere", [replace(SELF, host="another"), replace(SELF, boot="x"), replace(SELF, boot="")])
+def test_what_runs_elsewhere_cannot_be_told(elsewhere: Process) -> None:
+    assert elsewhere.is_alive() is None
+
+
+def test_without_proc_the_list_of_processes_is_asked(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As macOS has it: ps(1) says when a process began."""
+
+    def no_file(path: Path, **_: object) -> str:
+        raise FileNotFoundError(2, "No such file or directory", str(path))
+
+    at_ten = "Mon Jan  1 10:00:00 2026"
+    listed = {os.getpid(): f"S {at_ten}", 1: "S Mon Jan  1 09:00:00 2026", 5: f"Z {at_ten}"}
+
+    def absent(_: Path) -> bool:
+        return False
+
+    def run(arguments: list[str], **_: object) -> subprocess.CompletedProcess[str]:
+        text = listed.get(int(arguments[-1]), "")
+        return subprocess.CompletedProcess(arguments, 0 if text else 1, f"{text}\n", "")
+
+    monkeypatch.setattr(Path, "read_text", no_file)
+    monkeypatch.setattr(Path, "exists", absent)
+    monkeypatch.setattr(subprocess, "run", run)
+    own = Process.own()
+    assert (own.started, own.boot) == ("Mon Jan 1 10:00:00 2026", "Mon Jan 1 09:00:00 2026")
+    assert own.is_alive() is True
+    assert replace(own, pid=4).is_alive() is False
+    assert replace(own, pid=5).is_alive() is False
+
+
+def test_a_run_whose_process_is_gone_is_dead_at_once_however_long_it_meant_to_be_silent() -> None:
+    assert beat(until_s=3600).is_dead(NOW, alive=False)
+    assert not beat(until_s=-3600).is_dead(NOW, alive=True), "a process that is there is waited for"
+
+
+def test_elsewhere_it_is_dead_half_a_minute_after_its_next_sign_was_due() -> None:
+    assert not beat(until_s=10).is_dead(NOW + timedelta(seconds=39), alive=None)
+    assert beat(until_s=10).is_dead(NOW + timedelta(seconds=41), alive=None)
+
+
+def test_a_run_that_has_ended_is_never_dead() -> None:
+    assert not beat("ended", until_s=-3600).is_dead(NOW, alive=False)
+
+
+def test_what_a_reader_is_told() -> None:
+    assert beat().sentence_for(NOW, alive=True) == "taking 8 frames"
+    local = NOW.astimezone().strftime("%Y-%m-%d %H:%M:%S")
+    told = beat().sentence_for(NOW, alive=False)
+    assert told == f"stopped at {local}, killed or power lost: run the same command again"
+
+
+def test_a_journal_keeps_the_newest_sign_of_life(tmp_path: Path) -> None:
+    path = tmp_path / "journal.sqlite"
+    Journal.create(path, [])
+    with closing(Journal.open_for_run(path)) as journal:
+        assert journal.heartbeat() is None
+        for state in ("running", "paused"):
+            journal.beat(state, f"it is {state}", NOW)
+    with closing(Journal.open(path)) as journal:
+        found = journal.heartbeat()
+    assert found is not None
+    assert (found.state, found.sentence, found.until, found.process) == ("paused", "it is paused", NOW, SELF)
+    assert abs(found.at - datetime.now(UTC)) < timedelta(minutes=5)
+
+
+class TestPlace:
+    """Whose folder a sign of life was given for; a copy holds the same sign."""
+
+    @pytest.fixture
+    def run(self) -> Iterator[Path]:
+        """Return a session's folder in which a run has said that it takes frames, and still says so.
+
+        On the disk for temporary files, whose file system mostly tells folders of one number apart; one in memory
+        does not.
+        """
+        with TemporaryDirectory() as place:
+            folder = Path(place) / "night"
+            folder.mkdir()
+            Journal.create(folder / "journal.sqlite", ())
+            with closing(Journal.open_for_run(folder / "journal.sqlite")) as journal:
+                journal.beat("running", "frames are taken", NOW)
+            yield folder
+
+    @staticmethod
+    def of(folder: Path) -> tuple[Heartbeat, SessionPlace]:
+        here = SessionPlace.of(folder / "journal.sqlite")
+        with closing(Journal.open(folder / "journal.sqlite")) as journal:
+            told = journal.heartbeat()
+            assert journal.records() == {}, "the place is no device"
+        assert told is not None
+        assert here is not None
+        return told, here
+
+    def test_it_is_that_of_the_folder_also_when_it_was_renamed(self, run: Path) -> None:
+        told, here = self.of(run)
+        assert told.is_of(here) is True
+        told, here = self.of(run.rename(run.with_name("moved")))
+        assert told.is_of(here) is True
+
+    def test_a_copy_and_a_restored_backup_are_others(self, run: Path) -> None:
+        backup = run.with_name("backup")
+        shutil.copytree(run, backup)
+        told, here = self.of(backup)
+        assert told.is_of(here) is False
+        shutil.rmtree(run)
+        shutil.copytree(backup, run)
+        told, here = self.of(run)
+        if here.generation:  # Else numbers may be given anew, and nothing tells.
+            assert told.is_of(here) is False
+
+    def test_the_journal_of_a_backup_in_the_folder_of_the_run_is_another(self, run: Path) -> None:
+        _, before = self.of(run)
+        shutil.copy(run / "journal.sqlite", run / "copy")
+        (run / "copy").replace(run / "journal.sqlite")
+        _, here = self.of(run)
+        assert here.inode == before.inode
+        assert here.journal != before.journal
+
+    def test_a_folder_that_bears_the_number_of_one_that_is_gone_is_another(self, run: Path) -> None:
+        told, here = self.of(run)
+        said = replace(told, place=replace(here, generation=7))
+        assert said.is_of(replace(here, generation=8)) is False
+        assert said.is_of(replace(here, generation=0)) is True, "over NFS it is not told"
+
+    def test_a_snapshot_of_a_file_system_has_the_same_numbers_and_another_device(self, run: Path) -> None:
+        told, here = self.of(run)
+        assert told.is_of(replace(here, device=here.device + 1)) is False
+
+    def test_over_nfs_the_device_is_another_and_the_numbers_are_the_servers(self, run: Path) -> None:
+        told, here = self.of(run)
+        elsewhere = replace(told, process=replace(SELF, host="another"))
+        assert elsewhere.is_of(replace(here, device=here.device + 1, folder="/mnt/night")) is True
+        assert elsewhere.is_of(replace(here, inode=here.inode + 1)) is False
+
+    def test_after_a_boot_the_device_may_have_another_number(self, run: Path) -> None:
+        told, here = self.of(run)
+        before = replace(told, process=replace(SELF, boot="the one before"))
+        assert before.is_of(replace(here, device=here.device + 1)) is True
+
+    @pytest.mark.parametrize("kind", ["fuse.sshfs", "cifs", "virtiofs"])
+    def test_where_numbers_are_made_up_they_say_nothing(
+        self, run: Path, kind: str, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        told, here = self.of(run)
+        monkeypatch.setattr(heartbeat, "file_system_of", lambda path: kind)  # pyright: ignore[reportUnknownLambdaType, reportUnknownArgumentType]
+        mounted = SessionPlace.of(run / "journal.sqlite")
+        assert mounted is not None
+        assert mounted.folder == here.folder
+        assert told.is_of(mounted) is None
+
+    def test_older_signs_and_damaged_ones_say_nothing(self, run: Path) -> None:
+        told, here = self.of(run)
+        assert replace(told, place=None).is_of(here) is None
+        assert told.is_of(None) is None
+        for text in (
+            "",
+            "null",
+            "{}",
+            '["/night"]',
+            '["/night", 1, 2]',
+            '["/night", 1, 2, "x"]',
+            '["/night", 1, 2, null]',
+        ):
+            assert SessionPlace.from_text(text) is None
+        assert SessionPlace.from_text(here.to_text()) == here
+
+    def test_what_a_reader_of_a_copy_is_told(self, run: Path) -> None:
+        told, here = self.of(run)
+        copy, at = replace(here, folder="/backup/night", inode=1), told.at.astimezone().strftime("%Y-%m-%d %H:%M:%S")
+        elsewhere = replace(told, process=replace(SELF, host="lab"))
+        assert elsewhere.sentence_of_copy(copy, None) == (
+            f"copied from lab:{run} at {at} or later, and it is not known from here whether the run there goes on; ask "
+            "acquire status there"
+        )
+        assert "and the run there goes on; look there" in told.sentence_of_copy(copy, alive=True)
+        assert "which is over now; acquire status" in told.sentence_of_copy(copy, alive=False)
+        assert told.sentence_of_copy(here, alive=False) == (
+            f"restored from a copy of {at} or later, made while a run was at work; run the same command again"
+        )
+
+
+class TestSignsOfLife:
+    @staticmethod
+    def told(block: Callable[[Callable[[], None]], None]) -> list[tuple[str, str]]:
+        said: list[tuple[str, str]] = []
+        signs = signs_of_life(lambda state, sentence, until: said.append((state, sentence)), lambda: None, 60.0)
+        with contextlib.suppress(BaseException), signs as alive:
+            block(alive)
+        return said
+
+    def test_a_run_that_comes_to_its_end_gives_no_cause(self) -> None:
+        assert self.told(lambda alive: alive()) == [("running", "frames are taken"), ("ended", "")]
+
+    def test_what_ended_it_is_told(self) -> None:
+        def interrupted(alive: Callable[[], None]) -> None:
+            raise KeyboardInterrupt
+
+        def unplugged(alive: Callable[[], None]) -> None:
+            raise DeviceError("the camera is gone; find it")
+
+        def mistaken(alive: Callable[[], None]) -> None:
+            raise ZeroDivisionError
+
+        assert self.told(interrupted)[-1] == ("ended", "interrupted; run the same command again")
+        assert self.told(unplugged)[-1] == ("ended", "the camera is gone; find it")
+        assert self.told(mistaken)[-1][0] == "ended"
+        assert "mistake of the program" in self.told(mistaken)[-1][1]
+
+    def test_a_frame_a_second_is_no_write_a_second(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        seconds = itertools.count()
+        clock = SimpleNamespace(monotonic=lambda: float(next(seconds)))
+        monkeypatch.setattr(heartbeat, "time", clock)
+
+        def twelve_frames(alive: Callable[[], None]) -> None:
+            for _ in range(12):
+                alive()
+
+        assert len(self.told(twelve_frames)) < 8
+
+    def test_after_a_wait_the_first_frame_says_that_it_is_over(self, tmp_path: Path) -> None:
+        Journal.create(tmp_path / "journal.sqlite", ())
+        with closing(Journal.open_for_run(tmp_path / "journal.sqlite")) as journal:
+            with signs_of_life(journal.beat, journal.heartbeat, 60.0) as alive:
+                journal.beat("waiting", "the lamp warms up", NOW)
+                alive()
+                told = journal.heartbeat()
+                assert told is not None
+                assert told.state == "running"
+            told = journal.heartbeat()
+            assert told is not None
+            assert told.state == "ended"
+
+    def test_a_full_disk_does_not_end_the_run(self) -> None:
+        def full(state: str, sentence: str, until: datetime) -> None:
+            raise StorageError("no space")
+
+        with signs_of_life(full, lambda: None, 60.0) as alive:
+            alive()

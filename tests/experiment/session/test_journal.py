@@ -1,0 +1,119 @@
+"""The journal of a session: what is written is there after the program, and what is no journal is said to be none."""
+
+from __future__ import annotations
+
+import sqlite3
+from contextlib import closing
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+import pytest
+
+from drivers.presenter import Colour
+from experiment.lights.illuminations import Illumination
+from experiment.session import journal_file
+from experiment.session.journal import Journal
+from experiment.session.judgement import Judgement
+from experiment.session.plan import plan_steps
+from experiment.session.records import ACCEPTED, FAILED, AcceptedFile, SessionEvent
+from foundation.errors import FormatError, StorageError
+
+LIGHTS = (Illumination(0, "uniform", None, Colour(255, 0, 0)),)
+STEPS = plan_steps(LIGHTS, 2)
+NOW = datetime(2026, 1, 1, 9, 30, tzinfo=UTC)
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    Journal.create(tmp_path / "journal.sqlite", STEPS)
+    return tmp_path / "journal.sqlite"
+
+
+def commit(journal: Journal, attempt: int, reason: str = "") -> None:
+    journal.commit(
+        attempt,
+        file=f"frames/{attempt}.cr2",
+        size=10 * attempt,
+        sha256="00",
+        taken_at=NOW,
+        exposure_s=0.5,
+        ended_at=NOW + timedelta(seconds=2),
+        judgement=Judgement.of_reason("exposure", reason or None),
+    )
+
+
+def test_what_is_written_is_read_again(path: Path) -> None:
+    with closing(Journal.open_for_run(path)) as journal:
+        white, dark = (journal.begin(step, f"frames/{step.stem}", NOW) for step in STEPS[:2])
+        commit(journal, white)
+        journal.fail(dark, NOW, "the cable came off")
+        journal.note(NOW, "start", "4 of 4 frames to take")
+    with closing(Journal.open_for_run(path)) as journal:
+        assert journal.steps() == STEPS
+        attempts = journal.attempts()
+        assert [(attempt.step, attempt.verdict, attempt.has_frame) for attempt in attempts] == [
+            (0, ACCEPTED, True),
+            (1, FAILED, False),
+        ]
+        assert attempts[0].ended_at == NOW + timedelta(seconds=2)
+        assert attempts[1].reason == "the cable came off"
+        assert journal.accepted_files() == [AcceptedFile(1, 0, None, "frames/1.cr2", 10, "00")]
+        assert journal.events() == [SessionEvent(NOW, "start", "4 of 4 frames to take")]
+
+
+def test_frames_come_in_the_order_of_the_plan_refused_ones_with_their_reason(path: Path) -> None:
+    with closing(Journal.open_for_run(path)) as journal:
+        dark, white = journal.begin(STEPS[1], "a", NOW), journal.begin(STEPS[0], "b", NOW)
+        commit(journal, dark)
+        commit(journal, white, "too dark")
+        again = journal.begin(STEPS[0], "c", NOW)
+        assert [frame.verdict for frame in journal.frames()] == ["refused: too dark", "accepted"]
+        assert [frame.accepted for frame in journal.frames()] == [False, True]
+        assert journal.kept_files(STEPS[0]) == 1, "an attempt without a raw file keeps none"
+        assert journal.attempts()[again - 1].verdict is None
+
+
+def test_a_journal_that_cannot_be_written_says_what_helps(path: Path) -> None:
+    with (
+        closing(Journal.open(path)) as journal,
+        pytest.raises(StorageError, match=r"cannot write .*journal\.sqlite: attempt to write a readonly .*; see that"),
+    ):
+        journal.note(NOW, "start")
+
+
+def test_a_damaged_journal(path: Path) -> None:
+    path.write_bytes(b"not a database at all" * 100)
+    with pytest.raises(FormatError, match="damaged"):
+        Journal.open(path)
+
+
+def test_a_journal_without_its_plan(path: Path) -> None:
+    with closing(sqlite3.connect(path)) as journal, journal:
+        journal.execute("DROP TABLE plan")
+    with pytest.raises(FormatError, match=r"journal\.sqlite is damaged: it lacks its table plan; restore"):
+        Journal.open(path)
+
+
+def test_a_journal_that_may_not_be_read_is_not_damaged(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(file: Path, mode: str) -> None:
+        raise PermissionError(13, "Permission denied", str(file))
+
+    monkeypatch.setattr(Path, "open", refuse)
+    with pytest.raises(FormatError, match=r"cannot read .*journal\.sqlite: Permission denied; check its permissions"):
+        Journal.open(path)
+
+
+def test_a_journal_that_another_holds_is_not_damaged(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(journal_file, "READING_LIMIT_S", 0)
+    with closing(sqlite3.connect(path)) as other:
+        other.execute("BEGIN EXCLUSIVE")
+        with pytest.raises(FormatError, match="database is locked; see that no other program holds it"):
+            Journal.open(path)
+
+
+def test_a_journal_of_the_future(path: Path) -> None:
+    with sqlite3.connect(path) as journal:
+        journal.execute("PRAGMA user_version = 99")
+    journal.close()
+    with pytest.raises(FormatError, match="version 99"):
+        Journal.open(path)

@@ -1,0 +1,60 @@
+"""The plan of a session: which frames, in which order."""
+
+from __future__ import annotations
+
+from drivers.presenter import BLACK, WHITE, Colour
+from experiment.lights.illuminations import Illumination
+from experiment.session.plan import RESPONSE, SessionStep, plan_steps, tie_steps
+
+LIGHTS = tuple(Illumination(number, "uniform", None, Colour(255, number, 0)) for number in range(5))
+
+
+def test_the_plan_puts_white_and_dark_before_between_and_after() -> None:
+    steps = plan_steps(LIGHTS, 2)
+    kinds = "".join(step.kind[0] for step in steps)
+    assert kinds == "wdllwdllwdlwd"
+    assert [step.number for step in steps] == list(range(len(steps)))
+    assert {step.colour for step in steps if step.kind == "white"} == {WHITE}
+    assert {step.colour for step in steps if step.kind == "dark"} == {BLACK}
+    assert [step.illumination for step in steps if step.kind == "light"] == [0, 1, 2, 3, 4]
+
+
+def test_a_step_names_its_file_so_that_files_sort_in_taking_order() -> None:
+    steps = plan_steps(LIGHTS, 2)
+    stems = [step.stem for step in steps]
+    assert stems[:3] == ["0000_white", "0001_dark", "0002_light_000"]
+    assert stems == sorted(stems)
+    assert SessionStep(7, "light", 5, WHITE).stem == "0007_light_005"
+
+
+def test_a_seed_shuffles_the_lights_and_nothing_else() -> None:
+    listed, shuffled = plan_steps(LIGHTS, 2), plan_steps(LIGHTS, 2, seed=1)
+    assert [step.kind for step in shuffled] == [step.kind for step in listed]
+    # numpy.random.Generator(numpy.random.PCG64(1)).permutation(5) of numpy 2.4.6
+    assert [step.illumination for step in shuffled if step.kind == "light"] == [4, 0, 1, 2, 3]
+    assert all(step.colour == LIGHTS[step.illumination].colour for step in shuffled if step.illumination is not None)
+    assert plan_steps(LIGHTS, 2, seed=1) == shuffled != plan_steps(LIGHTS, 2, seed=2)
+
+
+def test_response_frames_come_after_the_first_pair_and_are_taken_for_nothing_else() -> None:
+    steps = plan_steps(LIGHTS, 2, response=RESPONSE)
+    assert "".join(step.kind[0] for step in steps) == "wd" + "r" * len(RESPONSE) + "llwdllwdlwd"
+    response = [step for step in steps if step.kind == "response"]
+    assert tuple(step.colour for step in response) == RESPONSE
+    assert all(step.illumination is None and max(step.colour.codes) < 255 for step in response)
+    assert response[0].stem == "0002_response"
+    assert len(set(RESPONSE)) == len(RESPONSE)
+
+
+def test_the_steps_that_tie_a_run_to_the_one_before_go_on_in_number() -> None:
+    steps = tie_steps(40)
+    assert [step.number for step in steps] == [40, 41, 42, 43, 44, 45]
+    assert [step.colour for step in steps] == [
+        Colour(250, 250, 250),
+        Colour(250, 0, 0),
+        Colour(0, 250, 0),
+        Colour(0, 0, 250),
+        Colour(255, 255, 255),
+        Colour(0, 0, 0),
+    ]
+    assert [step.kind for step in steps] == [*["response"] * 4, "white", "dark"]

@@ -1,0 +1,265 @@
+"""Frames that are taken again: what was damaged, what a person names, and what a report refused."""
+
+from __future__ import annotations
+
+import errno
+import hashlib
+import json
+import os
+from collections.abc import Generator, Sequence
+from contextlib import closing
+from datetime import UTC, datetime
+from pathlib import Path
+
+import pytest
+
+from drivers.camera import CapturedFrame
+from drivers.presenter import Colour
+from experiment.chart.layout import design_chart
+from experiment.lights.illuminations import Illumination
+from experiment.session.folder import Session
+from experiment.session.judgement import Judgement
+from experiment.session.mending.retaking import lights_text, parse_lights
+from experiment.session.mending.verification import MOST_UNREADABLE
+from experiment.session.plan import plan_steps
+from foundation.errors import FormatError, InputError, StorageError
+
+LIGHTS = tuple(Illumination(number, "uniform", None, Colour(255, number, 0)) for number in range(5))
+NOW = datetime(2026, 1, 1, 9, 30, tzinfo=UTC)
+
+
+@pytest.fixture
+def session(tmp_path: Path) -> Generator[Session]:
+    """Yield a complete session: white, dark, five lights, white, dark."""
+    made = Session.create(tmp_path / "s", "", design_chart(bits=1), LIGHTS, plan_steps(LIGHTS, 25))
+    with made:
+        take_what_is_left(made)
+        yield made
+
+
+def take_what_is_left(session: Session) -> list[int]:
+    """Take every step without an accepted frame; return their numbers."""
+    left = [step for step in session.steps if step.number not in session.done_steps()]
+    for step in left:
+        kept = session.journal.kept_files(step)
+        stem = step.stem if not kept else f"{step.stem}_try{kept + 1}"
+        content = f"frame {stem}".encode()
+        attempt = session.journal.begin(step, f"frames/{stem}", NOW)
+        received = session.receive(stem, lambda into, data=content: CapturedFrame("a.cr2", into.write(data), NOW))
+        session.commit(attempt, received, Judgement(()), exposure_s=0.5, ended_at=NOW)
+    return [step.number for step in left]
+
+
+def verdicts(session: Session, number: int) -> list[str | None]:
+    return [attempt.verdict for attempt in session.journal.attempts() if attempt.step == number]
+
+
+def test_an_undamaged_session_stays_as_it_is(session: Session) -> None:
+    seen: list[tuple[int, int]] = []
+    assert session.verify(lambda done, total: seen.append((done, total))) == ()
+    assert seen == [(done, 9) for done in range(10)]
+    assert take_what_is_left(session) == []
+
+
+@pytest.mark.parametrize("damage", ["a flipped byte", "cut off", "longer", "gone", "a folder"])
+def test_a_damaged_frame_is_voided_and_taken_again(session: Session, damage: str) -> None:
+    path = session.frames_folder / "0003_light_001.cr2"
+    before = path.read_bytes()
+    match damage:
+        case "a flipped byte":
+            path.write_bytes(before[:-1] + bytes([before[-1] ^ 1]))
+        case "cut off":
+            path.write_bytes(before[:-1])
+        case "longer":
+            path.write_bytes(before + b"!")
+        case _:
+            path.unlink()
+            if damage == "a folder":
+                path.mkdir()
+    (reason,) = session.verify()
+    assert reason.startswith("frames/0003_light_001.cr2 ")
+    assert take_what_is_left(session) == [3]
+    assert verdicts(session, 3) == ["voided", "accepted"]
+    of_light = [frame for frame in session.frames() if frame.illumination == 1]
+    assert [frame.verdict for frame in of_light] == [f"refused: {reason}", "accepted"]
+    assert of_light[1].file == "frames/0003_light_001_try2.cr2"
+    assert session.verify() == (), "what was voided is not looked at again"
+    assert path.exists() == (damage != "gone"), "nothing is deleted"
+
+
+def test_two_accepted_frames_of_a_step_count_once(session: Session) -> None:
+    """Older software retook a truncated frame and left both accepted."""
+    step = session.steps[3]
+    attempt = session.journal.begin(step, "frames/again", NOW)
+    received = session.receive("again", lambda into: CapturedFrame("a.cr2", into.write(b"again"), NOW))
+    session.commit(attempt, received, Judgement(()), exposure_s=0.5, ended_at=NOW)
+    counted = [frame.file for frame in session.frames() if frame.illumination == 1 and frame.accepted]
+    assert counted == ["frames/again.cr2"], "also where nobody has verified it"
+    assert session.verify() == ("taken again since, as frames/again.cr2",)
+    assert verdicts(session, 3) == ["voided", "accepted"]
+    assert session.done_steps() == set(range(9))
+
+
+def test_the_newest_sound_frame_stays_where_a_newer_one_is_gone(session: Session) -> None:
+    step = session.steps[3]
+    attempt = session.journal.begin(step, "frames/again", NOW)
+    received = session.receive("again", lambda into: CapturedFrame("a.cr2", into.write(b"again"), NOW))
+    session.commit(attempt, received, Judgement(()), exposure_s=0.5, ended_at=NOW)
+    received.path.unlink()
+    session.verify()
+    assert verdicts(session, 3) == ["accepted", "voided"]
+
+
+def unreadable(names: Sequence[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let the disk fail at files of these names."""
+    real = Path.open
+
+    def fail(path: Path, mode: str = "r") -> object:
+        if path.name in names:
+            raise OSError(errno.EIO, "Input/output error", str(path))
+        return real(path, mode)
+
+    monkeypatch.setattr(Path, "open", fail)
+
+
+def test_a_frame_in_bad_sectors_is_taken_again_and_its_file_stays(
+    session: Session, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with monkeypatch.context() as patched:
+        unreadable(["0003_light_001.cr2"], patched)
+        assert session.verify() == ("frames/0003_light_001.cr2 cannot be read: Input/output error; it is taken again",)
+    assert verdicts(session, 3) == ["voided"]
+    assert take_what_is_left(session) == [3]
+    assert (session.frames_folder / "0003_light_001.cr2").read_bytes() == b"frame 0003_light_001"
+
+
+def test_frames_that_cannot_be_read_are_not_given_up(session: Session, monkeypatch: pytest.MonkeyPatch) -> None:
+    """So many are not bad sectors: the disk fails, and what is on it may be sound."""
+    names = [Path(frame.file).name for frame in session.journal.accepted_files()][: MOST_UNREADABLE + 1]
+    with monkeypatch.context() as patched:
+        unreadable(names, patched)
+        with pytest.raises(StorageError, match=rf"{names[0]} and 3 more: Input/output error; check the disk"):
+            session.verify()
+    assert session.done_steps() == set(range(9))
+
+
+def test_a_session_whose_frames_are_elsewhere_loses_none(session: Session) -> None:
+    session.frames_folder.rename(session.folder / "elsewhere")
+    with pytest.raises(FormatError, match="frames is missing"):
+        session.verify()
+    (session.folder / "elsewhere").rename(session.frames_folder)
+    assert session.done_steps() == set(range(9))
+
+
+def test_lights_that_are_named_are_taken_again(session: Session) -> None:
+    assert session.retake("4, 1-2") == (1, 2, 4)
+    assert take_what_is_left(session) == [3, 4, 6]
+    assert verdicts(session, 3) == ["voided", "accepted"]
+    assert "--retake 1-2,4" in session.journal.attempts()[3].reason
+    assert session.retake("1-2,4") == (1, 2, 4), "asked for again after it was done, it is done again"
+    assert take_what_is_left(session) == [3, 4, 6]
+
+
+def test_the_same_command_after_an_interruption_takes_nothing_twice(session: Session) -> None:
+    session.retake("1,2")
+    step = session.steps[3]
+    attempt = session.journal.begin(step, "frames/x", NOW)
+    received = session.receive("x", lambda into: CapturedFrame("a.cr2", into.write(b"x"), NOW))
+    session.commit(attempt, received, Judgement(()), exposure_s=0.5, ended_at=NOW)
+    session.retake("1-2")
+    assert take_what_is_left(session) == [4]
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("900", r"the session has no light 900, its 5 lights are 0 … 4"),
+        ("3-7", "no light 7"),
+        ("4-2", r"4-2 runs backwards; name it 2-4"),
+        ("white", r"'white' is no light; name lights as 12,40-44, or bad for those that build-lut refused"),
+        ("1,,2", "'' is no light"),
+        ("-1", "'-1' is no light"),
+        ("²", "is no light"),
+        ("", "'' is no light"),
+        ("99999999999999", "is no light"),
+    ],
+)
+def test_what_is_no_selection(session: Session, text: str, said: str) -> None:
+    with pytest.raises(InputError, match=said):
+        session.retake(text)
+    assert session.done_steps() == set(range(9))
+
+
+@pytest.mark.parametrize("text", ["0", "0-4", "1,3", "0-1,3-4"])
+def test_lights_as_text_are_read_again(text: str) -> None:
+    assert lights_text(parse_lights(text, range(5))) == text
+
+
+def write_report(
+    folder: Path, lights: str, frames: Sequence[bytes], registered: bytes, age: int, newest: bytes | None = None
+) -> None:
+    folder.mkdir()
+    says: dict[str, object] = {
+        "retake": lights,
+        "retake_sha256": [hashlib.sha256(frame).hexdigest() for frame in frames],
+        "registered_sha256": hashlib.sha256(registered).hexdigest(),
+    }
+    if newest is not None:
+        says["newest_sha256"] = hashlib.sha256(newest).hexdigest()
+    (folder / "report.json").write_text(json.dumps(says))
+    os.utime(folder / "report.json", (age, age))
+
+
+def test_what_the_newest_report_refused_is_taken_again_once(session: Session, tmp_path: Path) -> None:
+    white = b"frame 0000_white"
+    write_report(tmp_path / "lut", "0", [b"frame 0002_light_000"], white, 100)
+    write_report(tmp_path / "lut.refused", "2", [b"frame 0004_light_002", white], white, 200)
+    write_report(tmp_path / "of another session", "3", [b"frame 0005_light_003"], b"another", 300)
+    (tmp_path / "broken").mkdir()
+    (tmp_path / "broken" / "report.json").write_text("{")
+    (tmp_path / "old").mkdir()
+    (tmp_path / "old" / "report.json").write_text('{"format": "crop.report"}')
+    assert session.retake("bad") == (2,)
+    assert take_what_is_left(session) == [0, 4], "references that were refused are taken again, too"
+    assert "lut.refused/report.json" in session.journal.attempts()[4].reason
+    session.retake("bad")
+    assert take_what_is_left(session) == [], "the report is on the frames that were there before"
+
+
+def test_the_newest_report_is_the_one_on_the_newest_frames_whatever_clocks_said(
+    session: Session, tmp_path: Path
+) -> None:
+    white = b"frame 0000_white"
+    write_report(tmp_path / "lut", "0", [b"frame 0002_light_000"], white, 900, newest=b"frame 0004_light_002")
+    # The machine's clock was set back before this one was written, which knows a later frame.
+    write_report(tmp_path / "later", "1", [b"frame 0003_light_001"], white, 100, newest=b"frame 0006_light_004")
+    # A copy of the session went on by itself: of this one, the report says nothing.
+    write_report(tmp_path / "of a copy", "3", [b"frame 0005_light_003"], white, 999, newest=b"taken in the copy")
+    assert session.retake("bad") == (1,)
+    assert take_what_is_left(session) == [3]
+
+
+def test_between_reports_on_the_same_frames_the_one_written_last_counts(session: Session, tmp_path: Path) -> None:
+    white, last = b"frame 0000_white", b"frame 0006_light_004"
+    write_report(tmp_path / "lut", "0", [b"frame 0002_light_000"], white, 200, newest=last)
+    write_report(tmp_path / "lut.refused", "1", [b"frame 0003_light_001"], white, 100, newest=last)
+    assert session.retake("bad") == (0,)
+
+
+def test_without_a_report_on_this_session_nothing_is_bad(session: Session, tmp_path: Path) -> None:
+    write_report(tmp_path / "of another session", "3", [b"frame 0005_light_003"], b"another", 300)
+    with pytest.raises(FormatError, match=r"no report of build-lut on .*/s lies beside it.*or name the lights"):
+        session.retake("bad")
+
+
+def test_a_report_that_refused_nothing_is_named(session: Session, tmp_path: Path) -> None:
+    write_report(tmp_path / "lut.refused", "2", [b"frame 0004_light_002"], b"frame 0000_white", 100)
+    write_report(tmp_path / "lut", "", [], b"frame 0000_white", 200)
+    with pytest.raises(InputError, match=r"lut/report.json, the newest report .* names no frame.*leave --retake out"):
+        session.retake("bad")
+
+
+def test_a_reader_takes_nothing_again(session: Session) -> None:
+    session.close()
+    with closing(Session.open(session.folder)) as reader, pytest.raises(StorageError, match="readonly"):
+        reader.retake("1")

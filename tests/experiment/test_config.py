@@ -1,0 +1,257 @@
+"""LAB.toml: every mistake is one sentence that names the key, the value and the remedy."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from acquisition.run.shutter import require_whole_turns
+from experiment.config import LabSettings, load_lab, parse_lab
+from foundation.errors import ConfigurationError
+from foundation.trust.secret_texts import target_label
+
+MINIMAL = 'rig = "simulated"\nchart = "c/chart.json"\nilluminations = "lights.csv"\n'
+
+
+def test_paths_are_relative_to_the_file(tmp_path: Path) -> None:
+    lab = tmp_path / "LAB.toml"
+    lab.write_text(MINIMAL)
+    settings = load_lab(lab)
+    assert settings.chart == tmp_path.resolve() / "c/chart.json"
+    assert settings.illuminations == tmp_path.resolve() / "lights.csv"
+
+
+def test_settings_as_used_read_back_equal() -> None:
+    settings = parse_lab(MINIMAL + "[camera]\niso = 200\n[simulated.room]\nwaviness_mm = 6.0\n", "LAB.toml")
+    again = parse_lab(settings.to_toml(), "session.toml")
+    assert again.read_from("LAB.toml") == settings
+    assert again.camera.iso == 200
+    assert again.simulated.room == {"waviness_mm": 6.0}
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        (MINIMAL + "[camera]\nshuter_s = 1\n", "unknown key 'camera.shuter_s'; did you mean 'shutter_s'?"),
+        (MINIMAL + "[camra]\niso = 1\n", "unknown key 'camra'; did you mean 'camera'?"),
+        (MINIMAL + "[sequence]\nxyzzy = 1\n", "known are attempts"),
+        (MINIMAL + "[camera]\niso = -5\n", "camera.iso = -5"),
+        (MINIMAL + "[camera]\nshutter_s = nan\n", "camera.shutter_s"),
+        (MINIMAL + "[camera]\niso = 'fast'\n", "camera.iso = 'fast'"),
+        (MINIMAL + "[sequence]\npatience_s = -1\n", "sequence.patience_s = -1"),
+        (MINIMAL + "[sequence]\npatience_s = nan\n", "sequence.patience_s = nan"),
+        (MINIMAL + "[sequence]\npatience_s = 'never'\n", "sequence.patience_s = 'never'"),
+        (MINIMAL + "[sequence]\norder = 'random'\n", "sequence.order = 'random'"),
+        (MINIMAL + "[sequence]\nlamp_if_unfinished = 'dim'\n", "sequence.lamp_if_unfinished = 'dim'"),
+        (MINIMAL + "[judge]\nmoved = 1\n", "unknown key 'judge.moved'; did you mean 'moved_px'?"),
+        ('rig = "simulated"\n', "chart is missing"),
+        (MINIMAL.replace("simulated", "lightsaber"), "rig = 'lightsaber'"),
+        ("rig = ", "is not TOML"),
+    ],
+)
+def test_a_mistake_is_named(text: str, expected: str) -> None:
+    with pytest.raises(ConfigurationError) as caught:
+        parse_lab(text, "LAB.toml")
+    assert expected in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+OLDER = """rig = "simulated"
+chart = "/lab/chart.json"
+illuminations = "/lab/lights.csv"
+
+[camera]
+iso = 100
+aperture = 8.0
+shutter_s = 0.5
+
+[sequence]
+settle_s = 0.5
+reference_every = 25
+attempts = 3
+warm_up_s = 1200.0
+patience_s = 600.0
+switch_off = true
+
+[limits]
+clipped_percent = 0.1
+too_dark_dn = 100.0
+stray_light_percent = 5.0
+
+[simulated]
+body = "EOS 550D"
+seed = 1
+
+[simulated.room]
+
+[lab.camera]
+connection = "usb"
+port = 15740
+
+[lab.projector]
+control = "pjlink"
+password = "JBMIAProjectorLink"
+refresh_hz = 60.0
+colour_wheel_hz = 60.0
+
+[lab.light]
+shown_by = "display"
+"""
+
+
+def test_the_settings_of_an_older_session_are_read() -> None:
+    settings = parse_lab(OLDER, "session.toml")
+    assert settings.sequence.patience_s == 600
+    assert settings.judge.chart
+
+
+@pytest.mark.parametrize("text", ["inf", '"forever"', '"Forever"'])
+def test_patience_may_have_no_end(text: str) -> None:
+    settings = parse_lab(MINIMAL + f"[sequence]\npatience_s = {text}\n", "LAB.toml")
+    assert settings.sequence.patience_s == math.inf
+    assert parse_lab(settings.to_toml(), "session.toml").sequence.patience_s == math.inf
+
+
+@pytest.mark.parametrize(
+    ("target", "label"),
+    [
+        ("", ""),
+        ("https://ntfy.example:8443/s3cret?auth=s3cret#s3cret", "https://ntfy.example:8443/…"),
+        ("HTTPS://s3cret:s3cret@ntfy.example", "https://ntfy.example/…"),
+        ("http://[::1]:80/s3cret", "http://[::1]:80/…"),
+        ("curl -H 'Authorization: s3cret' https://x", "curl …"),
+        ("/opt/lab/notify", "/opt/lab/notify"),
+        ("'/opt/my lab/notify' s3cret", "/opt/my lab/notify …"),
+    ],
+)
+def test_no_secret_gets_into_the_session(target: str, label: str) -> None:
+    settings = LabSettings.model_validate(
+        {
+            "rig": "lab",
+            "chart": "c",
+            "illuminations": "i",
+            "sequence": {"notify": target},
+            "lab": {"projector": {"control": "pjlink", "host": "h", "password": "s3cret"}},
+        }
+    )
+    assert target_label(target) == label
+    assert "s3cret" not in settings.to_toml()
+    assert "s3cret" not in repr(settings)
+    assert parse_lab(settings.to_toml(), "session.toml").sequence.notify == label
+
+
+@pytest.mark.parametrize(
+    ("line", "expected"),
+    [
+        ('notify = "curl \'s3cret"', "sequence.notify = …: No closing quotation"),
+        ('notify = "https:///s3cret"', "a URL names a host"),
+        ('notify = "https://s3cret:99999/"', "sequence.notify = …: Port out of range"),
+        ('notify = "https://x/s3cret word"', "a URL has no spaces"),
+        ('notify = ["s3cret"]', "sequence.notify = …: Input should be a valid string"),
+    ],
+)
+def test_a_mistake_in_a_secret_is_named_without_it(line: str, expected: str) -> None:
+    with pytest.raises(ConfigurationError) as caught:
+        parse_lab(MINIMAL + f"[sequence]\n{line}\n", "LAB.toml")
+    assert expected in str(caught.value)
+    assert "s3cret" not in str(caught.value)
+    assert caught.value.__cause__ is None
+
+
+def test_replay_needs_a_recording(tmp_path: Path) -> None:
+    lab = tmp_path / "LAB.toml"
+    lab.write_text(MINIMAL.replace("simulated", "replay"))
+    with pytest.raises(ConfigurationError, match=r"\[replay\]"):
+        load_lab(lab)
+
+
+def test_a_missing_file_is_named(tmp_path: Path) -> None:
+    with pytest.raises(ConfigurationError, match=r"nowhere\.toml"):
+        load_lab(tmp_path / "nowhere.toml")
+
+
+@pytest.mark.parametrize("name", ["simulated.toml", "lab.toml"])
+def test_the_settings_that_a_lab_begins_with_are_read(name: str) -> None:
+    settings = load_lab(Path(__file__).parents[2] / "acquisition" / "data" / name)
+    require_whole_turns(settings.camera, settings.lab.projector)
+
+
+REAL = (
+    MINIMAL.replace("simulated", "lab")
+    + """
+[lab.projector]
+control = "pjlink"
+host = "h"
+"""
+)
+
+
+@pytest.fixture
+def lab_with(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Path]:
+    """Return a maker of a LAB.toml beside a file with a secret in it."""
+    monkeypatch.setenv("PJLINK", "s3cret-env")
+    monkeypatch.delenv("NOWHERE", raising=False)
+    (tmp_path / "word.txt").write_bytes(b"\xef\xbb\xbf s3cret-file \r\nsecond line\n")
+    (tmp_path / "empty.txt").write_text("\ns3cret")
+    (tmp_path / "binary").write_bytes(b"\xff\xfes3cret")
+    os.mkfifo(tmp_path / "pipe")
+
+    def make(line: str, text: str = REAL) -> Path:
+        path = tmp_path / "LAB.toml"
+        path.write_text(text + line + "\n")
+        return path
+
+    return make
+
+
+@pytest.mark.parametrize(
+    ("line", "found"),
+    [
+        ('password = "s3cret-key"', "s3cret-key"),
+        ('password = { env = "PJLINK" }', "s3cret-env"),
+        ('password = { file = "word.txt" }', "s3cret-file"),
+    ],
+)
+def test_a_secret_is_found_where_the_settings_say(lab_with: Callable[..., Path], line: str, found: str) -> None:
+    settings = load_lab(lab_with(line))
+    assert settings.lab.projector.password == found
+    assert "s3cret" not in settings.to_toml()
+    assert "s3cret" not in repr(settings)
+    notify = REAL + "[sequence]\n" + line.replace("password", "notify")
+    assert load_lab(lab_with("", notify)).sequence.notify == found
+
+
+@pytest.mark.parametrize(
+    ("place", "expected"),
+    [
+        ('{ env = "NOWHERE" }', "the environment has no NOWHERE; set it"),
+        ('{ file = "gone.txt" }', "gone.txt: No such file or directory; name a readable file"),
+        ('{ file = "empty.txt" }', "the first line of .*empty.txt is empty"),
+        ('{ file = "binary" }', "binary: it is no text; name a readable file"),
+        ('{ file = "pipe" }', "pipe is no file; name one"),
+        ('{ env = "PJLINK", file = "word.txt" }', "and nothing beside"),
+        ("{ env = 3 }", "expected the text itself"),
+        ("{}", "expected the text itself"),
+    ],
+)
+def test_a_secret_that_is_not_there_is_named(lab_with: Callable[..., Path], place: str, expected: str) -> None:
+    with pytest.raises(ConfigurationError, match=rf"lab\.projector\.password: .*{expected}") as caught:
+        load_lab(lab_with(f"password = {place}"))
+    assert "s3cret" not in str(caught.value)
+
+
+def test_nobody_needs_a_password_to_rehearse(lab_with: Callable[..., Path]) -> None:
+    settings = load_lab(lab_with('password = { env = "NOWHERE" }', REAL.replace('"lab"', '"simulated"')))
+    assert settings.lab.projector.password is None
+
+
+@pytest.mark.parametrize("line", ['[lab]\nprojector = "s3cret"', '[[lab.projector]]\npassword = "s3cret"'])
+def test_what_holds_a_secret_is_not_shown_either(line: str) -> None:
+    with pytest.raises(ConfigurationError) as caught:
+        parse_lab(MINIMAL + line, "LAB.toml")
+    assert "s3cret" not in str(caught.value)
+    assert caught.value.__cause__ is None
