@@ -1,7 +1,9 @@
-"""Count the modules that a reader opens to follow one light through each command.
+"""Count what a reader opens to follow one light through each command, and how large the house is.
 
-`python -m benchmarks.reading [--files]` prints one JSON object a line for each figure; with `--files`, each figure is
-followed by its modules in the order in which they are first needed. Takes a minute.
+`python -m benchmarks.reading [--files] [--size]` prints one JSON object a line for each figure; with `--files`, each
+figure is followed by its modules in the order in which they are first needed; with `--size`, packages and tests are
+counted in place of that: modules with code, lines, lines of code (no docstrings, comments and blank lines), and how
+long functions and lines of code are in the mean. Takes a minute; `--size` a second or two.
 
 What is counted: each command does the same small work twice, the second time with one light (for `generate`: one
 picture) more. A module belongs to that light where one of its functions ran more often the second time. Only functions
@@ -13,13 +15,17 @@ report) is left out, and nothing here knows the name of a module: the figures of
 from __future__ import annotations
 
 import argparse
+import ast
 import importlib
+import io
 import json
 import os
+import statistics
 import subprocess
 import sys
 import tempfile
 import threading
+import tokenize
 import tomllib
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
@@ -33,15 +39,20 @@ import numpy as np
 ROOT = Path(__file__).parents[1]
 PROJECT: dict[str, Any] = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
 ROOMS = frozenset[str](PROJECT["tool"]["importlinter"]["root_packages"])
-BEFORE = {"acquire run": 45, "acquire run, without the simulated lab": 31, "build-lut": 24, "generate": 29}
-"""The same count of commit e04a2df, before the packages were divided into rooms."""
+BEFORE = {"acquire run": 53, "acquire run, without the simulated lab": 38, "build-lut": 35, "generate": 33}
+"""The same count of commit a3796081, before modules were made deep."""
 LINES_BEFORE = {
-    "acquire run": 10694,
-    "acquire run, without the simulated lab": 7321,
-    "build-lut": 6290,
-    "generate": 7428,
+    "acquire run": 10827,
+    "acquire run, without the simulated lab": 7673,
+    "build-lut": 5945,
+    "generate": 6511,
 }
 """Lines of those modules, at that commit."""
+SIZE_BEFORE = {
+    "packages": {"modules": 622, "lines": 111471, "lines of code": 65673, "lines of code a function": 9.2},
+    "tests": {"lines": 63836},
+}
+"""Figures of size at that commit."""
 
 LAB = """\
 rig = "simulated"
@@ -193,22 +204,74 @@ def measure(folder: Path) -> dict[str, list[str]]:
     return found
 
 
+def code_lines(text: str, tree: ast.Module) -> set[int]:
+    """Return the numbers of the lines that hold code: no docstring, comment or blank line."""
+    skipped = {tokenize.COMMENT, tokenize.NL, tokenize.NEWLINE, tokenize.INDENT, tokenize.DEDENT, tokenize.ENDMARKER}
+    found: set[int] = set()
+    for token in tokenize.generate_tokens(io.StringIO(text).readline):
+        if token.type not in skipped:
+            found |= set(range(token.start[0], token.end[0] + 1))
+    for node in ast.walk(tree):
+        match node:
+            case ast.Expr(value=ast.Constant(value=str())):
+                found -= set(range(node.lineno, (node.end_lineno or node.lineno) + 1))
+            case _:
+                pass
+    return found
+
+
+def size(folders: Iterable[str]) -> dict[str, float]:
+    """Return how large the Python files below folders are, figure by figure."""
+    modules, lines, code = 0, 0, 0
+    functions, lengths = list[int](), list[int]()
+    for path in (path for folder in folders for path in (ROOT / folder).rglob("*.py")):
+        text = path.read_text(encoding="utf-8")
+        tree = ast.parse(text)
+        rows, own = text.splitlines(), code_lines(text, tree)
+        modules, lines, code = modules + bool(own), lines + len(rows), code + len(own)
+        lengths += [len(rows[number - 1]) for number in own]
+        for node in ast.walk(tree):
+            if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+                functions.append(len(own.intersection(range(node.lineno, (node.end_lineno or node.lineno) + 1))))
+    return {
+        "modules": modules,
+        "lines": lines,
+        "lines of code": code,
+        "lines of code a function": round(statistics.mean(functions or [0]), 2),
+        "characters a line of code": round(statistics.mean(lengths or [0]), 1),
+    }
+
+
+def print_size() -> None:
+    """Print how large the packages, each of them, and the tests are."""
+    groups = {"packages": sorted(ROOMS), **{room: [room] for room in sorted(ROOMS)}, "tests": ["tests"]}
+    for group, folders in groups.items():
+        for name, value in size(folders).items():
+            before = SIZE_BEFORE.get(group, {}).get(name)
+            against = {} if before is None else {"against": f"{before} before modules were made deep"}
+            print(json.dumps({"name": f"{name}: {group}", "value": value, "unit": "", **against}), flush=True)
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """Count and print; return the exit code."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--files", action="store_true", help="list the modules, too")
+    parser.add_argument("--size", action="store_true", help="count the house in place of ways through it")
     parser.add_argument("--trace", type=Path, metavar="OUT", help=argparse.SUPPRESS)
     parser.add_argument("command", nargs=argparse.REMAINDER, help=argparse.SUPPRESS)
     given = parser.parse_args(argv)
     if given.trace is not None:
         return trace(given.command[0], given.command[1:], given.trace)
+    if given.size:
+        print_size()
+        return 0
     with tempfile.TemporaryDirectory() as scratch:
         found = measure(Path(scratch))
     files = found["acquire run"]
     found["acquire run, without the simulated lab"] = [file for file in files if Path(file).parts[0] != "sim"]
     for name, files in found.items():
         figure = {"name": f"modules opened to follow one light: {name}", "value": len(files), "unit": "modules"}
-        print(json.dumps(figure | {"against": f"{BEFORE[name]} before the packages had rooms"}), flush=True)
+        print(json.dumps(figure | {"against": f"{BEFORE[name]} before modules were made deep"}), flush=True)
         lines = sum(len((ROOT / file).read_text(encoding="utf-8").splitlines()) for file in files)
         figure = {"name": f"lines of these modules: {name}", "value": lines, "unit": "lines"}
         print(json.dumps(figure | {"against": f"{LINES_BEFORE[name]} before"}), flush=True)
