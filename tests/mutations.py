@@ -1,7 +1,7 @@
 """Draw mutations of the product at random and count those that no test notices.
 
 `python -m tests.mutations [--count 60] [--seed 1] [--jobs 2]` changes one place at a time in a copy of the repository
-(a comparison, an operator, a number, a condition), runs the tests near it, and prints one JSON object a mutation and one
+(a comparison, an operator, a number), runs the tests near it, and prints one JSON object a mutation and one
 for the whole. Every place is as likely, so that packages have their share by size. A mutation is killed where a test
 fails or does not end in time. Tests are tried from near to far and the first failure ends a try: those that import the
 module, those of its package, whole commands and the packages above; what survives these is said to survive.
