@@ -39,13 +39,13 @@ import numpy as np
 ROOT = Path(__file__).parents[1]
 PROJECT: dict[str, Any] = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
 ROOMS = frozenset[str](PROJECT["tool"]["importlinter"]["root_packages"])
-BEFORE = {"acquire run": 53, "acquire run, without the simulated lab": 38, "build-lut": 35, "generate": 33}
-"""The same count of commit a3796081, before modules were made deep."""
+BEFORE = {"acquire run": 94, "acquire run, without the simulated lab": 76, "build-lut": 41, "generate": 40}
+"""The same count at commit a3796081, before modules were made deep; docs/architecture.md had an older one, 53, 38, 35, 33."""
 LINES_BEFORE = {
-    "acquire run": 10827,
-    "acquire run, without the simulated lab": 7673,
-    "build-lut": 5945,
-    "generate": 6511,
+    "acquire run": 20906,
+    "acquire run, without the simulated lab": 16414,
+    "build-lut": 8119,
+    "generate": 8163,
 }
 """Lines of those modules, at that commit."""
 SIZE_BEFORE = {
