@@ -1,4 +1,4 @@
-"""One question and one answer at a time over a cable that keeps no messages apart.
+"""What all projectors on a serial cable share: one question and one answer at a time, and the driver around them.
 
 Rules that hold inside:
 
@@ -8,17 +8,21 @@ Rules that hold inside:
   never meets a later question; what waits unread when a question is asked answers none of ours, and is thrown away.
 - A question that meets a connection the other side has dropped meanwhile is asked once more over a new one; every
   command of these drivers may be repeated without harm.
+- A projector that cools down is not switched on, and one that warms up is not switched off; one that is there, or on
+  the way, is sent nothing.
 """
 
 from __future__ import annotations
 
 import logging
+from abc import ABC, abstractmethod
 from collections.abc import Callable
-from typing import TypeVar
+from typing import ClassVar, TypeVar
 
 from drivers.links.link import Link
+from drivers.projector import Fault, Lamp, Power, ProjectorIdentity
 from foundation.clock import Clock, SystemClock
-from foundation.errors import LinkClosed, LinkTimeout, ProtocolError
+from foundation.errors import DeviceRefused, LinkClosed, LinkTimeout, ProtocolError
 
 SYSTEM_CLOCK = SystemClock()
 
@@ -47,7 +51,7 @@ class Exchange:
         timeout: float,
         label: str,
         clock: Clock,
-        greet: Callable[[Exchange], None] | None = None,
+        greet: Callable[[Exchange], None],
     ) -> None:
         self._connect = connect
         self._timeout = timeout
@@ -116,8 +120,7 @@ class Exchange:
             link = self._link
             if link is None:
                 link = self._link = self._connect()
-                if self._greet is not None:
-                    self._greet(self)
+                self._greet(self)
             self._discard(link)
             link.write(command, self._timeout)
             _log.debug("sent %r", command)
@@ -175,3 +178,117 @@ def text_of(data: bytes) -> str:
     if any(not 0x20 <= byte < 0x7F for byte in data):
         raise ProtocolError(f"the projector sends {quoted(data)}, which is no text; {CHECK_SPEED}")
     return data.decode("ascii")
+
+
+def take_line(data: bytes) -> tuple[str, int] | None:
+    """Take one command's line, without its CR, off the front of what a projector hears."""
+    end = data.find(b"\r")
+    return None if end < 0 else (data[:end].decode("ascii", "replace").strip(), end + 1)
+
+
+class SerialProjector(ABC):
+    """A `drivers.projector.Projector` of one maker, whose subclass knows the words; nothing is opened before its use.
+
+    Every question and command may raise `DeviceRefused`, `DeviceFault`, `LinkError` and `ProtocolError`.
+    """
+
+    maker: ClassVar[str]
+
+    def __init__(
+        self,
+        connect: Callable[[], Link],
+        timeout: float = DEFAULT_TIMEOUT_S,
+        label: str = "the projector",
+        clock: Clock = SYSTEM_CLOCK,
+    ) -> None:
+        self.label = label
+        self.clock = clock
+        self.exchange = Exchange(connect, timeout, label, clock, self.greet)
+
+    @abstractmethod
+    def power(self) -> Power:
+        """Return the power state now."""
+
+    @abstractmethod
+    def muted(self) -> bool | None:
+        """Return whether the picture is blanked, None where it cannot tell; refused unless the projector is on."""
+
+    @abstractmethod
+    def set_muted(self, muted: bool) -> None:
+        """Blank the picture, or show it; refused unless the projector is on."""
+
+    @abstractmethod
+    def faults(self) -> tuple[Fault, ...]:
+        """Return every fault reported now; empty when healthy, and where the projector cannot tell."""
+
+    @abstractmethod
+    def switch(self, on: bool) -> None:
+        """Send the command that switches on or off."""
+
+    @abstractmethod
+    def lamp_hours(self) -> tuple[int, ...]:
+        """Return the hours of every lamp; empty where the projector does not count them."""
+
+    def greet(self, exchange: Exchange) -> None:
+        """Say over a new connection what must be said before the first question: nothing in most languages."""
+        return
+
+    def model(self) -> str:
+        """Return the model, empty where the language has no question for it."""
+        return ""
+
+    def name(self) -> str:
+        """Return the name that the projector was given, empty where the language has no question for it."""
+        return ""
+
+    def identity(self) -> ProjectorIdentity:
+        """Return maker, model and name; empty what the projector does not say."""
+        return ProjectorIdentity(self.maker, _unless_refused(self.model), _unless_refused(self.name))
+
+    def switch_on(self) -> None:
+        """Begin to switch on; refused while it cools down."""
+        match self.power():
+            case Power.STANDBY:
+                self.switch(True)
+            case Power.COOLING:
+                raise DeviceRefused(f"{self.label} is cooling down; wait until it is in standby and try again")
+            case Power.ON | Power.WARMING:
+                pass
+
+    def switch_off(self) -> None:
+        """Begin to switch off; refused while it warms up."""
+        match self.power():
+            case Power.ON:
+                self.switch(False)
+            case Power.WARMING:
+                raise DeviceRefused(f"{self.label} is warming up; wait until it is on and try again")
+            case Power.STANDBY | Power.COOLING:
+                pass
+
+    def lamps(self) -> tuple[Lamp, ...]:
+        """Return every lamp; empty for a lampless projector, and for one that does not count hours."""
+        hours = self.lamp_hours()
+        lit = bool(hours) and self.power() in (Power.ON, Power.WARMING)
+        return tuple(Lamp(count, lit) for count in hours)
+
+    def close(self) -> None:
+        """Release the cable; the power state stays."""
+        self.exchange.close()
+
+    def hours_in(self, question: str, answer: str) -> tuple[int, ...]:
+        """Return the hours in an answer: numbers with spaces between them."""
+        words = answer.split()
+        if not words or not all(word.isascii() and word.isdecimal() for word in words):
+            raise self.unexpected(question, answer, "hours")
+        return tuple(int(word) for word in words)
+
+    def unexpected(self, question: str, answer: str, expected: str) -> ProtocolError:
+        """Return the error of an answer that the language does not have."""
+        return ProtocolError(f"{self.label} answers {answer!r} to {question}; expected {expected}")
+
+
+def _unless_refused(question: Callable[[], str]) -> str:
+    try:
+        return question()
+    except DeviceRefused:
+        return ""

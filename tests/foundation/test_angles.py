@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from foundation.angles import angles_deg
+from foundation.colorimetry import angles_deg
 
 Colour = tuple[float, float, float]
 COLOURS = st.tuples(*[st.floats(1e-3, 1e3)] * 3)

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from experiment.lights.illuminations import CCTS_K, blackbody_light, shown_colour
-from foundation.colorimetry.observer import XYZ_TO_SRGB, linear_srgb, observer_cie_1931, planck, xyz_of
+from foundation.colorimetry import XYZ_TO_SRGB, linear_srgb, observer_cie_1931, planck, xyz_of
 
 WAVELENGTHS = np.arange(360.0, 781.0)
 

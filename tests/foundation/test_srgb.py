@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from foundation.srgb import decode_srgb, encode_srgb, srgb_codes
+from foundation.colorimetry import decode_srgb, encode_srgb, srgb_codes
 
 
 def test_the_landmarks_of_the_standard() -> None:

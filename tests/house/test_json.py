@@ -16,8 +16,8 @@ import numpy as np
 import pytest
 from typer.main import get_command
 
+from foundation.console import JsonOutput, json_output, plain, with_json
 from foundation.errors import QualityError
-from foundation.json_output import JsonOutput, json_output, plain, with_json
 from tests.house_commands import COMMANDS
 from tests.json_of import json_of
 

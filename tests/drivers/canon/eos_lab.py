@@ -8,9 +8,9 @@ from typing import Any
 
 from drivers.camera import CapturedFrame, capture
 from drivers.canon.camera import CanonEos
-from drivers.links.pipes import UsbPipes
-from drivers.ptp.transport import Transport
-from drivers.ptp.usb_transport import UsbTransport
+from drivers.links.link import UsbPipes
+from drivers.ptp.transaction import Transport
+from drivers.ptp.usb import UsbTransport
 from foundation.errors import DeviceError, DeviceFault, DeviceRefused
 from sim.buses.ptp_memory import MemoryPipes
 from sim.buses.responder import Responder

@@ -14,18 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from drivers.camera import CameraIdentity, ExposureSettings, ReportsSupplies, capture
-from drivers.canon.camera import CanonEos
-from drivers.canon.records import (
-    AvailableValues,
-    Notice,
-    OtherRecord,
-    PropertyChanged,
-    Record,
-    TransferRequest,
-    decode_events,
-    encode_events,
-)
-from drivers.canon.state import (
+from drivers.canon.body import (
     MAX_LIST,
     MAX_PROPERTIES,
     MAX_VALUE,
@@ -35,15 +24,26 @@ from drivers.canon.state import (
     power_source,
     problems,
 )
-from drivers.canon.values import ImageFile, ImageFormat, number_value
-from drivers.links.pipes import Pipe, UsbPipes
+from drivers.canon.camera import CanonEos
+from drivers.canon.records import (
+    AvailableValues,
+    ImageFile,
+    ImageFormat,
+    Notice,
+    OtherRecord,
+    PropertyChanged,
+    Record,
+    TransferRequest,
+    decode_events,
+    encode_events,
+    number_value,
+)
+from drivers.links.link import Pipe, UsbPipes
 from drivers.links.usb import open_usb
 from drivers.ptp.codes import AeMode, CaptureDestination, EosEvent, Operation, Property, ResponseCode
-from drivers.ptp.ip_transport import IpTransport
-from drivers.ptp.messages import PtpEvent, PtpRequest, PtpResponse
-from drivers.ptp.reception import Reception
-from drivers.ptp.transport import Transaction, Transport
-from drivers.ptp.usb_transport import UsbTransport
+from drivers.ptp.ip import IpTransport
+from drivers.ptp.transaction import PtpEvent, PtpRequest, PtpResponse, Reception, Transaction, Transport
+from drivers.ptp.usb import UsbTransport
 from foundation.errors import DeviceError, DeviceRefused, LinkClosed, ProtocolError, StorageError
 from sim.buses import faults
 from sim.buses.faults import Occasion

@@ -6,20 +6,24 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.canon import datasets, values
 from drivers.canon import records as canon
-from drivers.canon.datasets import DeviceInfoEx, ObjectEntry
+from drivers.canon import records as datasets
+from drivers.canon import records as values
 from drivers.canon.records import (
     AvailableFormats,
     AvailableValues,
+    DeviceInfoEx,
+    ImageFile,
+    ImageFormat,
     Notice,
+    ObjectEntry,
     ObjectEvent,
     OtherRecord,
     PropertyChanged,
+    PropertySetting,
     Record,
     TransferRequest,
 )
-from drivers.canon.values import ImageFile, ImageFormat, PropertySetting
 from drivers.ptp.codes import CameraStatus, CaptureDestination, EosEvent, ObjectFormat, Property
 from foundation.errors import ProtocolError
 from tests.drivers.ptp import examples

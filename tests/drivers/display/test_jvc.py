@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 
 from drivers.display import jvc
 from drivers.display.jvc import JvcFlatField
-from drivers.links.memory import PeerLink
-from drivers.links.tcp import TcpLink
+from drivers.links.link import PeerLink
+from drivers.links.network import TcpLink
 from drivers.presenter import BLACK, WHITE, Colour
 from foundation.errors import DeviceError, DeviceRefused, LinkClosed, LinkTimeout, ProtocolError
 from sim.clock import SimulatedClock

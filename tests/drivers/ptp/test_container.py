@@ -9,10 +9,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.ptp import container
+from drivers.ptp import usb as container
 from drivers.ptp.codes import EventCode, Operation, ResponseCode
-from drivers.ptp.container import ContainerReader, DataPiece, DataStart, DeviceStatus, Message
-from drivers.ptp.messages import PtpEvent, PtpRequest, PtpResponse, next_transaction
+from drivers.ptp.transaction import PtpEvent, PtpRequest, PtpResponse, next_transaction
+from drivers.ptp.usb import ContainerReader, DataPiece, DataStart, DeviceStatus, Message
 from foundation.errors import ProtocolError
 from tests.drivers.ptp import examples
 

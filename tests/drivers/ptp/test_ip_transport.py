@@ -9,11 +9,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.links.link import Link
-from drivers.links.memory import MemoryLink, memory_pair
-from drivers.links.tcp import TcpServer
-from drivers.ptp.ip_transport import IpTransport
-from drivers.ptp.messages import PtpRequest, PtpResponse
+from drivers.links.link import Link, MemoryLink, memory_pair
+from drivers.links.network import TcpServer
+from drivers.ptp.ip import IpTransport
+from drivers.ptp.transaction import PtpRequest, PtpResponse
 from foundation.clock import SystemClock
 from foundation.errors import DeviceRefused, LinkClosed, LinkTimeout, ProtocolError
 from sim.buses.ptpip_server import serve_ptpip
@@ -173,7 +172,7 @@ def test_pings_are_answered_between_transactions() -> None:
 
 
 def test_a_long_wait_for_a_response_answers_pings(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("drivers.ptp.ip_connection._PING_EVERY_S", 0.01)
+    monkeypatch.setattr("drivers.ptp.ip._PING_EVERY_S", 0.01)
     far = FarEnd()
     transport = far.connect()
     far.heard(far.event)

@@ -9,9 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.ptp import ptpip
-from drivers.ptp.messages import PtpEvent, PtpRequest, PtpResponse
-from drivers.ptp.ptpip import (
+from drivers.ptp import ip as ptpip
+from drivers.ptp.ip import (
     Cancel,
     Data,
     EndData,
@@ -27,6 +26,7 @@ from drivers.ptp.ptpip import (
     Pong,
     StartData,
 )
+from drivers.ptp.transaction import PtpEvent, PtpRequest, PtpResponse
 from foundation.errors import ProtocolError
 from tests.drivers.ptp import examples
 

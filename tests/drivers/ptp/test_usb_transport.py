@@ -6,9 +6,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.links.pipes import Pipe, PipeStalled, UsbPipes
-from drivers.ptp.messages import PtpEvent, PtpRequest, PtpResponse
-from drivers.ptp.usb_transport import UsbTransport
+from drivers.links.link import Pipe, PipeStalled, UsbPipes
+from drivers.ptp.transaction import PtpEvent, PtpRequest, PtpResponse
+from drivers.ptp.usb import UsbTransport
 from foundation.errors import DeviceError, LinkClosed, LinkTimeout, ProtocolError
 from sim.buses.faults import CutOff, Deaf, Garbling, HeaderAlone, Joining, ShortReads, Stalling, WithoutEmptyPackets
 from sim.buses.ptp_memory import MemoryPipes

@@ -5,8 +5,8 @@ from __future__ import annotations
 import struct
 from dataclasses import replace
 
-from drivers.raw.origin import FrameOrigin, body_and_lens
-from drivers.tiff.reading import read_directories
+from drivers.raw.rawfile import FrameOrigin, body_and_lens
+from drivers.tiff import read_directories
 
 
 def canon_file(serial: int, lens: bytes) -> bytes:

@@ -16,11 +16,11 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from drivers import tiff
 from drivers.camera import ExposureSettings
 from drivers.raw import plain_dng as dng_reading
 from drivers.raw import rawfile
 from drivers.raw.rawfile import Area, Mosaic, read_raw
-from drivers.tiff import reading as tiff
 from foundation.errors import FormatError
 from sim.camera.dng import write_dng as write_simulated_dng
 from sim.world.sensors import BODIES, Rectangle

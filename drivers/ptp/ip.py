@@ -1,4 +1,4 @@
-"""PTP over TCP as bytes: every packet of both channels, and a cutter for the stream.
+"""PTP over a network: transactions on one TCP connection, events on a second one.
 
 A packet is its length (32 bits, these included), its type (32), then the fields of that type. The initiator opens the
 command channel and sends `InitCommandRequest`, the responder answers `InitCommandAck` with a number; the initiator
@@ -9,23 +9,38 @@ Rules that hold inside:
 
 - `PacketCutter` takes a stream in any pieces. Data packets may be of any length, whatever comes of them is handed on
   as `Data` at once and only their last bytes as `EndData`, which means the same; every other packet is at most
-  `MAX_PACKET` bytes.
-- Whatever arrives, the only error is `ProtocolError`; after it the stream has lost its place and every further
-  `feed` raises too.
+  `MAX_PACKET` bytes. Whatever arrives, its only error is `ProtocolError`; after it the stream has lost its place and
+  every further `feed` raises too.
+- Whoever waits for the device also answers its pings, at least once a second; nothing here has a thread.
+- Events are kept until asked for, the newest `MAX_EVENTS` of them.
+- A transaction that is called off is awaited to its response.
 
-Source: CIPA DC-005-2005, PTP-IP, clause 2.3.
+Source: CIPA DC-005-2005, PTP-IP, clauses 2.2 (connections) and 2.3 (packets).
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import contextlib
+from collections import deque
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from enum import IntEnum
+from typing import Final
 
-from drivers.ptp.cursor import Cursor
-from drivers.ptp.datasets import encode_integer
-from drivers.ptp.messages import MAX_PARAMETERS, PtpEvent, PtpRequest, PtpResponse
-from foundation.errors import ProtocolError
+from drivers.links.link import Link
+from drivers.links.network import TcpLink
+from drivers.ptp.datasets import Cursor, encode_integer
+from drivers.ptp.transaction import (
+    MAX_PARAMETERS,
+    PtpEvent,
+    PtpRequest,
+    PtpResponse,
+    Reception,
+    Transaction,
+    TransactionState,
+)
+from foundation.clock import Clock
+from foundation.errors import DeviceRefused, LinkClosed, LinkError, LinkTimeout, ProtocolError
 
 PORT = 15740
 """TCP port of PTP-IP (CIPA DC-005-2005)."""
@@ -424,3 +439,317 @@ _SHORTEST: dict[int, int] = {
     PacketType.PING: HEADER_LENGTH,
     PacketType.PONG: HEADER_LENGTH,
 }
+
+
+MAX_EVENTS: Final = 4096
+"""Events kept for a caller who never asks for them."""
+
+CONNECT_S: Final = 10.0
+"""Wait for each connection and each greeting: a camera wakes its network up in a few seconds."""
+
+EVENT_CHANNEL_S: Final = 2.0
+"""How long the second connection is tried: devices refuse it for about 0.1 s after they acknowledged the first."""
+
+RETRY_S: Final = 0.1
+"""Pause between two such tries."""
+
+_READ: Final = 128 * 1024
+"""Bytes asked of a link at once: two pieces of data as bodies send them."""
+
+_PING_EVERY_S: Final = 1.0
+"""Longest wait on the command connection without a look at the event connection."""
+
+_EVENT_READS: Final = 64
+"""Reads of the event connection at one look: a device that never stops talking must not keep us there."""
+
+
+class IpConnection:
+    """Both connections to one device, which has accepted this initiator.
+
+    `name`: what the device calls itself; may be empty.
+    """
+
+    def __init__(
+        self,
+        command: tuple[Link, PacketCutter],
+        event: tuple[Link, PacketCutter],
+        name: str,
+        events: Iterable[PtpEvent],
+    ) -> None:
+        self._command, self._command_cutter = command
+        self._event, self._event_cutter = event
+        self.name = name
+        self._packets: deque[Packet] = deque()
+        self._events = deque(events, maxlen=MAX_EVENTS)
+
+    def write_command(self, data: bytes, timeout: float) -> None:
+        """Send bytes on the command connection."""
+        self._command.write(data, timeout)
+
+    def write_event(self, data: bytes, timeout: float) -> None:
+        """Send bytes on the event connection."""
+        self._event.write(data, timeout)
+
+    def next_command(self, timeout: float) -> Packet:
+        """Return the next packet on the command connection, waiting `timeout` seconds for each of its bytes."""
+        left = timeout
+        while not self._packets:
+            wait = min(left, _PING_EVERY_S)
+            try:
+                piece = self._command.read(_READ, wait)
+            except LinkTimeout:
+                left -= wait
+                if left <= 0:
+                    raise
+                self.attend()
+                continue
+            left = timeout
+            self._packets.extend(self._command_cutter.feed(piece))
+        return self._packets.popleft()
+
+    def attend(self) -> None:
+        """Take what the event connection holds, and answer pings; never waits."""
+        for _ in range(_EVENT_READS):
+            try:
+                piece = self._event.read(_READ, 0.0)
+            except LinkTimeout:
+                return
+            for packet in self._event_cutter.feed(piece):
+                match packet:
+                    case PtpEvent():
+                        self._events.append(packet)
+                    case Ping():
+                        self._event.write(encode(Pong()), _PING_EVERY_S)
+                    case _:
+                        pass
+
+    def keep_event(self, event: PtpEvent) -> None:
+        """Keep an event that came on the command connection."""
+        self._events.append(event)
+
+    def take_events(self) -> tuple[PtpEvent, ...]:
+        """Return the events kept since the last call."""
+        events = tuple(self._events)
+        self._events.clear()
+        return events
+
+    def close(self) -> None:
+        """Hang up both connections; a second call does nothing."""
+        self._event.close()
+        self._command.close()
+
+
+def greet(
+    open_command: Callable[[], Link],
+    open_event: Callable[[], Link],
+    initiator: InitCommandRequest,
+    clock: Clock,
+    place: str,
+) -> IpConnection:
+    """Open both connections and introduce the initiator on them (clause 2.2).
+
+    `open_command`, `open_event`: open the two connections; the second is tried for `EVENT_CHANNEL_S`.
+    """
+    hello = encode(initiator)
+    command, cutter = open_command(), PacketCutter()
+    try:
+        command.write(hello, CONNECT_S)
+        acknowledgement, events = _greeting(command, cutter, place)
+        if not isinstance(acknowledgement, InitCommandAck):
+            raise _refusal(acknowledgement, place)
+        event, event_cutter = _dial(open_event, clock), PacketCutter()
+    except BaseException:
+        command.close()
+        raise
+    try:
+        event.write(encode(InitEventRequest(acknowledgement.connection)), CONNECT_S)
+        answer, more = _greeting(event, event_cutter, place)
+        if not isinstance(answer, InitEventAck):
+            raise _refusal(answer, place)
+    except BaseException:
+        event.close()
+        command.close()
+        raise
+    return IpConnection((command, cutter), (event, event_cutter), acknowledgement.name.strip(), [*events, *more])
+
+
+def _dial(open_event: Callable[[], Link], clock: Clock) -> Link:
+    """Open the second connection."""
+    deadline = clock.monotonic() + EVENT_CHANNEL_S
+    while True:
+        try:
+            return open_event()
+        except LinkClosed:
+            if clock.monotonic() >= deadline:
+                raise
+            clock.sleep(RETRY_S)
+
+
+def _greeting(link: Link, cutter: PacketCutter, place: str) -> tuple[Packet, list[PtpEvent]]:
+    """Return the first packet on a new connection, and the events behind it; nothing else comes unasked."""
+    while True:
+        try:
+            packets = cutter.feed(link.read(_READ, CONNECT_S))
+        except ProtocolError as error:
+            raise ProtocolError(f"what answers in place of {place} speaks no PTP/IP: {error}") from error
+        if packets:
+            return packets[0], [packet for packet in packets[1:] if isinstance(packet, PtpEvent)]
+
+
+def _refusal(answer: Packet, place: str) -> DeviceRefused | ProtocolError:
+    if not isinstance(answer, InitFail):
+        return ProtocolError(
+            f"{place} answers a greeting with {type(answer).__name__}; an acknowledgement was expected: "
+            f"check that a camera listens at this port"
+        )
+    match answer.reason:
+        case FailReason.REJECTED:
+            why = "does not know this computer: pair the two anew in the camera's wireless menu"
+        case FailReason.BUSY:
+            why = "is in use by another program or computer: disconnect that one, or switch the camera off and on"
+        case _:
+            why = f"gives reason {answer.reason}: switch it off and on"
+    return DeviceRefused(f"{place} refuses the connection; it {why}")
+
+
+DATA_PIECE: Final = 64 * 1024
+"""Bytes of data in a packet to the device; what libgphoto2 sends, and bodies are used to it."""
+
+_CALL_OFF_S: Final = 2.0
+"""Wait for the end of a transaction that was cancelled."""
+
+
+class IpTransport:
+    """A `drivers.ptp.transaction.Transport` over two links.
+
+    `open_command`, `open_event`: open the two connections; called again by `reset`. The second may raise `LinkClosed`
+    for as long as the device has not opened its port: it is tried for 2 s. `guid`: 16 bytes by which a camera knows a
+    computer that it was paired with.
+    """
+
+    def __init__(
+        self,
+        open_command: Callable[[], Link],
+        open_event: Callable[[], Link],
+        *,
+        guid: bytes,
+        name: str,
+        clock: Clock,
+        label: str = "the camera",
+    ) -> None:
+        self._open_command = open_command
+        self._open_event = open_event
+        self._initiator = InitCommandRequest(guid, name)
+        self._clock = clock
+        self._place = label
+        self._connection = self._connect()
+        self._state = TransactionState()
+
+    @classmethod
+    def connect(
+        cls, host: str, port: int = PORT, *, event_port: int | None = None, guid: bytes, name: str, clock: Clock
+    ) -> IpTransport:
+        """Connect to the camera at an address; `event_port` only where it is not the same."""
+        second = port if event_port is None else event_port
+        return cls(
+            lambda: TcpLink.connect(host, port, CONNECT_S),
+            lambda: TcpLink.connect(host, second, CONNECT_S),
+            guid=guid,
+            name=name,
+            clock=clock,
+            label=f"the camera at {host}:{port}",
+        )
+
+    @property
+    def label(self) -> str:
+        """The name that the device gave, and its address."""
+        name = self._connection.name
+        return f"{name} ({self._place})" if name else self._place
+
+    def transact(
+        self,
+        request: PtpRequest,
+        *,
+        send: bytes | None = None,
+        receive: Callable[[bytes], object] | None = None,
+        timeout: float,
+    ) -> Transaction:
+        """Carry out one transaction; see `drivers.ptp.transaction.Transport`."""
+
+        def exchange(reception: Reception) -> Transaction:
+            self._send(request, send, timeout)
+            return self._receive(reception, timeout)
+
+        return self._state.take(Reception(request, receive, self.label), exchange, self._call_off)
+
+    def events(self) -> tuple[PtpEvent, ...]:
+        """Return the events that have come since the last call, and answer pings; never waits."""
+        self._connection.attend()
+        return self._connection.take_events()
+
+    def reset(self) -> None:
+        """Hang up and connect anew; the session that was open is over."""
+        self.close()
+        # A device needs a moment to see that the old connection is gone; until then we ourselves keep it busy.
+        deadline = self._clock.monotonic() + EVENT_CHANNEL_S
+        while True:
+            try:
+                self._connection = self._connect()
+            except (DeviceRefused, LinkClosed):
+                if self._clock.monotonic() >= deadline:
+                    raise
+                self._clock.sleep(RETRY_S)
+            else:
+                self._state = TransactionState()
+                return
+
+    def close(self) -> None:
+        """Hang up both connections; a second call does nothing."""
+        self._state.closed = True
+        self._connection.close()
+
+    def _connect(self) -> IpConnection:
+        return greet(self._open_command, self._open_event, self._initiator, self._clock, self._place)
+
+    def _send(self, request: PtpRequest, send: bytes | None, timeout: float) -> None:
+        self._connection.write_command(encode(OperationRequest(request, send is not None)), timeout)
+        if send is None:
+            return
+        transaction = request.transaction
+        self._connection.write_command(encode(StartData(transaction, len(send))), timeout)
+        view = memoryview(send)
+        last = max(0, len(send) - 1) // DATA_PIECE * DATA_PIECE
+        for at in range(0, last, DATA_PIECE):
+            self._connection.write_command(encode_data(transaction, view[at : at + DATA_PIECE], last=False), timeout)
+        self._connection.write_command(encode_data(transaction, view[last:], last=True), timeout)
+
+    def _receive(self, reception: Reception, timeout: float) -> Transaction:
+        while True:
+            match self._connection.next_command(timeout):
+                case StartData(transaction, total):
+                    reception.start(transaction, total)
+                case Data(_, data) | EndData(_, data):
+                    reception.take(data)
+                case PtpResponse() as response:
+                    return reception.end(response)
+                case PtpEvent() as event:
+                    self._connection.keep_event(event)
+                case Ping():
+                    self._connection.write_command(encode(Pong()), timeout)
+                case Pong():
+                    pass
+                case other:
+                    raise ProtocolError(
+                        f"{self.label} sends {type(other).__name__} in the middle of a transaction; reset it"
+                    )
+
+    def _call_off(self, transaction: int) -> bool:
+        """Cancel a transaction whose data the caller cannot take, and wait for its end; return whether it came."""
+        deadline = self._clock.monotonic() + _CALL_OFF_S
+        with contextlib.suppress(LinkError, ProtocolError):
+            self._connection.write_event(encode(Cancel(transaction)), _CALL_OFF_S)
+            while self._clock.monotonic() < deadline:
+                packet = self._connection.next_command(_CALL_OFF_S)
+                if isinstance(packet, PtpResponse) and packet.transaction == transaction:
+                    return True
+        return False

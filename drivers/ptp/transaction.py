@@ -1,7 +1,9 @@
-"""The part of a transaction that comes from the device, the same on every cable: checked, and handed on.
+"""One transaction of PTP, whatever the cable: a request, at most one data phase, a response; and the events beside it.
 
 Rules that hold inside:
 
+- A `Transport` deals with bytes, pipes and time limits, not with sessions or the meaning of operations. Codes stay
+  plain integers, for a device may use any; `drivers.ptp.codes` names those that are known.
 - Nothing is kept of a data phase that the caller takes piece by piece; otherwise at most `MAX_COLLECTED` bytes are.
 - Data and response must carry the request's transaction number, and a data phase the length that it announced.
 - A transaction that did not reach its response leaves the cable without a known place: every further one is refused
@@ -14,10 +16,115 @@ Source: ISO 15740:2013, clause 9.
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Protocol
 
-from drivers.ptp.messages import PtpRequest, PtpResponse
-from drivers.ptp.transport import MAX_COLLECTED, Transaction
+from drivers.ptp.codes import EventCode, Operation, ResponseCode, describe
 from foundation.errors import LinkClosed, LinkError, ProtocolError
+
+MAX_PARAMETERS = 5
+"""Parameters of 32 bits that a request, response or event may carry."""
+LAST_TRANSACTION = 0xFFFFFFFE
+"""The highest transaction number; 1 follows it, for 0 and 0xffffffff are taken."""
+
+
+@dataclass(frozen=True)
+class PtpRequest:
+    """An operation that the initiator asks for."""
+
+    code: int
+    transaction: int = 0
+    parameters: tuple[int, ...] = ()
+
+    def __str__(self) -> str:
+        return f"{describe(Operation, self.code)}{_listed(self.parameters)}"
+
+
+@dataclass(frozen=True)
+class PtpResponse:
+    """How an operation ended; `transaction` is the request's."""
+
+    code: int
+    transaction: int = 0
+    parameters: tuple[int, ...] = ()
+
+    @property
+    def ok(self) -> bool:
+        """Whether the operation was carried out."""
+        return self.code == ResponseCode.OK
+
+    def __str__(self) -> str:
+        return f"{describe(ResponseCode, self.code)}{_listed(self.parameters)}"
+
+
+@dataclass(frozen=True)
+class PtpEvent:
+    """Something that happened in the device; `transaction` is 0xffffffff where it belongs to none."""
+
+    code: int
+    transaction: int = 0xFFFFFFFF
+    parameters: tuple[int, ...] = ()
+
+    def __str__(self) -> str:
+        return f"{describe(EventCode, self.code)}{_listed(self.parameters)}"
+
+
+def next_transaction(transaction: int) -> int:
+    """Return the number that follows `transaction`; OpenSession carries 0 and 0xffffffff means none."""
+    return 1 if transaction >= LAST_TRANSACTION else transaction + 1
+
+
+def _listed(parameters: tuple[int, ...]) -> str:
+    return "(" + ", ".join(f"0x{parameter:x}" for parameter in parameters) + ")" if parameters else ""
+
+
+MAX_COLLECTED = 4 * 1024 * 1024
+"""Bytes of a data phase that a transport collects for a caller who takes none of it piece by piece."""
+
+
+@dataclass(frozen=True)
+class Transaction:
+    """How a transaction ended: the device's response, and the data phase if it was collected."""
+
+    response: PtpResponse
+    data: bytes = b""
+
+
+class Transport(Protocol):
+    """An open cable to a PTP device, seen from the initiator."""
+
+    @property
+    def label(self) -> str:
+        """What messages call the device: address and name as far as known."""
+        ...
+
+    def transact(
+        self,
+        request: PtpRequest,
+        *,
+        send: bytes | None = None,
+        receive: Callable[[bytes], object] | None = None,
+        timeout: float,
+    ) -> Transaction:
+        """Carry out one transaction.
+
+        `send`: the data phase to the device; None where the operation has none. `receive`: takes the data phase from
+        the device piece by piece; None collects up to `MAX_COLLECTED` bytes. `timeout`: longest wait for each answer of
+        the device, seconds.
+        """
+        ...
+
+    def events(self) -> tuple[PtpEvent, ...]:
+        """Return the events that have come since the last call; never waits."""
+        ...
+
+    def reset(self) -> None:
+        """Bring cable and device back to where a session can be opened; costs a session that is open."""
+        ...
+
+    def close(self) -> None:
+        """Release the device; a second call does nothing."""
+        ...
 
 
 class TransactionState:
