@@ -25,19 +25,19 @@ from collections import deque
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import Final
+from typing import Final, Self, cast
 
 from drivers.links.link import Link
 from drivers.links.network import TcpLink
-from drivers.ptp.datasets import Cursor, encode_integer
+from drivers.ptp.datasets import U32, Cursor, Dataset, encode_integer
 from drivers.ptp.transaction import (
     MAX_PARAMETERS,
+    CableTransport,
     PtpEvent,
     PtpRequest,
     PtpResponse,
     Reception,
     Transaction,
-    TransactionState,
 )
 from foundation.clock import Clock
 from foundation.errors import DeviceRefused, LinkClosed, LinkError, LinkTimeout, ProtocolError
@@ -86,16 +86,25 @@ class FailReason(IntEnum):
 
 
 @dataclass(frozen=True)
-class InitCommandRequest:
+class InitCommandRequest(Dataset):
     """The initiator names itself: a GUID of 16 bytes, which a camera may have been paired with, and a name."""
 
     guid: bytes
     name: str
     version: int = VERSION
 
+    @classmethod
+    def read(cls, cursor: Cursor) -> Self:
+        """Return the initiator at a cursor."""
+        return cls(*_read_names(cursor))
+
+    def encode(self) -> bytes:
+        """Return the initiator as bytes."""
+        return _encode_names(self.guid, self.name, self.version)
+
 
 @dataclass(frozen=True)
-class InitCommandAck:
+class InitCommandAck(Dataset):
     """The responder accepts, numbers the connection and names itself."""
 
     connection: int
@@ -103,40 +112,73 @@ class InitCommandAck:
     name: str
     version: int = VERSION
 
+    @classmethod
+    def read(cls, cursor: Cursor) -> Self:
+        """Return the responder at a cursor."""
+        return cls(cursor.u32("connection number"), *_read_names(cursor))
+
+    def encode(self) -> bytes:
+        """Return the responder as bytes."""
+        return encode_integer(self.connection, 4) + _encode_names(self.guid, self.name, self.version)
+
 
 @dataclass(frozen=True)
-class InitEventRequest:
+class InitEventRequest(Dataset):
     """The initiator names the connection that the event channel belongs to."""
 
-    connection: int
+    connection: U32
 
 
 @dataclass(frozen=True)
-class InitEventAck:
+class InitEventAck(Dataset):
     """The event channel stands."""
 
 
 @dataclass(frozen=True)
-class InitFail:
+class InitFail(Dataset):
     """The responder refuses; see `FailReason`."""
 
-    reason: int
+    reason: U32
 
 
 @dataclass(frozen=True)
-class OperationRequest:
+class OperationRequest(Dataset):
     """A request, and whether the initiator will send the data phase."""
 
     request: PtpRequest
     sends_data: bool = False
 
+    @classmethod
+    def read(cls, cursor: Cursor) -> Self:
+        """Return the request at a cursor."""
+        phase = cursor.u32("data phase")
+        if phase > _DATA_OUT:
+            raise cursor.fault("data phase", "1 none or in, 2 out", phase)
+        return cls(PtpRequest(*_read_message(cursor)), phase == _DATA_OUT)
+
+    def encode(self) -> bytes:
+        """Return the request as bytes."""
+        return encode_integer(_DATA_OUT if self.sends_data else _NO_DATA_OR_IN, 4) + _message(self.request)
+
 
 @dataclass(frozen=True)
-class StartData:
+class StartData(Dataset):
     """A data phase begins; `total` counts its bytes, None where the sender does not know."""
 
     transaction: int
     total: int | None
+
+    @classmethod
+    def read(cls, cursor: Cursor) -> Self:
+        """Return the beginning at a cursor."""
+        transaction, total = cursor.u32("transaction"), cursor.u64("total")
+        return cls(transaction, None if total == UNKNOWN_TOTAL else total)
+
+    def encode(self) -> bytes:
+        """Return the beginning as bytes."""
+        return encode_integer(self.transaction, 4) + encode_integer(
+            UNKNOWN_TOTAL if self.total is None else self.total, 8
+        )
 
 
 @dataclass(frozen=True)
@@ -156,19 +198,19 @@ class EndData:
 
 
 @dataclass(frozen=True)
-class Cancel:
+class Cancel(Dataset):
     """The data phase is called off."""
 
-    transaction: int
+    transaction: U32
 
 
 @dataclass(frozen=True)
-class Ping:
+class Ping(Dataset):
     """Asks whether the other side is there."""
 
 
 @dataclass(frozen=True)
-class Pong:
+class Pong(Dataset):
     """Answers `Ping`."""
 
 
@@ -199,37 +241,14 @@ _DATA_OUT = 2
 def encode(packet: Packet) -> bytes:
     """Return a packet's bytes."""
     match packet:
-        case InitCommandRequest(guid, name, version):
-            kind, body = PacketType.INIT_COMMAND_REQUEST, _guid(guid) + _name(name) + encode_integer(version, 4)
-        case InitCommandAck(connection, guid, name, version):
-            kind = PacketType.INIT_COMMAND_ACK
-            body = encode_integer(connection, 4) + _guid(guid) + _name(name) + encode_integer(version, 4)
-        case InitEventRequest(connection):
-            kind, body = PacketType.INIT_EVENT_REQUEST, encode_integer(connection, 4)
-        case InitEventAck():
-            kind, body = PacketType.INIT_EVENT_ACK, b""
-        case InitFail(reason):
-            kind, body = PacketType.INIT_FAIL, encode_integer(reason, 4)
-        case OperationRequest(request, sends_data):
-            kind = PacketType.OPERATION_REQUEST
-            body = encode_integer(_DATA_OUT if sends_data else _NO_DATA_OR_IN, 4) + _message(request)
         case PtpResponse():
             kind, body = PacketType.OPERATION_RESPONSE, _message(packet)
         case PtpEvent():
             kind, body = PacketType.EVENT, _message(packet)
-        case StartData(transaction, total):
-            kind = PacketType.START_DATA
-            body = encode_integer(transaction, 4) + encode_integer(UNKNOWN_TOTAL if total is None else total, 8)
-        case Data(transaction, data):
-            return encode_data(transaction, data, last=False)
-        case EndData(transaction, data):
-            return encode_data(transaction, data, last=True)
-        case Cancel(transaction):
-            kind, body = PacketType.CANCEL, encode_integer(transaction, 4)
-        case Ping():
-            kind, body = PacketType.PING, b""
-        case Pong():
-            kind, body = PacketType.PONG, b""
+        case Data(transaction, data) | EndData(transaction, data):
+            return encode_data(transaction, data, last=isinstance(packet, EndData))
+        case _:
+            kind, body = _KINDS[type(packet)], packet.encode()
     return encode_integer(HEADER_LENGTH + len(body), 4) + encode_integer(kind, 4) + body
 
 
@@ -247,7 +266,7 @@ def decode(data: bytes) -> Packet:
     if length != len(data):
         raise cursor.fault("length", f"{len(data)}, the bytes there are", length, at=0)
     _checked(kind, length)
-    packet = _BODIES[kind](cursor)
+    packet = _read(kind, cursor)
     if cursor.left:
         raise cursor.fault("the end", "no more bytes", f"followed by {cursor.left} bytes", at=cursor.at)
     return packet
@@ -339,31 +358,25 @@ def _unusable(what: str) -> ProtocolError:
     return ProtocolError(f"the PTP/IP connection gives {what}; check that a camera answers at this port, and reconnect")
 
 
-def _guid(guid: bytes) -> bytes:
+def _encode_names(guid: bytes, name: str, version: int) -> bytes:
+    octets = name.encode("utf-16-le")
     if len(guid) != GUID_LENGTH:
         raise ValueError(f"a GUID of {len(guid)} bytes; {GUID_LENGTH} are right")
-    return guid
-
-
-def _name(name: str) -> bytes:
-    octets = name.encode("utf-16-le")
     if "\0" in name or len(octets) > 2 * MAX_NAME_UNITS:
         raise ValueError(f"{name[:40]!r} is no PTP/IP name; at most {MAX_NAME_UNITS} UTF-16 units, no NUL")
-    return octets + b"\0\0"
+    return guid + octets + b"\0\0" + encode_integer(version, 4)
 
 
-def _read_name(cursor: Cursor) -> str:
+def _read_names(cursor: Cursor) -> tuple[bytes, str, int]:
+    guid = cursor.take(GUID_LENGTH, "GUID")
     octets = bytearray()
     while (unit := cursor.take(2, "name, or its closing NUL,")) != b"\0\0":
         octets += unit
         if len(octets) > 2 * MAX_NAME_UNITS:
             raise cursor.fault("name", f"at most {MAX_NAME_UNITS} UTF-16 units", "longer")
-    return octets.decode("utf-16-le", "replace")
-
-
-def _read_version(cursor: Cursor) -> int:
     # Some responders end with the name.
-    return cursor.u32("version") if cursor.left else VERSION
+    version = cursor.u32("version") if cursor.left else VERSION
+    return guid, octets.decode("utf-16-le", "replace"), version
 
 
 def _message(message: PtpRequest | PtpResponse | PtpEvent) -> bytes:
@@ -386,43 +399,35 @@ def _read_message(cursor: Cursor) -> tuple[int, int, tuple[int, ...]]:
     return code, transaction, cursor.integers(count, 4, "parameters")
 
 
-def _read_operation(cursor: Cursor) -> OperationRequest:
-    phase = cursor.u32("data phase")
-    if phase > _DATA_OUT:
-        raise cursor.fault("data phase", "1 none or in, 2 out", phase)
-    return OperationRequest(PtpRequest(*_read_message(cursor)), phase == _DATA_OUT)
-
-
-def _read_start(cursor: Cursor) -> StartData:
-    transaction, total = cursor.u32("transaction"), cursor.u64("total")
-    return StartData(transaction, None if total == UNKNOWN_TOTAL else total)
-
-
-def _read_command_request(cursor: Cursor) -> InitCommandRequest:
-    return InitCommandRequest(cursor.take(GUID_LENGTH, "GUID"), _read_name(cursor), _read_version(cursor))
-
-
-def _read_command_ack(cursor: Cursor) -> InitCommandAck:
-    connection = cursor.u32("connection number")
-    return InitCommandAck(connection, cursor.take(GUID_LENGTH, "GUID"), _read_name(cursor), _read_version(cursor))
-
-
-_BODIES: dict[int, Callable[[Cursor], Packet]] = {
-    PacketType.INIT_COMMAND_REQUEST: _read_command_request,
-    PacketType.INIT_COMMAND_ACK: _read_command_ack,
-    PacketType.INIT_EVENT_REQUEST: lambda cursor: InitEventRequest(cursor.u32("connection number")),
-    PacketType.INIT_EVENT_ACK: lambda cursor: InitEventAck(),
-    PacketType.INIT_FAIL: lambda cursor: InitFail(cursor.u32("reason")),
-    PacketType.OPERATION_REQUEST: _read_operation,
-    PacketType.OPERATION_RESPONSE: lambda cursor: PtpResponse(*_read_message(cursor)),
-    PacketType.EVENT: lambda cursor: PtpEvent(*_read_message(cursor)),
-    PacketType.START_DATA: _read_start,
-    PacketType.DATA: lambda cursor: Data(cursor.u32("transaction"), cursor.rest()),
-    PacketType.CANCEL: lambda cursor: Cancel(cursor.u32("transaction")),
-    PacketType.END_DATA: lambda cursor: EndData(cursor.u32("transaction"), cursor.rest()),
-    PacketType.PING: lambda cursor: Ping(),
-    PacketType.PONG: lambda cursor: Pong(),
+_PACKETS: dict[int, type[Dataset]] = {
+    PacketType.INIT_COMMAND_REQUEST: InitCommandRequest,
+    PacketType.INIT_COMMAND_ACK: InitCommandAck,
+    PacketType.INIT_EVENT_REQUEST: InitEventRequest,
+    PacketType.INIT_EVENT_ACK: InitEventAck,
+    PacketType.INIT_FAIL: InitFail,
+    PacketType.OPERATION_REQUEST: OperationRequest,
+    PacketType.START_DATA: StartData,
+    PacketType.CANCEL: Cancel,
+    PacketType.PING: Ping,
+    PacketType.PONG: Pong,
 }
+_KINDS = {packet: kind for kind, packet in _PACKETS.items()}
+
+
+def _read(kind: int, cursor: Cursor) -> Packet:
+    match kind:
+        case PacketType.OPERATION_RESPONSE:
+            return PtpResponse(*_read_message(cursor))
+        case PacketType.EVENT:
+            return PtpEvent(*_read_message(cursor))
+        case PacketType.DATA:
+            return Data(cursor.u32("transaction"), cursor.rest())
+        case PacketType.END_DATA:
+            return EndData(cursor.u32("transaction"), cursor.rest())
+        case _:
+            return cast("Packet", _PACKETS[kind].read(cursor))
+
+
 _SHORTEST: dict[int, int] = {
     PacketType.INIT_COMMAND_REQUEST: HEADER_LENGTH + GUID_LENGTH + 2,
     PacketType.INIT_COMMAND_ACK: HEADER_LENGTH + 4 + GUID_LENGTH + 2,
@@ -619,7 +624,7 @@ _CALL_OFF_S: Final = 2.0
 """Wait for the end of a transaction that was cancelled."""
 
 
-class IpTransport:
+class IpTransport(CableTransport):
     """A `drivers.ptp.transaction.Transport` over two links.
 
     `open_command`, `open_event`: open the two connections; called again by `reset`. The second may raise `LinkClosed`
@@ -637,13 +642,13 @@ class IpTransport:
         clock: Clock,
         label: str = "the camera",
     ) -> None:
+        super().__init__()
         self._open_command = open_command
         self._open_event = open_event
         self._initiator = InitCommandRequest(guid, name)
         self._clock = clock
         self._place = label
         self._connection = self._connect()
-        self._state = TransactionState()
 
     @classmethod
     def connect(
@@ -666,21 +671,10 @@ class IpTransport:
         name = self._connection.name
         return f"{name} ({self._place})" if name else self._place
 
-    def transact(
-        self,
-        request: PtpRequest,
-        *,
-        send: bytes | None = None,
-        receive: Callable[[bytes], object] | None = None,
-        timeout: float,
-    ) -> Transaction:
-        """Carry out one transaction; see `drivers.ptp.transaction.Transport`."""
-
-        def exchange(reception: Reception) -> Transaction:
-            self._send(request, send, timeout)
-            return self._receive(reception, timeout)
-
-        return self._state.take(Reception(request, receive, self.label), exchange, self._call_off)
+    def exchange(self, reception: Reception, send: bytes | None, timeout: float) -> Transaction:
+        """Send the request and the data phase to the device, and return what the device answers."""
+        self._send(reception.request, send, timeout)
+        return self._receive(reception, timeout)
 
     def events(self) -> tuple[PtpEvent, ...]:
         """Return the events that have come since the last call, and answer pings; never waits."""
@@ -700,12 +694,12 @@ class IpTransport:
                     raise
                 self._clock.sleep(RETRY_S)
             else:
-                self._state = TransactionState()
+                self.closed, self.between_transactions = False, True
                 return
 
     def close(self) -> None:
         """Hang up both connections; a second call does nothing."""
-        self._state.closed = True
+        self.closed = True
         self._connection.close()
 
     def _connect(self) -> IpConnection:
@@ -743,7 +737,7 @@ class IpTransport:
                         f"{self.label} sends {type(other).__name__} in the middle of a transaction; reset it"
                     )
 
-    def _call_off(self, transaction: int) -> bool:
+    def call_off(self, transaction: int) -> bool:
         """Cancel a transaction whose data the caller cannot take, and wait for its end; return whether it came."""
         deadline = self._clock.monotonic() + _CALL_OFF_S
         with contextlib.suppress(LinkError, ProtocolError):

@@ -15,6 +15,7 @@ Source: ISO 15740:2013, clause 9.
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
@@ -127,45 +128,6 @@ class Transport(Protocol):
         ...
 
 
-class TransactionState:
-    """State of a cable: whether it is closed, and whether it is between two transactions."""
-
-    def __init__(self) -> None:
-        self.closed = False
-        self.between_transactions = True
-
-    def take(
-        self,
-        reception: Reception,
-        exchange: Callable[[Reception], Transaction],
-        call_off: Callable[[int], bool],
-    ) -> Transaction:
-        """Carry out one transaction."""
-        self.check_open(reception.label)
-        if not self.between_transactions:
-            raise ProtocolError(
-                f"{reception.label}: the transaction before {reception.request} did not end; reset the connection"
-            )
-        self.between_transactions = False
-        try:
-            transaction = exchange(reception)
-        except LinkClosed:
-            self.closed = True
-            raise
-        except (LinkError, ProtocolError):
-            raise
-        except BaseException:
-            self.between_transactions = call_off(reception.request.transaction)
-            raise
-        self.between_transactions = True
-        return transaction
-
-    def check_open(self, label: str) -> None:
-        """Require that the cable is open."""
-        if self.closed:
-            raise LinkClosed(f"{label} is gone, or the connection to it was closed; open it again")
-
-
 class Reception:
     """Takes what the device sends between a request and the end of its response; `label` names the device."""
 
@@ -233,3 +195,55 @@ class Reception:
         return ProtocolError(
             f"{self.label} sends {length} bytes or more with {self.request}; at most {MAX_COLLECTED} were expected"
         )
+
+
+class CableTransport(ABC):
+    """A `Transport` over a real cable: one transaction after the other, and none where one was left unfinished."""
+
+    def __init__(self) -> None:
+        self.closed = False
+        self.between_transactions = True
+
+    @property
+    @abstractmethod
+    def label(self) -> str:
+        """What messages call the device: address and name as far as known."""
+
+    @abstractmethod
+    def exchange(self, reception: Reception, send: bytes | None, timeout: float) -> Transaction:
+        """Send the request and the data phase to the device, and return what the device answers."""
+
+    @abstractmethod
+    def call_off(self, transaction: int) -> bool:
+        """Call off a transaction whose data the caller cannot take; return whether the next can follow."""
+
+    def transact(
+        self,
+        request: PtpRequest,
+        *,
+        send: bytes | None = None,
+        receive: Callable[[bytes], object] | None = None,
+        timeout: float,
+    ) -> Transaction:
+        """Carry out one transaction; see `Transport`."""
+        self.check_open()
+        if not self.between_transactions:
+            raise ProtocolError(f"{self.label}: the transaction before {request} did not end; reset the connection")
+        self.between_transactions = False
+        try:
+            transaction = self.exchange(Reception(request, receive, self.label), send, timeout)
+        except LinkClosed:
+            self.closed = True
+            raise
+        except (LinkError, ProtocolError):
+            raise
+        except BaseException:
+            self.between_transactions = self.call_off(request.transaction)
+            raise
+        self.between_transactions = True
+        return transaction
+
+    def check_open(self) -> None:
+        """Require that the cable is open."""
+        if self.closed:
+            raise LinkClosed(f"{self.label} is gone, or the connection to it was closed; open it again")

@@ -22,7 +22,6 @@ ISO 15740:2013, annex D.
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable
 from dataclasses import dataclass
 from enum import IntEnum
 
@@ -31,12 +30,12 @@ from drivers.ptp.codes import ResponseCode
 from drivers.ptp.datasets import Cursor, encode_integer
 from drivers.ptp.transaction import (
     MAX_PARAMETERS,
+    CableTransport,
     PtpEvent,
     PtpRequest,
     PtpResponse,
     Reception,
     Transaction,
-    TransactionState,
 )
 from foundation.clock import Clock
 from foundation.errors import LinkError, LinkTimeout, ProtocolError
@@ -302,13 +301,13 @@ _EMPTY_READS = 16
 """Empty packets in a row that are skipped: one may follow a full packet, so many mean a fault."""
 
 
-class UsbTransport:
+class UsbTransport(CableTransport):
     """A `drivers.ptp.transaction.Transport` over the pipes of a still image interface, which it closes in the end."""
 
     def __init__(self, pipes: UsbPipes, clock: Clock) -> None:
+        super().__init__()
         self._pipes = pipes
         self._clock = clock
-        self._state = TransactionState()
         self._stalls = 0
         self._reader = ContainerReader(pipes.packet_size)
         self._events_reader = ContainerReader(pipes.packet_size)
@@ -318,30 +317,19 @@ class UsbTransport:
         """The device's name, numbers and port."""
         return self._pipes.label
 
-    def transact(
-        self,
-        request: PtpRequest,
-        *,
-        send: bytes | None = None,
-        receive: Callable[[bytes], object] | None = None,
-        timeout: float,
-    ) -> Transaction:
-        """Carry out one transaction; see `drivers.ptp.transaction.Transport`."""
-
-        def exchange(reception: Reception) -> Transaction:
-            self._stalls = 0
-            self._reader = ContainerReader(self._pipes.packet_size)
-            self._send(request, send, timeout)
-            return self._receive(reception, timeout)
-
-        return self._state.take(Reception(request, receive, self.label), exchange, self._cancel)
+    def exchange(self, reception: Reception, send: bytes | None, timeout: float) -> Transaction:
+        """Send the request and the data phase to the device, and return what the device answers."""
+        self._stalls = 0
+        self._reader = ContainerReader(self._pipes.packet_size)
+        self._send(reception.request, send, timeout)
+        return self._receive(reception, timeout)
 
     def events(self) -> tuple[PtpEvent, ...]:
         """Return the events that have come since the last call.
 
         Takes one polling interval of the interrupt pipe, some milliseconds, for the bus looks no more often.
         """
-        self._state.check_open(self.label)
+        self.check_open()
         events: list[PtpEvent] = []
         while len(events) < MAX_EVENTS:
             try:
@@ -363,7 +351,7 @@ class UsbTransport:
 
     def reset(self) -> None:
         """Have the device forget everything; the session that was open is over."""
-        self._state.check_open(self.label)
+        self.check_open()
         try:
             self._pipes.control_out(ControlRequest.RESET_DEVICE, b"", _CONTROL_S)
             self._await_ready()
@@ -371,11 +359,11 @@ class UsbTransport:
             self._pipes.reset_port()
         self._clean()
         self._events_reader = ContainerReader(self._pipes.packet_size)
-        self._state.between_transactions = True
+        self.between_transactions = True
 
     def close(self) -> None:
         """Release the device; a second call does nothing."""
-        self._state.closed = True
+        self.closed = True
         self._pipes.close()
 
     def _send(self, request: PtpRequest, send: bytes | None, timeout: float) -> None:
@@ -443,7 +431,7 @@ class UsbTransport:
         # Whole packets of the data only, so that the response never comes in the same read.
         return max(packet, min(PIECE, left // packet * packet))
 
-    def _cancel(self, transaction: int) -> bool:
+    def call_off(self, transaction: int) -> bool:
         """Call off a transaction whose data the caller cannot take; return whether the next can follow."""
         with contextlib.suppress(LinkError, ProtocolError):
             self._pipes.control_out(ControlRequest.CANCEL, encode_cancel(transaction), _CONTROL_S)
