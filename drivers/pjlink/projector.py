@@ -13,72 +13,25 @@ Rules that hold inside:
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Callable
 from typing import TypeVar
 
+from drivers.links.exchange import Exchange
 from drivers.links.link import Link
 from drivers.pjlink import wire
-from drivers.pjlink.wire import (
-    ErrorCode,
-    LineCutter,
-    NoResolution,
-    PjLinkReply,
-    PjLinkRequest,
-    Refused,
-    Resolution,
-)
+from drivers.pjlink.wire import ErrorCode, NoResolution, PjLinkReply, PjLinkRequest, Refused, Resolution
 from drivers.projector import Fault, Lamp, Power, ProjectorIdentity
 from foundation.clock import Clock, SystemClock
-from foundation.errors import DeviceFault, DeviceRefused, LinkClosed, LinkError, LinkTimeout, ProtocolError
-
-_log = logging.getLogger(__name__)
+from foundation.errors import DeviceFault, DeviceRefused, ProtocolError
 
 DEFAULT_TIMEOUT_S = 5.0
 """The standard asks for an answer within 2 s; real projectors take longer while they warm up."""
+_SILENT = "check that it is on the network, and that PJLink is enabled on it in standby too"
+_CHECK_PORT = "check that a projector answers at this port"
 
 _SYSTEM_CLOCK = SystemClock()
 
 _Answer = TypeVar("_Answer")
-
-
-class _ConnectionSpent(Exception):
-    """A connection that has served before serves no more; a new one may."""
-
-
-class _Connection:
-    """A greeted connection: the digest that its first command needs, and what was read beyond a line."""
-
-    def __init__(self, link: Link, timeout: float, clock: Clock) -> None:
-        self.link = link
-        self.digest = ""
-        self.used = False
-        self._timeout = timeout
-        self._clock = clock
-        self._cutter = LineCutter()
-        self._lines: list[bytes] = []
-
-    def read_line(self) -> bytes:
-        deadline = self._clock.monotonic() + self._timeout
-        while True:
-            while self._lines:
-                line = self._lines.pop(0)
-                # Some projectors announce their start here, too; it answers nothing.
-                if not wire.is_notice_of_start(line):
-                    return line
-            remaining = deadline - self._clock.monotonic()
-            if remaining <= 0:
-                raise LinkTimeout(f"the projector has not finished its answer within {self._timeout:g} s")
-            self._lines = self._cutter.feed(self.link.read(wire.MAX_LINE, remaining))
-
-    def ask(self, request: PjLinkRequest) -> PjLinkReply | Refused:
-        # Whatever stands here unasked answers no question of ours.
-        self._lines.clear()
-        self.link.write(wire.encode_request(request), self._timeout)
-        reply = self.read_line()
-        # Without the digest, which anybody can try passwords on.
-        _log.debug("%s %s: %r", request.command, request.parameter, reply)
-        return wire.parse_reply(reply)
 
 
 class PjLinkProjector:
@@ -99,12 +52,9 @@ class PjLinkProjector:
         clock: Clock = _SYSTEM_CLOCK,
     ) -> None:
         self._class: int | None = None
-        self._connect = connect
         self._password = password
-        self._timeout = timeout
         self._label = label
-        self._clock = clock
-        self._connection: _Connection | None = None
+        self._exchange = Exchange(connect, timeout, label, clock, self._greet, _SILENT, _CHECK_PORT)
         self._unknown: set[PjLinkRequest] = set()
 
     def identity(self) -> ProjectorIdentity:
@@ -138,7 +88,7 @@ class PjLinkProjector:
         if request in self._unknown:
             self.power()  # to be silent because the cable is out must not look like health
             return ()
-        reply = self._exchange(request)
+        reply = self._reply_to(request)
         if self._cannot_tell(request, reply) or reply.error is ErrorCode.UNAVAILABLE:
             return ()
         return wire.parse_faults(self._value(reply))
@@ -176,17 +126,15 @@ class PjLinkProjector:
         return None
 
     def close(self) -> None:
-        """Hang up; the power state stays."""
-        connection, self._connection = self._connection, None
-        if connection is not None:
-            connection.link.close()
+        """Release the control port; the power state stays."""
+        self._exchange.close()
 
     def _name(self, command: str) -> str:
-        reply = self._exchange(PjLinkRequest(command))
+        reply = self._reply_to(PjLinkRequest(command))
         return reply.value if reply.error is None else ""
 
     def _ask(self, command: str) -> str:
-        return self._value(self._exchange(PjLinkRequest(command)))
+        return self._value(self._reply_to(PjLinkRequest(command)))
 
     def _ask_class_2(self, command: str) -> str | None:
         if self.pjlink_class() < 2:
@@ -200,7 +148,7 @@ class PjLinkProjector:
         request = PjLinkRequest(command, level=level)
         if request in self._unknown:
             return None
-        reply = self._exchange(request)
+        reply = self._reply_to(request)
         return None if self._cannot_tell(request, reply) else self._value(reply)
 
     def _cannot_tell(self, request: PjLinkRequest, reply: PjLinkReply) -> bool:
@@ -216,12 +164,12 @@ class PjLinkProjector:
         try:
             return question()
         except DeviceRefused:
-            if self._connection is None:
+            if not self._exchange.connected:
                 raise  # it refused the connection, not the question
             return unknown
 
     def _set(self, command: str, parameter: str) -> None:
-        value = self._value(self._exchange(PjLinkRequest(command, parameter)), parameter)
+        value = self._value(self._reply_to(PjLinkRequest(command, parameter)), parameter)
         if value.upper() != wire.OK:
             self.close()
             raise ProtocolError(f"{self._label} answers {value!r} to {command} {parameter}; expected OK")
@@ -242,57 +190,39 @@ class PjLinkProjector:
             case ErrorCode.FAILURE:
                 raise DeviceFault(f"{asked}: it reports a failure of its own; look at its lamps and display")
 
-    def _exchange(self, request: PjLinkRequest) -> PjLinkReply:
-        """Return the answer to `request`, over a new connection if the one there is has been dropped meanwhile."""
+    def _reply_to(self, request: PjLinkRequest) -> PjLinkReply:
+        reply = self._exchange.ask(wire.encode_request(request), wire.take_line, wire.is_notice_of_start)
         try:
-            return self._exchange_once(request)
-        except _ConnectionSpent:
-            return self._exchange_once(request)
-
-    def _exchange_once(self, request: PjLinkRequest) -> PjLinkReply:
-        connection = self._connection
-        if connection is None:
-            connection = self._connection = self._greeted()
-        used, connection.used = connection.used, True
-        try:
-            digest, connection.digest = connection.digest, ""
-            reply = connection.ask(PjLinkRequest(request.command, request.parameter, request.level, digest))
-            if isinstance(reply, Refused):
-                if used:
-                    # Some servers want the digest before every command: a new connection begins with one.
-                    raise _ConnectionSpent
+            answer = wire.parse_reply(reply)
+            if isinstance(answer, Refused):
                 raise self._wrong_password()
-            if reply.command != request.command:
+            if answer.command != request.command:
                 raise ProtocolError(
-                    f"{self._label} answers {reply.command} to {request.command}; check that no other controller "
+                    f"{self._label} answers {answer.command} to {request.command}; check that no other controller "
                     "shares the connection"
                 )
-        except LinkClosed as error:
-            self.close()
-            if used:
-                raise _ConnectionSpent from error
+        except DeviceRefused:
+            asked_before = self._exchange.questions > 1
+            self._exchange.close()
+            if asked_before:
+                # Some servers want the digest before every command: a new connection begins with one.
+                return self._reply_to(request)
             raise
-        except (LinkError, ProtocolError, DeviceRefused, _ConnectionSpent):
-            self.close()
+        except ProtocolError:
+            self._exchange.close()
             raise
-        return reply
+        return answer
 
-    def _greeted(self) -> _Connection:
-        """Return a new connection, greeted, and with the digest that its first command needs."""
-        link = self._connect()
-        try:
-            connection = _Connection(link, self._timeout, self._clock)
-            greeting = wire.parse_greeting(connection.read_line())
-            if isinstance(greeting, Refused):
-                raise self._wrong_password()
-            if greeting.seed is not None:
-                if self._password is None:
-                    raise DeviceRefused(f"{self._label} asks for a password; give the one set for PJLink in its menu")
-                connection.digest = wire.authentication_digest(greeting.seed, self._password)
-        except BaseException:
-            link.close()
-            raise
-        return connection
+    def _greet(self, exchange: Exchange) -> bytes:
+        """Return the digest that the first command must begin with."""
+        greeting = wire.parse_greeting(exchange.listen(wire.take_line, wire.is_notice_of_start))
+        if isinstance(greeting, Refused):
+            raise self._wrong_password()
+        if greeting.seed is None:
+            return b""
+        if self._password is None:
+            raise DeviceRefused(f"{self._label} asks for a password; give the one set for PJLink in its menu")
+        return wire.authentication_digest(greeting.seed, self._password).encode("ascii")
 
     def _wrong_password(self) -> DeviceRefused:
         return DeviceRefused(f"{self._label} refuses the password; give the one set for PJLink in its menu")

@@ -97,25 +97,35 @@ class PjLinkReply:
             return None
 
 
+def take_line(data: bytes, limit: int = MAX_LINE) -> tuple[bytes, int] | None:
+    """Take one line, without its end, off the front of `data`, past empty ones and filling."""
+    start = len(data) - len(data.lstrip(b"\r\n\0"))
+    found = re.compile(rb"[\r\n]").search(data, start)
+    line = data[start : None if found is None else found.start()].replace(b"\0", b"")
+    if len(line) >= limit:
+        raise ProtocolError(
+            f"a PJLink line of more than {limit} bytes begins {_quoted(line)}; "
+            "check that this is a projector's control port"
+        )
+    return None if found is None else (line, found.end())
+
+
 class LineCutter:
     """Cuts a stream into lines, however it was split in transit."""
 
     def __init__(self, limit: int = MAX_LINE) -> None:
         self._limit = limit
-        self._rest = bytearray()
+        self._rest = b""
 
     def feed(self, data: bytes) -> list[bytes]:
         """Take the next bytes and return the lines that they complete, without their ends; empty lines are dropped."""
-        self._rest += data.replace(b"\0", b"")
-        *lines, rest = re.split(rb"[\r\n]", bytes(self._rest))
-        self._rest = bytearray(rest)
-        for line in (*lines, rest):
-            if len(line) >= self._limit:
-                raise ProtocolError(
-                    f"a PJLink line of more than {self._limit} bytes begins {_quoted(line)}; "
-                    "check that this is a projector's control port"
-                )
-        return [line for line in lines if line]
+        self._rest += data
+        lines: list[bytes] = []
+        while (taken := take_line(self._rest, self._limit)) is not None:
+            line, length = taken
+            self._rest = self._rest[length:]
+            lines.append(line)
+        return lines
 
 
 def authentication_digest(seed: str, password: str) -> str:

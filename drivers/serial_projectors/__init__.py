@@ -1,7 +1,7 @@
 """Projectors on a serial cable: which languages are spoken, and how fast.
 
 Each maker has a file of its own: a wire, which is pure functions of bytes for both ends, and a
-`drivers.serial_projectors.exchange.SerialProjector` that knows its words. What a language cannot express is stated in
+`drivers.serial_projectors.driver.SerialProjector` that knows its words. What a language cannot express is stated in
 that file's docstring.
 """
 
@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from drivers.serial_projectors import benq, epson, nec, optoma
-from drivers.serial_projectors.exchange import SerialProjector
+from drivers.serial_projectors.driver import SerialProjector
 from foundation.errors import ConfigurationError
 
 

@@ -18,8 +18,9 @@ from __future__ import annotations
 import contextlib
 import re
 
+from drivers.links.exchange import MessageParser
 from drivers.projector import Fault, Power
-from drivers.serial_projectors.exchange import CHECK_SPEED, MessageParser, SerialProjector, text_of
+from drivers.serial_projectors.driver import CHECK_SPEED, SerialProjector, text_of
 from foundation.errors import DeviceRefused, ProtocolError
 
 BAUD = 115200

@@ -19,8 +19,9 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 
+from drivers.links.exchange import Exchange, quoted
 from drivers.projector import Fault, Power, Severity
-from drivers.serial_projectors.exchange import CHECK_SPEED, Exchange, SerialProjector, quoted, text_of
+from drivers.serial_projectors.driver import CHECK_SPEED, SerialProjector, text_of
 from foundation.errors import DeviceFault, DeviceRefused, LinkTimeout, ProtocolError
 
 BAUD = 9600
@@ -251,7 +252,7 @@ class EpsonProjector(SerialProjector):
                 return None
             raise
 
-    def greet(self, exchange: Exchange) -> None:
+    def greet(self, exchange: Exchange) -> bytes:
         """Say CR, whose colon shows that it listens, and which ends an incomplete command on the line."""
         try:
             exchange.open_with(b"\r", take_reply)
@@ -259,14 +260,16 @@ class EpsonProjector(SerialProjector):
             raise LinkTimeout(
                 f"{error}; or it is still switching on or off for an earlier program: wait {SWITCHING_LIMIT_S:g} s"
             ) from error
+        return b""
 
 
 class EpsonOnNetwork(EpsonProjector):
     """The same after the handshake of ESC/VP.net."""
 
-    def greet(self, exchange: Exchange) -> None:
+    def greet(self, exchange: Exchange) -> bytes:
         """Shake hands."""
         state = exchange.open_with(HELLO, take_welcome)
         if state != WELCOME:
             reason = _HELLO_STATES.get(state, "look into its network menu")
             raise DeviceRefused(f"{self.label} refuses the connection with {state:#04x}: {reason}")
+        return b""

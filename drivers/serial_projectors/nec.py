@@ -18,8 +18,9 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
+from drivers.links.exchange import quoted
 from drivers.projector import Fault, Power, Severity
-from drivers.serial_projectors.exchange import CHECK_SPEED, SerialProjector, quoted
+from drivers.serial_projectors.driver import CHECK_SPEED, SerialProjector
 from foundation.errors import DeviceFault, DeviceRefused, ProtocolError
 
 BAUD = 38400

@@ -19,7 +19,7 @@ from typing import Protocol
 from drivers.links.link import Peer
 from drivers.projector import Power, Severity
 from drivers.serial_projectors import benq, epson, nec, optoma
-from drivers.serial_projectors.exchange import take_line
+from drivers.serial_projectors.driver import take_line
 from foundation.errors import DeviceFault, DeviceRefused, ProtocolError
 from sim.projectors.projector import SimulatedProjector
 

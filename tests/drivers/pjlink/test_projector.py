@@ -43,8 +43,8 @@ class Script:
         assert data == self._lines.pop(0)
 
     def read(self, limit: int, timeout: float) -> bytes:
-        if not self._lines:
-            raise LinkTimeout("the script has ended")
+        if not self._lines or not timeout:
+            raise LinkTimeout("the script has nothing to say")
         line = self._lines.pop(0)
         if line is None:
             raise LinkClosed("the script hangs up")
@@ -347,7 +347,7 @@ def test_an_answer_that_never_ends_is_a_timeout() -> None:
             clock.sleep(1.0)
             return b"P"
 
-    with pytest.raises(LinkTimeout, match="not finished its answer"):
+    with pytest.raises(LinkTimeout, match="within 5 s"):
         PjLinkProjector(lambda: Endless(b""), timeout=5.0, clock=clock).power()
 
 
@@ -443,7 +443,7 @@ def test_an_answer_that_comes_too_late_is_a_timeout() -> None:
     clock = SimulatedClock()
     peer = PjLinkPeer(SimulatedProjector(SimulatedClock()))
     projector = PjLinkProjector(lambda: Slow(memory_link(peer), clock, 6.0), clock=clock)
-    with pytest.raises(LinkTimeout, match="6 s"):
+    with pytest.raises(LinkTimeout, match="within 5 s"):
         projector.power()
 
 
@@ -495,7 +495,7 @@ def test_a_swallowed_answer_is_told_and_the_next_connection_is_clean() -> None:
         return made[-1]
 
     projector = PjLinkProjector(connect)
-    with pytest.raises(LinkTimeout, match="on purpose"):
+    with pytest.raises(LinkTimeout, match="within 5 s"):
         projector.switch_on()
     # The command itself went through; the driver does not hide that it cannot know.
     assert projector.power() is Power.WARMING
@@ -535,6 +535,6 @@ def test_what_is_logged_has_neither_password_nor_digest(caplog: pytest.LogCaptur
     caplog.set_level("DEBUG")
     script = Script(b"PJLINK 1 498e4a67\r", DIGEST + b"%1POWR ?\r", b"%1POWR=1\r")
     assert driver(script, password=PASSWORD).power() is Power.ON
-    assert "POWR ?: " in caplog.text
+    assert "%1POWR ?" in caplog.text
     assert PASSWORD not in caplog.text
     assert DIGEST.decode("ascii") not in caplog.text

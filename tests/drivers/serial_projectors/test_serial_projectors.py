@@ -14,12 +14,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from drivers.links.exchange import MAX_MESSAGE
 from drivers.links.link import Link
 from drivers.projector import Fault, Lamp, Power, Projector, ProjectorIdentity, Severity
 from drivers.serial_projectors import LANGUAGES, benq, epson, language, nec, optoma
 from drivers.serial_projectors.benq import BenqProjector
+from drivers.serial_projectors.driver import take_line
 from drivers.serial_projectors.epson import EpsonOnNetwork, EpsonProjector
-from drivers.serial_projectors.exchange import MAX_MESSAGE, take_line
 from drivers.serial_projectors.nec import NecProjector
 from drivers.serial_projectors.optoma import OptomaProjector
 from foundation.errors import (
