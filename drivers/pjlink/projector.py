@@ -19,7 +19,7 @@ from typing import TypeVar
 from drivers.links.exchange import Exchange
 from drivers.links.link import Link
 from drivers.pjlink import wire
-from drivers.pjlink.wire import ErrorCode, NoResolution, PjLinkReply, PjLinkRequest, Refused, Resolution
+from drivers.pjlink.wire import ErrorCode, Input, NoResolution, PjLinkReply, PjLinkRequest, Refused, Resolution
 from drivers.projector import Fault, Lamp, Power, ProjectorIdentity
 from foundation.clock import Clock, SystemClock
 from foundation.errors import DeviceFault, DeviceRefused, ProtocolError
@@ -105,6 +105,10 @@ class PjLinkProjector:
             self._class = 1 if value is None else wire.parse_class(value)
         return self._class
 
+    def input(self) -> Input:
+        """Return the input that is selected, without its name; refused unless the projector is on."""
+        return Input(wire.parse_input(self._ask("INPT", level=min(self.pjlink_class(), 2))))
+
     def input_resolution(self) -> Resolution | NoResolution | None:
         """Return the resolution of the signal, or why it has none; None where it cannot tell; class 2."""
         value = self._ask_class_2("IRES")
@@ -133,8 +137,8 @@ class PjLinkProjector:
         reply = self._reply_to(PjLinkRequest(command))
         return reply.value if reply.error is None else ""
 
-    def _ask(self, command: str) -> str:
-        return self._value(self._reply_to(PjLinkRequest(command)))
+    def _ask(self, command: str, level: int = 1) -> str:
+        return self._value(self._reply_to(PjLinkRequest(command, level=level)))
 
     def _ask_class_2(self, command: str) -> str | None:
         if self.pjlink_class() < 2:

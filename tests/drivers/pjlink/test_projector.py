@@ -12,7 +12,7 @@ import pytest
 from drivers.links.link import Link
 from drivers.links.network import TcpLink
 from drivers.pjlink.projector import PjLinkProjector
-from drivers.pjlink.wire import NoResolution, Resolution
+from drivers.pjlink.wire import Input, NoResolution, Resolution
 from drivers.projector import Fault, Lamp, Power, ProjectorIdentity, Severity
 from foundation.errors import DeviceFault, DeviceRefused, LinkClosed, LinkTimeout, ProtocolError
 from sim.clock import SimulatedClock
@@ -228,6 +228,17 @@ def test_what_class_2_tells() -> None:
     assert projector.input_resolution() is NoResolution.NO_SIGNAL
     assert projector.input_resolution() is NoResolution.UNKNOWN_SIGNAL
     assert projector.frozen()
+    assert script.ended()
+
+
+@pytest.mark.parametrize(("level", "code", "meant"), [(b"1", b"31", "31"), (b"2", b"3a", "3A")])
+def test_the_input_is_asked_for_in_the_projectors_class(level: bytes, code: bytes, meant: str) -> None:
+    script = Script(
+        b"PJLINK 0\r",
+        b"%1CLSS ?\r", b"%1CLSS=" + level + b"\r",
+        b"%" + level + b"INPT ?\r", b"%" + level + b"INPT=" + code + b"\r",
+    )  # fmt: skip
+    assert driver(script).input() == Input(meant)
     assert script.ended()
 
 
