@@ -65,3 +65,13 @@ class Lab:
         """Return how many objects wait in the body's memory now."""
         assert not self.eos.busy
         return len(self.eos._memory)  # pyright: ignore[reportPrivateUsage] - the body tells it nobody
+
+    def pull(self) -> None:
+        """Pull the cable out, and put it back."""
+        self.camera._drop(None)  # pyright: ignore[reportPrivateUsage]
+
+    def download(self) -> bytes:
+        """Return what the camera writes of the frame exposed last."""
+        into = io.BytesIO()
+        self.camera.download(into)
+        return into.getvalue()

@@ -16,7 +16,6 @@ from drivers.pjlink.wire import FaultsChanged, Found, InputChanged, LinkUp, PjLi
 from drivers.projector import Fault, Power, Severity
 from foundation.errors import LinkClosed, LinkTimeout
 from sim.clock import SimulatedClock
-from tests.drivers.pjlink.notice_port import NoticePort
 
 MAC = "00:11:22:aa:bb:cc"
 
@@ -174,29 +173,6 @@ def test_junk_without_end_does_not_prolong_the_search() -> None:
 def test_a_taken_port_is_told_with_its_remedy() -> None:
     with UdpSocket(host="127.0.0.1") as taken, pytest.raises(LinkClosed, match="end the other program"):
         search(listen_port=taken.address[1])
-
-
-def test_notices_arrive_in_order_past_everything_else() -> None:
-    with NoticePort(0, "127.0.0.1") as controller, UdpSocket(host="127.0.0.1") as projector:
-        for datagram in (
-            b"noise",
-            b"%2ACKN=00:11:22:aa:bb:cc\r",
-            b"%2POWR=3\r%2INPT=31\r",
-            b"%2LKUP=00:11:22:aa:bb:cc\r",
-        ):
-            projector.send(datagram, controller.address)
-        assert [controller.receive(30.0) for _ in range(3)] == [
-            ("127.0.0.1", PowerChanged(Power.WARMING)),
-            ("127.0.0.1", InputChanged("31")),
-            ("127.0.0.1", LinkUp(MAC)),
-        ]
-        with pytest.raises(LinkTimeout, match="no datagram came"):
-            controller.receive(0.0)
-        projector.send(b"noise", controller.address)
-        projector.send(b"%2POWR=1\r", controller.address)
-        with pytest.raises(LinkTimeout, match="no notice of a projector"):
-            controller.receive(0.0)
-        assert controller.receive(0.0) == ("127.0.0.1", PowerChanged(Power.ON))
 
 
 def test_a_socket_that_was_closed_says_so() -> None:
