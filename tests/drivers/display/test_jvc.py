@@ -18,6 +18,7 @@ from sim.clock import SimulatedClock
 from sim.projectors.jvc import JvcPeer, serve_jvc
 from sim.projectors.screen import Screen
 from tests.contracts.presenter import Bench, PresenterContract
+from tests.drivers.script import Script
 
 ACKNOWLEDGED = b"\x06\x89\x01SS\n"
 
@@ -40,26 +41,6 @@ class TestOverTcp(PresenterContract):
             presenter.close()
 
 
-class Script:
-    """A cable that has one conversation by heart; heard and said alternate, and nothing may be left over."""
-
-    def __init__(self, *lines: bytes) -> None:
-        self.lines = list(lines)
-        self.closed = False
-
-    def write(self, data: bytes, timeout: float) -> None:
-        assert self.lines, f"nothing more was to be said, but {data!r} was"
-        assert data == self.lines.pop(0)
-
-    def read(self, limit: int, timeout: float) -> bytes:
-        if not self.lines:
-            raise LinkTimeout("the script has ended")
-        return self.lines.pop(0)
-
-    def close(self) -> None:
-        self.closed = True
-
-
 def colour(red: bytes, green: bytes, blue: bytes) -> list[bytes]:
     commands = (b"SSTP02", b"SSFR" + red, b"SSFG" + green, b"SSFB" + blue)
     return [line for command in commands for line in (b"!\x89\x01" + command + b"\n", ACKNOWLEDGED)]
@@ -73,7 +54,7 @@ def test_speaks_as_specified() -> None:
     presenter = JvcFlatField(lambda: script, clock=SimulatedClock())
     presenter.show(Colour(255, 128, 10))
     presenter.close()
-    assert script.lines == []
+    assert script.ended()
     assert script.closed
 
 

@@ -20,41 +20,10 @@ from sim.projectors.pjlink import PjLinkPeer, memory_link, serve_pjlink
 from sim.projectors.projector import ProjectorTraits, SimulatedProjector
 from tests.contracts.projector import Bench, ProjectorContract
 from tests.drivers.links.troubled_links import Deaf, Dribbling, DroppedAfter, Garbling, Slow
+from tests.drivers.script import Script
 
 PASSWORD = "JBMIAProjectorLink"
 DIGEST = b"5d8409bc1c3fa39749434aa3a5c38682"
-
-
-class Script:
-    """A cable that has one conversation by heart and objects to a byte too many or too few.
-
-    `lines` alternates what the projector says and what it must hear; None hangs up. Unheard answers are an error, too:
-    see `ended`.
-    """
-
-    def __init__(self, *lines: bytes | None) -> None:
-        self._lines = list(lines)
-        self.closed = False
-
-    def write(self, data: bytes, timeout: float) -> None:
-        if self._lines and self._lines[0] is None:
-            raise LinkClosed("the script hangs up")
-        assert self._lines, f"nothing more was to be said, but {data!r} was"
-        assert data == self._lines.pop(0)
-
-    def read(self, limit: int, timeout: float) -> bytes:
-        if not self._lines or not timeout:
-            raise LinkTimeout("the script has nothing to say")
-        line = self._lines.pop(0)
-        if line is None:
-            raise LinkClosed("the script hangs up")
-        return line
-
-    def close(self) -> None:
-        self.closed = True
-
-    def ended(self) -> bool:
-        return not self._lines
 
 
 def driver(*scripts: Script, password: str | None = None) -> PjLinkProjector:
