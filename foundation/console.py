@@ -486,25 +486,26 @@ def json_output(command: str, asked: bool) -> Generator[JsonOutput]:
 
 
 def with_json(command: str) -> Callable[[Callable[..., None]], Callable[..., None]]:
-    """Return a decorator of a typer command whose parameter `told: JsonOutput` is replaced by the option ``--json``."""
+    """Return a decorator of a typer command whose one parameter of type `JsonOutput` becomes the option ``--json``."""
 
     def decorate(function: Callable[..., None]) -> Callable[..., None]:
         signature = inspect.signature(function)
-        if "told" not in signature.parameters:
-            raise ValueError(f"{command} has no parameter 'told' to put the option in the place of")
         given = getattr(function, "__annotations__", {})
         hints = given if "__signature__" in vars(function) else get_type_hints(function, include_extras=True)
+        output_name = next((name for name in signature.parameters if hints.get(name) is JsonOutput), None)
+        if output_name is None:
+            raise ValueError(f"{command} has no parameter of type JsonOutput to put the option in the place of")
         option = inspect.Parameter("as_json", inspect.Parameter.KEYWORD_ONLY, default=False, annotation=AsJson)
         others = [
             parameter.replace(annotation=hints.get(name, Any))
             for name, parameter in signature.parameters.items()
-            if name != "told"
+            if name != output_name
         ]
 
         @functools.wraps(function)
         def with_option(*arguments: Any, as_json: bool = False, **named: Any) -> None:
-            with json_output(command, as_json) as told:
-                function(*arguments, **named, told=told)
+            with json_output(command, as_json) as output:
+                function(*arguments, **named, **{output_name: output})
 
         with_option.__signature__ = signature.replace(parameters=[*others, option])  # type: ignore[attr-defined]
         with_option.__annotations__ = {

@@ -634,9 +634,9 @@ class EosBody:
         free: list[int] = []
         for storage in decode_u32_array(listed[1], "the list of cards")[:_MAX_CARDS]:
             if storage & _SLOT_FILLED:
-                told = self._optional(Operation.EOS_GET_STORAGE_INFO, storage)
-                if told is not None:
-                    free.append(StorageInfo.decode(told[1]).free)
+                answer = self._optional(Operation.EOS_GET_STORAGE_INFO, storage)
+                if answer is not None:
+                    free.append(StorageInfo.decode(answer[1]).free)
         return sum(free) if free else None
 
     def _requested(self, code: int) -> bool:

@@ -10,8 +10,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from drivers.canon import records as canon
-from drivers.canon import records as datasets
-from drivers.canon import records as values
 from drivers.canon.apex import APERTURE, ISO, SHUTTER, TOLERANCE, Scale
 from drivers.canon.records import (
     AvailableFormats,
@@ -64,13 +62,13 @@ RECORDS: st.SearchStrategy[Record] = st.one_of(
     st.builds(PropertyChanged, U32, st.binary(max_size=80)),
     st.builds(
         AvailableValues,
-        U32.filter(lambda code: code not in values.IMAGE_FORMAT_PROPERTIES),
+        U32.filter(lambda code: code not in canon.IMAGE_FORMAT_PROPERTIES),
         st.lists(U32, max_size=10).map(tuple),
     ),
     st.builds(AvailableValues, U32, st.just(()), st.sampled_from((1, 7))),
     st.builds(
         AvailableFormats,
-        st.sampled_from(sorted(values.IMAGE_FORMAT_PROPERTIES)),
+        st.sampled_from(sorted(canon.IMAGE_FORMAT_PROPERTIES)),
         st.lists(FORMATS, max_size=5).map(tuple),
     ),
     st.builds(ObjectEvent, st.sampled_from((EosEvent.OBJECT_ADDED, EosEvent.OBJECT_INFO_CHANGED)), _entries()),
@@ -132,7 +130,7 @@ def test_a_state_dump() -> None:
         PropertyChanged(Property.EOS_ISO_SPEED, b"\x68\0\0\0"),
         PropertyChanged(Property.EOS_SERIAL_NUMBER, b"1286027086\0"),
         AvailableValues(Property.EOS_APERTURE, (0x25, 0x28, 0x2B)),
-        AvailableFormats(Property.EOS_IMAGE_FORMAT, (values.RAW_ONLY, ImageFormat((raw, jpeg)))),
+        AvailableFormats(Property.EOS_IMAGE_FORMAT, (canon.RAW_ONLY, ImageFormat((raw, jpeg)))),
         Notice(EosEvent.CAMERA_STATUS_CHANGED, CameraStatus.BUSY),
         OtherRecord(0xC1FE, b"\xab\xcd"),
     )
@@ -255,13 +253,13 @@ def test_objects_on_the_card() -> None:
         0x21,
         0x4D987C10,
     )
-    assert datasets.decode_object_entries(examples.OBJECT_ENTRIES) == (folder, picture)
-    assert datasets.encode_object_entries((folder, picture)) == examples.OBJECT_ENTRIES
+    assert canon.decode_object_entries(examples.OBJECT_ENTRIES) == (folder, picture)
+    assert canon.encode_object_entries((folder, picture)) == examples.OBJECT_ENTRIES
 
 
 @given(st.lists(_entries(), max_size=5).map(tuple))
 def test_any_objects_come_back(entries: tuple[ObjectEntry, ...]) -> None:
-    assert datasets.decode_object_entries(datasets.encode_object_entries(entries)) == entries
+    assert canon.decode_object_entries(canon.encode_object_entries(entries)) == entries
 
 
 def test_what_no_body_could_say_is_our_own_mistake() -> None:
@@ -281,13 +279,13 @@ def test_a_name_must_fit() -> None:
 
 
 def test_settings_are_canons_bytes() -> None:
-    setting = PropertySetting(Property.EOS_CAPTURE_DESTINATION, values.number_value(CaptureDestination.HOST))
+    setting = PropertySetting(Property.EOS_CAPTURE_DESTINATION, canon.number_value(CaptureDestination.HOST))
     assert setting.encode() == examples.SETTING
     assert PropertySetting.decode(examples.SETTING) == setting
     # RAW only: 20 bytes of value, 28 with the header, as facts from the wire have it.
-    setting = PropertySetting(Property.EOS_IMAGE_FORMAT, values.RAW_ONLY.encode())
+    setting = PropertySetting(Property.EOS_IMAGE_FORMAT, canon.RAW_ONLY.encode())
     assert setting.encode() == examples.IMAGE_SETTING
-    assert ImageFormat.decode(PropertySetting.decode(examples.IMAGE_SETTING).value) == values.RAW_ONLY
+    assert ImageFormat.decode(PropertySetting.decode(examples.IMAGE_SETTING).value) == canon.RAW_ONLY
 
 
 @pytest.mark.parametrize("octets", ["07000000 1cd10000", "0d000000 1cd10000 04000000"])
@@ -297,20 +295,20 @@ def test_a_setting_that_is_none(octets: str) -> None:
 
 
 def test_values() -> None:
-    assert values.number_value(-3) == b"\xfd\xff\xff\xff"
-    assert values.number_of(b"\x87\x02\0\x80") == 0x80000287
-    assert values.text_value("Lab") == b"Lab\0"
-    assert values.text_of(b"EF-S15-85mm\0\0\0") == "EF-S15-85mm"
+    assert canon.number_value(-3) == b"\xfd\xff\xff\xff"
+    assert canon.number_of(b"\x87\x02\0\x80") == 0x80000287
+    assert canon.text_value("Lab") == b"Lab\0"
+    assert canon.text_of(b"EF-S15-85mm\0\0\0") == "EF-S15-85mm"
     with pytest.raises(ProtocolError, match="needs 4 bytes, but only 1"):
-        values.number_of(b"\0")
+        canon.number_of(b"\0")
     with pytest.raises(ValueError, match="NUL"):
-        values.text_value("a\0")
+        canon.text_value("a\0")
     with pytest.raises(ValueError, match="does not fit"):
-        values.number_value(1 << 32)
+        canon.number_value(1 << 32)
 
 
 def test_image_formats_have_names() -> None:
-    assert str(values.RAW_ONLY) == "RAW"
+    assert str(canon.RAW_ONLY) == "RAW"
     assert str(ImageFormat((ImageFile(6, 2, 4), ImageFile(1, 14, 2)))) == "sRAW + JPEG S1 normal"
     assert str(ImageFile(6, 0, 3)) == "RAW of compression 3"
     assert [file.is_raw for file in (ImageFile(6, 1, 4), ImageFile(1, 0, 3))] == [True, False]
