@@ -22,29 +22,25 @@ ICC Profiles in X Specification 0.4.
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import os
 import re
 import sys
-from collections.abc import Generator
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
-
-from drivers.display.x11 import outlive
-from foundation.errors import ConfigurationError, DeviceError
-
-if TYPE_CHECKING:
-    from types import ModuleType
-import ctypes
 import threading
-from collections.abc import Callable
-from typing import TYPE_CHECKING, Final
+from collections.abc import Callable, Generator
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 import numpy.typing as npt
 
-from drivers.display.x11 import XScreen, is_dark, is_lost
+from drivers.display.x11 import XScreen, is_dark, is_lost, outlive
 from drivers.presenter import BLACK, Colour
 from foundation.clock import Clock, SystemClock
+from foundation.errors import ConfigurationError, DeviceError
+
+if TYPE_CHECKING:
+    from types import ModuleType
 
 _users = 0
 """How many need GLFW now."""
