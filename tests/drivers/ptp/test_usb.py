@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from itertools import pairwise
 
 import pytest
@@ -234,40 +234,21 @@ def test_messages_read_well() -> None:
     assert str(PtpEvent(0xC999)) == "0xc999"
 
 
-class _OverMemory(TransportContract):
-    def trouble(self, good: UsbPipes) -> UsbPipes:
-        raise NotImplementedError
+WAYS: dict[str, Callable[[UsbPipes], UsbPipes]] = {
+    "short reads": ShortReads,
+    "header alone": HeaderAlone,
+    "data and response together": Joining,
+    "no empty packets": WithoutEmptyPackets,
+    "after a stall": lambda good: Stalling(Stalling(good, Pipe.BULK_IN, range(0, 10000, 40)), Pipe.BULK_OUT, ()),
+}
 
-    @pytest.fixture
-    def bench(self) -> Bench:
+
+class TestOverMemory(TransportContract):
+    @pytest.fixture(params=WAYS)
+    def bench(self, request: pytest.FixtureRequest) -> Bench:
         responder = Echo()
         pipes = MemoryPipes(PtpUsbDevice(responder))
-        return Bench(UsbTransport(self.trouble(pipes), SimulatedClock()), responder, pipes.pull)
-
-
-class TestShortReads(_OverMemory):
-    def trouble(self, good: UsbPipes) -> UsbPipes:
-        return ShortReads(good)
-
-
-class TestHeaderAlone(_OverMemory):
-    def trouble(self, good: UsbPipes) -> UsbPipes:
-        return HeaderAlone(good)
-
-
-class TestDataAndResponseTogether(_OverMemory):
-    def trouble(self, good: UsbPipes) -> UsbPipes:
-        return Joining(good)
-
-
-class TestWithoutEmptyPackets(_OverMemory):
-    def trouble(self, good: UsbPipes) -> UsbPipes:
-        return WithoutEmptyPackets(good)
-
-
-class TestAfterAStall(_OverMemory):
-    def trouble(self, good: UsbPipes) -> UsbPipes:
-        return Stalling(Stalling(good, Pipe.BULK_IN, range(0, 10000, 40)), Pipe.BULK_OUT, ())
+        return Bench(UsbTransport(WAYS[request.param](pipes), SimulatedClock()), responder, pipes.pull)
 
 
 class Script:
