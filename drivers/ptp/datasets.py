@@ -205,7 +205,7 @@ Text = Annotated[str, DataType.STRING]
 """What a dataset's fields are on the wire."""
 
 
-class Dataset:
+class PtpDataset:
     """A frozen dataclass whose fields, each a type above, follow each other on the wire."""
 
     @classmethod
@@ -231,7 +231,7 @@ class Dataset:
 
 
 @dataclass(frozen=True)
-class DeviceInfo(Dataset):
+class DeviceInfo(PtpDataset):
     """What a device is and can do (GetDeviceInfo, 5.5.1); version 100 is 1.00."""
 
     standard_version: U16 = 100
@@ -251,7 +251,7 @@ class DeviceInfo(Dataset):
 
 
 @dataclass(frozen=True)
-class ObjectInfo(Dataset):
+class ObjectInfo(PtpDataset):
     """An object in a store (GetObjectInfo, 5.5.3): bytes, pixels, dates as ``YYYYMMDDThhmmss``."""
 
     storage: U32 = 0
@@ -276,7 +276,7 @@ class ObjectInfo(Dataset):
 
 
 @dataclass(frozen=True)
-class StorageInfo(Dataset):
+class StorageInfo(PtpDataset):
     """A store (GetStorageInfo, 5.5.2): capacities in bytes; 0xffffffff free images where the device does not know.
 
     `padding` is what a device sends behind the dataset: two NULs on the EOS 60D.

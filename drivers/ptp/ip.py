@@ -29,7 +29,7 @@ from typing import Final, Self, cast
 
 from drivers.links.link import Link
 from drivers.links.network import TcpLink
-from drivers.ptp.datasets import U32, Cursor, Dataset, encode_integer
+from drivers.ptp.datasets import U32, Cursor, PtpDataset, encode_integer
 from drivers.ptp.transaction import (
     MAX_PARAMETERS,
     CableTransport,
@@ -86,7 +86,7 @@ class FailReason(IntEnum):
 
 
 @dataclass(frozen=True)
-class InitCommandRequest(Dataset):
+class InitCommandRequest(PtpDataset):
     """The initiator names itself: a GUID of 16 bytes, which a camera may have been paired with, and a name."""
 
     guid: bytes
@@ -104,7 +104,7 @@ class InitCommandRequest(Dataset):
 
 
 @dataclass(frozen=True)
-class InitCommandAck(Dataset):
+class InitCommandAck(PtpDataset):
     """The responder accepts, numbers the connection and names itself."""
 
     connection: int
@@ -123,26 +123,26 @@ class InitCommandAck(Dataset):
 
 
 @dataclass(frozen=True)
-class InitEventRequest(Dataset):
+class InitEventRequest(PtpDataset):
     """The initiator names the connection that the event channel belongs to."""
 
     connection: U32
 
 
 @dataclass(frozen=True)
-class InitEventAck(Dataset):
+class InitEventAck(PtpDataset):
     """The event channel stands."""
 
 
 @dataclass(frozen=True)
-class InitFail(Dataset):
+class InitFail(PtpDataset):
     """The responder refuses; see `FailReason`."""
 
     reason: U32
 
 
 @dataclass(frozen=True)
-class OperationRequest(Dataset):
+class OperationRequest(PtpDataset):
     """A request, and whether the initiator will send the data phase."""
 
     request: PtpRequest
@@ -162,7 +162,7 @@ class OperationRequest(Dataset):
 
 
 @dataclass(frozen=True)
-class StartData(Dataset):
+class StartData(PtpDataset):
     """A data phase begins; `total` counts its bytes, None where the sender does not know."""
 
     transaction: int
@@ -198,19 +198,19 @@ class EndData:
 
 
 @dataclass(frozen=True)
-class Cancel(Dataset):
+class Cancel(PtpDataset):
     """The data phase is called off."""
 
     transaction: U32
 
 
 @dataclass(frozen=True)
-class Ping(Dataset):
+class Ping(PtpDataset):
     """Asks whether the other side is there."""
 
 
 @dataclass(frozen=True)
-class Pong(Dataset):
+class Pong(PtpDataset):
     """Answers `Ping`."""
 
 
@@ -399,7 +399,7 @@ def _read_message(cursor: Cursor) -> tuple[int, int, tuple[int, ...]]:
     return code, transaction, cursor.integers(count, 4, "parameters")
 
 
-_PACKETS: dict[int, type[Dataset]] = {
+_PACKETS: dict[int, type[PtpDataset]] = {
     PacketType.INIT_COMMAND_REQUEST: InitCommandRequest,
     PacketType.INIT_COMMAND_ACK: InitCommandAck,
     PacketType.INIT_EVENT_REQUEST: InitEventRequest,
