@@ -58,7 +58,7 @@ class Exchange:
         self._silent_remedy, self._endless_remedy = silent, endless
         self._proof = b""
         self.questions = 0
-        """Asked on the connection there is."""
+        """Asked on the connection there is, since it was greeted."""
         self._link: Link | None = None
         self._rest = b""
 
@@ -134,8 +134,8 @@ class Exchange:
             link = self._link
             if link is None:
                 link = self._link = self._connect()
-                self.questions = 0
                 self._proof = self._greet(self)
+                self.questions = 0
             self._discard(link)
             proof, self._proof = self._proof, b""
             link.write(proof + command, self._timeout)

@@ -70,7 +70,7 @@ def test_an_answer_may_come_in_pieces() -> None:
         ((b"PJ_NG",), DeviceRefused, "another controller"),
         ((b"PJ_OK", b"PJREQ", b"PJNAK"), DeviceRefused, "password"),
         ((b"PJLINK 0\r",), ProtocolError, "answers b'PJLIN' in place of b'PJ_OK'"),
-        ((b"PJ_OK", b"PJREQ", b"PJACK", b"!\x89\x01SSTP02\n"), LinkTimeout, "does not acknowledge SSTP02 within 5 s"),
+        ((b"PJ_OK", b"PJREQ", b"PJACK", b"!\x89\x01SSTP02\n"), LinkTimeout, "within 5 s"),
         ((b"PJ_OK", b"PJREQ", b"PJACK", b"!\x89\x01SSTP02\n", b"\x06\x89\x01PW\n"), ProtocolError, "in place of"),
     ],
 )
@@ -88,6 +88,17 @@ def test_connects_again_when_the_projector_hung_up() -> None:
     peer.hang_up()
     presenter.show(Colour(9, 8, 7))
     assert screen.colour == Colour(9, 8, 7)
+
+
+@pytest.mark.parametrize("told", [1, 2, 3])
+def test_what_was_told_before_a_connection_was_lost_is_told_again(told: int) -> None:
+    black, grey = colour(b"0000", b"0000", b"0000"), colour(b"0009", b"0009", b"0009")
+    first = Script(b"PJ_OK", b"PJREQ", b"PJACK", *black, *grey[: 2 * told], None)
+    second = Script(b"PJ_OK", b"PJREQ", b"PJACK", *grey[2 * told :], *grey)
+    scripts = [first, second]
+    JvcFlatField(lambda: scripts.pop(0), clock=SimulatedClock()).show(Colour(9, 9, 9))
+    assert first.closed
+    assert second.ended()
 
 
 def test_a_projector_that_is_gone_is_told_and_may_come_back() -> None:
