@@ -12,9 +12,18 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from foundation import console
-from foundation.console import EXIT_CODES, Quiet, Verbose, Version, common_first, new_app, orderly_end
+from foundation.console import (
+    EXIT_CODES,
+    JsonOutput,
+    Quiet,
+    Verbose,
+    Version,
+    common_first,
+    new_app,
+    orderly_end,
+    with_json,
+)
 from foundation.errors import InputError, QualityError, first_of
-from foundation.json_output import JsonOutput, with_json
 
 if TYPE_CHECKING:
     from experiment.config import LabSettings

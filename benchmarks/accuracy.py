@@ -31,7 +31,7 @@ from experiment.chart.model import Chart
 from experiment.config import LabSettings, SequenceSettings, SimulatedSettings
 from experiment.lights.illuminations import Illumination, plan_illuminations, save_illuminations
 from experiment.session.folder import Session
-from foundation.angles import angles_deg
+from foundation.colorimetry import angles_deg
 from sim.world.sensors import BODIES, Body
 from sim.world.world import World
 

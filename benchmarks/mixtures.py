@@ -32,8 +32,7 @@ from experiment.chart.layout import A_SERIES_MM, design_chart
 from experiment.config import LabSettings, SimulatedSettings
 from experiment.lights.illuminations import Illumination, plan_illuminations, save_illuminations
 from experiment.session.folder import Session
-from foundation.angles import angles_deg
-from foundation.srgb import decode_srgb
+from foundation.colorimetry import angles_deg, decode_srgb
 from generator.lights.gamut import Gamut, Match, OutsideGamutError
 
 _Array = npt.NDArray[np.float64]

@@ -19,8 +19,7 @@ import time
 from collections.abc import Generator
 from typing import Any
 
-from drivers.display.displays import list_displays
-from drivers.display.fullscreen import FullScreen
+from drivers.display.fullscreen import FullScreen, list_displays
 from experiment.lights.illuminations import plan_illuminations
 
 SIZE = "1920x1080"

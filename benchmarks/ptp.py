@@ -13,13 +13,12 @@ import time
 from collections.abc import Callable
 from statistics import median
 
-from drivers.links.tcp import LOOPBACK
+from drivers.links.network import LOOPBACK
 from drivers.links.usb import open_usb
 from drivers.ptp.codes import Operation, ResponseCode
-from drivers.ptp.ip_transport import IpTransport
-from drivers.ptp.messages import PtpEvent, PtpRequest, PtpResponse
-from drivers.ptp.transport import Transport
-from drivers.ptp.usb_transport import UsbTransport
+from drivers.ptp.ip import IpTransport
+from drivers.ptp.transaction import PtpEvent, PtpRequest, PtpResponse, Transport
+from drivers.ptp.usb import UsbTransport
 from foundation.clock import SystemClock
 from sim.buses.ptpip_server import serve_ptpip
 from sim.buses.responder import Answer

@@ -40,7 +40,7 @@ from experiment.session.folder import Session
 from experiment.session.incoming import ReceivedFile
 from experiment.session.judgement import Judgement
 from experiment.session.plan import SessionStep, plan_steps
-from foundation.angles import angles_deg
+from foundation.colorimetry import angles_deg
 from sim.camera.dng import write_dng
 from sim.world.drawing import Print
 from sim.world.room import Room

@@ -20,9 +20,8 @@ from calibration.table_jobs import (
     verify_table,
 )
 from foundation import console
-from foundation.console import EXIT_CODES, Quiet, Verbose, Version, new_app
+from foundation.console import EXIT_CODES, AsJson, JsonOutput, Quiet, Verbose, Version, json_output, new_app
 from foundation.errors import FormatError, InputError, QualityError
-from foundation.json_output import AsJson, JsonOutput, json_output
 
 if TYPE_CHECKING:
     from calibration.pipeline.build import TableProgress

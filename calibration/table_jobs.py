@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING
 
 from foundation.console import shows_progress
 from foundation.errors import FormatError
-from foundation.trust.secret_texts import masked, printable
+from foundation.secret_texts import masked, printable
 
 if TYPE_CHECKING:
     from calibration.table.lut import Lut
-    from foundation.json_output import JsonOutput
+    from foundation.console import JsonOutput
 
 
 def print_table(folder: Path, told: JsonOutput) -> None:

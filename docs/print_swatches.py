@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from foundation.srgb import encode_srgb
+from foundation.colorimetry import encode_srgb
 from sim.world.profile import ProfileName, printed_reflectance
 from sim.world.spectra import WAVELENGTHS_NM, PaperName
 

@@ -19,7 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from calibration.table.lut import Lut, open_lut
-from foundation.angles import angles_deg
+from foundation.colorimetry import angles_deg
 from generator.kernels.dithering import nearest_nodes
 from generator.lights.choices import parse_lights
 from generator.pictures.picture import open_picture

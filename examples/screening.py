@@ -35,7 +35,7 @@ from evaluation.experiments.resampling import ErrorSample, bca, resamples
 from evaluation.learning.feature_learner import FeatureLearner
 from evaluation.learning.standard import standard_learners
 from evaluation.metrics import recovery_error
-from foundation.srgb import decode_srgb
+from foundation.colorimetry import decode_srgb
 from generator.rendering.matrices import camera_matrix
 from sim.world.spectra import print_reflectance, projector_primaries
 

@@ -20,7 +20,7 @@ from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Fie
 
 from drivers.camera import ExposureSettings
 from foundation.errors import ConfigurationError
-from foundation.trust.secret_texts import MASK, is_webhook, target_label
+from foundation.secret_texts import MASK, is_webhook, target_label
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]

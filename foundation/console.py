@@ -1,33 +1,41 @@
-"""The terminal's side of every command: errors become one sentence and an exit code.
+"""The terminal's side of every command: errors become one sentence and an exit code, figures one JSON object.
 
 Commands are thin: parse, build, call, print. `run` is the one place where an error turns into text.
 
 What all of them take: -h, --version, -v, -q and shell completion, in one style of help (`new_app`). Log records go to
 stderr, warnings and above unless asked otherwise. ``-v`` adds what is done (``INFO``), ``-vv`` every exchange with a
 device (``DEBUG``), and ``-q`` leaves errors alone: no warnings and no progress bars.
+
+Commands with figures take ``--json``: what they found is then one JSON object, alone on standard output, and what they
+print for a reader goes to standard error. `docs/reference/json.md` says which keys each command has; later versions
+add keys and keep those that there are. Numbers that are not known, or not finite, are null.
 """
 
 from __future__ import annotations
 
+import dataclasses
 import errno
+import functools
 import gc
 import inspect
+import json
 import logging
+import math
 import os
 import re
 import signal
 import sys
 import threading
-from collections.abc import Callable, Generator, Sequence
-from contextlib import ExitStack, contextmanager, suppress
-from typing import Annotated, Any
+from collections.abc import Callable, Generator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager, redirect_stdout, suppress
+from typing import Annotated, Any, TextIO, cast, get_type_hints
 
 import typer
 from typer.core import TyperCommand, TyperGroup
 
 from foundation.errors import EXIT_INTERRUPTED, CropError, InputError, StorageError
 from foundation.files import disk_remedy_of, remedy_of
-from foundation.trust.secret_texts import masked, printable
+from foundation.secret_texts import masked, printable
 
 EXIT_CODES = (
     "Exit codes: 0 done; 2 something given cannot be used; 3 a device failed; 4 the data are not good enough; "
@@ -427,3 +435,106 @@ def logging_as_before() -> Generator[None]:
 def shows_progress() -> bool:
     """Return whether progress is shown: it is not where errors alone are wanted."""
     return logging.getLogger().isEnabledFor(logging.WARNING)
+
+
+AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object, for programs; all else goes to stderr.")]
+"""The option ``--json``."""
+
+
+class JsonOutput:
+    """Figures of a command, gathered for the object that is printed at its end."""
+
+    def __init__(self, command: str, asked: bool) -> None:
+        self.asked = asked
+        self._command = command
+        self._values: dict[str, Any] = {}
+
+    def add(self, **values: Any) -> None:
+        """Add values; any that `plain` takes."""
+        self._values.update(values)
+
+    def append(self, key: str, value: Any) -> None:
+        """Add a value to the end of the list `key`, which is begun where it is not there."""
+        self._values.setdefault(key, []).append(value)
+
+    def write(self, stream: TextIO) -> None:
+        """Print the object, if there is anything in it."""
+        if self._values:
+            whole = plain({"command": self._command, **self._values})
+            print(json.dumps(whole, indent=2, ensure_ascii=False, allow_nan=False), file=stream)
+
+
+@contextmanager
+def json_output(command: str, asked: bool) -> Generator[JsonOutput]:
+    """Gather figures in the block, and print them at its end if asked; what the block prints is for a reader.
+
+    What was gathered is printed also where data are not good enough or something else ends the command: the exit code
+    says so, and standard error why.
+    """
+    output = JsonOutput(command, asked)
+    if not asked:
+        yield output
+        return
+    stdout = sys.stdout
+    with redirect_stdout(sys.stderr):
+        try:
+            yield output
+        except CropError:
+            output.write(stdout)
+            raise
+    output.write(stdout)
+
+
+def with_json(command: str) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """Return a decorator of a typer command whose one parameter of type `JsonOutput` becomes the option ``--json``."""
+
+    def decorate(function: Callable[..., None]) -> Callable[..., None]:
+        signature = inspect.signature(function)
+        given = getattr(function, "__annotations__", {})
+        hints = given if "__signature__" in vars(function) else get_type_hints(function, include_extras=True)
+        output_name = next((name for name in signature.parameters if hints.get(name) is JsonOutput), None)
+        if output_name is None:
+            raise ValueError(f"{command} has no parameter of type JsonOutput to put the option in the place of")
+        option = inspect.Parameter("as_json", inspect.Parameter.KEYWORD_ONLY, default=False, annotation=AsJson)
+        others = [
+            parameter.replace(annotation=hints.get(name, Any))
+            for name, parameter in signature.parameters.items()
+            if name != output_name
+        ]
+
+        @functools.wraps(function)
+        def with_option(*arguments: Any, as_json: bool = False, **named: Any) -> None:
+            with json_output(command, as_json) as output:
+                function(*arguments, **named, **{output_name: output})
+
+        with_option.__signature__ = signature.replace(parameters=[*others, option])  # type: ignore[attr-defined]
+        with_option.__annotations__ = {
+            **{parameter.name: parameter.annotation for parameter in (*others, option)},
+            "return": None,
+        }
+        return with_option
+
+    return decorate
+
+
+def plain(value: Any) -> Any:
+    """Return a value as JSON has it: paths and other objects as text, numbers of numpy as numbers, no infinities.
+
+    Examples
+    --------
+    >>> from pathlib import Path
+    >>> plain({"place": Path("lut"), "angles": (0.5, float("nan"))})
+    {'place': 'lut', 'angles': [0.5, None]}
+    """
+    if value is None or isinstance(value, str | bool | int):
+        return value
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return {field.name: plain(getattr(value, field.name)) for field in dataclasses.fields(value)}
+    if isinstance(value, Mapping):
+        return {str(key): plain(item) for key, item in cast("Mapping[Any, Any]", value).items()}
+    if isinstance(value, list | tuple | set | frozenset):
+        return [plain(item) for item in cast("list[Any]", value)]
+    listed: Callable[[], Any] | None = getattr(value, "tolist", None)
+    return str(value) if listed is None else plain(listed())

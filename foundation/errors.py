@@ -27,7 +27,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from foundation.trust.secret_texts import masked
+from foundation.secret_texts import masked
 
 EXIT_INTERRUPTED = 130
 """Exit code of a command that Ctrl-C ended; 128 + SIGINT, as shells have it."""

@@ -9,11 +9,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from foundation.console import EXIT_CODES, loaded, new_app, run
+from foundation.console import EXIT_CODES, JsonOutput, json_output, loaded, new_app, run
 from foundation.errors import InputError
-from foundation.json_output import JsonOutput, json_output
 from foundation.processors import processor_count
-from foundation.trust.secret_texts import masked, printable
+from foundation.secret_texts import masked, printable
 from generator.command.demo_table import table_folder
 from generator.command.grouping import grouped
 from generator.command.likeness_options import LikenessOptions, choose

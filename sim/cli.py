@@ -221,7 +221,7 @@ def _film(
     world: World, screen: str | None, projector: str | None, password: str | None, events: Sequence[str]
 ) -> Generator[Film]:
     """Yield pictures of a world under white light, or lit by a screen that is watched."""
-    from drivers.links.tcp import TcpLink
+    from drivers.links.network import TcpLink
     from drivers.pjlink.projector import PjLinkProjector
     from drivers.presenter import WHITE
     from foundation.clock import SystemClock

@@ -14,8 +14,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from calibration.citation.options import Licence, Note
-from foundation.console import EXIT_CODES, orderly_end, progress
-from foundation.json_output import JsonOutput, with_json
+from foundation.console import EXIT_CODES, JsonOutput, orderly_end, progress, with_json
 from sim import cli as devices
 from sim.cli import app
 

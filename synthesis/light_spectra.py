@@ -24,7 +24,7 @@ import numpy as np
 import numpy.typing as npt
 
 from experiment.lights.illuminations import Illumination, parse_ccts, shown_colour
-from foundation.colorimetry.observer import linear_srgb, planck, xyz_of
+from foundation.colorimetry import linear_srgb, planck, xyz_of
 from foundation.errors import FormatError, InputError
 from sim.spectral.grids import regridded, require_grid
 from sim.spectral.published import PublishedSpectrum, daylight, published_spectra

@@ -19,7 +19,7 @@ from experiment.framing.planes import CHANNELS
 from experiment.measures.least_squares import least_squares
 from experiment.measures.paper import MIN_REFERENCES, PaperReader
 from experiment.measures.polynomials import page_polynomial, page_powers
-from foundation.angles import angles_deg
+from foundation.colorimetry import angles_deg
 from foundation.robust import huber_weights, sigma_of
 
 LEAST_COUNTS = 300.0

@@ -111,8 +111,7 @@ def stated_focal_px(path: Path, mosaic: Mosaic) -> float | None:
     Exif 2.32: FocalLength in mm times FocalPlaneXResolution in pixels to the unit of FocalPlaneResolutionUnit, pixels
     of a picture of the size that Exif states, which is taken to be the visible one to a hundredth.
     """
-    from drivers.tiff.reading import TiffDamaged, is_tiff, read_directories
-    from drivers.tiff.tags import TiffTag
+    from drivers.tiff import TiffDamaged, TiffTag, is_tiff, read_directories
     from foundation.files import read_whole
 
     data = read_whole(path)

@@ -20,7 +20,7 @@ from acquisition.monitor.rows import AttemptView, EventView
 from experiment.lights.illuminations import Illumination
 from experiment.session.judgement import Check
 from experiment.session.plan import SessionStep
-from foundation.srgb import decode_srgb
+from foundation.colorimetry import decode_srgb
 
 Json = dict[str, Any]
 """A JSON object."""

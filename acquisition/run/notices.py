@@ -34,7 +34,7 @@ from datetime import datetime
 from typing import Final
 from urllib.parse import unquote, urlsplit, urlunsplit
 
-from foundation.trust.secret_texts import is_webhook, target_label
+from foundation.secret_texts import is_webhook, target_label
 
 LIMIT_S: Final = 20.0
 """How long a receiver may take; a message to a telephone takes seconds."""

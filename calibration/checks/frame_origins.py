@@ -10,7 +10,7 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from drivers.raw.origin import FrameOrigin
+from drivers.raw.rawfile import FrameOrigin
 from experiment.session.records import FrameRecord
 
 

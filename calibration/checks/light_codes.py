@@ -28,7 +28,7 @@ import numpy as np
 import numpy.typing as npt
 
 from calibration.checks.projector_response import ProjectorFit, fit_projector
-from foundation.angles import angles_deg
+from foundation.colorimetry import angles_deg
 
 CERTAIN = 4.0
 """Standard errors that are taken off an angle, or a brightness, so that noise is not taken for a wrong name."""

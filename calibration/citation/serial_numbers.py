@@ -17,7 +17,7 @@ from dataclasses import replace
 from functools import lru_cache
 from typing import Literal
 
-from drivers.raw.origin import FrameOrigin
+from drivers.raw.rawfile import FrameOrigin
 
 SerialForm = Literal["hash", "plain", "withheld"]
 """How the serial number of a body is told (`experiment.config.CitationSettings.camera_serial`)."""

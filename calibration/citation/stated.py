@@ -13,7 +13,7 @@ from pydantic import ValidationError
 
 from calibration.citation.record import OriginRecord, Rig
 from calibration.citation.serial_numbers import told_serials
-from drivers.raw.origin import FrameOrigin
+from drivers.raw.rawfile import FrameOrigin
 from experiment.config import CameraSettings, CitationSettings
 from experiment.session.folder import Session
 from experiment.session.records import FrameRecord

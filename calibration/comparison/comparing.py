@@ -31,7 +31,7 @@ from calibration.comparison.values import (
 )
 from calibration.table.file_names import REFERENCES, REPORT_JSON
 from calibration.table.lut import Lut
-from foundation.angles import angles_deg
+from foundation.colorimetry import angles_deg
 from foundation.errors import FormatError
 from foundation.processors import ordered_map, processor_count
 

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from calibration.checks.frame_consistency import FrameConsistency
-from drivers.raw.origin import FrameOrigin
+from drivers.raw.rawfile import FrameOrigin
 from experiment.framing.movement import Shift
 from experiment.framing.planes import Channel
 from experiment.measures.flat_field import FlatField

@@ -27,7 +27,7 @@ import numpy as np
 import numpy.typing as npt
 
 from foundation.files import partial_path, publish_folder, require_free, storage_error, sync_folder, write_whole
-from foundation.trust.held_folders import LOCK_FILE, held_folder
+from foundation.held_folders import LOCK_FILE, held_folder
 
 CHECKPOINT = "checkpoint.npz"
 """Name of the checkpoint in the hidden folder."""

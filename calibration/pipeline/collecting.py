@@ -30,7 +30,7 @@ from calibration.radiometry.primaries import pure_lights
 from calibration.radiometry.projector import additivity, drift_gains
 from experiment.lights.illuminations import Illumination
 from experiment.session.folder import Session
-from foundation.angles import angles_deg
+from foundation.colorimetry import angles_deg
 
 _LEAST_WHITE = 1e-3
 """Counts that a channel's ground truth has at least, so that it is a direction even where no light is measured."""

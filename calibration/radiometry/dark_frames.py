@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from drivers.raw.origin import FrameOrigin
+from drivers.raw.rawfile import FrameOrigin
 from experiment.session.records import FrameRecord
 from foundation.robust import MAD_TO_SIGMA, MEDIAN_ERROR
 

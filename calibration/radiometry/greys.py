@@ -19,7 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from experiment.chart.model import Reference
-from foundation.angles import angles_deg
+from foundation.colorimetry import angles_deg
 from foundation.robust import MAD_TO_SIGMA
 
 COLUMNS = ("light", "name", "r", "g", "b", "r_error", "g_error", "b_error")

@@ -22,7 +22,7 @@ from experiment.chart.model import Chart
 from experiment.framing.movement import STILL_PX
 from experiment.measures.flat_field import FlatField
 from experiment.measures.stains import Stains
-from foundation.srgb import decode_srgb
+from foundation.colorimetry import decode_srgb
 
 INK, FAINT, MARK = "#22262b", "#8a929c", "#e8502a"
 """Colours of text and data, of axes, and of what is marked."""

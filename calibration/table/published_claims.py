@@ -23,7 +23,7 @@ from calibration.table.provenance import Provenance
 from calibration.table.sample_hashes import MOST_SAMPLES
 from calibration.table.sums import MOST_BYTES
 from foundation.errors import FormatError, InputError, StorageError
-from foundation.trust.foreign_folders import parse_json_object, require_plain_tree
+from foundation.foreign_folders import parse_json_object, require_plain_tree
 
 FORMAT: Final = "crop.lut.published"
 VERSION: Final = 1

@@ -26,8 +26,8 @@ from calibration.table.file_names import (
 )
 from calibration.table.provenance import Provenance
 from foundation.errors import FormatError
+from foundation.foreign_folders import require_plain_folder
 from foundation.hashing import file_sha256
-from foundation.trust.foreign_folders import require_plain_folder
 
 MOST_BYTES: Final = {
     PROVENANCE: 64 << 20,

@@ -11,7 +11,7 @@ from calibration.spread.fitting import MOST_MISFIT
 from calibration.verdict.retaking import added_bleed
 from calibration.verdict.thresholds import THRESHOLDS
 from experiment.measures.reflections import added_light
-from foundation.angles import angles_deg
+from foundation.colorimetry import angles_deg
 
 _LEAST_CELLS = 8**4
 """Cells from which on a veil is told from other smooth light."""

@@ -1,4 +1,4 @@
-"""The event records of Canon's EOS bodies, as bytes and as values.
+"""What Canon's EOS bodies say beyond the standard, as bytes and as values: events, properties, lists of objects.
 
 GetEvent answers a chain of records: size (32 bits, these included), type (32), body; a record of size 8 and type 0
 ends it, which some bodies leave out. The first answer after SetEventMode holds the camera's whole state, later ones
@@ -10,6 +10,8 @@ Rules that hold inside:
   as it came, in `OtherRecord`, and is skipped by its size; a record that contradicts itself raises `ProtocolError`.
 - Counts and sizes are checked before they are believed; more than `MAX_EVENTS` bytes are refused unread, and more than
   `MAX_RECORDS` records once so many have been read.
+- Properties travel as bytes: 32 bits for every number, text with a closing NUL, structures for a few. Nothing here
+  knows which property is what, except for the image formats, whose lists cannot be cut without it.
 
 Source: no public standard; layouts as recorded from an EOS 60D and an EOS 400D, and as libgphoto2 2.5.34 reads them.
 """
@@ -21,12 +23,257 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Final
 
-from drivers.canon.datasets import ObjectEntry
-from drivers.canon.values import IMAGE_FORMAT_PROPERTIES, ImageFormat, number_of, text_of, text_value
 from drivers.ptp.codes import EosEvent, Property, describe
-from drivers.ptp.cursor import Cursor
-from drivers.ptp.datasets import encode_array, encode_integer
+from drivers.ptp.datasets import MAX_DATASET, Cursor, encode_array, encode_integer
 from foundation.errors import ProtocolError
+
+_RAW: Final = 6
+"""Kind of a raw file, see `ImageFile`."""
+_LOSSLESS: Final = 4
+"""Compression of a raw file, see `ImageFile`."""
+
+_JPEG_SIZES: Final = {0: "L", 1: "M", 2: "S", 5: "M1", 6: "M2", 14: "S1", 15: "S2", 16: "S3"}
+
+_IMAGE_FILE_LENGTH: Final = 16
+"""Bytes of one file's format: this length, kind, size and compression, 32 bits each."""
+
+_MAX_IMAGE_FILES: Final = 2
+"""Files of one release: a raw file and a JPEG."""
+
+_SETTING_HEADER: Final = 8
+"""Bytes before a new value: length and property."""
+
+
+def number_value(number: int) -> bytes:
+    """Return a number as a property's value; negative ones as their two's complement in 32 bits."""
+    return encode_integer(number & 0xFFFFFFFF if -(1 << 31) <= number < 0 else number, 4)
+
+
+def text_value(text: str) -> bytes:
+    """Return text as a property's value, closed by NUL."""
+    octets = text.encode("latin-1", "replace")
+    if b"\0" in octets:
+        raise ValueError(f"{text[:40]!r} holds a NUL")
+    return octets + b"\0"
+
+
+def number_of(value: bytes) -> int:
+    """Return the number in a property's value: its first 32 bits."""
+    return Cursor(value, "a property's value").u32("the number")
+
+
+def text_of(value: bytes) -> str:
+    """Return the text in a property's value, up to its first NUL."""
+    return value.partition(b"\0")[0].decode("latin-1")
+
+
+@dataclass(frozen=True)
+class ImageFile:
+    """One of the files that a release makes.
+
+    - `kind`: 1 JPEG, 6 raw.
+    - `size`: 0 large, 1 medium (of raw: mRAW), 2 small (sRAW), 5 and 6 M1 and M2, 14, 15 and 16 S1, S2 and S3.
+    - `compression`: of JPEG 2 normal and 3 fine; of raw 4 lossless and 3 lossy.
+    """
+
+    kind: int
+    size: int
+    compression: int
+
+    @property
+    def is_raw(self) -> bool:
+        """Whether the file is raw, of any size."""
+        return self.kind == _RAW
+
+    def __str__(self) -> str:
+        if self.is_raw:
+            size = {0: "RAW", 1: "mRAW", 2: "sRAW"}.get(self.size, f"RAW of size {self.size}")
+            return size if self.compression == _LOSSLESS else f"{size} of compression {self.compression}"
+        size = _JPEG_SIZES.get(self.size, f"of size {self.size}")
+        quality = {2: "normal", 3: "fine"}.get(self.compression, f"of compression {self.compression}")
+        return f"JPEG {size} {quality}"
+
+
+@dataclass(frozen=True)
+class ImageFormat:
+    """The one or two files of a release; the value of properties 0xd120 to 0xd123."""
+
+    files: tuple[ImageFile, ...]
+
+    @classmethod
+    def read(cls, cursor: Cursor) -> ImageFormat:
+        """Return the next image format at a cursor."""
+        count = cursor.u32("the count of files")
+        if not 1 <= count <= _MAX_IMAGE_FILES:
+            raise cursor.fault("the count of files", f"1 or {_MAX_IMAGE_FILES}", count)
+        files: list[ImageFile] = []
+        for _ in range(count):
+            length = cursor.u32("the length of a file's format")
+            if length != _IMAGE_FILE_LENGTH:
+                raise cursor.fault("the length of a file's format", str(_IMAGE_FILE_LENGTH), length)
+            files.append(ImageFile(cursor.u32("kind"), cursor.u32("size"), cursor.u32("compression")))
+        return cls(tuple(files))
+
+    @classmethod
+    def decode(cls, value: bytes) -> ImageFormat:
+        """Return the image format in a property's value."""
+        return cls.read(Cursor(value, "an image format"))
+
+    def encode(self) -> bytes:
+        """Return the property's value."""
+        if not 1 <= len(self.files) <= _MAX_IMAGE_FILES:
+            raise ValueError(f"{len(self.files)} files; a release makes 1 or {_MAX_IMAGE_FILES}")
+        return encode_integer(len(self.files), 4) + b"".join(
+            encode_integer(number, 4)
+            for file in self.files
+            for number in (_IMAGE_FILE_LENGTH, file.kind, file.size, file.compression)
+        )
+
+    def __str__(self) -> str:
+        return " + ".join(str(file) for file in self.files)
+
+
+RAW_ONLY = ImageFormat((ImageFile(_RAW, 0, _LOSSLESS),))
+"""One full raw file a release: what a measurement wants."""
+
+IMAGE_FORMAT_PROPERTIES = frozenset(
+    {
+        Property.EOS_IMAGE_FORMAT,
+        Property.EOS_IMAGE_FORMAT_CF,
+        Property.EOS_IMAGE_FORMAT_SD,
+        Property.EOS_IMAGE_FORMAT_EXT_HD,
+    }
+)
+"""Properties whose value is an `ImageFormat`."""
+
+
+@dataclass(frozen=True)
+class PropertySetting:
+    """What SetDevicePropValueEx (0x9110) sends: a property's new value, see `number_value` and `text_value`."""
+
+    code: int
+    value: bytes
+
+    @classmethod
+    def decode(cls, data: bytes) -> PropertySetting:
+        """Return the setting in the data of a request."""
+        cursor = Cursor(data, "SetDevicePropValueEx", MAX_DATASET)
+        length = cursor.u32("length")
+        if length < cursor.at + 4 or length > len(data):
+            raise cursor.fault("length", f"8 to {len(data)}", length)
+        return cls(cursor.u32("property"), cursor.take(length - cursor.at, "value"))
+
+    def encode(self) -> bytes:
+        """Return the data of the request."""
+        return encode_integer(_SETTING_HEADER + len(self.value), 4) + encode_integer(self.code, 4) + bytes(self.value)
+
+
+_NAME_WIDTH: Final = 16
+"""Bytes of a name's field: 8.3 characters and padding."""
+
+_TIME_LENGTH: Final = 4
+"""Bytes of a time, seconds since 1970."""
+
+
+@dataclass(frozen=True)
+class ObjectEntry:
+    """An object as EOS bodies list it, in GetObjectInfoEx and in events.
+
+    - `group`: A second handle; one and the same for files that belong together, else often the handle again.
+    - `name`: at most `name_width` characters.
+    - `time`: seconds since 1970 on the camera's clock; None where the body leaves it out.
+    - `name_width`: bytes of the name's field, padded with NUL; 16 on all bodies recorded.
+    """
+
+    handle: int
+    storage: int
+    format: int
+    size: int
+    name: str
+    parent: int = 0
+    group: int = 0
+    flags: int = 0
+    time: int | None = 0
+    name_width: int = _NAME_WIDTH
+    reserved: int = field(default=0, repr=False)
+
+    @classmethod
+    def read(cls, cursor: Cursor, size_length: int = 4) -> ObjectEntry:
+        """Return the object in the rest of a record; `size_length` is 8 on bodies with sizes of 64 bits."""
+        handle, storage, kind = cursor.u32("handle"), cursor.u32("storage"), cursor.u32("format")
+        reserved, flags = cursor.u32("reserved"), cursor.u32("flags")
+        size = cursor.integer(size_length, "size")
+        parent, group = cursor.u32("parent"), cursor.u32("group")
+        width = cursor.left
+        time = None
+        if width >= _NAME_WIDTH + _TIME_LENGTH:
+            width -= _TIME_LENGTH
+        name = text_of(cursor.take(width, "name"))
+        if cursor.left:
+            time = cursor.u32("time")
+        return cls(handle, storage, kind, size, name, parent, group, flags, time, width, reserved)
+
+    def encode(self, size_length: int = 4) -> bytes:
+        """Return the body of a record."""
+        name = self.name.encode("latin-1", "replace")
+        if len(name) > self.name_width or b"\0" in name:
+            raise ValueError(f"{self.name!r} is no name of at most {self.name_width} characters")
+        if self.name_width < _NAME_WIDTH if self.time is not None else self.name_width >= _NAME_WIDTH + _TIME_LENGTH:
+            raise ValueError(f"a name's field of {self.name_width} bytes and a time behind it look alike")
+        time = b"" if self.time is None else encode_integer(self.time, _TIME_LENGTH)
+        return b"".join(
+            (
+                *(encode_integer(n, 4) for n in (self.handle, self.storage, self.format, self.reserved, self.flags)),
+                encode_integer(self.size, size_length),
+                encode_integer(self.parent, 4),
+                encode_integer(self.group, 4),
+                name.ljust(self.name_width, b"\0"),
+                time,
+            )
+        )
+
+
+def decode_object_entries(data: bytes) -> tuple[ObjectEntry, ...]:
+    """Return the objects that GetObjectInfoEx (0x9109) answers."""
+    cursor = Cursor(data, "GetObjectInfoEx", MAX_DATASET)
+    count = cursor.u32("the count of objects")
+    entries: list[ObjectEntry] = []
+    # A record takes at least four bytes, so that the bytes left bound the loop whatever the count says.
+    for number in range(count):
+        length = cursor.u32("the length of a record")
+        body = cursor.take(max(length - 4, 0), f"record {number} of {count}")
+        entries.append(ObjectEntry.read(Cursor(body, f"GetObjectInfoEx, record {number}")))
+    return tuple(entries)
+
+
+def encode_object_entries(entries: Iterable[ObjectEntry]) -> bytes:
+    """Return the answer to GetObjectInfoEx."""
+    bodies = [entry.encode() for entry in entries]
+    return encode_integer(len(bodies), 4) + b"".join(encode_integer(4 + len(body), 4) + body for body in bodies)
+
+
+@dataclass(frozen=True)
+class DeviceInfoEx:
+    """What GetDeviceInfoEx (0x9108) answers: record types, properties, and numbers whose meaning is not known."""
+
+    events: tuple[int, ...] = ()
+    properties: tuple[int, ...] = ()
+    others: tuple[int, ...] = ()
+
+    @classmethod
+    def decode(cls, data: bytes) -> DeviceInfoEx:
+        """Return the device in an answer."""
+        cursor = Cursor(data, "DeviceInfoEx", MAX_DATASET)
+        length = cursor.u32("length")
+        if length > len(data):
+            raise cursor.fault("length", f"at most {len(data)}, the bytes there are", length)
+        return cls(cursor.array(4, "events"), cursor.array(4, "properties"), cursor.array(4, "others"))
+
+    def encode(self) -> bytes:
+        """Return the answer."""
+        arrays = b"".join(encode_array(array, 4) for array in (self.events, self.properties, self.others))
+        return encode_integer(4 + len(arrays), 4) + arrays
+
 
 MAX_EVENTS: Final = 4 << 20
 """Bytes of the longest answer to GetEvent that is read; a body left alone for a day queues some 250 kB."""

@@ -1,4 +1,4 @@
-"""Plain colours on a real display: exact codes, read back from the screen before a frame is taken.
+"""Plain colours on a display of the desktop: exact codes, read back from the screen before a frame is taken.
 
 Rules that hold inside:
 
@@ -9,33 +9,198 @@ Rules that hold inside:
 - A display that was away for a while is filled again by the next `show`, if it comes back in the mode that it had.
 - One thread owns the window: the one that opened it. OpenGL contexts and GLFW want it so.
 - The window belongs to this process: however that ends, killed included, the window goes with it.
-- GLFW and OpenGL are used in this folder and nowhere else; GLFW runs while anything here is open.
+- GLFW and OpenGL are used here and nowhere else; GLFW runs while anything here is open.
 
 On Linux the window is an X window. Under Wayland that is XWayland, whose compositor may scale and tint behind our back:
 `FullScreen.warnings` reports it. Gamma ramps, which night light and colour management load, lie behind everything that
 can be read back; `warnings` looks at them, too.
 
-Sources: GLFW 3.4 reference; OpenGL 2.1, clauses 4.2.3 (Clear) and 4.3.2 (ReadPixels); ICC Profiles in X
-Specification 0.4.
+Sources: GLFW 3.4 reference; OpenGL 2.1, clauses 4.2.3 (Clear) and 4.3.2 (ReadPixels), numbers from its header, gl.h;
+ICC Profiles in X Specification 0.4.
 """
 
 from __future__ import annotations
 
 import contextlib
 import ctypes
+import os
+import re
+import sys
 import threading
-from typing import Any, Final
+from collections.abc import Callable, Generator
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 import numpy.typing as npt
 
-from drivers.display import opengl
-from drivers.display.displays import Display, choose_display, displays_of, list_displays, running_glfw
-from drivers.display.opengl import OpenGl
-from drivers.display.x11 import XScreen, is_dark, is_lost
+from drivers.display.x11 import XScreen, is_dark, is_lost, outlive
 from drivers.presenter import BLACK, Colour
 from foundation.clock import Clock, SystemClock
-from foundation.errors import DeviceError
+from foundation.errors import ConfigurationError, DeviceError
+
+if TYPE_CHECKING:
+    from types import ModuleType
+
+_users = 0
+"""How many need GLFW now."""
+
+
+@dataclass(frozen=True)
+class Display:
+    """A display as the desktop arranged it; `x`, `y`, `width`, `height` in px of the whole desktop, y down."""
+
+    number: int
+    name: str
+    x: int
+    y: int
+    width: int
+    height: int
+    refresh_hz: int
+
+    @property
+    def place(self) -> str:
+        """Where it is, such as ``+1920+0``."""
+        return f"{self.x:+d}{self.y:+d}"
+
+    def __str__(self) -> str:
+        return f"{self.number}: {self.name} {self.width}×{self.height} at {self.place}, {self.refresh_hz} Hz"
+
+
+def list_displays() -> tuple[Display, ...]:
+    """Return every display, from left to right, then from top to bottom; `number` counts them from 1."""
+    with running_glfw() as glfw:
+        return tuple(display for display, _ in displays_of(glfw))
+
+
+def choose_display(displays: tuple[Display, ...], wanted: str | int | None = None) -> Display:
+    """Return the display that `wanted` names.
+
+    `wanted`: its name (``"HDMI-1"``), its place (``"+1920+0"``), ``"left"``, ``"right"``, or its number; None stands
+    for the only one.
+    """
+    there = "; ".join(str(display) for display in displays) or "none"
+    if wanted is None:
+        fitting = list(displays)
+    elif isinstance(wanted, int):
+        fitting = [display for display in displays if display.number == wanted]
+    elif wanted in ("left", "right"):
+        # With one display, the other is the one that is missing: that is no time to guess.
+        ends = [display.x for display in displays]
+        if len(set(ends)) < 2:
+            raise ConfigurationError(
+                f"display {wanted!r}: there are not two displays side by side, but {there}; "
+                "connect the projector and extend the desktop to it"
+            )
+        end = min(ends) if wanted == "left" else max(ends)
+        fitting = [display for display in displays if display.x == end]
+    elif re.fullmatch(r"[+-]\d+[+-]\d+", wanted):
+        fitting = [display for display in displays if display.place == wanted]
+    else:
+        fitting = [display for display in displays if display.name == wanted]
+        if not fitting and wanted.isdecimal():
+            return choose_display(displays, int(wanted))
+    if len(fitting) == 1:
+        return fitting[0]
+    named = "no display is named" if wanted is None else f"display {wanted!r}"
+    if fitting:
+        raise ConfigurationError(f"{named}: {len(fitting)} fit; name one by its place, such as +1920+0; found: {there}")
+    raise ConfigurationError(
+        f"{named} is not there; found: {there}; connect and switch on the projector, or name another"
+    )
+
+
+@contextlib.contextmanager
+def running_glfw() -> Generator[ModuleType]:
+    """Yield GLFW's module, running; it is terminated when the last block that needs it ends."""
+    global _users
+    glfw = _library()
+    if not _users:
+        if sys.platform == "linux":
+            glfw.init_hint(glfw.PLATFORM, glfw.PLATFORM_X11)
+        try:
+            glfw.init()
+        except glfw.GLFWError as error:
+            raise DeviceError(
+                f"no desktop to show a picture on ({error}); run this on the machine that the projector is connected "
+                "to, logged in there, with DISPLAY set on Linux"
+            ) from error
+        if sys.platform == "linux":
+            outlive(glfw.get_x11_display())
+    _users += 1
+    try:
+        yield glfw
+    finally:
+        _users -= 1
+        if not _users:
+            glfw.terminate()
+
+
+def _library() -> ModuleType:
+    """Return GLFW's module, imported late: to load it asks another process for its version."""
+    if sys.platform == "linux":
+        # The wheel holds two libraries; only the one for X can be made to use it.
+        os.environ.setdefault("PYGLFW_LIBRARY_VARIANT", "x11")
+    try:
+        import glfw
+    except (ImportError, OSError) as error:
+        raise DeviceError(
+            f"GLFW cannot be loaded ({error}); reinstall with: pip install --force-reinstall glfw"
+        ) from error
+    glfw.ERROR_REPORTING = "exception"
+    return glfw
+
+
+def displays_of(glfw: ModuleType) -> list[tuple[Display, Any]]:
+    """Return every display with GLFW's handle on it, in the order of `list_displays`."""
+    found: list[tuple[int, int, str, Any]] = []
+    for monitor in glfw.get_monitors():
+        x, y = glfw.get_monitor_pos(monitor)
+        name = glfw.get_monitor_name(monitor)
+        found.append((x, y, name.decode("utf-8", "replace") if isinstance(name, bytes) else name, monitor))
+    displays: list[tuple[Display, Any]] = []
+    for number, (x, y, name, monitor) in enumerate(sorted(found, key=lambda one: one[:3]), 1):
+        mode = glfw.get_video_mode(monitor)
+        displays.append((Display(number, name, x, y, mode.size.width, mode.size.height, mode.refresh_rate), monitor))
+    return displays
+
+
+# Numbers from gl.h: the two buffers of a window, the bit of Clear, and what would change a plain colour or its area.
+FRONT: Final = 0x0404
+BACK: Final = 0x0405
+COLOUR_BIT: Final = 0x4000
+DITHER: Final = 0x0BD0
+SCISSOR: Final = 0x0C11
+
+BGRA: Final = 0x80E1
+"""The order of channels that the next number is read with (gl.h)."""
+UNSIGNED_INT_8_8_8_8_REVERSED: Final = 0x8367
+"""Read so, a pixel is the number 0xAARRGGBB, which is how drivers keep it: nothing needs converting."""
+
+
+class OpenGl:
+    """The functions of the current context."""
+
+    def __init__(self, glfw: ModuleType) -> None:
+        kind: Callable[..., Any] = ctypes.WINFUNCTYPE if sys.platform == "win32" else ctypes.CFUNCTYPE
+        number, enum, real = ctypes.c_int, ctypes.c_uint, ctypes.c_float
+
+        def function(name: str, *arguments: type) -> Callable[..., None]:
+            address = glfw.get_proc_address(name)
+            if not address:
+                raise DeviceError(f"OpenGL has no {name} here; install the graphics driver (Debian: libgl1-mesa-dri)")
+            return kind(None, *arguments)(address)
+
+        self.clear = function("glClear", enum)
+        self.clear_colour = function("glClearColor", real, real, real, real)
+        self.disable = function("glDisable", enum)
+        self.enable = function("glEnable", enum)
+        self.finish = function("glFinish")
+        self.read_buffer = function("glReadBuffer", enum)
+        self.read_pixels = function("glReadPixels", number, number, number, number, enum, enum, ctypes.c_void_p)
+        self.scissor = function("glScissor", number, number, number, number)
+        self.viewport = function("glViewport", number, number, number, number)
+
 
 OPENING_S: Final = 5.0
 """How long a window may take to fill its display; window managers animate."""
@@ -122,7 +287,7 @@ class FullScreen:
         block = min(self.display.width // columns, self.display.height // rows)
         left = (self.display.width - columns * block) // 2
         top = (self.display.height + rows * block) // 2
-        self._gl.enable(opengl.SCISSOR)
+        self._gl.enable(SCISSOR)
         self._gl.clear_colour(1.0, 1.0, 1.0, 1.0)
         for place, digit in enumerate(digits):
             for cell in (cell for cell, lit in enumerate(digit) if lit == "1"):
@@ -130,8 +295,8 @@ class FullScreen:
                 # OpenGL counts from the bottom.
                 x, y = left + (1 + 4 * place + column) * block, top - (2 + row) * block
                 self._gl.scissor(x, y, block, block)
-                self._gl.clear(opengl.COLOUR_BIT)
-        self._gl.disable(opengl.SCISSOR)
+                self._gl.clear(COLOUR_BIT)
+        self._gl.disable(SCISSOR)
         self._glfw.swap_buffers(self._window)
         self._gl.finish()
         self._glfw.poll_events()
@@ -294,7 +459,7 @@ class FullScreen:
     def _present(self, colour: Colour) -> None:
         self._glfw.make_context_current(self._window)
         self._fill(colour)
-        self._require(self._read_buffer(opengl.BACK), colour, "OpenGL drew", on_screen=False)
+        self._require(self._read_buffer(BACK), colour, "OpenGL drew", on_screen=False)
         self._glfw.swap_buffers(self._window)
         self._gl.finish()
         deadline = self._clock.monotonic() + CONFIRMING_S
@@ -311,14 +476,14 @@ class FullScreen:
     def _fill(self, colour: Colour) -> None:
         gl = self._gl
         gl.viewport(0, 0, self.display.width, self.display.height)
-        gl.disable(opengl.DITHER)
+        gl.disable(DITHER)
         # Fixed point keeps round(255 · c / 255), which single precision gives back as the code (OpenGL 2.1, 2.14.9).
         gl.clear_colour(colour.red / 255, colour.green / 255, colour.blue / 255, 1.0)
-        gl.clear(opengl.COLOUR_BIT)
+        gl.clear(COLOUR_BIT)
 
     def _read_screen(self) -> npt.NDArray[np.uint32]:
         if self._screen is None:
-            return self._read_buffer(opengl.FRONT)
+            return self._read_buffer(FRONT)
         display = self.display
         return self._screen.read(display.x, display.y, display.width, display.height)
 
@@ -326,8 +491,8 @@ class FullScreen:
         """Return a buffer of the window as (height, width) uint32, 0xRRGGBB, bottom row first."""
         display = self.display
         self._gl.read_buffer(buffer)
-        pixels, kind = self._drawn.ctypes.data, opengl.UNSIGNED_INT_8_8_8_8_REVERSED
-        self._gl.read_pixels(0, 0, display.width, display.height, opengl.BGRA, kind, pixels)
+        pixels, kind = self._drawn.ctypes.data, UNSIGNED_INT_8_8_8_8_REVERSED
+        self._gl.read_pixels(0, 0, display.width, display.height, BGRA, kind, pixels)
         np.bitwise_and(self._drawn, np.uint32(0xFFFFFF), out=self._drawn)
         return self._drawn
 

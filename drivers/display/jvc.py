@@ -7,7 +7,7 @@ Rules that hold inside:
   and LF. `show` returns when the raster and all three levels have been acknowledged: the projector confirms commands,
   not what it shows.
 - The projector greets with PJ_OK, wants PJREQ within 5 s and answers PJACK; it serves one controller at a time. A
-  command that meets a connection lost meanwhile is sent once more over a new one.
+  command that meets a connection lost meanwhile is sent once more over a new one, and all of the colour after it.
 
 Not confirmed on hardware: that the raster (SSTP02) is the flat field on every model, that its levels (SSFR, SSFG, SSFB)
 are encoded as video is and pass the picture mode's gamma, and that they last through a lost connection; photograph a
@@ -23,10 +23,11 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Callable
 
+from drivers.links.exchange import Exchange, MessageParser
 from drivers.links.link import Link
 from drivers.presenter import BLACK, Colour
 from foundation.clock import Clock, SystemClock
-from foundation.errors import DeviceError, DeviceRefused, LinkClosed, LinkError, LinkTimeout, ProtocolError
+from foundation.errors import DeviceError, DeviceRefused, ProtocolError
 
 PORT = 20554
 """TCP port of the external control (JVC external control specification)."""
@@ -36,8 +37,8 @@ GREETING, REQUEST, ACCEPTED, BUSY, REFUSED = b"PJ_OK", b"PJREQ", b"PJACK", b"PJ_
 UNIT = b"\x89\x01"
 FLAT_FIELD = b"SSTP02"
 LEVELS = {"red": b"SSFR", "green": b"SSFG", "blue": b"SSFB"}
-MAX_COMMAND = 64
-"""Bytes read at once; more than a greeting or an answer has, which are 5 and 6."""
+_SILENT = "check that it is on, and that its model knows the flat field"
+_CHECK_MODEL = "check that it is a JVC D-ILA"
 
 _OPERATION, _ACKNOWLEDGED, _END = b"!", b"\x06", b"\n"
 _SYSTEM_CLOCK = SystemClock()
@@ -66,6 +67,11 @@ def encode_level(channel: str, code: int) -> bytes:
     return LEVELS[channel] + f"{code:04X}".encode("ascii")
 
 
+def take_bytes(count: int) -> MessageParser[bytes]:
+    """Return what takes `count` bytes off the front of what has come: an answer has no end of its own."""
+    return lambda data: None if len(data) < count else (data[:count], count)
+
+
 class JvcFlatField:
     """A `drivers.presenter.Presenter`; black from the moment it opens."""
 
@@ -76,12 +82,8 @@ class JvcFlatField:
         label: str = "the JVC projector",
         clock: Clock = _SYSTEM_CLOCK,
     ) -> None:
-        self._connect = connect
-        self._timeout = timeout
         self._label = label
-        self._clock = clock
-        self._link: Link | None = None
-        self._waiting = b""
+        self._exchange = Exchange(connect, timeout, label, clock, self._greet, _SILENT, _CHECK_MODEL)
         self._open = True
         self.show(BLACK)
 
@@ -89,14 +91,18 @@ class JvcFlatField:
         """Fill the picture with exactly `colour`; returns when the projector has acknowledged all of it."""
         if not self._open:
             raise DeviceError(f"{self._label} was closed; open the rig again")
-        used = self._link is not None
-        try:
-            self._show(colour)
-        except LinkClosed:
-            if not used:
-                raise
-            # It hangs up on controllers that say nothing for a while.
-            self._show(colour)
+        levels = zip(LEVELS, colour.codes, strict=True)
+        texts = (FLAT_FIELD, *(encode_level(channel, code) for channel, code in levels))
+        while True:
+            for text in texts:
+                expected = encode_acknowledgement(text)
+                answer = self._exchange.ask(encode_operation(text), take_bytes(len(expected)))
+                if answer != expected:
+                    self._exchange.close()
+                    raise self._unexpected(answer, expected)
+            # It hangs up on controllers that say nothing for a while; what it was told before is told again.
+            if self._exchange.questions >= len(texts):
+                return
 
     def close(self) -> None:
         """Leave the picture black and hang up; a second call does nothing."""
@@ -106,55 +112,20 @@ class JvcFlatField:
         with contextlib.suppress(DeviceError):
             self.show(BLACK)
         self._open = False
-        self._drop()
+        self._exchange.close()
 
-    def _show(self, colour: Colour) -> None:
-        try:
-            if self._link is None:
-                self._greet()
-            self._operate(FLAT_FIELD)
-            for channel, code in (("red", colour.red), ("green", colour.green), ("blue", colour.blue)):
-                self._operate(encode_level(channel, code))
-        except (LinkError, ProtocolError, DeviceRefused):
-            self._drop()
-            raise
+    def _greet(self, exchange: Exchange) -> bytes:
+        self._require(exchange.listen(take_bytes(len(GREETING))), GREETING)
+        self._require(exchange.open_with(REQUEST, take_bytes(len(ACCEPTED))), ACCEPTED)
+        return b""
 
-    def _greet(self) -> None:
-        self._link = self._connect()
-        self._waiting = b""
-        self._expect(GREETING)
-        self._link.write(REQUEST, self._timeout)
-        self._expect(ACCEPTED)
-
-    def _operate(self, text: bytes) -> None:
-        assert self._link is not None
-        self._link.write(encode_operation(text), self._timeout)
-        try:
-            self._expect(encode_acknowledgement(text))
-        except LinkTimeout as error:
-            raise LinkTimeout(
-                f"{self._label} does not acknowledge {text.decode('ascii')} within {self._timeout:g} s; check that it "
-                "is on, and that its model knows the flat field"
-            ) from error
-
-    def _expect(self, answer: bytes) -> None:
-        assert self._link is not None
-        deadline = self._clock.monotonic() + self._timeout
-        while len(self._waiting) < len(answer):
-            remaining = deadline - self._clock.monotonic()
-            if remaining <= 0:
-                raise LinkTimeout(f"{self._label} has not finished its answer within {self._timeout:g} s")
-            self._waiting += self._link.read(MAX_COMMAND, remaining)
-        found, self._waiting = self._waiting[: len(answer)], self._waiting[len(answer) :]
-        if found == answer:
-            return
-        if found == BUSY:
+    def _require(self, answer: bytes, expected: bytes) -> None:
+        if answer == BUSY:
             raise DeviceRefused(f"{self._label} serves another controller; close that one")
-        if found == REFUSED:
+        if answer == REFUSED:
             raise DeviceRefused(f"{self._label} wants a network password, which is not supported; switch it off there")
-        raise ProtocolError(f"{self._label} answers {found!r} in place of {answer!r}; check that it is a JVC D-ILA")
+        if answer != expected:
+            raise self._unexpected(answer, expected)
 
-    def _drop(self) -> None:
-        link, self._link = self._link, None
-        if link is not None:
-            link.close()
+    def _unexpected(self, answer: bytes, expected: bytes) -> ProtocolError:
+        return ProtocolError(f"{self._label} answers {answer!r} in place of {expected!r}; {_CHECK_MODEL}")

@@ -1,12 +1,22 @@
-"""A cable is three verbs and a time limit.
+"""What a cable is: three verbs and a time limit, or a bundle of USB pipes; and cables in memory.
 
-Implementations live in `drivers.links`; tests and the simulated lab join two ends in memory. A link translates the
-system's errors into `LinkTimeout` and `LinkClosed` at this border and nowhere else.
+Rules that hold inside:
+
+- An implementation translates the system's errors into `LinkTimeout`, `LinkClosed` and `PipeStalled` at this border and
+  nowhere else.
+- What was sent before hanging up can still be read after it.
+- `memory_pair` may be used from two threads, one an end. `PeerLink` has no thread and never waits: its peer has
+  answered by the time `write` returns, so an empty read can only mean that nothing will come.
 """
 
 from __future__ import annotations
 
-from typing import Protocol
+import threading
+import time
+from enum import Enum
+from typing import Final, Protocol
+
+from foundation.errors import LinkClosed, LinkError, LinkTimeout
 
 
 class Link(Protocol):
@@ -23,3 +33,186 @@ class Link(Protocol):
     def close(self) -> None:
         """Hang up; a second call does nothing."""
         ...
+
+
+STILL_IMAGE_CLASS: Final = (6, 1, 1)
+"""Class, subclass and protocol of a still image interface (USB Still Image Capture Device Definition 1.0, clause 4)."""
+
+
+class PipeStalled(LinkError):
+    """A pipe is halted: the device declines this transfer, and all others until the halt is cleared."""
+
+
+class Pipe(Enum):
+    """The pipes of a still image device, beside the control pipe."""
+
+    BULK_OUT = "bulk out"
+    BULK_IN = "bulk in"
+    INTERRUPT_IN = "interrupt in"
+
+
+class UsbPipes(Protocol):
+    """The open, claimed interface of one device.
+
+    Every method raises `LinkTimeout` when nothing happened in time, `LinkClosed` when the device is gone, and, where
+    it transfers, `PipeStalled`.
+    """
+
+    @property
+    def label(self) -> str:
+        """What messages call the device."""
+        ...
+
+    @property
+    def packet_size(self) -> int:
+        """Bytes of a full packet on the bulk pipes (wMaxPacketSize)."""
+        ...
+
+    @property
+    def polling_s(self) -> float:
+        """Seconds between two looks of the bus at the interrupt pipe; who waits less may never see anything."""
+        ...
+
+    def bulk_write(self, data: bytes, timeout: float) -> None:
+        """Send all of `data`; none is a zero-length packet."""
+        ...
+
+    def bulk_read(self, limit: int, timeout: float) -> bytes:
+        """Return what one transfer brings, up to `limit` bytes; b"" for a zero-length packet.
+
+        A transfer ends with a packet that is not full, or with `limit`, which must be a multiple of `packet_size`.
+        """
+        ...
+
+    def interrupt_read(self, timeout: float) -> bytes:
+        """Return the next packet of the interrupt pipe."""
+        ...
+
+    def control_out(self, request: int, data: bytes, timeout: float) -> None:
+        """Send a request of the interface's class on the control pipe."""
+        ...
+
+    def control_in(self, request: int, limit: int, timeout: float) -> bytes:
+        """Return the answer to a request of the interface's class, up to `limit` bytes."""
+        ...
+
+    def clear_halt(self, pipe: Pipe) -> None:
+        """Let a stalled pipe transfer again."""
+        ...
+
+    def reset_port(self) -> None:
+        """Have the bus reset the device, as if it had been unplugged and plugged in again."""
+        ...
+
+    def close(self) -> None:
+        """Release the interface; a second call does nothing."""
+        ...
+
+
+class Peer(Protocol):
+    """The far side of a connection as a pure machine: bytes in, bytes out."""
+
+    def connect(self) -> bytes:
+        """Begin a new connection, forgetting any other, and return what the far side sends first."""
+        ...
+
+    def receive(self, data: bytes) -> bytes:
+        """Take the next bytes from the near side and return the answer so far; may hang up."""
+        ...
+
+    @property
+    def closed(self) -> bool:
+        """Whether the far side has hung up."""
+        ...
+
+
+class PeerLink:
+    """A `Link` whose far side is a `Peer` in the same thread."""
+
+    def __init__(self, peer: Peer) -> None:
+        self._peer = peer
+        self._incoming = bytearray(peer.connect())
+        self._open = True
+
+    def write(self, data: bytes, timeout: float) -> None:
+        """Hand `data` to the peer; like a real cable, one that was hung up shows it only to the next reader."""
+        if not self._open:
+            raise LinkClosed("this end of the simulated cable was closed; open a new connection")
+        if not self._peer.closed:
+            self._incoming += self._peer.receive(data)
+
+    def read(self, limit: int, timeout: float) -> bytes:
+        """Return up to `limit` bytes of what the peer has answered."""
+        if not self._open:
+            raise LinkClosed("this end of the simulated cable was closed; open a new connection")
+        if not self._incoming:
+            if self._peer.closed:
+                raise LinkClosed("the simulated device hung up; open a new connection")
+            raise LinkTimeout(f"the simulated device has not answered within {timeout:g} s")
+        return _take(self._incoming, limit)
+
+    def close(self) -> None:
+        """Hang up."""
+        self._open = False
+
+
+class MemoryLink:
+    """One of two joined ends; see `memory_pair`."""
+
+    def __init__(self, changed: threading.Condition, outgoing: _Pipe, incoming: _Pipe) -> None:
+        self._changed = changed
+        self._outgoing = outgoing
+        self._incoming = incoming
+        self._open = True
+
+    def write(self, data: bytes, timeout: float) -> None:
+        """Put `data` where the other end reads it; never waits."""
+        with self._changed:
+            if not self._open or self._incoming.closed:
+                raise LinkClosed("the joined end was closed; open a new connection")
+            self._outgoing.waiting += data
+            self._changed.notify_all()
+
+    def read(self, limit: int, timeout: float) -> bytes:
+        """Return up to `limit` bytes that the other end wrote, waiting at most `timeout` seconds for the first."""
+        deadline = time.monotonic() + timeout
+        with self._changed:
+            while True:
+                if not self._open:
+                    raise LinkClosed("this end was closed; open a new connection")
+                if self._incoming.waiting:
+                    return _take(self._incoming.waiting, limit)
+                if self._incoming.closed:
+                    raise LinkClosed("the joined end was closed; open a new connection")
+                remaining = deadline - time.monotonic()
+                if remaining <= 0:
+                    raise LinkTimeout(f"nothing came from the joined end within {timeout:g} s")
+                self._changed.wait(remaining)
+
+    def close(self) -> None:
+        """Hang up; a reader waiting at either end is woken."""
+        with self._changed:
+            self._open = False
+            self._outgoing.closed = True
+            self._changed.notify_all()
+
+
+class _Pipe:
+    """Bytes under way in one direction."""
+
+    def __init__(self) -> None:
+        self.waiting = bytearray()
+        self.closed = False
+
+
+def memory_pair() -> tuple[MemoryLink, MemoryLink]:
+    """Return two ends of one cable: what one writes, the other reads."""
+    changed = threading.Condition()
+    there, back = _Pipe(), _Pipe()
+    return MemoryLink(changed, there, back), MemoryLink(changed, back, there)
+
+
+def _take(waiting: bytearray, limit: int) -> bytes:
+    taken = bytes(waiting[:limit])
+    del waiting[:limit]
+    return taken

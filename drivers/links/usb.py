@@ -1,14 +1,17 @@
-"""USB cables: finding still image devices on the bus and opening their pipes.
+"""USB cables: the pipes of still image devices, and the reports of HID devices.
 
 Rules that hold inside:
 
 - Devices are distinguished by vendor, product and serial number, or by the port they are plugged into: the address
   changes whenever a device restarts.
+- The kernel's own driver is asked to step aside, and given the interface back at the end.
 - The system's errors are translated here and nowhere else, and say what helps: ETIMEDOUT is `LinkTimeout`; ENODEV, EIO
   and whatever else ends the transfer is `LinkClosed`; EPIPE is `PipeStalled`; EBUSY and EACCES are `DeviceRefused`.
 - pyusb opens anew what was closed as soon as it is used; here, closed is closed.
+- Of a HID device only the interrupt pipes are used, one report a transfer; a report is never cut and never joined.
 
-Sources: USB 2.0, clauses 5.8 (bulk), 5.7 (interrupt) and 9.6 (descriptors); libusb 1.0's error codes.
+Sources: USB 2.0, clauses 5.8 (bulk), 5.7 (interrupt), 9.4 (SetConfiguration) and 9.6 (descriptors); Device Class
+Definition for HID 1.11, clauses 4.1 and 4.4; libusb 1.0's error codes.
 """
 
 from __future__ import annotations
@@ -18,20 +21,24 @@ import errno
 import math
 from collections.abc import Generator, Iterator, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, ClassVar, Final
 
 import usb.core
 import usb.util
 
-from drivers.links.pipes import STILL_IMAGE_CLASS, Pipe, PipeStalled
-from drivers.links.usb_claim import Claim
+from drivers.links.link import STILL_IMAGE_CLASS, Pipe, PipeStalled
 from foundation.errors import DeviceRefused, InputError, LinkClosed, LinkTimeout, ProtocolError
 
 if TYPE_CHECKING:
     from usb.backend import IBackend
 
+
 UDEV_RULE = "70-crop-cameras.rules"
 """The file in `drivers/data` that lets users of a Linux machine open cameras."""
+_FORBIDDEN = (
+    f"may not be opened by this user; on Linux install the rule {UDEV_RULE}, as docs/devices.md shows under USB "
+    "permission, and plug the camera in again"
+)
 
 _CLASS_OUT: Final = 0x21
 """bmRequestType of requests of the class to the interface (USB 2.0, 9.3)."""
@@ -45,6 +52,89 @@ _INTERRUPT: Final = 3
 
 _MAX_POLLING_S: Final = 0.05
 """Longest interval that is believed: a wrong descriptor must not slow the events down to seconds."""
+
+
+class _ClaimedDevice:
+    """A device whose interface is to be claimed, with what transfers raise in our words; `close` undoes all of it."""
+
+    held: ClassVar[str]
+    """What to do when another program holds it."""
+    forbidden: ClassVar[str]
+    """What to do when this user may not open it."""
+
+    def __init__(self, device: usb.core.Device, label: str) -> None:
+        self._device = device
+        self._label = label
+        self._detached: int | None = None
+        self._closed = False
+
+    @property
+    def label(self) -> str:
+        """The device's name and numbers."""
+        return self._label
+
+    def close(self) -> None:
+        """Release the device, and give it back to the kernel's driver if there was one; a second call does nothing."""
+        if self._closed:
+            return
+        self._closed = True
+        # A device that was unplugged cannot be released, and need not be.
+        with contextlib.suppress(usb.core.USBError, NotImplementedError):
+            if self._detached is not None:
+                usb.util.release_interface(self._device, self._detached)
+                self._device.attach_kernel_driver(self._detached)
+        with contextlib.suppress(usb.core.USBError, NotImplementedError):
+            usb.util.dispose_resources(self._device)
+
+    def _configuration(self) -> usb.core.Configuration:
+        """Return the device's configuration, made active if none is."""
+        try:
+            return self._device.get_active_configuration()
+        except usb.core.USBError as error:
+            if error.errno is not None:
+                raise
+            # None is active: a device fresh from the bus on systems that leave this to us.
+            self._device.set_configuration()
+            return self._device.get_active_configuration()
+
+    def _claim(self, interface: int) -> None:
+        """Claim the interface of this number, also again after a reset of the device."""
+        with contextlib.suppress(NotImplementedError):
+            if self._device.is_kernel_driver_active(interface):
+                self._device.detach_kernel_driver(interface)
+                self._detached = interface
+        usb.util.claim_interface(self._device, interface)
+
+    @contextlib.contextmanager
+    def _transfer(self, late: str) -> Generator[None]:
+        """Translate what the block raises; `late` is what a timeout means."""
+        label = self._label
+        if self._closed:
+            raise LinkClosed(f"{label} was closed; open it again")
+        try:
+            yield
+        except usb.core.USBTimeoutError as error:
+            raise LinkTimeout(f"{label} {late}; reset it, or switch it off and on") from error
+        except usb.core.USBError as error:
+            reason = error.strerror or str(error)
+            match error.errno:
+                case errno.ETIMEDOUT:
+                    fault = LinkTimeout(f"{label} does not answer ({reason}); reset it, or switch it off and on")
+                case errno.EPIPE:
+                    fault = PipeStalled(f"{label} stalls")
+                case errno.EBUSY:
+                    fault = DeviceRefused(f"{label} is held by another program{self.held}")
+                case errno.EACCES | errno.EPERM:
+                    fault = DeviceRefused(f"{label} {self.forbidden}")
+                case errno.EOVERFLOW:
+                    fault = ProtocolError(f"{label} sends more than was asked for; reset it")
+                case _:
+                    fault = LinkClosed(f"{label} is gone ({reason}); check cable and power, and open it again")
+            raise fault from error
+        except NotImplementedError as error:
+            raise DeviceRefused(
+                f"{label} cannot be used with the driver that the system has for it; on Windows install WinUSB for it"
+            ) from error
 
 
 @dataclass(frozen=True)
@@ -103,23 +193,22 @@ def open_usb(
     return OpenUsbDevice(*matching[0])
 
 
-class OpenUsbDevice:
-    """The `drivers.links.pipes.UsbPipes` of a device that `open_usb` found."""
+class OpenUsbDevice(_ClaimedDevice):
+    """The `drivers.links.link.UsbPipes` of a device that `open_usb` found."""
+
+    held = (
+        ", such as the desktop's photo monitor; close photo programs, and on Linux run: "
+        "systemctl --user stop gvfs-gphoto2-volume-monitor.service (on macOS: killall ptpcamerad)"
+    )
+    forbidden = _FORBIDDEN
 
     def __init__(self, device: usb.core.Device, description: UsbDevice) -> None:
-        self._device = device
-        self._label = str(description)
-        self._claimed = Claim(device)
+        super().__init__(device, str(description))
         try:
-            self._interface = self._claim()
+            self._interface = self._claimed()
         except BaseException:
             self.close()
             raise
-
-    @property
-    def label(self) -> str:
-        """The device's name, numbers and port."""
-        return self._label
 
     @property
     def packet_size(self) -> int:
@@ -171,34 +260,14 @@ class OpenUsbDevice:
         """Have the bus reset the device, and claim it again."""
         with self._transfer("does not come back from a reset"):
             self._device.reset()
-        self._interface = self._claim()
+        self._interface = self._claimed()
 
-    def close(self) -> None:
-        """Release the interface and give it back to the kernel's driver, if there was one."""
-        self._claimed.release()
-
-    def _claim(self) -> _StillImageInterface:
+    def _claimed(self) -> _StillImageInterface:
         with self._transfer("does not answer"):
-            interface = next(found for found in self._claimed.configuration() if _is_still_image(found))
+            interface = next(found for found in self._configuration() if _is_still_image(found))
             pipes = _pipes_of(interface, self._label)
-            self._claimed.make(pipes.number)
+            self._claim(pipes.number)
         return pipes
-
-    @contextlib.contextmanager
-    def _transfer(self, late: str) -> Generator[None]:
-        if self._claimed.released:
-            raise LinkClosed(f"{self._label} was closed; open it again")
-        try:
-            yield
-        except usb.core.USBTimeoutError as error:
-            raise LinkTimeout(f"{self._label} {late}; reset it, or switch it off and on") from error
-        except usb.core.USBError as error:
-            raise _translated(error, self._label) from error
-        except NotImplementedError as error:
-            raise DeviceRefused(
-                f"{self._label} cannot be used with the driver that the system has for it; "
-                f"on Windows install WinUSB for it"
-            ) from error
 
 
 @dataclass(frozen=True)
@@ -268,7 +337,8 @@ def _found(backend: IBackend | None) -> Iterator[tuple[usb.core.Device, UsbDevic
             name = usb.util.get_string(device, device.iProduct) or ""
         except (usb.core.USBError, ValueError, NotImplementedError):
             # pyusb raises ValueError, with no reason, when it cannot read the list of languages either.
-            refusal = DeviceRefused(_forbidden(f"the camera {device.idVendor:04x}:{device.idProduct:04x} at {port}"))
+            label = f"the camera {device.idVendor:04x}:{device.idProduct:04x} at {port}"
+            refusal = DeviceRefused(f"{label} {_FORBIDDEN}")
         finally:
             usb.util.dispose_resources(device)
         yield device, UsbDevice(device.idVendor, device.idProduct, serial, name, port, address), refusal
@@ -285,36 +355,6 @@ def _has_still_image(device: usb.core.Device) -> bool:
 def _is_still_image(interface: usb.core.Interface) -> bool:
     kind = (interface.bInterfaceClass, interface.bInterfaceSubClass, interface.bInterfaceProtocol)
     return kind == STILL_IMAGE_CLASS
-
-
-def _translated(
-    error: usb.core.USBError, label: str
-) -> LinkTimeout | LinkClosed | PipeStalled | DeviceRefused | ProtocolError:
-    reason = error.strerror or str(error)
-    match error.errno:
-        case errno.ETIMEDOUT:
-            return LinkTimeout(f"{label} does not answer ({reason}); reset it, or switch it off and on")
-        case errno.EPIPE:
-            return PipeStalled(f"{label} stalls")
-        case errno.EBUSY:
-            return DeviceRefused(
-                f"{label} is held by another program, such as the desktop's photo monitor; "
-                f"close photo programs, and on Linux run: systemctl --user stop gvfs-gphoto2-volume-monitor.service "
-                f"(on macOS: killall ptpcamerad)"
-            )
-        case errno.EACCES | errno.EPERM:
-            return DeviceRefused(_forbidden(label))
-        case errno.EOVERFLOW:
-            return ProtocolError(f"{label} sends more than was asked for; reset it")
-        case _:
-            return LinkClosed(f"{label} is gone ({reason}); check cable and power, and open it again")
-
-
-def _forbidden(label: str) -> str:
-    return (
-        f"{label} may not be opened by this user; on Linux install the rule {UDEV_RULE}, "
-        f"as docs/devices.md shows under USB permission, and plug the camera in again"
-    )
 
 
 def _absent(
@@ -334,3 +374,92 @@ def _absent(
 def _milliseconds(timeout: float) -> int:
     # libusb takes 0 for ever.
     return max(1, math.ceil(timeout * 1000))
+
+
+REPORT: Final = 64
+"""Bytes of a report in either direction."""
+
+_HID_CLASS: Final = 3
+"""bInterfaceClass of a human interface device (HID 1.11, 4.1)."""
+
+
+def open_hid(
+    vendor: int, product: int, *, name: str, serial: str | None = None, backend: IBackend | None = None
+) -> HidDevice:
+    """Open the one HID device with these marks."""
+    marks = f"{name} ({vendor:04x}:{product:04x}{f', serial number {serial}' if serial else ''})"
+
+    def fits(device: usb.core.Device) -> bool:
+        if (device.idVendor, device.idProduct) != (vendor, product):
+            return False
+        return serial is None or _serial(device) == serial
+
+    try:
+        found = list(usb.core.find(find_all=True, backend=backend, custom_match=fits))
+    except usb.core.NoBackendError as error:
+        raise LinkClosed("libusb is not installed; see docs/devices.md under USB permission") from error
+    if not found:
+        raise LinkClosed(f"no {marks} on USB; switch it on and check its cable")
+    if len(found) > 1:
+        raise InputError(f"{len(found)} devices on USB fit {marks}; name one by its serial number")
+    return HidDevice(found[0], marks)
+
+
+class HidDevice(_ClaimedDevice):
+    """A cable that carries reports of `REPORT` bytes, to a device that `open_hid` found."""
+
+    held = "; close its control program"
+    forbidden = (
+        "may not be opened by this user; on Linux add a udev rule for it, as docs/devices.md shows under The picture"
+    )
+
+    def __init__(self, device: usb.core.Device, label: str) -> None:
+        super().__init__(device, label)
+        try:
+            with self._transfer("does not answer"):
+                self._pipes = _report_pipes(self._configuration(), label)
+                self._claim(self._pipes.interface)
+        except BaseException:
+            self.close()
+            raise
+
+    def write(self, report: bytes, timeout: float) -> None:
+        """Send one report; raises `LinkTimeout` or `LinkClosed`."""
+        with self._transfer(f"takes no report for {timeout:g} s"):
+            self._device.write(self._pipes.outward, report, _milliseconds(timeout))
+
+    def read(self, timeout: float) -> bytes:
+        """Return the next report; raises `LinkTimeout` or `LinkClosed`."""
+        with self._transfer(f"has not answered for {timeout:g} s"):
+            return self._device.read(self._pipes.inward, REPORT, _milliseconds(timeout)).tobytes()
+
+
+@dataclass(frozen=True)
+class _ReportPipes:
+    """Number of a HID interface, and addresses of its two interrupt endpoints."""
+
+    interface: int
+    inward: int
+    outward: int
+
+
+def _report_pipes(configuration: usb.core.Configuration, label: str) -> _ReportPipes:
+    """Return the first HID interface that has interrupt pipes both ways; `label` names the device."""
+    for interface in configuration:
+        ends = {
+            bool(endpoint.bEndpointAddress & 0x80): endpoint.bEndpointAddress
+            for endpoint in interface
+            if endpoint.bmAttributes & 3 == _INTERRUPT
+        }
+        if interface.bInterfaceClass == _HID_CLASS and len(ends) == 2:
+            return _ReportPipes(interface.bInterfaceNumber, ends[True], ends[False])
+    raise ProtocolError(f"{label} has no HID interface with pipes both ways; it is another device")
+
+
+def _serial(device: usb.core.Device) -> str | None:
+    try:
+        return usb.util.get_string(device, device.iSerialNumber)
+    except (usb.core.USBError, ValueError, NotImplementedError):
+        return None
+    finally:
+        usb.util.dispose_resources(device)

@@ -13,79 +13,25 @@ Rules that hold inside:
 
 from __future__ import annotations
 
-import logging
-import secrets
 from collections.abc import Callable
 from typing import TypeVar
 
+from drivers.links.exchange import Exchange
 from drivers.links.link import Link
-from drivers.pjlink import notices, wire
-from drivers.pjlink.wire import (
-    ErrorCode,
-    Input,
-    LineCutter,
-    NoResolution,
-    PjLinkReply,
-    PjLinkRequest,
-    Refused,
-    Resolution,
-)
+from drivers.pjlink import wire
+from drivers.pjlink.wire import ErrorCode, Input, NoResolution, PjLinkReply, PjLinkRequest, Refused, Resolution
 from drivers.projector import Fault, Lamp, Power, ProjectorIdentity
 from foundation.clock import Clock, SystemClock
-from foundation.errors import DeviceFault, DeviceRefused, LinkClosed, LinkError, LinkTimeout, ProtocolError
-
-_log = logging.getLogger(__name__)
+from foundation.errors import DeviceFault, DeviceRefused, ProtocolError
 
 DEFAULT_TIMEOUT_S = 5.0
 """The standard asks for an answer within 2 s; real projectors take longer while they warm up."""
+_SILENT = "check that it is on the network, and that PJLink is enabled on it in standby too"
+_CHECK_PORT = "check that a projector answers at this port"
 
 _SYSTEM_CLOCK = SystemClock()
 
 _Answer = TypeVar("_Answer")
-
-
-def random_nonce() -> bytes:
-    """Return 16 random bytes."""
-    return secrets.token_bytes(16)
-
-
-class _ConnectionSpent(Exception):
-    """A connection that has served before serves no more; a new one may."""
-
-
-class _Connection:
-    """A greeted connection: the digest that its first command needs, and what was read beyond a line."""
-
-    def __init__(self, link: Link, timeout: float, clock: Clock) -> None:
-        self.link = link
-        self.digest = ""
-        self.used = False
-        self._timeout = timeout
-        self._clock = clock
-        self._cutter = LineCutter()
-        self._lines: list[bytes] = []
-
-    def read_line(self) -> bytes:
-        deadline = self._clock.monotonic() + self._timeout
-        while True:
-            while self._lines:
-                line = self._lines.pop(0)
-                # Some projectors announce their start here, too; it answers nothing.
-                if not notices.is_notice_of_start(line):
-                    return line
-            remaining = deadline - self._clock.monotonic()
-            if remaining <= 0:
-                raise LinkTimeout(f"the projector has not finished its answer within {self._timeout:g} s")
-            self._lines = self._cutter.feed(self.link.read(wire.MAX_LINE, remaining))
-
-    def ask(self, request: PjLinkRequest) -> PjLinkReply | Refused:
-        # Whatever stands here unasked answers no question of ours.
-        self._lines.clear()
-        self.link.write(wire.encode_request(request), self._timeout)
-        reply = self.read_line()
-        # Without the digest, which anybody can try passwords on.
-        _log.debug("%s %s: %r", request.command, request.parameter, reply)
-        return wire.parse_reply(reply)
 
 
 class PjLinkProjector:
@@ -94,10 +40,7 @@ class PjLinkProjector:
     Every question and command may raise `DeviceRefused` (not known, not offered, not now, wrong password),
     `DeviceFault` (the projector reports a failure of its own), `LinkError` and `ProtocolError`.
 
-    `password`: the PJLink password, None where the projector has none. `sha256`: offer the password by SHA-256 (PJLink
-    2.10) first, and by MD5 only where the projector does not take that up. Off unless asked for: it is tried against
-    the standard's example and our simulated projector alone, and a projector with MD5 alone may take the offer for a
-    wrong password and count it. `nonce`: gives the 16 random bytes that SHA-256 needs.
+    `password`: the PJLink password, None where the projector has none.
     """
 
     def __init__(
@@ -107,18 +50,11 @@ class PjLinkProjector:
         timeout: float = DEFAULT_TIMEOUT_S,
         label: str = "the projector",
         clock: Clock = _SYSTEM_CLOCK,
-        sha256: bool = False,
-        nonce: Callable[[], bytes] = random_nonce,
     ) -> None:
-        self._sha256 = sha256
-        self._nonce = nonce
         self._class: int | None = None
-        self._connect = connect
         self._password = password
-        self._timeout = timeout
         self._label = label
-        self._clock = clock
-        self._connection: _Connection | None = None
+        self._exchange = Exchange(connect, timeout, label, clock, self._greet, _SILENT, _CHECK_PORT)
         self._unknown: set[PjLinkRequest] = set()
 
     def identity(self) -> ProjectorIdentity:
@@ -152,7 +88,7 @@ class PjLinkProjector:
         if request in self._unknown:
             self.power()  # to be silent because the cable is out must not look like health
             return ()
-        reply = self._exchange(request)
+        reply = self._reply_to(request)
         if self._cannot_tell(request, reply) or reply.error is ErrorCode.UNAVAILABLE:
             return ()
         return wire.parse_faults(self._value(reply))
@@ -169,101 +105,46 @@ class PjLinkProjector:
             self._class = 1 if value is None else wire.parse_class(value)
         return self._class
 
-    def other_information(self) -> str:
-        """Return the maker's own text about the projector (INFO); empty where there is none."""
-        return self._name("INFO")
-
-    def inputs(self) -> tuple[Input, ...]:
-        """Return every input that can be selected, in the projector's order; with its name from class 2 on."""
-        if self.pjlink_class() < 2:
-            return tuple(Input(code) for code in wire.parse_inputs(self._ask("INST")))
-        codes = wire.parse_inputs(self._ask("INST", level=2))
-        return tuple(Input(code, self._input_name(code)) for code in codes)
-
     def input(self) -> Input:
-        """Return the input that is selected; refused unless the projector is on."""
-        level = min(self.pjlink_class(), 2)
-        code = wire.parse_input(self._ask("INPT", level=level))
-        return Input(code, self._input_name(code) if level == 2 else "")
-
-    def select_input(self, code: str) -> None:
-        """Show another input; refused unless the projector is on, and for one that it has not."""
-        try:
-            code = wire.parse_input(code)
-        except ProtocolError as error:
-            raise ValueError(
-                f"{code!r} is no PJLink input; expected a digit 1 to 6 and one of 1 to 9, A to Z"
-            ) from error
-        if wire.is_class_1_input(code):
-            self._set("INPT", code)
-        else:
-            self._set_class_2("INPT", code)
+        """Return the input that is selected, without its name; refused unless the projector is on."""
+        return Input(wire.parse_input(self._ask("INPT", level=min(self.pjlink_class(), 2))))
 
     def input_resolution(self) -> Resolution | NoResolution | None:
         """Return the resolution of the signal, or why it has none; None where it cannot tell; class 2."""
         value = self._ask_class_2("IRES")
         return None if value is None else wire.parse_input_resolution(value)
 
-    def recommended_resolution(self) -> Resolution | None:
-        """Return the resolution that the projector shows best, mostly that of its panels; as `input_resolution`."""
-        value = self._ask_class_2("RRES")
-        return None if value is None else wire.parse_resolution(value)
-
     def frozen(self) -> bool | None:
         """Return whether the picture is frozen: it then no longer follows the signal; as `input_resolution`."""
         value = self._ask_class_2("FREZ")
         return None if value is None else wire.parse_freeze(value)
 
-    def set_frozen(self, frozen: bool) -> None:
-        """Freeze the picture, or let it follow the signal again; refused unless the projector is on; class 2."""
-        self._set_class_2("FREZ", wire.format_freeze(frozen))
-
     def picture_fault(self) -> str | None:
         """Return whether the picture is frozen or no signal arrives, as far as the projector can tell; else None."""
-        if self._told(self.pjlink_class, 1) < 2:
+        if self._answer_now(self.pjlink_class, 1) < 2:
             return None
-        if self._told(self.frozen, None):
+        if self._answer_now(self.frozen, None):
             return "the projector's picture is frozen; release freeze on its remote control"
-        if self._told(self.input_resolution, None) is NoResolution.NO_SIGNAL:
+        if self._answer_now(self.input_resolution, None) is NoResolution.NO_SIGNAL:
             return "no signal arrives at the projector's input; check the cable, the input and the display's settings"
         return None
 
-    def serial_number(self) -> str:
-        """Return the serial number, empty where it has none to tell; class 2."""
-        return self._ask_class_2("SNUM") or ""
-
-    def software_version(self) -> str:
-        """Return the version of its software, empty where it does not tell; class 2."""
-        return self._ask_class_2("SVER") or ""
-
-    def filter_hours(self) -> int | None:
-        """Return the hours of its filter, 0 where it does not count them, None where it has no filter; class 2."""
-        value = self._ask_class_2("FILT")
-        return None if value is None else wire.parse_hours(value)
-
-    def lamp_models(self) -> tuple[str, ...]:
-        """Return the part numbers of lamps that fit; empty for a lampless projector; class 2."""
-        return wire.parse_models(self._ask_class_2("RLMP") or "")
-
-    def filter_models(self) -> tuple[str, ...]:
-        """Return the part numbers of filters that fit; empty for a projector without; class 2."""
-        return wire.parse_models(self._ask_class_2("RFIL") or "")
-
     def close(self) -> None:
-        """Hang up; the power state stays."""
-        connection, self._connection = self._connection, None
-        if connection is not None:
-            connection.link.close()
+        """Release the control port; the power state stays."""
+        self._exchange.close()
 
     def _name(self, command: str) -> str:
-        reply = self._exchange(PjLinkRequest(command))
+        reply = self._reply_to(PjLinkRequest(command))
         return reply.value if reply.error is None else ""
 
     def _ask(self, command: str, level: int = 1) -> str:
-        return self._value(self._exchange(PjLinkRequest(command, level=level)))
+        return self._value(self._reply_to(PjLinkRequest(command, level=level)))
 
     def _ask_class_2(self, command: str) -> str | None:
-        self._require_class_2(command)
+        if self.pjlink_class() < 2:
+            raise DeviceRefused(
+                f"{self._label} speaks PJLink class 1, {command} needs class 2; look in its menu or on its type plate"
+            )
         return self._ask_if_known(command, level=2)
 
     def _ask_if_known(self, command: str, level: int = 1) -> str | None:
@@ -271,7 +152,7 @@ class PjLinkProjector:
         request = PjLinkRequest(command, level=level)
         if request in self._unknown:
             return None
-        reply = self._exchange(request)
+        reply = self._reply_to(request)
         return None if self._cannot_tell(request, reply) else self._value(reply)
 
     def _cannot_tell(self, request: PjLinkRequest, reply: PjLinkReply) -> bool:
@@ -282,32 +163,17 @@ class PjLinkProjector:
             self._unknown.add(request)
         return unknown
 
-    def _told(self, question: Callable[[], _Answer], unknown: _Answer) -> _Answer:
+    def _answer_now(self, question: Callable[[], _Answer], unknown: _Answer) -> _Answer:
         """Return what is answered now, `unknown` where the projector declines to answer now."""
         try:
             return question()
         except DeviceRefused:
-            if self._connection is None:
+            if not self._exchange.connected:
                 raise  # it refused the connection, not the question
             return unknown
 
-    def _input_name(self, code: str) -> str:
-        # Names are a courtesy: some projectors keep them back in standby, or have none.
-        reply = self._exchange(PjLinkRequest("INNM", wire.QUERY + code, level=2))
-        return reply.value if reply.error is None else ""
-
-    def _require_class_2(self, command: str) -> None:
-        if self.pjlink_class() < 2:
-            raise DeviceRefused(
-                f"{self._label} speaks PJLink class 1, {command} needs class 2; look in its menu or on its type plate"
-            )
-
-    def _set_class_2(self, command: str, parameter: str) -> None:
-        self._require_class_2(command)
-        self._set(command, parameter, level=2)
-
-    def _set(self, command: str, parameter: str, level: int = 1) -> None:
-        value = self._value(self._exchange(PjLinkRequest(command, parameter, level)), parameter)
+    def _set(self, command: str, parameter: str) -> None:
+        value = self._value(self._reply_to(PjLinkRequest(command, parameter)), parameter)
         if value.upper() != wire.OK:
             self.close()
             raise ProtocolError(f"{self._label} answers {value!r} to {command} {parameter}; expected OK")
@@ -328,85 +194,39 @@ class PjLinkProjector:
             case ErrorCode.FAILURE:
                 raise DeviceFault(f"{asked}: it reports a failure of its own; look at its lamps and display")
 
-    def _exchange(self, request: PjLinkRequest) -> PjLinkReply:
-        """Return the answer to `request`, over a new connection if the one there is has been dropped meanwhile."""
+    def _reply_to(self, request: PjLinkRequest) -> PjLinkReply:
+        reply = self._exchange.ask(wire.encode_request(request), wire.take_line, wire.is_notice_of_start)
         try:
-            return self._exchange_once(request)
-        except _ConnectionSpent:
-            return self._exchange_once(request)
-
-    def _exchange_once(self, request: PjLinkRequest) -> PjLinkReply:
-        connection = self._connection
-        if connection is None:
-            connection = self._connection = self._greeted()
-        used, connection.used = connection.used, True
-        try:
-            digest, connection.digest = connection.digest, ""
-            reply = connection.ask(PjLinkRequest(request.command, request.parameter, request.level, digest))
-            if isinstance(reply, Refused):
-                if used:
-                    # Some servers want the digest before every command: a new connection begins with one.
-                    raise _ConnectionSpent
+            answer = wire.parse_reply(reply)
+            if isinstance(answer, Refused):
                 raise self._wrong_password()
-            if reply.command != request.command:
+            if answer.command != request.command:
                 raise ProtocolError(
-                    f"{self._label} answers {reply.command} to {request.command}; check that no other controller "
+                    f"{self._label} answers {answer.command} to {request.command}; check that no other controller "
                     "shares the connection"
                 )
-        except LinkClosed as error:
-            self.close()
-            if used:
-                raise _ConnectionSpent from error
+        except DeviceRefused:
+            asked_before = self._exchange.questions > 1
+            self._exchange.close()
+            if asked_before:
+                # Some servers want the digest before every command: a new connection begins with one.
+                return self._reply_to(request)
             raise
-        except (LinkError, ProtocolError, DeviceRefused, _ConnectionSpent):
-            self.close()
+        except ProtocolError:
+            self._exchange.close()
             raise
-        return reply
+        return answer
 
-    def _greeted(self) -> _Connection:
-        """Return a new connection, greeted, and with the digest that its first command needs."""
-        if self._sha256:
-            connection = self._greeted_once(sha256=True)
-            if connection is not None:
-                return connection
-            # 2.10, 5.1: a projector that does not take it up is connected to again, with MD5.
-            self._sha256 = False
-        connection = self._greeted_once(sha256=False)
-        assert connection is not None
-        return connection
-
-    def _greeted_once(self, sha256: bool) -> _Connection | None:
-        """Return a new connection; None, and none left open, where the projector does not take up SHA-256."""
-        link = self._connect()
-        try:
-            connection = _Connection(link, self._timeout, self._clock)
-            greeting = wire.parse_greeting(connection.read_line())
-            if isinstance(greeting, Refused):
-                raise self._wrong_password()
-            if greeting.seed is not None:
-                if self._password is None:
-                    raise DeviceRefused(f"{self._label} asks for a password; give the one set for PJLink in its menu")
-                if sha256:
-                    digest = self._sha256_digest(connection, self._password)
-                    if digest is None:
-                        link.close()
-                        return None
-                    connection.digest = digest
-                else:
-                    connection.digest = wire.authentication_digest(greeting.seed, self._password)
-        except BaseException:
-            link.close()
-            raise
-        return connection
-
-    def _sha256_digest(self, connection: _Connection, password: str) -> str | None:
-        try:
-            connection.link.write(wire.encode_security_question(), self._timeout)
-            challenge = wire.parse_challenge(connection.read_line())
-        except (LinkClosed, LinkTimeout):
-            # So do those answer that do not know the question.
-            return None
-        return None if challenge is None else wire.sha256_digest(challenge, self._nonce(), password)
+    def _greet(self, exchange: Exchange) -> bytes:
+        """Return the digest that the first command must begin with."""
+        greeting = wire.parse_greeting(exchange.listen(wire.take_line, wire.is_notice_of_start))
+        if isinstance(greeting, Refused):
+            raise self._wrong_password()
+        if greeting.seed is None:
+            return b""
+        if self._password is None:
+            raise DeviceRefused(f"{self._label} asks for a password; give the one set for PJLink in its menu")
+        return wire.authentication_digest(greeting.seed, self._password).encode("ascii")
 
     def _wrong_password(self) -> DeviceRefused:
         return DeviceRefused(f"{self._label} refuses the password; give the one set for PJLink in its menu")

@@ -1,24 +1,23 @@
-"""Finds PJLink projectors on the network, and receives the notices that they send (class 2 only).
+"""Finds PJLink projectors on the network (class 2 only).
 
 Rules that hold inside:
 
 - A search opens no control connection: many projectors serve one controller only, who would be disturbed.
-- Answers and notices come to one's own port 4352; only one program of a computer can hear them at a time.
+- Answers come to one's own port 4352; only one program of a computer can hear them at a time.
 - Who answers proves nothing: a search is a convenience, the address in the lab's settings is what counts.
 
-Source: JBMIA, PJLink Specifications 2.00 and 2.10, 3.2 (search) and 3.3 (status notification).
+Source: JBMIA, PJLink Specifications 2.00 and 2.10, 3.2 (search).
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from types import TracebackType
 from typing import Protocol
 
-from drivers.links.udp import ANY_HOST, BROADCAST, Address, UdpSocket
-from drivers.pjlink import notices, wire
-from drivers.pjlink.notices import COLLECT_S, Found, PjLinkNotice
+from drivers.links.network import BROADCAST, Address, UdpSocket
+from drivers.pjlink import wire
+from drivers.pjlink.wire import COLLECT_S, Found
 from foundation.clock import Clock, SystemClock
 from foundation.errors import LinkTimeout
 
@@ -31,7 +30,7 @@ _SYSTEM_CLOCK = SystemClock()
 
 
 class Datagrams(Protocol):
-    """The part of `drivers.links.udp.UdpSocket` that is used here."""
+    """The part of `drivers.links.network.UdpSocket` that is used here."""
 
     def send(self, data: bytes, address: Address) -> None:
         """Send one datagram to host and port."""
@@ -77,49 +76,16 @@ def search(
             if passed >= seconds:
                 break
             if asked < ASKED and passed >= asked * ASK_EVERY_S:
-                datagrams.send(notices.SEARCH, (address, port))
+                datagrams.send(wire.SEARCH, (address, port))
                 asked += 1
             ends = min(seconds, asked * ASK_EVERY_S) if asked < ASKED else seconds
             try:
                 datagram, (host, _) = datagrams.receive(max(ends - passed, 0.0))
             except LinkTimeout:
                 continue
-            for message in notices.decode(datagram):
+            for message in wire.decode_datagram(datagram):
                 if isinstance(message, Found):
                     found[FoundProjector(host, message.mac)] = None
     finally:
         datagrams.close()
     return tuple(found)
-
-
-class NoticePort:
-    """Hears the notices of all projectors in whose menus this computer's address was entered; close it."""
-
-    def __init__(self, port: int = wire.PORT, host: str = ANY_HOST, clock: Clock = _SYSTEM_CLOCK) -> None:
-        self._socket = UdpSocket(port, host)
-        self._clock = clock
-        self._waiting: list[tuple[str, PjLinkNotice]] = []
-        self.address = self._socket.address
-        """Host and port at which it listens."""
-
-    def __enter__(self) -> NoticePort:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
-
-    def receive(self, timeout: float) -> tuple[str, PjLinkNotice]:
-        """Return the next notice and the address of the projector that sent it."""
-        deadline = self._clock.monotonic() + timeout
-        while not self._waiting:
-            datagram, (host, _) = self._socket.receive(max(deadline - self._clock.monotonic(), 0.0))
-            self._waiting = [(host, message) for message in notices.decode(datagram) if not isinstance(message, Found)]
-            if not self._waiting and self._clock.monotonic() >= deadline:
-                raise LinkTimeout(f"among the datagrams that came within {timeout:g} s was no notice of a projector")
-        return self._waiting.pop(0)
-
-    def close(self) -> None:
-        """Stop listening; a second call does nothing."""
-        self._socket.close()

@@ -1,4 +1,4 @@
-"""PJLink as bytes: both ends of the cable, nothing but pure functions and a line cutter.
+"""PJLink as bytes: both ends of the cable over TCP and UDP, nothing but pure functions and a line cutter.
 
 Rules that hold inside:
 
@@ -6,10 +6,15 @@ Rules that hold inside:
   parameter. Whoever sends more gets `ProtocolError`, never memory.
 - What we send follows the standard to the letter; what we accept is wider: any case, LF after or instead of CR, empty
   lines, NUL between lines (some projectors fill their packets up with it).
-- Bytes that do not fit raise `ProtocolError`, which quotes them.
-- What class 2 sends over UDP is in `drivers.pjlink.notices`.
+- Bytes that do not fit raise `ProtocolError`, which quotes them. A datagram, which arrives unasked and from anybody, is
+  no error: one that holds nothing of ours is an empty answer.
 
-Source: JBMIA, PJLink Specifications 1.04 (class 1), 2.00 (class 2: same lines, digit 2), 2.10 (SHA-256).
+A controller broadcasts a search over UDP; each class 2 projector answers within 10 s with its MAC address. A projector
+also sends notices to the one controller whose address was entered in its menu: of its start, and of each change of
+fault, power and input. Nothing there is proved by a password.
+
+Source: JBMIA, PJLink Specifications 1.04 (class 1), 2.00 (class 2: same lines, digit 2; 3.2 search, 3.3 status
+notification), 2.10 (SHA-256).
 """
 
 from __future__ import annotations
@@ -92,35 +97,40 @@ class PjLinkReply:
             return None
 
 
+def take_line(data: bytes, limit: int = MAX_LINE) -> tuple[bytes, int] | None:
+    """Take one line, without its end, off the front of `data`, past empty ones and filling."""
+    start = len(data) - len(data.lstrip(b"\r\n\0"))
+    found = re.compile(rb"[\r\n]").search(data, start)
+    line = data[start : None if found is None else found.start()].replace(b"\0", b"")
+    if len(line) >= limit:
+        raise ProtocolError(
+            f"a PJLink line of more than {limit} bytes begins {_quoted(line)}; "
+            "check that this is a projector's control port"
+        )
+    return None if found is None else (line, found.end())
+
+
 class LineCutter:
     """Cuts a stream into lines, however it was split in transit."""
 
     def __init__(self, limit: int = MAX_LINE) -> None:
         self._limit = limit
-        self._rest = bytearray()
+        self._rest = b""
 
     def feed(self, data: bytes) -> list[bytes]:
         """Take the next bytes and return the lines that they complete, without their ends; empty lines are dropped."""
-        self._rest += data.replace(b"\0", b"")
-        *lines, rest = re.split(rb"[\r\n]", bytes(self._rest))
-        self._rest = bytearray(rest)
-        for line in (*lines, rest):
-            if len(line) >= self._limit:
-                raise ProtocolError(
-                    f"a PJLink line of more than {self._limit} bytes begins {_quoted(line)}; "
-                    "check that this is a projector's control port"
-                )
-        return [line for line in lines if line]
+        self._rest += data
+        lines: list[bytes] = []
+        while (taken := take_line(self._rest, self._limit)) is not None:
+            line, length = taken
+            self._rest = self._rest[length:]
+            lines.append(line)
+        return lines
 
 
 def authentication_digest(seed: str, password: str) -> str:
     """Return the digest that proves the password: MD5 of seed and password, 32 lowercase hex digits (1.04, 5.1)."""
     return hashlib.md5((seed + password).encode(), usedforsecurity=False).hexdigest()
-
-
-def encode_security_question() -> bytes:
-    """Return the line by which a controller asks for SHA-256 instead of MD5 (2.10, 5.1)."""
-    return b"PJLINK 2\r"
 
 
 def is_security_question(line: bytes) -> bool:
@@ -131,12 +141,6 @@ def is_security_question(line: bytes) -> bool:
 def encode_challenge(challenge: bytes) -> bytes:
     """Return the line by which a projector agrees to SHA-256; `challenge` is its 16 random bytes."""
     return f"PJLINK 2 {challenge.hex()}\r".encode("ascii")
-
-
-def parse_challenge(line: bytes) -> bytes | None:
-    """Return the projector's 16 random bytes, or None where the line is anything else: it has no SHA-256."""
-    found = re.fullmatch(rb"PJLINK 2 ([0-9A-F]{32})", line.strip().upper())
-    return bytes.fromhex(found[1].decode("ascii")) if found else None
 
 
 def sha256_digest(challenge: bytes, nonce: bytes, password: str) -> str:
@@ -274,29 +278,12 @@ def parse_lamps(value: str) -> tuple[Lamp, ...]:
     return tuple(Lamp(int(hours), lit == "1") for hours, lit in zip(words[::2], words[1::2], strict=True))
 
 
-class InputKind(Enum):
-    """What kind of terminal an input is: the first character of its code (INPT)."""
-
-    RGB = "1"
-    VIDEO = "2"
-    DIGITAL = "3"
-    STORAGE = "4"
-    NETWORK = "5"
-    INTERNAL = "6"
-    """Class 2 only, as are the numbers A … Z."""
-
-
 @dataclass(frozen=True)
 class Input:
     """One input: its code of two characters, kind and number, and its name, empty where the projector has none."""
 
     code: str
     name: str = ""
-
-    @property
-    def kind(self) -> InputKind:
-        """What kind of terminal it is."""
-        return InputKind(self.code[0])
 
 
 def is_class_1_input(code: str) -> bool:
@@ -309,11 +296,6 @@ def parse_input(value: str, command: str = "INPT") -> str:
     if not re.fullmatch("[1-6][1-9A-Z]", value.upper()):
         raise _unexpected(command, value, "a digit 1 to 6 and one of 1 to 9 or A to Z")
     return value.upper()
-
-
-def parse_inputs(value: str) -> tuple[str, ...]:
-    """Return the codes that INST lists; none for an empty list."""
-    return tuple(parse_input(code, "INST") for code in value.split())
 
 
 @dataclass(frozen=True)
@@ -354,13 +336,6 @@ def parse_input_resolution(value: str) -> Resolution | NoResolution:
         return parse_resolution(value, "IRES")
 
 
-def parse_hours(value: str) -> int:
-    """Return the filter's hours that FILT answers; 0 as well where the projector does not count them."""
-    if not re.fullmatch(r"[0-9]{1,10}", value, re.ASCII):
-        raise _unexpected("FILT", value, "hours")
-    return int(value)
-
-
 def format_freeze(frozen: bool) -> str:
     """Return FREZ's digit for a picture frozen or moving."""
     return "1" if frozen else "0"
@@ -380,14 +355,112 @@ def parse_class(value: str) -> int:
     return int(value)
 
 
-def parse_models(value: str) -> tuple[str, ...]:
-    """Return the part numbers that RLMP and RFIL list, divided by spaces."""
-    return tuple(value.split())
-
-
 def _unexpected(command: str, value: str, expected: str) -> ProtocolError:
     return ProtocolError(f"the projector answers {value!r} to {command} ?; expected {expected}")
 
 
 def _quoted(line: bytes) -> str:
     return repr(line[:40])[1:] + ("…" if len(line) > 40 else "")
+
+
+SEARCH = b"%2SRCH\r"
+COLLECT_S = 30.0
+"""So long a controller collects answers, which projectors delay by up to 10 s."""
+
+
+@dataclass(frozen=True)
+class Found:
+    """The answer to a search: the projector's MAC address, six pairs of lowercase hex digits with colons."""
+
+    mac: str
+
+
+@dataclass(frozen=True)
+class LinkUp:
+    """A projector has come up and can be controlled; `mac` as in `Found`."""
+
+    mac: str
+
+
+@dataclass(frozen=True)
+class FaultsChanged:
+    """Every fault that is there now; empty when healthy again."""
+
+    faults: tuple[Fault, ...]
+
+
+@dataclass(frozen=True)
+class PowerChanged:
+    """The new power state."""
+
+    power: Power
+
+
+@dataclass(frozen=True)
+class InputChanged:
+    """The code of the input that is shown now."""
+
+    code: str
+
+
+PjLinkNotice = LinkUp | FaultsChanged | PowerChanged | InputChanged
+
+
+def is_search(datagram: bytes) -> bool:
+    """Return whether a datagram asks projectors to answer."""
+    return datagram.strip(b"\0\r\n ").upper() == b"%2SRCH"
+
+
+def encode_datagram(message: Found | PjLinkNotice) -> bytes:
+    """Return the datagram of an answer or a notice."""
+    match message:
+        case Found(mac):
+            text = f"ACKN={mac}"
+        case LinkUp(mac):
+            text = f"LKUP={mac}"
+        case FaultsChanged(faults):
+            text = f"ERST={format_faults({fault.part: fault.severity for fault in faults})}"
+        case PowerChanged(power):
+            text = f"POWR={format_power(power)}"
+        case InputChanged(code):
+            text = f"INPT={code}"
+    return f"%2{text}\r".encode("ascii")
+
+
+def decode_datagram(datagram: bytes) -> tuple[Found | PjLinkNotice, ...]:
+    """Return the answers and notices in a datagram, in their order; what is neither is passed over."""
+    messages = (_message(line) for line in re.split(rb"[\r\n\0]+", datagram))
+    return tuple(message for message in messages if message is not None)
+
+
+def is_notice_of_start(line: bytes) -> bool:
+    """Return whether a line is LKUP, which some projectors send into a controller's TCP connection as well."""
+    return isinstance(_message(line), LinkUp)
+
+
+def _message(line: bytes) -> Found | PjLinkNotice | None:
+    try:
+        reply = parse_reply(line.strip())
+        if not isinstance(reply, PjLinkReply) or reply.level != 2:
+            return None
+        match reply.command:
+            case "ACKN":
+                return Found(_mac(reply.value))
+            case "LKUP":
+                return LinkUp(_mac(reply.value))
+            case "ERST":
+                return FaultsChanged(parse_faults(reply.value))
+            case "POWR":
+                return PowerChanged(parse_power(reply.value))
+            case "INPT":
+                return InputChanged(parse_input(reply.value))
+            case _:
+                return None
+    except ProtocolError:
+        return None
+
+
+def _mac(value: str) -> str:
+    if not re.fullmatch("[0-9A-Fa-f]{2}(:[0-9A-Fa-f]{2}){5}", value):
+        raise ProtocolError(f"the projector names itself {value!r}; expected a MAC address")
+    return value.lower()

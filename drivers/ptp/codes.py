@@ -1,6 +1,7 @@
 """The numbers of PTP and their names: the standard's, and Canon's for its EOS bodies.
 
-Messages carry plain integers, for a device may use codes that no one has named; `describe` turns one into words.
+Messages carry plain integers, for a device may use codes that no one has named; `describe` turns one into words. Of
+responses and event records all that are known have a name here, for users read them; of the rest those in use.
 Canon's meanings hold for EOS bodies alone: other makers use the same numbers for other things.
 
 Sources: ISO 15740:2013, tables of clauses 10 to 13; Canon's extensions have no public standard, their numbers were
@@ -28,32 +29,18 @@ class Operation(IntEnum):
     DELETE_OBJECT = 0x100B
     SEND_OBJECT_INFO = 0x100C
     SEND_OBJECT = 0x100D
-    INITIATE_CAPTURE = 0x100E
-    FORMAT_STORE = 0x100F
-    RESET_DEVICE = 0x1010
-    SELF_TEST = 0x1011
-    SET_OBJECT_PROTECTION = 0x1012
-    POWER_DOWN = 0x1013
     GET_DEVICE_PROP_DESC = 0x1014
     GET_DEVICE_PROP_VALUE = 0x1015
     SET_DEVICE_PROP_VALUE = 0x1016
-    RESET_DEVICE_PROP_VALUE = 0x1017
-    TERMINATE_OPEN_CAPTURE = 0x1018
-    MOVE_OBJECT = 0x1019
-    COPY_OBJECT = 0x101A
     GET_PARTIAL_OBJECT = 0x101B
-    INITIATE_OPEN_CAPTURE = 0x101C
 
     EOS_GET_STORAGE_IDS = 0x9101
     EOS_GET_STORAGE_INFO = 0x9102
-    EOS_GET_OBJECT_INFO = 0x9103
     EOS_GET_OBJECT = 0x9104
     EOS_DELETE_OBJECT = 0x9105
-    EOS_FORMAT_STORE = 0x9106
     EOS_GET_PARTIAL_OBJECT = 0x9107
     EOS_GET_DEVICE_INFO_EX = 0x9108
     EOS_GET_OBJECT_INFO_EX = 0x9109
-    EOS_GET_THUMB_EX = 0x910A
     EOS_REMOTE_RELEASE = 0x910F
     EOS_SET_DEVICE_PROP_VALUE_EX = 0x9110
     EOS_GET_REMOTE_MODE = 0x9113
@@ -67,25 +54,12 @@ class Operation(IntEnum):
     EOS_SET_UI_LOCK = 0x911B
     EOS_RESET_UI_LOCK = 0x911C
     EOS_KEEP_DEVICE_ON = 0x911D
-    EOS_SET_NULL_PACKET_MODE = 0x911E
     EOS_BULB_START = 0x9125
-    EOS_BULB_END = 0x9126
     EOS_REQUEST_DEVICE_PROP_VALUE = 0x9127
     EOS_REMOTE_RELEASE_ON = 0x9128
     EOS_REMOTE_RELEASE_OFF = 0x9129
     EOS_RESET_MIRROR_LOCKUP_STATE = 0x9130
-    EOS_SET_REQUEST_OLC_INFO_GROUP = 0x913D
-    EOS_INITIATE_VIEWFINDER = 0x9151
-    EOS_TERMINATE_VIEWFINDER = 0x9152
-    EOS_GET_VIEWFINDER_DATA = 0x9153
-    EOS_DO_AF = 0x9154
-    EOS_DRIVE_LENS = 0x9155
     EOS_AF_CANCEL = 0x9160
-    EOS_GET_OBJECT_INFO_64 = 0x9170
-    EOS_GET_OBJECT_64 = 0x9171
-    EOS_GET_PARTIAL_OBJECT_64 = 0x9172
-    EOS_GET_OBJECT_INFO_EX_64 = 0x9173
-    EOS_GET_PARTIAL_OBJECT_EX_64 = 0x9174
 
 
 class ResponseCode(IntEnum):
@@ -138,20 +112,12 @@ class EventCode(IntEnum):
     """What a device reports on its event channel; from 0xc000 Canon's."""
 
     UNDEFINED = 0x4000
-    CANCEL_TRANSACTION = 0x4001
     OBJECT_ADDED = 0x4002
     OBJECT_REMOVED = 0x4003
     STORE_ADDED = 0x4004
     STORE_REMOVED = 0x4005
-    DEVICE_PROP_CHANGED = 0x4006
     OBJECT_INFO_CHANGED = 0x4007
-    DEVICE_INFO_CHANGED = 0x4008
     REQUEST_OBJECT_TRANSFER = 0x4009
-    STORE_FULL = 0x400A
-    DEVICE_RESET = 0x400B
-    STORAGE_INFO_CHANGED = 0x400C
-    CAPTURE_COMPLETE = 0x400D
-    UNREPORTED_STATUS = 0x400E
 
     EOS_REQUEST_GET_EVENT = 0xC101
 
@@ -197,17 +163,11 @@ class ObjectFormat(IntEnum):
     UNDEFINED = 0x3000
     ASSOCIATION = 0x3001
     SCRIPT = 0x3002
-    TEXT = 0x3004
     DPOF = 0x3006
     WAV = 0x3008
     AVI = 0x300A
-    MPEG = 0x300B
     EXIF_JPEG = 0x3801
-    TIFF_EP = 0x3802
     JFIF = 0x3808
-    PNG = 0x380B
-    TIFF = 0x380D
-    DNG = 0x3811
     CRW = 0xB101
     CR2 = 0xB103
     MOV = 0xB104
@@ -219,18 +179,6 @@ class Property(IntEnum):
     """Settings and states of a device; from 0xd100 Canon's."""
 
     BATTERY_LEVEL = 0x5001
-    FUNCTIONAL_MODE = 0x5002
-    IMAGE_SIZE = 0x5003
-    COMPRESSION_SETTING = 0x5004
-    WHITE_BALANCE = 0x5005
-    F_NUMBER = 0x5007
-    FOCAL_LENGTH = 0x5008
-    FOCUS_MODE = 0x500A
-    EXPOSURE_TIME = 0x500D
-    EXPOSURE_PROGRAM_MODE = 0x500E
-    EXPOSURE_INDEX = 0x500F
-    EXPOSURE_BIAS_COMPENSATION = 0x5010
-    DATE_TIME = 0x5011
 
     USE_DEVICE_STAGE = 0xD303
     DEVICE_FRIENDLY_NAME = 0xD402
@@ -266,13 +214,8 @@ class Property(IntEnum):
     EOS_IMAGE_FORMAT_SD = 0xD122
     EOS_IMAGE_FORMAT_EXT_HD = 0xD123
     EOS_MIRROR_UP_SETTING = 0xD13A
-    EOS_HIGHLIGHT_TONE_PRIORITY = 0xD13B
     EOS_HDR_SETTING = 0xD13D
-    EOS_HIGH_ISO_NOISE_REDUCTION = 0xD178
-    EOS_MULTI_ASPECT = 0xD194
-    EOS_OLC_INFO_VERSION = 0xD199
     EOS_CUSTOM_FUNCTIONS = 0xD1A0
-    EOS_BATTERY_INFO = 0xD1A6
     EOS_LENS_STATUS = 0xD1A8
     EOS_QUICK_REVIEW_TIME = 0xD1A9
     EOS_TEMPERATURE_STATUS = 0xD1AB
@@ -311,9 +254,6 @@ class StorageType(IntEnum):
     """What a store is made of."""
 
     UNDEFINED = 0
-    FIXED_ROM = 1
-    REMOVABLE_ROM = 2
-    FIXED_RAM = 3
     REMOVABLE_RAM = 4
 
 
@@ -321,8 +261,6 @@ class FilesystemType(IntEnum):
     """How a store is ordered."""
 
     UNDEFINED = 0
-    GENERIC_FLAT = 1
-    GENERIC_HIERARCHICAL = 2
     DCF = 3
 
 
@@ -373,9 +311,6 @@ class WhiteBalance(IntEnum):
     MANUAL = 0x06
     SHADE = 0x08
     KELVIN = 0x09
-    PC_1 = 0x0A
-    PC_2 = 0x0B
-    PC_3 = 0x0C
     AUTO_WHITE = 0x17
 
 

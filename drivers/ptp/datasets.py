@@ -1,11 +1,12 @@
-"""The datasets of PTP as bytes and as values: device, object, storage, property.
+"""The datasets of PTP as bytes and as values: device, object, storage, property; and the cursor that reads them.
 
 Rules that hold inside:
 
 - ``decode`` and ``encode`` undo each other on well-formed bytes, so that both ends of the cable share one type.
-- A device's counts and lengths are not trusted: malformed bytes raise `ProtocolError`, and a dataset of more than
-  `MAX_DATASET` bytes is refused unread. Bytes behind a dataset's last field are no fault, for later
-  editions append.
+- Whatever bytes a device sends, the only error is `ProtocolError`; it names the dataset, the field, the place, what was
+  expected and what came. A count is compared with the bytes that are left before anything is made from it, and a
+  dataset of more than `MAX_DATASET` bytes is refused unread. Bytes behind a dataset's last field are no fault, for
+  later editions append.
 - ``encode`` raises ValueError for what the wire cannot hold; that is our own mistake, never a device's.
 
 Everything is little-endian, as USB and TCP carry it. A string is a count of UTF-16 units with the closing NUL, then
@@ -17,11 +18,86 @@ Source: ISO 15740:2013, clauses 5 (types and datasets) and 13 (properties).
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import IntEnum
+from functools import cache
+from typing import Annotated, Self, get_origin, get_type_hints
 
 from drivers.ptp.codes import DataType
-from drivers.ptp.cursor import Cursor
+from foundation.errors import ProtocolError
+
+
+class Cursor:
+    """Reads `data`, little-endian, from its start; `what` names it in messages."""
+
+    def __init__(self, data: bytes, what: str, limit: int | None = None) -> None:
+        if limit is not None and len(data) > limit:
+            raise ProtocolError(f"{what} of {len(data)} bytes; at most {limit} were expected")
+        self._data = bytes(data)
+        self.what = what
+        self.at = 0
+        self._before = 0
+
+    @property
+    def left(self) -> int:
+        """Bytes not yet read."""
+        return len(self._data) - self.at
+
+    def fault(self, field: str, expected: str, came: object, at: int | None = None) -> ProtocolError:
+        """Return the error that states what is wrong with the field that was read last, or with the one at `at`."""
+        place = self._before if at is None else at
+        return ProtocolError(f"{self.what}: {field} at byte {place} is {came}; expected {expected}")
+
+    def take(self, count: int, field: str) -> bytes:
+        """Return the next `count` bytes."""
+        if count > self.left:
+            raise ProtocolError(
+                f"{self.what}: {field} at byte {self.at} needs {count} bytes, but only {self.left} follow"
+            )
+        self._before = self.at
+        self.at += count
+        return self._data[self._before : self.at]
+
+    def rest(self) -> bytes:
+        """Return all bytes that are left."""
+        return self.take(self.left, "the rest")
+
+    def integer(self, size: int, field: str, signed: bool = False) -> int:
+        """Return the next integer of `size` bytes."""
+        return int.from_bytes(self.take(size, field), "little", signed=signed)
+
+    def u8(self, field: str) -> int:
+        """Return the next byte."""
+        return self.integer(1, field)
+
+    def u16(self, field: str) -> int:
+        """Return the next unsigned integer of 2 bytes."""
+        return self.integer(2, field)
+
+    def u32(self, field: str) -> int:
+        """Return the next unsigned integer of 4 bytes."""
+        return self.integer(4, field)
+
+    def u64(self, field: str) -> int:
+        """Return the next unsigned integer of 8 bytes."""
+        return self.integer(8, field)
+
+    def integers(self, count: int, size: int, field: str, signed: bool = False) -> tuple[int, ...]:
+        """Return `count` integers of `size` bytes."""
+        if count * size > self.left:
+            raise ProtocolError(
+                f"{self.what}: {field} at byte {self.at} announces {count} items of {size} bytes, "
+                f"but only {self.left} bytes follow"
+            )
+        octets = self.take(count * size, field)
+        return tuple(
+            int.from_bytes(octets[at : at + size], "little", signed=signed) for at in range(0, len(octets), size)
+        )
+
+    def array(self, size: int, field: str, signed: bool = False) -> tuple[int, ...]:
+        """Return an array: a count of 4 bytes, then as many integers of `size` bytes (ISO 15740, 5.3.3)."""
+        return self.integers(self.u32(f"the count of {field}"), size, field, signed)
+
 
 MAX_DATASET = 1 << 20
 """Bytes of the largest dataset that is read; real ones stay below 10 kB, long lists of handles included."""
@@ -121,193 +197,109 @@ def encode_value(data_type: int, value: Value) -> bytes:
     raise ValueError(f"{value!r} is not of type 0x{data_type:04x}")
 
 
+U16 = Annotated[int, DataType.UINT16]
+U32 = Annotated[int, DataType.UINT32]
+U64 = Annotated[int, DataType.UINT64]
+U16s = Annotated[tuple[int, ...], _ARRAY + DataType.UINT16]
+Text = Annotated[str, DataType.STRING]
+"""What a dataset's fields are on the wire."""
+
+
+class PtpDataset:
+    """A frozen dataclass whose fields, each a type above, follow each other on the wire."""
+
+    @classmethod
+    @cache
+    def _layout(cls) -> tuple[tuple[str, int], ...]:
+        """Return name and `DataType` of every field."""
+        hints = get_type_hints(cls, include_extras=True)
+        return tuple((name, int(hint.__metadata__[0])) for name, hint in hints.items() if get_origin(hint) is Annotated)
+
+    @classmethod
+    def decode(cls, data: bytes) -> Self:
+        """Return the value in a dataset."""
+        return cls.read(Cursor(data, cls.__name__, MAX_DATASET))
+
+    @classmethod
+    def read(cls, cursor: Cursor) -> Self:
+        """Return the value at a cursor."""
+        return cls(**{name: read_value(cursor, kind, name.replace("_", " ")) for name, kind in cls._layout()})
+
+    def encode(self) -> bytes:
+        """Return the dataset."""
+        return b"".join(encode_value(kind, getattr(self, name)) for name, kind in self._layout())
+
+
 @dataclass(frozen=True)
-class DeviceInfo:
+class DeviceInfo(PtpDataset):
     """What a device is and can do (GetDeviceInfo, 5.5.1); version 100 is 1.00."""
 
-    standard_version: int = 100
-    vendor_extension_id: int = 0
-    vendor_extension_version: int = 0
-    vendor_extension: str = ""
-    functional_mode: int = 0
-    operations: tuple[int, ...] = ()
-    events: tuple[int, ...] = ()
-    properties: tuple[int, ...] = ()
-    capture_formats: tuple[int, ...] = ()
-    image_formats: tuple[int, ...] = ()
-    manufacturer: str = ""
-    model: str = ""
-    device_version: str = ""
-    serial_number: str = ""
-
-    @classmethod
-    def decode(cls, data: bytes) -> DeviceInfo:
-        """Return the device in a dataset."""
-        cursor = Cursor(data, "DeviceInfo", MAX_DATASET)
-        return cls(
-            standard_version=cursor.u16("standard version"),
-            vendor_extension_id=cursor.u32("vendor extension id"),
-            vendor_extension_version=cursor.u16("vendor extension version"),
-            vendor_extension=read_string(cursor, "vendor extension"),
-            functional_mode=cursor.u16("functional mode"),
-            operations=cursor.array(2, "operations"),
-            events=cursor.array(2, "events"),
-            properties=cursor.array(2, "properties"),
-            capture_formats=cursor.array(2, "capture formats"),
-            image_formats=cursor.array(2, "image formats"),
-            manufacturer=read_string(cursor, "manufacturer"),
-            model=read_string(cursor, "model"),
-            device_version=read_string(cursor, "device version"),
-            serial_number=read_string(cursor, "serial number"),
-        )
-
-    def encode(self) -> bytes:
-        """Return the dataset."""
-        return b"".join(
-            (
-                encode_integer(self.standard_version, 2),
-                encode_integer(self.vendor_extension_id, 4),
-                encode_integer(self.vendor_extension_version, 2),
-                encode_string(self.vendor_extension),
-                encode_integer(self.functional_mode, 2),
-                encode_array(self.operations, 2),
-                encode_array(self.events, 2),
-                encode_array(self.properties, 2),
-                encode_array(self.capture_formats, 2),
-                encode_array(self.image_formats, 2),
-                encode_string(self.manufacturer),
-                encode_string(self.model),
-                encode_string(self.device_version),
-                encode_string(self.serial_number),
-            )
-        )
+    standard_version: U16 = 100
+    vendor_extension_id: U32 = 0
+    vendor_extension_version: U16 = 0
+    vendor_extension: Text = ""
+    functional_mode: U16 = 0
+    operations: U16s = ()
+    events: U16s = ()
+    properties: U16s = ()
+    capture_formats: U16s = ()
+    image_formats: U16s = ()
+    manufacturer: Text = ""
+    model: Text = ""
+    device_version: Text = ""
+    serial_number: Text = ""
 
 
 @dataclass(frozen=True)
-class ObjectInfo:
+class ObjectInfo(PtpDataset):
     """An object in a store (GetObjectInfo, 5.5.3): bytes, pixels, dates as ``YYYYMMDDThhmmss``."""
 
-    storage: int = 0
-    format: int = 0
-    protection: int = 0
-    size: int = 0
-    thumb_format: int = 0
-    thumb_size: int = 0
-    thumb_width: int = 0
-    thumb_height: int = 0
-    image_width: int = 0
-    image_height: int = 0
-    bit_depth: int = 0
-    parent: int = 0
-    association_type: int = 0
-    association_description: int = 0
-    sequence_number: int = 0
-    filename: str = ""
-    captured_at: str = ""
-    modified_at: str = ""
-    keywords: str = ""
-
-    @classmethod
-    def decode(cls, data: bytes) -> ObjectInfo:
-        """Return the object in a dataset."""
-        cursor = Cursor(data, "ObjectInfo", MAX_DATASET)
-        return cls(
-            storage=cursor.u32("storage"),
-            format=cursor.u16("format"),
-            protection=cursor.u16("protection"),
-            size=cursor.u32("size"),
-            thumb_format=cursor.u16("thumb format"),
-            thumb_size=cursor.u32("thumb size"),
-            thumb_width=cursor.u32("thumb width"),
-            thumb_height=cursor.u32("thumb height"),
-            image_width=cursor.u32("image width"),
-            image_height=cursor.u32("image height"),
-            bit_depth=cursor.u32("bit depth"),
-            parent=cursor.u32("parent"),
-            association_type=cursor.u16("association type"),
-            association_description=cursor.u32("association description"),
-            sequence_number=cursor.u32("sequence number"),
-            filename=read_string(cursor, "filename"),
-            captured_at=read_string(cursor, "capture date"),
-            modified_at=read_string(cursor, "modification date"),
-            keywords=read_string(cursor, "keywords"),
-        )
-
-    def encode(self) -> bytes:
-        """Return the dataset."""
-        return b"".join(
-            (
-                encode_integer(self.storage, 4),
-                encode_integer(self.format, 2),
-                encode_integer(self.protection, 2),
-                encode_integer(self.size, 4),
-                encode_integer(self.thumb_format, 2),
-                encode_integer(self.thumb_size, 4),
-                encode_integer(self.thumb_width, 4),
-                encode_integer(self.thumb_height, 4),
-                encode_integer(self.image_width, 4),
-                encode_integer(self.image_height, 4),
-                encode_integer(self.bit_depth, 4),
-                encode_integer(self.parent, 4),
-                encode_integer(self.association_type, 2),
-                encode_integer(self.association_description, 4),
-                encode_integer(self.sequence_number, 4),
-                encode_string(self.filename),
-                encode_string(self.captured_at),
-                encode_string(self.modified_at),
-                encode_string(self.keywords),
-            )
-        )
+    storage: U32 = 0
+    format: U16 = 0
+    protection: U16 = 0
+    size: U32 = 0
+    thumb_format: U16 = 0
+    thumb_size: U32 = 0
+    thumb_width: U32 = 0
+    thumb_height: U32 = 0
+    image_width: U32 = 0
+    image_height: U32 = 0
+    bit_depth: U32 = 0
+    parent: U32 = 0
+    association_type: U16 = 0
+    association_description: U32 = 0
+    sequence_number: U32 = 0
+    filename: Text = ""
+    captured_at: Text = ""
+    modified_at: Text = ""
+    keywords: Text = ""
 
 
 @dataclass(frozen=True)
-class StorageInfo:
+class StorageInfo(PtpDataset):
     """A store (GetStorageInfo, 5.5.2): capacities in bytes; 0xffffffff free images where the device does not know.
 
     `padding` is what a device sends behind the dataset: two NULs on the EOS 60D.
     """
 
-    storage_type: int = 0
-    filesystem_type: int = 0
-    access: int = 0
-    capacity: int = 0
-    free: int = 0
-    free_images: int = 0xFFFFFFFF
-    description: str = ""
-    label: str = ""
+    storage_type: U16 = 0
+    filesystem_type: U16 = 0
+    access: U16 = 0
+    capacity: U64 = 0
+    free: U64 = 0
+    free_images: U32 = 0xFFFFFFFF
+    description: Text = ""
+    label: Text = ""
     padding: bytes = field(default=b"", repr=False)
 
     @classmethod
-    def decode(cls, data: bytes) -> StorageInfo:
-        """Return the store in a dataset."""
-        cursor = Cursor(data, "StorageInfo", MAX_DATASET)
-        return cls(
-            storage_type=cursor.u16("storage type"),
-            filesystem_type=cursor.u16("filesystem type"),
-            access=cursor.u16("access"),
-            capacity=cursor.u64("capacity"),
-            free=cursor.u64("free bytes"),
-            free_images=cursor.u32("free images"),
-            description=read_string(cursor, "description"),
-            label=read_string(cursor, "label"),
-            padding=cursor.rest(),
-        )
+    def read(cls, cursor: Cursor) -> Self:
+        """Return the store at a cursor, with what follows it."""
+        return replace(super().read(cursor), padding=cursor.rest())
 
     def encode(self) -> bytes:
         """Return the dataset."""
-        return b"".join(
-            (
-                encode_integer(self.storage_type, 2),
-                encode_integer(self.filesystem_type, 2),
-                encode_integer(self.access, 2),
-                encode_integer(self.capacity, 8),
-                encode_integer(self.free, 8),
-                encode_integer(self.free_images, 4),
-                encode_string(self.description),
-                encode_string(self.label),
-                self.padding,
-            )
-        )
+        return super().encode() + self.padding
 
 
 class Form(IntEnum):

@@ -17,8 +17,7 @@ import logging
 from collections.abc import Callable, Iterator
 
 from drivers.ptp.codes import Operation, ResponseCode, describe
-from drivers.ptp.messages import PtpEvent, PtpRequest, next_transaction
-from drivers.ptp.transport import Transport
+from drivers.ptp.transaction import PtpEvent, PtpRequest, Transport, next_transaction
 from foundation.clock import Clock
 from foundation.errors import DeviceError, DeviceRefused, LinkTimeout, ProtocolError
 

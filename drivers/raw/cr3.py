@@ -21,8 +21,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 from drivers.raw.plain_dng import Area
-from drivers.tiff.reading import Directory, TiffDamaged, read_directories
-from drivers.tiff.tags import TiffTag
+from drivers.tiff import Directory, TiffDamaged, TiffTag, read_directories
 
 MAX_BOXES = 4096
 """Boxes that are walked; a real file has about a hundred."""

@@ -16,8 +16,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.tiff.reading import Directory
-from drivers.tiff.tags import CFA, TiffTag
+from drivers.tiff import CFA, Directory, TiffTag
 
 BAYER_PATTERNS = ("RGGB", "BGGR", "GRBG", "GBRG")
 

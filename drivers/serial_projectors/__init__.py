@@ -1,36 +1,18 @@
 """Projectors on a serial cable: which languages are spoken, and how fast.
 
-Each maker has a file of its own: a wire, which is pure functions of bytes for both ends, and a driver that keeps the
-contract of `drivers.projector.Projector`. What a language cannot express is stated in the driver's docstring.
+Each maker has a file of its own: a wire, which is pure functions of bytes for both ends, and a
+`drivers.serial_projectors.driver.SerialProjector` that knows its words. What a language cannot express is stated in
+that file's docstring.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import partial
-from typing import Protocol
 
-from drivers.links.link import Link
-from drivers.projector import Projector
 from drivers.serial_projectors import benq, epson, nec, optoma
-from drivers.serial_projectors.exchange import DEFAULT_TIMEOUT_S, SYSTEM_CLOCK
-from foundation.clock import Clock
+from drivers.serial_projectors.driver import SerialProjector
 from foundation.errors import ConfigurationError
-
-
-class ProjectorFactory(Protocol):
-    """Makes a projector's driver; nothing is opened before it is first used."""
-
-    def __call__(
-        self,
-        connect: Callable[[], Link],
-        timeout: float = DEFAULT_TIMEOUT_S,
-        label: str = "the projector",
-        clock: Clock = SYSTEM_CLOCK,
-    ) -> Projector:
-        """Return the driver of a projector to which `connect` opens cables."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -41,29 +23,25 @@ class Language:
     """
 
     name: str
-    maker: str
     baud: int
     parity: str
-    projector: ProjectorFactory
+    projector: type[SerialProjector]
     tcp_port: int = 0
-    network: ProjectorFactory | None = None
+    network: type[SerialProjector] | None = None
+
+    @property
+    def maker(self) -> str:
+        """The maker, as messages call it."""
+        return self.projector.maker
 
 
 LANGUAGES: Mapping[str, Language] = {
     language.name: language
     for language in (
-        Language("benq", "BenQ", benq.BAUD, "N", benq.BenqProjector, benq.TCP_PORT, benq.BenqProjector),
-        Language(
-            "epson",
-            "Epson",
-            epson.BAUD,
-            "N",
-            epson.EpsonProjector,
-            epson.TCP_PORT,
-            partial(epson.EpsonProjector, network=True),
-        ),
-        Language("nec", "NEC", nec.BAUD, "N", nec.NecProjector, nec.TCP_PORT, nec.NecProjector),
-        Language("optoma", "Optoma", optoma.BAUD, "N", optoma.OptomaProjector),
+        Language("benq", benq.BAUD, "N", benq.BenqProjector, benq.TCP_PORT, benq.BenqProjector),
+        Language("epson", epson.BAUD, "N", epson.EpsonProjector, epson.TCP_PORT, epson.EpsonOnNetwork),
+        Language("nec", nec.BAUD, "N", nec.NecProjector, nec.TCP_PORT, nec.NecProjector),
+        Language("optoma", optoma.BAUD, "N", optoma.OptomaProjector),
     )
 }
 

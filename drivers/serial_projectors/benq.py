@@ -17,19 +17,10 @@ from __future__ import annotations
 
 import contextlib
 import re
-from collections.abc import Callable
 
-from drivers.links.link import Link
-from drivers.projector import Fault, Lamp, Power, ProjectorIdentity
-from drivers.serial_projectors.exchange import (
-    CHECK_SPEED,
-    DEFAULT_TIMEOUT_S,
-    SYSTEM_CLOCK,
-    Exchange,
-    MessageParser,
-    text_of,
-)
-from foundation.clock import Clock
+from drivers.links.exchange import MessageParser
+from drivers.projector import Fault, Power
+from drivers.serial_projectors.driver import CHECK_SPEED, SerialProjector, text_of
 from foundation.errors import DeviceRefused, ProtocolError
 
 BAUD = 115200
@@ -57,12 +48,6 @@ def encode_command(name: str, value: str = QUERY) -> bytes:
 def encode_answer(text: str) -> bytes:
     """Return an answer, such as ``POW=ON`` or `BLOCKED`."""
     return f"*{text}#\r\n".encode("ascii")
-
-
-def take_command(data: bytes) -> tuple[str, int] | None:
-    """Take one line, without its CR, off the front of `data`."""
-    end = data.find(b"\r")
-    return None if end < 0 else (data[:end].decode("ascii", "replace").strip(), end + 1)
 
 
 def reply_parser(command: bytes) -> MessageParser[str]:
@@ -118,29 +103,18 @@ def on_or_off(name: str, value: str) -> bool:
     return value.upper() == "ON"
 
 
-class BenqProjector:
+class BenqProjector(SerialProjector):
     """A `drivers.projector.Projector` over BenQ's commands."""
 
-    def __init__(
-        self,
-        connect: Callable[[], Link],
-        timeout: float = DEFAULT_TIMEOUT_S,
-        label: str = "the projector",
-        clock: Clock = SYSTEM_CLOCK,
-    ) -> None:
-        self._label = label
-        self._exchange = Exchange(connect, timeout, label, clock)
-        self._settled: Power | None = None
+    maker = "BenQ"
+    _settled: Power | None = None
 
-    def identity(self) -> ProjectorIdentity:
-        """Return maker and model; empty what it does not say."""
-        try:
-            return ProjectorIdentity("BenQ", self._command("modelname"), "")
-        except DeviceRefused:
-            return ProjectorIdentity("BenQ", "", "")
+    def model(self) -> str:
+        """Return the model."""
+        return self._command("modelname")
 
     def power(self) -> Power:
-        """Return the power state now."""
+        """Return the power state now; warm-up and cooling by what it was before."""
         try:
             lit = on_or_off("pow", self._command("pow"))
         except Blocked as error:
@@ -151,29 +125,19 @@ class BenqProjector:
                     return Power.COOLING
                 case _:
                     raise DeviceRefused(
-                        f"{self._label} is warming up or cooling down, and does not report which; wait two minutes"
+                        f"{self.label} is warming up or cooling down, and does not report which; wait two minutes"
                     ) from error
         self._settled = Power.ON if lit else Power.STANDBY
         return self._settled
 
-    def switch_on(self) -> None:
-        """Begin to switch on; refused while it cools down."""
-        if self.power() not in (Power.ON, Power.WARMING):
-            self._command("pow", "on")
-
-    def switch_off(self) -> None:
-        """Begin to switch off; refused while it warms up."""
-        if self.power() not in (Power.STANDBY, Power.COOLING):
-            self._command("pow", "off")
+    def switch(self, on: bool) -> None:
+        """Send the command that switches on or off."""
+        self._command("pow", "on" if on else "off")
 
     def muted(self) -> bool | None:
         """Return whether the picture is blanked, None where it cannot tell; refused unless the projector is on."""
-        try:
-            return on_or_off("blank", self._command("blank"))
-        except Blocked:
-            raise
-        except DeviceRefused:
-            return None
+        value = self._command_if_known("blank")
+        return None if value is None else on_or_off("blank", value)
 
     def set_muted(self, muted: bool) -> None:
         """Blank the picture, or show it; refused unless the projector is on."""
@@ -187,27 +151,24 @@ class BenqProjector:
             self._command("pow")
         return ()
 
-    def lamps(self) -> tuple[Lamp, ...]:
-        """Return the first lamp; empty for a lampless projector, which does not know the question."""
+    def lamp_hours(self) -> tuple[int, ...]:
+        """Return the hours of the first lamp; empty for a lampless projector, which does not know the question."""
+        value = self._command_if_known("ltim")
+        return () if value is None else self.hours_in("ltim", value)
+
+    def _command_if_known(self, name: str) -> str | None:
         try:
-            value = self._command("ltim")
+            return self._command(name)
         except Blocked:
             raise
         except DeviceRefused:
-            return ()
-        if not re.fullmatch("[0-9]+", value):
-            raise ProtocolError(f"{self._label} answers ltim={value}; expected hours")
-        return (Lamp(int(value), self.power() in (Power.ON, Power.WARMING)),)
-
-    def close(self) -> None:
-        """Release the cable; the power state stays."""
-        self._exchange.close()
+            return None
 
     def _command(self, name: str, value: str = QUERY) -> str:
         command = encode_command(name, value)
-        reply = self._exchange.ask(command, reply_parser(command))
+        reply = self.exchange.ask(command, reply_parser(command))
         try:
             return value_of(name, reply)
         except ProtocolError:
-            self._exchange.close()
+            self.exchange.close()
             raise

@@ -17,12 +17,11 @@ the codes of ERR? (as other drivers have them), the events that newer projectors
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 
-from drivers.links.link import Link
-from drivers.projector import Fault, Lamp, Power, ProjectorIdentity, Severity
-from drivers.serial_projectors.exchange import CHECK_SPEED, DEFAULT_TIMEOUT_S, SYSTEM_CLOCK, Exchange, quoted, text_of
-from foundation.clock import Clock
+from drivers.links.exchange import Exchange, quoted
+from drivers.projector import Fault, Power, Severity
+from drivers.serial_projectors.driver import CHECK_SPEED, SerialProjector, text_of
 from foundation.errors import DeviceFault, DeviceRefused, LinkTimeout, ProtocolError
 
 BAUD = 9600
@@ -97,12 +96,6 @@ def take_reply(data: bytes) -> tuple[str, int] | None:
     return None
 
 
-def take_command(data: bytes) -> tuple[str, int] | None:
-    """Take one command, without its CR, off the front of `data`."""
-    end = data.find(b"\r")
-    return None if end < 0 else (data[:end].decode("ascii", "replace").strip(), end + 1)
-
-
 def value_of(name: str, reply: str) -> str:
     """Return the value in the answer to the question after `name`."""
     if reply == REFUSAL:
@@ -153,54 +146,27 @@ def parse_faults(codes: str) -> tuple[Fault, ...]:
     return tuple(Fault(part, Severity.ERROR) for part in parts)
 
 
-class EpsonProjector:
+class EpsonProjector(SerialProjector):
     """A `drivers.projector.Projector` over ESC/VP21."""
 
-    def __init__(
-        self,
-        connect: Callable[[], Link],
-        timeout: float = DEFAULT_TIMEOUT_S,
-        label: str = "the projector",
-        clock: Clock = SYSTEM_CLOCK,
-        network: bool = False,
-    ) -> None:
-        self._label = label
-        self._clock = clock
-        self._exchange = Exchange(connect, timeout, label, clock, self._greet_network if network else self._greet)
-        self._under_way: Power | None = None
-        self._give_up_at = 0.0
+    maker = "Epson"
+    _under_way: Power | None = None
+    _give_up_at = 0.0
 
-    def identity(self) -> ProjectorIdentity:
-        """Return the maker, and the serial number for the name; empty what it does not say."""
-        try:
-            return ProjectorIdentity("Epson", "", self._get("SNO"))
-        except DeviceRefused:
-            return ProjectorIdentity("Epson", "", "")
+    def name(self) -> str:
+        """Return the serial number."""
+        return self._get("SNO")
 
     def power(self) -> Power:
         """Return the power state now; while it carries out our own command, what that brings about."""
         self._meet_late_answer()
         return self._under_way or parse_power(self._get("PWR"))
 
-    def switch_on(self) -> None:
-        """Begin to switch on; refused while it cools down."""
-        match self.power():
-            case Power.STANDBY:
-                self._begin("ON", Power.WARMING)
-            case Power.COOLING:
-                raise DeviceRefused(f"{self._label} is cooling down; wait until it is in standby and try again")
-            case Power.ON | Power.WARMING:
-                pass
-
-    def switch_off(self) -> None:
-        """Begin to switch off; refused while it warms up."""
-        match self.power():
-            case Power.ON:
-                self._begin("OFF", Power.COOLING)
-            case Power.WARMING:
-                raise DeviceRefused(f"{self._label} is warming up; wait until it is on and try again")
-            case Power.STANDBY | Power.COOLING:
-                pass
+    def switch(self, on: bool) -> None:
+        """Send the command that switches on or off, whose answer comes when that is done."""
+        self.exchange.send(encode_set("PWR", "ON" if on else "OFF"))
+        self._under_way = Power.WARMING if on else Power.COOLING
+        self._give_up_at = self.clock.monotonic() + SWITCHING_LIMIT_S
 
     def muted(self) -> bool | None:
         """Return whether the picture is blanked by mute, None where it cannot tell; refused unless it is on."""
@@ -208,19 +174,19 @@ class EpsonProjector:
         if value is None:
             return None
         if value not in ("ON", "OFF"):
-            raise ProtocolError(f"{self._label} answers MUTE={value}; expected ON or OFF")
+            raise ProtocolError(f"{self.label} answers MUTE={value}; expected ON or OFF")
         return value == "ON"
 
     def set_muted(self, muted: bool) -> None:
         """Blank picture and sound, or show them; refused unless the projector is on."""
         self._wait_its_turn()
         command = encode_set("MUTE", "ON" if muted else "OFF")
-        reply = self._exchange.ask(command, take_reply)
+        reply = self.exchange.ask(command, take_reply)
         if reply == REFUSAL:
-            raise DeviceRefused(f"{self._label} answers ERR to MUTE; wait until its power is on and try again")
+            raise DeviceRefused(f"{self.label} answers ERR to MUTE; wait until its power is on and try again")
         if reply:
-            self._exchange.close()
-            raise ProtocolError(f"{self._label} answers {reply!r} to MUTE; expected the colon alone")
+            self.exchange.close()
+            raise ProtocolError(f"{self.label} answers {reply!r} to MUTE; expected the colon alone")
 
     def faults(self) -> tuple[Fault, ...]:
         """Return the fault reported now; empty when healthy, and where it reports none, as in warm-up and cooling."""
@@ -231,25 +197,15 @@ class EpsonProjector:
                 return ()
             raise
 
-    def lamps(self) -> tuple[Lamp, ...]:
-        """Return every lamp; empty where the projector has no hours, refused where it does not report them now."""
+    def lamp_hours(self) -> tuple[int, ...]:
+        """Return the hours of every lamp; empty where it has none, refused where it does not report them now."""
         value = self._get_if_known("LAMP")
-        if value is None:
-            return ()
-        if not re.fullmatch(r"[0-9]+( +[0-9]+)*", value):
-            raise ProtocolError(f"{self._label} answers LAMP={value}; expected hours")
-        lit = self.power() in (Power.ON, Power.WARMING)
-        return tuple(Lamp(int(hours), lit) for hours in value.split())
+        return () if value is None else self.hours_in("LAMP", value)
 
     def close(self) -> None:
         """Release the cable; the power state stays."""
         self._under_way = None
-        self._exchange.close()
-
-    def _begin(self, value: str, brings: Power) -> None:
-        self._exchange.send(encode_set("PWR", value))
-        self._under_way = brings
-        self._give_up_at = self._clock.monotonic() + SWITCHING_LIMIT_S
+        super().close()
 
     def _meet_late_answer(self) -> None:
         """Check whether the command under way has been carried out."""
@@ -257,34 +213,34 @@ class EpsonProjector:
             return
         command = "PWR ON" if self._under_way is Power.WARMING else "PWR OFF"
         try:
-            reply = self._exchange.glance(take_reply)
+            reply = self.exchange.glance(take_reply)
         except BaseException:
             self._under_way = None
             raise
         if reply is None:
-            if self._clock.monotonic() >= self._give_up_at:
+            if self.clock.monotonic() >= self._give_up_at:
                 self.close()
                 raise LinkTimeout(
-                    f"{self._label} has not carried out {command} within {SWITCHING_LIMIT_S:g} s; "
+                    f"{self.label} has not carried out {command} within {SWITCHING_LIMIT_S:g} s; "
                     "look at its indicators and its cable"
                 )
             return
         self._under_way = None
         if reply == REFUSAL:
-            raise DeviceRefused(f"{self._label} answers ERR to {command}; look at its indicators and try again")
+            raise DeviceRefused(f"{self.label} answers ERR to {command}; look at its indicators and try again")
 
     def _wait_its_turn(self) -> None:
         self._meet_late_answer()
         if self._under_way is not None:
-            raise DeviceRefused(f"{self._label} is busy with its {self._under_way.value}; wait until that is done")
+            raise DeviceRefused(f"{self.label} is busy with its {self._under_way.value}; wait until that is done")
 
     def _get(self, name: str) -> str:
         self._wait_its_turn()
-        reply = self._exchange.ask(encode_get(name), take_reply)
+        reply = self.exchange.ask(encode_get(name), take_reply)
         try:
             return value_of(name, reply)
         except ProtocolError:
-            self._exchange.close()
+            self.exchange.close()
             raise
 
     def _get_if_known(self, name: str) -> str | None:
@@ -296,17 +252,24 @@ class EpsonProjector:
                 return None
             raise
 
-    def _greet(self, exchange: Exchange) -> None:
-        # The colon shows that it listens, and ends an incomplete command on the line.
+    def greet(self, exchange: Exchange) -> bytes:
+        """Say CR, whose colon shows that it listens, and which ends an incomplete command on the line."""
         try:
             exchange.open_with(b"\r", take_reply)
         except LinkTimeout as error:
             raise LinkTimeout(
                 f"{error}; or it is still switching on or off for an earlier program: wait {SWITCHING_LIMIT_S:g} s"
             ) from error
+        return b""
 
-    def _greet_network(self, exchange: Exchange) -> None:
+
+class EpsonOnNetwork(EpsonProjector):
+    """The same after the handshake of ESC/VP.net."""
+
+    def greet(self, exchange: Exchange) -> bytes:
+        """Shake hands."""
         state = exchange.open_with(HELLO, take_welcome)
         if state != WELCOME:
             reason = _HELLO_STATES.get(state, "look into its network menu")
-            raise DeviceRefused(f"{self._label} refuses the connection with {state:#04x}: {reason}")
+            raise DeviceRefused(f"{self.label} refuses the connection with {state:#04x}: {reason}")
+        return b""

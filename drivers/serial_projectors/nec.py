@@ -15,13 +15,12 @@ Source: NEC, Projector Control Command Reference Manual, revision 6.1 (037, 078-
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
-from drivers.links.link import Link
-from drivers.projector import Fault, Lamp, Power, ProjectorIdentity, Severity
-from drivers.serial_projectors.exchange import CHECK_SPEED, DEFAULT_TIMEOUT_S, SYSTEM_CLOCK, Exchange, quoted
-from foundation.clock import Clock
+from drivers.links.exchange import quoted
+from drivers.projector import Fault, Power, Severity
+from drivers.serial_projectors.driver import CHECK_SPEED, SerialProjector
 from foundation.errors import DeviceFault, DeviceRefused, ProtocolError
 
 BAUD = 38400
@@ -229,47 +228,28 @@ class _NotKnown(DeviceRefused):
     """The projector, or its model, does not know a command."""
 
 
-class NecProjector:
+class NecProjector(SerialProjector):
     """A `drivers.projector.Projector` over NEC's control commands."""
 
-    def __init__(
-        self,
-        connect: Callable[[], Link],
-        timeout: float = DEFAULT_TIMEOUT_S,
-        label: str = "the projector",
-        clock: Clock = SYSTEM_CLOCK,
-    ) -> None:
-        self._label = label
-        self._exchange = Exchange(connect, timeout, label, clock)
-        self._ordered_off = False
+    maker = "NEC"
+    _ordered_off = False
 
-    def identity(self) -> ProjectorIdentity:
-        """Return maker, model and name; empty what it does not say."""
-        try:
-            model = parse_text(self._ask(MODEL))
-        except DeviceRefused:
-            model = ""
-        try:
-            name, _ = parse_information(self._ask(INFORMATION))
-        except DeviceRefused:
-            name = ""
-        return ProjectorIdentity("NEC", model, name)
+    def model(self) -> str:
+        """Return the model."""
+        return parse_text(self._ask(MODEL))
+
+    def name(self) -> str:
+        """Return the name that it was given."""
+        return parse_information(self._ask(INFORMATION))[0]
 
     def power(self) -> Power:
         """Return the power state now."""
         return parse_running(self._ask(RUNNING), self._ordered_off)
 
-    def switch_on(self) -> None:
-        """Begin to switch on; refused while it cools down."""
-        if self.power() not in (Power.ON, Power.WARMING):
-            self._ask(POWER_ON)
-            self._ordered_off = False
-
-    def switch_off(self) -> None:
-        """Begin to switch off; refused while it warms up."""
-        if self.power() not in (Power.STANDBY, Power.COOLING):
-            self._ask(POWER_OFF)
-            self._ordered_off = True
+    def switch(self, on: bool) -> None:
+        """Send the command that switches on or off."""
+        self._ask(POWER_ON if on else POWER_OFF)
+        self._ordered_off = not on
 
     def muted(self) -> bool | None:
         """Return whether the picture is muted, None where it cannot tell."""
@@ -277,7 +257,7 @@ class NecProjector:
         if data is None:
             return None
         if not data or data[0] not in (0, 1):
-            raise ProtocolError(f"{self._label} answers {quoted(data)} to its mutes; expected 00 or 01 first")
+            raise ProtocolError(f"{self.label} answers {quoted(data)} to its mutes; expected 00 or 01 first")
         return data[0] == 1
 
     def set_muted(self, muted: bool) -> None:
@@ -291,17 +271,10 @@ class NecProjector:
         """
         return parse_errors(self._ask_if_known(ERRORS) or b"")
 
-    def lamps(self) -> tuple[Lamp, ...]:
-        """Return its first lamp, or what lights it instead; empty where its model does not count hours."""
+    def lamp_hours(self) -> tuple[int, ...]:
+        """Return the hours of its first lamp, or of what lights it; empty where its model does not count them."""
         data = self._ask_if_known(INFORMATION)
-        if data is None:
-            return ()
-        _, seconds = parse_information(data)
-        return (Lamp(seconds // 3600, self.power() in (Power.ON, Power.WARMING)),)
-
-    def close(self) -> None:
-        """Release the cable; the power state stays."""
-        self._exchange.close()
+        return () if data is None else (parse_information(data)[1] // 3600,)
 
     def _ask_if_known(self, command: NecCommand) -> bytes | None:
         """Return what a question is answered, None where the model does not know it."""
@@ -311,16 +284,16 @@ class NecProjector:
             return None
 
     def _ask(self, command: NecCommand) -> bytes:
-        reply = self._exchange.ask(encode_command(command), take_reply)
+        reply = self.exchange.ask(encode_command(command), take_reply)
         asked = f"command {command.kind:02X}h {command.code:02X}h"
         if (reply.kind, reply.code) != (command.kind, command.code):
-            self._exchange.close()
-            raise ProtocolError(f"{self._label} answers {reply.kind:02X}h {reply.code:02X}h to {asked}; {CHECK_SPEED}")
+            self.exchange.close()
+            raise ProtocolError(f"{self.label} answers {reply.kind:02X}h {reply.code:02X}h to {asked}; {CHECK_SPEED}")
         if reply.failed is None:
             return reply.data
         if reply.failed == EXECUTION_FAILED:
-            raise DeviceFault(f"{self._label} failed to carry out {asked}; look at its indicators")
+            raise DeviceFault(f"{self.label} failed to carry out {asked}; look at its indicators")
         high, low = reply.failed
         reason = _FAILURES.get(reply.failed, "look up this code in its manual")
         kind = _NotKnown if reply.failed in (UNKNOWN_COMMAND, UNKNOWN_TO_MODEL) else DeviceRefused
-        raise kind(f"{self._label} refuses {asked} with {high:02X}h {low:02X}h: {reason}")
+        raise kind(f"{self.label} refuses {asked} with {high:02X}h {low:02X}h: {reason}")

@@ -18,9 +18,10 @@ import re
 from collections.abc import Callable
 from dataclasses import dataclass
 
+from drivers.links.exchange import quoted
 from drivers.links.link import Link
-from drivers.projector import Fault, Lamp, Power, ProjectorIdentity, Severity
-from drivers.serial_projectors.exchange import CHECK_SPEED, DEFAULT_TIMEOUT_S, SYSTEM_CLOCK, Exchange, quoted, text_of
+from drivers.projector import Fault, Power, Severity
+from drivers.serial_projectors.driver import CHECK_SPEED, DEFAULT_TIMEOUT_S, SYSTEM_CLOCK, SerialProjector, text_of
 from foundation.clock import Clock
 from foundation.errors import DeviceRefused, ProtocolError
 
@@ -133,8 +134,12 @@ def info_of_fault(part: str) -> Info | None:
     return None if number is None else Info(number)
 
 
-class OptomaProjector:
+class OptomaProjector(SerialProjector):
     """A `drivers.projector.Projector` over Optoma's commands."""
+
+    maker = "Optoma"
+    _on_the_way: Power | None = None
+    _muted: bool | None = None
 
     def __init__(
         self,
@@ -143,18 +148,12 @@ class OptomaProjector:
         label: str = "the projector",
         clock: Clock = SYSTEM_CLOCK,
     ) -> None:
-        self._label = label
-        self._exchange = Exchange(connect, timeout, label, clock)
-        self._on_the_way: Power | None = None
+        super().__init__(connect, timeout, label, clock)
         self._faults: dict[str, None] = {}
-        self._muted: bool | None = None
 
-    def identity(self) -> ProjectorIdentity:
-        """Return the maker, and the number that the language has for the model."""
-        try:
-            return ProjectorIdentity("Optoma", f"model {self._get(MODEL)}", "")
-        except DeviceRefused:
-            return ProjectorIdentity("Optoma", "", "")
+    def model(self) -> str:
+        """Return the number that the language has for the model."""
+        return f"model {self._get(MODEL)}"
 
     def power(self) -> Power:
         """Return the power state now; before the first change is overheard, on or standby only."""
@@ -168,29 +167,12 @@ class OptomaProjector:
             case "0", on_the_way:
                 return on_the_way or Power.STANDBY
             case _:
-                raise ProtocolError(f"{self._label} answers OK{value} to its power state; expected OK0 or OK1")
+                raise ProtocolError(f"{self.label} answers OK{value} to its power state; expected OK0 or OK1")
 
-    def switch_on(self) -> None:
-        """Begin to switch on; refused while it cools down."""
-        match self.power():
-            case Power.STANDBY:
-                self._set(POWER, "1")
-                self._on_the_way = Power.WARMING
-            case Power.COOLING:
-                raise DeviceRefused(f"{self._label} is cooling down; wait until it is in standby and try again")
-            case Power.ON | Power.WARMING:
-                pass
-
-    def switch_off(self) -> None:
-        """Begin to switch off; refused while it warms up."""
-        match self.power():
-            case Power.ON:
-                self._set(POWER, "0")
-                self._on_the_way = Power.COOLING
-            case Power.WARMING:
-                raise DeviceRefused(f"{self._label} is warming up; wait until it is on and try again")
-            case Power.STANDBY | Power.COOLING:
-                pass
+    def switch(self, on: bool) -> None:
+        """Send the command that switches on or off."""
+        self._set(POWER, "1" if on else "0")
+        self._on_the_way = Power.WARMING if on else Power.COOLING
 
     def muted(self) -> bool | None:
         """Return whether the picture is blanked; None where it cannot be read and was not set by this driver."""
@@ -208,33 +190,27 @@ class OptomaProjector:
         """Return every fault overheard since the lamp was last struck; the language cannot ask for them."""
         # To be silent because the cable is out must not look like health.
         self.power()
-        while (message := self._exchange.glance(take_message)) is not None:
+        while (message := self.exchange.glance(take_message)) is not None:
             self._overheard(message)
         return tuple(Fault(part, Severity.ERROR) for part in self._faults)
 
-    def lamps(self) -> tuple[Lamp, ...]:
-        """Return its lamp; empty where the projector reports no hours."""
+    def lamp_hours(self) -> tuple[int, ...]:
+        """Return the hours of its lamp; empty where the projector reports none."""
         try:
             value = self._get(LAMP_HOURS)
         except DeviceRefused:
             return ()
-        if not re.fullmatch("[0-9]+", value):
-            raise ProtocolError(f"{self._label} answers OK{value} to its lamp hours; expected digits")
-        return (Lamp(int(value), self.power() in (Power.ON, Power.WARMING)),)
-
-    def close(self) -> None:
-        """Release the cable; the power state stays."""
-        self._exchange.close()
+        return self.hours_in("its lamp hours", value)
 
     def _get(self, number: int) -> str:
         match self._ask(OptomaCommand(number, "1")):
             case AnswerText(text):
                 return text
             case PassFail(passed=False):
-                raise DeviceRefused(f"{self._label} answers F to question {number}: its model does not know it, or now")
+                raise DeviceRefused(f"{self.label} answers F to question {number}: its model does not know it, or now")
             case message:
-                self._exchange.close()
-                raise ProtocolError(f"{self._label} answers {message} to question {number}; expected OK…")
+                self.exchange.close()
+                raise ProtocolError(f"{self.label} answers {message} to question {number}; expected OK…")
 
     def _set(self, number: int, value: str) -> None:
         match self._ask(OptomaCommand(number, value)):
@@ -242,17 +218,17 @@ class OptomaProjector:
                 return
             case PassFail(passed=False):
                 raise DeviceRefused(
-                    f"{self._label} answers F to command {number} {value}; wait until its power is on and try again"
+                    f"{self.label} answers F to command {number} {value}; wait until its power is on and try again"
                 )
             case message:
-                self._exchange.close()
-                raise ProtocolError(f"{self._label} answers {message} to command {number} {value}; expected P or F")
+                self.exchange.close()
+                raise ProtocolError(f"{self.label} answers {message} to command {number} {value}; expected P or F")
 
     def _ask(self, command: OptomaCommand) -> Message:
         # The exchange throws away what waits when a question is asked; here it may be news.
-        while (message := self._exchange.glance(take_message, 0.0)) is not None:
+        while (message := self.exchange.glance(take_message, 0.0)) is not None:
             self._overheard(message)
-        return self._exchange.ask(encode_command(command), take_message, self._overheard)
+        return self.exchange.ask(encode_command(command), take_message, self._overheard)
 
     def _overheard(self, message: Message) -> bool:
         if not isinstance(message, Info):

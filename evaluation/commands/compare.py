@@ -7,8 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from foundation.console import EXIT_CODES
-from foundation.json_output import JsonOutput, with_json
+from foundation.console import EXIT_CODES, JsonOutput, with_json
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence

@@ -10,8 +10,7 @@ import typer
 from evaluation.commands.data_options import DataReading, with_data_options
 from evaluation.commands.result_options import PrintedError, PrintedStatistics
 from evaluation.commands.train import LEARNERS_HELP
-from foundation.console import EXIT_CODES
-from foundation.json_output import JsonOutput, with_json
+from foundation.console import EXIT_CODES, JsonOutput, with_json
 
 if TYPE_CHECKING:
     import numpy as np

@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from evaluation.commands.data_options import DataReading, with_data_options
-from foundation.console import EXIT_CODES, shows_progress
-from foundation.json_output import JsonOutput, with_json
+from foundation.console import EXIT_CODES, JsonOutput, shows_progress, with_json
 
 if TYPE_CHECKING:
     from evaluation.experiments.describing import DataDescription

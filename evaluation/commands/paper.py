@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 
 from evaluation.commands.data_options import DataReading, with_data_options
-from foundation.console import EXIT_CODES, new_app, shows_progress
-from foundation.json_output import JsonOutput, with_json
+from foundation.console import EXIT_CODES, JsonOutput, new_app, shows_progress, with_json
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Generator

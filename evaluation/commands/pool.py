@@ -7,8 +7,7 @@ from typing import Annotated, Literal
 
 import typer
 
-from foundation.console import EXIT_CODES
-from foundation.json_output import JsonOutput, with_json
+from foundation.console import EXIT_CODES, JsonOutput, with_json
 
 HELP = f"""Pool the results of several transfers, such as one for each of several cameras.
 

@@ -11,8 +11,7 @@ import typer
 from evaluation.commands.choosing import METHOD_HELP
 from evaluation.commands.data_options import DataReading, with_data_options
 from evaluation.commands.result_options import PrintedError, PrintedStatistics
-from foundation.console import EXIT_CODES
-from foundation.json_output import JsonOutput, with_json
+from foundation.console import EXIT_CODES, JsonOutput, with_json
 
 if TYPE_CHECKING:
     from evaluation.metrics import ErrorKind

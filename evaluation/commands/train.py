@@ -8,8 +8,7 @@ from typing import Annotated
 import typer
 
 from evaluation.commands.data_options import DataReading, with_data_options
-from foundation.console import EXIT_CODES
-from foundation.json_output import JsonOutput, with_json
+from foundation.console import EXIT_CODES, JsonOutput, with_json
 
 LEARNERS_HELP = "regression-trees, smart-color-cat, color-beaver, log-chroma, kernel-ridge, convnet or constant-light"
 """The suite's own, for the help of commands."""

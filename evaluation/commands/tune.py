@@ -8,8 +8,7 @@ from typing import Annotated, Literal
 import typer
 
 from evaluation.commands.data_options import DataReading, with_data_options
-from foundation.console import EXIT_CODES
-from foundation.json_output import JsonOutput, with_json
+from foundation.console import EXIT_CODES, JsonOutput, with_json
 
 FAMILIES_HELP = "shades-of-gray, general-gray-world, gray-edge-1 or gray-edge-2"
 """The families, for the help."""

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from evaluation.scene import SceneSet
-from foundation.trust.secret_texts import masked
+from foundation.secret_texts import masked
 from generator.dataset.reader import Dataset, Entry, open_dataset
 
 

@@ -18,7 +18,7 @@ import numpy.typing as npt
 from evaluation.experiments.bootstrap import Compared, paired
 from evaluation.metrics import ErrorKind
 from evaluation.results.errors_file import MethodErrors
-from foundation.angles import angles_deg
+from foundation.colorimetry import angles_deg
 from foundation.errors import InputError, counted
 
 _SAME_TRUTH_DEG: Final = 0.01

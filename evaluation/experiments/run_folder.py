@@ -41,8 +41,8 @@ from evaluation.scene import MixedScene, Scene, SceneSet
 from foundation.errors import InputError, first_of
 from foundation.files import make_folder, partial_path, publish_folder, require_free, write_whole
 from foundation.hashing import sha256_of
+from foundation.held_folders import LOCK_FILE, held_folder
 from foundation.processors import ordered_map
-from foundation.trust.held_folders import LOCK_FILE, held_folder
 from foundation.version import software
 
 WHAT = "the results"

@@ -7,7 +7,7 @@ from typing import Final, Literal
 import numpy as np
 import numpy.typing as npt
 
-from foundation.angles import angles_deg
+from foundation.colorimetry import angles_deg
 
 ErrorKind = Literal["reproduction", "recovery"]
 

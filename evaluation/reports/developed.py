@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from evaluation.scene import MixedScene, Scene
-from foundation.srgb import srgb_codes
+from foundation.colorimetry import srgb_codes
 
 _HEIGHT = 170
 """Pixels of a picture's height: three beside each other fill half a page."""

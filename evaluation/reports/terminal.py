@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from evaluation.results.tables import Table
-    from foundation.json_output import JsonOutput
+    from foundation.console import JsonOutput
 
 _WIDE = 10_000
 """Columns of a terminal that no table fills: the table is measured as wide as it likes to be."""

@@ -16,7 +16,7 @@ from collections.abc import Mapping
 import numpy as np
 import numpy.typing as npt
 
-from foundation.srgb import decode_srgb, encode_srgb
+from foundation.colorimetry import decode_srgb, encode_srgb
 
 _PRIMARIES = np.array(
     [[0.4360747, 0.3850649, 0.1430804], [0.2225045, 0.7168786, 0.0606169], [0.0139322, 0.0971045, 0.7141733]]

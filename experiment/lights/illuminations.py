@@ -19,10 +19,9 @@ import numpy as np
 import numpy.typing as npt
 
 from drivers.presenter import Colour
-from foundation.colorimetry.observer import linear_srgb, planck, xyz_of
+from foundation.colorimetry import encode_srgb, linear_srgb, planck, xyz_of
 from foundation.errors import FormatError, InputError
 from foundation.files import reading_error, write_whole
-from foundation.srgb import encode_srgb
 
 Kind = Literal["uniform", "blackbody", "spectrum"]
 COLUMNS = ("index", "kind", "cct_k", "red", "green", "blue")

@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 
 from experiment.lights.illuminations import Illumination
+from foundation.colorimetry import decode_srgb
 from foundation.errors import InputError
 from foundation.files import whole_file
-from foundation.srgb import decode_srgb
 
 FORMATS = ("png", "pdf", "svg")
 """Endings of a figure's file name, and Matplotlib's names of these formats."""

@@ -33,8 +33,8 @@ from experiment.session.plan import SessionStep
 from experiment.session.records import FrameRecord
 from foundation.errors import FormatError, InputError
 from foundation.files import is_partial, reading_error, require_free, storage_error, whole_folder, write_whole
-from foundation.trust.foreign_folders import require_plain_folder
-from foundation.trust.held_folders import held_folder
+from foundation.foreign_folders import require_plain_folder
+from foundation.held_folders import held_folder
 
 FRAME_COLUMNS = ("kind", "illumination", "file", "sha256", "taken_at", "exposure_s", "verdict")
 """Columns of `frames.csv` (docs/formats.md)."""

@@ -31,7 +31,7 @@ from experiment.session.journal_schema import MOST_BYTES, limit_values, require_
 from foundation.errors import FormatError, InputError, StorageError
 from foundation.files import disk_remedy_of, partial_path, storage_error, sync_folder
 from foundation.files import reading_error as file_reading_error
-from foundation.trust.foreign_folders import require_plain_folder
+from foundation.foreign_folders import require_plain_folder
 
 _T = TypeVar("_T")
 _log = logging.getLogger(__name__)

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Final
 
 from foundation.errors import FormatError
-from foundation.trust.foreign_folders import is_inside_name
+from foundation.foreign_folders import is_inside_name
 
 MOST_VALUE_BYTES: Final = 64 << 20
 """Longest text, blob or row that SQLite makes of a journal: what the judge keeps of a frame is some 100 kilobytes."""

@@ -13,9 +13,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from foundation.console import Quiet, Verbose, Version
+from foundation.console import AsJson, Quiet, Verbose, Version
 from foundation.errors import InputError
-from foundation.json_output import AsJson
 from foundation.processors import processor_count
 from generator.command.grouping import option
 from generator.dataset.production.workers import Workers

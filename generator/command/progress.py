@@ -10,7 +10,7 @@ from datetime import timedelta
 from typing import TYPE_CHECKING, Final
 
 from foundation.console import shows_progress
-from foundation.trust.secret_texts import printable
+from foundation.secret_texts import printable
 from generator.dataset.production.workers import SILENT, Callbacks
 
 if TYPE_CHECKING:

@@ -12,7 +12,7 @@ from itertools import groupby
 from typing import Final
 
 from foundation.errors import FormatError, InputError
-from foundation.trust.foreign_folders import bounded_lines
+from foundation.foreign_folders import bounded_lines
 from generator.dataset.production.records import (
     GROUND_TRUTH,
     GROUND_TRUTH_COLUMNS,

@@ -32,7 +32,7 @@ import numpy.typing as npt
 from pydantic import ValidationError
 
 from foundation.errors import FormatError, InputError
-from foundation.trust.foreign_folders import MOST_JSON_BYTES, parse_json_object
+from foundation.foreign_folders import MOST_JSON_BYTES, parse_json_object
 from generator.dataset.entries import read_entries
 from generator.dataset.production.layouts.by_name import read_member
 from generator.dataset.production.layouts.samples import member_name

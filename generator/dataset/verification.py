@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import Final
 
 from foundation.errors import FormatError
+from foundation.foreign_folders import bounded_lines, is_inside_name
 from foundation.hashing import stream_sha256
 from foundation.processors import ordered_map
-from foundation.trust.foreign_folders import bounded_lines, is_inside_name
 from generator.dataset.production.cards.facts import COMPLETED_BY_HAND
 from generator.dataset.production.records import SUMS
 from generator.stores.places import DESCRIPTION

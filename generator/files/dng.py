@@ -16,9 +16,8 @@ import math
 import numpy as np
 import numpy.typing as npt
 
-from drivers.raw.camera_matrix import Matrix, camera_matrix
-from drivers.tiff.tags import CFA, D65, TiffTag
-from drivers.tiff.writing import Tags, ValueType, head, rationals, text
+from drivers.raw.rawfile import Matrix, camera_matrix
+from drivers.tiff import CFA, D65, Tags, TiffTag, ValueType, head, rationals, text
 from foundation.errors import InputError
 from generator.files.metadata import ImageMetadata
 

@@ -11,8 +11,7 @@ import io
 import numpy as np
 import numpy.typing as npt
 
-from drivers.tiff.tags import RGB, TiffTag
-from drivers.tiff.writing import Tags, ValueType, head, text
+from drivers.tiff import RGB, Tags, TiffTag, ValueType, head, text
 from foundation.errors import InputError
 from generator.files.metadata import ImageMetadata
 

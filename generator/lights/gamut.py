@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Final, Literal
 import numpy as np
 import numpy.typing as npt
 
-from foundation.angles import angles_deg
+from foundation.colorimetry import angles_deg
 from foundation.errors import InputError
 from generator.lights.lighting import Mixture, mixture_of
 

@@ -25,8 +25,8 @@ from typing import Any, Final, Literal
 import numpy as np
 import numpy.typing as npt
 
+from foundation.colorimetry import srgb_codes
 from foundation.errors import FormatError, InputError
-from foundation.srgb import srgb_codes
 from generator.pictures.crop_places import random_places
 from generator.pictures.profiles import ADOBE_RGB, ASSUMED, from_adobe_rgb, to_srgb
 

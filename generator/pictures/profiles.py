@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 import numpy.typing as npt
 
-from foundation.srgb import srgb_codes
+from foundation.colorimetry import srgb_codes
 
 if TYPE_CHECKING:
     from PIL.ImageCms import ImageCmsTransform

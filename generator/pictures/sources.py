@@ -16,7 +16,7 @@ import numpy as np
 
 from foundation.errors import FormatError, InputError, StorageError
 from foundation.hashing import file_sha256, sha256_of, stream_sha256
-from foundation.trust.secret_texts import masked
+from foundation.secret_texts import masked
 from generator import philox
 from generator.pictures.picture import LARGEST_SIDE, UNPREPARED, Cut, Picture, Preparation, open_picture
 from generator.stores.places import DESCRIPTION, filesystem, is_remote, local_path

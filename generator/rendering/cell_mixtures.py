@@ -24,7 +24,7 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
-from foundation.angles import angles_deg
+from foundation.colorimetry import angles_deg
 from foundation.compiled import compiled
 from generator.rendering.print_profiles import PrintProfile
 

@@ -24,7 +24,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 import numpy.typing as npt
 
-from foundation.angles import angles_deg
+from foundation.colorimetry import angles_deg
 from foundation.errors import QualityError
 from foundation.hashing import sha256_of
 from generator.lights.gamut import black_body

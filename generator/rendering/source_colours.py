@@ -11,7 +11,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from foundation.srgb import decode_srgb
+from foundation.colorimetry import decode_srgb
 from generator.kernels.palette import channels_of
 from generator.rendering.matrices import ColourMatrix
 

@@ -13,8 +13,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 import numpy.typing as npt
 
-from foundation.angles import angles_deg
-from foundation.srgb import decode_srgb
+from foundation.colorimetry import angles_deg, decode_srgb
 from generator.kernels.palette import channels_of
 from generator.rendering.matrices import ColourMatrix, camera_matrix, choose_matrix
 from generator.rendering.print_profiles import PrintProfile, profile_of

@@ -12,7 +12,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from foundation.angles import angles_deg
+from foundation.colorimetry import angles_deg
 
 CELLS: Final = 64
 """Cells a side: the size of the thumbnails that colour constancy is learned from (FFCC, and the sets at hand)."""

@@ -27,8 +27,8 @@ from typing import TYPE_CHECKING, BinaryIO, Final, Protocol, cast
 
 from foundation.errors import CropError, FormatError, StorageError
 from foundation.files import is_partial, partial_path, reading_error, storage_error, sync_folder
-from foundation.trust.foreign_folders import is_inside_name, open_inside
-from foundation.trust.secret_texts import masked
+from foundation.foreign_folders import is_inside_name, open_inside
+from foundation.secret_texts import masked
 from generator.stores.places import filesystem, is_remote, local_path
 
 Pieces = Iterable[bytes | memoryview]

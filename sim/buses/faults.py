@@ -1,8 +1,8 @@
 """Faults of cameras and cables, each as a wrapper around a device or cable that works.
 
 Three places can be troubled: the device, as a `sim.buses.responder.Responder`; its pipes, as
-`drivers.links.pipes.UsbPipes`; the whole cable, as a `drivers.ptp.transport.Transport`. A wrapper keeps the contract of
-what it wraps and may be wrapped again. What happens and when is set on construction; nothing is random.
+`drivers.links.link.UsbPipes`; the whole cable, as a `drivers.ptp.transaction.Transport`. A wrapper keeps the contract
+of what it wraps and may be wrapped again. What happens and when is set on construction; nothing is random.
 
 A device that restarts in the middle of an operation is `Interrupting` with the simulated bus's ``replug``, one that is
 pulled out the same with ``unplug``.
@@ -12,10 +12,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection
 
-from drivers.links.pipes import Pipe, PipeStalled, UsbPipes
-from drivers.ptp.container import HEADER_LENGTH
-from drivers.ptp.messages import PtpEvent, PtpRequest, PtpResponse
-from drivers.ptp.transport import Transaction, Transport
+from drivers.links.link import Pipe, PipeStalled, UsbPipes
+from drivers.ptp.transaction import PtpEvent, PtpRequest, PtpResponse, Transaction, Transport
+from drivers.ptp.usb import HEADER_LENGTH
 from foundation.errors import LinkClosed, LinkTimeout
 from sim.buses.responder import Answer, NoAnswer, Responder
 

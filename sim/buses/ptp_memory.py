@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from drivers.links.pipes import Pipe, PipeStalled
-from drivers.ptp.usb_transport import UsbTransport
+from drivers.links.link import Pipe, PipeStalled
+from drivers.ptp.usb import UsbTransport
 from foundation.errors import LinkClosed, LinkTimeout, ProtocolError
 from sim.buses.responder import Responder
 from sim.buses.usb_device import (
@@ -23,7 +23,7 @@ _ADDRESSES = {Pipe.BULK_OUT: BULK_OUT, Pipe.BULK_IN: BULK_IN, Pipe.INTERRUPT_IN:
 
 
 class MemoryPipes:
-    """The `drivers.links.pipes.UsbPipes` of a device in the same thread; what it has not sent yet, it will not send."""
+    """The `drivers.links.link.UsbPipes` of a device in the same thread; what it has not sent yet, it will not send."""
 
     def __init__(self, device: PtpUsbDevice) -> None:
         self._device = device
@@ -117,7 +117,7 @@ class MemoryPipes:
 
 
 class MemoryTransport(UsbTransport):
-    """A `drivers.ptp.transport.Transport` straight to a responder."""
+    """A `drivers.ptp.transaction.Transport` straight to a responder."""
 
     def __init__(self, responder: Responder) -> None:
         self._memory = MemoryPipes(PtpUsbDevice(responder))

@@ -18,10 +18,9 @@ import threading
 from collections.abc import Iterator
 
 from drivers.links.link import Link
-from drivers.links.tcp import LOOPBACK, TcpServer
+from drivers.links.network import LOOPBACK, TcpServer
 from drivers.ptp.codes import ResponseCode
-from drivers.ptp.messages import PtpRequest, PtpResponse
-from drivers.ptp.ptpip import (
+from drivers.ptp.ip import (
     PORT,
     Cancel,
     Data,
@@ -41,6 +40,7 @@ from drivers.ptp.ptpip import (
     encode,
     encode_data,
 )
+from drivers.ptp.transaction import PtpRequest, PtpResponse
 from foundation.errors import LinkClosed, LinkTimeout, ProtocolError
 from sim.buses.responder import Answer, NoAnswer, Responder
 

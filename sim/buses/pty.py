@@ -17,7 +17,7 @@ import tty
 from types import TracebackType
 from typing import Final
 
-from drivers.links.memory import Peer
+from drivers.links.link import Peer
 from foundation.errors import LinkClosed
 from sim.buses.serial_cable import POLLING_S
 

@@ -8,8 +8,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Final
 
-from drivers.links.memory import Peer, PeerLink
-from drivers.links.tcp import TcpLink, TcpServer
+from drivers.links.link import Peer, PeerLink
+from drivers.links.network import TcpLink, TcpServer
 from foundation.errors import LinkTimeout
 
 POLLING_S: Final = 0.02

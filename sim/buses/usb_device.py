@@ -20,9 +20,10 @@ import struct
 from collections import deque
 from dataclasses import dataclass, field
 
-from drivers.links.pipes import STILL_IMAGE_CLASS
+from drivers.links.link import STILL_IMAGE_CLASS
 from drivers.ptp.codes import VENDOR_CANON_USB, ResponseCode
-from drivers.ptp.container import (
+from drivers.ptp.transaction import PtpRequest
+from drivers.ptp.usb import (
     HIGH_SPEED_PACKET,
     ContainerReader,
     ControlRequest,
@@ -35,7 +36,6 @@ from drivers.ptp.container import (
     encode_data_header,
     ends_with_empty_packet,
 )
-from drivers.ptp.messages import PtpRequest
 from foundation.errors import ProtocolError
 from sim.buses.responder import NoAnswer, Responder
 

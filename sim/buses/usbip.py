@@ -20,7 +20,7 @@ import threading
 from collections.abc import Sequence
 
 from drivers.links.link import Link
-from drivers.links.tcp import LOOPBACK, TcpServer
+from drivers.links.network import LOOPBACK, TcpServer
 from foundation.errors import LinkClosed, LinkTimeout, ProtocolError
 from sim.buses.usb_device import BULK_IN, BULK_OUT, INTERRUPT_IN, PACKET, Overflowed, PtpUsbDevice, Setup, Stalled
 from sim.buses.usbip_wire import (

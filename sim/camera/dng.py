@@ -3,7 +3,7 @@
 What raw converters need to read it as they read a camera's own file: the visible part (ActiveArea) inside the masked
 borders (MaskedAreas), the colour filters counted from the visible part's corner, black and white level, and the
 exposure in an Exif directory. `Software` says that no camera took the picture. Laid out by
-`drivers.tiff.writing`, for the Exif directory (LibRaw takes the ISO speed from nowhere else) and because it is one head
+`drivers.tiff`, for the Exif directory (LibRaw takes the ISO speed from nowhere else) and because it is one head
 before the counts as they lie in memory. The same arguments give the same bytes.
 
 Sources: DNG 1.4 chapter 2 and 4, Exif 2.32 section 4.6.
@@ -20,8 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.camera import ExposureSettings
-from drivers.tiff.tags import CFA, D65, TiffTag
-from drivers.tiff.writing import Tags, ValueType, head, rationals, text
+from drivers.tiff import CFA, D65, Tags, TiffTag, ValueType, head, rationals, text
 from sim.world.sensors import Body
 
 SOFTWARE = "CroP simulated camera"
@@ -117,7 +116,7 @@ def _colour_matrix(body: Body) -> tuple[int, ...]:
     known = _COLOUR_MATRICES.get(body.sensitivities)
     if known is not None:
         return known
-    from drivers.raw.camera_matrix import camera_matrix
+    from drivers.raw.rawfile import camera_matrix
 
     rows = camera_matrix(body.camera)
     return _LINEAR_SRGB if rows is None else tuple(round(10_000 * value) for row in rows for value in row)

@@ -24,10 +24,9 @@ from collections.abc import Callable, Iterable
 from concurrent.futures import Executor
 from dataclasses import replace
 
-from drivers.canon.records import Notice
-from drivers.canon.values import ImageFormat, number_of, number_value
+from drivers.canon.records import ImageFormat, Notice, number_of, number_value
 from drivers.ptp.codes import AeMode, EosEvent, FocusMode, Operation, Property, ReleaseButton, ResponseCode
-from drivers.ptp.messages import PtpEvent, PtpRequest, PtpResponse
+from drivers.ptp.transaction import PtpEvent, PtpRequest, PtpResponse
 from foundation.clock import Clock
 from foundation.errors import LinkClosed
 from sim.buses.responder import Answer

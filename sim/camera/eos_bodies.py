@@ -18,7 +18,7 @@ from itertools import product
 from types import MappingProxyType
 
 from drivers.canon import apex
-from drivers.canon.values import RAW_ONLY, ImageFile, ImageFormat, number_value, text_value
+from drivers.canon.records import RAW_ONLY, ImageFile, ImageFormat, number_value, text_value
 from drivers.ptp.codes import (
     VENDOR_CANON_USB,
     AeMode,

@@ -5,8 +5,7 @@ Source: a recorded EOS 60D; ISO 15740:2013 for what is standard.
 
 from __future__ import annotations
 
-from drivers.canon.datasets import encode_object_entries
-from drivers.canon.records import Notice, TransferRequest
+from drivers.canon.records import Notice, TransferRequest, encode_object_entries
 from drivers.ptp.codes import EosEvent, FilesystemType, ObjectFormat, Property, ResponseCode, StorageType
 from drivers.ptp.datasets import ObjectInfo, StorageInfo, encode_u32_array
 from sim.camera.eos_state import (

@@ -13,8 +13,7 @@ import struct
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
-from drivers.canon.datasets import DeviceInfoEx
-from drivers.canon.values import ImageFormat
+from drivers.canon.records import DeviceInfoEx, ImageFormat
 from drivers.ptp.codes import EosEvent, EventCode, Operation, Property
 from drivers.ptp.datasets import DeviceInfo
 

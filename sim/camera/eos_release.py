@@ -13,8 +13,7 @@ from io import BytesIO
 
 from drivers.camera import ExposureSettings
 from drivers.canon import apex
-from drivers.canon.records import Notice, ObjectEvent
-from drivers.canon.values import ImageFormat
+from drivers.canon.records import ImageFormat, Notice, ObjectEvent
 from drivers.ptp.codes import (
     AeMode,
     CameraStatus,

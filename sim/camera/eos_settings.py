@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from datetime import UTC, datetime
 
-from drivers.canon.values import IMAGE_FORMAT_PROPERTIES, ImageFormat, PropertySetting, number_of
+from drivers.canon.records import IMAGE_FORMAT_PROPERTIES, ImageFormat, PropertySetting, number_of
 from drivers.ptp.codes import DataType, Property, ResponseCode
 from drivers.ptp.datasets import DevicePropDesc, EnumerationForm, Value, decode_value, encode_value
 from foundation.errors import ProtocolError

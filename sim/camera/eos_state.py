@@ -16,11 +16,22 @@ from dataclasses import dataclass, field
 from datetime import datetime, timedelta
 from typing import NamedTuple
 
-from drivers.canon.datasets import ObjectEntry
-from drivers.canon.records import AvailableFormats, AvailableValues, Notice, PropertyChanged, Record, encode_events
-from drivers.canon.values import IMAGE_FORMAT_PROPERTIES, ImageFormat, number_of, number_value, text_value
+from drivers.canon.records import (
+    IMAGE_FORMAT_PROPERTIES,
+    AvailableFormats,
+    AvailableValues,
+    ImageFormat,
+    Notice,
+    ObjectEntry,
+    PropertyChanged,
+    Record,
+    encode_events,
+    number_of,
+    number_value,
+    text_value,
+)
 from drivers.ptp.codes import AeMode, CaptureDestination, EosEvent, EventCode, ObjectFormat, Property, ResponseCode
-from drivers.ptp.messages import PtpEvent
+from drivers.ptp.transaction import PtpEvent
 from foundation.clock import Clock
 from sim.camera.eos_model import MIRROR_LOCKUP, EosModel, custom_functions
 from sim.camera.film import Film

@@ -11,7 +11,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from drivers.display import jvc
-from drivers.links.tcp import TcpLink, TcpServer
+from drivers.links.network import TcpLink, TcpServer
 from drivers.presenter import WHITE, Colour
 from foundation.errors import LinkTimeout, ProtocolError
 from sim.projectors.screen import Screen
@@ -31,7 +31,7 @@ class _Connection:
 
 
 class JvcPeer:
-    """The far side of the network port; keeps the contract of `drivers.links.memory.Peer`."""
+    """The far side of the network port; keeps the contract of `drivers.links.link.Peer`."""
 
     def __init__(self, screen: Screen) -> None:
         self._screen = screen

@@ -16,9 +16,8 @@ from collections import deque
 
 import usb.core
 
-from drivers.display import lightcrafter_wire as wire
-from drivers.display.lightcrafter import PRODUCTS, VENDOR
-from drivers.display.lightcrafter_wire import LightCrafterCommand, LightCrafterReply
+from drivers.display import lightcrafter as wire
+from drivers.display.lightcrafter import PRODUCTS, VENDOR, LightCrafterCommand, LightCrafterReply
 from drivers.presenter import WHITE, Colour
 from foundation.errors import ProtocolError
 from sim.buses.usb import Handle, SimulatedBus

@@ -9,9 +9,8 @@ from __future__ import annotations
 import secrets
 from dataclasses import dataclass
 
-from drivers.links.link import Link
-from drivers.links.memory import PeerLink
-from drivers.links.tcp import TcpLink, TcpServer
+from drivers.links.link import Link, PeerLink
+from drivers.links.network import TcpLink, TcpServer
 from drivers.pjlink import wire
 from drivers.pjlink.wire import ErrorCode, Greeting, LineCutter, PjLinkReply, PjLinkRequest, Refused
 from foundation.errors import DeviceFault, DeviceRefused, LinkTimeout, ProtocolError

@@ -6,10 +6,9 @@ import contextlib
 import threading
 from types import TracebackType
 
-from drivers.links.tcp import LOOPBACK
-from drivers.links.udp import Address, UdpSocket
-from drivers.pjlink import notices, wire
-from drivers.pjlink.notices import FaultsChanged, Found, InputChanged, LinkUp, PjLinkNotice, PowerChanged
+from drivers.links.network import LOOPBACK, Address, UdpSocket
+from drivers.pjlink import wire
+from drivers.pjlink.wire import FaultsChanged, Found, InputChanged, LinkUp, PjLinkNotice, PowerChanged
 from foundation.errors import DeviceRefused, LinkClosed, LinkTimeout
 from sim.projectors.projector import SimulatedProjector
 
@@ -85,7 +84,7 @@ class ProjectorDatagrams:
                 return
             for notice in self._announcer.news():
                 with contextlib.suppress(LinkClosed):
-                    self._socket.send(notices.encode(notice), self._controller)
+                    self._socket.send(wire.encode_datagram(notice), self._controller)
 
     def close(self) -> None:
         """Stop listening and wait for the threads; a second call does nothing."""
@@ -107,9 +106,9 @@ class ProjectorDatagrams:
                 continue
             except LinkClosed:
                 return
-            if notices.is_search(datagram) and self._projector.traits.pjlink_class >= 2:
+            if wire.is_search(datagram) and self._projector.traits.pjlink_class >= 2:
                 with contextlib.suppress(LinkClosed):
-                    self._socket.send(notices.encode(Found(self._projector.traits.mac)), sender)
+                    self._socket.send(wire.encode_datagram(Found(self._projector.traits.mac)), sender)
 
     def _watch(self) -> None:
         while not self._closing.wait(WATCH_S):

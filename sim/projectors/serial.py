@@ -16,9 +16,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Protocol
 
-from drivers.links.memory import Peer
+from drivers.links.link import Peer
 from drivers.projector import Power, Severity
 from drivers.serial_projectors import benq, epson, nec, optoma
+from drivers.serial_projectors.driver import take_line
 from foundation.errors import DeviceFault, DeviceRefused, ProtocolError
 from sim.projectors.projector import SimulatedProjector
 
@@ -72,7 +73,7 @@ class EpsonPeer(_Listener):
             self._greeted = self._heard.startswith(epson.HELLO)
             self._heard = self._heard[len(epson.HELLO) :]
             said += epson.encode_welcome(epson.WELCOME if self._greeted else 0x40)
-        while self._switching_to is None and (taken := epson.take_command(self._heard)) is not None:
+        while self._switching_to is None and (taken := take_line(self._heard)) is not None:
             command, length = taken
             self._heard = self._heard[length:]
             said += self._answer(command)
@@ -139,7 +140,7 @@ class BenqPeer(_Listener):
         """Take the next bytes and return the answers to the lines that they complete."""
         self._heard += data
         said = b""
-        while (taken := benq.take_command(self._heard)) is not None:
+        while (taken := take_line(self._heard)) is not None:
             line, length = taken
             self._heard = self._heard[length:]
             if line:

@@ -21,8 +21,7 @@ from typing import Literal, get_args
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from foundation.colorimetry.observer import observer_cie_1931
-from foundation.srgb import decode_srgb
+from foundation.colorimetry import decode_srgb, observer_cie_1931
 from sim.spectral.published import published_spectra
 from sim.world.spectra import WAVELENGTHS_NM, YULE_NIELSEN_N, PaperName, ink_coverage, paper, print_reflectance
 

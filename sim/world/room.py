@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from pydantic import TypeAdapter, ValidationError
 
 from drivers.camera import ExposureSettings
+from foundation.colorimetry import decode_srgb
 from foundation.errors import ConfigurationError
-from foundation.srgb import decode_srgb
 from sim.world.profile import ProfileName
 from sim.world.spectra import LampSpectrum, PaperName
 

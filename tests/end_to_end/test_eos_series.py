@@ -13,9 +13,9 @@ import pytest
 from drivers.camera import CapturedFrame, capture
 from drivers.canon.camera import CanonEos
 from drivers.canon.records import OtherRecord, TransferRequest, decode_events, encode_events
-from drivers.links.pipes import UsbPipes
+from drivers.links.link import UsbPipes
 from drivers.ptp.codes import Operation, ResponseCode
-from drivers.ptp.messages import PtpRequest, PtpResponse
+from drivers.ptp.transaction import PtpRequest, PtpResponse
 from foundation.errors import DeviceError, DeviceRefused
 from foundation.files import whole_file
 from sim.buses.faults import CutOff, TroubledResponder

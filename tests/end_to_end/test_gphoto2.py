@@ -24,7 +24,7 @@ import pytest
 
 from drivers.camera import ExposureSettings
 from drivers.canon import apex
-from drivers.canon.values import RAW_ONLY, ImageFile, ImageFormat
+from drivers.canon.records import RAW_ONLY, ImageFile, ImageFormat
 from drivers.presenter import WHITE
 from drivers.ptp.codes import Property
 from drivers.raw.rawfile import read_raw

@@ -18,8 +18,8 @@ if sys.platform == "win32":
     pytest.skip("Windows has no pseudo-terminals", allow_module_level=True)
 
 from acquisition.cli import main
-from drivers.display.displays import Display, choose_display
-from drivers.links.tcp import TcpLink, TcpServer
+from drivers.display.fullscreen import Display, choose_display
+from drivers.links.network import TcpLink, TcpServer
 from drivers.links.usb import open_usb
 from drivers.pjlink.projector import PjLinkProjector
 from drivers.projector import Power

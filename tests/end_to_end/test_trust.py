@@ -23,7 +23,7 @@ from drivers.camera import ExposureSettings
 from drivers.presenter import WHITE, Colour
 from experiment.session.folder import Session
 from experiment.session.plan import SessionStep
-from foundation.angles import angles_deg
+from foundation.colorimetry import angles_deg
 from foundation.errors import CropError, QualityError
 from sim.world.room import Room
 from tests.calibration.lab import LIGHTS, SETTINGS, Lab, hang, renumbered, take

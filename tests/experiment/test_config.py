@@ -12,7 +12,7 @@ import pytest
 from acquisition.run.shutter import require_whole_turns
 from experiment.config import LabSettings, load_lab, parse_lab
 from foundation.errors import ConfigurationError
-from foundation.trust.secret_texts import target_label
+from foundation.secret_texts import target_label
 
 MINIMAL = 'rig = "simulated"\nchart = "c/chart.json"\nilluminations = "lights.csv"\n'
 

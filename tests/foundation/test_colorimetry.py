@@ -1,4 +1,4 @@
-"""Colorimetry against colour-science, which the suite itself does without."""
+"""Colorimetry against colour-science, the standard's landmarks of sRGB, and angles that no formula may break."""
 
 from __future__ import annotations
 
@@ -9,7 +9,17 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from experiment.lights.illuminations import CCTS_K, blackbody_light, shown_colour
-from foundation.colorimetry.observer import XYZ_TO_SRGB, linear_srgb, observer_cie_1931, planck, xyz_of
+from foundation.colorimetry import (
+    XYZ_TO_SRGB,
+    angles_deg,
+    decode_srgb,
+    encode_srgb,
+    linear_srgb,
+    observer_cie_1931,
+    planck,
+    srgb_codes,
+    xyz_of,
+)
 
 WAVELENGTHS = np.arange(360.0, 781.0)
 
@@ -45,3 +55,75 @@ def test_the_plan_s_codes_are_those_that_colour_science_gives(cct_k: float) -> N
 def test_a_light_that_is_scaled_has_the_same_xyz() -> None:
     power = planck(WAVELENGTHS, 5000)
     assert xyz_of(WAVELENGTHS, 7 * power) == pytest.approx(xyz_of(WAVELENGTHS, power))
+
+
+def test_the_landmarks_of_the_standard() -> None:
+    assert encode_srgb([0.0, 1.0]).tolist() == [0.0, pytest.approx(1.0)]
+    assert encode_srgb(0.0031308) == pytest.approx(12.92 * 0.0031308)
+    assert encode_srgb(0.18) == pytest.approx(0.4613561, abs=1e-7)
+    assert decode_srgb(0.5) == pytest.approx(0.2140411, abs=1e-7)
+    assert decode_srgb(0.04045) == pytest.approx(0.04045 / 12.92)
+
+
+@given(st.floats(0, 1))
+def test_decoding_undoes_encoding(linear: float) -> None:
+    # The two pieces of the standard's curve meet within 2·10⁻⁷ of each other.
+    assert float(decode_srgb(encode_srgb(linear))) == pytest.approx(linear, abs=3e-8)
+
+
+def test_every_code_comes_back() -> None:
+    codes = np.arange(256, dtype=np.uint8)
+    back = srgb_codes(decode_srgb(codes / 255))
+    assert back.dtype == np.uint8
+    np.testing.assert_array_equal(back, codes)
+
+
+def test_codes_are_clipped_and_keep_the_shape() -> None:
+    assert srgb_codes([[-0.5, 0.0], [1.0, 7.0]]).tolist() == [[0, 0], [255, 255]]
+
+
+def test_both_rise() -> None:
+    ramp = np.linspace(0, 1, 10_001)
+    assert np.all(np.diff(encode_srgb(ramp)) > 0)
+    assert np.all(np.diff(decode_srgb(ramp)) > 0)
+
+
+Colour = tuple[float, float, float]
+COLOURS = st.tuples(*[st.floats(1e-3, 1e3)] * 3)
+
+
+def test_known_angles() -> None:
+    assert angles_deg([1, 0, 0], [0, 1, 0]) == pytest.approx(90)
+    assert angles_deg([1, 0, 0], [1, 1, 0]) == pytest.approx(45)
+    assert angles_deg([1, 1, 1], [-1, -1, -1]) == pytest.approx(180)
+
+
+@pytest.mark.parametrize("degrees", [1e-9, 1e-6, 1e-3, 1.0, 179.999])
+def test_no_angle_loses_its_digits(degrees: float) -> None:
+    angle = np.radians(degrees)
+    other = np.array([np.cos(angle), np.sin(angle), 0])
+    assert float(angles_deg([1, 0, 0], other)) == pytest.approx(degrees, rel=1e-9)
+
+
+@given(COLOURS, COLOURS, st.floats(1e-3, 1e3))
+def test_neither_order_nor_brightness_matters(one: Colour, other: Colour, times: float) -> None:
+    angle = float(angles_deg(one, other))
+    assert 0 <= angle <= 90 + 1e-9
+    assert float(angles_deg(other, one)) == pytest.approx(angle, abs=1e-9)
+    assert float(angles_deg(np.array(one) * times, other)) == pytest.approx(angle, abs=1e-9)
+
+
+@given(COLOURS)
+def test_a_colour_makes_no_angle_with_itself(colour: Colour) -> None:
+    assert float(angles_deg(colour, colour)) == 0
+
+
+@given(COLOURS, COLOURS, COLOURS)
+def test_no_detour_is_shorter(one: Colour, between: Colour, other: Colour) -> None:
+    assert float(angles_deg(one, other)) <= float(angles_deg(one, between) + angles_deg(between, other)) + 1e-9
+
+
+def test_shapes_are_broadcast() -> None:
+    angles = angles_deg(np.ones((4, 1, 3)), np.eye(3))
+    assert angles.shape == (4, 3)
+    np.testing.assert_allclose(angles, np.degrees(np.arccos(1 / np.sqrt(3))))

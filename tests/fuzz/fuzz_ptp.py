@@ -20,9 +20,15 @@ import atheris  # pyright: ignore[reportMissingModuleSource]  # installed by han
 
 with atheris.instrument_imports():
     from drivers.canon import records
-    from drivers.canon.datasets import DeviceInfoEx, decode_object_entries, encode_object_entries
-    from drivers.canon.values import ImageFormat, PropertySetting
-    from drivers.ptp import container, ptpip
+    from drivers.canon.records import (
+        DeviceInfoEx,
+        ImageFormat,
+        PropertySetting,
+        decode_object_entries,
+        encode_object_entries,
+    )
+    from drivers.ptp import ip as ptpip
+    from drivers.ptp import usb as container
     from drivers.ptp.datasets import (
         DeviceInfo,
         DevicePropDesc,

@@ -16,8 +16,8 @@ import numpy as np
 import pytest
 from typer.main import get_command
 
+from foundation.console import JsonOutput, json_output, plain, with_json
 from foundation.errors import QualityError
-from foundation.json_output import JsonOutput, json_output, plain, with_json
 from tests.house_commands import COMMANDS
 from tests.json_of import json_of
 
@@ -86,7 +86,7 @@ class TestOutput:
         assert capsys.readouterr().out == ""
 
     def test_a_command_without_a_place_for_it_is_our_mistake(self) -> None:
-        with pytest.raises(ValueError, match="no parameter 'told'"):
+        with pytest.raises(ValueError, match="JsonOutput"):
             with_json("x")(lambda: None)
 
     def test_standard_output_is_given_back(self) -> None:

@@ -11,14 +11,14 @@ import pytest
 import usbip
 import usbip.host
 
-from drivers.links.tcp import TcpLink, TcpServer
-from drivers.links.udp import UdpSocket
-from drivers.pjlink.notices import LinkUp
+from drivers.links.network import TcpLink, TcpServer, UdpSocket
 from drivers.pjlink.projector import PjLinkProjector
-from drivers.pjlink.search import NoticePort, search
+from drivers.pjlink.search import search
+from drivers.pjlink.wire import LinkUp
 from drivers.projector import Power
 from sim.cli import main
 from tests.drivers.display.x_servers import virtual_screen
+from tests.drivers.pjlink.notice_port import NoticePort
 
 SIM = [sys.executable, "-c", "from sim.cli import main; raise SystemExit(main())"]
 

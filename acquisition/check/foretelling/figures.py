@@ -25,9 +25,8 @@ from experiment.limits.table import ONLY_OF_A_SESSION, TABLE_LIMITS, TableOutcom
 from experiment.measures.paper import Paper, PaperReader
 from experiment.measures.reflections import added_light
 from experiment.measures.stains import Stains, find_stains
-from foundation.angles import angles_deg
+from foundation.colorimetry import angles_deg, decode_srgb
 from foundation.errors import QualityError
-from foundation.srgb import decode_srgb
 
 _Array = npt.NDArray[np.float64]
 _Mask = npt.NDArray[np.bool_]

@@ -19,8 +19,7 @@ from acquisition.judge.known.knowledge import Knowledge, Leaning, Seen, combined
 from acquisition.judge.known.response import Codes, Fit, ProjectorModel
 from experiment.session.judgement import Check
 from experiment.session.plan import SessionStep
-from foundation.angles import angles_deg
-from foundation.srgb import decode_srgb
+from foundation.colorimetry import angles_deg, decode_srgb
 
 _SAME_SD = 0.0015
 """Scatter of amounts between two frames of one light that is reckoned with at least, relative."""

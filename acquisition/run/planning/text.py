@@ -13,7 +13,7 @@ from experiment.config import LabSettings
 from experiment.session.plan import KINDS
 from experiment.session.progress import duration_text
 from foundation.errors import counted
-from foundation.trust.secret_texts import target_label
+from foundation.secret_texts import target_label
 
 
 def plan_lines(plan: RunPlan) -> tuple[str, ...]:

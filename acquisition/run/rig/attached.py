@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Generator, Iterable
 from dataclasses import dataclass
 
-from drivers.display.displays import list_displays
-from drivers.display.fullscreen import identify_displays
+from drivers.display.fullscreen import identify_displays, list_displays
 from drivers.links.serial import list_serial_ports
 from drivers.links.usb import list_devices
 from drivers.pjlink.search import search

@@ -14,18 +14,18 @@ from drivers.display.fullscreen import FullScreen
 from drivers.display.jvc import PORT as JVC_PORT
 from drivers.display.jvc import JvcFlatField
 from drivers.display.lightcrafter import LightCrafter, find_lightcrafter
-from drivers.gphoto2_camera.camera import Gphoto2Camera
-from drivers.links.pipes import UsbPipes
+from drivers.gphoto2_camera import Gphoto2Camera
+from drivers.links.link import UsbPipes
+from drivers.links.network import TcpLink
 from drivers.links.serial import SerialLink
-from drivers.links.tcp import TcpLink
 from drivers.links.usb import open_usb
 from drivers.pjlink.projector import PjLinkProjector
 from drivers.pjlink.wire import PORT as PJLINK_PORT
 from drivers.presenter import Presenter
 from drivers.projector import Projector
 from drivers.ptp.codes import VENDOR_CANON_USB
-from drivers.ptp.ip_transport import IpTransport
-from drivers.ptp.usb_transport import UsbTransport
+from drivers.ptp.ip import IpTransport
+from drivers.ptp.usb import UsbTransport
 from drivers.serial_projectors import language
 from experiment.config import CameraCable, LabSettings, LightSource, ProjectorCable
 from experiment.session.folder import Session

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from evaluation.results.tables import Table
-from foundation.angles import angles_deg
+from foundation.colorimetry import angles_deg
 
 if TYPE_CHECKING:
     from generator import Lut

@@ -28,8 +28,8 @@ from evaluation.methods.pixels import usable
 from evaluation.scene import Scene, SceneSet
 from foundation.errors import FormatError, InputError
 from foundation.files import reading_error, whole_folder, write_whole
+from foundation.foreign_folders import is_inside_name, read_inside
 from foundation.processors import ordered_map
-from foundation.trust.foreign_folders import is_inside_name, read_inside
 from generator.pictures.bits import clear_bits
 from generator.pictures.tonemap import Flash
 

@@ -20,8 +20,8 @@ import numpy.typing as npt
 
 from evaluation.datasets.generated import GeneratedScene
 from evaluation.experiments.transfer.pictures import FoundPicture
+from foundation.colorimetry import decode_srgb
 from foundation.errors import FormatError, InputError
-from foundation.srgb import decode_srgb
 from generator.lights.lighting import parse_mixture
 from generator.rendering.matrices import ColourMatrix
 from generator.variation.gradients import Falloff, described_gradient

@@ -14,8 +14,8 @@ import tomli_w
 
 from foundation.errors import FormatError
 from foundation.files import reading_error, write_whole
-from foundation.trust.foreign_folders import read_inside
-from foundation.trust.secret_texts import MASK, target_label
+from foundation.foreign_folders import read_inside
+from foundation.secret_texts import MASK, target_label
 
 SETTINGS_FILE: Final = "session.toml"
 """Name of the settings of a session."""

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from foundation.errors import InputError
-from foundation.trust.secret_texts import masked_values
+from foundation.secret_texts import masked_values
 from foundation.version import software
 from generator.dataset.production.layouts.by_name import require_libraries
 from generator.dataset.production.options import DatasetOptions

@@ -17,7 +17,7 @@ from experiment.lights.illuminations import Illumination, plan_illuminations, sa
 from experiment.session.journal import JOURNAL_FILE, Journal
 from experiment.session.judgement import Check, Judgement
 from experiment.session.plan import RESPONSE, SessionStep, plan_steps
-from foundation.srgb import decode_srgb
+from foundation.colorimetry import decode_srgb
 
 BEGUN = datetime(2026, 3, 1, 22, 0, tzinfo=UTC)
 FRAME_S = 5.0

@@ -20,14 +20,13 @@ from acquisition.run.devices import Devices
 from acquisition.run.sequencer import RunOutcome, take_session
 from drivers.camera import ExposureSettings
 from drivers.canon.camera import CanonEos
-from drivers.links.link import Link
-from drivers.links.pipes import Pipe, UsbPipes
+from drivers.links.link import Link, Pipe, UsbPipes
 from drivers.pjlink.projector import PjLinkProjector
 from drivers.presenter import BLACK, Colour
 from drivers.projector import Power, Severity
 from drivers.ptp.codes import ResponseCode
-from drivers.ptp.transport import Transport
-from drivers.ptp.usb_transport import UsbTransport
+from drivers.ptp.transaction import Transport
+from drivers.ptp.usb import UsbTransport
 from experiment.chart.layout import design_chart
 from experiment.config import LabSettings
 from experiment.lights.illuminations import Illumination

@@ -16,9 +16,8 @@ from calibration.verdict.thresholds import THRESHOLDS
 from calibration.verdict.verdict import judge
 from experiment.lights.illuminations import plan_illuminations
 from experiment.session.plan import SessionStep
-from foundation.angles import angles_deg
+from foundation.colorimetry import angles_deg, decode_srgb
 from foundation.errors import FormatError
-from foundation.srgb import decode_srgb
 from sim.world.room import Room
 from sim.world.spectra import projector_primaries, sensitivities
 from tests.calibration.lab import LIGHTS, SETTINGS, Lab, hang, take

@@ -17,7 +17,7 @@ from calibration.citation.stated import StatedOrigin, origin_record, with_change
 from calibration.cli import main
 from calibration.table.lut import open_lut
 from calibration.table.provenance import parse_provenance
-from drivers.raw.origin import FrameOrigin
+from drivers.raw.rawfile import FrameOrigin
 from experiment.config import CameraSettings, CitationSettings, parse_lab
 from experiment.session.records import FrameRecord
 from foundation.errors import ConfigurationError, InputError

@@ -27,7 +27,7 @@ from calibration.spread.surroundings import FrameLevels, Surroundings, UsualLigh
 from experiment.chart.layout import A_SERIES_MM, design_chart, paper_chart
 from experiment.chart.model import Chart
 from experiment.measures.flat_field import FlatField
-from foundation.angles import angles_deg
+from foundation.colorimetry import angles_deg
 
 pytestmark = pytest.mark.slow
 

@@ -8,9 +8,9 @@ from typing import Any
 
 from drivers.camera import CapturedFrame, capture
 from drivers.canon.camera import CanonEos
-from drivers.links.pipes import UsbPipes
-from drivers.ptp.transport import Transport
-from drivers.ptp.usb_transport import UsbTransport
+from drivers.links.link import UsbPipes
+from drivers.ptp.transaction import Transport
+from drivers.ptp.usb import UsbTransport
 from foundation.errors import DeviceError, DeviceFault, DeviceRefused
 from sim.buses.ptp_memory import MemoryPipes
 from sim.buses.responder import Responder
@@ -65,3 +65,13 @@ class Lab:
         """Return how many objects wait in the body's memory now."""
         assert not self.eos.busy
         return len(self.eos._memory)  # pyright: ignore[reportPrivateUsage] - the body tells it nobody
+
+    def pull(self) -> None:
+        """Pull the cable out, and put it back."""
+        self.camera._drop(None)  # pyright: ignore[reportPrivateUsage]
+
+    def download(self) -> bytes:
+        """Return what the camera writes of the frame exposed last."""
+        into = io.BytesIO()
+        self.camera.download(into)
+        return into.getvalue()

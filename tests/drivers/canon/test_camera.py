@@ -14,18 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from drivers.camera import CameraIdentity, ExposureSettings, ReportsSupplies, capture
-from drivers.canon.camera import CanonEos
-from drivers.canon.records import (
-    AvailableValues,
-    Notice,
-    OtherRecord,
-    PropertyChanged,
-    Record,
-    TransferRequest,
-    decode_events,
-    encode_events,
-)
-from drivers.canon.state import (
+from drivers.canon.body import (
     MAX_LIST,
     MAX_PROPERTIES,
     MAX_VALUE,
@@ -35,15 +24,26 @@ from drivers.canon.state import (
     power_source,
     problems,
 )
-from drivers.canon.values import ImageFile, ImageFormat, number_value
-from drivers.links.pipes import Pipe, UsbPipes
+from drivers.canon.camera import CanonEos
+from drivers.canon.records import (
+    AvailableValues,
+    ImageFile,
+    ImageFormat,
+    Notice,
+    OtherRecord,
+    PropertyChanged,
+    Record,
+    TransferRequest,
+    decode_events,
+    encode_events,
+    number_value,
+)
+from drivers.links.link import Pipe, UsbPipes
 from drivers.links.usb import open_usb
 from drivers.ptp.codes import AeMode, CaptureDestination, EosEvent, Operation, Property, ResponseCode
-from drivers.ptp.ip_transport import IpTransport
-from drivers.ptp.messages import PtpEvent, PtpRequest, PtpResponse
-from drivers.ptp.reception import Reception
-from drivers.ptp.transport import Transaction, Transport
-from drivers.ptp.usb_transport import UsbTransport
+from drivers.ptp.ip import IpTransport
+from drivers.ptp.transaction import PtpEvent, PtpRequest, PtpResponse, Reception, Transaction, Transport
+from drivers.ptp.usb import UsbTransport
 from foundation.errors import DeviceError, DeviceRefused, LinkClosed, ProtocolError, StorageError
 from sim.buses import faults
 from sim.buses.faults import Occasion
@@ -616,9 +616,7 @@ def test_a_full_disk_costs_no_frame(lab: Lab) -> None:
     with pytest.raises(StorageError):
         lab.camera.download(Full())
     assert lab.waiting() == 1
-    into = io.BytesIO()
-    lab.camera.download(into)
-    assert into.getvalue() == lab.film.frames[-1]
+    assert lab.download() == lab.film.frames[-1]
     assert len(lab.film.frames) == 1
     assert lab.waiting() == 0
     lab.take()
@@ -690,12 +688,9 @@ def test_a_camera_that_is_gone_for_good_says_what_to_do(lab: Lab) -> None:
     lab.camera.configure(SETTINGS)
     lab.take()
 
-    def gone(transport: Transport) -> Transport:
-        raise LinkClosed("no camera on USB")
-
-    lab.cable = gone
+    lab.cable = gone_for_good
     lab.device = lab.eos
-    lab.camera._drop(None)  # pyright: ignore[reportPrivateUsage] - the cable is pulled
+    lab.pull()
     begun = lab.clock.monotonic()
     with pytest.raises(DeviceError, match=r"^no camera on USB; no connection for \d+ s; check the cable and"):
         lab.take(attempts=1)
@@ -711,12 +706,9 @@ def test_the_first_cause_is_kept_and_what_came_of_it_told_after(lab: Lab) -> Non
     )
     lab.device = busy
 
-    def gone(transport: Transport) -> Transport:
-        raise LinkClosed("no camera on USB")
-
-    lab.camera._drop(None)  # pyright: ignore[reportPrivateUsage] - the cable is pulled
+    lab.pull()
     lab.camera.idle()
-    lab.cable = gone
+    lab.cable = gone_for_good
     with pytest.raises(
         DeviceError, match=r"^.*GENERAL_ERROR.*; no connection for \d+ s; at last: no camera on USB; check the cable"
     ):
@@ -736,7 +728,7 @@ def test_no_call_is_silent_for_long(kind: str) -> None:
     }[kind]()
     if kind == "gone":
         lab.cable = gone_for_good
-    lab.camera._drop(None)  # pyright: ignore[reportPrivateUsage] - the cable is pulled
+    lab.pull()
     begun = lab.clock.monotonic()
     cause = {
         "busy": "answers DEVICE_BUSY",
@@ -758,10 +750,8 @@ def test_a_cable_that_fails_between_exposure_and_download_costs_no_frame(lab: La
     lab.camera.configure(SETTINGS)
     for number in range(3):
         lab.camera.expose()
-        lab.camera._drop(None)  # pyright: ignore[reportPrivateUsage] - the cable is pulled
-        into = io.BytesIO()
-        lab.camera.download(into)
-        assert into.getvalue() == lab.film.frames[number]
+        lab.pull()
+        assert lab.download() == lab.film.frames[number]
         assert lab.waiting() == 0
     assert len(lab.film.frames) == 3
 
@@ -769,22 +759,20 @@ def test_a_cable_that_fails_between_exposure_and_download_costs_no_frame(lab: La
 def test_a_cable_that_stays_out_for_a_while_costs_no_frame_either(lab: Lab) -> None:
     lab.camera.configure(SETTINGS)
     lab.camera.expose()
-    lab.camera._drop(None)  # pyright: ignore[reportPrivateUsage] - the cable is pulled
+    lab.pull()
     lab.cable = gone_for_good
     for _ in range(3):
         with pytest.raises(DeviceError, match="no camera on USB"):
             lab.camera.download(io.BytesIO())
     lab.cable = lambda transport: transport
-    into = io.BytesIO()
-    lab.camera.download(into)
-    assert [into.getvalue()] == lab.film.frames
+    assert [lab.download()] == lab.film.frames
 
 
 def test_a_body_that_forgets_its_frames_says_so_once(lab: Lab) -> None:
     lab = Lab(forgetful=True)
     lab.camera.configure(SETTINGS)
     lab.camera.expose()
-    lab.camera._drop(None)  # pyright: ignore[reportPrivateUsage] - the cable is pulled
+    lab.pull()
     with pytest.raises(DeviceError, match="holds none in its memory; take it again"):
         lab.camera.download(io.BytesIO())
     with pytest.raises(DeviceError, match="no exposed frame waits"):
@@ -796,9 +784,7 @@ def test_a_finger_on_the_camera_between_exposure_and_download_changes_no_frame(l
     lab.camera.configure(SETTINGS)
     lab.camera.expose()
     lab.press()
-    into = io.BytesIO()
-    lab.camera.download(into)
-    assert into.getvalue() == lab.film.frames[0]
+    assert lab.download() == lab.film.frames[0]
     assert len(lab.film.frames) == 2
     assert lab.waiting() == 0
 
@@ -900,9 +886,7 @@ def test_asking_for_supplies_costs_no_exposed_frame(lab: Lab) -> None:
     lab.camera.configure(SETTINGS)
     lab.camera.expose()
     lab.camera.supplies()
-    into = io.BytesIO()
-    lab.camera.download(into)
-    assert [into.getvalue()] == lab.film.frames
+    assert [lab.download()] == lab.film.frames
 
 
 @pytest.mark.parametrize(
@@ -934,7 +918,7 @@ def test_a_camera_that_never_was_is_told_at_once() -> None:
 def test_another_body_in_its_place_is_refused(lab: Lab) -> None:
     lab.camera.configure(SETTINGS)
     lab.device = SimulatedEos(EOS_550D, lab.film, lab.clock, serial="0000000002", auto_power_off_s=0)
-    lab.camera._drop(None)  # pyright: ignore[reportPrivateUsage] - the cable is pulled
+    lab.pull()
     with pytest.raises(DeviceRefused, match="serial number 0000000001 there is now a Canon EOS 550D with 0000000002"):
         lab.take()
 
@@ -950,7 +934,7 @@ def test_a_release_that_stays_refused_says_where_to_look(lab: Lab) -> None:
     lab.device = faults.Declining(
         lab.eos, ResponseCode.DEVICE_BUSY, Occasion({Operation.EOS_REMOTE_RELEASE_ON}, times=None)
     )
-    lab.camera._drop(None)  # pyright: ignore[reportPrivateUsage] - the cable is pulled
+    lab.pull()
     with pytest.raises(DeviceRefused, match="look for mirror lockup"):
         lab.take()
     lab.device = lab.eos

@@ -1,27 +1,33 @@
-"""Canon's records against what bodies have sent, and round trips of whatever they can hold."""
+"""Canon's records and dial positions against what bodies have sent, and round trips of whatever they can hold."""
 
 from __future__ import annotations
+
+import math
+from itertools import pairwise
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.canon import datasets, values
 from drivers.canon import records as canon
-from drivers.canon.datasets import DeviceInfoEx, ObjectEntry
+from drivers.canon.apex import APERTURE, ISO, SHUTTER, TOLERANCE, Scale
 from drivers.canon.records import (
     AvailableFormats,
     AvailableValues,
+    DeviceInfoEx,
+    ImageFile,
+    ImageFormat,
     Notice,
+    ObjectEntry,
     ObjectEvent,
     OtherRecord,
     PropertyChanged,
+    PropertySetting,
     Record,
     TransferRequest,
 )
-from drivers.canon.values import ImageFile, ImageFormat, PropertySetting
 from drivers.ptp.codes import CameraStatus, CaptureDestination, EosEvent, ObjectFormat, Property
-from foundation.errors import ProtocolError
+from foundation.errors import InputError, ProtocolError
 from tests.drivers.ptp import examples
 
 U32 = st.integers(0, 0xFFFFFFFF)
@@ -56,13 +62,13 @@ RECORDS: st.SearchStrategy[Record] = st.one_of(
     st.builds(PropertyChanged, U32, st.binary(max_size=80)),
     st.builds(
         AvailableValues,
-        U32.filter(lambda code: code not in values.IMAGE_FORMAT_PROPERTIES),
+        U32.filter(lambda code: code not in canon.IMAGE_FORMAT_PROPERTIES),
         st.lists(U32, max_size=10).map(tuple),
     ),
     st.builds(AvailableValues, U32, st.just(()), st.sampled_from((1, 7))),
     st.builds(
         AvailableFormats,
-        st.sampled_from(sorted(values.IMAGE_FORMAT_PROPERTIES)),
+        st.sampled_from(sorted(canon.IMAGE_FORMAT_PROPERTIES)),
         st.lists(FORMATS, max_size=5).map(tuple),
     ),
     st.builds(ObjectEvent, st.sampled_from((EosEvent.OBJECT_ADDED, EosEvent.OBJECT_INFO_CHANGED)), _entries()),
@@ -124,7 +130,7 @@ def test_a_state_dump() -> None:
         PropertyChanged(Property.EOS_ISO_SPEED, b"\x68\0\0\0"),
         PropertyChanged(Property.EOS_SERIAL_NUMBER, b"1286027086\0"),
         AvailableValues(Property.EOS_APERTURE, (0x25, 0x28, 0x2B)),
-        AvailableFormats(Property.EOS_IMAGE_FORMAT, (values.RAW_ONLY, ImageFormat((raw, jpeg)))),
+        AvailableFormats(Property.EOS_IMAGE_FORMAT, (canon.RAW_ONLY, ImageFormat((raw, jpeg)))),
         Notice(EosEvent.CAMERA_STATUS_CHANGED, CameraStatus.BUSY),
         OtherRecord(0xC1FE, b"\xab\xcd"),
     )
@@ -247,13 +253,13 @@ def test_objects_on_the_card() -> None:
         0x21,
         0x4D987C10,
     )
-    assert datasets.decode_object_entries(examples.OBJECT_ENTRIES) == (folder, picture)
-    assert datasets.encode_object_entries((folder, picture)) == examples.OBJECT_ENTRIES
+    assert canon.decode_object_entries(examples.OBJECT_ENTRIES) == (folder, picture)
+    assert canon.encode_object_entries((folder, picture)) == examples.OBJECT_ENTRIES
 
 
 @given(st.lists(_entries(), max_size=5).map(tuple))
 def test_any_objects_come_back(entries: tuple[ObjectEntry, ...]) -> None:
-    assert datasets.decode_object_entries(datasets.encode_object_entries(entries)) == entries
+    assert canon.decode_object_entries(canon.encode_object_entries(entries)) == entries
 
 
 def test_what_no_body_could_say_is_our_own_mistake() -> None:
@@ -273,13 +279,13 @@ def test_a_name_must_fit() -> None:
 
 
 def test_settings_are_canons_bytes() -> None:
-    setting = PropertySetting(Property.EOS_CAPTURE_DESTINATION, values.number_value(CaptureDestination.HOST))
+    setting = PropertySetting(Property.EOS_CAPTURE_DESTINATION, canon.number_value(CaptureDestination.HOST))
     assert setting.encode() == examples.SETTING
     assert PropertySetting.decode(examples.SETTING) == setting
     # RAW only: 20 bytes of value, 28 with the header, as facts from the wire have it.
-    setting = PropertySetting(Property.EOS_IMAGE_FORMAT, values.RAW_ONLY.encode())
+    setting = PropertySetting(Property.EOS_IMAGE_FORMAT, canon.RAW_ONLY.encode())
     assert setting.encode() == examples.IMAGE_SETTING
-    assert ImageFormat.decode(PropertySetting.decode(examples.IMAGE_SETTING).value) == values.RAW_ONLY
+    assert ImageFormat.decode(PropertySetting.decode(examples.IMAGE_SETTING).value) == canon.RAW_ONLY
 
 
 @pytest.mark.parametrize("octets", ["07000000 1cd10000", "0d000000 1cd10000 04000000"])
@@ -289,20 +295,20 @@ def test_a_setting_that_is_none(octets: str) -> None:
 
 
 def test_values() -> None:
-    assert values.number_value(-3) == b"\xfd\xff\xff\xff"
-    assert values.number_of(b"\x87\x02\0\x80") == 0x80000287
-    assert values.text_value("Lab") == b"Lab\0"
-    assert values.text_of(b"EF-S15-85mm\0\0\0") == "EF-S15-85mm"
+    assert canon.number_value(-3) == b"\xfd\xff\xff\xff"
+    assert canon.number_of(b"\x87\x02\0\x80") == 0x80000287
+    assert canon.text_value("Lab") == b"Lab\0"
+    assert canon.text_of(b"EF-S15-85mm\0\0\0") == "EF-S15-85mm"
     with pytest.raises(ProtocolError, match="needs 4 bytes, but only 1"):
-        values.number_of(b"\0")
+        canon.number_of(b"\0")
     with pytest.raises(ValueError, match="NUL"):
-        values.text_value("a\0")
+        canon.text_value("a\0")
     with pytest.raises(ValueError, match="does not fit"):
-        values.number_value(1 << 32)
+        canon.number_value(1 << 32)
 
 
 def test_image_formats_have_names() -> None:
-    assert str(values.RAW_ONLY) == "RAW"
+    assert str(canon.RAW_ONLY) == "RAW"
     assert str(ImageFormat((ImageFile(6, 2, 4), ImageFile(1, 14, 2)))) == "sRAW + JPEG S1 normal"
     assert str(ImageFile(6, 0, 3)) == "RAW of compression 3"
     assert [file.is_raw for file in (ImageFile(6, 1, 4), ImageFile(1, 0, 3))] == [True, False]
@@ -312,3 +318,119 @@ def test_a_device_and_what_it_reports() -> None:
     info = DeviceInfoEx((0xC181, 0xC189), (0xD101,), (4,))
     assert info.encode() == examples.DEVICE_INFO_EX
     assert DeviceInfoEx.decode(examples.DEVICE_INFO_EX) == info
+
+
+SCALES = pytest.mark.parametrize("scale", [SHUTTER, APERTURE, ISO], ids=lambda scale: scale.name)
+# The list of apertures that the recorded 60D offered: third stops, f/3.5 to f/22.
+APERTURES_60D = (0x25, 0x28, 0x2B, 0x2D, 0x30, 0x33, 0x35, 0x38, 0x3B, 0x3D, 0x40, 0x43, 0x45, 0x48, 0x4B, 0x4D, 0x50)
+
+
+@pytest.mark.parametrize(
+    ("scale", "code", "label", "value"),
+    [
+        (SHUTTER, 0x10, "30", 30),
+        (SHUTTER, 0x38, "1", 1),
+        (SHUTTER, 0x45, "0.3", 0.3),
+        (SHUTTER, 0x68, "1/60", 1 / 60),
+        (SHUTTER, 0xA0, "1/8000", 1 / 8000),
+        (APERTURE, 0x10, "1.4", 1.4),
+        (APERTURE, 0x25, "3.5", 3.5),
+        (APERTURE, 0x38, "8", 8),
+        (APERTURE, 0x50, "22", 22),
+        (ISO, 0x48, "100", 100),
+        (ISO, 0x4D, "160", 160),
+        (ISO, 0x78, "6400", 6400),
+        (ISO, 0x98, "102400", 102400),
+    ],
+)
+def test_codes_are_canons(scale: Scale, code: int, label: str, value: float) -> None:
+    assert scale.label(code) == label
+    assert scale.value(code) == pytest.approx(value)
+    assert scale.code(label) == scale.code(value) == code
+
+
+@SCALES
+def test_every_label_finds_its_code_back(scale: Scale) -> None:
+    for step in scale.steps:
+        assert scale.code(step.label, [step.code]) == scale.code(step.value, [step.code]) == step.code
+
+
+@SCALES
+def test_labels_are_rounded_stops(scale: Scale) -> None:
+    # A nominal value lies within a quarter of a stop of the exact one (0.3 s and f/1.8 as half stops are the
+    # coarsest), so that no code can be off by a third.
+    for step in scale.steps:
+        stops = abs(math.log2(step.value / scale.exact(step.code))) * (2 if scale is APERTURE else 1)
+        assert stops < 0.25, (step, stops)
+
+
+@SCALES
+def test_neighbours_are_wider_apart_than_the_tolerance(scale: Scale) -> None:
+    values = sorted({step.value for step in scale.steps})
+    assert min(high / low for low, high in pairwise(values)) > 1.05 > 1 + 2 * TOLERANCE
+
+
+@SCALES
+def test_codes_ascend_as_values_do(scale: Scale) -> None:
+    values = [step.value for step in scale.steps]
+    assert values == sorted(values, reverse=scale is SHUTTER)
+    assert len({step.code for step in scale.steps}) == len(scale.steps)
+
+
+def test_the_list_of_the_body_decides_between_half_and_third_stops() -> None:
+    assert SHUTTER.code("1/10") == SHUTTER.code(0.1, [0x50, 0x53, 0x55]) == 0x53
+    assert SHUTTER.code("1/10", [0x50, 0x54, 0x58]) == 0x54
+    assert APERTURE.code(3.5, APERTURES_60D) == 0x25
+
+
+@pytest.mark.parametrize("wanted", [0.0167, 1 / 60, "1/60", " 1/60 s", "0.01667"])
+def test_rounded_values_are_the_nominal_ones(wanted: float | str) -> None:
+    assert SHUTTER.code(wanted) == 0x68
+
+
+def test_apertures_as_people_write_them() -> None:
+    assert APERTURE.code("f/8", APERTURES_60D) == APERTURE.code("F/8.0") == APERTURE.code(8) == 0x38
+
+
+def test_what_is_between_is_not_guessed() -> None:
+    with pytest.raises(InputError, match=r"^aperture 7\.5 is not offered; near it: 6\.3, 7\.1, 8, 9$"):
+        APERTURE.code(7.5, APERTURES_60D)
+    with pytest.raises(InputError, match=r"aperture 2\.8 is not offered; near it: 3\.5, 4, 4\.5, 5"):
+        APERTURE.code(2.8, APERTURES_60D)
+    with pytest.raises(InputError, match="the list is empty"):
+        SHUTTER.code("1/60", [])
+
+
+@pytest.mark.parametrize("wanted", ["", "fast", "1/0", "-1", 0, -1.0, math.nan, math.inf, "nan", "inf", "1/2/3"])
+def test_what_is_no_value(wanted: float | str) -> None:
+    with pytest.raises(InputError, match="is not offered"):
+        SHUTTER.code(wanted)
+
+
+def test_bulb_and_auto_are_no_values() -> None:
+    assert SHUTTER.code("bulb", [0x0C, 0x10]) == 0x0C
+    assert ISO.code("Auto") == 0
+    assert SHUTTER.label(0x0C) == "bulb"
+    with pytest.raises(ProtocolError, match="the camera reports shutter time bulb"):
+        SHUTTER.value(0x0C)
+    with pytest.raises(ProtocolError, match="turn its mode dial to M"):
+        APERTURE.value(0)
+    with pytest.raises(InputError, match="is not offered"):
+        SHUTTER.code("bulb", [0x10])
+
+
+def test_a_code_in_no_table_has_a_label_and_its_law() -> None:
+    assert SHUTTER.label(0xA9) == "code 0xa9"
+    with pytest.raises(ProtocolError, match="code 0xa9"):
+        SHUTTER.value(0xA9)
+    assert SHUTTER.exact(0x60) == 2.0**-5
+    assert APERTURE.exact(0x28) == 4
+    assert ISO.exact(0x58) == 400
+    for code in (-1, 0x100, 0xFFFFFFFF, 0):
+        with pytest.raises(ProtocolError, match="has no value"):
+            APERTURE.exact(code)
+
+
+def test_lists_read_well() -> None:
+    assert APERTURE.labels((0x25, 0x28, 0xF1)) == "3.5, 4, code 0xf1"
+    assert APERTURE.labels(()) == "nothing"

@@ -20,8 +20,7 @@ import numpy as np
 import pytest
 
 from drivers.display import fullscreen
-from drivers.display.displays import Display, choose_display, list_displays
-from drivers.display.fullscreen import FullScreen, identify_displays
+from drivers.display.fullscreen import Display, FullScreen, choose_display, identify_displays, list_displays
 from drivers.display.x11 import XScreen, is_dark
 from drivers.presenter import BLACK, WHITE, Colour
 from experiment.lights.illuminations import plan_illuminations

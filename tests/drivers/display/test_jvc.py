@@ -10,14 +10,15 @@ from hypothesis import strategies as st
 
 from drivers.display import jvc
 from drivers.display.jvc import JvcFlatField
-from drivers.links.memory import PeerLink
-from drivers.links.tcp import TcpLink
+from drivers.links.link import PeerLink
+from drivers.links.network import TcpLink
 from drivers.presenter import BLACK, WHITE, Colour
 from foundation.errors import DeviceError, DeviceRefused, LinkClosed, LinkTimeout, ProtocolError
 from sim.clock import SimulatedClock
 from sim.projectors.jvc import JvcPeer, serve_jvc
 from sim.projectors.screen import Screen
 from tests.contracts.presenter import Bench, PresenterContract
+from tests.drivers.script import Script
 
 ACKNOWLEDGED = b"\x06\x89\x01SS\n"
 
@@ -40,26 +41,6 @@ class TestOverTcp(PresenterContract):
             presenter.close()
 
 
-class Script:
-    """A cable that has one conversation by heart; heard and said alternate, and nothing may be left over."""
-
-    def __init__(self, *lines: bytes) -> None:
-        self.lines = list(lines)
-        self.closed = False
-
-    def write(self, data: bytes, timeout: float) -> None:
-        assert self.lines, f"nothing more was to be said, but {data!r} was"
-        assert data == self.lines.pop(0)
-
-    def read(self, limit: int, timeout: float) -> bytes:
-        if not self.lines:
-            raise LinkTimeout("the script has ended")
-        return self.lines.pop(0)
-
-    def close(self) -> None:
-        self.closed = True
-
-
 def colour(red: bytes, green: bytes, blue: bytes) -> list[bytes]:
     commands = (b"SSTP02", b"SSFR" + red, b"SSFG" + green, b"SSFB" + blue)
     return [line for command in commands for line in (b"!\x89\x01" + command + b"\n", ACKNOWLEDGED)]
@@ -73,7 +54,7 @@ def test_speaks_as_specified() -> None:
     presenter = JvcFlatField(lambda: script, clock=SimulatedClock())
     presenter.show(Colour(255, 128, 10))
     presenter.close()
-    assert script.lines == []
+    assert script.ended()
     assert script.closed
 
 
@@ -89,7 +70,7 @@ def test_an_answer_may_come_in_pieces() -> None:
         ((b"PJ_NG",), DeviceRefused, "another controller"),
         ((b"PJ_OK", b"PJREQ", b"PJNAK"), DeviceRefused, "password"),
         ((b"PJLINK 0\r",), ProtocolError, "answers b'PJLIN' in place of b'PJ_OK'"),
-        ((b"PJ_OK", b"PJREQ", b"PJACK", b"!\x89\x01SSTP02\n"), LinkTimeout, "does not acknowledge SSTP02 within 5 s"),
+        ((b"PJ_OK", b"PJREQ", b"PJACK", b"!\x89\x01SSTP02\n"), LinkTimeout, "within 5 s"),
         ((b"PJ_OK", b"PJREQ", b"PJACK", b"!\x89\x01SSTP02\n", b"\x06\x89\x01PW\n"), ProtocolError, "in place of"),
     ],
 )
@@ -107,6 +88,17 @@ def test_connects_again_when_the_projector_hung_up() -> None:
     peer.hang_up()
     presenter.show(Colour(9, 8, 7))
     assert screen.colour == Colour(9, 8, 7)
+
+
+@pytest.mark.parametrize("told", [1, 2, 3])
+def test_what_was_told_before_a_connection_was_lost_is_told_again(told: int) -> None:
+    black, grey = colour(b"0000", b"0000", b"0000"), colour(b"0009", b"0009", b"0009")
+    first = Script(b"PJ_OK", b"PJREQ", b"PJACK", *black, *grey[: 2 * told], None)
+    second = Script(b"PJ_OK", b"PJREQ", b"PJACK", *grey[2 * told :], *grey)
+    scripts = [first, second]
+    JvcFlatField(lambda: scripts.pop(0), clock=SimulatedClock()).show(Colour(9, 9, 9))
+    assert first.closed
+    assert second.ended()
 
 
 def test_a_projector_that_is_gone_is_told_and_may_come_back() -> None:

@@ -12,10 +12,17 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.display import lightcrafter_wire as wire
-from drivers.display.lightcrafter import PRODUCTS, VENDOR, LightCrafter, find_lightcrafter
-from drivers.display.lightcrafter_wire import LightCrafterCommand, LightCrafterReply, LightCrafterRequest
-from drivers.links.hid import HidDevice, open_hid
+from drivers.display import lightcrafter as wire
+from drivers.display.lightcrafter import (
+    PRODUCTS,
+    VENDOR,
+    LightCrafter,
+    LightCrafterCommand,
+    LightCrafterReply,
+    LightCrafterRequest,
+    find_lightcrafter,
+)
+from drivers.links.usb import HidDevice, open_hid
 from drivers.presenter import BLACK, WHITE, Colour
 from foundation.errors import DeviceError, DeviceRefused, InputError, LinkClosed, LinkTimeout, ProtocolError
 from sim.clock import SimulatedClock

@@ -14,7 +14,7 @@ from types import SimpleNamespace
 from typing import Any
 
 from drivers.camera import ExposureSettings
-from drivers.gphoto2_camera.settings import BodySetting, number_of
+from drivers.gphoto2_camera import BodySetting, number_of
 from foundation.clock import Clock
 from tests.contracts.camera import SeededFilm
 

@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 from drivers.camera import CameraIdentity, ExposureSettings, capture
-from drivers.gphoto2_camera.camera import Gphoto2Camera
+from drivers.gphoto2_camera import Gphoto2Camera
 from foundation.clock import SystemClock
 from foundation.errors import ConfigurationError, DeviceError, DeviceRefused, LinkError
 from tests.contracts.camera import SETTINGS, Bench, CameraContract, SeededFilm

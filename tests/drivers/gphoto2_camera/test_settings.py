@@ -14,10 +14,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from drivers import gphoto2_camera
 from drivers.camera import CameraIdentity, ExposureSettings, ReportsSupplies, Supplies, capture
-from drivers.gphoto2_camera import camera as gphoto2_camera
-from drivers.gphoto2_camera.camera import Gphoto2Camera
-from drivers.gphoto2_camera.settings import BodySetting, battery_level, is_same, label_of, number_of, plan
+from drivers.gphoto2_camera import BodySetting, Gphoto2Camera, battery_level, is_same, label_of, number_of, plan
 from foundation.errors import DeviceError, DeviceRefused
 from sim.clock import SimulatedClock
 from tests.contracts.camera import SETTINGS, Bench, CameraContract, SeededFilm
@@ -302,7 +301,7 @@ def test_what_is_left(monkeypatch: pytest.MonkeyPatch) -> None:
 VIRTUAL = """
 import io, json, sys
 from drivers.camera import ExposureSettings
-from drivers.gphoto2_camera.camera import Gphoto2Camera
+from drivers.gphoto2_camera import Gphoto2Camera
 from foundation.errors import DeviceError
 
 camera = Gphoto2Camera()

@@ -7,8 +7,8 @@ from collections.abc import Iterator
 
 import pytest
 
-from drivers.links.memory import PeerLink, memory_pair
-from drivers.links.tcp import LOOPBACK, TcpLink, TcpServer
+from drivers.links.link import PeerLink, memory_pair
+from drivers.links.network import LOOPBACK, TcpLink, TcpServer
 from foundation.errors import LinkClosed, LinkTimeout
 from tests.contracts.link import PATIENCE_S, Ends, LinkContract, read_exactly
 

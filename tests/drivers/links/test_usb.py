@@ -7,10 +7,10 @@ from importlib import resources
 import pytest
 import usb.core
 
-from drivers.links.pipes import Pipe, PipeStalled
+from drivers.links.link import Pipe, PipeStalled
 from drivers.links.usb import UDEV_RULE, UsbDevice, list_devices, open_usb
-from drivers.ptp.messages import PtpRequest
-from drivers.ptp.usb_transport import UsbTransport
+from drivers.ptp.transaction import PtpRequest
+from drivers.ptp.usb import UsbTransport
 from foundation.errors import DeviceRefused, InputError, LinkClosed, LinkTimeout
 from sim.buses.usb import SimulatedBus
 from sim.buses.usb_device import BULK_IN, PtpUsbDevice, Setup, UsbIdentity

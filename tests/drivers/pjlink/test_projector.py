@@ -1,6 +1,6 @@
 """The PJLink driver: conversations in the standard's bytes, the projector contract, and troubled cables.
 
-The conversations are written after PJLink 1.04, 2.00 and 2.10 (sections 4 and 5), not after the codec under test.
+The conversations are written after PJLink 1.04, 2.00 (sections 4 and 5), not after the codec under test.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator
 import pytest
 
 from drivers.links.link import Link
-from drivers.links.tcp import TcpLink
+from drivers.links.network import TcpLink
 from drivers.pjlink.projector import PjLinkProjector
 from drivers.pjlink.wire import Input, NoResolution, Resolution
 from drivers.projector import Fault, Lamp, Power, ProjectorIdentity, Severity
@@ -20,53 +20,16 @@ from sim.projectors.pjlink import PjLinkPeer, memory_link, serve_pjlink
 from sim.projectors.projector import ProjectorTraits, SimulatedProjector
 from tests.contracts.projector import Bench, ProjectorContract
 from tests.drivers.links.troubled_links import Deaf, Dribbling, DroppedAfter, Garbling, Slow
+from tests.drivers.script import Script
 
 PASSWORD = "JBMIAProjectorLink"
 DIGEST = b"5d8409bc1c3fa39749434aa3a5c38682"
-# PJLink 2.10, 5.1: the controller's random number, and the digest for the projector's CHALLENGE.
-NONCE = b"c14b279e603d8a5f17e849ba360f2dc5"
-CHALLENGE = b"PJLINK 2 3db25e10f69c47a85adb24cf361897e0\r"
-SHA256 = b"70ab129eac6924d4c129c9c4fcf45be42e1e776325a66db67e5b6eee50f2a692"
 
 
-class Script:
-    """A cable that has one conversation by heart and objects to a byte too many or too few.
-
-    `lines` alternates what the projector says and what it must hear; None hangs up. Unheard answers are an error, too:
-    see `ended`.
-    """
-
-    def __init__(self, *lines: bytes | None) -> None:
-        self._lines = list(lines)
-        self.closed = False
-
-    def write(self, data: bytes, timeout: float) -> None:
-        if self._lines and self._lines[0] is None:
-            raise LinkClosed("the script hangs up")
-        assert self._lines, f"nothing more was to be said, but {data!r} was"
-        assert data == self._lines.pop(0)
-
-    def read(self, limit: int, timeout: float) -> bytes:
-        if not self._lines:
-            raise LinkTimeout("the script has ended")
-        line = self._lines.pop(0)
-        if line is None:
-            raise LinkClosed("the script hangs up")
-        return line
-
-    def close(self) -> None:
-        self.closed = True
-
-    def ended(self) -> bool:
-        return not self._lines
-
-
-def driver(*scripts: Script, password: str | None = None, sha256: bool = False) -> PjLinkProjector:
+def driver(*scripts: Script, password: str | None = None) -> PjLinkProjector:
     """Return the driver on one script after another; a connection too many is an error."""
     waiting = list(scripts)
-    return PjLinkProjector(
-        lambda: waiting.pop(0), password, sha256=sha256, nonce=lambda: bytes.fromhex(NONCE.decode("ascii"))
-    )
+    return PjLinkProjector(lambda: waiting.pop(0), password)
 
 
 def test_power_without_password() -> None:
@@ -220,48 +183,6 @@ def test_a_set_command_must_be_answered_by_ok() -> None:
         driver(Script(b"PJLINK 0\r", b"%1POWR 1\r", b"%1POWR=1\r")).switch_on()
 
 
-def test_inputs_of_class_1_have_no_names() -> None:
-    script = Script(
-        b"PJLINK 0\r",
-        b"%1CLSS ?\r", b"%1CLSS=1\r",
-        b"%1INST ?\r", b"%1INST=11 12 21 31\r",
-        b"%1INPT ?\r", b"%1INPT=31\r",
-        b"%1INPT 11\r", b"%1INPT=OK\r",
-    )  # fmt: skip
-    projector = driver(script)
-    assert projector.inputs() == (Input("11"), Input("12"), Input("21"), Input("31"))
-    assert projector.input() == Input("31")
-    projector.select_input("11")
-    assert script.ended()
-
-
-def test_inputs_of_class_2_have_names_where_the_projector_gives_them() -> None:
-    script = Script(
-        b"PJLINK 0\r",
-        b"%1CLSS ?\r", b"%1CLSS=2\r",
-        b"%2INST ?\r", b"%2INST=11 31 3A 61\r",
-        b"%2INNM ?11\r", b"%2INNM=Computer\r",
-        b"%2INNM ?31\r", "%2INNM=Anschlu\u00df 1\r".encode(),
-        b"%2INNM ?3A\r", b"%2INNM=ERR3\r",
-        b"%2INNM ?61\r", b"%2INNM=\r",
-        b"%2INPT ?\r", b"%2INPT=3a\r",
-        b"%2INNM ?3A\r", b"%2INNM=HDBaseT\r",
-        b"%2INPT 61\r", b"%2INPT=OK\r",
-        b"%1INPT 31\r", b"%1INPT=OK\r",
-    )  # fmt: skip
-    projector = driver(script)
-    assert projector.inputs() == (Input("11", "Computer"), Input("31", "Anschlu\u00df 1"), Input("3A"), Input("61"))
-    assert projector.input() == Input("3A", "HDBaseT")
-    projector.select_input("61")
-    projector.select_input("31")
-    assert script.ended()
-
-
-def test_an_input_that_cannot_be_is_our_mistake() -> None:
-    with pytest.raises(ValueError, match="is no PJLink input"):
-        driver().select_input("HDMI")
-
-
 def test_what_class_2_tells() -> None:
     script = Script(
         b"PJLINK 0\r",
@@ -269,31 +190,24 @@ def test_what_class_2_tells() -> None:
         b"%2IRES ?\r", b"%2IRES=1920x1080\r",
         b"%2IRES ?\r", b"%2IRES=-\r",
         b"%2IRES ?\r", b"%2IRES=*\r",
-        b"%2RRES ?\r", b"%2RRES=1920x1200\r",
         b"%2FREZ ?\r", b"%2FREZ=1\r",
-        b"%2FREZ 0\r", b"%2FREZ=OK\r",
-        b"%2SNUM ?\r", b"%2SNUM=X5A 0012\r",
-        b"%2SVER ?\r", b"%2SVER=1.03\r",
-        b"%2FILT ?\r", b"%2FILT=300\r",
-        b"%2FILT ?\r", b"%2FILT=ERR1\r",
-        b"%2RLMP ?\r", b"%2RLMP=ELPLP96 ELPLP97\r",
-        b"%2RFIL ?\r", b"%2RFIL=ERR1\r",
-        b"%1INFO ?\r", b"%1INFO=\r",
     )  # fmt: skip
     projector = driver(script)
     assert projector.input_resolution() == Resolution(1920, 1080)
     assert projector.input_resolution() is NoResolution.NO_SIGNAL
     assert projector.input_resolution() is NoResolution.UNKNOWN_SIGNAL
-    assert projector.recommended_resolution() == Resolution(1920, 1200)
     assert projector.frozen()
-    projector.set_frozen(False)
-    assert projector.serial_number() == "X5A 0012"
-    assert projector.software_version() == "1.03"
-    assert projector.filter_hours() == 300
-    assert projector.filter_hours() is None
-    assert projector.lamp_models() == ("ELPLP96", "ELPLP97")
-    assert projector.filter_models() == ()
-    assert projector.other_information() == ""
+    assert script.ended()
+
+
+@pytest.mark.parametrize(("level", "code", "meant"), [(b"1", b"31", "31"), (b"2", b"3a", "3A")])
+def test_the_input_is_asked_for_in_the_projectors_class(level: bytes, code: bytes, meant: str) -> None:
+    script = Script(
+        b"PJLINK 0\r",
+        b"%1CLSS ?\r", b"%1CLSS=" + level + b"\r",
+        b"%" + level + b"INPT ?\r", b"%" + level + b"INPT=" + code + b"\r",
+    )  # fmt: skip
+    assert driver(script).input() == Input(meant)
     assert script.ended()
 
 
@@ -308,10 +222,6 @@ def test_a_class_2_projector_that_does_not_know_a_question_cannot_tell(code: byt
         b"%1CLSS ?\r", b"%1CLSS=2\r",
         b"%2FREZ ?\r", b"%2FREZ=" + code + b"\r",
         b"%2IRES ?\r", b"%2IRES=" + code + b"\r",
-        b"%2RRES ?\r", b"%2RRES=" + code + b"\r",
-        b"%2SNUM ?\r", b"%2SNUM=" + code + b"\r",
-        b"%2SVER ?\r", b"%2SVER=" + code + b"\r",
-        b"%2FILT ?\r", b"%2FILT=" + code + b"\r",
         b"%1AVMT ?\r", b"%1AVMT=" + code + b"\r",
         b"%1LAMP ?\r", b"%1LAMP=" + code + b"\r",
         b"%1ERST ?\r", b"%1ERST=" + code + b"\r",
@@ -323,10 +233,6 @@ def test_a_class_2_projector_that_does_not_know_a_question_cannot_tell(code: byt
         assert projector.picture_fault() is None
     assert projector.frozen() is None
     assert projector.input_resolution() is None
-    assert projector.recommended_resolution() is None
-    assert projector.serial_number() == ""
-    assert projector.software_version() == ""
-    assert projector.filter_hours() is None
     assert projector.muted() is None
     assert projector.lamps() == ()
     assert projector.faults() == ()
@@ -381,30 +287,16 @@ def test_a_wrong_password_is_no_ignorance() -> None:
         driver(script, password=PASSWORD).picture_fault()
 
 
-def test_a_command_that_the_projector_does_not_know_is_refused() -> None:
-    projector = class_2(b"%2FREZ 0\r", b"%2FREZ=ERR1\r", b"%2FREZ ?\r", b"%2FREZ=0\r")
-    with pytest.raises(DeviceRefused, match="ERR1 to FREZ 0: it does not know this command"):
-        projector.set_frozen(False)
-    assert projector.frozen() is False
-
-
 @pytest.mark.parametrize("answer", [b"%1CLSS=1\r", b"%1CLSS=ERR1\r"])
 def test_class_1_is_never_asked_what_class_2_knows(answer: bytes) -> None:
     script = Script(b"PJLINK 0\r", b"%1CLSS ?\r", answer)
     projector = driver(script)
     for ask in (
         projector.input_resolution,
-        projector.recommended_resolution,
         projector.frozen,
-        projector.serial_number,
-        projector.software_version,
-        projector.filter_hours,
-        projector.lamp_models,
     ):
         with pytest.raises(DeviceRefused, match="speaks PJLink class 1"):
             ask()
-    with pytest.raises(DeviceRefused, match="speaks PJLink class 1"):
-        projector.select_input("3A")
     assert projector.pjlink_class() == 1
     assert script.ended()
 
@@ -422,45 +314,6 @@ def test_a_notice_of_start_inside_the_connection_answers_nothing() -> None:
     assert script.ended()
 
 
-def test_sha256_proves_the_password_once() -> None:
-    script = Script(
-        b"PJLINK 1 498e4a67\r", b"PJLINK 2\r", CHALLENGE,
-        NONCE + SHA256 + b"%1POWR ?\r", b"%1POWR=1\r",
-        b"%1ERST ?\r", b"%1ERST=000000\r",
-    )  # fmt: skip
-    projector = driver(script, password=PASSWORD, sha256=True)
-    assert projector.power() is Power.ON
-    assert projector.faults() == ()
-    assert script.ended()
-
-
-@pytest.mark.parametrize("answer", [b"PJLINK ERRA\r", b"%1POWR=ERR1\r", None, "silence"])
-def test_who_knows_no_sha256_is_met_again_with_md5_and_for_good(answer: bytes | str | None) -> None:
-    first = Script(b"PJLINK 1 498e4a67\r", b"PJLINK 2\r", *([] if isinstance(answer, str) else [answer]))
-    second = Script(b"PJLINK 1 498e4a67\r", DIGEST + b"%1POWR ?\r", b"%1POWR=1\r", None)
-    third = Script(b"PJLINK 1 498e4a67\r", DIGEST + b"%1POWR ?\r", b"%1POWR=1\r")
-    projector = driver(first, second, third, password=PASSWORD, sha256=True)
-    assert projector.power() is Power.ON
-    assert projector.power() is Power.ON
-    assert first.closed
-    assert third.ended()
-
-
-def test_sha256_is_not_offered_where_no_password_is_wanted() -> None:
-    script = Script(b"PJLINK 0\r", b"%1POWR ?\r", b"%1POWR=1\r")
-    assert driver(script, password=PASSWORD, sha256=True).power() is Power.ON
-    assert script.ended()
-
-
-def test_a_wrong_password_by_sha256_is_refused_in_words() -> None:
-    script = Script(
-        b"PJLINK 1 498e4a67\r", b"PJLINK 2\r", CHALLENGE, NONCE + SHA256 + b"%1POWR ?\r", b"PJLINK ERRA\r"
-    )  # fmt: skip
-    with pytest.raises(DeviceRefused, match="refuses the password"):
-        driver(script, password=PASSWORD, sha256=True).power()
-    assert script.closed
-
-
 def test_another_service_at_that_port_is_named() -> None:
     with pytest.raises(ProtocolError, match=r"SSH-2\.0"):
         driver(Script(b"SSH-2.0-OpenSSH_9.2\r\n")).power()
@@ -474,7 +327,7 @@ def test_an_answer_that_never_ends_is_a_timeout() -> None:
             clock.sleep(1.0)
             return b"P"
 
-    with pytest.raises(LinkTimeout, match="not finished its answer"):
+    with pytest.raises(LinkTimeout, match="within 5 s"):
         PjLinkProjector(lambda: Endless(b""), timeout=5.0, clock=clock).power()
 
 
@@ -482,13 +335,12 @@ def simulated_bench(
     connect: Callable[[SimulatedProjector], Callable[[], Link]],
     password: str | None = None,
     traits: ProjectorTraits | None = None,
-    sha256: bool = False,
 ) -> Bench:
     """Return the driver on a simulated projector behind `connect`."""
     clock = SimulatedClock()
     device = SimulatedProjector(clock, traits=traits)
     return Bench(
-        PjLinkProjector(connect(device), password, sha256=sha256),
+        PjLinkProjector(connect(device), password),
         clock.sleep,
         device.break_part,
         device.repair,
@@ -502,25 +354,6 @@ class TestOverMemory(ProjectorContract):
     @pytest.fixture(params=[None, PASSWORD], ids=["open", "password"])
     def bench(self, request: pytest.FixtureRequest) -> Bench:
         return simulated_bench(lambda device: lambda: memory_link(PjLinkPeer(device, request.param)), request.param)
-
-
-class TestSha256(ProjectorContract):
-    @pytest.fixture(params=[True, False], ids=["known", "unknown"])
-    def bench(self, request: pytest.FixtureRequest) -> Bench:
-        return simulated_bench(
-            lambda device: lambda: memory_link(PjLinkPeer(device, PASSWORD)),
-            PASSWORD,
-            ProjectorTraits(sha256=request.param),
-            sha256=True,
-        )
-
-
-class TestClass1(ProjectorContract):
-    @pytest.fixture
-    def bench(self) -> Bench:
-        return simulated_bench(
-            lambda device: lambda: memory_link(PjLinkPeer(device)), traits=ProjectorTraits(pjlink_class=1)
-        )
 
 
 class TestOverLoopback(ProjectorContract):
@@ -590,7 +423,7 @@ def test_an_answer_that_comes_too_late_is_a_timeout() -> None:
     clock = SimulatedClock()
     peer = PjLinkPeer(SimulatedProjector(SimulatedClock()))
     projector = PjLinkProjector(lambda: Slow(memory_link(peer), clock, 6.0), clock=clock)
-    with pytest.raises(LinkTimeout, match="6 s"):
+    with pytest.raises(LinkTimeout, match="within 5 s"):
         projector.power()
 
 
@@ -614,34 +447,13 @@ class TestClass2:
             yield projector, device
             projector.close()
 
-    def test_inputs(self, lit: tuple[PjLinkProjector, SimulatedProjector]) -> None:
-        projector, device = lit
-        assert projector.inputs() == device.traits.inputs
-        for source in device.traits.inputs:
-            projector.select_input(source.code)
-            assert projector.input() == source
-        with pytest.raises(DeviceRefused, match="does not offer this value"):
-            projector.select_input("59")
-
     def test_resolution_and_freeze(self, lit: tuple[PjLinkProjector, SimulatedProjector]) -> None:
         projector, device = lit
-        assert projector.input_resolution() == projector.recommended_resolution() == device.traits.panel
+        assert projector.input_resolution() == device.traits.panel
         device.signal = NoResolution.NO_SIGNAL
         assert projector.input_resolution() is NoResolution.NO_SIGNAL
         device.set_frozen(True)
         assert projector.frozen()
-        projector.set_frozen(False)
-        assert not device.frozen()
-
-    def test_names_and_hours(self, lit: tuple[PjLinkProjector, SimulatedProjector]) -> None:
-        projector, _ = lit
-        assert projector.pjlink_class() == 2
-        assert projector.serial_number() == "SIM0000001"
-        assert projector.software_version() == "1.00"
-        assert projector.filter_hours() == 45
-        assert projector.lamp_models() == ("LAMP-1",)
-        assert projector.filter_models() == ("FILTER-1",)
-        assert projector.other_information() == "simulated"
 
 
 def test_a_garbled_answer_is_told_and_the_next_connection_is_clean() -> None:
@@ -663,7 +475,7 @@ def test_a_swallowed_answer_is_told_and_the_next_connection_is_clean() -> None:
         return made[-1]
 
     projector = PjLinkProjector(connect)
-    with pytest.raises(LinkTimeout, match="on purpose"):
+    with pytest.raises(LinkTimeout, match="within 5 s"):
         projector.switch_on()
     # The command itself went through; the driver does not hide that it cannot know.
     assert projector.power() is Power.WARMING
@@ -677,17 +489,6 @@ def test_a_restarted_server_goes_unnoticed() -> None:
         server.hang_up()
         assert projector.power() is Power.STANDBY
         projector.close()
-
-
-@pytest.mark.parametrize("knows_sha256", [True, False])
-@pytest.mark.parametrize("offered", [True, False])
-def test_a_wrong_password_over_memory(knows_sha256: bool, offered: bool) -> None:
-    peer = PjLinkPeer(
-        SimulatedProjector(SimulatedClock(), traits=ProjectorTraits(sha256=knows_sha256)), PASSWORD
-    )  # fmt: skip
-    projector = PjLinkProjector(lambda: memory_link(peer), "guess", sha256=offered)
-    with pytest.raises(DeviceRefused, match="refuses the password"):
-        projector.power()
 
 
 def test_a_connection_left_idle_over_loopback_is_replaced_silently() -> None:
@@ -710,17 +511,10 @@ def test_a_connection_left_idle_over_loopback_is_replaced_silently() -> None:
         projector.close()
 
 
-def test_a_wrong_password_over_loopback() -> None:
-    with serve_pjlink(SimulatedProjector(SimulatedClock()), password=PASSWORD) as server:
-        projector = PjLinkProjector(lambda: TcpLink.connect(*server.address, 10.0), "guess", 10.0)
-        with pytest.raises(DeviceRefused, match="refuses the password"):
-            projector.power()
-
-
 def test_what_is_logged_has_neither_password_nor_digest(caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level("DEBUG")
     script = Script(b"PJLINK 1 498e4a67\r", DIGEST + b"%1POWR ?\r", b"%1POWR=1\r")
     assert driver(script, password=PASSWORD).power() is Power.ON
-    assert "POWR ?: " in caplog.text
+    assert "%1POWR ?" in caplog.text
     assert PASSWORD not in caplog.text
     assert DIGEST.decode("ascii") not in caplog.text

@@ -10,8 +10,6 @@ from drivers.pjlink import wire
 from drivers.pjlink.wire import (
     ErrorCode,
     Greeting,
-    Input,
-    InputKind,
     LineCutter,
     NoResolution,
     PjLinkReply,
@@ -42,13 +40,9 @@ def test_sha256_digest_is_the_standards_example() -> None:
 
 
 def test_the_offer_of_sha256_is_the_standards_bytes() -> None:
-    assert wire.encode_security_question() == b"PJLINK 2\r"
     assert wire.is_security_question(b"pjlink 2")
     assert not wire.is_security_question(b"PJLINK 1")
     assert wire.encode_challenge(CHALLENGE) == b"PJLINK 2 3db25e10f69c47a85adb24cf361897e0\r"
-    assert wire.parse_challenge(b"pjlink 2 3DB25E10F69C47A85ADB24CF361897E0") == CHALLENGE
-    for other in (b"PJLINK ERRA", b"PJLINK 2", b"PJLINK 2 3db2", b"%1POWR=ERR1", b"\xff"):
-        assert wire.parse_challenge(other) is None
 
 
 @pytest.mark.parametrize(
@@ -146,20 +140,14 @@ def test_values_of_the_standard() -> None:
 def test_values_of_class_2() -> None:
     # PJLink 2.00, 4.4, 4.9, 4.14 and 4.18 to 4.26.
     assert [wire.parse_input(code) for code in ("11", "59", "3A", "6z")] == ["11", "59", "3A", "6Z"]
-    assert Input("3A").kind is InputKind.DIGITAL
-    assert Input("61").kind is InputKind.INTERNAL
-    assert wire.parse_inputs("11 31 3A 6Z") == ("11", "31", "3A", "6Z")
-    assert wire.parse_inputs("") == ()
     assert [wire.is_class_1_input(code) for code in ("11", "59", "3A", "61", "10")] == [True, True, False, False, False]
     assert wire.parse_input_resolution("1920x1080") == Resolution(1920, 1080)
     assert wire.parse_input_resolution("1024X768") == Resolution(1024, 768)
     assert wire.parse_input_resolution("-") is NoResolution.NO_SIGNAL
     assert wire.parse_input_resolution("*") is NoResolution.UNKNOWN_SIGNAL
     assert wire.parse_resolution("4096x2160") == Resolution(4096, 2160)
-    assert wire.parse_hours("99999") == 99999
     assert [wire.parse_freeze(digit) for digit in "01"] == [False, True]
     assert [wire.parse_class(digit) for digit in "12"] == [1, 2]
-    assert wire.parse_models("ELPLP96 ELPLP97") == ("ELPLP96", "ELPLP97")
 
 
 @pytest.mark.parametrize(
@@ -168,14 +156,11 @@ def test_values_of_class_2() -> None:
         (wire.parse_input, "71"),
         (wire.parse_input, "30"),
         (wire.parse_input, "3"),
-        (wire.parse_inputs, "11 3"),
         (wire.parse_input_resolution, "1920"),
         (wire.parse_input_resolution, ""),
         (wire.parse_resolution, "-"),
         (wire.parse_resolution, "1920x1080p"),
         (wire.parse_resolution, "٣x٣"),
-        (wire.parse_hours, "-1"),
-        (wire.parse_hours, ""),
         (wire.parse_freeze, "2"),
         (wire.parse_class, "0"),
         (wire.parse_class, "²"),

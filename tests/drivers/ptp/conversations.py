@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TypedDict
 
 from drivers.ptp.codes import AeMode, DriveMode, Operation, Property
-from drivers.ptp.messages import PtpRequest
+from drivers.ptp.transaction import PtpRequest
 from sim.camera.eos import SimulatedEos
 from sim.camera.eos_bodies import EOS_550D
 from sim.clock import SimulatedClock

@@ -7,9 +7,11 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from drivers.canon import datasets, values
 from drivers.canon import records as canon
-from drivers.ptp import container, ptpip
+from drivers.canon import records as datasets
+from drivers.canon import records as values
+from drivers.ptp import ip as ptpip
+from drivers.ptp import usb as container
 from drivers.ptp.datasets import DeviceInfo, DevicePropDesc, ObjectInfo, StorageInfo, decode_u32_array, decode_value
 
 # ISO 15740, 5.5.1: version 1.00, vendor 0xb "ab", two operations, one event, no properties, one capture format,

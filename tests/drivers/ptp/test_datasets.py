@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from drivers.ptp import datasets
@@ -174,26 +174,6 @@ def test_more_than_the_bound_is_refused_unread() -> None:
         datasets.decode_u32_array(bytes(datasets.MAX_DATASET + 1))
 
 
-@given(st.builds(DeviceInfo, U16, U32, U16, TEXT, U16, CODES, CODES, CODES, CODES, CODES, TEXT, TEXT, TEXT, TEXT))
-def test_any_device_comes_back(info: DeviceInfo) -> None:
-    assert DeviceInfo.decode(info.encode()) == info
-
-
-@given(st.builds(StorageInfo, U16, U16, U16, U64, U64, U32, TEXT, TEXT, st.binary(max_size=8)))
-def test_any_store_comes_back(info: StorageInfo) -> None:
-    assert StorageInfo.decode(info.encode()) == info
-
-
-@given(
-    st.builds(
-        ObjectInfo,
-        *(U32, U16, U16, U32, U16, U32, U32, U32, U32, U32, U32, U32, U16, U32, U32, TEXT, TEXT, TEXT, TEXT),
-    )
-)
-def test_any_object_comes_back(info: ObjectInfo) -> None:
-    assert ObjectInfo.decode(info.encode()) == info
-
-
 def _integers(size: int, signed: bool) -> st.SearchStrategy[Value]:
     bits = 8 * size
     return st.integers(-(1 << bits - 1), (1 << bits - 1) - 1) if signed else st.integers(0, (1 << bits) - 1)
@@ -220,9 +200,21 @@ def _properties(draw: st.DrawFn) -> DevicePropDesc:
     return DevicePropDesc(draw(U16), data_type, draw(st.booleans()), draw(values), draw(values), draw(forms))
 
 
-@given(_properties())
-def test_any_property_comes_back(described: DevicePropDesc) -> None:
-    assert DevicePropDesc.decode(described.encode()) == described
+DATASETS = st.one_of(
+    st.builds(DeviceInfo, U16, U32, U16, TEXT, U16, CODES, CODES, CODES, CODES, CODES, TEXT, TEXT, TEXT, TEXT),
+    st.builds(StorageInfo, U16, U16, U16, U64, U64, U32, TEXT, TEXT, st.binary(max_size=8)),
+    st.builds(
+        ObjectInfo,
+        *(U32, U16, U16, U32, U16, U32, U32, U32, U32, U32, U32, U32, U16, U32, U32, TEXT, TEXT, TEXT, TEXT),
+    ),
+    _properties(),
+)
+
+
+@settings(max_examples=400)
+@given(DATASETS)
+def test_any_dataset_comes_back(dataset: DeviceInfo | StorageInfo | ObjectInfo | DevicePropDesc) -> None:
+    assert type(dataset).decode(dataset.encode()) == dataset
 
 
 @given(st.lists(U32, max_size=50).map(tuple))

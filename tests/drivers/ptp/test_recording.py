@@ -10,14 +10,11 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from drivers.canon import records as canon
-from drivers.canon import values
+from drivers.canon import records as values
 from drivers.canon.apex import APERTURE, ISO
-from drivers.canon.datasets import DeviceInfoEx
-from drivers.canon.records import AvailableValues, Notice, PropertyChanged
-from drivers.canon.values import ImageFormat, PropertySetting
-from drivers.ptp import container
+from drivers.canon.records import AvailableValues, DeviceInfoEx, ImageFormat, Notice, PropertyChanged, PropertySetting
+from drivers.ptp import usb as container
 from drivers.ptp.codes import Operation, Property
-from drivers.ptp.container import ContainerReader, DataPiece, DataStart
 from drivers.ptp.datasets import (
     DeviceInfo,
     DevicePropDesc,
@@ -26,8 +23,9 @@ from drivers.ptp.datasets import (
     decode_u32_array,
     encode_u32_array,
 )
-from drivers.ptp.messages import PtpRequest, PtpResponse
-from drivers.ptp.ptpip import EndData, OperationRequest, PacketCutter, StartData, encode
+from drivers.ptp.ip import EndData, OperationRequest, PacketCutter, StartData, encode
+from drivers.ptp.transaction import PtpRequest, PtpResponse
+from drivers.ptp.usb import ContainerReader, DataPiece, DataStart
 from tests.drivers.ptp.conversations import EOS_60D_PROPERTIES, Recorded
 
 REBUILT: dict[int, Callable[[bytes], bytes]] = {

@@ -7,9 +7,8 @@ from collections.abc import Callable
 import pytest
 
 from drivers.ptp.codes import Operation, ResponseCode
-from drivers.ptp.messages import LAST_TRANSACTION, PtpEvent, PtpRequest, PtpResponse
 from drivers.ptp.session import OPEN_TRIES, PASSING_LIMIT_S, OperationDeclined, PtpSession
-from drivers.ptp.transport import Transaction
+from drivers.ptp.transaction import LAST_TRANSACTION, PtpEvent, PtpRequest, PtpResponse, Transaction
 from foundation.errors import DeviceRefused, LinkClosed, LinkTimeout, ProtocolError
 from sim.clock import SimulatedClock
 

@@ -14,12 +14,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from drivers.links.exchange import MAX_MESSAGE
 from drivers.links.link import Link
 from drivers.projector import Fault, Lamp, Power, Projector, ProjectorIdentity, Severity
 from drivers.serial_projectors import LANGUAGES, benq, epson, language, nec, optoma
 from drivers.serial_projectors.benq import BenqProjector
-from drivers.serial_projectors.epson import EpsonProjector
-from drivers.serial_projectors.exchange import MAX_MESSAGE
+from drivers.serial_projectors.driver import take_line
+from drivers.serial_projectors.epson import EpsonOnNetwork, EpsonProjector
 from drivers.serial_projectors.nec import NecProjector
 from drivers.serial_projectors.optoma import OptomaProjector
 from foundation.errors import (
@@ -117,7 +118,7 @@ class TestOverTheNetwork(ProjectorContract):
             silent = BenqPeer(device, network=True)
             return bench_of("benq", device, BenqProjector(lambda: SerialPeerLink(silent)), lambda: None)
         greeting = EpsonPeer(device, network=True)
-        projector = EpsonProjector(lambda: SerialPeerLink(greeting), clock=device.clock, network=True)
+        projector = EpsonOnNetwork(lambda: SerialPeerLink(greeting), clock=device.clock)
         return bench_of("epson", device, projector, lambda: None)
 
 
@@ -309,17 +310,17 @@ WELCOME = b"ESC/VP.net\x10\x03\x00\x00\x20\x00"
 
 def test_epson_network_handshake() -> None:
     script = Script((b"ESC/VP.net\x10\x03\x00\x00\x00\x00", (WELCOME[:7], WELCOME[7:])), (b"PWR?\r", b"PWR=01\r:"))
-    assert EpsonProjector(lambda: script, network=True).power() is Power.ON
+    assert EpsonOnNetwork(lambda: script).power() is Power.ON
     assert script.ended()
 
 
 def test_epson_network_refusals_say_why() -> None:
     script = Script((b"ESC/VP.net\x10\x03\x00\x00\x00\x00", WELCOME[:14] + b"\x41\x00"))
     with pytest.raises(DeviceRefused, match="password"):
-        EpsonProjector(lambda: script, network=True).power()
+        EpsonOnNetwork(lambda: script).power()
     script = Script((b"ESC/VP.net\x10\x03\x00\x00\x00\x00", b"PJLINK 0\r"))
     with pytest.raises(ProtocolError, match="check the port"):
-        EpsonProjector(lambda: script, network=True).power()
+        EpsonOnNetwork(lambda: script).power()
 
 
 def test_a_network_that_always_hangs_up_is_not_tried_for_ever() -> None:
@@ -330,7 +331,7 @@ def test_a_network_that_always_hangs_up_is_not_tried_for_ever() -> None:
         return opened[-1]
 
     with pytest.raises(LinkClosed):
-        EpsonProjector(connect, network=True).power()
+        EpsonOnNetwork(connect).power()
     assert len(opened) == 1
 
 
@@ -632,8 +633,7 @@ TAKERS: list[Callable[[bytes], tuple[Any, int] | None]] = [
     optoma.take_message,
 ]
 COMMAND_TAKERS: list[Callable[[bytes], tuple[Any, int] | None]] = [
-    benq.take_command,
-    epson.take_command,
+    take_line,
     nec.take_command,
     optoma.take_command,
 ]

@@ -23,7 +23,7 @@ from evaluation.scene import Scene, SceneSet
 from foundation.clock import SystemClock
 from foundation.errors import InputError
 from foundation.files import partial_path
-from foundation.trust.held_folders import held_folder
+from foundation.held_folders import held_folder
 from tests.evaluation.made_up import MixedWall, Wall, as_set, walls
 
 pytestmark = pytest.mark.slow

@@ -24,8 +24,8 @@ from experiment.lights.illuminations import (
     uniform_lights,
 )
 from experiment.lights.plots import plot_illuminations
+from foundation.colorimetry import decode_srgb
 from foundation.errors import FormatError, InputError
-from foundation.srgb import decode_srgb
 
 HEADER = "index,kind,cct_k,red,green,blue\n"
 

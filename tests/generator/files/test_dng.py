@@ -15,8 +15,7 @@ import tifffile
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from drivers.raw.camera_matrix import camera_matrix
-from drivers.raw.rawfile import decode_raw
+from drivers.raw.rawfile import camera_matrix, decode_raw
 from foundation.errors import InputError
 from generator.files.formats import ImageMetadata, decode_image, encode_image
 

@@ -15,7 +15,7 @@ import numpy.typing as npt
 import pytest
 from scipy.stats import norm
 
-from foundation.angles import angles_deg
+from foundation.colorimetry import angles_deg
 from generator.kernels.mixing import mix_samples
 from generator.kernels.rendering import draw_samples
 from generator.lights.lighting import Lighting, Mixture, plain

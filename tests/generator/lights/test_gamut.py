@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from foundation.angles import angles_deg
+from foundation.colorimetry import angles_deg
 from foundation.errors import InputError
 from generator.lights.gamut import (
     TOLERANCE_DEG,

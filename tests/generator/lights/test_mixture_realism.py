@@ -15,7 +15,7 @@ from calibration.pipeline.build import build
 from calibration.table.lut import Lut, open_lut
 from drivers.presenter import Colour
 from experiment.lights.illuminations import Illumination
-from foundation.angles import angles_deg
+from foundation.colorimetry import angles_deg
 from generator.lights.gamut import Gamut
 from generator.lights.lighting import Mixture, plain
 from sim.world.room import Room

@@ -16,7 +16,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from foundation.angles import angles_deg
+from foundation.colorimetry import angles_deg
 from foundation.errors import FormatError
 from generator.files.formats import encode_map
 from generator.lights.lighting import Lighting, plain

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from foundation.srgb import decode_srgb
+from foundation.colorimetry import decode_srgb
 from generator.kernels.palette import channels_of
 
 Array = npt.NDArray[np.float64]

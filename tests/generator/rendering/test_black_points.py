@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from foundation.angles import angles_deg
+from foundation.colorimetry import angles_deg
 from foundation.errors import InputError, QualityError
 from generator.dataset.production.options import DatasetOptions
 from generator.dataset.production.photographing import photograph

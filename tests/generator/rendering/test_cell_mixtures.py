@@ -6,7 +6,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from foundation.angles import angles_deg
+from foundation.colorimetry import angles_deg
 from generator.rendering.cell_mixtures import (
     _AXES,  # pyright: ignore[reportPrivateUsage]  # what differences cost is no part of the result
     BRIGHTNESS_COST,

@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from foundation.angles import angles_deg
+from foundation.colorimetry import angles_deg
 from foundation.errors import InputError, QualityError
 from generator.lights.lighting import Lighting, Mixture, plain
 from generator.masks.request import parse_masks

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from drivers.raw.camera_matrix import camera_matrix as of_libraw
+from drivers.raw.rawfile import camera_matrix as of_libraw
 from foundation.errors import InputError
 from generator.rendering.matrices import camera_matrix, cameras, choose_matrix
 from sim.world.body_settings import FACTS

@@ -8,9 +8,8 @@ import pytest
 
 from drivers.links.usb import open_usb
 from drivers.ptp.codes import ResponseCode
-from drivers.ptp.messages import PtpEvent, PtpRequest
-from drivers.ptp.transport import Transport
-from drivers.ptp.usb_transport import UsbTransport
+from drivers.ptp.transaction import PtpEvent, PtpRequest, Transport
+from drivers.ptp.usb import UsbTransport
 from foundation.errors import LinkClosed, LinkTimeout, ProtocolError
 from sim.buses.faults import (
     Declining,

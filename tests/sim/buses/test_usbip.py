@@ -15,13 +15,11 @@ import usbip.host
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.links.memory import MemoryLink, memory_pair
-from drivers.links.pipes import Pipe, PipeStalled
-from drivers.links.tcp import TcpServer
-from drivers.ptp.container import ContainerReader, DataPiece, DataStart, encode
+from drivers.links.link import MemoryLink, Pipe, PipeStalled, memory_pair
+from drivers.links.network import TcpServer
 from drivers.ptp.datasets import DeviceInfo
-from drivers.ptp.messages import PtpRequest, PtpResponse
-from drivers.ptp.usb_transport import UsbTransport
+from drivers.ptp.transaction import PtpRequest, PtpResponse
+from drivers.ptp.usb import ContainerReader, DataPiece, DataStart, UsbTransport, encode
 from foundation.errors import LinkClosed, LinkTimeout, ProtocolError
 from sim.buses.usb_device import BULK_IN, BULK_OUT, INTERRUPT_IN, PtpUsbDevice, UsbIdentity
 from sim.buses.usbip import UsbIpService, serve_usbip

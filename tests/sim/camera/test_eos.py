@@ -17,18 +17,25 @@ from hypothesis import strategies as st
 from drivers.camera import ExposureSettings, capture
 from drivers.canon import apex
 from drivers.canon.camera import CanonEos
-from drivers.canon.datasets import DeviceInfoEx, decode_object_entries
 from drivers.canon.records import (
+    RAW_ONLY,
     AvailableFormats,
     AvailableValues,
+    DeviceInfoEx,
+    ImageFile,
+    ImageFormat,
     Notice,
     ObjectEvent,
     PropertyChanged,
+    PropertySetting,
     Record,
     TransferRequest,
     decode_events,
+    decode_object_entries,
+    number_of,
+    number_value,
+    text_value,
 )
-from drivers.canon.values import RAW_ONLY, ImageFile, ImageFormat, PropertySetting, number_of, number_value, text_value
 from drivers.ptp.codes import (
     AeMode,
     CaptureDestination,
@@ -49,7 +56,7 @@ from drivers.ptp.datasets import (
     decode_value,
     encode_string,
 )
-from drivers.ptp.messages import PtpRequest
+from drivers.ptp.transaction import PtpRequest
 from foundation.errors import DeviceRefused, LinkClosed
 from sim.buses.ptp_memory import MemoryTransport
 from sim.buses.responder import Answer

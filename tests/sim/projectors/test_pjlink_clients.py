@@ -18,7 +18,7 @@ import pytest
 from aiopjlink import PJClass
 from pypjlink.projector import ProjectorError
 
-from drivers.links.tcp import TcpServer
+from drivers.links.network import TcpServer
 from drivers.pjlink.wire import NoResolution
 from drivers.projector import Power, Severity
 from sim.clock import SimulatedClock

@@ -6,10 +6,9 @@ import hashlib
 
 import pytest
 
-from drivers.links.udp import UdpSocket
-from drivers.pjlink.notices import FaultsChanged, InputChanged, LinkUp, PowerChanged
-from drivers.pjlink.search import NoticePort, search
-from drivers.pjlink.wire import NoResolution
+from drivers.links.network import UdpSocket
+from drivers.pjlink.search import search
+from drivers.pjlink.wire import FaultsChanged, InputChanged, LinkUp, NoResolution, PowerChanged
 from drivers.projector import Fault, Power, Severity
 from foundation.errors import DeviceFault, LinkTimeout
 from sim.clock import SimulatedClock
@@ -17,6 +16,7 @@ from sim.projectors.pjlink import PjLinkPeer
 from sim.projectors.pjlink_notices import Announcer, ProjectorDatagrams
 from sim.projectors.projector import ProjectorTraits, SimulatedProjector
 from tests.contracts.projector import Bench, ProjectorContract
+from tests.drivers.pjlink.notice_port import NoticePort
 
 
 class TestSimulatedProjector(ProjectorContract):

@@ -17,12 +17,12 @@ if sys.platform == "win32":
 from benqprojector import BenQProjectorSerial
 from epson_projector import Projector
 
+from drivers.links.network import TcpLink
 from drivers.links.serial import SerialLink
-from drivers.links.tcp import TcpLink
 from drivers.projector import Power, Severity
 from drivers.serial_projectors import LANGUAGES
 from drivers.serial_projectors.benq import BenqProjector
-from drivers.serial_projectors.epson import EpsonProjector
+from drivers.serial_projectors.epson import EpsonOnNetwork, EpsonProjector
 from sim.buses.pty import PseudoTerminal
 from sim.buses.serial_cable import serve_network
 from sim.cli import main
@@ -136,7 +136,7 @@ def served(request: pytest.FixtureRequest, device: SimulatedProjector) -> Iterat
         def connect() -> TcpLink:
             return TcpLink.connect(*server.address, 10.0)
 
-        yield BenqProjector(connect) if request.param == "benq" else EpsonProjector(connect, network=True)
+        yield BenqProjector(connect) if request.param == "benq" else EpsonOnNetwork(connect)
 
 
 def test_serves_the_network_as_well(served: BenqProjector | EpsonProjector) -> None:

@@ -20,8 +20,8 @@ import numpy as np
 import numpy.typing as npt
 
 from evaluation.scene import Image, Scene, SceneSet
+from foundation.colorimetry import srgb_codes
 from foundation.errors import InputError
-from foundation.srgb import srgb_codes
 from generator.pictures.sources import SourcePicture
 from generator.rendering.matrices import ColourMatrix
 

@@ -18,7 +18,7 @@ from drivers.presenter import Colour
 from evaluation.datasets.generated import open_generated
 from evaluation.scene import SceneSet
 from experiment.lights.illuminations import Illumination
-from foundation.srgb import decode_srgb
+from foundation.colorimetry import decode_srgb
 from generator.dataset.making import DatasetOptions, generate_dataset
 from generator.lights.choices import LightChoice, ListedLights
 from generator.pictures.picture import UNPREPARED, Preparation

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from foundation.errors import FormatError, InputError
-from foundation.trust.held_folders import FolderLock, held_folder
+from foundation.held_folders import FolderLock, held_folder
 from generator.dataset.making import (
     DatasetOptions,
     Plan,

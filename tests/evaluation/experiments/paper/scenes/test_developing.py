@@ -10,8 +10,8 @@ import pytest
 
 from evaluation.experiments.paper.scenes.developing import DevelopedSource, develop, developed
 from evaluation.scene import SceneSet
+from foundation.colorimetry import decode_srgb, srgb_codes
 from foundation.errors import InputError
-from foundation.srgb import decode_srgb, srgb_codes
 from generator.rendering.matrices import camera_matrix
 
 

@@ -6,7 +6,7 @@ import pytest
 
 from foundation.console import run
 from foundation.errors import InputError, StorageError
-from foundation.trust.secret_texts import is_webhook, masked, masked_values, printable, target_label
+from foundation.secret_texts import is_webhook, masked, masked_values, printable, target_label
 
 
 @pytest.mark.parametrize(

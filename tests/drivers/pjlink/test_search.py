@@ -9,10 +9,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.links.udp import Address, UdpSocket
-from drivers.pjlink import notices
-from drivers.pjlink.notices import FaultsChanged, Found, InputChanged, LinkUp, PjLinkNotice, PowerChanged
-from drivers.pjlink.search import FoundProjector, NoticePort, search
+from drivers.links.network import Address, UdpSocket
+from drivers.pjlink import wire
+from drivers.pjlink.search import FoundProjector, search
+from drivers.pjlink.wire import FaultsChanged, Found, InputChanged, LinkUp, PjLinkNotice, PowerChanged
 from drivers.projector import Fault, Power, Severity
 from foundation.errors import LinkClosed, LinkTimeout
 from sim.clock import SimulatedClock
@@ -36,8 +36,8 @@ MAC = "00:11:22:aa:bb:cc"
     ],
 )
 def test_the_standards_datagrams(datagram: bytes, message: Found | PjLinkNotice) -> None:
-    assert notices.decode(datagram) == (message,)
-    assert notices.encode(message) == datagram
+    assert wire.decode_datagram(datagram) == (message,)
+    assert wire.encode_datagram(message) == datagram
 
 
 @pytest.mark.parametrize(
@@ -45,7 +45,7 @@ def test_the_standards_datagrams(datagram: bytes, message: Found | PjLinkNotice)
     [b"%2ackn=00:11:22:AA:BB:CC\r\n", b"%2ACKN=00:11:22:aa:bb:cc", b"\r%2ACKN=00:11:22:aa:bb:cc \r\0\0\0\0"],
 )
 def test_tolerates_case_line_ends_and_filling(datagram: bytes) -> None:
-    assert notices.decode(datagram) == (Found(MAC),)
+    assert wire.decode_datagram(datagram) == (Found(MAC),)
 
 
 @pytest.mark.parametrize(
@@ -69,27 +69,27 @@ def test_tolerates_case_line_ends_and_filling(datagram: bytes) -> None:
     ],
 )
 def test_what_is_none_of_ours_is_passed_over(datagram: bytes) -> None:
-    assert notices.decode(datagram) == ()
+    assert wire.decode_datagram(datagram) == ()
 
 
 def test_several_in_one_datagram_keep_their_order() -> None:
-    assert notices.decode(b"%2POWR=3\r%2what\r%2INPT=31\r") == (PowerChanged(Power.WARMING), InputChanged("31"))
+    assert wire.decode_datagram(b"%2POWR=3\r%2what\r%2INPT=31\r") == (PowerChanged(Power.WARMING), InputChanged("31"))
 
 
 def test_the_search_is_the_standards_bytes() -> None:
-    assert notices.SEARCH == b"%2SRCH\r"
-    assert all(notices.is_search(datagram) for datagram in (b"%2SRCH\r", b"%2srch\r\n", b"%2SRCH"))
-    assert not any(notices.is_search(datagram) for datagram in (b"", b"%1SRCH\r", b"%2ACKN=00:11:22:aa:bb:cc\r"))
+    assert wire.SEARCH == b"%2SRCH\r"
+    assert all(wire.is_search(datagram) for datagram in (b"%2SRCH\r", b"%2srch\r\n", b"%2SRCH"))
+    assert not any(wire.is_search(datagram) for datagram in (b"", b"%1SRCH\r", b"%2ACKN=00:11:22:aa:bb:cc\r"))
 
 
 @given(st.binary(max_size=300))
 def test_any_datagram_is_decoded_without_complaint(datagram: bytes) -> None:
-    assert len(notices.decode(datagram)) <= len(datagram)
+    assert len(wire.decode_datagram(datagram)) <= len(datagram)
 
 
 @given(st.lists(st.sampled_from((Found(MAC), LinkUp(MAC), PowerChanged(Power.ON), InputChanged("6Z"))), max_size=6))
 def test_messages_come_back(messages: list[Found | PjLinkNotice]) -> None:
-    assert notices.decode(b"".join(map(notices.encode, messages))) == tuple(messages)
+    assert wire.decode_datagram(b"".join(map(wire.encode_datagram, messages))) == tuple(messages)
 
 
 class PaperNetwork:
@@ -173,29 +173,6 @@ def test_junk_without_end_does_not_prolong_the_search() -> None:
 def test_a_taken_port_is_told_with_its_remedy() -> None:
     with UdpSocket(host="127.0.0.1") as taken, pytest.raises(LinkClosed, match="end the other program"):
         search(listen_port=taken.address[1])
-
-
-def test_notices_arrive_in_order_past_everything_else() -> None:
-    with NoticePort(0, "127.0.0.1") as controller, UdpSocket(host="127.0.0.1") as projector:
-        for datagram in (
-            b"noise",
-            b"%2ACKN=00:11:22:aa:bb:cc\r",
-            b"%2POWR=3\r%2INPT=31\r",
-            b"%2LKUP=00:11:22:aa:bb:cc\r",
-        ):
-            projector.send(datagram, controller.address)
-        assert [controller.receive(30.0) for _ in range(3)] == [
-            ("127.0.0.1", PowerChanged(Power.WARMING)),
-            ("127.0.0.1", InputChanged("31")),
-            ("127.0.0.1", LinkUp(MAC)),
-        ]
-        with pytest.raises(LinkTimeout, match="no datagram came"):
-            controller.receive(0.0)
-        projector.send(b"noise", controller.address)
-        projector.send(b"%2POWR=1\r", controller.address)
-        with pytest.raises(LinkTimeout, match="no notice of a projector"):
-            controller.receive(0.0)
-        assert controller.receive(0.0) == ("127.0.0.1", PowerChanged(Power.ON))
 
 
 def test_a_socket_that_was_closed_says_so() -> None:

@@ -1,7 +1,8 @@
-"""Light as the CIE's standard observer sees it: spectra to XYZ, XYZ to linear sRGB, and black bodies.
+"""Light as colour: spectra to CIE XYZ, XYZ to linear sRGB and its codes, black bodies, and angles between colours.
 
 The colour-matching functions are those of the CIE 1931 2° standard observer at 1 nm (ISO/CIE 11664-1), in
-`foundation/colorimetry/data/cie_1931_2_degree.csv`; that folder's README says where they are from.
+`foundation/data/cie_1931_2_degree.csv`; that folder's README says where they are from. The transfer function is that of
+sRGB (IEC 61966-2-1:1999, clauses 5.2 and 5.3).
 """
 
 from __future__ import annotations
@@ -28,9 +29,7 @@ _Array = npt.NDArray[np.float64]
 @cache
 def observer_cie_1931() -> tuple[_Array, _Array]:
     """Return the wavelengths (471,) float64, 360 … 830 nm by 1, and x̄, ȳ, z̄ there, (471, 3) float64; read-only."""
-    with (
-        resources.files("foundation.colorimetry").joinpath("data/cie_1931_2_degree.csv").open(encoding="utf-8") as file
-    ):
+    with resources.files("foundation").joinpath("data/cie_1931_2_degree.csv").open(encoding="utf-8") as file:
         table = np.loadtxt(file, delimiter=",", skiprows=1)
     table.flags.writeable = False
     return table[:, 0], table[:, 1:]
@@ -58,3 +57,36 @@ def xyz_of(wavelengths_nm: _Array, power: _Array) -> _Array:
 def linear_srgb(xyz: npt.ArrayLike) -> _Array:
     """Return linear sRGB (..., 3) float64 of CIE XYZ (..., 3), Y 1 white; what lies outside the gamut is below 0."""
     return np.asarray(xyz, dtype=np.float64) @ XYZ_TO_SRGB.T
+
+
+def encode_srgb(linear: npt.ArrayLike) -> npt.NDArray[np.float64]:
+    """Return sRGB code values 0 … 1 of linear light 0 … 1, of any shape; float64."""
+    linear = np.asarray(linear, dtype=np.float64)
+    return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * np.maximum(linear, 0.0031308) ** (1 / 2.4) - 0.055)
+
+
+def decode_srgb(code: npt.ArrayLike) -> npt.NDArray[np.float64]:
+    """Return linear light 0 … 1 of sRGB code values 0 … 1, of any shape; float64."""
+    code = np.asarray(code, dtype=np.float64)
+    return np.where(code <= 0.04045, code / 12.92, ((np.maximum(code, 0.04045) + 0.055) / 1.055) ** 2.4)
+
+
+def srgb_codes(linear: npt.ArrayLike) -> npt.NDArray[np.uint8]:
+    """Return sRGB codes 0 … 255 of linear light, clipped to 0 … 1, of any shape; uint8."""
+    return np.rint(255 * encode_srgb(np.clip(linear, 0.0, 1.0))).astype(np.uint8)
+
+
+def angles_deg(one: npt.ArrayLike, other: npt.ArrayLike) -> npt.NDArray[np.float64]:
+    """Return the angles between colours and others, degrees.
+
+    `one`, `other`: (..., 3) float or int each, broadcast against each other; linear RGB of any length above 0. Returns
+    (...) float64, 0 … 180. By W. Kahan's formula of the half angle, which keeps its digits at every angle; the arc
+    cosine loses half of them at small ones.
+    """
+    a, b = _unit(one), _unit(other)
+    return np.degrees(2 * np.arctan2(np.linalg.norm(a - b, axis=-1), np.linalg.norm(a + b, axis=-1)))
+
+
+def _unit(vector: npt.ArrayLike) -> npt.NDArray[np.float64]:
+    vector = np.asarray(vector, dtype=np.float64)
+    return vector / np.linalg.norm(vector, axis=-1, keepdims=True)

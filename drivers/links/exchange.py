@@ -17,21 +17,16 @@ from collections.abc import Callable
 from typing import TypeVar
 
 from drivers.links.link import Link
-from foundation.clock import Clock, SystemClock
+from foundation.clock import Clock
 from foundation.errors import LinkClosed, LinkTimeout, ProtocolError
 
-SYSTEM_CLOCK = SystemClock()
-
 _log = logging.getLogger(__name__)
-
-DEFAULT_TIMEOUT_S = 5.0
-"""Epson's manual asks for an answer within 3 s, 5 s after a change of source; the others say nothing."""
 
 GLANCE_S = 0.1
 """How long to look for something that may have come and answers no question."""
 
 MAX_MESSAGE = 512
-"""Bytes; no message of any language here comes near it."""
+"""Bytes; no message of any language comes near it."""
 
 _T = TypeVar("_T")
 MessageParser = Callable[[bytes], tuple[_T, int] | None]
@@ -39,7 +34,11 @@ MessageParser = Callable[[bytes], tuple[_T, int] | None]
 
 
 class Exchange:
-    """Questions and answers over connections that `connect` opens."""
+    """Questions and answers over connections that `connect` opens.
+
+    `greet`: says and hears over a new connection what comes before the first question; returns what that question must
+    begin with, which is not logged. `silent`, `endless`: what helps where no answer comes, and where one has no end.
+    """
 
     def __init__(
         self,
@@ -47,13 +46,19 @@ class Exchange:
         timeout: float,
         label: str,
         clock: Clock,
-        greet: Callable[[Exchange], None] | None = None,
+        greet: Callable[[Exchange], bytes],
+        silent: str,
+        endless: str,
     ) -> None:
         self._connect = connect
         self._timeout = timeout
         self._label = label
         self._clock = clock
         self._greet = greet
+        self._silent_remedy, self._endless_remedy = silent, endless
+        self._proof = b""
+        self.questions = 0
+        """Asked on the connection there is, since it was greeted."""
         self._link: Link | None = None
         self._rest = b""
 
@@ -70,6 +75,11 @@ class Exchange:
     def open_with(self, question: bytes, take: MessageParser[_T]) -> _T:
         """Send `question` over the connection just opened and return its answer; only for `greet`."""
         return self._ask_once(question, take, None)
+
+    def listen(self, take: MessageParser[_T], overheard: Callable[[_T], bool] | None = None) -> _T:
+        """Return what the other side says first over the connection just opened; only for `greet`."""
+        assert self._link is not None
+        return self._answer(self._link, take, overheard)
 
     def send(self, command: bytes) -> None:
         """Send `command`, whose answer will take its time and be met by `glance`."""
@@ -93,6 +103,11 @@ class Exchange:
             self.close()
             raise
 
+    @property
+    def connected(self) -> bool:
+        """Whether there is a connection."""
+        return self._link is not None
+
     def close(self) -> None:
         """Drop the connection, if there is one."""
         link, self._link = self._link, None
@@ -103,23 +118,28 @@ class Exchange:
     def _ask_once(self, question: bytes, take: MessageParser[_T], overheard: Callable[[_T], bool] | None) -> _T:
         link = self._send_once(question)
         try:
-            while True:
-                message = self._next(link, take, self._timeout)
-                if overheard is None or not overheard(message):
-                    return message
+            return self._answer(link, take, overheard)
         except BaseException:
             self.close()
             raise
+
+    def _answer(self, link: Link, take: MessageParser[_T], overheard: Callable[[_T], bool] | None) -> _T:
+        while True:
+            message = self._next(link, take, self._timeout)
+            if overheard is None or not overheard(message):
+                return message
 
     def _send_once(self, command: bytes) -> Link:
         try:
             link = self._link
             if link is None:
                 link = self._link = self._connect()
-                if self._greet is not None:
-                    self._greet(self)
+                self._proof = self._greet(self)
+                self.questions = 0
             self._discard(link)
-            link.write(command, self._timeout)
+            proof, self._proof = self._proof, b""
+            link.write(proof + command, self._timeout)
+            self.questions += 1
             _log.debug("sent %r", command)
         except BaseException:
             self.close()
@@ -131,7 +151,7 @@ class Exchange:
         remaining = wait
         while (taken := take(self._rest)) is None:
             if len(self._rest) > MAX_MESSAGE:
-                raise ProtocolError(f"{self._label} sends without end; {CHECK_SPEED}")
+                raise ProtocolError(f"{self._label} sends without end; {self._endless_remedy}")
             if remaining < 0:
                 raise self._silent(wait)
             try:
@@ -155,23 +175,9 @@ class Exchange:
 
     def _silent(self, wait: float) -> LinkTimeout:
         begun = f" beyond {quoted(self._rest)}" if self._rest else ""
-        return LinkTimeout(
-            f"{self._label} has not answered within {wait:g} s{begun}; check the cable (straight or null-modem, as its "
-            f"manual says), the speed, and that it may be controlled in standby"
-        )
-
-
-CHECK_SPEED = "check that speed and parity are those set in the projector's menu, and the language its maker's"
-"""The remedy against bytes that make no sense."""
+        return LinkTimeout(f"{self._label} has not answered within {wait:g} s{begun}; {self._silent_remedy}")
 
 
 def quoted(data: bytes) -> str:
     """Return bytes as a message shows them."""
     return repr(data[:40])[1:] + ("…" if len(data) > 40 else "")
-
-
-def text_of(data: bytes) -> str:
-    """Return printable ASCII as text."""
-    if any(not 0x20 <= byte < 0x7F for byte in data):
-        raise ProtocolError(f"the projector sends {quoted(data)}, which is no text; {CHECK_SPEED}")
-    return data.decode("ascii")

@@ -16,9 +16,9 @@ from pathlib import Path
 
 import pytest
 
+from foundation import held_folders
 from foundation.errors import InputError, StorageError
-from foundation.trust import held_folders
-from foundation.trust.held_folders import LOCK_FILE, held_folder
+from foundation.held_folders import LOCK_FILE, held_folder
 
 BUSY = "another program is at it; wait for it"
 Flock = Callable[[int, int], None]
@@ -234,7 +234,7 @@ def test_a_folder_that_is_made_and_never_there_is_not_waited_for(
     def make_nothing(folder: Path, of: Path | None = None) -> None:
         del folder, of
 
-    monkeypatch.setattr("foundation.trust.held_folders.make_folder", make_nothing)
+    monkeypatch.setattr("foundation.held_folders.make_folder", make_nothing)
     with (
         pytest.raises(StorageError, match="its folder is made and not there; name a place on an ordinary disk"),
         held_folder(tmp_path / "x", "busy"),

@@ -1,1 +1,0 @@
-"""Any tethered camera that libgphoto2 supports."""

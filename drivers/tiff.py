@@ -1,0 +1,348 @@
+"""TIFF files: their tags, their directories read, and the head of a new file laid out; never the pixels themselves.
+
+Rules that hold inside:
+
+- Pure functions of bytes and numbers: every byte sequence whatever ends in a result or in `TiffDamaged`, and the same
+  tags give the same head.
+- Only the tags in `_DECODED` are decoded; maker notes and previews are not touched. Makers' own magic numbers (Olympus,
+  Panasonic) pass, since what follows is TIFF all the same.
+- A head has one picture in one uncompressed strip, little-endian; the pixels follow as they lie in memory.
+
+Sources: TIFF 6.0, sections 2, 8 and 15 and supplement 1 (SubIFDs); TIFF/EP (ISO 12234-2) for the colour filter array;
+Exif 2.32, section 4.6; DNG 1.7.1, chapters 2 and 4. The one tag of Canon's is known from its CR2 files alone.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import IntEnum
+from fractions import Fraction
+from typing import Final
+
+
+class TiffTag(IntEnum):
+    """Tag codes of TIFF, TIFF/EP, Exif and DNG, and the one of CR2."""
+
+    # TIFF 6.0
+    NEW_SUBFILE_TYPE = 254
+    IMAGE_WIDTH = 256
+    IMAGE_LENGTH = 257
+    BITS_PER_SAMPLE = 258
+    COMPRESSION = 259
+    PHOTOMETRIC_INTERPRETATION = 262
+    IMAGE_DESCRIPTION = 270
+    MAKE = 271
+    MODEL = 272
+    STRIP_OFFSETS = 273
+    ORIENTATION = 274
+    SAMPLES_PER_PIXEL = 277
+    ROWS_PER_STRIP = 278
+    STRIP_BYTE_COUNTS = 279
+    PLANAR_CONFIGURATION = 284
+    SOFTWARE = 305
+    DATE_TIME = 306
+    TILE_OFFSETS = 324
+    TILE_BYTE_COUNTS = 325
+    SUB_IFDS = 330
+    SAMPLE_FORMAT = 339
+
+    # TIFF/EP
+    CFA_REPEAT_PATTERN_DIM = 33421
+    CFA_PATTERN = 33422
+
+    # Exif 2.32
+    EXPOSURE_TIME = 33434
+    F_NUMBER = 33437
+    EXIF_IFD_POINTER = 34665
+    PHOTOGRAPHIC_SENSITIVITY = 34855
+    EXIF_VERSION = 36864
+    DATE_TIME_ORIGINAL = 36867
+    OFFSET_TIME_ORIGINAL = 36881
+    FOCAL_LENGTH = 37386
+    FOCAL_PLANE_X_RESOLUTION = 41486
+    FOCAL_PLANE_RESOLUTION_UNIT = 41488
+    BODY_SERIAL_NUMBER = 42033
+    LENS_MODEL = 42036
+
+    # DNG 1.7.1
+    DNG_VERSION = 50706
+    DNG_BACKWARD_VERSION = 50707
+    UNIQUE_CAMERA_MODEL = 50708
+    CFA_PLANE_COLOR = 50710
+    CFA_LAYOUT = 50711
+    LINEARIZATION_TABLE = 50712
+    BLACK_LEVEL_REPEAT_DIM = 50713
+    BLACK_LEVEL = 50714
+    BLACK_LEVEL_DELTA_H = 50715
+    BLACK_LEVEL_DELTA_V = 50716
+    WHITE_LEVEL = 50717
+    COLOR_MATRIX_1 = 50721
+    AS_SHOT_NEUTRAL = 50728
+    CAMERA_SERIAL_NUMBER = 50735
+    CALIBRATION_ILLUMINANT_1 = 50778
+    ACTIVE_AREA = 50829
+    MASKED_AREAS = 50830
+
+    # Canon CR2: widths of the vertical slices in which the raw pixels are stored
+    CR2_SLICES = 50752
+
+
+RGB: Final = 2
+"""PhotometricInterpretation of red, green and blue (TIFF 6.0, section 8)."""
+
+CFA: Final = 32803
+"""PhotometricInterpretation of a colour filter array (TIFF/EP)."""
+
+D65: Final = 21
+"""LightSource of daylight of 6504 K (Exif 2.32, section 4.6.5), as in DNG's CalibrationIlluminant."""
+
+
+class TiffDamaged(ValueError):
+    """The bytes are no TIFF, or a directory points beyond their end."""
+
+
+_MAX_DIRECTORIES: Final = 64
+"""Directories that are read: a camera's file has under ten, and a damaged chain must end."""
+
+_MAX_VALUES: Final = 1 << 20
+"""Values of one tag: a linearisation table, the longest that is read, has at most 65 536."""
+
+_TEXT: Final = 2
+"""Type ASCII (TIFF 6.0, section 2)."""
+
+_FORMATS: Final = {
+    1: "B",
+    2: "s",
+    3: "H",
+    4: "I",
+    5: "II",
+    6: "b",
+    7: "B",
+    8: "h",
+    9: "i",
+    10: "ii",
+    11: "f",
+    12: "d",
+    13: "I",
+}
+"""Letters of `struct` by type (TIFF 6.0, section 2; 13, IFD: TIFF technical note 1); rationals are two numbers."""
+
+_DECODED: Final = frozenset(
+    {
+        TiffTag.IMAGE_WIDTH,
+        TiffTag.IMAGE_LENGTH,
+        TiffTag.BITS_PER_SAMPLE,
+        TiffTag.COMPRESSION,
+        TiffTag.PHOTOMETRIC_INTERPRETATION,
+        TiffTag.MAKE,
+        TiffTag.MODEL,
+        TiffTag.STRIP_OFFSETS,
+        TiffTag.SAMPLES_PER_PIXEL,
+        TiffTag.STRIP_BYTE_COUNTS,
+        TiffTag.TILE_OFFSETS,
+        TiffTag.TILE_BYTE_COUNTS,
+        TiffTag.SUB_IFDS,
+        TiffTag.CFA_REPEAT_PATTERN_DIM,
+        TiffTag.CFA_PATTERN,
+        TiffTag.EXPOSURE_TIME,
+        TiffTag.F_NUMBER,
+        TiffTag.EXIF_IFD_POINTER,
+        TiffTag.PHOTOGRAPHIC_SENSITIVITY,
+        TiffTag.BODY_SERIAL_NUMBER,
+        TiffTag.LENS_MODEL,
+        TiffTag.CAMERA_SERIAL_NUMBER,
+        TiffTag.DNG_VERSION,
+        TiffTag.UNIQUE_CAMERA_MODEL,
+        TiffTag.CFA_PLANE_COLOR,
+        TiffTag.CFA_LAYOUT,
+        TiffTag.LINEARIZATION_TABLE,
+        TiffTag.BLACK_LEVEL_REPEAT_DIM,
+        TiffTag.BLACK_LEVEL,
+        TiffTag.BLACK_LEVEL_DELTA_H,
+        TiffTag.BLACK_LEVEL_DELTA_V,
+        TiffTag.WHITE_LEVEL,
+        TiffTag.CR2_SLICES,
+        TiffTag.ACTIVE_AREA,
+        TiffTag.MASKED_AREAS,
+    }
+)
+"""Tags whose values are read; a damaged value of any other is no fault of the pixels."""
+
+ReadValue = str | tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class Directory:
+    """One image file directory: the decoded tags that it holds; rationals have become floats."""
+
+    values: dict[int, ReadValue]
+
+    def numbers(self, tag: TiffTag) -> tuple[float, ...]:
+        """Return the numbers of `tag`; empty where the directory has none."""
+        value = self.values.get(tag, ())
+        return () if isinstance(value, str) else value
+
+    def integers(self, tag: TiffTag) -> tuple[int, ...]:
+        """Return the numbers of `tag` cut to integers; empty where the directory has none."""
+        return tuple(int(number) for number in self.numbers(tag))
+
+    def text(self, tag: TiffTag) -> str:
+        """Return the text of `tag`; empty where the directory has none."""
+        value = self.values.get(tag, "")
+        return value if isinstance(value, str) else ""
+
+    def extents(self) -> list[tuple[int, int]]:
+        """Return offset and size in bytes of every strip and tile."""
+        strips = zip(self.integers(TiffTag.STRIP_OFFSETS), self.integers(TiffTag.STRIP_BYTE_COUNTS), strict=False)
+        tiles = zip(self.integers(TiffTag.TILE_OFFSETS), self.integers(TiffTag.TILE_BYTE_COUNTS), strict=False)
+        return [*strips, *tiles]
+
+
+def is_tiff(data: bytes | memoryview) -> bool:
+    """Return whether `data` begins as TIFF does, or as a maker's near copy of it."""
+    return data[:4] in (b"II*\0", b"MM\0*", b"IIRO", b"IIRS", b"MMOR", b"IIU\0")
+
+
+def read_directories(data: bytes | memoryview) -> list[Directory]:
+    """Return the directories of the main chain and, after each, those it points to by SubIFDs and as Exif."""
+    if not is_tiff(data) or len(data) < 8:
+        raise TiffDamaged("it does not begin as a TIFF file does")
+    order = "<" if data[:2] == b"II" else ">"
+    directories: list[Directory] = []
+    seen: set[int] = set()
+    waiting = [_unpack(order, "I", data, 4)[0]]
+    while waiting:
+        offset = waiting.pop()
+        if offset == 0 or offset in seen or len(seen) >= _MAX_DIRECTORIES:
+            continue
+        seen.add(offset)
+        directory, following = _read_directory(order, data, offset)
+        directories.append(directory)
+        waiting.append(following)
+        waiting.extend(reversed([*directory.integers(TiffTag.SUB_IFDS), *directory.integers(TiffTag.EXIF_IFD_POINTER)]))
+    return directories
+
+
+def _read_directory(order: str, data: bytes | memoryview, offset: int) -> tuple[Directory, int]:
+    (count,) = _unpack(order, "H", data, offset)
+    values: dict[int, ReadValue] = {}
+    for number in range(count):
+        entry = offset + 2 + 12 * number
+        tag, kind, length = _unpack(order, "HHI", data, entry)
+        if tag in _DECODED and kind in _FORMATS:
+            values[tag] = _read_value(order, data, entry + 8, kind, length)
+    end = offset + 2 + 12 * count
+    # Some writers leave out the link that ends the chain when the directory is the last thing in the file.
+    following = _unpack(order, "I", data, end)[0] if end + 4 <= len(data) else 0
+    return Directory(values), following
+
+
+def _read_value(order: str, data: bytes | memoryview, place: int, kind: int, length: int) -> ReadValue:
+    if length > _MAX_VALUES:
+        raise TiffDamaged(f"a tag claims {length} values")
+    one = _FORMATS[kind]
+    size = struct.calcsize(order + one) * length
+    if size > 4:
+        (place,) = _unpack(order, "I", data, place)
+    if kind == _TEXT:
+        if place + length > len(data):
+            raise TiffDamaged(f"a text reaches to byte {place + length}, and it has only {len(data)}")
+        return bytes(data[place : place + length]).split(b"\0")[0].decode("utf-8", "replace").strip()
+    numbers = _unpack(order, one * length if len(one) == 2 else f"{length}{one}", data, place)
+    if len(one) == 2:
+        return tuple(top / bottom if bottom else 0.0 for top, bottom in zip(numbers[::2], numbers[1::2], strict=True))
+    return tuple(numbers)
+
+
+def _unpack(order: str, layout: str, data: bytes | memoryview, offset: int) -> tuple[int, ...]:
+    try:
+        return struct.unpack_from(order + layout, data, offset)
+    except struct.error as error:
+        raise TiffDamaged(f"it points to byte {offset}, and has only {len(data)}") from error
+
+
+class ValueType(IntEnum):
+    """The types of a tag's values that are written (TIFF 6.0, section 2)."""
+
+    BYTE = 1
+    ASCII = 2
+    SHORT = 3
+    LONG = 4
+    RATIONAL = 5
+    UNDEFINED = 7
+    SRATIONAL = 10
+
+
+Value = tuple[ValueType, Sequence[int]]
+"""A tag's type and its numbers; a rational is two of them, numerator first."""
+
+Tags = dict[TiffTag, Value]
+"""Values by tag."""
+
+LARGEST_FILE: Final = (1 << 32) - 1
+"""Bytes that the 32-bit offsets of TIFF reach."""
+
+_LETTERS: Final = {
+    ValueType.BYTE: "B",
+    ValueType.ASCII: "B",
+    ValueType.SHORT: "H",
+    ValueType.LONG: "I",
+    ValueType.RATIONAL: "II",
+    ValueType.UNDEFINED: "B",
+    ValueType.SRATIONAL: "ii",
+}
+_HEADER: Final = struct.pack("<2sHI", b"II", 42, 8)
+_ALIGNMENT: Final = 16
+"""Bytes on whose multiple the pixels begin, so that samples of any type are aligned."""
+
+
+def text(value: str) -> Value:
+    """Return the value of an ASCII tag; what ASCII cannot write becomes a question mark."""
+    return ValueType.ASCII, value.encode("ascii", "replace") + b"\0"
+
+
+def rationals(*values: float | Fraction) -> Value:
+    """Return numbers ≥ 0 as the nearest fractions of denominators up to 100 000."""
+    near = (Fraction(value).limit_denominator(100_000) for value in values)
+    return ValueType.RATIONAL, [part for value in near for part in value.as_integer_ratio()]
+
+
+def head(main: Tags, strip: int, exif: Tags | None = None) -> bytes:
+    """Return the bytes before the pixels."""
+    tags: Tags = {
+        **main,
+        TiffTag.STRIP_OFFSETS: (ValueType.LONG, [0]),
+        TiffTag.STRIP_BYTE_COUNTS: (ValueType.LONG, [min(strip, LARGEST_FILE)]),
+    }
+    if exif is not None:
+        tags[TiffTag.EXIF_IFD_POINTER] = (ValueType.LONG, [0])
+    exif_at = len(_HEADER) + len(_directory(tags, 0))
+    end = exif_at
+    if exif is not None:
+        tags[TiffTag.EXIF_IFD_POINTER] = (ValueType.LONG, [exif_at])
+        end += len(_directory(exif, 0))
+    strip_at = end + -end % _ALIGNMENT
+    if strip_at + strip > LARGEST_FILE:
+        raise ValueError(f"{strip} bytes of pixels are more than the 4 GiB of a TIFF file")
+    tags[TiffTag.STRIP_OFFSETS] = (ValueType.LONG, [strip_at])
+    directories = _directory(tags, len(_HEADER)) + (b"" if exif is None else _directory(exif, exif_at))
+    return _HEADER + directories + bytes(strip_at - end)
+
+
+def _directory(tags: Tags, at: int) -> bytes:
+    """Return a directory that stands at byte `at` of the file, its longer values behind it; of even length."""
+    entries = struct.pack("<H", len(tags))
+    values = b""
+    values_at = at + 2 + 12 * len(tags) + 4
+    for code, (kind, numbers) in sorted(tags.items()):
+        letters = _LETTERS[kind]
+        value = struct.pack(f"<{len(numbers)}{letters[0]}", *numbers)
+        entries += struct.pack("<HHI", code, kind, len(numbers) // len(letters))
+        if len(value) <= 4:
+            entries += value.ljust(4, b"\0")
+        else:
+            entries += struct.pack("<I", values_at + len(values))
+            values += value + bytes(len(value) % 2)
+    return entries + struct.pack("<I", 0) + values

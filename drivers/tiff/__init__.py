@@ -1,1 +1,0 @@
-"""TIFF containers: directories and tags, read and written."""

@@ -1,1 +1,0 @@
-"""Light as the CIE's standard observer sees it."""

@@ -1,0 +1,37 @@
+"""A cable that has one conversation by heart, and objects to a byte too many or too few."""
+
+from __future__ import annotations
+
+from foundation.errors import LinkClosed, LinkTimeout
+
+
+class Script:
+    """Lines that the device says and lines that it must hear, in their order; None hangs up.
+
+    What it says is never given to one who does not wait: that is who looks for what came unasked. Unheard answers are
+    an error, too: see `ended`.
+    """
+
+    def __init__(self, *lines: bytes | None) -> None:
+        self._lines = list(lines)
+        self.closed = False
+
+    def write(self, data: bytes, timeout: float) -> None:
+        if self._lines and self._lines[0] is None:
+            raise LinkClosed("the script hangs up")
+        assert self._lines, f"nothing more was to be said, but {data!r} was"
+        assert data == self._lines.pop(0)
+
+    def read(self, limit: int, timeout: float) -> bytes:
+        if not self._lines or not timeout:
+            raise LinkTimeout("the script has nothing to say")
+        line = self._lines.pop(0)
+        if line is None:
+            raise LinkClosed("the script hangs up")
+        return line
+
+    def close(self) -> None:
+        self.closed = True
+
+    def ended(self) -> bool:
+        return not self._lines
