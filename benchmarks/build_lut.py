@@ -52,9 +52,9 @@ from experiment.session.folder import Session
 from experiment.session.incoming import ReceivedFile
 from experiment.session.judgement import Judgement
 from experiment.session.plan import plan_steps
-from sim.camera.dng import write_dng
-from sim.optics.photographic_lens import MILD_SHOULDERS
-from sim.world.drawing import Print
+from sim.camera.film import write_dng
+from sim.optics import MILD_SHOULDERS
+from sim.world.rendering import Print
 from sim.world.room import REFERENCE_EXPOSURE, Room
 from sim.world.sensors import BODIES
 from sim.world.world import World

@@ -47,10 +47,10 @@ from experiment.lights.illuminations import Illumination
 from experiment.session.folder import Session
 from experiment.session.plan import SessionStep
 from foundation.errors import CropError
-from sim.optics.photographic_lens import MILD_SHOULDERS, STRONG_SHOULDERS
+from sim.optics import MILD_SHOULDERS, STRONG_SHOULDERS
+from sim.world.disturbances import Blob, Glare, Situation
 from sim.world.room import Room
 from sim.world.sensors import BODIES
-from sim.world.situation import Blob, Glare, Situation
 from sim.world.world import World
 
 WRONG_DEG: Final = 0.1

@@ -28,8 +28,8 @@ from experiment.chart.layout import A_SERIES_MM, design_chart
 from experiment.config import LabSettings, SimulatedSettings
 from experiment.lights.illuminations import plan_illuminations, save_illuminations
 from experiment.session.folder import Session
-from sim.world.body_settings import find_body
-from synthesis.settings import TableSettings, room_of
+from sim.world.sensors import find_body
+from synthesis.cli import TableSettings, room_of
 from synthesis.table import TableTask, compute_table
 
 LEAST_COUNTS = 30.0

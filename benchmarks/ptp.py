@@ -20,10 +20,9 @@ from drivers.ptp.ip import IpTransport
 from drivers.ptp.transaction import PtpEvent, PtpRequest, PtpResponse, Transport
 from drivers.ptp.usb import UsbTransport
 from foundation.clock import SystemClock
-from sim.buses.ptpip_server import serve_ptpip
+from sim.buses.ptp import serve_ptpip
 from sim.buses.responder import Answer
-from sim.buses.usb import SimulatedBus
-from sim.buses.usb_device import PtpUsbDevice
+from sim.buses.usb import PtpUsbDevice, SimulatedBus
 
 OBJECT = bytes(range(256)) * 117_188
 """30 MB, a raw file."""

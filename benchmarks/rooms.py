@@ -42,9 +42,9 @@ from drivers.raw.rawfile import Mosaic, read_raw
 from experiment.chart.layout import A_SERIES_MM, design_chart
 from experiment.chart.model import Chart
 from experiment.chart.printing import drawing
-from sim.camera.dng import write_dng
-from sim.optics.photographic_lens import MILD_SHOULDERS
-from sim.world.drawing import Print
+from sim.camera.film import write_dng
+from sim.optics import MILD_SHOULDERS
+from sim.world.rendering import Print
 from sim.world.room import Room
 from sim.world.sensors import BODIES
 from sim.world.world import World

@@ -74,7 +74,7 @@ class Latencies:
 
     - `release_s`: from the command to the open shutter: mirror and two messages (60D: 2 … 40 ms a message; mirror
       chosen).
-    - `readout_s`: from the closed shutter to the announcement: an EOS 550D's in `sim.camera.eos_bodies`.
+    - `readout_s`: from the closed shutter to the announcement: an EOS 550D's in `sim.camera.bodies`.
     - `bytes_per_s`: of the cable: USB 2.0 carries 25 to 40 million.
     - `show_s`: from the call to a colour that is known to be on the screen: a picture or two at 60 Hz.
     - `verify_s`: reading the screen back.

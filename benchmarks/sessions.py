@@ -41,11 +41,11 @@ from experiment.session.incoming import ReceivedFile
 from experiment.session.judgement import Judgement
 from experiment.session.plan import SessionStep, plan_steps
 from foundation.colorimetry import angles_deg
-from sim.camera.dng import write_dng
-from sim.world.drawing import Print
+from sim.camera.film import write_dng
+from sim.world.disturbances import UNDISTURBED, Situation
+from sim.world.rendering import Print
 from sim.world.room import Room
 from sim.world.sensors import Body
-from sim.world.situation import UNDISTURBED, Situation
 from sim.world.world import World
 
 SETTINGS = ExposureSettings(iso=100, aperture=8.0, shutter_s=0.5)

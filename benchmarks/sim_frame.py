@@ -15,8 +15,8 @@ from io import BytesIO
 import numpy as np
 
 from drivers.presenter import WHITE
-from sim.camera.dng import write_dng
-from sim.world.drawing import Print
+from sim.camera.film import write_dng
+from sim.world.rendering import Print
 from sim.world.room import REFERENCE_EXPOSURE, Room
 from sim.world.sensors import BODIES
 from sim.world.world import World

@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from foundation.colorimetry import encode_srgb
-from sim.world.profile import ProfileName, printed_reflectance
-from sim.world.spectra import WAVELENGTHS_NM, PaperName
+from sim.world.room import WAVELENGTHS_NM, PaperName, ProfileName, printed_reflectance
 
 PAPERS: tuple[PaperName, ...] = ("poster", "matt", "glossy")
 PROFILES: tuple[ProfileName, ...] = ("unmanaged", "managed")

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
     from sim.camera.film import Film
     from sim.projectors.projector import SimulatedProjector
-    from sim.world.drawing import Print
+    from sim.world.rendering import Print
     from sim.world.world import World
 
 app = new_app(
@@ -103,8 +103,7 @@ def _serve_network(
     controller: tuple[str, int] | None,
     answer_s: float,
 ) -> None:
-    from sim.projectors.pjlink import serve_pjlink
-    from sim.projectors.pjlink_notices import ProjectorDatagrams
+    from sim.projectors.pjlink import ProjectorDatagrams, serve_pjlink
 
     with ExitStack() as served:
         host, port = served.enter_context(serve_pjlink(device, pjlink, password, answer_s=answer_s)).address
@@ -121,7 +120,7 @@ def _serve_serial(device: SimulatedProjector, name: str) -> None:
 
     spoken = language(name)
     try:
-        from sim.buses.pty import PseudoTerminal
+        from sim.buses.serial import PseudoTerminal
     except ImportError as error:
         raise ConfigurationError("this system has no pseudo-terminals; --serial needs Linux or macOS") from error
     from sim.projectors.serial import PEERS
@@ -179,11 +178,11 @@ def camera(
     from drivers.ptp.codes import Property
     from foundation.clock import SystemClock
     from foundation.errors import ConfigurationError
-    from sim.buses.ptpip_server import serve_ptpip
-    from sim.buses.usb_device import PtpUsbDevice, UsbIdentity
+    from sim.buses.ptp import serve_ptpip
+    from sim.buses.usb import PtpUsbDevice, UsbIdentity
     from sim.buses.usbip import serve_usbip
+    from sim.camera.bodies import EOS_BODIES
     from sim.camera.eos import SimulatedEos
-    from sim.camera.eos_bodies import EOS_BODIES
     from sim.world.room import REFERENCE_EXPOSURE, read_room
     from sim.world.sensors import BODIES
     from sim.world.world import World
@@ -296,7 +295,7 @@ def _grey_squares() -> Print:
     """Return an A4 sheet with five by three squares from black to paper white."""
     import numpy as np
 
-    from sim.world.drawing import Print
+    from sim.world.rendering import Print
 
     column, row = (grid.ravel() for grid in np.meshgrid(np.arange(5), np.arange(3)))
     left, top = 18 + 54.0 * column, 21 + 60.0 * row

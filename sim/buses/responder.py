@@ -1,6 +1,6 @@
 """The other end of PTP: the interface of a simulated device, whatever the cable.
 
-`sim.camera.eos` is one; `sim.buses.usb`, `sim.buses.ptpip_server` and `sim.buses.usbip` put it on a cable. A responder
+`sim.camera.eos` is one; `sim.buses.usb`, `sim.buses.ptp` and `sim.buses.usbip` put it on a cable. A responder
 deals with operations and state, not with containers or packets.
 """
 

@@ -1,7 +1,7 @@
 """The simulated EOS: a PTP responder that behaves as a Canon EOS body does, with a `Film` where the sensor would be.
 
-Here stand its two sides, the session, and its sleep. What it is stands in `sim.camera.eos_state`; what it does, in
-`sim.camera.eos_settings`, `sim.camera.eos_files` and `sim.camera.eos_release`. The rules of all five:
+Here stand its two sides, the session, and its sleep. What it is stands in `sim.camera.eos`; what it does, in
+`sim.camera.eos`, `sim.camera.eos` and `sim.camera.eos`. The rules of all five:
 
 - State moves with the time that is handed in, and only when somebody asks or touches the camera: what falls due in
   between happens then, in its order. With a `SimulatedClock` an initiator that waits must sleep by the same clock;
@@ -14,27 +14,876 @@ An initiator reaches it through `answer`; a hand on the camera through `turn_dia
 `insert_card`, `remove_card` and `wake`. Both may be used from several threads.
 
 Source: a recorded EOS 60D; ISO 15740:2013 for what is standard; libgphoto2 2.5.34 for what initiators expect.
+
+What a simulated EOS is at a moment, and what moves it: its time, its events, the values of its properties.
+
+The rules, and who joins all this to a camera, stand in `sim.camera.eos`. Everything that a body remembers is set here,
+so that the files above hold behaviour alone.
+
+Source: a recorded EOS 60D; libgphoto2 2.5.34 for what initiators expect.
+
+The simulated EOS's files: those on its card, and those in its memory that wait to be fetched.
+
+Source: a recorded EOS 60D; ISO 15740:2013 for what is standard.
+
+The simulated EOS's release: focus, the press, drive modes and brackets, and the frame until it is a file.
+
+The rules stand in `sim.camera.eos`.
+
+The simulated EOS's settings, as an initiator reaches them: Canon's own properties, and the standard's few.
+
+Source: a recorded EOS 60D; ISO 15740:2013 for the standard's properties.
 """
 
 from __future__ import annotations
 
 import hashlib
+import heapq
+import itertools
 import threading
 from collections.abc import Callable, Iterable
-from concurrent.futures import Executor
-from dataclasses import replace
+from concurrent.futures import Executor, Future
+from dataclasses import dataclass, field, replace
+from datetime import UTC, datetime, timedelta
+from enum import Enum
+from io import BytesIO
+from typing import NamedTuple
 
-from drivers.canon.records import ImageFormat, Notice, number_of, number_value
-from drivers.ptp.codes import AeMode, EosEvent, FocusMode, Operation, Property, ReleaseButton, ResponseCode
+from drivers.camera import ExposureSettings
+from drivers.canon import apex
+from drivers.canon.records import (
+    IMAGE_FORMAT_PROPERTIES,
+    AvailableFormats,
+    AvailableValues,
+    ImageFormat,
+    Notice,
+    ObjectEntry,
+    ObjectEvent,
+    PropertyChanged,
+    PropertySetting,
+    Record,
+    TransferRequest,
+    encode_events,
+    encode_object_entries,
+    number_of,
+    number_value,
+    text_value,
+)
+from drivers.ptp.codes import (
+    AeMode,
+    CameraStatus,
+    CaptureDestination,
+    DataType,
+    DriveMode,
+    EosEvent,
+    EventCode,
+    FilesystemType,
+    FocusMode,
+    ObjectFormat,
+    Operation,
+    Property,
+    ReleaseButton,
+    ResponseCode,
+    StorageType,
+)
+from drivers.ptp.datasets import (
+    DevicePropDesc,
+    EnumerationForm,
+    ObjectInfo,
+    StorageInfo,
+    Value,
+    decode_value,
+    encode_u32_array,
+    encode_value,
+)
 from drivers.ptp.transaction import PtpEvent, PtpRequest, PtpResponse
 from foundation.clock import Clock
-from foundation.errors import LinkClosed
+from foundation.errors import CropError, DeviceError, DeviceRefused, LinkClosed, ProtocolError
 from sim.buses.responder import Answer
-from sim.camera.eos_model import EosModel
-from sim.camera.eos_release import EosRelease
-from sim.camera.eos_settings import EosSettings
-from sim.camera.eos_state import CARD, Arguments, OperationRefusal, OperationResult
+from sim.camera.bodies import FOCUS_CENTRE, FREE, LIST, MIRROR_LOCKUP, EosModel, custom_functions, focus_points
 from sim.camera.film import Film
+
+CARD = 0x00020001
+"""The store that is the card."""
+EMPTY_SLOT = 0x00020000
+"""The storage id while there is no card."""
+DCIM = 0x90000000
+"""Handle of the folder DCIM in the root of the card."""
+FOLDER = 0x91900000
+"""Handle of the folder 100CANON; files on the card are numbered from it, 16 apart."""
+BULB = 0x0C
+"""The shutter speed that lasts as long as the release is held."""
+U32 = 0xFFFFFFFF
+"""What a parameter or a time can hold at most."""
+_MEMORY = 0xA0000000
+"""Handles of objects in the camera's memory are numbered from here (assumed)."""
+_MOST_SHOTS = 0x7FFFFFFF
+"""Highest number of free shots that is reported: what a signed number of 32 bits holds."""
+_TEXTS = (Property.EOS_OWNER, Property.EOS_ARTIST, Property.EOS_COPYRIGHT)
+
+
+class OperationRefusal(Exception):
+    """Ends an operation with another response than OK."""
+
+    def __init__(self, code: int, *parameters: int) -> None:
+        super().__init__(code)
+        self.code = code
+        self.parameters = parameters
+
+
+class OperationResult(NamedTuple):
+    """What an operation that was carried out answers."""
+
+    data: bytes | None = None
+    parameters: tuple[int, ...] = ()
+
+
+class Arguments(NamedTuple):
+    """What came with a request: three parameters, 0 where it had fewer, and the data phase."""
+
+    one: int
+    two: int
+    three: int
+    data: bytes | None
+
+
+@dataclass
+class PropertyState:
+    """A property as it stands: what it is, and what it can be set to."""
+
+    value: bytes
+    kind: int
+    reported: bool
+    choices: tuple[int, ...] = ()
+    formats: tuple[ImageFormat, ...] = ()
+
+
+@dataclass(frozen=True)
+class StoredObject:
+    """A file or folder: on the card, or in the camera's memory where `storage` is 0."""
+
+    handle: int
+    storage: int
+    format: int
+    name: str
+    taken_at: datetime
+    parent: int = 0
+    data: bytes = b""
+
+    @property
+    def entry(self) -> ObjectEntry:
+        """It as a body lists it, and announces it."""
+        return ObjectEntry(
+            self.handle, self.storage, self.format, len(self.data), self.name, self.parent, self.handle,
+            time=int(self.taken_at.timestamp()) & U32,
+        )  # fmt: skip
+
+
+@dataclass
+class Card:
+    """A memory card: its capacity in bytes, and the objects on it by handle."""
+
+    capacity: int
+    objects: dict[int, StoredObject] = field(default_factory=dict[int, StoredObject])
+
+    @property
+    def free(self) -> int:
+        """Bytes that still fit on it."""
+        return self.capacity - sum(len(item.data) for item in self.objects.values())
+
+
+class SimulatedEosState:
+    """The state of a body; see `sim.camera.eos.SimulatedEos` for the parameters."""
+
+    def __init__(
+        self,
+        body: EosModel,
+        film: Film,
+        clock: Clock,
+        *,
+        serial: str,
+        card_bytes: int | None,
+        auto_power_off_s: int | None,
+        battery: float,
+        shutter_count: int,
+        forgetful: bool,
+        executor: Executor | None,
+    ) -> None:
+        self.body = body
+        self.serial = serial
+        self._film = film
+        self._clock = clock
+        self._executor = executor
+        self._forgetful = forgetful
+        self._card = None if card_bytes is None else self._blank_card(card_bytes)
+        self._battery = battery
+        self._shutter_count = shutter_count
+        self._time_offset = timedelta()
+        self._initiator = "Unknown Initiator"
+        self._number = 0
+        self._handles = itertools.count(_MEMORY + 1)
+        self._mirror_lockup = False
+        self._finds_focus = True
+        self._asleep = False
+        # What a session has and loses.
+        self._session = 0
+        self._last_transaction = 0
+        self._remote_mode = 0
+        self._event_mode = 0
+        self._queue: list[Record] = []
+        self._memory: dict[int, StoredObject] = {}
+        self._host_bytes = 0
+        self._hints: list[PtpEvent] = []
+        self._idle_since = clock.monotonic()
+        self._warned = False
+        # What is under way: (when, order, what happens then), the earliest first.
+        self._due: list[tuple[float, int, Callable[[], None]]] = []
+        self._order = itertools.count()
+        self._unfinished = 0
+        self._focused = False
+        self._pressed_at: float | None = None
+        self._bulb_since: tuple[float, datetime] | None = None
+        self._bracket_step = 0
+        self._properties = {
+            spec.code: PropertyState(
+                spec.value or b"", spec.kind, spec.value is not None, tuple(spec.choices), tuple(spec.formats)
+            )
+            for spec in body.properties
+        }
+        self._properties[Property.EOS_SERIAL_NUMBER].value = text_value(serial)
+        for code in _TEXTS:
+            self._properties[code].value = text_value("")
+        if auto_power_off_s is not None:
+            self._properties[Property.EOS_AUTO_POWER_OFF].value = number_value(auto_power_off_s)
+        self._renew_destinations()
+        self._renew_exposure_lists()
+
+    # Time.
+
+    def _move(self) -> None:
+        """Let everything happen that has fallen due."""
+        now = self._clock.monotonic()
+        while self._due and self._due[0][0] <= now:
+            _, _, happen = heapq.heappop(self._due)
+            happen()
+
+    def _at(self, when: float, happen: Callable[[], None]) -> None:
+        heapq.heappush(self._due, (when, next(self._order), happen))
+
+    @property
+    def _is_busy(self) -> bool:
+        return self._unfinished > 0 or self._bulb_since is not None
+
+    def _now(self) -> datetime:
+        return self._clock.now() + self._time_offset
+
+    # Events.
+
+    def _get_event(self, _: Arguments) -> OperationResult:
+        if self._bulb_since is not None and self._event_mode:
+            open_s = int(self._clock.monotonic() - self._bulb_since[0])
+            self._record(Notice(EosEvent.BULB_EXPOSURE_TIME, open_s))
+        records, self._queue = self._queue, []
+        return OperationResult(encode_events(records))
+
+    def _record(self, record: Record) -> None:
+        if not self._event_mode:
+            return
+        if not self._queue:
+            self._hints.append(PtpEvent(EventCode.EOS_REQUEST_GET_EVENT))
+        self._queue.append(record)
+
+    def _report_list(self, code: int) -> None:
+        known = self._properties[code]
+        if code in IMAGE_FORMAT_PROPERTIES:
+            self._record(AvailableFormats(code, known.formats, known.kind))
+        else:
+            self._record(AvailableValues(code, known.choices, known.kind))
+
+    # The values of properties.
+
+    def _value(self, code: int) -> bytes:
+        """Return a property's value; some are never stored, for they follow from the camera's state."""
+        match code:
+            case Property.EOS_AVAILABLE_SHOTS:
+                return number_value(self._available_shots())
+            case Property.EOS_BATTERY_POWER:
+                return number_value(self._battery_code())
+            case Property.EOS_CAMERA_TIME:
+                return number_value(int(self._now().timestamp()) & U32)
+            case Property.EOS_SHUTTER_COUNTER:
+                return number_value(self._shutter_count)
+            case Property.EOS_CURRENT_STORAGE:
+                return number_value(EMPTY_SLOT if self._card is None else CARD)
+            case Property.EOS_CURRENT_FOLDER:
+                return number_value(0 if self._card is None else FOLDER)
+            case _:
+                return self._properties[code].value
+
+    def _number_of(self, code: int) -> int:
+        known = self._properties.get(code)
+        return 0 if known is None else number_of(known.value)
+
+    def _report(self, *codes: int) -> None:
+        for code in codes:
+            self._record(PropertyChanged(code, self._value(code)))
+            if code == Property.EOS_CUSTOM_FUNCTIONS and Property.EOS_MIRROR_UP_SETTING not in self._properties:
+                # Custom functions come as one record a group.
+                self._record(PropertyChanged(code, custom_functions(3, {MIRROR_LOCKUP: int(self._mirror_lockup)})))
+
+    def _change(self, code: int, value: bytes) -> None:
+        self._properties[code].value = value
+        self._report(code)
+
+    def _offer(self, code: int, choices: tuple[int, ...]) -> None:
+        if self._properties[code].choices != choices:
+            self._properties[code].choices = choices
+            self._report_list(code)
+
+    def _renew_exposure_lists(self) -> None:
+        mode = self._number_of(Property.EOS_AE_MODE)
+        bulb = mode == AeMode.BULB
+        timed = mode in (AeMode.MANUAL, AeMode.SHUTTER_PRIORITY)
+        shutter = () if not timed else self.body.shutter_codes
+        if mode == AeMode.SHUTTER_PRIORITY:
+            shutter = tuple(code for code in shutter if code != BULB)
+        self._offer(Property.EOS_SHUTTER_SPEED, shutter)
+        apertured = mode in (AeMode.MANUAL, AeMode.APERTURE_PRIORITY, AeMode.BULB)
+        self._offer(Property.EOS_APERTURE, self.body.aperture_codes if apertured else ())
+        if bulb:
+            self._change(Property.EOS_SHUTTER_SPEED, number_value(BULB))
+        elif shutter and self._number_of(Property.EOS_SHUTTER_SPEED) not in shutter:
+            self._change(Property.EOS_SHUTTER_SPEED, number_value(shutter[len(shutter) // 2]))
+
+    def _renew_destinations(self) -> None:
+        """Offer the destinations that there are; without remote control frames go to the card."""
+        both = (CaptureDestination.CARD, CaptureDestination.HOST, CaptureDestination.CARD_AND_HOST)
+        choices = both if self._card is not None else (CaptureDestination.HOST,)
+        self._offer(Property.EOS_CAPTURE_DESTINATION, choices)
+        if not self._session or self._number_of(Property.EOS_CAPTURE_DESTINATION) not in choices:
+            # The 60D without a card reports the card as destination all the same.
+            self._change(Property.EOS_CAPTURE_DESTINATION, number_value(CaptureDestination.CARD))
+            self._report(Property.EOS_AVAILABLE_SHOTS, Property.EOS_CURRENT_STORAGE, Property.EOS_CURRENT_FOLDER)
+
+    def _battery_code(self) -> int:
+        return next(
+            code for least, code in ((0.88, 2), (0.63, 4), (0.38, 1), (0.1, 5), (-1, 0)) if self._battery > least
+        )
+
+    # Who is in control, and what there is room for.
+
+    def _require_remote(self) -> None:
+        # Assumed: nothing shows what a body says to whoever has not taken control of it.
+        if not self._remote_mode:
+            raise OperationRefusal(ResponseCode.EOS_OPERATION_REFUSED)
+
+    def _blank_card(self, capacity: int) -> Card:
+        now = self._clock.now()
+        card = Card(capacity)
+        for folder in (
+            StoredObject(DCIM, CARD, ObjectFormat.ASSOCIATION, "DCIM", now),
+            StoredObject(FOLDER, CARD, ObjectFormat.ASSOCIATION, "100CANON", now, DCIM),
+        ):
+            card.objects[folder.handle] = folder
+        return card
+
+    def _available_shots(self) -> int:
+        destination = self._number_of(Property.EOS_CAPTURE_DESTINATION)
+        card = 0 if self._card is None else self._card.free
+        if destination == CaptureDestination.HOST:
+            free = self._host_bytes
+        elif destination == CaptureDestination.CARD_AND_HOST:
+            free = min(card, self._host_bytes)
+        else:
+            free = card
+        return min(max(free, 0) // self.body.frame_bytes, _MOST_SHOTS)
+
+
+_ROOT = 0xFFFFFFFF
+"""Parent in GetObjectHandles: only what lies in the root (ISO 15740, GetObjectHandles)."""
+_ANY_STORE = _ANY_FORMAT = 0xFFFFFFFF
+"""Store or format in GetObjectHandles: all of them."""
+
+
+class EosFiles(SimulatedEosState):
+    """What an initiator can ask of a body's files, and do with them."""
+
+    def _get_storage_ids(self, _: Arguments) -> OperationResult:
+        return OperationResult(encode_u32_array((EMPTY_SLOT if self._card is None else CARD,)))
+
+    def _get_storage_info(self, arguments: Arguments) -> OperationResult:
+        self._require_store(arguments.one)
+        capacity, free = (0, 0) if self._card is None else (self._card.capacity, self._card.free)
+        info = StorageInfo(
+            StorageType.REMOVABLE_RAM, FilesystemType.DCF, capacity=capacity, free=free, description="SD"
+        )
+        return OperationResult(info.encode())
+
+    def _require_store(self, storage: int) -> None:
+        if storage not in (EMPTY_SLOT if self._card is None else CARD, _ANY_STORE):
+            raise OperationRefusal(ResponseCode.INVALID_STORAGE_ID)
+
+    def _on_card(self) -> dict[int, StoredObject]:
+        return {} if self._card is None else self._card.objects
+
+    def _children(self, parent: int) -> list[StoredObject]:
+        if parent not in (0, _ROOT) and parent not in self._on_card():
+            raise OperationRefusal(ResponseCode.INVALID_OBJECT_HANDLE)
+        return [item for item in self._on_card().values() if item.parent == (0 if parent == _ROOT else parent)]
+
+    def _listed(self, arguments: Arguments) -> list[StoredObject]:
+        self._require_store(arguments.one)
+        everything = arguments.three == 0
+        found = list(self._on_card().values()) if everything else self._children(arguments.three)
+        return [item for item in found if arguments.two in (0, _ANY_FORMAT, item.format)]
+
+    def _get_num_objects(self, arguments: Arguments) -> OperationResult:
+        return OperationResult(parameters=(len(self._listed(arguments)),))
+
+    def _get_object_handles(self, arguments: Arguments) -> OperationResult:
+        return OperationResult(encode_u32_array(item.handle for item in self._listed(arguments)))
+
+    def _get_object_info_ex(self, arguments: Arguments) -> OperationResult:
+        self._require_store(arguments.one)
+        return OperationResult(encode_object_entries(item.entry for item in self._children(arguments.two)))
+
+    def _object(self, handle: int) -> StoredObject:
+        found = self._memory.get(handle) or self._on_card().get(handle)
+        if found is None:
+            raise OperationRefusal(ResponseCode.INVALID_OBJECT_HANDLE)
+        return found
+
+    def _get_object_info(self, arguments: Arguments) -> OperationResult:
+        item = self._object(arguments.one)
+        stamp = item.taken_at.strftime("%Y%m%dT%H%M%S")
+        folder = item.format == ObjectFormat.ASSOCIATION
+        return OperationResult(
+            ObjectInfo(
+                storage=item.storage, format=item.format, size=len(item.data), parent=item.parent,
+                association_type=int(folder), filename=item.name, captured_at=stamp, modified_at=stamp,
+            ).encode()
+        )  # fmt: skip
+
+    def _get_object(self, arguments: Arguments) -> OperationResult:
+        item = self._object(arguments.one)
+        if item.format == ObjectFormat.ASSOCIATION:
+            raise OperationRefusal(ResponseCode.INVALID_OBJECT_HANDLE)
+        return OperationResult(item.data)
+
+    def _get_partial_object(self, arguments: Arguments) -> OperationResult:
+        item = self._object(arguments.one)
+        if arguments.two > len(item.data):
+            raise OperationRefusal(ResponseCode.INVALID_PARAMETER)
+        part = item.data[arguments.two : arguments.two + arguments.three]
+        return OperationResult(part, (len(part),))
+
+    def _get_thumb(self, arguments: Arguments) -> OperationResult:
+        self._object(arguments.one)
+        raise OperationRefusal(ResponseCode.NO_THUMBNAIL_PRESENT)
+
+    def _delete_object(self, arguments: Arguments) -> OperationResult:
+        item = self._object(arguments.one)
+        if item.format == ObjectFormat.ASSOCIATION:
+            raise OperationRefusal(ResponseCode.OBJECT_WRITE_PROTECTED)
+        if item.storage:
+            del self._on_card()[item.handle]
+            self._record(Notice(EosEvent.OBJECT_REMOVED, item.handle))
+            self._report(Property.EOS_AVAILABLE_SHOTS)
+        else:
+            del self._memory[item.handle]
+        return OperationResult()
+
+    def _transfer_complete(self, arguments: Arguments) -> OperationResult:
+        if self._memory.pop(arguments.one, None) is None:
+            raise OperationRefusal(ResponseCode.INVALID_OBJECT_HANDLE)
+        return OperationResult()
+
+    def _reset_transfer(self, _: Arguments) -> OperationResult:
+        self._memory.clear()
+        return OperationResult()
+
+    def _pc_hdd_capacity(self, arguments: Arguments) -> OperationResult:
+        self._host_bytes = arguments.one * arguments.two
+        self._report(Property.EOS_AVAILABLE_SHOTS)
+        return OperationResult()
+
+    def _frames_waiting(self) -> int:
+        return len({item.name.rpartition(".")[0] for item in self._memory.values()})
+
+    def _offer_transfer(self, item: StoredObject) -> None:
+        wide = self.body.wide_objects
+        request = EosEvent.REQUEST_OBJECT_TRANSFER_64 if wide else EosEvent.REQUEST_OBJECT_TRANSFER
+        self._record(TransferRequest(item.handle, item.format, len(item.data), item.name, request))
+
+
+_TIMERS_S: dict[int, float] = {
+    DriveMode.TIMER_10_S: 10.0,
+    DriveMode.TIMER_2_S: 2.0,
+    DriveMode.TIMER_CONTINUOUS: 10.0,
+}
+_CONTINUOUS = (
+    DriveMode.CONTINUOUS,
+    DriveMode.CONTINUOUS_HIGH,
+    DriveMode.CONTINUOUS_LOW,
+    DriveMode.CONTINUOUS_SILENT,
+)
+_AUTO_ISO = 400
+"""ISO speed where the body may choose (assumed; there is no meter)."""
+_METERED_S = 1 / 60
+"""Shutter time where the body may choose (assumed; there is no meter)."""
+_METERED_APERTURE = 5.6
+"""Aperture where the body may choose (assumed; there is no meter)."""
+_FORMATS_BY_SUFFIX = {".crw": ObjectFormat.CRW, ".cr3": ObjectFormat.CR3}
+_JPEG_SIZE = (160, 240)
+"""Height and width, px: enough for the file's name, and next to nothing to encode."""
+
+
+class _Refusal(Enum):
+    """Why a full press takes no picture: the response to RemoteReleaseOn, and the result of RemoteRelease."""
+
+    BUSY = (ResponseCode.DEVICE_BUSY, 0x2019)
+    NO_FOCUS = (ResponseCode.DEVICE_BUSY, 1)
+    MIRROR_LOCKUP = (ResponseCode.DEVICE_BUSY, 3)
+    MEMORY_FULL = (ResponseCode.DEVICE_BUSY, 7)
+    STORE_FULL = (ResponseCode.STORE_FULL, 7)
+    BATTERY_EMPTY = (ResponseCode.EOS_LOW_BATTERY, ResponseCode.EOS_LOW_BATTERY)
+    EXPOSURE = (ResponseCode.GENERAL_ERROR, ResponseCode.GENERAL_ERROR)
+
+    def __init__(self, response: int, result: int) -> None:
+        self.response = response
+        self.result = result
+
+
+@dataclass(frozen=True)
+class _Frame:
+    """A picture under way: what the film makes of it (None where it failed) and where it goes."""
+
+    number: int
+    taken_at: datetime
+    raw: Future[bytes | None]
+    formats: ImageFormat
+    destination: int
+
+
+class EosRelease(EosFiles):
+    """What a finger on the release does, at the camera or far away."""
+
+    def _remote_release_on(self, arguments: Arguments) -> OperationResult:
+        self._require_remote()
+        if not 1 <= arguments.one <= ReleaseButton.HALF_AND_FULL:
+            raise OperationRefusal(ResponseCode.INVALID_PARAMETER)
+        if self._is_busy:
+            raise OperationRefusal(ResponseCode.DEVICE_BUSY)
+        automatic = arguments.two == 0
+        if arguments.one & ReleaseButton.HALF and automatic:
+            self._focus()
+        if arguments.one & ReleaseButton.FULL:
+            refusal = self._full_press(automatic)
+            if refusal is not None:
+                raise OperationRefusal(refusal.response)
+        return OperationResult()
+
+    def _remote_release_off(self, arguments: Arguments) -> OperationResult:
+        self._require_remote()
+        if not 1 <= arguments.one <= ReleaseButton.HALF_AND_FULL:
+            raise OperationRefusal(ResponseCode.INVALID_PARAMETER)
+        self._let_go(arguments.one)
+        return OperationResult()
+
+    def _remote_release(self, _: Arguments) -> OperationResult:
+        self._require_remote()
+        self._focus()
+        refusal = self._full_press(automatic=True)
+        self._let_go(ReleaseButton.HALF_AND_FULL)
+        return OperationResult(parameters=(0 if refusal is None else refusal.result,))
+
+    @property
+    def _has_autofocus(self) -> bool:
+        return self._number_of(Property.EOS_FOCUS_MODE) != FocusMode.MANUAL
+
+    def _focus(self) -> None:
+        if self._has_autofocus:
+            self._focused = self._finds_focus
+            self._change(Property.EOS_FOCUS_INFO, focus_points((FOCUS_CENTRE,) if self._focused else ()))
+
+    def _cancel_focus(self, _: Arguments) -> OperationResult:
+        self._focused = False
+        return OperationResult()
+
+    def _full_press(self, automatic: bool) -> _Refusal | None:
+        settings = self._settings()
+        refusal = self._refusal(automatic, settings)
+        if refusal is not None:
+            return refusal
+        now = self._clock.monotonic()
+        self._pressed_at = now
+        drive = self._number_of(Property.EOS_DRIVE_MODE)
+        bracketing = self._number_of(Property.EOS_AEB)
+        if self._number_of(Property.EOS_SHUTTER_SPEED) == BULB:
+            self._bulb_since = now, self._clock.now()
+            self._record(Notice(EosEvent.CAMERA_STATUS_CHANGED, CameraStatus.BUSY))
+            return None
+        # A bracket comes whole, except in single drive, where each press takes one of its three.
+        whole = bracketing and (drive in _CONTINUOUS or drive in _TIMERS_S)
+        opens_at = now + _TIMERS_S.get(drive, 0.0)
+        for _ in range(3 if whole else 1):
+            opens_at = self._plan(opens_at, self._bracketed(settings, bracketing))
+        self._move()
+        return None
+
+    def _refusal(self, automatic: bool, settings: ExposureSettings) -> _Refusal | None:
+        destination = self._number_of(Property.EOS_CAPTURE_DESTINATION)
+        if self._is_busy:
+            return _Refusal.BUSY
+        if self._battery <= 0:
+            return _Refusal.BATTERY_EMPTY
+        if self._mirror_lockup:
+            return _Refusal.MIRROR_LOCKUP
+        if automatic and self._has_autofocus and not self._focused:
+            return _Refusal.NO_FOCUS
+        if destination & CaptureDestination.HOST and self._frames_waiting() >= self.body.burst:
+            return _Refusal.MEMORY_FULL
+        if not self._available_shots():
+            return _Refusal.STORE_FULL
+        if self._number_of(Property.EOS_SHUTTER_SPEED) != BULB:
+            try:
+                self._film.accept(settings)
+            except DeviceRefused:
+                return _Refusal.EXPOSURE
+        return None
+
+    def _let_go(self, button: int) -> None:
+        if button & ReleaseButton.HALF:
+            self._focused = False
+        if not button & ReleaseButton.FULL or self._pressed_at is None:
+            return
+        now = self._clock.monotonic()
+        if self._bulb_since is not None:
+            since, opened = self._bulb_since
+            self._bulb_since = None
+            settings = self._settings()
+            held = ExposureSettings(settings.iso, settings.aperture, max(now - since, 1e-3))
+            self._expose(held, opened, now)
+        elif self._number_of(Property.EOS_DRIVE_MODE) in _CONTINUOUS and not self._number_of(Property.EOS_AEB):
+            self._continue_series(now)
+        self._pressed_at = None
+        self._move()
+
+    def _continue_series(self, now: float) -> None:
+        """Take the further frames of continuous drive that the time of the press was good for."""
+        assert self._pressed_at is not None
+        settings = self._settings()
+        pace = max(1 / self.body.frames_per_s, settings.shutter_s)
+        room = min(self.body.burst - self._frames_waiting(), self._available_shots()) - 1
+        for number in range(1, min(int((now - self._pressed_at) / pace), room) + 1):
+            self._plan(self._pressed_at + number * pace, settings)
+
+    def _settings(self) -> ExposureSettings:
+        """Return the exposure that is set, in nominal values; where the body would measure, what it is assumed to."""
+        iso = self._number_of(Property.EOS_ISO_SPEED)
+        aperture = self._number_of(Property.EOS_APERTURE)
+        shutter = self._number_of(Property.EOS_SHUTTER_SPEED)
+        mode = self._number_of(Property.EOS_AE_MODE)
+        return ExposureSettings(
+            round(apex.ISO.value(iso)) if iso else _AUTO_ISO,
+            apex.APERTURE.value(aperture)
+            if aperture and mode in (AeMode.MANUAL, AeMode.APERTURE_PRIORITY, AeMode.BULB)
+            else _METERED_APERTURE,
+            apex.SHUTTER.value(shutter)
+            if shutter and shutter != BULB and mode in (AeMode.MANUAL, AeMode.SHUTTER_PRIORITY)
+            else _METERED_S,
+        )
+
+    def _bracketed(self, settings: ExposureSettings, bracketing: int) -> ExposureSettings:
+        """Return the next of a bracket's three exposures: as set, under, over."""
+        if not bracketing:
+            return settings
+        stops = (0, -bracketing, bracketing)[self._bracket_step] / 8
+        self._bracket_step = (self._bracket_step + 1) % 3
+        return ExposureSettings(settings.iso, settings.aperture, settings.shutter_s * 2**stops)
+
+    # The shutter.
+
+    def _plan(self, opens_at: float, settings: ExposureSettings) -> float:
+        """Open the shutter at a time; return when it can open again."""
+        self._unfinished += 1
+        if self._unfinished == 1:
+            self._record(Notice(EosEvent.CAMERA_STATUS_CHANGED, CameraStatus.BUSY))
+
+        def open_shutter() -> None:
+            late = timedelta(seconds=self._clock.monotonic() - opens_at)
+            self._unfinished -= 1
+            self._expose(settings, self._clock.now() - late, opens_at + settings.shutter_s)
+
+        self._at(opens_at, open_shutter)
+        return opens_at + max(settings.shutter_s, 1 / self.body.frames_per_s)
+
+    def _expose(self, settings: ExposureSettings, opened: datetime, closes_at: float) -> None:
+        self._unfinished += 1
+        self._shutter_count += 1
+        self._battery = max(self._battery - 1 / self.body.shots_per_charge, 0.0)
+        self._number = self._number % 9999 + 1
+        frame = _Frame(
+            self._number,
+            opened + self._time_offset,
+            self._develop(settings, opened),
+            ImageFormat.decode(self._properties[Property.EOS_IMAGE_FORMAT].value),
+            self._number_of(Property.EOS_CAPTURE_DESTINATION),
+        )
+        self._at(closes_at + self.body.write_s, lambda: self._written(frame))
+
+    def _develop(self, settings: ExposureSettings, opened: datetime) -> Future[bytes | None]:
+        def develop() -> bytes | None:
+            into = BytesIO()
+            try:
+                self._film.accept(settings)
+                self._film.expose(settings, opened, into)
+            except (DeviceError, CropError):
+                # A film that has no such picture is a camera whose frame never comes.
+                return None
+            return into.getvalue()
+
+        if self._executor is not None:
+            return self._executor.submit(develop)
+        done: Future[bytes | None] = Future()
+        done.set_result(develop())
+        return done
+
+    def _written(self, frame: _Frame) -> None:
+        """Announce a frame's files; where the film takes longer than the body would, look again soon."""
+        if not frame.raw.done():
+            self._at(self._clock.monotonic() + 0.01, lambda: self._written(frame))
+            return
+        raw = frame.raw.result()
+        self._unfinished -= 1
+        if raw is not None:
+            suffix = self._film.suffix.lower()
+            for index, file in enumerate(frame.formats.files):
+                name = f"IMG_{frame.number:04d}"
+                if file.is_raw:
+                    kind = _FORMATS_BY_SUFFIX.get(suffix, ObjectFormat.CR2)
+                    self._deliver(frame, index, f"{name}{suffix.upper()}", kind, raw)
+                else:
+                    self._deliver(frame, index, f"{name}.JPG", ObjectFormat.EXIF_JPEG, _small_jpeg(name))
+        self._report(Property.EOS_AVAILABLE_SHOTS, Property.EOS_SHUTTER_COUNTER, Property.EOS_BATTERY_POWER)
+        if not self._is_busy:
+            self._record(Notice(EosEvent.CAMERA_STATUS_CHANGED, CameraStatus.IDLE))
+        self._idle_since = self._clock.monotonic()
+
+    def _deliver(self, frame: _Frame, index: int, name: str, kind: int, data: bytes) -> None:
+        wide = self.body.wide_objects
+        if frame.destination != CaptureDestination.HOST and self._card is not None:
+            handle = FOLDER | frame.number << 4 | index + 1
+            item = StoredObject(handle, CARD, kind, name, frame.taken_at, FOLDER, data)
+            self._card.objects[handle] = item
+            self._record(ObjectEvent(EosEvent.OBJECT_ADDED_64 if wide else EosEvent.OBJECT_ADDED, item.entry))
+            self._record(Notice(EosEvent.STORAGE_INFO_CHANGED, CARD))
+        if frame.destination & CaptureDestination.HOST:
+            handle = next(self._handles)
+            self._memory[handle] = StoredObject(handle, 0, kind, name, frame.taken_at, data=data)
+            self._host_bytes = max(self._host_bytes - len(data), 0)
+            self._offer_transfer(self._memory[handle])
+
+
+def _small_jpeg(name: str) -> bytes:
+    """Return a JPEG file of a grey picture with its own name on it: what stands in for a rendered frame."""
+    import cv2
+    import numpy as np
+
+    picture = np.full((*_JPEG_SIZE, 3), 118, dtype=np.uint8)
+    picture = cv2.putText(picture, name, (20, 90), cv2.FONT_HERSHEY_SIMPLEX, 1.0, (255, 255, 255))
+    return cv2.imencode(".jpg", picture)[1].tobytes()
+
+
+_FREELY_SET = (Property.EOS_OWNER, Property.EOS_ARTIST, Property.EOS_COPYRIGHT, Property.EOS_CAMERA_TIME)
+
+
+class EosSettings(SimulatedEosState):
+    """What an initiator can ask of a body's settings, and set."""
+
+    def _set_device_prop_value_ex(self, arguments: Arguments) -> OperationResult:
+        self._require_remote()
+        try:
+            setting = PropertySetting.decode(arguments.data or b"")
+        except ProtocolError:
+            raise OperationRefusal(ResponseCode.INVALID_DEVICE_PROP_FORMAT) from None
+        known = self._properties.get(setting.code)
+        if known is None:
+            raise OperationRefusal(ResponseCode.DEVICE_PROP_NOT_SUPPORTED)
+        # The recorded 60D answers 2019 to a value that its list does not hold, not 201c.
+        if self._is_busy or not self._allows(setting, known):
+            raise OperationRefusal(ResponseCode.DEVICE_BUSY)
+        self._store(setting.code, setting.value)
+        return OperationResult()
+
+    def _allows(self, setting: PropertySetting, known: PropertyState) -> bool:
+        try:
+            if setting.code in IMAGE_FORMAT_PROPERTIES:
+                return ImageFormat.decode(setting.value) in known.formats
+            if known.kind == LIST:
+                return number_of(setting.value) in known.choices
+        except ProtocolError:
+            raise OperationRefusal(ResponseCode.INVALID_DEVICE_PROP_FORMAT) from None
+        return known.kind == FREE and setting.code in _FREELY_SET
+
+    def _store(self, code: int, value: bytes) -> None:
+        if code == Property.EOS_CAMERA_TIME:
+            self._time_offset = datetime.fromtimestamp(number_of(value), UTC) - self._clock.now()
+            self._report(code)
+            return
+        if code in (Property.EOS_IMAGE_FORMAT, Property.EOS_IMAGE_FORMAT_SD):
+            self._change(Property.EOS_IMAGE_FORMAT, value)
+            self._change(Property.EOS_IMAGE_FORMAT_SD, value)
+            return
+        if code == Property.EOS_MIRROR_UP_SETTING:
+            self._mirror_lockup = bool(number_of(value))
+        if code == Property.EOS_AEB:
+            self._bracket_step = 0
+        self._change(code, value)
+        if code == Property.EOS_CAPTURE_DESTINATION:
+            self._report(Property.EOS_AVAILABLE_SHOTS, Property.EOS_CURRENT_STORAGE, Property.EOS_CURRENT_FOLDER)
+
+    def _request_device_prop_value(self, arguments: Arguments) -> OperationResult:
+        if arguments.one not in self._properties:
+            raise OperationRefusal(ResponseCode.GENERAL_ERROR)
+        self._report(arguments.one)
+        return OperationResult()
+
+    def _description(self, code: int) -> DevicePropDesc:
+        match code:
+            case Property.BATTERY_LEVEL:
+                percent = round(100 * self._battery)
+                levels = EnumerationForm((100, 75, 50, 25, 0), widened=True)
+                return DevicePropDesc(code, DataType.UINT8, False, percent, percent, levels)
+            case Property.DEVICE_FRIENDLY_NAME:
+                return DevicePropDesc(code, DataType.STRING, False, self.body.model, self.body.model)
+            case Property.PERCEIVED_DEVICE_TYPE:
+                return DevicePropDesc(code, DataType.UINT32, False, 1, 1)
+            case Property.SESSION_INITIATOR:
+                return DevicePropDesc(code, DataType.STRING, True, "Unknown Initiator", self._initiator)
+            case Property.USE_DEVICE_STAGE:
+                return DevicePropDesc(code, DataType.UINT8, False, 1, 1)
+            case _:
+                raise OperationRefusal(ResponseCode.DEVICE_PROP_NOT_SUPPORTED)
+
+    def _get_device_prop_desc(self, arguments: Arguments) -> OperationResult:
+        return OperationResult(self._description(arguments.one).encode())
+
+    def _get_device_prop_value(self, arguments: Arguments) -> OperationResult:
+        description = self._description(arguments.one)
+        return OperationResult(encode_value(description.data_type, description.current))
+
+    def _set_device_prop_value(self, arguments: Arguments) -> OperationResult:
+        description = self._description(arguments.one)
+        if not description.writable:
+            raise OperationRefusal(ResponseCode.ACCESS_DENIED)
+        try:
+            value: Value = decode_value(description.data_type, arguments.data or b"")
+        except ProtocolError:
+            raise OperationRefusal(ResponseCode.INVALID_DEVICE_PROP_FORMAT) from None
+        self._initiator = str(value)
+        return OperationResult()
+
 
 _SHUTDOWN_WARNING_S = 10.0
 """How long before it goes to sleep the camera says so (assumed)."""

@@ -14,7 +14,7 @@ from drivers.display import jvc
 from drivers.links.network import TcpLink, TcpServer
 from drivers.presenter import WHITE, Colour
 from foundation.errors import LinkTimeout, ProtocolError
-from sim.projectors.screen import Screen
+from sim.projectors.projector import Screen
 
 _PATIENCE_S = 5.0
 """For one read or write; a silent client is listened to again."""

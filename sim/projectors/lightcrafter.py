@@ -20,9 +20,8 @@ from drivers.display import lightcrafter as wire
 from drivers.display.lightcrafter import PRODUCTS, VENDOR, LightCrafterCommand, LightCrafterReply
 from drivers.presenter import WHITE, Colour
 from foundation.errors import ProtocolError
-from sim.buses.usb import Handle, SimulatedBus
-from sim.buses.usb_device import Setup, Stalled
-from sim.projectors.screen import Screen
+from sim.buses.usb import Handle, Setup, SimulatedBus, Stalled
+from sim.projectors.projector import Screen
 
 REPORT_IN, REPORT_OUT = 0x81, 0x01
 """The endpoints' addresses, those of the real boards."""

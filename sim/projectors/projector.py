@@ -5,6 +5,8 @@ Rules that hold inside:
 - It has states and no bytes; `sim.projectors.pjlink` and `sim.projectors.serial` translate for it.
 - State moves with the time that is handed in, and only when somebody looks.
 - What the world needs is `light`: how much of the full light reaches the screen now.
+
+The simulated screen: one plain colour that the simulated camera sees when it looks.
 """
 
 from __future__ import annotations
@@ -13,9 +15,42 @@ import threading
 from dataclasses import dataclass
 
 from drivers.pjlink.wire import FAULT_PARTS, Input, NoResolution, Resolution
+from drivers.presenter import BLACK, Colour
 from drivers.projector import Fault, Lamp, Power, ProjectorIdentity, Severity
 from foundation.clock import Clock
-from foundation.errors import DeviceFault, DeviceRefused
+from foundation.errors import DeviceError, DeviceFault, DeviceRefused
+
+REFRESH_S = 1 / 60
+"""60 Hz, the usual picture rate."""
+
+
+@dataclass
+class Screen:
+    """The colour shown now; shared by the presenter, who writes, and the camera, who looks."""
+
+    colour: Colour = BLACK
+
+
+class SimulatedPresenter:
+    """A `drivers.presenter.Presenter` on a `Screen`."""
+
+    def __init__(self, screen: Screen, clock: Clock) -> None:
+        self._screen = screen
+        self._clock = clock
+        self._open = True
+
+    def show(self, colour: Colour) -> None:
+        """Put `colour` on the screen, one refresh from now."""
+        if not self._open:
+            raise DeviceError("the simulated screen is closed; open the rig again")
+        self._clock.sleep(REFRESH_S)
+        self._screen.colour = colour
+
+    def close(self) -> None:
+        """Leave the screen black."""
+        self._screen.colour = BLACK
+        self._open = False
+
 
 WARM_UP_S = 30.0
 """A little less than the 40 s typical of PWR ON (Epson, ESC/VP21 Command User's Guide)."""

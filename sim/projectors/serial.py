@@ -6,7 +6,7 @@ Rules that hold inside:
 - A serial cable has no connections: a peer goes on where it was when its cable is opened again, and forgets only a
   half-heard command.
 - `receive` with no bytes asks what a peer has to say by now: a late answer, or news. Whoever joins a peer to a cable
-  asks often (`sim.buses.serial_cable`, `sim.buses.pty`).
+  asks often (`sim.buses.serial`, `sim.buses.serial`).
 - Where the manuals leave open what a projector does, a peer does what is harder on the driver: it falls silent, or
   refuses.
 """

@@ -27,16 +27,11 @@ from numpy.typing import ArrayLike, NDArray
 from drivers.camera import ExposureSettings
 from drivers.presenter import Colour
 from foundation.processors import processor_count
-from sim.optics.falloff import lens_falloff, projector_falloff
-from sim.optics.photographic_lens import APERTURE_VARIANCE, PhotographicLens
-from sim.world.drawing import PAPER, Print, label_map
-from sim.world.geometry import View, surface_of
-from sim.world.profile import printed_reflectance
-from sim.world.room import REFERENCE_EXPOSURE, Room
+from sim.optics import APERTURE_VARIANCE, PhotographicLens, lens_falloff, projector_falloff
+from sim.world.disturbances import UNDISTURBED, Situation, moved, moved_back
+from sim.world.rendering import PAPER, Print, View, label_map, surface_of
+from sim.world.room import REFERENCE_EXPOSURE, Room, printed_reflectance, projector_primaries, sensitivities, worn
 from sim.world.sensors import Body, HotPattern
-from sim.world.situation import UNDISTURBED, Situation, moved, moved_back
-from sim.world.spectra import projector_primaries, sensitivities
-from sim.world.wear import worn
 
 _BACKDROP_REFLECTANCE: Final = 0.04
 """Of what lies behind the print, at every wavelength: dark, as a backdrop should be."""

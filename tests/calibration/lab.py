@@ -23,8 +23,8 @@ from experiment.lights.illuminations import Illumination, plan_illuminations
 from experiment.session.folder import Session
 from experiment.session.plan import SessionStep
 from experiment.session.records import ACCEPTED
-from sim.camera.dng import write_dng
-from sim.world.drawing import Print
+from sim.camera.film import write_dng
+from sim.world.rendering import Print
 from sim.world.room import Room
 from sim.world.sensors import BODIES
 from sim.world.world import World

@@ -15,9 +15,9 @@ from typing import BinaryIO
 from drivers.camera import ExposureSettings
 from drivers.ptp.codes import AeMode
 from foundation.clock import SystemClock
-from sim.buses.ptpip_server import serve_ptpip
+from sim.buses.ptp import serve_ptpip
+from sim.camera.bodies import EOS_550D
 from sim.camera.eos import SimulatedEos
-from sim.camera.eos_bodies import EOS_550D
 from tests.contracts.camera import SeededFilm
 
 FILM_BYTES = 3_000_000

@@ -18,9 +18,9 @@ from drivers.ptp.codes import Operation, ResponseCode
 from drivers.ptp.transaction import PtpRequest, PtpResponse
 from foundation.errors import DeviceError, DeviceRefused
 from foundation.files import whole_file
-from sim.buses.faults import CutOff, TroubledResponder
 from sim.buses.responder import Answer, NoAnswer, Responder
-from sim.camera.eos_bodies import EOS_550D
+from sim.camera.bodies import EOS_550D
+from tests.cable_faults import CutOff, TroubledResponder
 from tests.contracts.camera import SETTINGS
 from tests.drivers.canon.eos_lab import Lab
 

@@ -25,9 +25,9 @@ from calibration.pipeline.build import build
 from calibration.table.lut import open_lut
 from drivers.raw.rawfile import read_raw
 from experiment.session.plan import SessionStep
+from sim.world.disturbances import Blob, Glare, Situation
 from sim.world.room import Room
 from sim.world.sensors import BODIES
-from sim.world.situation import Blob, Glare, Situation
 from sim.world.world import World
 
 pytestmark = pytest.mark.slow

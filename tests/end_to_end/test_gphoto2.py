@@ -29,11 +29,11 @@ from drivers.presenter import WHITE
 from drivers.ptp.codes import Property
 from drivers.raw.rawfile import read_raw
 from foundation.clock import SystemClock
-from sim.buses.ptpip_server import serve_ptpip
+from sim.buses.ptp import serve_ptpip
+from sim.camera.bodies import EOS_6D_MARK_II, EOS_550D_AS_LISTED, TEST_BODY
 from sim.camera.eos import SimulatedEos
-from sim.camera.eos_bodies import EOS_6D_MARK_II, EOS_550D_AS_LISTED, TEST_BODY
 from sim.camera.film import Film, WorldFilm
-from sim.world.drawing import Print
+from sim.world.rendering import Print
 from sim.world.room import Room
 from sim.world.sensors import BODIES
 from sim.world.world import World

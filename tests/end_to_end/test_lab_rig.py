@@ -30,18 +30,15 @@ from experiment.chart.model import load_chart
 from experiment.config import load_lab
 from experiment.session.folder import Session
 from foundation.clock import Clock, SystemClock
-from sim.buses.ptpip_server import serve_ptpip
-from sim.buses.pty import PseudoTerminal
-from sim.buses.serial_cable import serve_network
-from sim.buses.usb import SimulatedBus
-from sim.buses.usb_device import PtpUsbDevice
+from sim.buses.ptp import serve_ptpip
+from sim.buses.serial import PseudoTerminal, serve_network
+from sim.buses.usb import PtpUsbDevice, SimulatedBus
+from sim.camera.bodies import EOS_BODIES
 from sim.camera.eos import SimulatedEos
-from sim.camera.eos_bodies import EOS_BODIES
 from sim.camera.film import WorldFilm
 from sim.clock import OPENING
 from sim.projectors.pjlink import serve_pjlink
-from sim.projectors.projector import SimulatedProjector
-from sim.projectors.screen import Screen, SimulatedPresenter
+from sim.projectors.projector import Screen, SimulatedPresenter, SimulatedProjector
 from sim.projectors.serial import PEERS, BenqPeer, EpsonPeer
 from sim.world.world import World
 from tests.found_texts import files_with

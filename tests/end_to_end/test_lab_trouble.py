@@ -25,15 +25,13 @@ from drivers.pjlink.projector import PjLinkProjector
 from drivers.projector import Power
 from foundation.clock import Clock, SystemClock
 from foundation.errors import DeviceRefused
-from sim.buses.ptpip_server import serve_ptpip
-from sim.buses.pty import PseudoTerminal
-from sim.buses.usb import SimulatedBus
-from sim.buses.usb_device import PtpUsbDevice, UsbIdentity
+from sim.buses.ptp import serve_ptpip
+from sim.buses.serial import PseudoTerminal
+from sim.buses.usb import PtpUsbDevice, SimulatedBus, UsbIdentity
+from sim.camera.bodies import EOS_BODIES
 from sim.camera.eos import SimulatedEos
-from sim.camera.eos_bodies import EOS_BODIES
 from sim.projectors.pjlink import serve_pjlink
-from sim.projectors.projector import SimulatedProjector
-from sim.projectors.screen import Screen, SimulatedPresenter
+from sim.projectors.projector import Screen, SimulatedPresenter, SimulatedProjector
 from sim.projectors.serial import EpsonPeer
 from tests.contracts.camera import SeededFilm
 

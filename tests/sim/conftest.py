@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sim.world.drawing import Print
+from sim.world.rendering import Print
 from sim.world.room import Room
 from sim.world.sensors import BODIES
 from sim.world.world import World

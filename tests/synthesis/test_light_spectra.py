@@ -9,8 +9,8 @@ import pytest
 
 from experiment.lights.illuminations import blackbody_light, shown_colour
 from foundation.errors import FormatError, InputError
-from sim.world.spectra import WAVELENGTHS_NM
-from synthesis.light_spectra import illuminations_of, parse_spectra, read_lights
+from sim.world.room import WAVELENGTHS_NM
+from synthesis.lamps import illuminations_of, parse_spectra, read_lights
 
 
 def table(step: int = 5, low: int = 380, high: int = 780, **lights: float) -> str:

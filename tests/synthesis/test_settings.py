@@ -8,9 +8,8 @@ from typing import Any
 import pytest
 
 from foundation.errors import ConfigurationError
-from sim.world.body_settings import FACTS, find_body
-from sim.world.sensors import BODIES
-from synthesis.settings import TableSettings, load_settings, parse_settings, room_of
+from sim.world.sensors import BODIES, FACTS, find_body
+from synthesis.cli import TableSettings, load_settings, parse_settings, room_of
 
 FILE = """
 seed = 3

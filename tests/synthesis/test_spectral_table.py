@@ -17,12 +17,10 @@ from experiment.lights.illuminations import load_illuminations
 from foundation.errors import FormatError, InputError
 from generator.cli import main as generate
 from generator.lights.choices import parse_light
-from sim.world.profile import printed_reflectance
-from sim.world.spectra import print_reflectance, sensitivities
-from synthesis.light_spectra import LightSpectra, read_lights
-from synthesis.settings import parse_settings
+from sim.world.room import print_reflectance, printed_reflectance, sensitivities
+from synthesis.cli import parse_settings, table_task
+from synthesis.lamps import LightSpectra, read_lights
 from synthesis.table import compute_table
-from synthesis.tasks import table_task
 
 pytestmark = pytest.mark.slow
 

@@ -20,9 +20,8 @@ from experiment.lights.illuminations import plan_illuminations
 from foundation.errors import InputError, QualityError, StorageError
 from sim.world.room import Room
 from sim.world.sensors import BODIES
-from synthesis.settings import TableSettings, parse_settings
+from synthesis.cli import TableSettings, parse_settings, table_task
 from synthesis.table import TableTask, compute_table
-from synthesis.tasks import table_task
 from tests.calibration.lab import LIGHTS, SETTINGS, designed, hang, take
 
 pytestmark = pytest.mark.slow

@@ -22,21 +22,18 @@ from experiment.config import LabSettings
 from experiment.session.folder import Session
 from experiment.session.records import last_moment
 from foundation.errors import ConfigurationError, FormatError
-from sim.buses.ptp_memory import MemoryTransport
+from sim.buses.ptp import MemoryTransport
+from sim.camera.bodies import EOS_BODIES
 from sim.camera.eos import SimulatedEos
-from sim.camera.eos_bodies import EOS_BODIES
-from sim.camera.film import Film, WorldFilm
-from sim.camera.replay import RecordedFrame, ReplayFilm
+from sim.camera.film import Film, RecordedFrame, ReplayFilm, WorldFilm
 from sim.clock import OPENING, SimulatedClock
 from sim.projectors.pjlink import PjLinkPeer, memory_link
-from sim.projectors.projector import SimulatedProjector
-from sim.projectors.screen import Screen, SimulatedPresenter
-from sim.spectral.sensitivities import known_sensitivities
-from sim.world.body_settings import find_body
+from sim.projectors.projector import Screen, SimulatedPresenter, SimulatedProjector
+from sim.spectral import known_sensitivities
 from sim.world.disturbances import read_disturbances
-from sim.world.drawing import Print
+from sim.world.rendering import Print
 from sim.world.room import Room, read_room
-from sim.world.sensors import BODIES, Body
+from sim.world.sensors import BODIES, Body, find_body
 from sim.world.world import World
 
 SERIAL = "0000000001"

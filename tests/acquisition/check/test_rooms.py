@@ -17,8 +17,7 @@ from experiment.chart.layout import paper_chart
 from experiment.chart.model import load_chart
 from experiment.config import load_lab
 from sim.world import world
-from sim.world.room import Room
-from sim.world.wear import Stain, worn
+from sim.world.room import Room, Stain, worn
 from tests.acquisition.check.conftest import Check, lab_toml
 
 pytestmark = pytest.mark.slow

@@ -23,7 +23,7 @@ from experiment.config import LabSettings, parse_lab
 from experiment.lights.illuminations import Illumination, plan_illuminations
 from experiment.session.judgement import Judgement
 from experiment.session.plan import RESPONSE, SessionStep, plan_steps
-from sim.camera.dng import write_dng
+from sim.camera.film import write_dng
 from sim.world.disturbances import AnyDisturbance, Disturbances, Moment
 from sim.world.room import Room
 from sim.world.sensors import BODIES, Body

@@ -14,7 +14,7 @@ from acquisition.judge.exposure import Exposure, disagreement, measure_exposure,
 from drivers.camera import ExposureSettings
 from drivers.raw.rawfile import Mosaic, read_raw
 from experiment.config import LimitSettings
-from sim.camera.dng import write_dng
+from sim.camera.film import write_dng
 from sim.world.sensors import BODIES
 
 BODY = BODIES["Test"]

@@ -35,16 +35,16 @@ from experiment.session.journal import Journal
 from experiment.session.judgement import Judgement
 from experiment.session.plan import SessionStep, plan_steps
 from foundation.errors import CropError, DeviceError, LinkClosed, StorageError
-from sim.buses import faults
-from sim.buses.faults import Occasion
-from sim.buses.ptp_memory import MemoryPipes
+from sim.buses.ptp import MemoryPipes
 from sim.buses.responder import Responder
-from sim.buses.usb_device import PtpUsbDevice
+from sim.buses.usb import PtpUsbDevice
+from sim.camera.bodies import EOS_550D
 from sim.camera.eos import SimulatedEos
-from sim.camera.eos_bodies import EOS_550D
 from sim.clock import SimulatedClock
 from sim.projectors.pjlink import PjLinkPeer, memory_link
 from sim.projectors.projector import SimulatedProjector
+from tests import cable_faults as faults
+from tests.cable_faults import Occasion
 
 LIGHTS = tuple(Illumination(n, "uniform", None, Colour(255, 12 * n, 255 - n)) for n in range(20))
 SETTINGS = LabSettings.model_validate(

@@ -21,7 +21,7 @@ from experiment.lights.illuminations import Illumination
 from experiment.session.folder import Session
 from experiment.session.plan import plan_steps
 from foundation.errors import DeviceError
-from sim.camera.dng import write_dng
+from sim.camera.film import write_dng
 from sim.clock import SimulatedClock
 from sim.projectors.projector import SimulatedProjector
 from sim.world.sensors import BODIES

@@ -18,7 +18,7 @@ from drivers.projector import Fault, Lamp, Power, Projector, Severity
 from drivers.serial_projectors.optoma import OptomaProjector
 from experiment.config import SequenceSettings
 from foundation.errors import DeviceFault, LinkClosed, LinkTimeout
-from sim.buses.serial_cable import SerialPeerLink
+from sim.buses.serial import SerialPeerLink
 from sim.clock import SimulatedClock
 from sim.projectors.pjlink import PjLinkPeer, memory_link
 from sim.projectors.projector import SimulatedProjector

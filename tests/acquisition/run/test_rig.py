@@ -18,8 +18,8 @@ from experiment.lights.illuminations import plan_illuminations, save_illuminatio
 from experiment.session.folder import Session
 from foundation.clock import Clock
 from foundation.errors import ConfigurationError
-from sim.projectors.screen import Screen, SimulatedPresenter
-from sim.world.body_settings import FACTS
+from sim.projectors.projector import Screen, SimulatedPresenter
+from sim.world.sensors import FACTS
 
 HEAD = 'rig = "simulated"\nchart = "c.json"\nilluminations = "l.csv"\n'
 

@@ -15,8 +15,8 @@ from drivers.presenter import Colour
 from experiment.lights.illuminations import Illumination
 from experiment.session.folder import Session
 from experiment.session.plan import SessionStep
-from sim.camera.dng import write_dng
-from sim.world.situation import UNDISTURBED, Blob, Situation
+from sim.camera.film import write_dng
+from sim.world.disturbances import UNDISTURBED, Blob, Situation
 from tests.calibration.lab import LIGHTS, SETTINGS, TAKEN_AT, Lab, renumbered, take
 
 BRIGHT = renumbered(

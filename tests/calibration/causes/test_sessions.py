@@ -31,8 +31,8 @@ from calibration.verdict.wording import remark
 from drivers.presenter import Colour
 from experiment.session.folder import Session
 from experiment.session.plan import SessionStep
+from sim.world.disturbances import Blob, Situation
 from sim.world.room import Room
-from sim.world.situation import Blob, Situation
 from tests.calibration.causes.rooms import BRIGHT, HAND, Counts, glare, half, nth_white, taken
 from tests.calibration.lab import Lab, hang
 

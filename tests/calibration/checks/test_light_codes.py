@@ -18,8 +18,7 @@ from experiment.lights.illuminations import plan_illuminations
 from experiment.session.plan import SessionStep
 from foundation.colorimetry import angles_deg, decode_srgb
 from foundation.errors import FormatError
-from sim.world.room import Room
-from sim.world.spectra import projector_primaries, sensitivities
+from sim.world.room import Room, projector_primaries, sensitivities
 from tests.calibration.lab import LIGHTS, SETTINGS, Lab, hang, take
 
 pytestmark = pytest.mark.slow

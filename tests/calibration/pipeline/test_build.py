@@ -30,7 +30,7 @@ from experiment.measures.polynomials import order_of, page_polynomial
 from experiment.session.folder import Session
 from experiment.session.plan import SessionStep, plan_steps
 from foundation.errors import FormatError, InputError, QualityError, RegistrationError
-from sim.camera.dng import write_dng
+from sim.camera.film import write_dng
 from sim.world.room import Room
 from tests.calibration.lab import LIGHTS, SETTINGS, TAKEN_AT, Lab, hang, renumbered, take
 from tests.json_of import json_of

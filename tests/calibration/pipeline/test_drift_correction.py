@@ -20,7 +20,7 @@ from calibration.table.verification import find_faults
 from experiment.session.folder import Session
 from experiment.session.plan import SessionStep
 from foundation.errors import FormatError, QualityError
-from sim.camera.dng import write_dng
+from sim.camera.film import write_dng
 from tests.calibration.lab import LIGHTS, SETTINGS, TAKEN_AT, Lab, take
 
 pytestmark = pytest.mark.slow

@@ -21,7 +21,7 @@ from experiment.session.folder import Session
 from experiment.session.mending.retaking import lights_text
 from experiment.session.plan import SessionStep
 from foundation.errors import QualityError
-from sim.camera.dng import write_dng
+from sim.camera.film import write_dng
 from sim.world.room import Room
 from sim.world.sensors import BODIES
 from sim.world.world import World

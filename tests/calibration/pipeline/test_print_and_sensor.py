@@ -12,10 +12,8 @@ from calibration.report.report import write_report
 from calibration.table.lut import open_lut
 from calibration.verdict.values import judged_values
 from drivers.presenter import WHITE, Colour
-from sim.world.drawing import PAPER
-from sim.world.profile import ProfileName
-from sim.world.room import Room
-from sim.world.spectra import PaperName
+from sim.world.rendering import PAPER
+from sim.world.room import PaperName, ProfileName, Room
 from tests.calibration.causes.rooms import BRIGHT, Counts, taken
 from tests.calibration.lab import LIGHTS, SETTINGS, hang, renumbered, take
 

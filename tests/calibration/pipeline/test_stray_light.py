@@ -19,9 +19,9 @@ from calibration.verdict.verdict import judge
 from calibration.verdict.wording import remark
 from drivers.presenter import Colour
 from experiment.session.plan import SessionStep
+from sim.world.disturbances import Situation
 from sim.world.room import Room
 from sim.world.sensors import BODIES
-from sim.world.situation import Situation
 
 pytestmark = pytest.mark.slow
 

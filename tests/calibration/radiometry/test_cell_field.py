@@ -11,7 +11,7 @@ from drivers.presenter import WHITE, Colour
 from experiment.chart.layout import paper_chart
 from experiment.chart.printing import drawing
 from experiment.measures.paper import PaperReader
-from sim.world.drawing import Print
+from sim.world.rendering import Print
 from sim.world.room import Room
 from sim.world.sensors import BODIES
 from sim.world.world import World

@@ -12,12 +12,11 @@ from drivers.links.link import UsbPipes
 from drivers.ptp.transaction import Transport
 from drivers.ptp.usb import UsbTransport
 from foundation.errors import DeviceError, DeviceFault, DeviceRefused
-from sim.buses.ptp_memory import MemoryPipes
+from sim.buses.ptp import MemoryPipes
 from sim.buses.responder import Responder
-from sim.buses.usb_device import PtpUsbDevice
+from sim.buses.usb import PtpUsbDevice
+from sim.camera.bodies import EOS_550D, EosModel
 from sim.camera.eos import SimulatedEos
-from sim.camera.eos_bodies import EOS_550D
-from sim.camera.eos_model import EosModel
 from sim.clock import SimulatedClock
 from tests.contracts.camera import SeededFilm
 

@@ -45,16 +45,14 @@ from drivers.ptp.ip import IpTransport
 from drivers.ptp.transaction import PtpEvent, PtpRequest, PtpResponse, Reception, Transaction, Transport
 from drivers.ptp.usb import UsbTransport
 from foundation.errors import DeviceError, DeviceRefused, LinkClosed, ProtocolError, StorageError
-from sim.buses import faults
-from sim.buses.faults import Occasion
-from sim.buses.ptpip_server import serve_ptpip
+from sim.buses.ptp import serve_ptpip
 from sim.buses.responder import Answer, Responder
-from sim.buses.usb import SimulatedBus
-from sim.buses.usb_device import PtpUsbDevice
+from sim.buses.usb import PtpUsbDevice, SimulatedBus
+from sim.camera.bodies import EOS_6D_MARK_II, EOS_550D, EosModel
 from sim.camera.eos import SimulatedEos
-from sim.camera.eos_bodies import EOS_6D_MARK_II, EOS_550D
-from sim.camera.eos_model import EosModel
 from sim.clock import SimulatedClock
+from tests import cable_faults as faults
+from tests.cable_faults import Occasion
 from tests.contracts.camera import SETTINGS, Bench, CameraContract
 from tests.drivers.canon.eos_lab import Lab
 from tests.drivers.ptp.conversations import Recorded

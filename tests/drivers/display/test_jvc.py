@@ -16,7 +16,7 @@ from drivers.presenter import BLACK, WHITE, Colour
 from foundation.errors import DeviceError, DeviceRefused, LinkClosed, LinkTimeout, ProtocolError
 from sim.clock import SimulatedClock
 from sim.projectors.jvc import JvcPeer, serve_jvc
-from sim.projectors.screen import Screen
+from sim.projectors.projector import Screen
 from tests.contracts.presenter import Bench, PresenterContract
 from tests.drivers.script import Script
 

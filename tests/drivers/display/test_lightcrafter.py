@@ -27,7 +27,7 @@ from drivers.presenter import BLACK, WHITE, Colour
 from foundation.errors import DeviceError, DeviceRefused, InputError, LinkClosed, LinkTimeout, ProtocolError
 from sim.clock import SimulatedClock
 from sim.projectors.lightcrafter import VIDEO_INPUT, Controller, HidBus, LightCrafterUsb
-from sim.projectors.screen import Screen
+from sim.projectors.projector import Screen
 from tests.contracts.presenter import Bench, PresenterContract
 
 

@@ -12,8 +12,7 @@ from drivers.links.usb import UDEV_RULE, UsbDevice, list_devices, open_usb
 from drivers.ptp.transaction import PtpRequest
 from drivers.ptp.usb import UsbTransport
 from foundation.errors import DeviceRefused, InputError, LinkClosed, LinkTimeout
-from sim.buses.usb import SimulatedBus
-from sim.buses.usb_device import BULK_IN, PtpUsbDevice, Setup, UsbIdentity
+from sim.buses.usb import BULK_IN, PtpUsbDevice, Setup, SimulatedBus, UsbIdentity
 from sim.clock import SimulatedClock
 from tests.contracts.transport import ECHO, PATIENCE_S, Bench, Echo, TransportContract
 

@@ -15,8 +15,8 @@ from typing import TypedDict
 
 from drivers.ptp.codes import AeMode, DriveMode, Operation, Property
 from drivers.ptp.transaction import PtpRequest
+from sim.camera.bodies import EOS_550D
 from sim.camera.eos import SimulatedEos
-from sim.camera.eos_bodies import EOS_550D
 from sim.clock import SimulatedClock
 from tests.contracts.camera import SeededFilm
 from tests.data_files import available

@@ -33,7 +33,7 @@ from drivers.ptp.ip import (
 from drivers.ptp.transaction import PtpEvent, PtpRequest, PtpResponse
 from foundation.clock import SystemClock
 from foundation.errors import DeviceRefused, LinkClosed, LinkTimeout, ProtocolError
-from sim.buses.ptpip_server import serve_ptpip
+from sim.buses.ptp import serve_ptpip
 from sim.clock import SimulatedClock
 from tests.contracts.link import read_exactly
 from tests.contracts.transport import PATIENCE_S, Bench, Echo, TransportContract

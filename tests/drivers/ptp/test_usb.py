@@ -15,10 +15,10 @@ from drivers.ptp.codes import EventCode, Operation, ResponseCode
 from drivers.ptp.transaction import PtpEvent, PtpRequest, PtpResponse, next_transaction
 from drivers.ptp.usb import ContainerReader, DataPiece, DataStart, DeviceStatus, Message, UsbTransport
 from foundation.errors import DeviceError, LinkClosed, LinkTimeout, ProtocolError
-from sim.buses.faults import CutOff, Deaf, Garbling, HeaderAlone, Joining, ShortReads, Stalling, WithoutEmptyPackets
-from sim.buses.ptp_memory import MemoryPipes
-from sim.buses.usb_device import PtpUsbDevice
+from sim.buses.ptp import MemoryPipes
+from sim.buses.usb import PtpUsbDevice
 from sim.clock import SimulatedClock
+from tests.cable_faults import CutOff, Deaf, Garbling, HeaderAlone, Joining, ShortReads, Stalling, WithoutEmptyPackets
 from tests.contracts.transport import (
     ECHO,
     GIVE,

@@ -25,7 +25,7 @@ from drivers.raw import rawfile
 from drivers.raw.rawfile import Area, FrameOrigin, Mosaic, body_and_lens, read_raw
 from drivers.tiff import read_directories
 from foundation.errors import FormatError
-from sim.camera.dng import write_dng as write_simulated_dng
+from sim.camera.film import write_dng as write_simulated_dng
 from sim.world.sensors import BODIES, Rectangle
 from tests.data_files import available, shipped
 from tests.drivers.raw.raw_files import Tags, longs, lossless_jpeg, ratios, shorts, text, write_cr2, write_dng

@@ -32,7 +32,7 @@ from foundation.errors import (
     LinkTimeout,
     ProtocolError,
 )
-from sim.buses.serial_cable import SerialPeerLink
+from sim.buses.serial import SerialPeerLink
 from sim.clock import SimulatedClock
 from sim.projectors.projector import SimulatedProjector
 from sim.projectors.serial import PEERS, SERIAL_NUMBER, BenqPeer, EpsonPeer, OptomaPeer
@@ -127,7 +127,7 @@ class TestOverAPseudoTerminal(ProjectorContract):
     @pytest.fixture(params=NAMES)
     def bench(self, request: pytest.FixtureRequest) -> Iterator[Bench]:
         from drivers.links.serial import SerialLink
-        from sim.buses.pty import PseudoTerminal
+        from sim.buses.serial import PseudoTerminal
 
         spoken = LANGUAGES[request.param]
         device = SimulatedProjector(SimulatedClock())
@@ -743,7 +743,7 @@ def test_a_late_answer_never_meets_a_later_question(name: str) -> None:
 @pytest.mark.parametrize("name", NAMES)
 def test_a_cable_pulled_out_is_told(name: str) -> None:
     from drivers.links.serial import SerialLink
-    from sim.buses.pty import PseudoTerminal
+    from sim.buses.serial import PseudoTerminal
 
     spoken = language(name)
     with PseudoTerminal(PEERS[name](SimulatedProjector(SimulatedClock(), Power.ON))) as terminal:

@@ -25,8 +25,8 @@ from experiment.framing.planes import CHANNELS, Plane, channel_offset_px, phases
 from experiment.framing.sharpness import blur_px
 from experiment.framing.tags import find_tags
 from foundation.errors import RegistrationError
-from sim.camera.dng import write_dng
-from sim.world.drawing import Print
+from sim.camera.film import write_dng
+from sim.world.rendering import Print
 from sim.world.room import Room
 from sim.world.sensors import BODIES
 from sim.world.world import World

@@ -26,8 +26,8 @@ from experiment.framing.planes import CHANNELS, Plane, plane_of
 from experiment.framing.sharpness import blur_px
 from experiment.framing.tagless_field import FoundField, field_mm, find_field
 from foundation.errors import CropError, InputError, RegistrationError
-from sim.camera.dng import write_dng
-from sim.world.drawing import Print
+from sim.camera.film import write_dng
+from sim.world.rendering import Print
 from sim.world.room import Room
 from sim.world.sensors import BODIES
 from sim.world.world import World

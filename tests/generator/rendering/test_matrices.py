@@ -10,8 +10,7 @@ import pytest
 from drivers.raw.rawfile import camera_matrix as of_libraw
 from foundation.errors import InputError
 from generator.rendering.matrices import camera_matrix, cameras, choose_matrix
-from sim.world.body_settings import FACTS
-from sim.world.sensors import BODIES, Body
+from sim.world.sensors import BODIES, FACTS, Body
 
 
 def test_every_camera_keeps_white() -> None:

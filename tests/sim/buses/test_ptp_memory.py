@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from sim.buses.ptp_memory import MemoryTransport
+from sim.buses.ptp import MemoryTransport
 from tests.contracts.transport import Bench, Echo, TransportContract
 
 

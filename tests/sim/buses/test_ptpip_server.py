@@ -10,7 +10,7 @@ from collections.abc import Iterator
 import pytest
 
 from drivers.links.network import TcpServer
-from sim.buses.ptpip_server import serve_ptpip
+from sim.buses.ptp import serve_ptpip
 from tests.contracts.transport import BREAK_OFF, ECHO, GIVE, PATIENCE_S, RAISE, TAKE, Echo, payload
 
 GUID = bytes(range(100, 116))

@@ -21,11 +21,10 @@ from drivers.ptp.datasets import DeviceInfo
 from drivers.ptp.transaction import PtpRequest, PtpResponse
 from drivers.ptp.usb import ContainerReader, DataPiece, DataStart, UsbTransport, encode
 from foundation.errors import LinkClosed, LinkTimeout, ProtocolError
-from sim.buses.usb_device import BULK_IN, BULK_OUT, INTERRUPT_IN, PtpUsbDevice, UsbIdentity
-from sim.buses.usbip import UsbIpService, serve_usbip
-from sim.buses.usbip_wire import ImportRequest, RequestReader, Submit, Unlink
+from sim.buses.usb import BULK_IN, BULK_OUT, INTERRUPT_IN, PtpUsbDevice, UsbIdentity
+from sim.buses.usbip import ImportRequest, RequestReader, Submit, Unlink, UsbIpService, serve_usbip
+from sim.camera.bodies import EOS_550D
 from sim.camera.eos import SimulatedEos
-from sim.camera.eos_bodies import EOS_550D
 from sim.clock import SimulatedClock
 from tests.contracts.camera import SeededFilm
 from tests.contracts.transport import GIVE, HANG, PATIENCE_S, RAISE, Bench, Echo, TransportContract, payload

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from drivers.camera import ExposureSettings
 from drivers.raw.rawfile import read_raw
-from sim.camera.dng import write_dng
+from sim.camera.film import write_dng
 from sim.world.sensors import BODIES, Body
 
 pytestmark = pytest.mark.slow

@@ -58,12 +58,10 @@ from drivers.ptp.datasets import (
 )
 from drivers.ptp.transaction import PtpRequest
 from foundation.errors import DeviceRefused, LinkClosed
-from sim.buses.ptp_memory import MemoryTransport
+from sim.buses.ptp import MemoryTransport
 from sim.buses.responder import Answer
-from sim.camera.eos import SimulatedEos
-from sim.camera.eos_bodies import EOS_6D_MARK_II, EOS_550D, EOS_550D_AS_LISTED, EOS_BODIES, TEST_BODY
-from sim.camera.eos_model import OPERATIONS, EosModel
-from sim.camera.eos_state import CARD, DCIM, EMPTY_SLOT, FOLDER
+from sim.camera.bodies import EOS_6D_MARK_II, EOS_550D, EOS_550D_AS_LISTED, EOS_BODIES, OPERATIONS, TEST_BODY, EosModel
+from sim.camera.eos import CARD, DCIM, EMPTY_SLOT, FOLDER, SimulatedEos
 from sim.clock import OPENING, SimulatedClock
 from tests.drivers.ptp.conversations import EOS_60D_PROPERTIES, Recorded, conversations, transcript
 

@@ -12,12 +12,11 @@ import pytest
 from numpy.typing import NDArray
 
 from drivers.presenter import BLACK, WHITE, Colour
-from sim.optics.photographic_lens import MILD_SHOULDERS, STRONG_SHOULDERS, PhotographicLens, mtf
-from sim.world.drawing import Print
-from sim.world.geometry import surface_of
+from sim.optics import MILD_SHOULDERS, STRONG_SHOULDERS, PhotographicLens, mtf
+from sim.world.disturbances import Blob, Situation
+from sim.world.rendering import Print, surface_of
 from sim.world.room import REFERENCE_EXPOSURE, Room
 from sim.world.sensors import BODIES
-from sim.world.situation import Blob, Situation
 from sim.world.world import World
 
 PAGE_MM = (180.0, 125.0)

@@ -12,8 +12,7 @@ from drivers.pjlink.wire import FaultsChanged, InputChanged, LinkUp, NoResolutio
 from drivers.projector import Fault, Power, Severity
 from foundation.errors import DeviceFault, LinkTimeout
 from sim.clock import SimulatedClock
-from sim.projectors.pjlink import PjLinkPeer
-from sim.projectors.pjlink_notices import Announcer, ProjectorDatagrams
+from sim.projectors.pjlink import Announcer, PjLinkPeer, ProjectorDatagrams
 from sim.projectors.projector import ProjectorTraits, SimulatedProjector
 from tests.contracts.projector import Bench, ProjectorContract
 from tests.drivers.pjlink.notice_port import NoticePort

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from sim.clock import SimulatedClock
-from sim.projectors.screen import Screen, SimulatedPresenter
+from sim.projectors.projector import Screen, SimulatedPresenter
 from tests.contracts.presenter import Bench, PresenterContract
 
 

@@ -23,8 +23,7 @@ from drivers.projector import Power, Severity
 from drivers.serial_projectors import LANGUAGES
 from drivers.serial_projectors.benq import BenqProjector
 from drivers.serial_projectors.epson import EpsonOnNetwork, EpsonProjector
-from sim.buses.pty import PseudoTerminal
-from sim.buses.serial_cable import serve_network
+from sim.buses.serial import PseudoTerminal, serve_network
 from sim.cli import main
 from sim.clock import SimulatedClock
 from sim.projectors.projector import ProjectorTraits, SimulatedProjector

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from foundation.errors import FormatError
-from sim.spectral.grids import regridded, require_grid
+from sim.spectral import regridded, require_grid
 
 NODES = np.arange(380.0, 781.0, 5.0)
 

@@ -8,7 +8,7 @@ import colour
 import numpy as np
 import pytest
 
-from sim.spectral.published import daylight, published_spectra
+from sim.spectral import daylight, published_spectra
 
 
 def test_every_light_is_the_published_one() -> None:

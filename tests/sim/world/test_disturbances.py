@@ -19,6 +19,7 @@ from sim.camera.film import WorldFilm
 from sim.clock import OPENING
 from sim.world.disturbances import (
     KINDS,
+    OVERSCAN,
     AmbientStep,
     AnyDisturbance,
     Bump,
@@ -34,15 +35,18 @@ from sim.world.disturbances import (
     Reflection,
     ScrambledRows,
     SensorWarming,
+    Situation,
     StaleFile,
     ZeroedStrip,
     drawn,
+    moved,
+    moved_back,
+    projected_mm,
     read_disturbances,
 )
-from sim.world.drawing import Print
+from sim.world.rendering import Print
 from sim.world.room import REFERENCE_EXPOSURE, Room
 from sim.world.sensors import BODIES
-from sim.world.situation import OVERSCAN, Situation, moved, moved_back, projected_mm
 from sim.world.world import World
 from tests.sim.conftest import PAGE_MM
 

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from sim.world.geometry import View, Waviness
+from sim.world.rendering import View, Waviness
 
 pytestmark = pytest.mark.slow
 

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from drivers.camera import ExposureSettings
 from drivers.presenter import BLACK, WHITE, Colour
-from sim.world.drawing import Print
+from sim.world.rendering import Print
 from sim.world.room import REFERENCE_EXPOSURE, Room
 from sim.world.sensors import BODIES, Body, Rectangle
 from sim.world.world import World
@@ -310,7 +310,7 @@ def test_later_rectangles_cover_earlier_ones_and_paper_shows_between() -> None:
 
 def test_a_drawing_off_every_lattice_is_still_drawn(square_world: World, monkeypatch: pytest.MonkeyPatch) -> None:
     """A thousand crumbs have more edges than are kept apart; joining them moves the squares beside them little."""
-    monkeypatch.setattr("sim.world.drawing._MOST_LINES", 1500)
+    monkeypatch.setattr("sim.world.rendering._MOST_LINES", 1500)
     rng = np.random.default_rng(3)
     corner = rng.uniform(0, [10, 115], (1000, 2))
     crumbs = np.concatenate([corner, corner + rng.uniform(1, 5, (1000, 2))], axis=1)

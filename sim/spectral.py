@@ -5,6 +5,16 @@ The layout is that of AcademySoftwareFoundation/rawtoaces-data, schema 0.1.0: ``
 power by wavelength in nanometres. Only proportions matter: exposure is set elsewhere.
 
 Files of some cameras come with the suite (`sim.data`) and are known by name; any other is named by its path.
+
+Wavelength grids: what a measured spectrum must cover, and how it comes to another grid.
+
+What stands on a finer grid is not picked at the new grid's wavelengths but gathered: a line of a lamp that lies between
+two of them must not be lost. What stands on a coarser or the same grid is joined by straight lines.
+
+Spectra of lights that the CIE and others have published, by their names.
+
+The tables are in `sim/data`, whose README says where they are from: the illuminants of CIE 15:2018 and ISO 7589, and
+measured light sources.
 """
 
 from __future__ import annotations
@@ -13,8 +23,10 @@ import json
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cache
 from importlib import resources
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, Final
 
 import numpy as np
@@ -23,7 +35,136 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 
 from foundation.errors import FormatError, InputError
 from foundation.hashing import sha256_of
-from sim.spectral.grids import regridded, require_grid
+
+NEEDED_NM: Final = (400.0, 700.0)
+"""Wavelengths that must be covered: beyond them a camera with its infrared filter sees under 2 % of its light."""
+
+WIDEST_STEP_NM: Final = 20.0
+"""Distance of two wavelengths that may be bridged by a straight line: filters' edges rise over some 40 nm, and bench
+measurements are taken every 5 or 10 nm."""
+
+_Array = npt.NDArray[np.float64]
+
+
+def require_grid(wavelengths_nm: _Array, where: str) -> None:
+    """Refuse wavelengths (W,), ascending, that do not cover the visible range without gaps.
+
+    `wavelengths_nm`: (W,) float64.
+    """
+    low, high = NEEDED_NM
+    if len(wavelengths_nm) < 2 or wavelengths_nm[0] > low or wavelengths_nm[-1] < high:
+        span = "none" if not len(wavelengths_nm) else f"{wavelengths_nm[0]:g} to {wavelengths_nm[-1]:g}"
+        raise FormatError(
+            f"{where}: its wavelengths are {span}, {low:g} to {high:g} nm at least expected; "
+            "convert them to nanometres if they are not, or measure the rest"
+        )
+    steps = np.diff(wavelengths_nm)
+    if steps.min() <= 0:
+        raise FormatError(f"{where}: {wavelengths_nm[int(steps.argmin())]:g} nm stands there twice; leave one out")
+    inside = (wavelengths_nm[:-1] < high) & (wavelengths_nm[1:] > low)
+    if steps[inside].max() > WIDEST_STEP_NM:
+        at = int(np.flatnonzero(inside)[steps[inside].argmax()])
+        raise FormatError(
+            f"{where}: there is a gap from {wavelengths_nm[at]:g} to {wavelengths_nm[at + 1]:g} nm, "
+            f"{WIDEST_STEP_NM:g} nm at most expected; measure what lies between"
+        )
+
+
+def regridded(wavelengths_nm: _Array, curves: _Array, onto_nm: _Array) -> _Array:
+    """Return curves on another grid.
+
+    `wavelengths_nm`: (W,) float64, ascending. `curves`: (W, N) float64, per nanometre. `onto_nm`: (M,) float64,
+    ascending in even steps. Returns (M, N) float64; 0 beyond the given wavelengths. If some of these are nearer to each
+    other than those of the new grid, each of its values is the mean of the curve weighted by a triangle that reaches to
+    the neighbouring wavelengths, which leaves the curve's integral as it is; else the curve's own value.
+
+    Examples
+    --------
+    >>> line = np.zeros((401, 1)); line[202] = 5.0  # 582 nm, on a grid of 1 nm
+    >>> on_5 = regridded(np.arange(380.0, 781.0), line, np.arange(380.0, 781.0, 5.0))
+    >>> on_5[40:42, 0].round(3).tolist(), round(float(on_5.sum() * 5), 3)
+    ([0.6, 0.4], 5.0)
+    """
+    step = float(onto_nm[1] - onto_nm[0])
+    found = np.zeros((len(onto_nm), curves.shape[1]))
+    if float(np.diff(wavelengths_nm).min()) > 0.999 * step:
+        for number in range(curves.shape[1]):
+            found[:, number] = np.interp(onto_nm, wavelengths_nm, curves[:, number], left=0, right=0)
+        return found
+    if float(np.diff(wavelengths_nm).max()) > 0.999 * step:
+        # Where steps are wider, a wavelength would stand for nodes that lie between it and the next.
+        wavelengths_nm, curves = _filled(wavelengths_nm, curves, step)
+    # Each wavelength stands for half the way to its neighbours.
+    edges = np.concatenate([wavelengths_nm[:1], (wavelengths_nm[1:] + wavelengths_nm[:-1]) / 2, wavelengths_nm[-1:]])
+    share = np.clip(1 - np.abs(onto_nm[:, None] - wavelengths_nm[None]) / step, 0, None)
+    weights = share * np.diff(edges)[None] / step
+    return np.asarray(weights @ curves, dtype=np.float64)
+
+
+def _filled(wavelengths_nm: _Array, curves: _Array, step: float) -> tuple[_Array, _Array]:
+    """Return wavelengths (V,) and curves (V, N) with the gaps of an uneven grid filled to steps below `step` / 4."""
+    parts = np.maximum(np.ceil(4 * np.diff(wavelengths_nm) / step), 1).astype(np.int64)
+    starts = np.repeat(wavelengths_nm[:-1], parts)
+    widths = np.repeat(np.diff(wavelengths_nm) / parts, parts)
+    within = np.arange(len(starts)) - np.repeat(np.cumsum(parts) - parts, parts)
+    filled = np.append(starts + within * widths, wavelengths_nm[-1])
+    found = np.empty((len(filled), curves.shape[1]))
+    for number in range(curves.shape[1]):
+        found[:, number] = np.interp(filled, wavelengths_nm, curves[:, number])
+    return filled, found
+
+
+@dataclass(frozen=True, eq=False)
+class PublishedSpectrum:
+    """A spectrum as it was published.
+
+    - `wavelengths_nm`: (W,) float64, ascending in even steps.
+    - `power`: (W,) float64, relative, per nm.
+    """
+
+    wavelengths_nm: _Array
+    power: _Array
+
+
+@cache
+def published_spectra() -> Mapping[str, PublishedSpectrum]:
+    """Return every published light by its name, such as ``D65``, ``FL2``, ``LED-B3``, ``Kinoton 75P``."""
+    return MappingProxyType(_read("published_lights.csv"))
+
+
+def daylight(cct_k: float) -> PublishedSpectrum:
+    """Return the CIE daylight of a correlated colour temperature (CIE 15:2018, 4.1.2), K, 4000 … 25 000.
+
+    From the components S₀, S₁ and S₂, their factors rounded to three places as the CIE does.
+    """
+    inverse = 1000 / cct_k
+    low = (0.244063, 0.09911, 2.9678, -4.6070)
+    high = (0.237040, 0.24748, 1.9018, -2.0064)
+    x = sum(factor * inverse**power for power, factor in enumerate(low if cct_k <= 7000 else high))
+    y = -3.0 * x**2 + 2.870 * x - 0.275
+    scale = 0.0241 + 0.2562 * x - 0.7341 * y
+    first = round((-1.3515 - 1.7703 * x + 5.9114 * y) / scale, 3)
+    second = round((0.0300 - 31.4424 * x + 30.0717 * y) / scale, 3)
+    mean, yellow_blue, pink_green = (_components()[name] for name in ("S0", "S1", "S2"))
+    power = mean.power + first * yellow_blue.power + second * pink_green.power
+    return PublishedSpectrum(mean.wavelengths_nm, power)
+
+
+@cache
+def _components() -> dict[str, PublishedSpectrum]:
+    return _read("daylight_components.csv")
+
+
+def _read(name: str) -> dict[str, PublishedSpectrum]:
+    """Return the spectra of a table in `sim.data`: a line each, name, first wavelength, step, values."""
+    found: dict[str, PublishedSpectrum] = {}
+    text = resources.files("sim").joinpath("data", name).read_text("utf-8")
+    for line in text.splitlines()[1:]:
+        light, first, step, values = line.split(";")
+        power = np.array(values.split(), dtype=np.float64)
+        found[light] = PublishedSpectrum(float(first) + float(step) * np.arange(len(power), dtype=np.float64), power)
+    return found
+
 
 SUFFIX: Final = "_380_780_5.json"
 """What the names of the files in `sim.data` end in: first and last wavelength, and the step (as rawtoaces-data)."""
@@ -33,8 +174,6 @@ EDGE_SHARE: Final = 0.05
 is taken to be blind (judgement): what is cut off there is below a hundredth of its light."""
 
 _CHANNELS: Final = ("R", "G", "B")
-
-_Array = npt.NDArray[np.float64]
 
 
 class _Header(BaseModel):

@@ -5,6 +5,10 @@ Rules that hold inside:
 - One thread serves the device; it is joined when the terminal is closed.
 - To close it is to pull the cable out: whoever has the port open finds it gone.
 - What nobody reads is lost when the system's buffer is full, as on a cable without flow control.
+
+Cables to a peer that speaks when it has something to say: in the same thread, and over TCP.
+
+`sim.buses.serial` has the serial port of the system.
 """
 
 from __future__ import annotations
@@ -14,12 +18,47 @@ import os
 import select
 import threading
 import tty
+from collections.abc import Callable
 from types import TracebackType
 from typing import Final
 
-from drivers.links.link import Peer
-from foundation.errors import LinkClosed
-from sim.buses.serial_cable import POLLING_S
+from drivers.links.link import Peer, PeerLink
+from drivers.links.network import TcpLink, TcpServer
+from foundation.errors import LinkClosed, LinkTimeout
+
+POLLING_S: Final = 0.02
+"""How often a peer on a real cable is asked what it has to say by now: drivers wait seconds for an answer."""
+
+_CABLE_PATIENCE_S: Final = 5.0
+"""Longest wait for a client to take an answer."""
+
+
+class SerialPeerLink(PeerLink):
+    """A cable to a peer in the same thread, which hears before each read what the peer has to say by now."""
+
+    def read(self, limit: int, timeout: float) -> bytes:
+        """Return up to `limit` bytes of what the peer has said."""
+        if self._open:
+            self._incoming += self._peer.receive(b"")
+        return super().read(limit, timeout)
+
+
+def serve_network(peer: Callable[[], Peer], port: int = 0) -> TcpServer:
+    """Return a running server that gives each connection a peer of its own; close it, or use it in a `with` block."""
+
+    def handle(link: TcpLink) -> None:
+        there = peer()
+        said = there.connect()
+        while True:
+            if said:
+                link.write(said, _CABLE_PATIENCE_S)
+            try:
+                said = there.receive(link.read(4096, POLLING_S))
+            except LinkTimeout:
+                said = there.receive(b"")
+
+    return TcpServer(handle, port)
+
 
 _WAKE: Final = b"w"
 _END: Final = b"e"

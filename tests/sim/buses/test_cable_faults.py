@@ -11,7 +11,11 @@ from drivers.ptp.codes import ResponseCode
 from drivers.ptp.transaction import PtpEvent, PtpRequest, Transport
 from drivers.ptp.usb import UsbTransport
 from foundation.errors import LinkClosed, LinkTimeout, ProtocolError
-from sim.buses.faults import (
+from sim.buses.ptp import MemoryTransport
+from sim.buses.responder import Responder
+from sim.buses.usb import PtpUsbDevice, SimulatedBus
+from sim.clock import SimulatedClock
+from tests.cable_faults import (
     Declining,
     DelayingEvents,
     Falsifying,
@@ -24,11 +28,6 @@ from sim.buses.faults import (
     RepeatingEvents,
     UnknownEvents,
 )
-from sim.buses.ptp_memory import MemoryTransport
-from sim.buses.responder import Responder
-from sim.buses.usb import SimulatedBus
-from sim.buses.usb_device import PtpUsbDevice
-from sim.clock import SimulatedClock
 from tests.contracts.transport import ECHO, GIVE, PATIENCE_S, RAISE, TAKE, Echo, payload
 
 

@@ -1,1 +1,0 @@
-"""What lens and projector do to the light beside a Gaussian blur: shoulders, veil, lateral colour, fall-off."""
