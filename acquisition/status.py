@@ -11,12 +11,8 @@ from dataclasses import asdict
 from datetime import datetime
 from typing import Any
 
-from acquisition.monitor.head import Head
-from acquisition.monitor.reading import SessionView
-from acquisition.monitor.rows import AttemptView
-from experiment.session.judgement import Check
-from experiment.session.progress import duration_text
-from experiment.session.records import ACCEPTED
+from acquisition.monitor.view import AttemptView, Head, SessionView
+from experiment.session.records import ACCEPTED, Check, duration_text
 from foundation.errors import counted
 
 LAST = 5

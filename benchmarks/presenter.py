@@ -21,7 +21,7 @@ from typing import Any
 
 from drivers.display.displays import list_displays
 from drivers.display.fullscreen import FullScreen
-from experiment.lights.illuminations import plan_illuminations
+from experiment.lights import plan_illuminations
 
 SIZE = "1920x1080"
 

@@ -35,11 +35,10 @@ from experiment.chart.model import Chart
 from experiment.chart.printing import drawing
 from experiment.framing.movement import STILL_PX
 from experiment.framing.planes import CHANNELS
-from experiment.lights.illuminations import Illumination
-from experiment.session.folder import Session
-from experiment.session.incoming import ReceivedFile
-from experiment.session.judgement import Judgement
+from experiment.lights import Illumination
+from experiment.session.folder import ReceivedFile, Session
 from experiment.session.plan import SessionStep, plan_steps
+from experiment.session.records import Judgement
 from foundation.angles import angles_deg
 from sim.camera.dng import write_dng
 from sim.world.drawing import Print

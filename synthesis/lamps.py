@@ -16,7 +16,7 @@ import numpy.typing as npt
 from calibration.radiometry.primaries import pure_lights
 from drivers.camera import ExposureSettings
 from drivers.presenter import WHITE
-from experiment.lights.illuminations import Illumination
+from experiment.lights import Illumination
 from sim.world.drawing import PAPER
 from sim.world.profile import printed_reflectance
 from sim.world.spectra import sensitivities

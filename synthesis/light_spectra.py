@@ -23,7 +23,7 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
-from experiment.lights.illuminations import Illumination, parse_ccts, shown_colour
+from experiment.lights import Illumination, parse_ccts, shown_colour
 from foundation.colorimetry.observer import linear_srgb, planck, xyz_of
 from foundation.errors import FormatError, InputError
 from sim.spectral.grids import regridded, require_grid

@@ -18,7 +18,7 @@ from calibration.radiometry.primaries import Primaries
 from calibration.sampling.patch_statistics import patch_means
 from calibration.sampling.samples import Sites, gather, gather_values
 from experiment.measures.paper import MAX_ORDER, MAX_ORDER_AROUND, MIN_REFERENCES, Paper, PaperReader
-from experiment.measures.sensor_range import saturation
+from experiment.measures.sensor import saturation
 from foundation.errors import QualityError
 from synthesis.lamps import ChartLamp
 from synthesis.patch_frames import PatchSensor

@@ -29,7 +29,7 @@ from calibration.table.writer import LutWriter
 from drivers.camera import ExposureSettings
 from experiment.chart.model import Chart
 from experiment.framing.planes import CLIPPING_SHARE
-from experiment.lights.illuminations import Illumination
+from experiment.lights import Illumination
 from foundation.errors import StorageError
 from foundation.files import require_free, whole_folder
 from foundation.processors import ordered_map

@@ -12,7 +12,7 @@ from calibration.citation.record import OriginRecord
 from calibration.citation.stated import with_changes
 from experiment.chart.layout import design_chart
 from experiment.config import CitationSettings
-from experiment.lights.illuminations import plan_illuminations
+from experiment.lights import plan_illuminations
 from sim.spectral.sensitivities import describe_sensitivities, read_sensitivities
 from sim.world.body_settings import find_body
 from synthesis.light_spectra import LightSpectra, illuminations_of

@@ -2,6 +2,10 @@
 
 The policy that goes with it (Content Security Policy, level 3) lets a browser run this script and no other, so that a
 name or a sentence out of a session cannot become code even if it reached the page as markup.
+
+`report.html` of a session: what the live page shows at its end, in one file that needs no server and no network.
+
+Pictures stand in it, those of refused frames first, up to a bound; `previews/` and the raw files have the others.
 """
 
 from __future__ import annotations
@@ -10,11 +14,19 @@ import base64
 import hashlib
 import html
 import re
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
 from functools import cache
 from importlib import resources
+from pathlib import Path
 
-from acquisition.monitor.encoding import Json, to_bytes
+from acquisition.monitor.feed import Json, SessionWatch, head_json, read_picture, to_bytes
+from acquisition.monitor.view import AttemptView, Head, SessionView, read_session
+from experiment.session.heartbeat import Process
+from experiment.session.records import ACCEPTED, duration_text, preview_path
+from foundation.errors import FormatError
+from foundation.files import write_whole
 
 SCRIPTS = ("plots.js", "head.js", "series.js", "page.js")
 """Files that make up the page's script, in the order in which they stand in it; the last one begins."""
@@ -80,3 +92,82 @@ def _policy(more: str) -> str:
 
 def _hash(text: str) -> str:
     return f"'sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}'"
+
+
+REPORT_FILE = "report.html"
+"""Name of a session's report in its folder."""
+
+MOST_PICTURES_BYTES = 6 << 20
+"""Bytes of all pictures in a report: with the third that base64 adds it can still be mailed (10 MB at most servers)."""
+
+
+def write_session_report(folder: Path) -> Path:
+    """Write the report of the session in `folder` into it, in place of one that is there, and return its path.
+
+    To be called at the end of a run, also by the run itself: a run that goes on in this very process counts as ended.
+    """
+    path = folder / REPORT_FILE
+    save_report(folder, path)
+    return path
+
+
+def save_report(folder: Path, path: Path) -> None:
+    """Write the report of the session in `folder` to `path`, in place of a file that is there."""
+    read_session(folder)
+    watch = SessionWatch(folder)
+    state, view = watch.state(), watch.view()
+    if state is None or view is None:
+        raise FormatError(f"{folder} has gone while its report was made; name a session")
+    now = datetime.now(UTC)
+    head = _ended(view).head(now)
+    state["head"] = head_json(head)
+    state["pictures"] = {str(number): _data_url(data) for number, data in _pictures(folder, view.attempts)}
+    name = f"{view.name}, report of {now.astimezone():%Y-%m-%d %H:%M}"
+    write_whole(path, still_page(name, _plain(head), state).text)
+
+
+def _ended(view: SessionView) -> SessionView:
+    """Return a session whose run, if this process is at it, has ended."""
+    beat = view.heartbeat
+    if beat is None or beat.process != Process.own() or beat.state == "ended":
+        return view
+    return replace(view, heartbeat=replace(beat, state="ended", sentence=""))
+
+
+def _pictures(folder: Path, attempts: Sequence[AttemptView]) -> Iterator[tuple[int, bytes]]:
+    """Yield attempts with their pictures, as many as fit: the refused ones, then the last, then evenly spread ones."""
+    left = MOST_PICTURES_BYTES
+    refused = [view for view in attempts if view.has_frame and view.verdict not in (None, ACCEPTED)]
+    accepted = [view for view in attempts if view.verdict == ACCEPTED]
+    for view in [*refused, *(accepted[place] for place in _spread(len(accepted)))]:
+        data = read_picture(preview_path(folder, view.file))
+        if data and len(data) <= left:
+            left -= len(data)
+            yield view.id, data
+
+
+def _spread(count: int) -> list[int]:
+    """Return 0 … count − 1 so that any number of them from the front is spread evenly; the last and the first lead."""
+    places = dict.fromkeys([count - 1, 0] if count else [])
+    step = count
+    while step > 1:
+        step = (step + 1) // 2
+        places |= dict.fromkeys(range(0, count, step))
+    return list(places)
+
+
+def _data_url(data: bytes) -> str:
+    return f"data:image/jpeg;base64,{base64.b64encode(data).decode()}"
+
+
+def _plain(head: Head) -> str:
+    """Return the most important of it in a few lines."""
+    return "\n".join(
+        (
+            head.sentence,
+            f"frames {head.done} of {head.total}, lights {head.lights_done} of {head.lights_total}",
+            f"refused {head.refused}, failed {head.failed}, voided {head.voided}",
+            f"a frame took {duration_text(head.seconds_per_frame)}",
+            "Pictures and plots are shown by a script, which this viewer does not run; open the file in a browser.",
+        )
+    )

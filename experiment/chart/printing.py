@@ -27,11 +27,9 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from experiment.chart.margins import margin_marks
+from experiment.chart.margins import DESIGN_DPI, MM_PER_INCH, PX_MM, Boxes, margin_marks, whole_px
 from experiment.chart.model import PAPER_WHITE, TAG_FAMILY, TAG_MODULES, Chart, Tag
-from experiment.chart.pdf_x import filled, save_page
-from experiment.chart.pixels import DESIGN_DPI, MM_PER_INCH, PX_MM, Boxes, whole_px
-from experiment.chart.rgb_profiles import srgb_display_profile
+from experiment.chart.pdf_x import filled, save_page, srgb_display_profile
 from foundation.errors import InputError
 from foundation.files import whole_file, write_whole
 

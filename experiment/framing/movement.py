@@ -13,10 +13,9 @@ import numpy as np
 import numpy.typing as npt
 
 from drivers.raw.rawfile import Mosaic
-from experiment.framing.finding import Framing
+from experiment.framing.field import FoundField
+from experiment.framing.finding import FoundTag, Framing
 from experiment.framing.planes import Channel, Plane, channel_offset_px, phases
-from experiment.framing.tagless_field import FoundField
-from experiment.framing.tags import FoundTag
 from foundation.robust import huber_weights, sigma_of
 
 MAX_SHIFT_PX = 3.0

@@ -6,10 +6,16 @@
   that foretells references which it has not seen, and none that describes their noise. A criterion on the fit's own
   residuals (BIC) did worse where it matters: a corner at half of the centre's light is shown by few references, and
   their misfit is outvoted by the price of the terms that it needs.
-- What the terms may be is what lenses and projectors do (`experiment.measures.polynomials.light_terms`).
+- What the terms may be is what lenses and projectors do (`experiment.measures.least_squares.light_terms`).
 - A lens darkens its corners in all channels alike, so that in a frame without a base the channels first have one shape,
   from their sum, and then each its own on it. Other frames have that frame's shape as base, and one too dark to show a
   shape of its own keeps it.
+
+The flat field: how evenly projector and lens light the print in a frame.
+
+A smooth shape for each channel, divided out of samples and ground truth alike. Its mean over the centres of the chart's
+cells is 1, so that dividing it out leaves the table's mean level as it was. Its parameters are kept, so it can be
+undone.
 """
 
 from __future__ import annotations
@@ -20,11 +26,63 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from experiment.measures.flat_field import LEAST_FIELD, FlatField
-from experiment.measures.least_squares import held_out_squares, linear_combinations, robust_least_squares
-from experiment.measures.polynomials import light_terms, order_of, page_polynomial, page_powers
+from experiment.measures.least_squares import (
+    held_out_squares,
+    light_terms,
+    linear_combinations,
+    order_of,
+    page_polynomial,
+    page_powers,
+    product,
+    robust_least_squares,
+)
 from foundation.errors import QualityError
 from foundation.robust import sigma_of
+
+LEAST_FIELD = 0.05
+"""Where a polynomial that is extrapolated falls below this share of the mean light, the field is taken to be this:
+samples are divided by it, and no print is lit so unevenly."""
+
+_Array = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class FlatField:
+    """The shape of the light over the print, mean 1 over the cells' centres.
+
+    - `page_mm`: width and height of the page.
+    - `coefficients`: for each channel, the factors whose product the shape is: each (terms,) float64, of some total
+      order.
+    """
+
+    page_mm: tuple[float, float]
+    coefficients: tuple[tuple[_Array, ...], tuple[_Array, ...], tuple[_Array, ...]]
+
+    @classmethod
+    def uniform(cls, page_mm: tuple[float, float]) -> FlatField:
+        """Return the field that is 1 everywhere on a page of that width and height."""
+        return cls(page_mm, ((), (), ()))
+
+    def at(self, points_mm: npt.ArrayLike) -> _Array:
+        """Return the field (N, 3) float64 at points (N, 2) mm, > 0; 1 is its mean over the cells."""
+        points = np.asarray(points_mm, dtype=np.float64).reshape(-1, 2)
+        shape = np.ones((len(points), 3))
+        for channel, factors in enumerate(self.coefficients):
+            for factor in factors:
+                shape[:, channel] *= product(page_polynomial(points, self.page_mm, order_of(len(factor))), factor)
+        return np.maximum(shape, LEAST_FIELD)
+
+    def orders(self) -> tuple[int, ...]:
+        """Return the total order of each channel's last factor, which was fitted on the frame itself."""
+        return tuple(order_of(len(factors[-1])) if factors else 0 for factors in self.coefficients)
+
+    def parameters(self) -> list[list[list[float]]]:
+        """Return the coefficients for `lut.json`: [channel][factor][term], seven significant digits."""
+        return [
+            [[float(f"{value:.7g}") for value in factor.tolist()] for factor in factors]
+            for factors in self.coefficients
+        ]
+
 
 MAX_ORDER = 8
 """Highest order of a frame's flat field: light whose corners have 42 to 52 % of the centre's needs the sixth power of
@@ -69,8 +127,6 @@ _USUAL = 5.0
 
 _EXACT = 1e-9
 """Coefficients of terms below this are rounding errors of their computation."""
-
-_Array = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -34,7 +34,6 @@ from experiment.session.journal_file import (
     reading_error,
     writing_error,
 )
-from experiment.session.judgement import AttemptDetails, Check, Judgement
 from experiment.session.plan import KINDS, FrameKind, SessionStep
 from experiment.session.records import (
     ACCEPTED,
@@ -43,7 +42,10 @@ from experiment.session.records import (
     VOIDED,
     AcceptedFile,
     Attempt,
+    AttemptDetails,
+    Check,
     FrameRecord,
+    Judgement,
     SessionEvent,
 )
 from foundation.errors import FormatError, counted

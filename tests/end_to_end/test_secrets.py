@@ -13,9 +13,9 @@ from acquisition.monitor.server import open_monitor
 from acquisition.run.run import run_session
 from experiment.chart.model import Chart, load_chart
 from experiment.config import load_lab
-from experiment.lights.illuminations import Illumination, load_illuminations
+from experiment.lights import Illumination, load_illuminations
 from experiment.session.folder import Session
-from experiment.session.mending.redaction import held_secrets
+from experiment.session.repair import held_secrets
 from tests.found_texts import files_with
 
 pytestmark = pytest.mark.slow

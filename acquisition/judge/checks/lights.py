@@ -17,8 +17,8 @@ from acquisition.judge import limits
 from acquisition.judge.known.basis import FrameLight
 from acquisition.judge.known.knowledge import Knowledge, Leaning, Seen, combined
 from acquisition.judge.known.response import Codes, Fit, ProjectorModel
-from experiment.session.judgement import Check
 from experiment.session.plan import SessionStep
+from experiment.session.records import Check
 from foundation.angles import angles_deg
 from foundation.srgb import decode_srgb
 

@@ -13,7 +13,7 @@ from acquisition.judge.measured.measuring import Measured
 from drivers.raw.rawfile import Mosaic
 from experiment.config import JudgeSettings
 from experiment.framing.planes import CHANNELS, Channel
-from experiment.session.judgement import Check
+from experiment.session.records import Check
 
 UNTOLD_PX: npt.NDArray[np.float64] = np.full(2, np.nan)
 """Place of a chart in a frame that is too dark to tell."""

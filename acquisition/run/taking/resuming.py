@@ -19,8 +19,7 @@ from drivers.projector import ProjectorIdentity
 from experiment.config import LabSettings
 from experiment.session.folder import Session
 from experiment.session.plan import SessionStep, tie_steps
-from experiment.session.progress import duration_text
-from experiment.session.records import ACCEPTED, Attempt
+from experiment.session.records import ACCEPTED, Attempt, duration_text
 from foundation.clock import Clock, SteadyClock
 from foundation.errors import DeviceRefused, first_of
 from foundation.version import software

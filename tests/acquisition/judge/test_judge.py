@@ -13,8 +13,8 @@ from acquisition.judge.judge import LiveJudge
 from acquisition.judge.known.knowledge import Leaning
 from drivers.camera import ExposureSettings
 from drivers.presenter import BLACK, WHITE, Colour
-from experiment.session.judgement import Check, Judgement
 from experiment.session.plan import SessionStep, tie_steps
+from experiment.session.records import Check, Judgement
 from sim.world.disturbances import (
     AmbientStep,
     Bump,

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from acquisition.monitor.access import Access, Refusal, Request, is_loopback, reachable_addresses
+from acquisition.monitor.server import Access, Refusal, Request, is_loopback, reachable_addresses
 
 OPEN = Access("", frozenset({"localhost"}))
 CLOSED = Access("secret", frozenset({"localhost"}))

@@ -10,8 +10,7 @@ from datetime import UTC, datetime, timedelta
 
 import pytest
 
-from acquisition.monitor.head import Head, head_of
-from acquisition.monitor.rows import AttemptView, with_seconds
+from acquisition.monitor.view import AttemptView, Head, head_of, with_seconds
 from experiment.session.heartbeat import Heartbeat, Process, RunState, SessionPlace
 from experiment.session.plan import plan_steps
 from tests.acquisition.monitor.made_up import LIGHTS

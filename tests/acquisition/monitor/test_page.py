@@ -12,9 +12,9 @@ from pathlib import Path
 
 import pytest
 
-from acquisition.monitor.report import save_report
+from acquisition.monitor.page import save_report
 from acquisition.monitor.server import MonitorServer, open_monitor
-from experiment.lights.illuminations import plan_illuminations
+from experiment.lights import plan_illuminations
 from tests.acquisition.monitor.browser import Tab, browser_tab, needs_chromium
 from tests.acquisition.monitor.made_up import LIGHTS, MadeUpRun
 from tests.acquisition.monitor.page_checks import NAMELESS, OUTSIDE, POOR_CONTRAST, TOO_WIDE

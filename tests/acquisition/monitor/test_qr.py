@@ -7,7 +7,7 @@ import re
 import cv2
 import numpy as np
 
-from acquisition.monitor.qr import qr_text
+from acquisition.monitor.server import qr_text
 
 ADDRESS = "http://192.168.178.123:8707/abcdefghijklmnopqrstuv/"
 

@@ -12,8 +12,8 @@ from typing import Any
 import pytest
 
 from acquisition.cli import main
-from acquisition.monitor import report
-from acquisition.monitor.report import save_report, write_session_report
+from acquisition.monitor import page as report
+from acquisition.monitor.page import save_report, write_session_report
 from experiment.session.journal import Journal
 from foundation.errors import FormatError, StorageError
 from tests.acquisition.monitor.made_up import MadeUpRun

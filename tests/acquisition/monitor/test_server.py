@@ -19,7 +19,8 @@ from typing import Any
 import pytest
 
 from acquisition.cli import main
-from acquisition.monitor import access, server
+from acquisition.monitor import server
+from acquisition.monitor import server as access
 from acquisition.monitor.server import MonitorServer, open_monitor
 from foundation.errors import FormatError, InputError
 from tests.acquisition.monitor.made_up import MadeUpRun, jpeg

@@ -11,8 +11,7 @@ from typing import Any
 
 import pytest
 
-from acquisition.monitor.encoding import place_of, planned_places
-from acquisition.monitor.watching import SessionWatch
+from acquisition.monitor.feed import SessionWatch, place_of, planned_places
 from experiment.session.journal import Journal
 from experiment.session.plan import tie_steps
 from tests.acquisition.monitor.made_up import LIGHTS, MadeUpRun
@@ -115,14 +114,14 @@ def test_nothing_new_is_nothing_told_and_the_journal_is_not_opened(
     run: MadeUpRun, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     watch = SessionWatch(run.folder)
-    monkeypatch.setattr("acquisition.monitor.watching.FRESH_S", 0.0)
+    monkeypatch.setattr("acquisition.monitor.feed.FRESH_S", 0.0)
     cursor = told(watch)["cursor"]
     assert watch.state(cursor) is None
 
     def opened(*_: object) -> None:
         raise AssertionError("opened")
 
-    monkeypatch.setattr("acquisition.monitor.watching.read_session", opened)
+    monkeypatch.setattr("acquisition.monitor.feed.read_session", opened)
     assert watch.state(cursor) is None
 
 

@@ -24,7 +24,7 @@ from drivers.display.displays import Display, choose_display, list_displays
 from drivers.display.fullscreen import FullScreen, identify_displays
 from drivers.display.x11 import XScreen, is_dark
 from drivers.presenter import BLACK, WHITE, Colour
-from experiment.lights.illuminations import plan_illuminations
+from experiment.lights import plan_illuminations
 from foundation.errors import ConfigurationError, DeviceError
 from sim.clock import SimulatedClock
 from tests.contracts.presenter import Bench, PresenterContract

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import pytest
 
-from experiment.framing.corners import corners_text, parse_corners
+from experiment.framing.field import corners_text, parse_corners
 from foundation.errors import InputError
 
 GOOD = ("101,51", "3000.5,60", "2990,1900", "95,1890")

@@ -19,11 +19,10 @@ from drivers.raw.rawfile import Mosaic, read_raw
 from experiment.chart.layout import A_SERIES_MM, design_chart
 from experiment.chart.model import Chart
 from experiment.chart.printing import drawing
-from experiment.framing.finding import find_chart
+from experiment.framing.finding import find_chart, find_tags
 from experiment.framing.movement import shift_between
 from experiment.framing.planes import CHANNELS, Plane, channel_offset_px, phases, plane_of, strongest_plane
 from experiment.framing.sharpness import blur_px
-from experiment.framing.tags import find_tags
 from foundation.errors import RegistrationError
 from sim.camera.dng import write_dng
 from sim.world.drawing import Print

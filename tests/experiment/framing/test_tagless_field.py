@@ -20,11 +20,10 @@ from drivers.raw.rawfile import Mosaic, read_raw
 from experiment.chart.layout import design_chart, paper_chart
 from experiment.chart.model import Chart
 from experiment.chart.printing import drawing
+from experiment.framing.field import FoundField, field_mm, find_field, refine_edges
 from experiment.framing.finding import find_chart
-from experiment.framing.outline import refine_edges
 from experiment.framing.planes import CHANNELS, Plane, plane_of
 from experiment.framing.sharpness import blur_px
-from experiment.framing.tagless_field import FoundField, field_mm, find_field
 from foundation.errors import CropError, InputError, RegistrationError
 from sim.camera.dng import write_dng
 from sim.world.drawing import Print

@@ -12,18 +12,18 @@ from hypothesis import strategies as st
 
 from acquisition.cli import main
 from drivers.presenter import Colour
-from experiment.lights.illuminations import (
+from experiment.lights import (
     Illumination,
     encode_srgb,
     illuminations_to_csv,
     load_illuminations,
     parse_ccts,
     plan_illuminations,
+    plot_illuminations,
     save_illuminations,
     shown_colour,
     uniform_lights,
 )
-from experiment.lights.plots import plot_illuminations
 from foundation.errors import FormatError, InputError
 from foundation.srgb import decode_srgb
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from experiment.measures.polynomials import (
+from experiment.measures.least_squares import (
     code_polynomial,
     code_powers,
     light_terms,

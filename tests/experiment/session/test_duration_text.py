@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from experiment.session.progress import duration_text
+from experiment.session.records import duration_text
 
 
 @pytest.mark.parametrize(

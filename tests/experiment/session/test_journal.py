@@ -10,12 +10,11 @@ from pathlib import Path
 import pytest
 
 from drivers.presenter import Colour
-from experiment.lights.illuminations import Illumination
+from experiment.lights import Illumination
 from experiment.session import journal_file
 from experiment.session.journal import Journal
-from experiment.session.judgement import Judgement
 from experiment.session.plan import plan_steps
-from experiment.session.records import ACCEPTED, FAILED, AcceptedFile, SessionEvent
+from experiment.session.records import ACCEPTED, FAILED, AcceptedFile, Judgement, SessionEvent
 from foundation.errors import FormatError, StorageError
 
 LIGHTS = (Illumination(0, "uniform", None, Colour(255, 0, 0)),)

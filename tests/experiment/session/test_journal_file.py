@@ -18,7 +18,7 @@ from pathlib import Path
 import pytest
 
 from drivers.presenter import Colour
-from experiment.lights.illuminations import Illumination
+from experiment.lights import Illumination
 from experiment.session import journal_file
 from experiment.session.journal import Journal
 from experiment.session.plan import plan_steps

@@ -19,10 +19,10 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from drivers.presenter import Colour
-from experiment.lights.illuminations import Illumination
+from experiment.lights import Illumination
 from experiment.session.journal import Journal
-from experiment.session.judgement import AttemptDetails, Check, Judgement
 from experiment.session.plan import SessionStep, plan_steps, tie_steps
+from experiment.session.records import AttemptDetails, Check, Judgement
 
 pytestmark = pytest.mark.slow
 

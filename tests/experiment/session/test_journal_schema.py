@@ -11,8 +11,7 @@ from pathlib import Path
 import pytest
 
 from experiment.session.journal import time_text
-from experiment.session.journal_file import JOURNAL_VERSION, create_file
-from experiment.session.journal_schema import require_sound_rows
+from experiment.session.journal_file import JOURNAL_VERSION, create_file, require_sound_rows
 from foundation.errors import FormatError
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from drivers.presenter import BLACK, WHITE, Colour
-from experiment.lights.illuminations import Illumination
+from experiment.lights import Illumination
 from experiment.session.plan import RESPONSE, SessionStep, plan_steps, tie_steps
 
 LIGHTS = tuple(Illumination(number, "uniform", None, Colour(255, number, 0)) for number in range(5))

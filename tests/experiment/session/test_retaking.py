@@ -16,12 +16,11 @@ import pytest
 from drivers.camera import CapturedFrame
 from drivers.presenter import Colour
 from experiment.chart.layout import design_chart
-from experiment.lights.illuminations import Illumination
+from experiment.lights import Illumination
 from experiment.session.folder import Session
-from experiment.session.judgement import Judgement
-from experiment.session.mending.retaking import lights_text, parse_lights
-from experiment.session.mending.verification import MOST_UNREADABLE
 from experiment.session.plan import plan_steps
+from experiment.session.records import Judgement
+from experiment.session.repair import MOST_UNREADABLE, lights_text, parse_lights
 from foundation.errors import FormatError, InputError, StorageError
 
 LIGHTS = tuple(Illumination(number, "uniform", None, Colour(255, number, 0)) for number in range(5))

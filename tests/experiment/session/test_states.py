@@ -20,13 +20,20 @@ from drivers.camera import Camera, CapturedFrame
 from drivers.presenter import BLACK, Colour, Presenter
 from experiment.chart.layout import design_chart
 from experiment.config import LabSettings
-from experiment.lights.illuminations import Illumination
+from experiment.lights import Illumination
 from experiment.session import records
-from experiment.session.folder import Session
-from experiment.session.incoming import IncomingFile, ReceivedFile
-from experiment.session.judgement import Check, Judgement
-from experiment.session.plan import SessionStep, plan_steps
-from experiment.session.states import AHEAD, TRANSITIONS, UNDER_WAY, StepState, may_follow, may_lead_to
+from experiment.session.folder import IncomingFile, ReceivedFile, Session
+from experiment.session.plan import (
+    AHEAD,
+    TRANSITIONS,
+    UNDER_WAY,
+    SessionStep,
+    StepState,
+    may_follow,
+    may_lead_to,
+    plan_steps,
+)
+from experiment.session.records import Check, Judgement
 from foundation.clock import Clock
 from foundation.errors import DeviceError, LinkTimeout, StorageError
 

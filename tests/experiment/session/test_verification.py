@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from experiment.session.mending import verification
+from experiment.session import repair as verification
 from experiment.session.records import AcceptedFile
 from foundation.errors import StorageError
 from foundation.hashing import file_sha256
