@@ -175,7 +175,7 @@ KILLED = """
 import os, signal, sqlite3, sys
 from pathlib import Path
 from experiment.session.journal import Journal
-from tests.acquisition.session.test_journal_model import night
+from tests.experiment.session.test_journal_model import night
 
 statements = 0
 
