@@ -451,10 +451,9 @@ def report(
 
     Reads SESSION, also while it is being taken. acquire run writes the same file when it ends.
     """
-    from acquisition.monitor.page import REPORT_FILE, save_report
+    from acquisition.monitor.page import write_session_report
 
-    path = session / REPORT_FILE if out is None else out
-    save_report(session, path)
+    path = write_session_report(session, out)
     print(f"{path}: written")
 
 

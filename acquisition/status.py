@@ -47,7 +47,7 @@ def status_lines(view: SessionView, now: datetime) -> list[str]:
 def status_json(view: SessionView, now: datetime) -> dict[str, Any]:
     """Return a session's state for programs: the fields of `Head`, and what was measured and refused; times as text."""
     head = view.head(now)
-    values = {name: value.isoformat() if isinstance(value, datetime) else value for name, value in asdict(head).items()}
+    values = head.to_plain()
     if not head.alive:
         values["remaining_s"] = None
     return values | {

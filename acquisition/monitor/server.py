@@ -3,16 +3,11 @@
 It never writes, and holds nothing open between two requests; any number of pages may look, and it may be ended at any
 time.
 
-Who may look at a session over the network, and at what: decided from a request's text alone.
-
-A page on this machine's loopback needs no token: who is logged in here may read the folder anyway. Two things are still
-refused there: names that another site has made to point here (DNS rebinding, by which a web page could read what
-answers on loopback), and everything that is not one of four addresses.
-
-For other machines the address itself holds a token, as its first part, so that the page's relative addresses carry it
-on and nothing has to be typed.
-
-An address as a QR code (ISO/IEC 18004) in the terminal, for a phone's camera; OpenCV makes the code.
+Who may look, and at what, is decided from a request's text alone. A page on this machine's loopback needs no token: who
+is logged in here may read the folder anyway. Two things are still refused there: names that another site has made to
+point here (DNS rebinding, by which a web page could read what answers on loopback), and everything that is not one of
+the four addresses. For other machines the address itself holds a token, as its first part, so that the page's relative
+addresses carry it on and nothing has to be typed; a QR code (ISO/IEC 18004) in the terminal gives it to a phone.
 """
 
 from __future__ import annotations
@@ -26,7 +21,6 @@ import secrets
 import socket
 import threading
 from dataclasses import dataclass
-from datetime import datetime
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any, Literal
@@ -34,7 +28,7 @@ from urllib.parse import parse_qs
 
 import numpy as np
 
-from acquisition.monitor.feed import SessionWatch, read_picture, to_bytes
+from acquisition.monitor.feed import SessionWatch, to_bytes
 from acquisition.monitor.page import live_page
 from acquisition.monitor.view import read_session
 from experiment.session.journal import JOURNAL_FILE
@@ -43,7 +37,154 @@ from foundation.errors import FormatError, InputError
 TOKEN_BYTES = 16
 """Random bytes of a token: 128 bits cannot be guessed, and still make a QR code that a terminal has room for."""
 
+
+QUIET_MODULES = 4
+"""Light modules around a code, as ISO/IEC 18004 asks for."""
+
+
+MOST_CONNECTIONS = 64
+"""Connections at once; a page holds one or two, and what goes beyond is turned away rather than served by threads
+without number."""
+
+IDLE_S = 30.0
+"""A connection on which nothing is asked for so long is closed; a page that is hidden asks every ten seconds."""
+
+GZIP_FROM_BYTES = 2048
+"""A smaller answer is one packet or two either way."""
+
+_TEXT = "text/plain; charset=utf-8"
+
 _FRAME = re.compile(r"frame/([1-9][0-9]{0,8})\.jpg")
+
+
+def open_monitor(folder: Path, port: int, host: str = "127.0.0.1") -> MonitorServer:
+    """Return a server for a session, not yet serving."""
+    if (folder / JOURNAL_FILE).exists():
+        read_session(folder)
+    elif folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        raise FormatError(
+            f"{folder} is no session: it holds no {JOURNAL_FILE}; name a folder made by acquire run or import, or one "
+            "that is not there yet"
+        )
+    try:
+        return MonitorServer(SessionWatch(folder), host, port)
+    except (OSError, OverflowError) as error:
+        reason = error.strerror if isinstance(error, OSError) and error.strerror else error
+        own = "" if is_loopback(host) else " or an address of this machine with --host"
+        raise InputError(f"cannot serve on {host} port {port}: {reason}; name another with --port{own}") from error
+
+
+class MonitorServer(ThreadingHTTPServer):
+    """Serves one session; not yet serving when it is made."""
+
+    daemon_threads = True
+    request_queue_size = MOST_CONNECTIONS
+
+    def __init__(self, watch: SessionWatch, host: str, port: int) -> None:
+        self.watch = watch
+        self.access = Access.to(host)
+        self.page = live_page(watch.folder.resolve().name)
+        self._free = threading.BoundedSemaphore(MOST_CONNECTIONS)
+        if ":" in host:
+            self.address_family = socket.AF_INET6
+        super().__init__((host, port), _Handler)
+
+    @property
+    def port(self) -> int:
+        """The port that it listens on."""
+        return self.server_address[1]
+
+    @property
+    def path(self) -> str:
+        """What stands behind the first slash of the page's address: its token and a slash, or nothing."""
+        return f"{self.access.token}/" if self.access.token else ""
+
+    def process_request(self, request: Any, client_address: Any) -> None:
+        """Answer in a thread of its own, unless there are too many."""
+        if not self._free.acquire(blocking=False):
+            self.shutdown_request(request)
+            return
+        super().process_request(request, client_address)
+
+    def process_request_thread(self, request: Any, client_address: Any) -> None:
+        """Answer one connection, and make room for the next."""
+        try:
+            super().process_request_thread(request, client_address)
+        finally:
+            self._free.release()
+
+    def handle_error(self, request: Any, client_address: Any) -> None:
+        """Say nothing of viewers that went away: the terminal is the user's."""
+
+
+class _Handler(BaseHTTPRequestHandler):
+    server: MonitorServer  # pyright: ignore[reportIncompatibleVariableOverride]  # the handler's own server, by construction
+    protocol_version = "HTTP/1.1"
+    timeout = IDLE_S
+
+    def do_GET(self) -> None:  # the name is http.server's
+        asked = self.server.access.judge(self.path, self.headers.get("Host"))
+        if isinstance(asked, Refusal):
+            self._answer(asked.status, _TEXT, f"{asked.sentence}\n".encode())
+            return
+        match asked.what:
+            case "page":
+                text, policy = self.server.page
+                self._answer(200, "text/html; charset=utf-8", text.encode(), {"Content-Security-Policy": policy})
+            case "state":
+                state = self.server.watch.state(asked.since)
+                if state is None:
+                    self._answer(204, "", b"")
+                else:
+                    self._answer(200, "application/json", to_bytes(state))
+            case "status":
+                self._answer(200, "application/json", json.dumps(self.server.watch.head().to_plain()).encode())
+            case "frame":
+                self._send_picture(asked)
+
+    do_HEAD = do_GET  # noqa: N815
+
+    def _refuse(self) -> None:
+        # A body that comes along is not read: what follows on this connection would be taken for a request.
+        more = {"Allow": "GET, HEAD", "Connection": "close"}
+        self._answer(405, _TEXT, b"this server only shows; ask with GET\n", more)
+
+    do_POST = do_PUT = do_DELETE = do_PATCH = do_OPTIONS = _refuse  # noqa: N815
+
+    def _send_picture(self, asked: Request) -> None:
+        data = self.server.watch.picture(asked.attempt)
+        if not data:
+            self._answer(404, _TEXT, b"there is no picture of that frame\n")
+            return
+        # The page names the version of a picture, so that one that is written anew has another address.
+        self._answer(200, "image/jpeg", data, {"Cache-Control": "private, max-age=86400"})
+
+    def _answer(self, status: int, kind: str, body: bytes, more: dict[str, str] | None = None) -> None:
+        headers = {"Content-Type": kind} if kind else {}
+        headers |= {
+            "Cache-Control": "no-store",
+            "X-Content-Type-Options": "nosniff",
+            "Referrer-Policy": "no-referrer",
+            "Cross-Origin-Resource-Policy": "same-origin",
+        }
+        if kind != "image/jpeg" and len(body) >= GZIP_FROM_BYTES and "gzip" in self.headers.get("Accept-Encoding", ""):
+            body = gzip.compress(body, 5, mtime=0)
+            headers["Content-Encoding"] = "gzip"
+        if status != 204:
+            headers["Content-Length"] = str(len(body))
+        self.send_response(status)
+        for name, value in (headers | (more or {})).items():
+            self.send_header(name, value)
+        self.end_headers()
+        if self.command != "HEAD":
+            self.wfile.write(body)
+
+    def version_string(self) -> str:
+        """Return what the Server header says: no versions for strangers."""
+        return "acquire monitor"
+
+    def log_message(self, format: str, *args: object) -> None:
+        """Log nothing: the terminal is the user's."""
 
 
 @dataclass(frozen=True)
@@ -150,10 +291,6 @@ def reachable_addresses(host: str) -> tuple[str, ...]:
     return tuple(found) or (socket.gethostname(),)
 
 
-QUIET_MODULES = 4
-"""Light modules around a code, as ISO/IEC 18004 asks for."""
-
-
 def qr_text(text: str) -> str:
     """Return a QR code of `text` as lines of half blocks, dark on light on any terminal: two rows of modules a line."""
     import cv2
@@ -170,154 +307,3 @@ def qr_text(text: str) -> str:
         for above, below in zip(code[::2], code[1::2], strict=True)
     )
     return "\n".join(f"\x1b[97;40m{line}\x1b[0m" for line in lines)
-
-
-MOST_CONNECTIONS = 64
-"""Connections at once; a page holds one or two, and what goes beyond is turned away rather than served by threads
-without number."""
-
-IDLE_S = 30.0
-"""A connection on which nothing is asked for so long is closed; a page that is hidden asks every ten seconds."""
-
-GZIP_FROM_BYTES = 2048
-"""A smaller answer is one packet or two either way."""
-
-_TEXT = "text/plain; charset=utf-8"
-
-
-class MonitorServer(ThreadingHTTPServer):
-    """Serves one session; not yet serving when it is made."""
-
-    daemon_threads = True
-    request_queue_size = MOST_CONNECTIONS
-
-    def __init__(self, watch: SessionWatch, host: str, port: int) -> None:
-        self.watch = watch
-        self.access = Access.to(host)
-        self.page = live_page(watch.folder.resolve().name)
-        self._free = threading.BoundedSemaphore(MOST_CONNECTIONS)
-        if ":" in host:
-            self.address_family = socket.AF_INET6
-        super().__init__((host, port), _Handler)
-
-    @property
-    def port(self) -> int:
-        """The port that it listens on."""
-        return self.server_address[1]
-
-    @property
-    def path(self) -> str:
-        """What stands behind the first slash of the page's address: its token and a slash, or nothing."""
-        return f"{self.access.token}/" if self.access.token else ""
-
-    def process_request(self, request: Any, client_address: Any) -> None:
-        """Answer in a thread of its own, unless there are too many."""
-        if not self._free.acquire(blocking=False):
-            self.shutdown_request(request)
-            return
-        super().process_request(request, client_address)
-
-    def process_request_thread(self, request: Any, client_address: Any) -> None:
-        """Answer one connection, and make room for the next."""
-        try:
-            super().process_request_thread(request, client_address)
-        finally:
-            self._free.release()
-
-    def handle_error(self, request: Any, client_address: Any) -> None:
-        """Say nothing of viewers that went away: the terminal is the user's."""
-
-
-class _Handler(BaseHTTPRequestHandler):
-    server: MonitorServer  # pyright: ignore[reportIncompatibleVariableOverride]  # the handler's own server, by construction
-    protocol_version = "HTTP/1.1"
-    timeout = IDLE_S
-
-    def do_GET(self) -> None:  # the name is http.server's
-        asked = self.server.access.judge(self.path, self.headers.get("Host"))
-        if isinstance(asked, Refusal):
-            self._answer(asked.status, _TEXT, f"{asked.sentence}\n".encode())
-            return
-        match asked.what:
-            case "page":
-                page = self.server.page
-                more = {"Content-Security-Policy": page.policy}
-                self._answer(200, "text/html; charset=utf-8", page.text.encode(), more)
-            case "state":
-                state = self.server.watch.state(asked.since)
-                if state is None:
-                    self._answer(204, "", b"")
-                else:
-                    self._answer(200, "application/json", to_bytes(state))
-            case "status":
-                self._answer(200, "application/json", self._status())
-            case "frame":
-                self._send_picture(asked)
-
-    do_HEAD = do_GET  # noqa: N815
-
-    def _refuse(self) -> None:
-        # A body that comes along is not read: what follows on this connection would be taken for a request.
-        more = {"Allow": "GET, HEAD", "Connection": "close"}
-        self._answer(405, _TEXT, b"this server only shows; ask with GET\n", more)
-
-    do_POST = do_PUT = do_DELETE = do_PATCH = do_OPTIONS = _refuse  # noqa: N815
-
-    def _status(self) -> bytes:
-        """Return how the session stands, for scripts: `Head` with times as ISO 8601 text."""
-        head = self.server.watch.head()
-        told = {name: value.isoformat() if isinstance(value, datetime) else value for name, value in vars(head).items()}
-        return json.dumps(told).encode()
-
-    def _send_picture(self, asked: Request) -> None:
-        path = self.server.watch.picture(asked.attempt)
-        data = b"" if path is None else read_picture(path)
-        if not data:
-            self._answer(404, _TEXT, b"there is no picture of that frame\n")
-            return
-        # The page names the version of a picture, so that one that is written anew has another address.
-        self._answer(200, "image/jpeg", data, {"Cache-Control": "private, max-age=86400"})
-
-    def _answer(self, status: int, kind: str, body: bytes, more: dict[str, str] | None = None) -> None:
-        headers = {"Content-Type": kind} if kind else {}
-        headers |= {
-            "Cache-Control": "no-store",
-            "X-Content-Type-Options": "nosniff",
-            "Referrer-Policy": "no-referrer",
-            "Cross-Origin-Resource-Policy": "same-origin",
-        }
-        if kind != "image/jpeg" and len(body) >= GZIP_FROM_BYTES and "gzip" in self.headers.get("Accept-Encoding", ""):
-            body = gzip.compress(body, 5, mtime=0)
-            headers["Content-Encoding"] = "gzip"
-        if status != 204:
-            headers["Content-Length"] = str(len(body))
-        self.send_response(status)
-        for name, value in (headers | (more or {})).items():
-            self.send_header(name, value)
-        self.end_headers()
-        if self.command != "HEAD":
-            self.wfile.write(body)
-
-    def version_string(self) -> str:
-        """Return what the Server header says: no versions for strangers."""
-        return "acquire monitor"
-
-    def log_message(self, format: str, *args: object) -> None:
-        """Log nothing: the terminal is the user's."""
-
-
-def open_monitor(folder: Path, port: int, host: str = "127.0.0.1") -> MonitorServer:
-    """Return a server for a session, not yet serving."""
-    if (folder / JOURNAL_FILE).exists():
-        read_session(folder)
-    elif folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise FormatError(
-            f"{folder} is no session: it holds no {JOURNAL_FILE}; name a folder made by acquire run or import, or one "
-            "that is not there yet"
-        )
-    try:
-        return MonitorServer(SessionWatch(folder), host, port)
-    except (OSError, OverflowError) as error:
-        reason = error.strerror if isinstance(error, OSError) and error.strerror else error
-        own = "" if is_loopback(host) else " or an address of this machine with --host"
-        raise InputError(f"cannot serve on {host} port {port}: {reason}; name another with --port{own}") from error

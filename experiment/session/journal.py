@@ -53,10 +53,10 @@ from foundation.errors import FormatError, counted
 JOURNAL_FILE = "journal.sqlite"
 """Name of the journal in a session's folder."""
 
-AMONG = "IN (SELECT value FROM json_each(?))"
+_AMONG = "IN (SELECT value FROM json_each(?))"
 """Condition on numbers that are given as a JSON list, however many there are."""
 
-PLACE = "place"
+_PLACE = "place"
 """Key of the record that says which folder the signs of life are given for."""
 
 PATIENCE_S = 600.0
@@ -112,6 +112,13 @@ class Journal:
     def be_patient(self, patience_s: float, announce: Callable[[str], object]) -> None:
         """Change how long a write waits and who is told; see `open_for_run`."""
         self._patience = LockPatience(self._path, patience_s, announce)
+
+    @contextmanager
+    def one_moment(self) -> Generator[None]:
+        """Let all that is read inside be of one moment: a verdict is never seen without its checks."""
+        self._rows("BEGIN")
+        yield
+        self._rows("ROLLBACK")
 
     def steps(self) -> tuple[SessionStep, ...]:
         """Return the plan, in taking order."""
@@ -210,7 +217,7 @@ class Journal:
         own, at, place = Process.own(), datetime.now(UTC), SessionPlace.of(self._path)
         with self._writing():
             if place is not None:
-                self._connection.execute("INSERT OR REPLACE INTO records VALUES (?, ?)", (PLACE, place.to_text()))
+                self._connection.execute("INSERT OR REPLACE INTO records VALUES (?, ?)", (_PLACE, place.to_text()))
             self._connection.execute(
                 "INSERT OR REPLACE INTO heartbeat VALUES (1, ?, ?, ?, ?, ?, ?, ?, ?)",
                 (time_text(at), own.pid, own.started, own.host, own.boot, state, sentence, time_text(until)),
@@ -223,7 +230,7 @@ class Journal:
 
     def records(self) -> dict[str, str]:
         """Return what the session was taken with, by key."""
-        return dict(self._newer_rows(f"SELECT key, text FROM records WHERE key <> '{PLACE}' ORDER BY key"))
+        return dict(self._newer_rows(f"SELECT key, text FROM records WHERE key <> '{_PLACE}' ORDER BY key"))
 
     def heartbeat(self) -> Heartbeat | None:
         """Return the newest sign of life; None if none was ever given."""
@@ -231,7 +238,7 @@ class Journal:
         if not rows:
             return None
         at, *process, state, sentence, until = rows[0]
-        said = self._newer_rows(f"SELECT text FROM records WHERE key = '{PLACE}'")
+        said = self._newer_rows(f"SELECT text FROM records WHERE key = '{_PLACE}'")
         place = SessionPlace.from_text(said[0][0]) if said else None
         begun, due = datetime.fromisoformat(at), datetime.fromisoformat(until)
         return Heartbeat(begun, Process(*process), state, sentence, due, place)
@@ -239,29 +246,21 @@ class Journal:
     def attempts(self) -> list[Attempt]:
         """Return every attempt, oldest first."""
         rows = self._rows(
-            "SELECT id, step, kind, illumination, file, started_at, ended_at, verdict, reason, sha256 IS NOT NULL"
+            "SELECT id, step, kind, illumination, file, started_at, ended_at, taken_at, verdict, reason"
             " FROM attempts ORDER BY id"
         )
         return [
             Attempt(
-                row[0],
-                row[1],
-                self._kind(row[2]),
-                row[3],
-                row[4],
-                datetime.fromisoformat(row[5]),
-                datetime.fromisoformat(row[6]) if row[6] else None,
-                row[7],
-                row[8],
-                bool(row[9]),
+                *(number, step, self._kind(kind), light, file),
+                *(datetime.fromisoformat(started_at), _time(ended_at), _time(taken_at), verdict, reason),
             )
-            for row in rows
+            for number, step, kind, light, file, started_at, ended_at, taken_at, verdict, reason in rows
         ]
 
     def events(self) -> list[SessionEvent]:
         """Return every event, oldest first."""
-        rows = self._rows("SELECT at, what, detail FROM events ORDER BY id")
-        return [SessionEvent(datetime.fromisoformat(row[0]), row[1], row[2]) for row in rows]
+        rows = self._rows("SELECT at, what, detail, id FROM events ORDER BY id")
+        return [SessionEvent(datetime.fromisoformat(at), *event) for at, *event in rows]
 
     def details(self, attempts: Sequence[int] | None = None) -> dict[int, AttemptDetails]:
         """Return what is kept of attempts, those of these numbers or all, by number, oldest first; see `begin`.
@@ -270,7 +269,7 @@ class Journal:
         """
         among, numbers = "", tuple[str, ...]()
         if attempts is not None:
-            among, numbers = f"AND attempt {AMONG}", (json.dumps(list(attempts)),)
+            among, numbers = f"AND attempt {_AMONG}", (json.dumps(list(attempts)),)
         seen: dict[int, tuple[float, float, float]] = {
             attempt: (red, green, blue)
             for attempt, red, green, blue in self._newer_rows(
@@ -376,6 +375,10 @@ class Journal:
 def time_text(at: datetime) -> str:
     """Return a time as journal and `frames.csv` have it: ISO 8601 with microseconds and zone."""
     return at.isoformat(timespec="microseconds")
+
+
+def _time(text: str | None) -> datetime | None:
+    return datetime.fromisoformat(text) if text else None
 
 
 def _verdict_text(verdict: str, reason: str, newest: bool) -> str:

@@ -236,7 +236,8 @@ class AcceptedFile:
 class Attempt:
     """One try at a step as the journal has it.
 
-    `verdict` is None while it is under way, or if it was cut off; `has_frame` is whether a raw file came of it.
+    Times are those of the lab's clock, None where it has not come so far. The verdict is None while it is under way, or
+    if it was cut off.
     """
 
     id: int
@@ -246,9 +247,14 @@ class Attempt:
     file: str
     started_at: datetime
     ended_at: datetime | None
+    taken_at: datetime | None
     verdict: str | None
     reason: str
-    has_frame: bool
+
+    @property
+    def has_frame(self) -> bool:
+        """Whether a raw file came of it; the name of one that failed may be that of the next try."""
+        return self.taken_at is not None
 
 
 def last_moment(attempts: Iterable[Attempt]) -> datetime | None:
@@ -264,6 +270,7 @@ class SessionEvent:
     at: datetime
     what: str
     detail: str
+    number: int
 
 
 def preview_path(folder: Path, file: str) -> Path:

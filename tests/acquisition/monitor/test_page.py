@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from acquisition.monitor.page import save_report
+from acquisition.monitor.page import write_session_report
 from acquisition.monitor.server import MonitorServer, open_monitor
 from experiment.lights import plan_illuminations
 from tests.acquisition.monitor.browser import Tab, browser_tab, needs_chromium
@@ -293,7 +293,7 @@ def test_several_pages_look_at_once_and_a_frame_costs_little(tab: Tab, run: Made
 
 def test_the_report_shows_the_same_from_a_file(tab: Tab, run: MadeUpRun, tmp_path: Path) -> None:
     path = tmp_path / "report.html"
-    save_report(run.folder, path)
+    write_session_report(run.folder, path)
     tab.open(path.as_uri())
     tab.wait_for("document.readyState === 'complete' && document.querySelectorAll('#planned .mark').length > 0")
     assert tab.value("window.hacked") is None

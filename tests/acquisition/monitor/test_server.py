@@ -20,7 +20,6 @@ import pytest
 
 from acquisition.cli import main
 from acquisition.monitor import server
-from acquisition.monitor import server as access
 from acquisition.monitor.server import MonitorServer, open_monitor
 from foundation.errors import FormatError, InputError
 from tests.acquisition.monitor.made_up import MadeUpRun, jpeg
@@ -335,7 +334,7 @@ def test_the_address_for_a_phone_is_printed_with_a_warning_and_as_a_code(
         return ("192.168.1.7",)
 
     monkeypatch.setattr(ThreadingHTTPServer, "serve_forever", interrupted)
-    monkeypatch.setattr(access, "reachable_addresses", addresses)
+    monkeypatch.setattr(server, "reachable_addresses", addresses)
     monkeypatch.setattr(sys.stdout, "isatty", lambda: True)
     assert main(["monitor", str(run.folder), "--port", "0", "--host", "0.0.0.0"]) == 0
     printed = capsys.readouterr()

@@ -57,7 +57,7 @@ def test_what_is_written_is_read_again(path: Path) -> None:
         assert attempts[0].ended_at == NOW + timedelta(seconds=2)
         assert attempts[1].reason == "the cable came off"
         assert journal.accepted_files() == [AcceptedFile(1, 0, None, "frames/1.cr2", 10, "00")]
-        assert journal.events() == [SessionEvent(NOW, "start", "4 of 4 frames to take")]
+        assert journal.events() == [SessionEvent(NOW, "start", "4 of 4 frames to take", 1)]
 
 
 def test_frames_come_in_the_order_of_the_plan_refused_ones_with_their_reason(path: Path) -> None:
