@@ -18,7 +18,7 @@ from drivers.presenter import BLACK, WHITE, Colour
 from drivers.projector import Power
 from experiment.lights import Illumination
 from experiment.session.folder import Session
-from experiment.session.plan import SessionStep, tie_steps
+from experiment.session.plan import SessionStep, link_steps
 from experiment.session.records import Check, Judgement
 from foundation.console import Ending
 from foundation.errors import DeviceError, DeviceFault, LinkTimeout, QualityError, StorageError
@@ -210,7 +210,7 @@ class TestRefusals:
         with pytest.raises(KeyboardInterrupt):
             run(lab, ScriptedJudge(), ending=ending, observe=end_after(3))
         before = len(lab.taken())
-        ties = tie_steps(lab.session.steps[-1].number + 1)
+        ties = link_steps(lab.session.steps[-1].number + 1)
         lab.session.add_steps(ties)
         judge = ScriptedJudge({3: refused("somebody passed", voids=True)})
         assert run(lab, judge, first=tuple(step.number for step in ties)).complete

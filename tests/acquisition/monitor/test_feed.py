@@ -13,7 +13,7 @@ import pytest
 
 from acquisition.monitor.feed import SessionWatch, place_of, planned_places
 from experiment.session.journal import Journal
-from experiment.session.plan import tie_steps
+from experiment.session.plan import link_steps
 from tests.acquisition.monitor.made_up import LIGHTS, MadeUpRun
 
 
@@ -151,7 +151,7 @@ def test_a_failed_try_has_no_picture_even_if_the_next_bears_its_name(run: MadeUp
 def test_more_steps_or_another_device_are_told_as_a_whole(run: MadeUpRun) -> None:
     watch = SessionWatch(run.folder)
     state = told(watch)
-    added = tie_steps(len(run.steps))
+    added = link_steps(len(run.steps))
     run.journal.add_steps(added)
     more = told(watch, state["cursor"])
     assert [step[0] for step in more["session"]["steps"]] == [step.number for step in (*run.steps, *added)]
