@@ -1,14 +1,8 @@
-"""The illuminations of a session: which codes the projector shows, as a list and as a plot.
-
-The lights of an experiment, as many as the paper's 707, and their file `illuminations.csv`.
+"""The lights of an experiment, as many as the paper's 707, their file `illuminations.csv`, and the figure of them.
 
 The paper (section 3.1) asks for chromaticities spread uniformly and for black bodies but gives no recipe. Ours: the
 points of a triangular grid r = i/n, b = j/n, g = 1 − r − b in linear light, and black bodies from 2000 K to 10 000 K;
 each scaled to its brightest channel and encoded with the projector's transfer function (sRGB unless measured).
-
-Figures of the experiment's design: the chromaticities of the lights, as in the paper's figure of them.
-
-Matplotlib is imported where a figure is made, and through its objects only: no window, no state left behind.
 """
 
 from __future__ import annotations
@@ -45,6 +39,13 @@ CCTS_K = tuple(range(2000, 10001, 200))
 
 MOST_CCTS = 10_000
 """Most temperatures that a text may name: more are a mistake in the step."""
+
+
+FORMATS = ("png", "pdf", "svg")
+"""Endings of a figure's file name, and Matplotlib's names of these formats."""
+
+_NAMED_CCTS_K = (2000, 3000, 4000, 6000, 10000)
+"""Temperatures that the figure names, kelvin: few enough for their names not to touch."""
 
 
 @dataclass(frozen=True)
@@ -192,13 +193,6 @@ def _require_kelvin(ccts: Sequence[float], given: str) -> None:
     for cct_k in ccts:
         if not 1000 <= cct_k <= 100_000:
             raise InputError(f"{given}: {cct_k:g} K is not within 1000 … 100 000 K")
-
-
-FORMATS = ("png", "pdf", "svg")
-"""Endings of a figure's file name, and Matplotlib's names of these formats."""
-
-_NAMED_CCTS_K = (2000, 3000, 4000, 6000, 10000)
-"""Temperatures that the figure names, kelvin: few enough for their names not to touch."""
 
 
 def plot_illuminations(illuminations: Sequence[Illumination], path: Path) -> None:

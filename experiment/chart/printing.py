@@ -177,17 +177,13 @@ def label(chart: Chart) -> str:
     return ". ".join(label_lines(chart))
 
 
-@dataclass(frozen=True)
-class _Band:
-    """Pixel rows `top` … `bottom` − 1, which all look like `row`, (width, 3) uint8."""
+def _bands(
+    drawn: Drawing, pixels_per_mm: float, size: tuple[int, int]
+) -> Iterator[tuple[int, int, npt.NDArray[np.uint8]]]:
+    """Yield the picture from top to bottom: rows `top` … `bottom` − 1, which all look alike, and one of them.
 
-    top: int
-    bottom: int
-    row: npt.NDArray[np.uint8]
-
-
-def _bands(drawn: Drawing, pixels_per_mm: float, size: tuple[int, int]) -> Iterator[_Band]:
-    """Yield the picture from top to bottom; `size` is its width and height in pixels, edges go to the nearest pixel."""
+    `size` is its width and height in pixels, edges go to the nearest pixel; a row is (width, 3) uint8.
+    """
     width, height = size
     edges = np.rint(drawn.rectangles_mm * pixels_per_mm).astype(np.int64)
     edges = np.clip(edges, 0, [width, height, width, height])
@@ -197,15 +193,15 @@ def _bands(drawn: Drawing, pixels_per_mm: float, size: tuple[int, int]) -> Itera
         inside = (edges[:, 1] <= top) & (edges[:, 3] > top)
         for (left, _, right, _), rgb in zip(edges[inside].tolist(), drawn.rgb[inside], strict=True):
             row[left:right] = rgb
-        yield _Band(top, bottom, row)
+        yield top, bottom, row
 
 
-def _packed_strips(bands: Iterator[_Band], height: int) -> Iterator[bytes]:
+def _packed_strips(bands: Iterator[tuple[int, int, npt.NDArray[np.uint8]]], height: int) -> Iterator[bytes]:
     """Yield the picture as deflated strips of `_STRIP_ROWS` rows, the last one shorter."""
     rows: list[npt.NDArray[np.uint8]] = []
-    for band in bands:
-        for y in range(band.top, band.bottom):
-            rows.append(band.row)
+    for top, bottom, row in bands:
+        for y in range(top, bottom):
+            rows.append(row)
             if len(rows) == _STRIP_ROWS or y == height - 1:
                 # Rows repeat so much that a harder setting saves a quarter of the size for three times the time.
                 yield zlib.compress(np.stack(rows).tobytes(), 1)
@@ -298,16 +294,12 @@ def preview(chart: Chart, width_px: int) -> npt.NDArray[np.uint8]:
         raise InputError(f"a preview of {width_px} pixels has no width; give 1 or more")
     height_px = max(1, round(width_px * chart.page_mm[1] / chart.page_mm[0]))
     fine = (width_px * _SUPERSAMPLING, height_px * _SUPERSAMPLING)
-    bands = list(_bands(drawing(chart), fine[0] / chart.page_mm[0], fine))
+    band_tops, band_bottoms, rows = zip(*_bands(drawing(chart), fine[0] / chart.page_mm[0], fine), strict=True)
     # A mean by whole numbers of pixels; OpenCV takes it a good deal faster than numpy.
     means = np.stack(
-        [
-            cv2.resize(band.row[None].astype(np.float32), (width_px, 1), interpolation=cv2.INTER_AREA)[0]
-            for band in bands
-        ]
+        [cv2.resize(row[None].astype(np.float32), (width_px, 1), interpolation=cv2.INTER_AREA)[0] for row in rows]
     )
     tops = np.arange(height_px)[:, None] * _SUPERSAMPLING
-    band_tops, band_bottoms = np.array([[band.top, band.bottom] for band in bands]).T
     shared = np.minimum(band_bottoms, tops + _SUPERSAMPLING) - np.maximum(band_tops, tops)
     weights = np.maximum(shared, 0) / _SUPERSAMPLING
     return np.rint(np.tensordot(weights, means, axes=1)).astype(np.uint8)

@@ -10,11 +10,9 @@ Rules that hold inside:
 Knows the chart and a mosaic of counts; nothing of sessions, cells' colours or lenses
 (`calibration.registration.register`).
 
-The AprilTags of a chart in one colour plane of a picture.
-
-Source: E. Olson, "AprilTag: A robust and flexible visual fiducial system", ICRA 2011; J. Wang and E. Olson,
-"AprilTag 2: Efficient and robust fiducial detection", IROS 2016; detected by the AprilTag authors' library
-(pyapriltags). Places are half-size pixels (`experiment.framing.planes`).
+Sources of the tags: E. Olson, "AprilTag: A robust and flexible visual fiducial system", ICRA 2011; J. Wang and E.
+Olson, "AprilTag 2: Efficient and robust fiducial detection", IROS 2016; detected by the AprilTag authors' library
+(pyapriltags).
 """
 
 from __future__ import annotations
@@ -34,6 +32,12 @@ from experiment.framing.homography import project, rms, robust_homography
 from experiment.framing.planes import CHANNELS, MIN_SIGNAL, Plane, frame_black, paper_level, plane_of, strongest_plane
 from foundation.errors import InputError, RegistrationError
 
+MIN_TAGS = 2
+"""Tags without which no homography is looked for: two give eight points, twice as many as one needs."""
+
+MIN_TAG_SHARE = 0.8
+"""Share of the chart's tags that must be found; fewer mean that part of the chart is covered, dark or outside."""
+
 MIN_MODULE_PX = 3.0
 """Half-size pixels a tag module must have; below, detectors fail one tag after another."""
 
@@ -41,6 +45,9 @@ _CORNERS = [1, 0, 3, 2]
 """pyapriltags' corners in the order clockwise from the printed top-left."""
 
 _Points = npt.NDArray[np.float64]
+
+
+_detectors = threading.local()
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,45 +67,6 @@ class FoundTag:
     def side_px(self) -> float:
         """Mean length of the black square's sides, half-size px."""
         return float(np.linalg.norm(self.corners_px - np.roll(self.corners_px, 1, axis=0), axis=1).mean())
-
-
-_detectors = threading.local()
-
-
-def find_tags(plane: Plane) -> tuple[FoundTag, ...]:
-    """Return the 36h11 tags of a plane, sorted by id, each at most once (the surest).
-
-    Corners are good to about 0.09 px RMS at 4 px a module and σ = 0.7 px blur.
-    """
-    white = paper_level(plane)
-    if white < MIN_SIGNAL:
-        return ()
-    image = np.clip(plane.values * (255.0 / white), 0, 255)
-    return _detect(np.rint(image).astype(np.uint8), plane.offset_px)
-
-
-def _detect(image: npt.NDArray[np.uint8], offset_px: tuple[float, float]) -> tuple[FoundTag, ...]:
-    from pyapriltags import Detector
-
-    # A detector keeps C state between calls, so each thread has its own.
-    if not hasattr(_detectors, "detector"):
-        _detectors.detector = Detector(families="tag36h11", nthreads=1, quad_decimate=1.0, refine_edges=1)
-    detector: Detector = _detectors.detector
-    found: dict[int, FoundTag] = {}
-    for detection in detector.detect(np.ascontiguousarray(image)):
-        # AprilTag puts a pixel's corner, not its centre, at integers.
-        corners = detection.corners[_CORNERS] - 0.5 + np.asarray(offset_px)
-        tag = FoundTag(detection.tag_id, corners, float(detection.decision_margin))
-        if detection.hamming <= 1 and (tag.id not in found or found[tag.id].margin < tag.margin):
-            found[tag.id] = tag
-    return tuple(found[number] for number in sorted(found))
-
-
-MIN_TAGS = 2
-"""Tags without which no homography is looked for: two give eight points, twice as many as one needs."""
-
-MIN_TAG_SHARE = 0.8
-"""Share of the chart's tags that must be found; fewer mean that part of the chart is covered, dark or outside."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -258,3 +226,32 @@ def _not_found(
 def _some(ids: Sequence[int]) -> str:
     text = ", ".join(str(number) for number in ids[:8])
     return text + (f" and {len(ids) - 8} more" if len(ids) > 8 else "")
+
+
+def find_tags(plane: Plane) -> tuple[FoundTag, ...]:
+    """Return the 36h11 tags of a plane, sorted by id, each at most once (the surest).
+
+    Corners are good to about 0.09 px RMS at 4 px a module and σ = 0.7 px blur.
+    """
+    white = paper_level(plane)
+    if white < MIN_SIGNAL:
+        return ()
+    image = np.clip(plane.values * (255.0 / white), 0, 255)
+    return _detect(np.rint(image).astype(np.uint8), plane.offset_px)
+
+
+def _detect(image: npt.NDArray[np.uint8], offset_px: tuple[float, float]) -> tuple[FoundTag, ...]:
+    from pyapriltags import Detector
+
+    # A detector keeps C state between calls, so each thread has its own.
+    if not hasattr(_detectors, "detector"):
+        _detectors.detector = Detector(families="tag36h11", nthreads=1, quad_decimate=1.0, refine_edges=1)
+    detector: Detector = _detectors.detector
+    found: dict[int, FoundTag] = {}
+    for detection in detector.detect(np.ascontiguousarray(image)):
+        # AprilTag puts a pixel's corner, not its centre, at integers.
+        corners = detection.corners[_CORNERS] - 0.5 + np.asarray(offset_px)
+        tag = FoundTag(detection.tag_id, corners, float(detection.decision_margin))
+        if detection.hamming <= 1 and (tag.id not in found or found[tag.id].margin < tag.margin):
+            found[tag.id] = tag
+    return tuple(found[number] for number in sorted(found))

@@ -1,8 +1,7 @@
-"""A frame as a picture to look at: what of the chart was found on it, or what was looked for and not found.
+"""A frame as a picture to look at: what of the chart was found on it, looked for and not found, or deviates.
 
-The ticks along the border count raw pixels, in which corners are given by hand (`experiment.framing.field`).
-
-A frame as a small picture for people: tone mapped, with the chart's tags, what deviates, and the cause drawn in.
+`annotated_png` shows where the chart is, at half size; the ticks along its border count raw pixels, in which corners
+are given by hand (`experiment.framing.field`). `preview_jpeg` is the small picture that a session keeps of each frame.
 """
 
 from __future__ import annotations
@@ -21,11 +20,26 @@ from experiment.framing.finding import Framing, find_tags
 from experiment.framing.homography import project
 from experiment.framing.planes import CHANNELS, Plane, frame_black, phases, plane_of, strongest_plane
 
+WIDTH_PX = 640
+"""Longer side of a preview at most, as the journal has it."""
+
+_QUALITY = 80
+"""JPEG quality: some 40 kB, 30 MB a session."""
+
 _GREEN, _RED, _AMBER, _GREY = (60, 200, 60), (40, 40, 255), (40, 200, 255), (200, 200, 200)
-"""BGR codes: of the page, of tags and outlines that place it, of mere candidates and numbers, of the ticks."""
+"""BGR codes: of page and tags; of outlines that place them and of what deviates; of texts and candidates; of ticks."""
 _FONT = cv2.FONT_HERSHEY_SIMPLEX
 _TICK_RAW_PX = 500
 """Raw pixels from tick to tick along the border: about ten on the longer side of an 18-megapixel frame."""
+
+_LETTER_PX = 7.4
+"""Width of a letter of the cause at `_SCALE`, px."""
+
+_SCALE = 0.42
+"""Size of the letters, of OpenCV's font: the least that is read with ease."""
+
+_FAINTEST = 0.01
+"""Share of white to which a dark frame is brightened at most: else its noise would be the picture."""
 
 _Image = npt.NDArray[np.uint8]
 _Points = npt.NDArray[np.float64]
@@ -113,31 +127,11 @@ def _draw_text(image: _Image, *lines: str) -> None:
         cv2.putText(image, line, place, _FONT, scale, _AMBER, 1, cv2.LINE_AA)
 
 
-WIDTH_PX = 640
-"""Longer side of a preview at most, as the journal has it."""
-
-_QUALITY = 80
-"""JPEG quality: some 40 kB, 30 MB a session."""
-
-_GREEN, _RED, _AMBER = (60, 200, 60), (40, 40, 255), (40, 200, 255)
-"""BGR codes: of tags, of what deviates, of the cause."""
-_LETTER_PX = 7.4
-"""Width of a letter of the cause at `_SCALE`, px."""
-
-_SCALE = 0.42
-"""Size of the letters, of OpenCV's font: the least that is read with ease."""
-
-_FAINTEST = 0.01
-"""Share of white to which a dark frame is brightened at most: else its noise would be the picture."""
-
-_Array = npt.NDArray[np.float64]
-
-
 def preview_jpeg(
     mosaic: Mosaic,
-    black: _Array,
-    white: _Array,
-    outlines_px: Sequence[_Array],
+    black: _Points,
+    white: _Points,
+    outlines_px: Sequence[_Points],
     boxes: Sequence[tuple[int, int, int, int]],
     cause: str,
 ) -> bytes:

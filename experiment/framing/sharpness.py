@@ -1,9 +1,7 @@
-"""How soft a picture of the chart is, measured on its printed edges.
-
-How large a chart's parts are in a camera's frames, and the warning when they are too small.
+"""How large and how sharp a chart's printed parts are in a camera's frames, half-size pixels.
 
 A chart fills its share of the frame whatever its size in millimetres, so what counts is how many cells stand side by
-side: a small sheet is photographed from nearer. Half-size pixels. Knows sizes of frames, nothing of lenses or prints.
+side: a small sheet is photographed from nearer. How soft a picture is, is measured on its printed edges.
 """
 
 from __future__ import annotations
@@ -29,6 +27,22 @@ HALF_SIZE_PX = {"EOS 550D": (2601, 1732), "EOS 6D Mark II": (3132, 2090)}
 
 FILL = 0.94
 """Share of the frame that a sheet fills along its tighter axis."""
+
+
+MAX_BLUR_PX = 1.0
+"""σ of the print's edges up to which cells of any size are found to a few hundredths of a pixel; beyond it the 25
+samples of a cell of 10 px take in more than 1 % of light from its neighbours."""
+
+_BLURS = np.geomspace(0.15, 4, 48)
+"""σ that are tried, half-size px: from less than a photosite's own to far beyond use, 7 % apart."""
+
+_OUTLINE_PLACES = 80
+"""Places of the field's outline at which blur is measured: enough for a median that marks in the margin do not move."""
+
+_INWARDS_PX, _OUTWARDS_PX, _ALONG_PX = 5.0, 2.5, 3.0
+"""How much around a place of the field's outline is looked at: one cell, and not the marks in the margin."""
+
+_Points = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -72,22 +86,6 @@ def small_parts_warning(chart: Chart) -> str | None:
         f"{'; '.join(map(str, seen))}; {MIN_CELL_PX:g} px a cell{least} are needed: fewer bits, larger cells, or a "
         "page nearer to 3 : 2"
     )
-
-
-MAX_BLUR_PX = 1.0
-"""σ of the print's edges up to which cells of any size are found to a few hundredths of a pixel; beyond it the 25
-samples of a cell of 10 px take in more than 1 % of light from its neighbours."""
-
-_BLURS = np.geomspace(0.15, 4, 48)
-"""σ that are tried, half-size px: from less than a photosite's own to far beyond use, 7 % apart."""
-
-_OUTLINE_PLACES = 80
-"""Places of the field's outline at which blur is measured: enough for a median that marks in the margin do not move."""
-
-_INWARDS_PX, _OUTWARDS_PX, _ALONG_PX = 5.0, 2.5, 3.0
-"""How much around a place of the field's outline is looked at: one cell, and not the marks in the margin."""
-
-_Points = npt.NDArray[np.float64]
 
 
 def blur_px(framing: Framing) -> float:

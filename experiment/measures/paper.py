@@ -1,21 +1,16 @@
-"""What bare paper shows in a frame: the shape of the light over the print, and the ground truth.
+"""What bare paper shows in a frame: the flat field (the shape of the light over the print) and the ground truth.
 
 - The flat field is fitted to the frame's white references, channel by channel. The ground truth of a light is what is
-  left of them when it is divided out, and comes from the very frame of the light's samples.
+  left of them when it is divided out, and comes from the very frame of the light's samples. The field's mean over the
+  centres of the chart's cells is 1, so that dividing it out leaves the table's mean level as it was.
 - Which terms it has is decided by references held out: each as the fit to all others predicts it, so that a term stays
-  that foretells references which it has not seen, and none that describes their noise. A criterion on the fit's own
+  that forecasts references which it has not seen, and none that describes their noise. A criterion on the fit's own
   residuals (BIC) did worse where it matters: a corner at half of the centre's light is shown by few references, and
   their misfit is outvoted by the price of the terms that it needs.
 - What the terms may be is what lenses and projectors do (`experiment.measures.least_squares.light_terms`).
 - A lens darkens its corners in all channels alike, so that in a frame without a base the channels first have one shape,
   from their sum, and then each its own on it. Other frames have that frame's shape as base, and one too dark to show a
   shape of its own keeps it.
-
-The flat field: how evenly projector and lens light the print in a frame.
-
-A smooth shape for each channel, divided out of samples and ground truth alike. Its mean over the centres of the chart's
-cells is 1, so that dividing it out leaves the table's mean level as it was. Its parameters are kept, so it can be
-undone.
 """
 
 from __future__ import annotations
@@ -42,6 +37,51 @@ from foundation.robust import sigma_of
 LEAST_FIELD = 0.05
 """Where a polynomial that is extrapolated falls below this share of the mean light, the field is taken to be this:
 samples are divided by it, and no print is lit so unevenly."""
+
+
+MAX_ORDER = 8
+"""Highest order of a frame's flat field: light whose corners have 42 to 52 % of the centre's needs the sixth power of
+the distance from its centre, and where the mount shades the rim the eighth, on simulated frames."""
+
+MAX_ORDER_AROUND = 3
+"""The same where references lie around the cells and not among them: from order 4 on there are shapes that vanish in
+all the margin."""
+
+MIN_REFERENCES = 6
+"""White references that a frame must show (judgement): with fewer, their mean has no error that means anything."""
+
+REFERENCES_A_TERM = 3
+"""With fewer references for each term, a fit forecasts none of them."""
+
+JUDGING_A_TERM = 12
+"""References for each term of the fit that tells which are covered or dirty: with three, the terms describe a stain of
+a tenth of the references."""
+
+_PLAIN = 6
+"""Terms of a slope and a bend."""
+
+TERM_PRICE = 1.0
+"""By how much a term must lower N log(mean squared error of the N references held out), chosen: 0 takes a shape for one
+in four frames that have none, and at 60 counts adds .2 % of noise to the field; 4 misses shapes of .3 % at 300."""
+
+READ_COUNTS = 65.0
+"""Signal whose photon noise is as large as the read noise, counts: 6 counts at 1.8 electrons a count. The variance of a
+reference is taken to be that of the light there and of this, so that dim corners count as they are known."""
+
+_ROUNDS = 4
+"""Solutions in a row of the robust fit; of references few are covered or dirty, and the weights settle at once."""
+
+_RINGS = 10
+"""Rings of equally many references about the page's middle, by which a fall-off that is left over is recognised."""
+
+_NEAR = 4
+"""References, one and its neighbours, whose mean deviation is the worst: a tenth of a page's side on A0."""
+
+_USUAL = 5.0
+"""Usual deviations beyond which a reference is off: by chance one in two million."""
+
+_EXACT = 1e-9
+"""Coefficients of terms below this are rounding errors of their computation."""
 
 _Array = npt.NDArray[np.float64]
 
@@ -82,51 +122,6 @@ class FlatField:
             [[float(f"{value:.7g}") for value in factor.tolist()] for factor in factors]
             for factors in self.coefficients
         ]
-
-
-MAX_ORDER = 8
-"""Highest order of a frame's flat field: light whose corners have 42 to 52 % of the centre's needs the sixth power of
-the distance from its centre, and where the mount shades the rim the eighth, on simulated frames."""
-
-MAX_ORDER_AROUND = 3
-"""The same where references lie around the cells and not among them: from order 4 on there are shapes that vanish in
-all the margin."""
-
-MIN_REFERENCES = 6
-"""White references that a frame must show (judgement): with fewer, their mean has no error that means anything."""
-
-REFERENCES_A_TERM = 3
-"""With fewer references for each term, a fit foretells none of them."""
-
-JUDGING_A_TERM = 12
-"""References for each term of the fit that tells which are covered or dirty: with three, the terms describe a stain of
-a tenth of the references."""
-
-_PLAIN = 6
-"""Terms of a slope and a bend."""
-
-TERM_PRICE = 1.0
-"""By how much a term must lower N log(mean squared error of the N references held out), chosen: 0 takes a shape for one
-in four frames that have none, and at 60 counts adds .2 % of noise to the field; 4 misses shapes of .3 % at 300."""
-
-READ_COUNTS = 65.0
-"""Signal whose photon noise is as large as the read noise, counts: 6 counts at 1.8 electrons a count. The variance of a
-reference is taken to be that of the light there and of this, so that dim corners count as they are known."""
-
-_ROUNDS = 4
-"""Solutions in a row of the robust fit; of references few are covered or dirty, and the weights settle at once."""
-
-_RINGS = 10
-"""Rings of equally many references about the page's middle, by which a fall-off that is left over is recognised."""
-
-_NEAR = 4
-"""References, one and its neighbours, whose mean deviation is the worst: a tenth of a page's side on A0."""
-
-_USUAL = 5.0
-"""Usual deviations beyond which a reference is off: by chance one in two million."""
-
-_EXACT = 1e-9
-"""Coefficients of terms below this are rounding errors of their computation."""
 
 
 @dataclass(frozen=True)
@@ -290,7 +285,7 @@ def _best_fit(
     judging: int,
     light: _Array | None = None,
 ) -> tuple[_Array, _Array]:
-    """Return solution (terms,) and weights (N,), 0 … 1, of the fit that foretells references best.
+    """Return solution (terms,) and weights (N,), 0 … 1, of the fit that forecasts references best.
 
     `basis`: (N, T) float64, the terms. `known`: (N,) float64, the base's shape. `values`: (N,) float64 counts above
     black. `light`: (N,) float64, relative light by which the references' noise is known; the base's shape if not given.

@@ -1,4 +1,4 @@
-"""Stains, folds and shadows on the print: cells whose colour is not that of their code.
+"""Stains, folds, shadows and reflections on the print: cells whose colour is not that of their code.
 
 A stain leaves its cells of one colour each, so that neither rim nor noise of a cell shows it, and the table would hold
 the colours of a dirty print. It is recognised by a whole neighbourhood that deviates at once, while the same codes,
@@ -12,12 +12,9 @@ Rules that hold inside:
   judged alone as well, for only half of the neighbourhood of a cell at a stain's rim is stained; that half must show.
 - Charts of less than `LEAST_BITS` cannot be judged: between four levels of a code curvature does not change slowly.
 - A deviation must be significant and large enough to matter. What is found is listed, never corrected.
-
-Light added to a place of the print, as a reflection does: the same to all cells there, whatever their colour.
-
-A stain takes of each cell a share of its light, a reflection adds to each as much. So the light that cells of a place
-show is a line over the light that they should have: its slope is the share of their own that they keep, and what it
-leaves at 0 is the light added (dichromatic reflection: S. Shafer, Color Research & Application 10, 1985, eq. 1).
+- A stain takes of each cell a share of its light, a reflection adds to each as much. So the light that cells of a place
+  show is a line over the light that they should have: its slope is the share of their own that they keep, and what it
+  leaves at 0 is the light added (dichromatic reflection: S. Shafer, Color Research & Application 10, 1985, eq. 1).
 """
 
 from __future__ import annotations
@@ -52,6 +49,18 @@ LEAST_COUNTS = 30.0
 LEAST_BITS = 3
 """Bits of a channel: with 2, curvature changes too fast between the four levels of a code to be predicted."""
 
+
+LEAST_CELLS = 6
+"""Cells of a place for a line through them to mean anything."""
+
+LARGE_SPOT = 0.005
+"""Share of the cells from which on a place counts: that of the limit on unfit cells. A glint on fewer is listed, and
+what it leaves around them is a few cells' error."""
+
+OWN_KEPT = 0.85
+"""Share of their own light that cells keep under a reflection at least: less, and something covers them (as in the
+table of causes, where a hand is named below it)."""
+
 _ROUNDS = 3
 """Repetitions at most, each without the stained cells of the one before in the predictions."""
 
@@ -63,6 +72,19 @@ _LEAST_NEIGHBOURS = 5
 
 _MANY_BESIDE = 3
 """Stained cells of a neighbourhood from which on it need not deviate itself for a cell to belong to the stain."""
+
+_BRIGHT_PERCENTILE = 99.0
+"""Of the cells' levels, what is taken for paper white."""
+
+_BESIDE = 2.3
+"""Distance, in sides of a cell, up to which deviating cells are of one place: one may lie between them."""
+
+_AROUND = 2.5
+"""Distance, in sides of a cell, from the cells of a spot up to which light is looked for in cells that are not listed:
+two rings, of which the first is half in the neighbourhoods of the spot (chosen)."""
+
+_Array = npt.NDArray[np.float64]
+_Index = npt.NDArray[np.int64]
 _Mask = npt.NDArray[np.bool_]
 
 
@@ -220,31 +242,6 @@ def _of_neighbourhoods(log_ratios: _Array, near: npt.NDArray[np.intp]) -> tuple[
         error = np.sqrt(np.maximum(inside, spread**2) / np.maximum(count, 1))
     enough = count >= _LEAST_NEIGHBOURS
     return np.where(enough, np.expm1(mean), np.nan), np.where(enough, error, np.nan)
-
-
-LEAST_CELLS = 6
-"""Cells of a place for a line through them to mean anything."""
-
-LARGE_SPOT = 0.005
-"""Share of the cells from which on a place counts: that of the limit on unfit cells. A glint on fewer is listed, and
-what it leaves around them is a few cells' error."""
-
-OWN_KEPT = 0.85
-"""Share of their own light that cells keep under a reflection at least: less, and something covers them (as in the
-table of causes, where a hand is named below it)."""
-
-_BRIGHT_PERCENTILE = 99.0
-"""Of the cells' levels, what is taken for paper white."""
-
-_BESIDE = 2.3
-"""Distance, in sides of a cell, up to which deviating cells are of one place: one may lie between them."""
-
-_AROUND = 2.5
-"""Distance, in sides of a cell, from the cells of a spot up to which light is looked for in cells that are not listed:
-two rings, of which the first is half in the neighbourhoods of the spot (chosen)."""
-
-_Array = npt.NDArray[np.float64]
-_Index = npt.NDArray[np.int64]
 
 
 def cell_mm(stains: Stains) -> float:

@@ -1,4 +1,4 @@
-"""The file of a session's journal: its tables, and how it is opened, so that readers and the run never stop each other.
+"""The file of a session's journal: its tables, what may stand in them, and how it is opened by a run and its readers.
 
 Rules that hold inside:
 
@@ -7,14 +7,11 @@ Rules that hold inside:
 - A reader creates, migrates and changes nothing. What cannot be read in place without doing so (a journal copied with
   its `-wal`, one in a folder that cannot be written) is read from a copy in memory.
 - Where write-ahead mode does not work (file systems of a network share no memory) the journal stays in the older mode.
+- A session may be a stranger's, and an SQLite file can hold more than rows: views that never end, triggers that delete,
+  columns that are computed, text where a number is meant, names of files outside. All that is refused when the journal
+  is opened, so that nothing behind this has to expect it.
 
 Sources: sqlite.org/wal.html, in particular "Read-Only Databases" and "Disadvantages"; sqlite.org/lockingv3.html.
-
-Whether a journal holds what a journal may hold: plain tables, and values of the kinds that its readers expect.
-
-A session may be a stranger's, and an SQLite file can hold more than rows: views that never end, triggers that delete,
-columns that are computed, text where a number is meant, names of files outside. All that is refused when the journal is
-opened, so that nothing behind this has to expect it.
 """
 
 from __future__ import annotations
@@ -38,134 +35,6 @@ from foundation.files import disk_remedy_of, partial_path, storage_error, sync_f
 from foundation.files import reading_error as file_reading_error
 from foundation.trust.foreign_folders import is_inside_name, require_plain_folder
 
-MOST_VALUE_BYTES: Final = 64 << 20
-"""Longest text, blob or row that SQLite makes of a journal: what the judge keeps of a frame is some 100 kilobytes."""
-
-MOST_BYTES: Final = {"chart.json": 256 << 20, "illuminations.csv": 16 << 20, "session.toml": 1 << 20}
-"""Largest sizes of what is read whole beside a journal: forty times those of 707 lights and 32 768 colours."""
-
-_DAMAGED: Final = "it is damaged, or not to be trusted; restore it from a copy"
-
-_WHOLE = "typeof({0}) = 'integer' AND {0} BETWEEN 0 AND 1000000000"
-_MAYBE_WHOLE = "({0} IS NULL OR " + _WHOLE + ")"
-_CODE = "typeof({0}) = 'integer' AND {0} BETWEEN 0 AND 255"
-_SIZE = "({0} IS NULL OR (typeof({0}) = 'integer' AND {0} >= 0))"
-_TEXT = "typeof({0}) = 'text' AND length({0}) < 100000"
-_MAYBE_TEXT = "({0} IS NULL OR " + _TEXT + ")"
-_REAL = "typeof({0}) IN ('real', 'integer') AND abs({0}) < 9e300"
-_MAYBE_REAL = "({0} IS NULL OR typeof({0}) IN ('real', 'integer'))"
-_MOMENT = "[0-9][0-9][0-9][0-9]-[01][0-9]-[0-3][0-9]T[0-2][0-9]:[0-5][0-9]:[0-5][0-9]"
-_ZONE = "[+-][0-9][0-9]:[0-9][0-9]"
-_FORMS = f"{{0}} GLOB '{_MOMENT}.{6 * '[0-9]'}{_ZONE}' OR {{0}} GLOB '{_MOMENT}{_ZONE}'"
-# SQLite ends a text at a zero byte, takes 30 February for 2 March, and knows the zones that there are.
-_TIME = (
-    f"typeof({{0}}) = 'text' AND ({_FORMS}) AND length(CAST({{0}} AS BLOB)) = length({{0}}) "
-    "AND {0} BETWEEN '1970' AND '9999' AND datetime({0}) IS NOT NULL "
-    "AND strftime('%Y-%m-%dT%H:%M:%S', substr({0}, 1, 19), '+0 seconds') = substr({0}, 1, 19)"
-)
-_MAYBE_TIME = "({0} IS NULL OR {0} = '' OR (" + _TIME + "))"
-_SHA256 = "({0} IS NULL OR (typeof({0}) = 'text' AND length({0}) <= 64 AND {0} NOT GLOB '*[^0-9a-f]*'))"
-
-_COLUMNS: Final = {
-    "plan": {
-        "step": _WHOLE,
-        "kind": _TEXT,
-        "illumination": _MAYBE_WHOLE,
-        "red": _CODE,
-        "green": _CODE,
-        "blue": _CODE,
-    },
-    "attempts": {
-        "id": _WHOLE,
-        "step": _WHOLE,
-        "kind": _TEXT,
-        "illumination": _MAYBE_WHOLE,
-        "file": _TEXT,
-        "started_at": _TIME,
-        "ended_at": _MAYBE_TIME,
-        "taken_at": _MAYBE_TIME,
-        "exposure_s": _MAYBE_REAL,
-        "size": _SIZE,
-        "sha256": _SHA256,
-        "verdict": _MAYBE_TEXT,
-        "reason": _TEXT,
-    },
-    "events": {"id": _WHOLE, "at": _TIME, "what": _TEXT, "detail": _TEXT},
-    "checks": {
-        "attempt": _WHOLE,
-        "position": _WHOLE,
-        "name": _TEXT,
-        "value": _MAYBE_REAL,
-        "low": _MAYBE_REAL,
-        "high": _MAYBE_REAL,
-        "unit": _TEXT,
-        "reason": _TEXT,
-    },
-    "measurements": {
-        "attempt": _WHOLE,
-        "red": _MAYBE_REAL,
-        "green": _MAYBE_REAL,
-        "blue": _MAYBE_REAL,
-        "data": "typeof({0}) = 'blob'",
-        "voids": _WHOLE,
-        "lasting": _WHOLE,
-    },
-    "timings": {"attempt": _WHOLE, "name": _TEXT, "seconds": _REAL},
-    "heartbeat": {
-        "id": _WHOLE,
-        "at": _TIME,
-        "pid": "typeof({0}) = 'integer'",
-        "started": _TEXT,
-        "host": _TEXT,
-        "boot": _TEXT,
-        "state": _TEXT,
-        "sentence": _TEXT,
-        "until": _TIME,
-    },
-    "records": {"key": _TEXT, "text": _TEXT},
-}
-"""What a row must fulfil, by table and column; times as `datetime.fromisoformat` reads them."""
-
-_TOGETHER: Final = {
-    # A frame that has a hash was taken at a time with an exposure (0 where nobody knows), and has a verdict.
-    "attempts": "(sha256 IS NULL OR (taken_at <> '' AND exposure_s BETWEEN 0 AND 1e9 AND size IS NOT NULL "
-    "AND verdict IS NOT NULL))",
-    "measurements": "(red IS NULL OR (green IS NOT NULL AND blue IS NOT NULL))",
-}
-
-
-def limit_values(connection: sqlite3.Connection) -> None:
-    """Bound what SQLite makes of a journal, and let nothing in its schema do more than hold rows."""
-    connection.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, MOST_VALUE_BYTES)
-    connection.execute("PRAGMA trusted_schema = OFF")
-
-
-def require_plain_schema(path: Path, connection: sqlite3.Connection) -> None:
-    """Refuse a journal with views, triggers, virtual tables or computed columns; a FormatError names it."""
-    for kind, name, sql in connection.execute("SELECT type, name, sql FROM sqlite_master").fetchall():
-        plain = kind == "table" and not str(sql or "").lstrip().upper().startswith("CREATE VIRTUAL")
-        # SQLite makes an index of each primary key, without a text.
-        if not (plain or (kind == "index" and sql is None)):
-            raise FormatError(f"{path} holds the {kind} {str(name)[:80]!r}, which no journal has; {_DAMAGED}")
-
-
-def require_sound_rows(path: Path, connection: sqlite3.Connection, version: int) -> None:
-    """Refuse a journal with values that no run writes; costs milliseconds."""
-    for table in list(_COLUMNS)[: 3 if version == 1 else None]:
-        columns = {row[1]: row[6] for row in connection.execute(f"PRAGMA table_xinfo({table})")}
-        lacking = _COLUMNS[table].keys() - columns.keys()
-        if lacking or any(columns.values()):
-            raise FormatError(f"{path}: the columns of {table} are not those of a journal; {_DAMAGED}")
-        sound = " AND ".join([f"({form.format(column)})" for column, form in _COLUMNS[table].items()])
-        together = _TOGETHER.get(table, "1")
-        query = f"SELECT COUNT(*) FROM {table} WHERE ({sound} AND {together}) IS NOT TRUE"
-        if found := connection.execute(query).fetchone()[0]:
-            raise FormatError(f"{path}: {found} rows of {table} hold values that no run writes; {_DAMAGED}")
-    for (file,) in connection.execute("SELECT DISTINCT file FROM attempts"):
-        if not is_inside_name(file):
-            raise FormatError(f"{path} names the file {file[:200]!r}, which is none of the session; {_DAMAGED}")
-
-
 _T = TypeVar("_T")
 _log = logging.getLogger(__name__)
 
@@ -181,6 +50,12 @@ TRY_S = 1.0
 READING_LIMIT_S = 10.0
 """How long a reader waits where the journal is not in write-ahead mode: a commit takes milliseconds, a disk may stall
 for seconds."""
+
+MOST_VALUE_BYTES: Final = 64 << 20
+"""Longest text, blob or row that SQLite makes of a journal: what the judge keeps of a frame is some 100 kilobytes."""
+
+MOST_BYTES: Final = {"chart.json": 256 << 20, "illuminations.csv": 16 << 20, "session.toml": 1 << 20}
+"""Largest sizes of what is read whole beside a journal: forty times those of 707 lights and 32 768 colours."""
 
 _VERSION_1 = """
 CREATE TABLE attempts (
@@ -224,9 +99,6 @@ CREATE TABLE IF NOT EXISTS heartbeat (
 );
 CREATE TABLE IF NOT EXISTS records (key TEXT PRIMARY KEY, text TEXT NOT NULL);
 """
-
-_TABLES = {1: {"attempts", "plan", "events"}}
-_TABLES[2] = _TABLES[1] | {"checks", "measurements", "timings", "heartbeat", "records"}
 
 _CANNOT_IN_PLACE = {sqlite3.SQLITE_CANTOPEN, sqlite3.SQLITE_READONLY}
 """What SQLite answers where it would have to write in order to read."""
@@ -336,86 +208,6 @@ def close_after_run(connection: sqlite3.Connection) -> None:
         connection.close()
 
 
-def reading_error(path: Path, error: OSError | sqlite3.DatabaseError) -> FormatError | StorageError:
-    """Return why a journal cannot be read, and what helps.
-
-    SQLite calls a file damaged whose disk does not read it, and a copy must not take the place of a sound journal: so
-    the disk is tried, and the file checked again.
-    """
-    if isinstance(error, OSError):
-        return file_reading_error(path, error, "check its permissions")
-    if is_busy(error):
-        return FormatError(f"cannot read {path}: {error}; see that no other program holds it")
-    code = _primary_code(error)
-    fault = _disk_fault(path)
-    # Where permissions are in the way, the disk is not.
-    openable = os.access(path, os.R_OK) or (fault is not None and disk_remedy_of(fault) is not None)
-    failed = code == sqlite3.SQLITE_IOERR or (code == sqlite3.SQLITE_CANTOPEN and openable)
-    if fault is not None and (failed or fault.errno not in _READABLE_FAULTS):
-        return file_reading_error(path, fault, "check the permissions of its folder")
-    if failed or (_is_damage(error) and _is_sound(path)):
-        return StorageError(
-            f"cannot read {path}: {error}, and its disk did not say why; check the disk and its cable, then run the "
-            "same command again"
-        )
-    if not _is_damage(error):
-        return FormatError(f"cannot read {path}: {error}; check its permissions and the disk")
-    return FormatError(f"{path} is damaged: {error}; restore it from a copy")
-
-
-def writing_error(path: Path, error: sqlite3.DatabaseError) -> FormatError | InputError | StorageError:
-    """Return why a journal cannot be written, and what helps; the disk itself is asked what ails it."""
-    if is_busy(error):
-        return HeldJournalError(
-            f"cannot write {path}: {error}; end the other program that holds the session, then run the same command "
-            "again"
-        )
-    if (fault := _disk_fault(path)) is not None:
-        return storage_error(path, fault)
-    if _primary_code(error) == sqlite3.SQLITE_FULL:
-        remedy = "free space"
-    elif _primary_code(error) in (sqlite3.SQLITE_READONLY, sqlite3.SQLITE_PERM, sqlite3.SQLITE_CANTOPEN):
-        remedy = "see that the folder may be written and the disk is there"
-    elif _is_damage(error) and not _is_sound(path):
-        return FormatError(f"{path} is damaged: {error}; restore it from a copy")
-    else:
-        remedy = "check the disk and its cable"
-    return StorageError(f"cannot write {path}: {error}; {remedy}, then run the same command again")
-
-
-def _disk_fault(path: Path) -> OSError | None:
-    """Return what the disk answers when something is written beside the journal; None if it does not mind."""
-    try:
-        # Without a name, so that nothing is left behind.
-        with tempfile.TemporaryFile(dir=path.parent, buffering=0) as stream:
-            stream.write(bytes(_PROBE_BYTES))
-            os.fsync(stream.fileno())
-    except OSError as error:
-        return error
-    return None
-
-
-def _is_damage(error: sqlite3.DatabaseError) -> bool:
-    return _primary_code(error) in (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB)
-
-
-def _is_sound(path: Path) -> bool:
-    """Return whether a journal that was called damaged is whole, read once more."""
-    try:
-        with closing(_connect(path, "ro")) as connection:
-            return connection.execute("PRAGMA quick_check(1)").fetchall() == [("ok",)]
-    except sqlite3.DatabaseError:
-        return False
-
-
-def _primary_code(error: sqlite3.DatabaseError) -> int:
-    return getattr(error, "sqlite_errorcode", 0) & 0xFF
-
-
-def _beside(path: Path, suffix: str) -> Path:
-    return path.with_name(path.name + suffix)
-
-
 def _connect(path: Path, mode: str) -> sqlite3.Connection:
     """Return a connection; without locks where the file system has none."""
     try:
@@ -496,43 +288,6 @@ def _is_write_ahead(path: Path) -> bool:
         return stream.read(20)[18:] == b"\x02\x02"
 
 
-def _checked(path: Path, connection: sqlite3.Connection) -> int:
-    """Return the journal's version; close the connection and refuse what is not known or lacks a table."""
-    try:
-        limit_values(connection)
-        require_plain_schema(path, connection)
-        version = connection.execute("PRAGMA user_version").fetchone()[0]
-        tables = {name for (name,) in connection.execute("SELECT name FROM sqlite_master WHERE type = 'table'")}
-        if version not in READABLE:
-            raise FormatError(
-                f"{path} is of version {version}, this software reads {READABLE[0]} and {READABLE[-1]}; "
-                "use the software that wrote it"
-            )
-        if lacking := _TABLES[version] - tables:
-            raise FormatError(
-                f"{path} is damaged: it lacks its table {' and '.join(sorted(lacking))}; restore it from a copy"
-            )
-        require_sound_rows(path, connection, version)
-    except BaseException:
-        connection.close()
-        raise
-    return version
-
-
-def _execute_all(connection: sqlite3.Connection, statements: str, version: int) -> None:
-    """Execute statements and set the version, all or nothing."""
-    connection.execute("BEGIN IMMEDIATE")
-    try:
-        for statement in statements.split(";"):
-            connection.execute(statement)
-        connection.execute(f"PRAGMA user_version = {version}")
-        connection.execute("COMMIT")
-    except BaseException:
-        if connection.in_transaction:
-            connection.execute("ROLLBACK")
-        raise
-
-
 def _in_write_ahead(path: Path, connection: sqlite3.Connection, patience: LockPatience) -> sqlite3.Connection:
     """Return a connection in write-ahead mode, where the file system allows it.
 
@@ -573,3 +328,243 @@ def file_system_of(path: Path) -> str:
     place = path.resolve()
     holding = [(len(at), kind) for _, at, kind, *_ in mounts if place.is_relative_to(at.replace("\\040", " "))]
     return max(holding, default=(0, ""))[1]
+
+
+def _beside(path: Path, suffix: str) -> Path:
+    return path.with_name(path.name + suffix)
+
+
+def _execute_all(connection: sqlite3.Connection, statements: str, version: int) -> None:
+    """Execute statements and set the version, all or nothing."""
+    connection.execute("BEGIN IMMEDIATE")
+    try:
+        for statement in statements.split(";"):
+            connection.execute(statement)
+        connection.execute(f"PRAGMA user_version = {version}")
+        connection.execute("COMMIT")
+    except BaseException:
+        if connection.in_transaction:
+            connection.execute("ROLLBACK")
+        raise
+
+
+def _checked(path: Path, connection: sqlite3.Connection) -> int:
+    """Return the journal's version; close the connection and refuse what is not known or lacks a table."""
+    try:
+        # Bounds what SQLite makes of a stranger's file, and lets nothing in its schema do more than hold rows.
+        connection.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, MOST_VALUE_BYTES)
+        connection.execute("PRAGMA trusted_schema = OFF")
+        _require_plain_schema(path, connection)
+        version = connection.execute("PRAGMA user_version").fetchone()[0]
+        tables = {name for (name,) in connection.execute("SELECT name FROM sqlite_master WHERE type = 'table'")}
+        if version not in READABLE:
+            raise FormatError(
+                f"{path} is of version {version}, this software reads {READABLE[0]} and {READABLE[-1]}; "
+                "use the software that wrote it"
+            )
+        if lacking := set(_tables_of(version)) - tables:
+            raise FormatError(
+                f"{path} is damaged: it lacks its table {' and '.join(sorted(lacking))}; restore it from a copy"
+            )
+        require_sound_rows(path, connection, version)
+    except BaseException:
+        connection.close()
+        raise
+    return version
+
+
+def reading_error(path: Path, error: OSError | sqlite3.DatabaseError) -> FormatError | StorageError:
+    """Return why a journal cannot be read, and what helps.
+
+    SQLite calls a file damaged whose disk does not read it, and a copy must not take the place of a sound journal: so
+    the disk is tried, and the file checked again.
+    """
+    if isinstance(error, OSError):
+        return file_reading_error(path, error, "check its permissions")
+    if is_busy(error):
+        return FormatError(f"cannot read {path}: {error}; see that no other program holds it")
+    code = _primary_code(error)
+    fault = _disk_fault(path)
+    # Where permissions are in the way, the disk is not.
+    openable = os.access(path, os.R_OK) or (fault is not None and disk_remedy_of(fault) is not None)
+    failed = code == sqlite3.SQLITE_IOERR or (code == sqlite3.SQLITE_CANTOPEN and openable)
+    if fault is not None and (failed or fault.errno not in _READABLE_FAULTS):
+        return file_reading_error(path, fault, "check the permissions of its folder")
+    if failed or (_is_damage(error) and _is_sound(path)):
+        return StorageError(
+            f"cannot read {path}: {error}, and its disk did not say why; check the disk and its cable, then run the "
+            "same command again"
+        )
+    if not _is_damage(error):
+        return FormatError(f"cannot read {path}: {error}; check its permissions and the disk")
+    return FormatError(f"{path} is damaged: {error}; restore it from a copy")
+
+
+def writing_error(path: Path, error: sqlite3.DatabaseError) -> FormatError | InputError | StorageError:
+    """Return why a journal cannot be written, and what helps; the disk itself is asked what ails it."""
+    if is_busy(error):
+        return HeldJournalError(
+            f"cannot write {path}: {error}; end the other program that holds the session, then run the same command "
+            "again"
+        )
+    if (fault := _disk_fault(path)) is not None:
+        return storage_error(path, fault)
+    if _primary_code(error) == sqlite3.SQLITE_FULL:
+        remedy = "free space"
+    elif _primary_code(error) in (sqlite3.SQLITE_READONLY, sqlite3.SQLITE_PERM, sqlite3.SQLITE_CANTOPEN):
+        remedy = "see that the folder may be written and the disk is there"
+    elif _is_damage(error) and not _is_sound(path):
+        return FormatError(f"{path} is damaged: {error}; restore it from a copy")
+    else:
+        remedy = "check the disk and its cable"
+    return StorageError(f"cannot write {path}: {error}; {remedy}, then run the same command again")
+
+
+def _disk_fault(path: Path) -> OSError | None:
+    """Return what the disk answers when something is written beside the journal; None if it does not mind."""
+    try:
+        # Without a name, so that nothing is left behind.
+        with tempfile.TemporaryFile(dir=path.parent, buffering=0) as stream:
+            stream.write(bytes(_PROBE_BYTES))
+            os.fsync(stream.fileno())
+    except OSError as error:
+        return error
+    return None
+
+
+def _is_damage(error: sqlite3.DatabaseError) -> bool:
+    return _primary_code(error) in (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB)
+
+
+def _is_sound(path: Path) -> bool:
+    """Return whether a journal that was called damaged is whole, read once more."""
+    try:
+        with closing(_connect(path, "ro")) as connection:
+            return connection.execute("PRAGMA quick_check(1)").fetchall() == [("ok",)]
+    except sqlite3.DatabaseError:
+        return False
+
+
+def _primary_code(error: sqlite3.DatabaseError) -> int:
+    return getattr(error, "sqlite_errorcode", 0) & 0xFF
+
+
+_DAMAGED: Final = "it is damaged, or not to be trusted; restore it from a copy"
+
+_WHOLE = "typeof({0}) = 'integer' AND {0} BETWEEN 0 AND 1000000000"
+_MAYBE_WHOLE = "({0} IS NULL OR " + _WHOLE + ")"
+_CODE = "typeof({0}) = 'integer' AND {0} BETWEEN 0 AND 255"
+_SIZE = "({0} IS NULL OR (typeof({0}) = 'integer' AND {0} >= 0))"
+_TEXT = "typeof({0}) = 'text' AND length({0}) < 100000"
+_MAYBE_TEXT = "({0} IS NULL OR " + _TEXT + ")"
+_REAL = "typeof({0}) IN ('real', 'integer') AND abs({0}) < 9e300"
+_MAYBE_REAL = "({0} IS NULL OR typeof({0}) IN ('real', 'integer'))"
+_MOMENT = "[0-9][0-9][0-9][0-9]-[01][0-9]-[0-3][0-9]T[0-2][0-9]:[0-5][0-9]:[0-5][0-9]"
+_ZONE = "[+-][0-9][0-9]:[0-9][0-9]"
+_FORMS = f"{{0}} GLOB '{_MOMENT}.{6 * '[0-9]'}{_ZONE}' OR {{0}} GLOB '{_MOMENT}{_ZONE}'"
+# SQLite ends a text at a zero byte, takes 30 February for 2 March, and knows the zones that there are.
+_TIME = (
+    f"typeof({{0}}) = 'text' AND ({_FORMS}) AND length(CAST({{0}} AS BLOB)) = length({{0}}) "
+    "AND {0} BETWEEN '1970' AND '9999' AND datetime({0}) IS NOT NULL "
+    "AND strftime('%Y-%m-%dT%H:%M:%S', substr({0}, 1, 19), '+0 seconds') = substr({0}, 1, 19)"
+)
+_MAYBE_TIME = "({0} IS NULL OR {0} = '' OR (" + _TIME + "))"
+_SHA256 = "({0} IS NULL OR (typeof({0}) = 'text' AND length({0}) <= 64 AND {0} NOT GLOB '*[^0-9a-f]*'))"
+
+_COLUMNS: Final = {
+    "plan": {
+        "step": _WHOLE,
+        "kind": _TEXT,
+        "illumination": _MAYBE_WHOLE,
+        "red": _CODE,
+        "green": _CODE,
+        "blue": _CODE,
+    },
+    "attempts": {
+        "id": _WHOLE,
+        "step": _WHOLE,
+        "kind": _TEXT,
+        "illumination": _MAYBE_WHOLE,
+        "file": _TEXT,
+        "started_at": _TIME,
+        "ended_at": _MAYBE_TIME,
+        "taken_at": _MAYBE_TIME,
+        "exposure_s": _MAYBE_REAL,
+        "size": _SIZE,
+        "sha256": _SHA256,
+        "verdict": _MAYBE_TEXT,
+        "reason": _TEXT,
+    },
+    "events": {"id": _WHOLE, "at": _TIME, "what": _TEXT, "detail": _TEXT},
+    "checks": {
+        "attempt": _WHOLE,
+        "position": _WHOLE,
+        "name": _TEXT,
+        "value": _MAYBE_REAL,
+        "low": _MAYBE_REAL,
+        "high": _MAYBE_REAL,
+        "unit": _TEXT,
+        "reason": _TEXT,
+    },
+    "measurements": {
+        "attempt": _WHOLE,
+        "red": _MAYBE_REAL,
+        "green": _MAYBE_REAL,
+        "blue": _MAYBE_REAL,
+        "data": "typeof({0}) = 'blob'",
+        "voids": _WHOLE,
+        "lasting": _WHOLE,
+    },
+    "timings": {"attempt": _WHOLE, "name": _TEXT, "seconds": _REAL},
+    "heartbeat": {
+        "id": _WHOLE,
+        "at": _TIME,
+        "pid": "typeof({0}) = 'integer'",
+        "started": _TEXT,
+        "host": _TEXT,
+        "boot": _TEXT,
+        "state": _TEXT,
+        "sentence": _TEXT,
+        "until": _TIME,
+    },
+    "records": {"key": _TEXT, "text": _TEXT},
+}
+"""What a row must fulfil, by table (those of version 1 first) and column; times as `datetime.fromisoformat` reads
+them."""
+
+_TOGETHER: Final = {
+    # A frame that has a hash was taken at a time with an exposure (0 where nobody knows), and has a verdict.
+    "attempts": "(sha256 IS NULL OR (taken_at <> '' AND exposure_s BETWEEN 0 AND 1e9 AND size IS NOT NULL "
+    "AND verdict IS NOT NULL))",
+    "measurements": "(red IS NULL OR (green IS NOT NULL AND blue IS NOT NULL))",
+}
+
+
+def _tables_of(version: int) -> list[str]:
+    return list(_COLUMNS)[: 3 if version == 1 else None]
+
+
+def _require_plain_schema(path: Path, connection: sqlite3.Connection) -> None:
+    """Refuse a journal with views, triggers, virtual tables or computed columns; a FormatError names it."""
+    for kind, name, sql in connection.execute("SELECT type, name, sql FROM sqlite_master").fetchall():
+        plain = kind == "table" and not str(sql or "").lstrip().upper().startswith("CREATE VIRTUAL")
+        # SQLite makes an index of each primary key, without a text.
+        if not (plain or (kind == "index" and sql is None)):
+            raise FormatError(f"{path} holds the {kind} {str(name)[:80]!r}, which no journal has; {_DAMAGED}")
+
+
+def require_sound_rows(path: Path, connection: sqlite3.Connection, version: int) -> None:
+    """Refuse a journal with values that no run writes; costs milliseconds."""
+    for table in _tables_of(version):
+        columns = {row[1]: row[6] for row in connection.execute(f"PRAGMA table_xinfo({table})")}
+        lacking = _COLUMNS[table].keys() - columns.keys()
+        if lacking or any(columns.values()):
+            raise FormatError(f"{path}: the columns of {table} are not those of a journal; {_DAMAGED}")
+        sound = " AND ".join([f"({form.format(column)})" for column, form in _COLUMNS[table].items()])
+        together = _TOGETHER.get(table, "1")
+        query = f"SELECT COUNT(*) FROM {table} WHERE ({sound} AND {together}) IS NOT TRUE"
+        if found := connection.execute(query).fetchone()[0]:
+            raise FormatError(f"{path}: {found} rows of {table} hold values that no run writes; {_DAMAGED}")
+    for (file,) in connection.execute("SELECT DISTINCT file FROM attempts"):
+        if not is_inside_name(file):
+            raise FormatError(f"{path} names the file {file[:200]!r}, which is none of the session; {_DAMAGED}")

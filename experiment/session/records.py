@@ -1,14 +1,9 @@
-"""The rows of a session's journal as values: frames that count, attempts, events, and the words of verdicts.
+"""What a session's journal keeps, as values: attempts, frames that count, events, and what is said of a frame.
 
-And where the preview is that belongs to a row.
-
-What is said of a frame: the things looked at, each with its number, its limits and its reason, and what follows.
-
-Values only, and the contract of whoever judges. What is measured, and by which limits, is the judge's affair; the
-journal keeps a judgement whole, so that every refusal can be read again with its numbers, and so that a run that is
-taken up again knows what the frames before looked like.
-
-Time as people want to know it: how long a session will still take, and durations in words.
+A `Judgement` holds the things looked at, each with its number, its limits and its reason, and what follows. What is
+measured, and by which limits, is the affair of whoever judges (`FrameJudge`); the journal keeps a judgement whole, so
+that every refusal can be read again with its numbers, and so that a run that is taken up again knows what the frames
+before looked like. From the attempts follows how long a session will still take.
 """
 
 from __future__ import annotations
@@ -22,6 +17,23 @@ from pathlib import Path
 from typing import Protocol, runtime_checkable
 
 from experiment.session.plan import FrameKind, SessionStep
+
+ACCEPTED = "accepted"
+"""Verdict of a frame that may be used."""
+
+REFUSED = "refused"
+"""Verdict of a frame that is there and cannot be used."""
+
+FAILED = "failed"
+"""Verdict of an attempt that gave no frame."""
+
+VOIDED = "voided"
+"""Verdict of a frame that was accepted and must not be used: what was found out later says why."""
+
+
+RECENT = 50
+"""Attempts by which the time left is told: enough that retakes and references do not sway their median, few enough to
+follow a change of the settings."""
 
 
 @dataclass(frozen=True)
@@ -91,20 +103,6 @@ class Judgement:
         return next((check.reason for check in self.checks if check.reason), "")
 
 
-@dataclass(frozen=True)
-class AttemptDetails:
-    """What a journal keeps of an attempt beside its row.
-
-    - `seen`: camera RGB of the paper above black, counts; None if it was not measured.
-    - `checks`: what was looked at, in the judge's order.
-    - `timings`: seconds of each part of it, by name.
-    """
-
-    seen: tuple[float, float, float] | None = None
-    checks: tuple[Check, ...] = ()
-    timings: Mapping[str, float] = field(default_factory=dict[str, float])
-
-
 class FrameJudge(Protocol):
     """Judges the frames of a session as they are taken.
 
@@ -135,9 +133,103 @@ class OutlastsPauses(Protocol):
         ...
 
 
-RECENT = 50
-"""Attempts by which the time left is told: enough that retakes and references do not sway their median, few enough to
-follow a change of the settings."""
+@dataclass(frozen=True)
+class Attempt:
+    """One try at a step as the journal has it.
+
+    Times are those of the lab's clock, None where it has not come so far. The verdict is None while it is under way, or
+    if it was cut off.
+    """
+
+    id: int
+    step: int
+    kind: FrameKind
+    illumination: int | None
+    file: str
+    started_at: datetime
+    ended_at: datetime | None
+    taken_at: datetime | None
+    verdict: str | None
+    reason: str
+
+    @property
+    def has_frame(self) -> bool:
+        """Whether a raw file came of it; the name of one that failed may be that of the next try."""
+        return self.taken_at is not None
+
+
+@dataclass(frozen=True)
+class AttemptDetails:
+    """What a journal keeps of an attempt beside its row.
+
+    - `seen`: camera RGB of the paper above black, counts; None if it was not measured.
+    - `checks`: what was looked at, in the judge's order.
+    - `timings`: seconds of each part of it, by name.
+    """
+
+    seen: tuple[float, float, float] | None = None
+    checks: tuple[Check, ...] = ()
+    timings: Mapping[str, float] = field(default_factory=dict[str, float])
+
+
+@dataclass(frozen=True)
+class FrameRecord:
+    """A frame that counts as taken and judged; the row of `frames.csv`.
+
+    `file` is relative to the session's folder; `illumination` is None but for lights; `verdict` is
+    ``accepted`` or ``refused: reason``, also of a frame that was accepted at first; `attempt` is its number in the
+    journal, by which frames are in the order taken whatever a clock said.
+    """
+
+    kind: FrameKind
+    illumination: int | None
+    file: str
+    sha256: str
+    taken_at: datetime
+    exposure_s: float
+    verdict: str
+    attempt: int = 0
+
+    @property
+    def accepted(self) -> bool:
+        """Whether the frame may be used."""
+        return self.verdict == ACCEPTED
+
+
+@dataclass(frozen=True)
+class AcceptedFile:
+    """The raw file of an accepted frame: of which attempt, step and light, its name in the session, its bytes."""
+
+    attempt: int
+    step: int
+    illumination: int | None
+    file: str
+    size: int
+    sha256: str
+
+
+@dataclass(frozen=True)
+class SessionEvent:
+    """What happened at some time that is no frame: start, stop, warm-up, a device's fault."""
+
+    at: datetime
+    what: str
+    detail: str
+    number: int
+
+
+def last_moment(attempts: Iterable[Attempt]) -> datetime | None:
+    """Return when the last of those attempts was over that gave a frame; None where none did."""
+    ends = (attempt.ended_at for attempt in attempts if attempt.has_frame and attempt.ended_at is not None)
+    return max(ends, default=None)
+
+
+def preview_path(folder: Path, file: str) -> Path:
+    """Return where the preview of a raw file is, if there is one; `folder` is the session, `file` as in the journal.
+
+    Only the name of `file` counts, so that no row of a journal leads out of `previews/`.
+    """
+    return folder / "previews" / f"{Path(file).stem}.jpg"
 
 
 @dataclass(frozen=True)
@@ -181,101 +273,3 @@ def duration_text(seconds: float | None) -> str:
     if hours:
         return f"{hours} h {minutes:02d} min"
     return f"{minutes} min {rest:02d} s" if minutes else f"{rest} s"
-
-
-ACCEPTED = "accepted"
-"""Verdict of a frame that may be used."""
-
-REFUSED = "refused"
-"""Verdict of a frame that is there and cannot be used."""
-
-FAILED = "failed"
-"""Verdict of an attempt that gave no frame."""
-
-VOIDED = "voided"
-"""Verdict of a frame that was accepted and must not be used: what was found out later says why."""
-
-
-@dataclass(frozen=True)
-class FrameRecord:
-    """A frame that counts as taken and judged; the row of `frames.csv`.
-
-    `file` is relative to the session's folder; `illumination` is None but for lights; `verdict` is
-    ``accepted`` or ``refused: reason``, also of a frame that was accepted at first; `attempt` is its number in the
-    journal, by which frames are in the order taken whatever a clock said.
-    """
-
-    kind: FrameKind
-    illumination: int | None
-    file: str
-    sha256: str
-    taken_at: datetime
-    exposure_s: float
-    verdict: str
-    attempt: int = 0
-
-    @property
-    def accepted(self) -> bool:
-        """Whether the frame may be used."""
-        return self.verdict == ACCEPTED
-
-
-@dataclass(frozen=True)
-class AcceptedFile:
-    """The raw file of an accepted frame: of which attempt, step and light, its name in the session, its bytes."""
-
-    attempt: int
-    step: int
-    illumination: int | None
-    file: str
-    size: int
-    sha256: str
-
-
-@dataclass(frozen=True)
-class Attempt:
-    """One try at a step as the journal has it.
-
-    Times are those of the lab's clock, None where it has not come so far. The verdict is None while it is under way, or
-    if it was cut off.
-    """
-
-    id: int
-    step: int
-    kind: FrameKind
-    illumination: int | None
-    file: str
-    started_at: datetime
-    ended_at: datetime | None
-    taken_at: datetime | None
-    verdict: str | None
-    reason: str
-
-    @property
-    def has_frame(self) -> bool:
-        """Whether a raw file came of it; the name of one that failed may be that of the next try."""
-        return self.taken_at is not None
-
-
-def last_moment(attempts: Iterable[Attempt]) -> datetime | None:
-    """Return when the last of those attempts was over that gave a frame; None where none did."""
-    ends = (attempt.ended_at for attempt in attempts if attempt.has_frame and attempt.ended_at is not None)
-    return max(ends, default=None)
-
-
-@dataclass(frozen=True)
-class SessionEvent:
-    """What happened at some time that is no frame: start, stop, warm-up, a device's fault."""
-
-    at: datetime
-    what: str
-    detail: str
-    number: int
-
-
-def preview_path(folder: Path, file: str) -> Path:
-    """Return where the preview of a raw file is, if there is one; `folder` is the session, `file` as in the journal.
-
-    Only the name of `file` counts, so that no row of a journal leads out of `previews/`.
-    """
-    return folder / "previews" / f"{Path(file).stem}.jpg"
