@@ -60,7 +60,7 @@ def run_session(
         checked_plan(settings, folder, session, devices)
         if session is None:
             session = opened.enter_context(_begun(settings, folder))
-            session.journal.be_patient(settings.sequence.patience_s, announce)
+            session.journal.retry_locked(settings.sequence.patience_s, announce)
         require_same_devices(session, devices, settings)
         if note := clock_note(session, devices.clock):
             announce(note)

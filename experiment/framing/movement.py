@@ -68,7 +68,7 @@ class Shift:
       lies further right or down.
     - `largest_px`: the largest movement of a tag, or of a corner of the field, so that a rotation shows.
     - `gauges`: tags, or strips, that could be measured; 0 leaves the rest 0 and means unknown.
-    - `softer_px2`: how much more blurred the later frame is: the difference of the blurs' variances, half-size px²,
+    - `blur_growth_px2`: how much more blurred the later frame is: the difference of the blurs' variances, half-size px²,
       negative when it is sharper; median. Linear in the difference, so read low from about 1 px² on.
     """
 
@@ -76,7 +76,7 @@ class Shift:
     dy: float
     largest_px: float
     gauges: int
-    softer_px2: float = 0.0
+    blur_growth_px2: float = 0.0
 
     @property
     def length_px(self) -> float:

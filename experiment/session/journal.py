@@ -26,7 +26,7 @@ from drivers.presenter import Colour
 from experiment.session.heartbeat import Heartbeat, Process, RunState, SessionPlace
 from experiment.session.journal_file import (
     JOURNAL_VERSION,
-    LockPatience,
+    LockRetry,
     close_after_run,
     create_file,
     open_for_run,
@@ -67,22 +67,22 @@ default (`sequence.patience_s`)."""
 class Journal:
     """An open journal; close it after use. Used from one thread.
 
-    `patience`: with which other programs are waited for; None for a reader, for whom SQLite waits.
+    `retry`: with which other programs are waited for; None for a reader, for whom SQLite waits.
     """
 
     def __init__(
-        self, path: Path, connection: sqlite3.Connection, version: int, patience: LockPatience | None = None
+        self, path: Path, connection: sqlite3.Connection, version: int, retry: LockRetry | None = None
     ) -> None:
         self._path = path
         self._connection = connection
         self._version = version
-        self._writes = patience is not None
-        self._patience = patience or LockPatience(path, 0, lambda sentence: None)
+        self._writes = retry is not None
+        self._retry = retry or LockRetry(path, 0, lambda sentence: None)
 
     @staticmethod
     def create(path: Path, steps: Sequence[SessionStep]) -> None:
         """Write a new journal with the plan and nothing else."""
-        alone = LockPatience(path, 0, lambda sentence: None)
+        alone = LockRetry(path, 0, lambda sentence: None)
         with closing(Journal(path, create_file(path), JOURNAL_VERSION, alone)) as journal:
             journal.add_steps(steps)
 
@@ -99,8 +99,8 @@ class Journal:
         announce: Callable[[str], object] = lambda sentence: None,
     ) -> Journal:
         """Open a journal to write it; one of an older version gets what it lacks."""
-        patience = LockPatience(path, patience_s, announce)
-        return cls(path, open_for_run(path, patience), JOURNAL_VERSION, patience)
+        retry = LockRetry(path, patience_s, announce)
+        return cls(path, open_for_run(path, retry), JOURNAL_VERSION, retry)
 
     def close(self) -> None:
         """Release the file; a second call does nothing."""
@@ -109,9 +109,9 @@ class Journal:
         else:
             self._connection.close()
 
-    def be_patient(self, patience_s: float, announce: Callable[[str], object]) -> None:
-        """Change how long a write waits and who is told; see `open_for_run`."""
-        self._patience = LockPatience(self._path, patience_s, announce)
+    def retry_locked(self, patience_s: float, announce: Callable[[str], object]) -> None:
+        """Change how long a write waits for other programs, and who is told that it does; see `open_for_run`."""
+        self._retry = LockRetry(self._path, patience_s, announce)
 
     @contextmanager
     def one_moment(self) -> Generator[None]:
@@ -353,7 +353,7 @@ class Journal:
     def _rows(self, query: str, values: tuple[Any, ...] = ()) -> list[Any]:
         """Return all rows at once, so that nothing is held once they are read."""
         try:
-            return self._patience.insist(lambda: self._connection.execute(query, values).fetchall())
+            return self._retry.run(lambda: self._connection.execute(query, values).fetchall())
         except sqlite3.DatabaseError as error:
             raise reading_error(self._path, error) from error
 
@@ -361,9 +361,9 @@ class Journal:
     def _writing(self) -> Generator[None]:
         """Make what is written inside one transaction, which is on the disk when the block ends."""
         try:
-            self._patience.insist(lambda: self._connection.execute("BEGIN IMMEDIATE"))
+            self._retry.run(lambda: self._connection.execute("BEGIN IMMEDIATE"))
             yield
-            self._patience.insist(lambda: self._connection.execute("COMMIT"))
+            self._retry.run(lambda: self._connection.execute("COMMIT"))
         except sqlite3.DatabaseError as error:
             raise writing_error(self._path, error) from error
         finally:

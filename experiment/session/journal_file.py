@@ -120,7 +120,7 @@ class HeldJournalError(StorageError):
     """Another program held the journal for as long as a write waits: waiting once more would only double that."""
 
 
-class LockPatience:
+class LockRetry:
     """Waits while another program holds the journal."""
 
     def __init__(self, path: Path, seconds: float, announce: Callable[[str], object]) -> None:
@@ -128,18 +128,18 @@ class LockPatience:
         self._seconds = seconds
         self._announce = announce
 
-    def insist(self, attempt: Callable[[], _T]) -> _T:
+    def run(self, attempt: Callable[[], _T]) -> _T:
         """Return what `attempt` returns, after trying it again while another program holds the journal."""
-        begun, told = time.monotonic(), False
+        begun, announced = time.monotonic(), False
         while True:
             try:
                 return attempt()
             except sqlite3.OperationalError as error:
                 if not is_busy(error) or time.monotonic() - begun >= self._seconds:
                     raise
-                if not told:
+                if not announced:
                     self._announce(f"another program holds {self._path}; the run goes on when it has finished")
-                    told = True
+                    announced = True
 
 
 def is_busy(error: sqlite3.DatabaseError) -> bool:
@@ -171,24 +171,24 @@ def open_to_read(path: Path) -> tuple[sqlite3.Connection, int]:
         raise reading_error(path, error) from error
 
 
-def open_for_run(path: Path, patience: LockPatience) -> sqlite3.Connection:
+def open_for_run(path: Path, retry: LockRetry) -> sqlite3.Connection:
     """Return a connection that writes, after bringing the journal up to this version and into write-ahead mode.
 
     The caller holds the session's folder, so that no other run is at work. Who else writes is waited for.
     """
     require_plain_folder(path.parent, MOST_BYTES)
     try:
-        connection = patience.insist(lambda: _connect(path, "rw"))
-        version = patience.insist(lambda: _checked(path, connection))
+        connection = retry.run(lambda: _connect(path, "rw"))
+        version = retry.run(lambda: _checked(path, connection))
     except (OSError, sqlite3.DatabaseError) as error:
         raise reading_error(path, error) from error
     try:
         with suppress(OSError):  # Left by a run that was killed while it made a copy.
             partial_path(path).unlink(missing_ok=True)
         if not _on_network(path):
-            connection = _in_write_ahead(path, connection, patience)
+            connection = _in_write_ahead(path, connection, retry)
         if version < JOURNAL_VERSION:
-            patience.insist(lambda: _execute_all(connection, _VERSION_2, JOURNAL_VERSION))
+            retry.run(lambda: _execute_all(connection, _VERSION_2, JOURNAL_VERSION))
     except OSError as error:
         connection.close()
         raise storage_error(path, error) from error
@@ -288,7 +288,7 @@ def _is_write_ahead(path: Path) -> bool:
         return stream.read(20)[18:] == b"\x02\x02"
 
 
-def _in_write_ahead(path: Path, connection: sqlite3.Connection, patience: LockPatience) -> sqlite3.Connection:
+def _in_write_ahead(path: Path, connection: sqlite3.Connection, retry: LockRetry) -> sqlite3.Connection:
     """Return a connection in write-ahead mode, where the file system allows it.
 
     The mode cannot be changed while somebody reads. A reader who will not end keeps the file that he has, under no
@@ -301,7 +301,7 @@ def _in_write_ahead(path: Path, connection: sqlite3.Connection, patience: LockPa
             raise
         copy = partial_path(path)
         # No other writer may be at work meanwhile.
-        patience.insist(lambda: connection.execute("BEGIN IMMEDIATE"))
+        retry.run(lambda: connection.execute("BEGIN IMMEDIATE"))
         with closing(_connect(path, "ro")) as source, closing(_connect(copy, "rwc")) as target:
             source.backup(target)
         connection.execute("ROLLBACK")

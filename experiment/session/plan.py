@@ -41,7 +41,7 @@ RESPONSE = (
     *(Colour(TOP, TOP, 0), Colour(TOP, 0, TOP), Colour(0, TOP, TOP)),
     *(Colour(MIDDLE, 0, 0), Colour(0, MIDDLE, 0), Colour(0, 0, MIDDLE)),
 )
-"""What a session shows first so that the light of any codes can be foretold: the primaries; greys that give the curve
+"""What a session shows first so that the light of any codes can be predicted: the primaries; greys that give the curve
 from codes to light; pairs of primaries, for what light is added where they overlap; and each primary at half code, for
 what its curve has of its own. The steps are chosen: even in code, and closer where the curve is steep in proportion."""
 
@@ -99,7 +99,7 @@ def plan_steps(
 
 
 def link_steps(first_number: int, *, response: bool = True) -> tuple[SessionStep, ...]:
-    """Return what a run that is taken up again shows first, to tie it to what was taken before.
+    """Return what a run that is taken up again shows first, to link it to what was taken before.
 
     A grey and the primaries, by which the projector is known again, and a white and a dark frame, so that lights lie
     between references of one level of the lamp.

@@ -123,10 +123,10 @@ class FrameJudge(Protocol):
 
 @runtime_checkable
 class OutlastsPauses(Protocol):
-    """A judge that wants to be told of pauses of a run."""
+    """A judge that takes pauses of a run into account."""
 
     def after_pause(self) -> None:
-        """Take in that the run paused for something lasting, and that what is judged next ties it to what was before.
+        """Take in that the run paused for something lasting, and that what is judged next links it to what was before.
 
         Called when everything that was taken before is judged, and when nothing is being judged.
         """
