@@ -68,8 +68,8 @@ class Shift:
       lies further right or down.
     - `largest_px`: the largest movement of a tag, or of a corner of the field, so that a rotation shows.
     - `gauges`: tags, or strips, that could be measured; 0 leaves the rest 0 and means unknown.
-    - `blur_growth_px2`: how much more blurred the later frame is: the difference of the blurs' variances, half-size px²,
-      negative when it is sharper; median. Linear in the difference, so read low from about 1 px² on.
+    - `blur_growth_px2`: how much more blurred the later frame is, the difference of the blurs' variances, half-size
+      px²; negative when it is sharper; median. Linear in the difference, so read low from about 1 px² on.
     """
 
     dx: float

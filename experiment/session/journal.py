@@ -323,19 +323,14 @@ class Journal:
             "SELECT step, kind, illumination, file, sha256, taken_at, exposure_s, verdict, reason, id FROM attempts"
             " WHERE sha256 IS NOT NULL ORDER BY step, id"
         )
-        newest = {row[0]: row[3] for row in rows if row[7] == ACCEPTED}
+        newest = {step: attempt for step, *_, verdict, _, attempt in rows if verdict == ACCEPTED}
         return [
             FrameRecord(
-                self._kind(row[1]),
-                row[2],
-                row[3],
-                row[4],
-                datetime.fromisoformat(row[5]),
-                row[6],
-                _verdict_text(row[7], row[8], newest.get(row[0], row[3]) == row[3]),
-                row[9],
+                *(self._kind(kind), light, file, sha256, datetime.fromisoformat(taken_at), exposure_s),
+                _verdict_text(verdict, reason, newest.get(step, attempt) == attempt),
+                attempt,
             )
-            for row in rows
+            for step, kind, light, file, sha256, taken_at, exposure_s, verdict, reason, attempt in rows
         ]
 
     def _kind(self, kind: str) -> FrameKind:
