@@ -294,11 +294,15 @@ def preview(chart: Chart, width_px: int) -> npt.NDArray[np.uint8]:
         raise InputError(f"a preview of {width_px} pixels has no width; give 1 or more")
     height_px = max(1, round(width_px * chart.page_mm[1] / chart.page_mm[0]))
     fine = (width_px * _SUPERSAMPLING, height_px * _SUPERSAMPLING)
-    band_tops, band_bottoms, rows = zip(*_bands(drawing(chart), fine[0] / chart.page_mm[0], fine), strict=True)
+    bands = list(_bands(drawing(chart), fine[0] / chart.page_mm[0], fine))
     # A mean by whole numbers of pixels; OpenCV takes it a good deal faster than numpy.
     means = np.stack(
-        [cv2.resize(row[None].astype(np.float32), (width_px, 1), interpolation=cv2.INTER_AREA)[0] for row in rows]
+        [
+            cv2.resize(row[None].astype(np.float32), (width_px, 1), interpolation=cv2.INTER_AREA)[0]
+            for _, _, row in bands
+        ]
     )
+    band_tops, band_bottoms = np.array([[top, bottom] for top, bottom, _ in bands]).T
     tops = np.arange(height_px)[:, None] * _SUPERSAMPLING
     shared = np.minimum(band_bottoms, tops + _SUPERSAMPLING) - np.maximum(band_tops, tops)
     weights = np.maximum(shared, 0) / _SUPERSAMPLING

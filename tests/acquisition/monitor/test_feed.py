@@ -173,6 +173,21 @@ def test_an_older_copy_put_back_is_told_as_a_whole(run: MadeUpRun, tmp_path: Pat
     assert len(told(watch, state["cursor"])["frames"]) == 4
 
 
+def test_another_attempt_of_a_known_number_is_read_again(run: MadeUpRun, tmp_path: Path) -> None:
+    """As where an older copy was put back and taken up between two looks."""
+    run.journal.close()
+    older = (run.folder / "journal.sqlite").read_bytes()
+    run.journal = Journal.open_for_run(run.folder / "journal.sqlite")
+    assert run.take(run.steps[4]) == 5
+    run.journal.close()
+    watch = SessionWatch(run.folder)
+    cursor = told(watch)["cursor"]
+    (run.folder / "journal.sqlite").write_bytes(older)
+    run.journal = Journal.open_for_run(run.folder / "journal.sqlite")
+    assert run.take(run.steps[5]) == 5
+    assert told(watch, cursor)["frames"][-1]["step"] == 5
+
+
 def test_a_journal_of_the_first_version_is_shown(run: MadeUpRun) -> None:
     run.journal.close()
     with sqlite3.connect(run.folder / "journal.sqlite") as connection:

@@ -119,6 +119,17 @@ def test_frames_come_in_the_order_of_the_plan_refused_ones_with_their_reason(pat
         assert journal.attempts()[again - 1].verdict is None
 
 
+def test_what_is_read_at_one_moment_fits_together(path: Path) -> None:
+    with closing(Journal.open_for_run(path)) as run:
+        run.note(NOW, "start")
+        with closing(Journal.open(path)) as reader:
+            with reader.one_moment():
+                assert len(reader.events()) == 1
+                run.note(NOW, "stop")
+                assert len(reader.events()) == 1
+            assert [event.what for event in reader.events()] == ["start", "stop"]
+
+
 def test_a_journal_that_cannot_be_written_says_what_helps(path: Path) -> None:
     with (
         closing(Journal.open(path)) as journal,
