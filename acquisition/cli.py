@@ -125,7 +125,7 @@ def chart(
     from experiment.chart.layout import design_chart, paper_chart
     from experiment.chart.printing import save_pdf, save_preview, save_tiff
     from experiment.chart.proof import save_instructions, save_proof
-    from experiment.framing.visibility import small_parts_warning
+    from experiment.framing.sharpness import small_parts_warning
     from foundation.files import whole_folder
 
     if arrangement is Arrangement.PAPER:
@@ -191,8 +191,7 @@ def illuminations(
     """
     from collections import Counter
 
-    from experiment.lights.illuminations import parse_ccts, plan_illuminations, save_illuminations
-    from experiment.lights.plots import plot_illuminations
+    from experiment.lights import parse_ccts, plan_illuminations, plot_illuminations, save_illuminations
     from foundation.files import require_free
 
     plot = out.with_suffix(".png")
@@ -277,7 +276,7 @@ def check(
     settings = load_lab(lab)
     given = None
     if corners is not None:
-        from experiment.framing.corners import parse_corners
+        from experiment.framing.field import parse_corners
 
         given = parse_corners(corners)
     if identify:
@@ -385,10 +384,10 @@ def status(
     """
     from datetime import UTC, datetime
 
-    from acquisition.monitor.reading import read_session
+    from acquisition.monitor.view import read_session
     from acquisition.status import status_json, status_lines
     from experiment.session.folder import journal_path
-    from experiment.session.mending.redaction import secrets_warning
+    from experiment.session.repair import secrets_warning
 
     journal_path(session)
     view, now = read_session(session), datetime.now(UTC)
@@ -407,8 +406,8 @@ def redact(session: Annotated[Path, typer.Argument(help="Session folder.")]) -> 
     Reads and writes SESSION/session.toml; frames and journal stay as they are. The projector's password is removed, of
     sequence.notify the host or the program's name is left. Sessions that this software takes hold no secret.
     """
-    from experiment.session.mending.redaction import SETTINGS_FILE
-    from experiment.session.mending.redaction import redact as take_out
+    from experiment.session.repair import SETTINGS_FILE
+    from experiment.session.repair import redact as take_out
 
     found = take_out(session)
     if found:
@@ -432,8 +431,7 @@ def monitor(
     a token, new at each start: whoever has the address can look, and nobody can change anything. It is printed as a QR
     code, too.
     """
-    from acquisition.monitor.access import is_loopback, reachable_addresses
-    from acquisition.monitor.server import open_monitor
+    from acquisition.monitor.server import is_loopback, open_monitor, reachable_addresses
 
     with open_monitor(session, port, host) as server, suppress(KeyboardInterrupt):
         addresses = [f"http://{name}:{server.port}/{server.path}" for name in reachable_addresses(host)]
@@ -445,7 +443,7 @@ def monitor(
                 file=sys.stderr,
             )
             if sys.stdout.isatty() and "utf" in sys.stdout.encoding.lower():
-                from acquisition.monitor.qr import qr_text
+                from acquisition.monitor.server import qr_text
 
                 print(qr_text(addresses[0]), flush=True)
         server.serve_forever()
@@ -462,10 +460,9 @@ def report(
 
     Reads SESSION, also while it is being taken. acquire run writes the same file when it ends.
     """
-    from acquisition.monitor.report import REPORT_FILE, save_report
+    from acquisition.monitor.page import write_session_report
 
-    path = session / REPORT_FILE if out is None else out
-    save_report(session, path)
+    path = write_session_report(session, out)
     print(f"{path}: written")
 
 

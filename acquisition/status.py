@@ -11,12 +11,8 @@ from dataclasses import asdict
 from datetime import datetime
 from typing import Any
 
-from acquisition.monitor.head import Head
-from acquisition.monitor.reading import SessionView
-from acquisition.monitor.rows import AttemptView
-from experiment.session.judgement import Check
-from experiment.session.progress import duration_text
-from experiment.session.records import ACCEPTED
+from acquisition.monitor.view import AttemptView, Head, SessionView
+from experiment.session.records import ACCEPTED, Check, duration_text
 from foundation.errors import counted
 
 LAST = 5
@@ -51,7 +47,7 @@ def status_lines(view: SessionView, now: datetime) -> list[str]:
 def status_json(view: SessionView, now: datetime) -> dict[str, Any]:
     """Return a session's state for programs: the fields of `Head`, and what was measured and refused; times as text."""
     head = view.head(now)
-    values = {name: value.isoformat() if isinstance(value, datetime) else value for name, value in asdict(head).items()}
+    values = head.to_plain()
     if not head.alive:
         values["remaining_s"] = None
     return values | {

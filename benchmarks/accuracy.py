@@ -29,7 +29,7 @@ from drivers.camera import ExposureSettings
 from experiment.chart.layout import design_chart
 from experiment.chart.model import Chart
 from experiment.config import LabSettings, SequenceSettings, SimulatedSettings
-from experiment.lights.illuminations import Illumination, plan_illuminations, save_illuminations
+from experiment.lights import Illumination, plan_illuminations, save_illuminations
 from experiment.session.folder import Session
 from foundation.colorimetry import angles_deg
 from sim.world.sensors import BODIES, Body

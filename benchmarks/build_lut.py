@@ -47,10 +47,8 @@ from drivers.raw.rawfile import read_raw
 from experiment.chart.layout import design_chart
 from experiment.chart.printing import drawing
 from experiment.framing.planes import frame_black
-from experiment.lights.illuminations import plan_illuminations
-from experiment.session.folder import Session
-from experiment.session.incoming import ReceivedFile
-from experiment.session.judgement import Judgement
+from experiment.lights import plan_illuminations
+from experiment.session.folder import ReceivedFile, Session
 from experiment.session.plan import plan_steps
 from sim.camera.film import write_dng
 from sim.optics import MILD_SHOULDERS

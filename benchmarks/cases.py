@@ -43,7 +43,7 @@ from drivers.camera import ExposureSettings
 from drivers.presenter import WHITE, Colour
 from experiment.chart.layout import A_SERIES_MM, design_chart
 from experiment.chart.model import Chart
-from experiment.lights.illuminations import Illumination
+from experiment.lights import Illumination
 from experiment.session.folder import Session
 from experiment.session.plan import SessionStep
 from foundation.errors import CropError

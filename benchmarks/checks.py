@@ -18,7 +18,7 @@ from acquisition.check.check import check_lab
 from acquisition.check.findings import CheckReport
 from experiment.chart.layout import design_chart
 from experiment.config import load_lab
-from experiment.lights.illuminations import plan_illuminations, save_illuminations
+from experiment.lights import plan_illuminations, save_illuminations
 
 SEEDS = range(30)
 """Of the good rooms."""

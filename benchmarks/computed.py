@@ -26,7 +26,7 @@ from calibration.table.lut import Lut, open_lut
 from calibration.table.verification import require_match
 from experiment.chart.layout import A_SERIES_MM, design_chart
 from experiment.config import LabSettings, SimulatedSettings
-from experiment.lights.illuminations import plan_illuminations, save_illuminations
+from experiment.lights import plan_illuminations, save_illuminations
 from experiment.session.folder import Session
 from sim.world.sensors import find_body
 from synthesis.cli import TableSettings, room_of

@@ -27,7 +27,7 @@ from benchmarks.disturbance_trials import detection
 from benchmarks.false_alarms import false_alarms, odd_worlds
 from benchmarks.judged_labs import Lab, lab_of, rooms
 from experiment.chart.layout import design_chart
-from experiment.lights.illuminations import Illumination
+from experiment.lights import Illumination
 from sim.world.room import Room
 
 

@@ -86,7 +86,7 @@ def natural_picture(width: int, height: int) -> npt.NDArray[np.uint8]:
 
 def noisy_table(folder: Path, lights: int) -> Lut:
     """Return a table of 32768 colours with shot noise."""
-    from experiment.lights.illuminations import Illumination
+    from experiment.lights import Illumination
 
     index = np.arange(32768)
     code = np.stack([index >> 10, index >> 5 & 31, index & 31], axis=-1) / 31

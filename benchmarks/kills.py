@@ -43,7 +43,7 @@ def report(name: str, value: float, unit: str, against: str = "") -> None:
 
 def small_table(folder: Path) -> Lut:
     """Return a table of 64 colours and 8 lights."""
-    from experiment.lights.illuminations import Illumination
+    from experiment.lights import Illumination
 
     folder.mkdir()
     rng = np.random.default_rng(1)

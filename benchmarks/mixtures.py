@@ -30,7 +30,7 @@ from calibration.pipeline.build import build
 from calibration.table.lut import Lut, open_lut
 from experiment.chart.layout import A_SERIES_MM, design_chart
 from experiment.config import LabSettings, SimulatedSettings
-from experiment.lights.illuminations import Illumination, plan_illuminations, save_illuminations
+from experiment.lights import Illumination, plan_illuminations, save_illuminations
 from experiment.session.folder import Session
 from foundation.colorimetry import angles_deg, decode_srgb
 from generator.lights.gamut import Gamut, Match, OutsideGamutError

@@ -20,10 +20,10 @@ from threading import Thread
 from typing import Any
 
 from acquisition.monitor.server import open_monitor
-from experiment.lights.illuminations import plan_illuminations, save_illuminations
+from experiment.lights import plan_illuminations, save_illuminations
 from experiment.session.journal import JOURNAL_FILE, Journal
-from experiment.session.judgement import Check, Judgement
 from experiment.session.plan import RESPONSE, SessionStep, plan_steps
+from experiment.session.records import Check, Judgement
 
 ATTEMPTS = 800
 """Attempts of a night: 707 lights, references, response frames, and some that were refused."""

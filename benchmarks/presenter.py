@@ -20,7 +20,7 @@ from collections.abc import Generator
 from typing import Any
 
 from drivers.display.fullscreen import FullScreen, list_displays
-from experiment.lights.illuminations import plan_illuminations
+from experiment.lights import plan_illuminations
 
 SIZE = "1920x1080"
 

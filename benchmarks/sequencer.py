@@ -47,11 +47,11 @@ from drivers.presenter import BLACK, Colour
 from drivers.projector import Fault, Lamp, Power, ProjectorIdentity
 from experiment.chart.layout import design_chart
 from experiment.config import LabSettings, SequenceSettings
-from experiment.lights.illuminations import Illumination, plan_illuminations
+from experiment.lights import Illumination, plan_illuminations
 from experiment.session.folder import Session
 from experiment.session.journal import Journal
-from experiment.session.judgement import Judgement
 from experiment.session.plan import SessionStep, plan_steps
+from experiment.session.records import Judgement
 from foundation.clock import Clock, SystemClock
 from sim.clock import OPENING, SimulatedClock
 from sim.world.sensors import BODIES

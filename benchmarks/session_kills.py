@@ -36,12 +36,11 @@ from drivers.camera import CameraIdentity, CapturedFrame, ExposureSettings
 from drivers.presenter import BLACK, Colour
 from experiment.chart.layout import design_chart
 from experiment.config import LabSettings
-from experiment.lights.illuminations import Illumination
-from experiment.session.folder import Session
-from experiment.session.incoming import IncomingFile
+from experiment.lights import Illumination
+from experiment.session.folder import IncomingFile, Session
 from experiment.session.journal import Journal
-from experiment.session.judgement import Judgement
 from experiment.session.plan import SessionStep, plan_steps
+from experiment.session.records import Judgement
 from sim.clock import OPENING, SimulatedClock
 
 KILLS = 10_000

@@ -35,10 +35,8 @@ from experiment.chart.model import Chart
 from experiment.chart.printing import drawing
 from experiment.framing.movement import STILL_PX
 from experiment.framing.planes import CHANNELS
-from experiment.lights.illuminations import Illumination
-from experiment.session.folder import Session
-from experiment.session.incoming import ReceivedFile
-from experiment.session.judgement import Judgement
+from experiment.lights import Illumination
+from experiment.session.folder import ReceivedFile, Session
 from experiment.session.plan import SessionStep, plan_steps
 from foundation.colorimetry import angles_deg
 from sim.camera.film import write_dng

@@ -291,7 +291,7 @@ def build_lut(
         else:
             from calibration.pipeline.options import BuildOptions
             from calibration.sampling.samples import WINDOW
-            from experiment.framing.corners import parse_corners
+            from experiment.framing.field import parse_corners
 
             if picture is not None and not check:
                 raise InputError("--picture goes with --check; a table that is built has its report")

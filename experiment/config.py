@@ -33,40 +33,27 @@ _SECRET_BYTES = 4096
 longer was named by mistake."""
 
 
-def _require_target(target: str) -> None:
-    """Require that a target is a URL with a host, or a command line; empty is nobody.
+def _target_checked(target: str) -> str:
+    """Return the target of notices as it is: a URL with a host, or a command line; empty is nobody.
 
-    Raises
-    ------
-    ValueError
-        It is neither; the message does not hold it.
+    Anything else is refused by a ValueError, whose message does not hold it.
     """
     if not is_webhook(target):
         # A quotation that does not end is refused here.
         shlex.split(target)
-        return
+        return target
     parts = urlsplit(target)
     if not parts.hostname or parts.port == 0:
         raise ValueError("a URL names a host, as in https://ntfy.sh/my-lab")
     if not target.removesuffix(f"/{MASK}").isascii() or any(character.isspace() for character in target):
         raise ValueError("a URL has no spaces and no letters but ASCII's; write them as %20 and the like")
-
-
-def _target_checked(target: str) -> str:
-    """Return the target of notices as it is; refuse one that is neither a URL nor a command line."""
-    _require_target(target)
     return target
 
 
 def spdx_expression(licence: str) -> str:
     """Return an SPDX licence expression in its canonical spelling, ``CC-BY-4.0``; empty stays empty.
 
-    SPDX specification 2.3, annex D, so that programs and lawyers read the same.
-
-    Raises
-    ------
-    ValueError
-        It is none; the message says what is expected.
+    SPDX specification 2.3, annex D, so that programs and lawyers read the same; anything else is a ValueError.
     """
     from packaging.licenses import InvalidLicenseExpression, canonicalize_license_expression
 
@@ -337,18 +324,7 @@ def unknown_key(key: str, known: Iterable[str], where: str) -> ConfigurationErro
 
 
 def load_lab(path: Path) -> LabSettings:
-    """Read `LAB.toml`.
-
-    Returns
-    -------
-    LabSettings
-        With every path resolved against the folder of the file.
-
-    Raises
-    ------
-    ConfigurationError
-        The file is missing, not TOML, or holds an unknown key or an unusable value.
-    """
+    """Read `LAB.toml`, every path resolved against its folder; a ConfigurationError names what cannot be used."""
     try:
         text = path.read_text(encoding="utf-8-sig")
     except OSError as error:
@@ -357,10 +333,10 @@ def load_lab(path: Path) -> LabSettings:
         ) from error
     except UnicodeDecodeError as error:
         raise ConfigurationError(f"{path} is no text in UTF-8: {error}; save it as such") from error
-    settings = parse_lab(text, str(path), path.resolve().parent)
+    folder = path.resolve().parent
+    settings = parse_lab(text, str(path), folder)
     if settings.rig == "replay" and settings.replay is None:
         raise ConfigurationError(f"{path}: rig = 'replay' needs [replay] with session = 'FOLDER' of the recording")
-    folder = path.resolve().parent
     changes: dict[str, Any] = {"chart": folder / settings.chart, "illuminations": folder / settings.illuminations}
     if settings.replay is not None:
         changes["replay"] = ReplaySettings(session=folder / settings.replay.session)
@@ -368,22 +344,10 @@ def load_lab(path: Path) -> LabSettings:
 
 
 def parse_lab(text: str, where: str, folder: Path | None = None) -> LabSettings:
-    """Return the settings in a TOML text, paths as they stand there.
+    """Return the settings in a TOML text, paths as they stand there; a ConfigurationError names what cannot be used.
 
-    Parameters
-    ----------
-    text
-        The settings.
-    where
-        Names them in errors.
-    folder
-        What files that hold secrets are relative to; None where secrets are not looked up: in a session's own settings
-        there are none.
-
-    Raises
-    ------
-    ConfigurationError
-        The text is not TOML, holds an unknown key or an unusable value, or names a secret that is not there.
+    `where`: names them in errors. `folder`: what files that hold secrets are relative to; None where secrets are not
+    looked up: in a session's own settings there are none.
     """
     try:
         document = tomllib.loads(text)

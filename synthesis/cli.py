@@ -30,7 +30,7 @@ from calibration.sampling.windows import WINDOWS
 from drivers.camera import ExposureSettings
 from experiment.chart.layout import design_chart
 from experiment.config import CitationSettings, unknown_key
-from experiment.lights.illuminations import plan_illuminations
+from experiment.lights import plan_illuminations
 from foundation.console import EXIT_CODES, JsonOutput, orderly_end, progress, with_json
 from foundation.errors import ConfigurationError
 from sim import cli as devices

@@ -45,7 +45,7 @@ from calibration.sampling.samples import Sites
 from drivers.camera import ExposureSettings
 from drivers.presenter import WHITE
 from drivers.raw.rawfile import Area, Mosaic
-from experiment.lights.illuminations import Illumination, parse_ccts, shown_colour
+from experiment.lights import Illumination, parse_ccts, shown_colour
 from foundation.colorimetry import linear_srgb, planck, xyz_of
 from foundation.errors import FormatError, InputError
 from sim.spectral import PublishedSpectrum, daylight, published_spectra, regridded, require_grid

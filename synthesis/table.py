@@ -39,9 +39,9 @@ from calibration.table.writer import LutWriter
 from drivers.camera import ExposureSettings
 from experiment.chart.model import Chart
 from experiment.framing.planes import CLIPPING_SHARE
-from experiment.lights.illuminations import Illumination
+from experiment.lights import Illumination
 from experiment.measures.paper import MAX_ORDER, MAX_ORDER_AROUND, MIN_REFERENCES, Paper, PaperReader
-from experiment.measures.sensor_range import saturation
+from experiment.measures.sensor import saturation
 from foundation.errors import QualityError, StorageError
 from foundation.files import require_free, whole_folder
 from foundation.processors import ordered_map

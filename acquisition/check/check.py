@@ -49,8 +49,8 @@ from drivers.presenter import Colour, ReportsWarnings
 from drivers.projector import Power, Projector, Severity
 from experiment.chart.model import Chart, load_chart
 from experiment.config import LabSettings
-from experiment.framing.corners import Corners
-from experiment.lights.illuminations import Illumination, load_illuminations
+from experiment.framing.field import Corners
+from experiment.lights import Illumination, load_illuminations
 from foundation.errors import DeviceError, counted
 from foundation.files import write_whole
 
@@ -65,7 +65,7 @@ class CheckOptions:
     """What is asked of a check.
 
     - `picture`: where to draw what was found, PNG; None for nowhere.
-    - `corners`: of the field of a chart without tags, as given by hand, half-size px; `experiment.framing.corners`.
+    - `corners`: of the field of a chart without tags, as given by hand, half-size px; `experiment.framing.field`.
     - `linearity`: whether to take a series of exposures that shows the sensor's linearity and noise.
     - `session`: where the session is to lie, for the disk's free space; the settings' folder if not given.
     """

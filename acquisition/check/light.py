@@ -16,9 +16,8 @@ from acquisition.check.findings import LIMITS, Finding, judged, not_checked, per
 from acquisition.check.places import Levels
 from experiment.chart.model import Chart
 from experiment.framing.planes import CHANNELS
-from experiment.measures.least_squares import least_squares
+from experiment.measures.least_squares import least_squares, page_polynomial, page_powers
 from experiment.measures.paper import MIN_REFERENCES, PaperReader
-from experiment.measures.polynomials import page_polynomial, page_powers
 from foundation.colorimetry import angles_deg
 from foundation.robust import huber_weights, sigma_of
 

@@ -31,10 +31,10 @@ from acquisition.check.taking import Photographer, Shot
 from drivers.presenter import BLACK, WHITE, Colour
 from experiment.chart.model import Chart
 from experiment.config import LabSettings
-from experiment.framing.corners import Corners
+from experiment.framing.field import Corners
 from experiment.framing.finding import Framing, find_chart
 from experiment.framing.planes import frame_black
-from experiment.measures.sensor_range import saturation as shown_saturation
+from experiment.measures.sensor import saturation as shown_saturation
 from foundation.errors import DeviceError, RegistrationError
 
 REPEATS = 6

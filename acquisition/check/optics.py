@@ -14,10 +14,9 @@ from acquisition.check.findings import LIMITS, Finding, Grade, amount, judged, n
 from acquisition.check.light import AREAS, area_name
 from acquisition.check.places import ChartMap
 from experiment.chart.model import Chart
-from experiment.framing.finding import Framing
+from experiment.framing.finding import MIN_MODULE_PX, Framing
 from experiment.framing.homography import project
 from experiment.framing.sharpness import edge_blurs
-from experiment.framing.tags import MIN_MODULE_PX
 from experiment.limits.bleed import bleed, largest_blur_px
 
 USUAL_FOCAL_DIAGONALS = 1.3

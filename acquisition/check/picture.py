@@ -17,7 +17,7 @@ from acquisition.check.light import light_share
 from acquisition.check.looking import ChartFigures, CheckFrames
 from acquisition.check.print_state import Spot
 from experiment.chart.model import Chart
-from experiment.framing.annotated import annotated_png
+from experiment.framing.pictures import annotated_png
 from experiment.framing.sharpness import MAX_BLUR_PX
 
 COLOURS = {"fault": "#b42318", "remark": "#b54708", "not checked": "#667085", "good": "#027a48"}

@@ -21,8 +21,7 @@ from experiment.chart.printing import field_drawing
 from experiment.framing.finding import Framing
 from experiment.framing.homography import project
 from experiment.framing.planes import CHANNELS, CLIPPING_SHARE, Plane, frame_black, plane_of
-from experiment.measures.least_squares import robust_least_squares
-from experiment.measures.polynomials import page_polynomial, page_powers
+from experiment.measures.least_squares import page_polynomial, page_powers, robust_least_squares
 
 MAX_TERMS_SHARE = 0.6
 """Terms of the smooth map over the number of tags, at most: each tag is one independent place."""

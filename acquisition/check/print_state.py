@@ -22,8 +22,7 @@ from acquisition.check.findings import LIMITS, Finding, judged, not_checked, per
 from acquisition.check.light import SmoothLight, no_light
 from acquisition.check.places import Levels
 from experiment.chart.model import Chart
-from experiment.measures.least_squares import robust_least_squares
-from experiment.measures.polynomials import page_polynomial, page_powers
+from experiment.measures.least_squares import page_polynomial, page_powers, robust_least_squares
 from experiment.measures.stains import LEAST_BITS, LEAST_COUNTS, find_stains
 from foundation.robust import sigma_of
 

@@ -19,7 +19,7 @@ from acquisition.check.places import ChartMap
 from acquisition.check.taking import Shot
 from drivers.raw.rawfile import Mosaic
 from experiment.framing.planes import CHANNELS, CLIPPING_SHARE, frame_black, phases
-from experiment.measures.linearity import HIGHEST, LOWEST, deviations
+from experiment.measures.sensor import HIGHEST, LOWEST, deviations
 from foundation.robust import sigma_of
 
 HOT_COUNTS = 30.0

@@ -16,8 +16,8 @@ from drivers.camera import ExposureSettings
 from drivers.raw.rawfile import Mosaic, read_raw
 from experiment.config import LabSettings, LimitSettings
 from experiment.framing.planes import CLIPPING_SHARE, frame_black
-from experiment.session.judgement import Judgement
 from experiment.session.plan import FrameKind, SessionStep
+from experiment.session.records import Judgement
 from foundation.errors import FormatError
 
 BRIGHTEST_PERCENTILE = 99.9
@@ -113,7 +113,7 @@ def judge_file(path: Path, kind: FrameKind, settings: LabSettings) -> str | None
 
 
 class ExposureJudge:
-    """A `experiment.session.judgement.FrameJudge` that looks at the exposure of each frame alone."""
+    """A `experiment.session.records.FrameJudge` that looks at the exposure of each frame alone."""
 
     def __init__(self, settings: LabSettings) -> None:
         self._settings = settings

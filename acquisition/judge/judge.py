@@ -27,18 +27,18 @@ from acquisition.judge.measured.frame import Frame
 from drivers.raw.rawfile import read_raw
 from experiment.chart.model import Chart
 from experiment.config import LabSettings
+from experiment.framing.pictures import preview_jpeg
 from experiment.framing.planes import frame_black
-from experiment.framing.previews import preview_jpeg
-from experiment.lights.illuminations import Illumination
-from experiment.session.judgement import Check, Judgement
+from experiment.lights import Illumination
 from experiment.session.plan import REFERENCES, SessionStep
+from experiment.session.records import Check, Judgement
 from foundation.errors import FormatError
 
 _BESIDE = "it was under way when the frames before it were found to contradict each other; they are taken again first"
 
 
 class LiveJudge:
-    """Judges the frames of a session as they come: `experiment.session.judgement.FrameJudge`."""
+    """Judges the frames of a session as they come: `experiment.session.records.FrameJudge`."""
 
     def __init__(self, settings: LabSettings, chart: Chart, illuminations: Sequence[Illumination]) -> None:
         self._settings = settings
@@ -53,7 +53,7 @@ class LiveJudge:
         return self._known
 
     def recall(self, step: SessionStep, measurement: bytes, accepted: bool) -> None:
-        """Take in a frame of an earlier run; see `experiment.session.judgement.FrameJudge.recall`."""
+        """Take in a frame of an earlier run; see `experiment.session.records.FrameJudge.recall`."""
         frame = Frame.of_bytes(measurement) if measurement else None
         if frame is None:
             lost = accepted and step.kind in ("white", "dark")
@@ -63,12 +63,12 @@ class LiveJudge:
         self._known = self._known.after(step, Examined(frame, light, accepted))
 
     def after_pause(self) -> None:
-        """Take in that lamp and chart may have changed; see `experiment.session.judgement.OutlastsPauses`."""
+        """Take in that lamp and chart may have changed; see `experiment.session.records.OutlastsPauses`."""
         self._known = self._base = self._known.paused()
         self._fresh = False
 
     def judge(self, file: Path, step: SessionStep) -> Judgement:
-        """Return what is said of a raw file; see `experiment.session.judgement.FrameJudge.judge`."""
+        """Return what is said of a raw file; see `experiment.session.records.FrameJudge.judge`."""
         if self._fresh:
             self.after_pause()
         expected, self._known = self._known.expected, replace(self._known, expected=None)

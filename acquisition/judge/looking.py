@@ -22,8 +22,8 @@ from drivers.raw.rawfile import Mosaic
 from experiment.chart.model import Chart
 from experiment.config import LabSettings
 from experiment.framing.planes import phases
-from experiment.session.judgement import Check
 from experiment.session.plan import REFERENCES, SessionStep
+from experiment.session.records import Check
 from foundation.errors import RegistrationError
 
 _UNFOUNDED = (

@@ -20,11 +20,10 @@ from drivers.camera import CapturedFrame
 from drivers.presenter import BLACK, WHITE
 from experiment.chart.model import load_chart
 from experiment.config import LabSettings
-from experiment.lights.illuminations import Illumination, load_illuminations
+from experiment.lights import Illumination, load_illuminations
 from experiment.session.folder import FRAME_COLUMNS, Session
-from experiment.session.judgement import Judgement
 from experiment.session.plan import FrameKind, SessionStep
-from experiment.session.records import ACCEPTED, REFUSED
+from experiment.session.records import ACCEPTED, REFUSED, Judgement
 from foundation.errors import FormatError
 from foundation.files import require_free
 from foundation.hashing import file_sha256

@@ -20,7 +20,7 @@ from typing import Final
 from acquisition.run.patience import PAUSE_S, Patience, Pause
 from drivers.projector import Power, Projector, ReportsPictureFault, Severity
 from experiment.config import SequenceSettings
-from experiment.session.progress import duration_text
+from experiment.session.records import duration_text
 from foundation.clock import Clock
 from foundation.errors import DeviceError, DeviceFault, DeviceRefused, LinkError
 

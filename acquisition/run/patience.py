@@ -39,7 +39,7 @@ from contextlib import AbstractContextManager, nullcontext, suppress
 from typing import Final, Protocol, TypeVar
 
 from experiment.session.journal_file import HeldJournalError
-from experiment.session.progress import duration_text
+from experiment.session.records import duration_text
 from foundation import errors
 from foundation.clock import Clock
 from foundation.errors import CropError, DeviceError, StorageError

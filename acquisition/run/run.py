@@ -7,7 +7,7 @@ from contextlib import ExitStack
 from pathlib import Path
 
 from acquisition.judge.judge import LiveJudge
-from acquisition.monitor.report import write_session_report
+from acquisition.monitor.page import write_session_report
 from acquisition.run.patience import TRY_S
 from acquisition.run.planning.dry_run import checked_plan
 from acquisition.run.planning.work import planned_steps, require_same
@@ -17,10 +17,10 @@ from acquisition.run.taking.pipeline import Taken
 from acquisition.run.taking.resuming import check_frames, clock_note, require_same_devices, tie, white_first
 from experiment.chart.model import load_chart
 from experiment.config import LabSettings
-from experiment.lights.illuminations import load_illuminations
+from experiment.lights import load_illuminations
 from experiment.session.folder import Session, busy_sentence, session_exists
 from experiment.session.heartbeat import signs_of_life
-from experiment.session.mending.redaction import secrets_warning
+from experiment.session.repair import secrets_warning
 from foundation.console import Ending
 from foundation.errors import CropError, InputError
 
@@ -60,7 +60,7 @@ def run_session(
         checked_plan(settings, folder, session, devices)
         if session is None:
             session = opened.enter_context(_begun(settings, folder))
-            session.journal.be_patient(settings.sequence.patience_s, announce)
+            session.journal.retry_locked(settings.sequence.patience_s, announce)
         require_same_devices(session, devices, settings)
         if note := clock_note(session, devices.clock):
             announce(note)

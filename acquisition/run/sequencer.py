@@ -25,9 +25,8 @@ from drivers.presenter import BLACK, WHITE
 from experiment.config import LabSettings
 from experiment.session.folder import Session
 from experiment.session.heartbeat import RunState
-from experiment.session.judgement import FrameJudge
 from experiment.session.plan import FrameKind, SessionStep
-from experiment.session.records import ACCEPTED, VOIDED
+from experiment.session.records import ACCEPTED, VOIDED, FrameJudge
 from foundation.clock import Clock
 from foundation.console import Ending
 from foundation.errors import StorageError

@@ -15,8 +15,7 @@ from typing import Self
 
 from acquisition.run.taking.agenda import step_name
 from acquisition.run.taking.pipeline import Taken
-from experiment.session.judgement import Check, Judgement
-from experiment.session.progress import RECENT, TimedAttempt, duration_text, time_left
+from experiment.session.records import RECENT, Check, Judgement, TimedAttempt, duration_text, time_left
 
 SHOWN = ("light", "movement", "blur", "white drift", "dark", "ambient", "exposure")
 """Checks that the line about the last frame has, as far as they have a number."""

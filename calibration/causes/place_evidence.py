@@ -12,8 +12,7 @@ from calibration.figures.frame_figures import FrameFigures
 from calibration.figures.table_figures import TableFigures
 from calibration.sampling.windows import bleed
 from experiment.limits.bleed import WINDOW_PX
-from experiment.measures.reflections import cell_mm, joined_cells, light_of_spot, spot_colour, spots_of
-from experiment.measures.stains import Stains
+from experiment.measures.stains import Stains, cell_mm, joined_cells, light_of_spot, spot_colour, spots_of
 from experiment.session.records import FrameRecord
 
 LEAST_BLOCK = 0.004

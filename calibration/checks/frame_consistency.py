@@ -30,8 +30,14 @@ import numpy.typing as npt
 from scipy.spatial import cKDTree
 
 from calibration.checks.small_places import LEAST_MODEL_ERROR, SmallPlaces, cells_without_hot
-from experiment.measures.least_squares import least_absolute_line, least_squares, linear_combinations, product
-from experiment.measures.polynomials import code_polynomial, code_powers
+from experiment.measures.least_squares import (
+    code_polynomial,
+    code_powers,
+    least_absolute_line,
+    least_squares,
+    linear_combinations,
+    product,
+)
 from foundation.robust import huber_weights, sigma_of
 
 DEGREE = 4

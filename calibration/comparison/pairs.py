@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from calibration.table.lut import Lut
-from experiment.lights.illuminations import Illumination
+from experiment.lights import Illumination
 from foundation.errors import FormatError, counted
 
 

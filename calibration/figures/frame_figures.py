@@ -12,8 +12,7 @@ from calibration.checks.frame_consistency import FrameConsistency
 from drivers.raw.rawfile import FrameOrigin
 from experiment.framing.movement import Shift
 from experiment.framing.planes import Channel
-from experiment.measures.flat_field import FlatField
-from experiment.measures.paper import FieldResidual, Paper
+from experiment.measures.paper import FieldResidual, FlatField, Paper
 from experiment.session.records import FrameRecord
 
 _Array = npt.NDArray[np.float64]

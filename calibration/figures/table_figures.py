@@ -27,7 +27,7 @@ from calibration.registration.registration import Registration
 from calibration.spread.correction import LensFigures
 from calibration.spread.point_spread import PointSpread
 from calibration.table.provenance import Unfit
-from experiment.measures.sensor_range import black_drift
+from experiment.measures.sensor import black_drift
 from experiment.measures.stains import Stains
 
 _Array = npt.NDArray[np.float64]

@@ -58,8 +58,8 @@ from calibration.verdict.thresholds import THRESHOLDS, Threshold
 from calibration.verdict.values import judged_values
 from calibration.verdict.verdict import judge
 from calibration.verdict.wording import refusal
-from experiment.framing.annotated import annotated_png
 from experiment.framing.movement import Shift
+from experiment.framing.pictures import annotated_png
 from experiment.session.folder import Session
 from experiment.session.records import FrameRecord
 from foundation.errors import FormatError, QualityError, RegistrationError, counted, first_of

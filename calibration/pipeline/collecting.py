@@ -28,7 +28,7 @@ from calibration.pipeline.intake import Intake, IntakeState
 from calibration.radiometry.drift import drift_correction
 from calibration.radiometry.primaries import pure_lights
 from calibration.radiometry.projector import additivity, drift_gains
-from experiment.lights.illuminations import Illumination
+from experiment.lights import Illumination
 from experiment.session.folder import Session
 from foundation.colorimetry import angles_deg
 

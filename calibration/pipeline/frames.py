@@ -25,7 +25,7 @@ from calibration.table.lut import Lut
 from calibration.table.source_frames import SourceFrame, frames_sha256
 from drivers.raw.rawfile import Mosaic, decode_raw
 from experiment.framing.planes import Channel, frame_black, strongest_channel
-from experiment.measures.sensor_range import saturation
+from experiment.measures.sensor import saturation
 from experiment.session.folder import Session
 from experiment.session.records import FrameRecord
 from foundation.errors import FormatError

@@ -1,6 +1,6 @@
 """A series of exposures of the chart, under one light, in its place: how linear the sensor is.
 
-What the patches show is computed by `experiment.measures.linearity`.
+What the patches show is computed by `experiment.measures.sensor`.
 
 Rules that hold inside:
 
@@ -20,8 +20,7 @@ from calibration.pipeline.baseline import Baseline
 from drivers.raw.rawfile import Mosaic, read_raw
 from experiment.framing.movement import REREGISTER_PX, Shift
 from experiment.framing.planes import CLIPPING_SHARE, frame_black, strongest_channel
-from experiment.measures.linearity import HIGHEST, LOWEST, deviations
-from experiment.measures.sensor_range import saturation
+from experiment.measures.sensor import HIGHEST, LOWEST, deviations, saturation
 from foundation.errors import FormatError, InputError
 
 LEAST_FRAMES = 4

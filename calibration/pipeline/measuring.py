@@ -244,5 +244,5 @@ def _to_subtract(
 
 def _blur_px(registered: RegisteredFrame, grid: _Grid) -> float:
     """Return σ of the blur, half-size px: that of the registered frame, and what the gauges are softer than in it."""
-    softer = 0.0 if grid.reregistered else grid.shift.softer_px2
+    softer = 0.0 if grid.reregistered else grid.shift.blur_growth_px2
     return float(np.sqrt(max(registered.registration.blur_px**2 + softer, 0.0)))

@@ -8,7 +8,7 @@ from typing import Any
 from calibration.sampling.samples import WINDOW
 from calibration.sampling.windows import WINDOWS
 from experiment.config import CitationSettings
-from experiment.framing.corners import Corners
+from experiment.framing.field import Corners
 from foundation.errors import InputError
 
 

@@ -13,9 +13,8 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from experiment.measures.flat_field import FlatField
-from experiment.measures.least_squares import least_squares
-from experiment.measures.polynomials import code_polynomial, code_powers, page_polynomial
+from experiment.measures.least_squares import code_polynomial, code_powers, least_squares, page_polynomial
+from experiment.measures.paper import FlatField
 from foundation.robust import huber_weights, sigma_of
 
 CODE_DEGREE = 8

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from experiment.framing.planes import CLIPPING_SHARE
-from experiment.measures.flat_field import FlatField
+from experiment.measures.paper import FlatField
 
 _Array = npt.NDArray[np.float64]
 

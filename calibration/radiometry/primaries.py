@@ -17,10 +17,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from experiment.lights.illuminations import Illumination
-from experiment.measures.flat_field import FlatField
+from experiment.lights import Illumination
 from experiment.measures.least_squares import product
-from experiment.measures.paper import Paper
+from experiment.measures.paper import FlatField, Paper
 
 LEAST_PAPER = 300.0
 """Counts above black that paper must show under a primary for its field to be known well enough (judgement)."""

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 import numpy as np
 import numpy.typing as npt
 
-from experiment.lights.illuminations import Illumination
+from experiment.lights import Illumination
 
 _Array = npt.NDArray[np.float64]
 

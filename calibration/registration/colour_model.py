@@ -10,8 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from experiment.measures.least_squares import least_squares
-from experiment.measures.polynomials import code_powers
+from experiment.measures.least_squares import code_powers, least_squares
 from foundation.robust import huber_weights, sigma_of
 
 _Array = npt.NDArray[np.float64]

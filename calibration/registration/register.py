@@ -29,13 +29,11 @@ from calibration.registration.matching import Anchors, Matcher, not_this_chart
 from calibration.registration.registration import Registration
 from drivers.raw.rawfile import Mosaic
 from experiment.chart.model import Chart
+from experiment.framing.field import SIDE_POINTS, FoundField, field_mm, refine_edges
 from experiment.framing.finding import Framing, find_chart
 from experiment.framing.homography import rms
-from experiment.framing.outline import SIDE_POINTS, refine_edges
 from experiment.framing.planes import CHANNELS, Plane, frame_black, plane_of
-from experiment.framing.sharpness import blur_px
-from experiment.framing.tagless_field import FoundField, field_mm
-from experiment.framing.visibility import MIN_CELL_PX
+from experiment.framing.sharpness import MIN_CELL_PX, blur_px
 from experiment.limits.bleed import largest_blur_px
 from foundation.errors import RegistrationError
 from foundation.robust import sigma_of

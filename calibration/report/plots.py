@@ -20,7 +20,7 @@ from calibration.sampling.patch_statistics import rim_difference, sample_noise
 from calibration.sampling.samples import sites_at
 from experiment.chart.model import Chart
 from experiment.framing.movement import STILL_PX
-from experiment.measures.flat_field import FlatField
+from experiment.measures.paper import FlatField
 from experiment.measures.stains import Stains
 from foundation.colorimetry import decode_srgb
 

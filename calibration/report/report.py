@@ -42,7 +42,7 @@ from calibration.verdict.result import BuildResult
 from calibration.verdict.retaking import findings
 from drivers.raw.rawfile import read_raw
 from experiment.chart.model import Chart
-from experiment.measures.flat_field import FlatField
+from experiment.measures.paper import FlatField
 from experiment.measures.stains import Stains
 from experiment.session.folder import Session
 from foundation.files import write_whole

@@ -22,8 +22,8 @@ from calibration.spread.fitting import VARYING_BITS, ReferenceData, SpreadData, 
 from calibration.spread.point_spread import FAR_PX, NEAR_PX, PLACES, PointSpread, kernel_of_terms, terms_of
 from calibration.spread.printed_grid import PrintedGrid
 from calibration.spread.surroundings import FrameLevels, NearLight, Surroundings, UsualLight, light_at, surroundings
-from experiment.measures.flat_field import FlatField
-from experiment.measures.polynomials import page_polynomial, page_powers
+from experiment.measures.least_squares import page_polynomial, page_powers
+from experiment.measures.paper import FlatField
 
 _MARGIN_PX = 12.0
 """How far from the sheet's edge what lies behind it is looked at."""

@@ -25,7 +25,7 @@ import numpy as np
 import numpy.typing as npt
 
 from calibration.spread.point_spread import LEAST_GAIN, TERMS, PointSpread, free_terms, groups_of_terms, terms_of
-from experiment.measures.polynomials import page_polynomial, page_powers
+from experiment.measures.least_squares import page_polynomial, page_powers
 from foundation.robust import MAD_TO_SIGMA
 
 MOST_MISFIT = 5.0

@@ -24,7 +24,7 @@ from calibration.spread.point_spread import NEAR_PX, place_terms
 from calibration.spread.printed_grid import PARTS, PrintedGrid
 from drivers.raw.rawfile import Mosaic
 from experiment.framing.planes import CHANNELS, channel_offset_px, phases
-from experiment.measures.flat_field import FlatField
+from experiment.measures.paper import FlatField
 
 _OFFSETS_PX = (-2.0, 1 / 16, 65)
 """First, step and number of the offsets of windows that shares are tabulated at: rounding, a quarter pixel of the

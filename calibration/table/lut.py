@@ -25,7 +25,7 @@ from calibration.table.provenance import Provenance, parse_provenance
 from calibration.table.sample_hashes import light_sha256, map_samples
 from calibration.table.source_frames import SourceFrame, load_frames
 from calibration.table.sums import require_listed, require_plain_table
-from experiment.lights.illuminations import Illumination, load_illuminations
+from experiment.lights import Illumination, load_illuminations
 from foundation.errors import FormatError
 from foundation.files import partial_path
 from foundation.hashing import file_sha256

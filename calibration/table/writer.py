@@ -18,7 +18,7 @@ from calibration.table.provenance import Provenance
 from calibration.table.sample_hashes import light_sha256, samples_sha256
 from calibration.table.source_frames import SourceFrame, frames_csv
 from calibration.table.sums import sums_of
-from experiment.lights.illuminations import COLUMNS, NAME, Illumination
+from experiment.lights import COLUMNS, NAME, Illumination
 from foundation.errors import StorageError
 from foundation.files import storage_error, write_whole
 from foundation.hashing import sha256_of

@@ -46,7 +46,7 @@ from calibration.table.published_claims import (
 )
 from calibration.table.sample_hashes import light_sha256
 from calibration.table.sums import known_sums, require_listed
-from experiment.lights.illuminations import load_illuminations
+from experiment.lights import load_illuminations
 from foundation.errors import CropError, FormatError, InputError, StorageError
 from foundation.files import require_free, storage_error, whole_folder, write_whole
 from foundation.hashing import file_sha256

@@ -17,8 +17,8 @@ from calibration.figures.table_figures import TableFigures
 from calibration.registration.registration import Registration
 from calibration.sampling.windows import bleed
 from calibration.verdict.verdict import JudgedValue, Verdict
-from experiment.session.mending.retaking import lights_text
 from experiment.session.records import FrameRecord
+from experiment.session.repair import lights_text
 
 COMMAND = "acquire run LAB.toml SESSION --retake bad"
 """What takes them again, as the report names them."""

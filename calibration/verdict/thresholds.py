@@ -20,7 +20,7 @@ from calibration.registration.register import (
     MIN_GOOD_BLOCKS,
 )
 from experiment.limits.table import TABLE_LIMITS, Sense
-from experiment.measures.sensor_range import MAX_BLACK_DRIFT
+from experiment.measures.sensor import MAX_BLACK_DRIFT
 
 JUDGEMENT = "judgement"
 """The source of a limit that nothing but experience supports."""

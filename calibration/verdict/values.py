@@ -10,7 +10,7 @@ from calibration.sampling.windows import bleed
 from calibration.spread.fitting import MOST_MISFIT
 from calibration.verdict.retaking import added_bleed
 from calibration.verdict.thresholds import THRESHOLDS
-from experiment.measures.reflections import added_light
+from experiment.measures.stains import added_light
 from foundation.colorimetry import angles_deg
 
 _LEAST_CELLS = 8**4

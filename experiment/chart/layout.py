@@ -27,9 +27,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from experiment.chart.margins import GAP_PX
+from experiment.chart.margins import DESIGN_DPI, GAP_PX, PX_MM
 from experiment.chart.model import PAPER_WHITE, TAG_FAMILY, TAG_MODULES, Chart, Reference, Tag
-from experiment.chart.pixels import DESIGN_DPI, PX_MM
 from foundation.errors import InputError
 from foundation.version import software
 

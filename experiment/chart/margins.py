@@ -2,8 +2,9 @@
 
 Laws that hold here:
 
-- Places and sizes are whole pixels at 600 dpi, so the TIFF and the PDF show the same; what is printed is black on bare
-  paper, in rectangles, so neither file needs a font.
+- Places and sizes are whole pixels at 600 dpi, the raster in which a chart is designed (lengths on the print are
+  millimetres elsewhere), so the TIFF and the PDF show the same; what is printed is black on bare paper, in rectangles,
+  so neither file needs a font.
 - Nothing stands nearer to the field than 1.5 mm, leaves the sheet, or touches what the chart has in its margin. What
   finds no room is left out, and the rest stays.
 - A ruler's ticks stand at the whole pixel nearest to their millimetre: each within 0.022 mm, and the errors do not add
@@ -22,7 +23,29 @@ from typing import Literal
 import numpy as np
 import numpy.typing as npt
 
-from experiment.chart.pixels import PX_MM, Boxes
+MM_PER_INCH = 25.4
+"""Exact, by definition of the international inch."""
+
+DESIGN_DPI = 600
+"""Resolution of the design: photo printers and plotters work at it or at a multiple."""
+
+PX_MM = MM_PER_INCH / DESIGN_DPI
+"""Millimetres of a pixel of the design."""
+
+_ROUNDING_PX = 1e-3
+"""How far a coordinate read from a file may lie beside a whole pixel: six decimals of a millimetre are 2e-5 px."""
+
+Boxes = npt.NDArray[np.int64]
+"""(N, 4) int64: left, top, right, bottom, px at 600 dpi."""
+
+
+def whole_px(boxes_mm: npt.ArrayLike) -> Boxes:
+    """Return the smallest boxes (N, 4) int64, whole pixels, that hold boxes (N, 4) mm: left, top, right, bottom."""
+    exact = np.asarray(boxes_mm, dtype=np.float64).reshape(-1, 4) / PX_MM
+    return np.concatenate([np.floor(exact[:, :2] + _ROUNDING_PX), np.ceil(exact[:, 2:] - _ROUNDING_PX)], axis=1).astype(
+        np.int64
+    )
+
 
 GAP_PX = 35
 """Bare paper around the field: 1.5 mm are three half-size pixels of the EOS 550D, more than its blur reaches."""
@@ -232,10 +255,6 @@ class Margins:
                 return True
         return False
 
-    def targets(self, side: Side, start: int) -> bool:
-        """Put star, slanted edge and bars side by side at the first free place from `start` on."""
-        return self.put_somewhere(side, target_boxes(), start)
-
     def _on_sheet(self, side: Side, boxes: Boxes) -> Boxes:
         left, top, right, bottom = self._field.tolist()
         u0, v0, u1, v1 = boxes.T
@@ -303,17 +322,18 @@ def margin_marks(field: Boxes, page_px: tuple[int, int], taken: Boxes, lines: It
     margins.ruler("bottom")
     margins.ruler("left")
     names = list(lines)
-    long = int(target_boxes()[:, 2].max()) + GAP_PX
+    targets = target_boxes()
+    long = int(targets[:, 2].max()) + GAP_PX
     across, down = margins.length("top"), margins.length("right")
     # A short sheet has no room for both: then it is named and has its targets on the right.
     name_length = max(int(text_boxes(line)[:, 2].max(initial=0)) for line in names) if names else 0
     roomy = across >= 2 * long + name_length
     if roomy:
-        margins.targets("top", 0)
+        margins.put_somewhere("top", targets, 0)
     if names:
         margins.lines(names, long if roomy else 0)
     for start in (0, (down - long) // 2, down - long) if down >= 3 * long else (0,):
-        margins.targets("right", start)
+        margins.put_somewhere("right", targets, start)
     for start in ((across - long) // 2, across - long) if across >= 3 * long else ():
-        margins.targets("top", start)
+        margins.put_somewhere("top", targets, start)
     return margins.boxes

@@ -56,14 +56,24 @@ class Tag:
     corners_mm: npt.NDArray[np.float64]
 
 
+_STRICT = ConfigDict(extra="ignore", allow_inf_nan=False, strict=True)
+_Point = tuple[float, float]
+_Length = Annotated[float, Field(gt=0)]
+_Size = tuple[_Length, _Length]
+_Code = Annotated[int, Field(ge=0, le=255)]
+_Colour = Annotated[int, Field(ge=0, lt=8**5)]
+
+
 @dataclass(frozen=True)
 class Reference:
     """One achromatic patch; `rgb` is the printed code, (255, 255, 255) bare paper."""
 
+    __pydantic_config__ = _STRICT
+
     name: str
-    rgb: tuple[int, int, int]
-    centre_mm: tuple[float, float]
-    size_mm: tuple[float, float]
+    rgb: tuple[_Code, _Code, _Code]
+    centre_mm: _Point
+    size_mm: _Size
 
     @property
     def is_white(self) -> bool:
@@ -155,16 +165,8 @@ class Chart:
         write_whole(path, self.to_json())
 
 
-_Point = tuple[float, float]
-_Length = Annotated[float, Field(gt=0)]
-_Size = tuple[_Length, _Length]
-_Code = Annotated[int, Field(ge=0, le=255)]
-
-_Colour = Annotated[int, Field(ge=0, lt=8**5)]
-
-
 class _Strict(BaseModel):
-    model_config = ConfigDict(extra="ignore", frozen=True, allow_inf_nan=False, strict=True)
+    model_config = _STRICT
 
 
 class _Cells(_Strict):
@@ -178,13 +180,6 @@ class _Tag(_Strict):
     corners_mm: tuple[_Point, _Point, _Point, _Point]
 
 
-class _Reference(_Strict):
-    name: str
-    rgb: tuple[_Code, _Code, _Code]
-    centre_mm: _Point
-    size_mm: _Size
-
-
 class _Document(_Strict):
     format: Literal["crop.chart"]
     version: Literal[1]
@@ -193,7 +188,7 @@ class _Document(_Strict):
     cell_mm: _Size
     cells: _Cells
     tags: list[_Tag]
-    references: list[_Reference]
+    references: tuple[Reference, ...]
     seed: int | None = Field(default=None, ge=0)
     software: str | None = None
 
@@ -231,10 +226,7 @@ def load_chart(path: Path) -> Chart:
         centres_mm=np.asarray(document.cells.centre_mm, dtype=np.float64).reshape(count, 2),
         colours=colours,
         tags=tuple(Tag(tag.family, tag.id, np.asarray(tag.corners_mm, dtype=np.float64)) for tag in document.tags),
-        references=tuple(
-            Reference(reference.name, reference.rgb, reference.centre_mm, reference.size_mm)
-            for reference in document.references
-        ),
+        references=document.references,
         seed=document.seed,
         software=document.software,
     )

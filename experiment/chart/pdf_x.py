@@ -1,4 +1,4 @@
-"""A PDF of one page of filled rectangles as print shops take it: PDF/X-4 (ISO 15930-7:2010), written by hand.
+"""A PDF of one page of filled rectangles as print shops take it, PDF/X-4 (ISO 15930-7:2010), and its ICC profiles.
 
 What the standard asks of such a page, with the clauses of ISO 32000-1 (PDF 1.7) that define it:
 
@@ -9,18 +9,28 @@ What the standard asks of such a page, with the clauses of ISO 32000-1 (PDF 1.7)
 - XMP metadata with the version of PDF/X, dates, identifiers and whether it is trapped (14.3.2, 14.11.6).
 - Nothing that needs a font, a reader's action or another file; no transparency, no transfer function.
 
-Libraries that write PDF put fonts, dates or their own dictionaries into it, and none that is kept writes PDF/X.
+The profiles say what RGB codes are taken for where a printer manages colours: sRGB (IEC 61966-2-1). Two of them, since
+a TIFF takes a profile of an input or display and the output intent of PDF/X one of an output device; neither describes
+a printer. Sources: ICC.1:2001-04 (version 2.4): header 6.1, required tags 6.3, lut16Type 6.5.8, textDescriptionType
+6.5.17; the primaries of sRGB adapted to D50 by the Bradford transform, as in the ICC's own sRGB profiles.
+
+Written by hand, without dates, so that the same chart gives the same bytes: libraries that write PDF put fonts, dates
+or their own dictionaries into it, and none that is kept writes PDF/X.
 """
 
 from __future__ import annotations
 
 import hashlib
+import struct
 import zlib
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from xml.sax.saxutils import escape
 
-from experiment.chart.rgb_profiles import srgb_output_profile
+import numpy as np
+import numpy.typing as npt
+
+from foundation.colorimetry import decode_srgb, encode_srgb
 from foundation.files import whole_file
 
 DATE = "2000-01-01T00:00:00+00:00"
@@ -35,8 +45,33 @@ CONDITION_INFO = (
 )
 """The output intent in words."""
 
+_PRIMARIES = np.array(
+    [[0.4360747, 0.3850649, 0.1430804], [0.2225045, 0.7168786, 0.0606169], [0.0139322, 0.0971045, 0.7141733]]
+)
+"""XYZ of red, green and blue at full, columns, relative to D50."""
+
+_WHITE = (0.9642, 1.0, 0.8249)
+"""D50, the white of the profile connection space (ICC.1:2001-04, 6.1.11)."""
+
+_CURVE = 4096
+"""Entries of a curve, the most that lut16Type takes."""
+
+_DISPLAY_CURVE = 1024
+"""Entries of a curve of the display profile, as in the ICC's own."""
+
+_GAMUT_GRID = 17
+"""Points along each side of the gamut's table: a warning needs no more."""
+
+_FULL = 65535
+"""Encoding of 1 of a device value, 16 bits (ICC.1:2001-04, 6.5.8)."""
+
+_ONE_XYZ = 32768
+"""Encoding of 1 of X, Y or Z as u1Fixed15 (ICC.1:2001-04, 5.3.4.2)."""
+
 Box = tuple[float, float, float, float]
 Code = tuple[int, int, int]
+
+_Array = npt.NDArray[np.float64]
 
 
 def filled(boxes: Iterable[Box], code: Code) -> bytes:
@@ -131,3 +166,112 @@ def _metadata(title: str, subject: str, name: str) -> str:
 </x:xmpmeta>
 <?xpacket end="r"?>
 """
+
+
+def srgb_output_profile() -> bytes:
+    """Return a profile of an output device whose RGB codes look as sRGB's: exact both ways, by tables of two points.
+
+    It is of the class ``prtr``, which output intents need (ISO 32000-1, 14.11.5), with the tags of a table-based output
+    profile. All rendering intents are alike: relative to the medium's white.
+    """
+    to_pcs = _lut16(np.eye(3), _curves(decode_srgb(np.linspace(0, 1, _CURVE))), _corners_xyz(), _LINEAR)
+    # The matrix works on encoded values, of which 1 is 65535 / 32768 in XYZ.
+    from_xyz = np.linalg.inv(_PRIMARIES) * _FULL / _ONE_XYZ
+    from_pcs = _lut16(from_xyz, _LINEAR, _corners_rgb(), _curves(encode_srgb(np.linspace(0, 1, _CURVE))))
+    tags = {
+        "desc": _description("CroP RGB codes taken as sRGB (no printer is characterised)"),
+        "cprt": _text("No copyright, use freely"),
+        "wtpt": _xyz(_WHITE),
+        **dict.fromkeys(("A2B0", "A2B1", "A2B2"), to_pcs),
+        **dict.fromkeys(("B2A0", "B2A1", "B2A2"), from_pcs),
+        "gamt": _gamut(),
+    }
+    return _profile(b"prtr", tags)
+
+
+def srgb_display_profile() -> bytes:
+    """Return a profile of a display whose RGB codes are sRGB: three primaries and a curve, class ``mntr``."""
+    curve = np.rint(_FULL * decode_srgb(np.linspace(0, 1, _DISPLAY_CURVE))).astype(">u2").tobytes()
+    curve = b"curv" + bytes(4) + struct.pack(">I", _DISPLAY_CURVE) + curve
+    tags = {
+        "desc": _description("sRGB IEC61966-2.1 (CroP)"),
+        "cprt": _text("No copyright, use freely"),
+        "wtpt": _xyz(_WHITE),
+        **{f"{name}XYZ": _xyz(tuple(column)) for name, column in zip("rgb", _PRIMARIES.T.tolist(), strict=True)},
+        **dict.fromkeys(("rTRC", "gTRC", "bTRC"), curve),
+    }
+    return _profile(b"mntr", tags)
+
+
+def _curves(curve: _Array) -> npt.NDArray[np.uint16]:
+    """Return a curve, 0 … 1, three times over, (3, N) uint16."""
+    return np.tile(np.rint(_FULL * np.clip(curve, 0, 1)).astype(np.uint16), (3, 1))
+
+
+_LINEAR = _curves(np.array([0.0, 1.0]))
+"""A curve that changes nothing."""
+
+
+def _corners() -> _Array:
+    """Return the corners of the cube of RGB, (8, 3), the last channel running fastest."""
+    return np.stack(np.meshgrid([0.0, 1.0], [0.0, 1.0], [0.0, 1.0], indexing="ij"), axis=-1).reshape(-1, 3)
+
+
+def _corners_xyz() -> npt.NDArray[np.uint16]:
+    """Return XYZ of the corners; between them XYZ is linear in linear RGB, so that two points a side are exact."""
+    return np.rint(_ONE_XYZ * (_corners() @ _PRIMARIES.T)).astype(np.uint16)
+
+
+def _corners_rgb() -> npt.NDArray[np.uint16]:
+    return (_FULL * _corners()).astype(np.uint16)
+
+
+def _gamut() -> bytes:
+    """Return the gamut tag: 0 where a colour can be shown, more where it cannot."""
+    side = np.linspace(0, _FULL / _ONE_XYZ, _GAMUT_GRID)
+    xyz = np.stack(np.meshgrid(side, side, side, indexing="ij"), axis=-1).reshape(-1, 3)
+    rgb = xyz @ np.linalg.inv(_PRIMARIES).T
+    outside = np.asarray(((rgb < 0) | (rgb > 1)).any(axis=1, keepdims=True), dtype=np.uint16)
+    return _lut16(np.eye(3), _LINEAR, np.uint16(_FULL) * outside, _LINEAR[:1])
+
+
+def _lut16(
+    matrix: _Array, entering: npt.NDArray[np.uint16], table: npt.NDArray[np.uint16], leaving: npt.NDArray[np.uint16]
+) -> bytes:
+    """Return a lut16Type: matrix, curves, table (points, channels), curves."""
+    grid = round(len(table) ** (1 / 3))
+    head = struct.pack(">4s4x3Bx", b"mft2", 3, table.shape[1], grid)
+    numbers = np.rint(matrix * 65536).astype(">i4").tobytes()
+    sizes = struct.pack(">2H", entering.shape[1], leaving.shape[1])
+    return head + numbers + sizes + b"".join(part.astype(">u2").tobytes() for part in (entering, table, leaving))
+
+
+def _xyz(values: tuple[float, ...]) -> bytes:
+    return b"XYZ " + bytes(4) + np.rint(np.array(values) * 65536).astype(">i4").tobytes()
+
+
+def _text(text: str) -> bytes:
+    return b"text" + bytes(4) + text.encode("ascii") + b"\0"
+
+
+def _description(text: str) -> bytes:
+    """Return a textDescriptionType in ASCII alone; the two other scripts are empty."""
+    data = text.encode("ascii") + b"\0"
+    return b"desc" + bytes(4) + struct.pack(">I", len(data)) + data + bytes(8) + bytes(3) + bytes(67)
+
+
+def _profile(kind: bytes, tags: Mapping[str, bytes]) -> bytes:
+    """Return a profile of RGB with XYZ as connection space; equal tags share their data."""
+    offset = 128 + 4 + 12 * len(tags)
+    entries, body = b"", b""
+    places: dict[bytes, int] = {}
+    for name, data in tags.items():
+        if data not in places:
+            places[data] = offset + len(body)
+            body += data + bytes(-len(data) % 4)
+        entries += struct.pack(">4s2I", name.encode("ascii"), places[data], len(data))
+    size = offset + len(body)
+    white = np.rint(np.array(_WHITE) * 65536).astype(">i4").tobytes()
+    head = struct.pack(">I4sI4s4s4s", size, bytes(4), 0x02400000, kind, b"RGB ", b"XYZ ")
+    head += struct.pack(">6H", 2000, 1, 1, 0, 0, 0) + b"acsp" + bytes(24) + struct.pack(">I", 1) + white
+    return head.ljust(128, b"\0") + struct.pack(">I", len(tags)) + entries + body

@@ -27,11 +27,9 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from experiment.chart.margins import margin_marks
+from experiment.chart.margins import DESIGN_DPI, MM_PER_INCH, PX_MM, Boxes, margin_marks, whole_px
 from experiment.chart.model import PAPER_WHITE, TAG_FAMILY, TAG_MODULES, Chart, Tag
-from experiment.chart.pdf_x import filled, save_page
-from experiment.chart.pixels import DESIGN_DPI, MM_PER_INCH, PX_MM, Boxes, whole_px
-from experiment.chart.rgb_profiles import srgb_display_profile
+from experiment.chart.pdf_x import filled, save_page, srgb_display_profile
 from foundation.errors import InputError
 from foundation.files import whole_file, write_whole
 
@@ -179,17 +177,13 @@ def label(chart: Chart) -> str:
     return ". ".join(label_lines(chart))
 
 
-@dataclass(frozen=True)
-class _Band:
-    """Pixel rows `top` … `bottom` − 1, which all look like `row`, (width, 3) uint8."""
+def _bands(
+    drawn: Drawing, pixels_per_mm: float, size: tuple[int, int]
+) -> Iterator[tuple[int, int, npt.NDArray[np.uint8]]]:
+    """Yield the picture from top to bottom: rows `top` … `bottom` − 1, which all look alike, and one of them.
 
-    top: int
-    bottom: int
-    row: npt.NDArray[np.uint8]
-
-
-def _bands(drawn: Drawing, pixels_per_mm: float, size: tuple[int, int]) -> Iterator[_Band]:
-    """Yield the picture from top to bottom; `size` is its width and height in pixels, edges go to the nearest pixel."""
+    `size` is its width and height in pixels, edges go to the nearest pixel; a row is (width, 3) uint8.
+    """
     width, height = size
     edges = np.rint(drawn.rectangles_mm * pixels_per_mm).astype(np.int64)
     edges = np.clip(edges, 0, [width, height, width, height])
@@ -199,15 +193,15 @@ def _bands(drawn: Drawing, pixels_per_mm: float, size: tuple[int, int]) -> Itera
         inside = (edges[:, 1] <= top) & (edges[:, 3] > top)
         for (left, _, right, _), rgb in zip(edges[inside].tolist(), drawn.rgb[inside], strict=True):
             row[left:right] = rgb
-        yield _Band(top, bottom, row)
+        yield top, bottom, row
 
 
-def _packed_strips(bands: Iterator[_Band], height: int) -> Iterator[bytes]:
+def _packed_strips(bands: Iterator[tuple[int, int, npt.NDArray[np.uint8]]], height: int) -> Iterator[bytes]:
     """Yield the picture as deflated strips of `_STRIP_ROWS` rows, the last one shorter."""
     rows: list[npt.NDArray[np.uint8]] = []
-    for band in bands:
-        for y in range(band.top, band.bottom):
-            rows.append(band.row)
+    for top, bottom, row in bands:
+        for y in range(top, bottom):
+            rows.append(row)
             if len(rows) == _STRIP_ROWS or y == height - 1:
                 # Rows repeat so much that a harder setting saves a quarter of the size for three times the time.
                 yield zlib.compress(np.stack(rows).tobytes(), 1)
@@ -304,12 +298,12 @@ def preview(chart: Chart, width_px: int) -> npt.NDArray[np.uint8]:
     # A mean by whole numbers of pixels; OpenCV takes it a good deal faster than numpy.
     means = np.stack(
         [
-            cv2.resize(band.row[None].astype(np.float32), (width_px, 1), interpolation=cv2.INTER_AREA)[0]
-            for band in bands
+            cv2.resize(row[None].astype(np.float32), (width_px, 1), interpolation=cv2.INTER_AREA)[0]
+            for _, _, row in bands
         ]
     )
+    band_tops, band_bottoms = np.array([[top, bottom] for top, bottom, _ in bands]).T
     tops = np.arange(height_px)[:, None] * _SUPERSAMPLING
-    band_tops, band_bottoms = np.array([[band.top, band.bottom] for band in bands]).T
     shared = np.minimum(band_bottoms, tops + _SUPERSAMPLING) - np.maximum(band_tops, tops)
     weights = np.maximum(shared, 0) / _SUPERSAMPLING
     return np.rint(np.tensordot(weights, means, axes=1)).astype(np.uint8)

@@ -14,10 +14,9 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from experiment.chart.margins import margin_marks, text_boxes
+from experiment.chart.margins import DESIGN_DPI, MM_PER_INCH, PX_MM, Boxes, margin_marks, text_boxes, whole_px
 from experiment.chart.model import Chart
 from experiment.chart.pdf_x import row_of_pixels
-from experiment.chart.pixels import DESIGN_DPI, MM_PER_INCH, PX_MM, Boxes, whole_px
 from experiment.chart.printing import (
     POINTS_PER_MM,
     Drawing,

@@ -13,10 +13,9 @@ import numpy as np
 import numpy.typing as npt
 
 from drivers.raw.rawfile import Mosaic
-from experiment.framing.finding import Framing
+from experiment.framing.field import FoundField
+from experiment.framing.finding import FoundTag, Framing
 from experiment.framing.planes import Channel, Plane, channel_offset_px, phases
-from experiment.framing.tagless_field import FoundField
-from experiment.framing.tags import FoundTag
 from foundation.robust import huber_weights, sigma_of
 
 MAX_SHIFT_PX = 3.0
@@ -69,15 +68,15 @@ class Shift:
       lies further right or down.
     - `largest_px`: the largest movement of a tag, or of a corner of the field, so that a rotation shows.
     - `gauges`: tags, or strips, that could be measured; 0 leaves the rest 0 and means unknown.
-    - `softer_px2`: how much more blurred the later frame is: the difference of the blurs' variances, half-size px²,
-      negative when it is sharper; median. Linear in the difference, so read low from about 1 px² on.
+    - `blur_growth_px2`: how much more blurred the later frame is, the difference of the blurs' variances, half-size
+      px²; negative when it is sharper; median. Linear in the difference, so read low from about 1 px² on.
     """
 
     dx: float
     dy: float
     largest_px: float
     gauges: int
-    softer_px2: float = 0.0
+    blur_growth_px2: float = 0.0
 
     @property
     def length_px(self) -> float:

@@ -17,7 +17,7 @@ from typing import Literal
 
 from experiment.framing.finding import MIN_TAG_SHARE
 from experiment.framing.planes import CLIPPING_SHARE, MIN_SIGNAL
-from experiment.framing.visibility import MIN_CELL_PX
+from experiment.framing.sharpness import MIN_CELL_PX
 
 Sense = Literal["at most", "at least"]
 TableOutcome = Literal["accept", "accept with remarks", "refuse"]

@@ -1,19 +1,45 @@
-"""Weighted linear least squares and products of small matrices, without threads.
+"""Weighted linear least squares without threads, and the polynomial bases that are fitted with it.
 
-Frames are decoded by threads of ours; a linear-algebra library that starts its own beside them is slower than one that
-starts none, for problems of a few dozen unknowns.
+Rules that hold inside:
+
+- Frames are decoded by threads of ours; a linear-algebra library that starts its own beside them is slower than one
+  that starts none, for problems of a few dozen unknowns.
+- The inner loops stand at the end, compiled for the processor at hand at the first call and kept on disk. No state, no
+  lock, and the interpreter's is released. Without licence to reorder sums: a table's bytes depend on neither processor
+  nor thread.
+- Bases are Legendre polynomials, orthogonal and of order unity on their ranges, as normal equations need them.
 """
 
 from __future__ import annotations
 
+from functools import lru_cache
+from typing import Final
+
 import numpy as np
 import numpy.typing as npt
+
+from foundation.compiled import compiled
+from foundation.robust import MAD_TO_SIGMA
+
+_CACHED_ORDER: Final = 8
+"""The highest order that flat fields are fitted with: a basis of a lower one is the beginning of this one's."""
+
 
 _LINE_ROUNDS = 8
 """Reweighted solutions in a row of a line."""
 
 _LEAST_RESIDUAL = 0.1
 """Of the median residual: what a point's residual counts for at least, so that none on the line has all the weight."""
+
+_POINTS_AT_A_TIME = 2048
+"""Points that the terms are added up for at a time: three channels of them, and a line of the basis, stay in the
+processor's second cache."""
+
+_RIDGE = 1e-10
+"""Share of the normal matrix's mean diagonal that is added to it: keeps equal columns solvable."""
+
+_CUT = 6.0
+"""Robust standard deviations from which on a residual has no weight (J. W. Tukey's biweight)."""
 
 _Array = npt.NDArray[np.float64]
 
@@ -32,10 +58,8 @@ def linear_combinations(basis: _Array, factors: _Array) -> _Array:
     `basis`: (K, N) float64, term by term, so that the compiled loop runs along the points. `factors`: (3, K) float64;
     terms whose factor is 0 cost nothing. Returns (3, N) float64.
     """
-    from experiment.measures import kernels
-
     sums = np.empty((len(factors), basis.shape[1]))
-    kernels.linear_combinations(basis, factors, sums)
+    _fill_combinations(basis, factors, sums)
     return sums
 
 
@@ -47,9 +71,7 @@ def least_squares(design: _Array, values: _Array, weights: _Array) -> _Array:
 
     `design`: (N, K) float64. `values`: (N,) float64. `weights`: (N,) float64, ≥ 0.
     """
-    from experiment.measures import kernels
-
-    return kernels.weighted_fit(*(_plain(array) for array in (design, values, weights)))
+    return _weighted_fit(*(_plain(array) for array in (design, values, weights)))
 
 
 def robust_least_squares(design: _Array, values: _Array, rounds: int) -> tuple[_Array, _Array, _Array]:
@@ -61,9 +83,7 @@ def robust_least_squares(design: _Array, values: _Array, rounds: int) -> tuple[_
     `design`: (N, K) float64. `values`: (N,) float64. Returns (K,) float64. Returns (N,) float64, 0 … 1. Returns (N,)
     float64, values − design x.
     """
-    from experiment.measures import kernels
-
-    return kernels.robust_fit(_plain(design), _plain(values), rounds)
+    return _robust_fit(_plain(design), _plain(values), rounds)
 
 
 def least_absolute_line(x: _Array, y: _Array) -> tuple[float, float]:
@@ -89,12 +109,253 @@ def held_out_squares(design: _Array, values: _Array, weights: _Array, counts: tu
     the fits nor for their errors. Returns (M,) float64, the weighted mean for each count; every point as the fit to all
     others predicts it.
     """
-    from experiment.measures import kernels
-
     fits = np.array(counts, dtype=np.int64)
-    return kernels.held_out_squares(_plain(design), _plain(values), _plain(weights), fits)
+    return _held_out_squares(_plain(design), _plain(values), _plain(weights), fits)
 
 
 def _plain(array: _Array) -> _Array:
     """Return an array as float64, C order, writable: numba compiles a function anew for each other kind."""
     return np.require(array, np.float64, ["C", "W"])
+
+
+def page_powers(order: int) -> list[tuple[int, int]]:
+    """Return the degrees (i, j) in x and y of the terms of a polynomial of total order `order`, lower totals first.
+
+    >>> page_powers(2)
+    [(0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2)]
+    """
+    return [(total - j, j) for total in range(order + 1) for j in range(total + 1)]
+
+
+def order_of(count: int) -> int:
+    """Return the total order of a polynomial of `count` terms: the inverse of the number of `page_powers`.
+
+    >>> order_of(6)
+    2
+    """
+    return round((np.sqrt(8 * count + 1) - 3) / 2)
+
+
+def page_polynomial(points_mm: npt.ArrayLike, page_mm: tuple[float, float], order: int) -> _Array:
+    """Return the basis at points of the page: products P_i(x) P_j(y) of Legendre polynomials, x, y −1 … 1 on the page.
+
+    `points_mm`: (N, 2) float mm on the print. Returns (N, terms) float64, read-only, terms as in `page_powers`.
+    """
+    points = np.ascontiguousarray(points_mm, dtype=np.float64).reshape(-1, 2)
+    # Terms stand in rising order, so a lower order's basis is the beginning of a higher one's.
+    return _page_basis(points.tobytes(), page_mm, max(order, _CACHED_ORDER))[:, : len(page_powers(order))]
+
+
+@lru_cache(maxsize=8)
+def _page_basis(points: bytes, page_mm: tuple[float, float], order: int) -> _Array:
+    """Return the basis at points (N, 2) float64, read-only; the same cells and references come with every frame."""
+    unit = 2 * np.frombuffer(points).reshape(-1, 2) / np.asarray(page_mm, dtype=np.float64) - 1
+    x, y = (np.polynomial.legendre.legvander(unit[:, axis], order) for axis in (0, 1))
+    basis = np.stack([x[:, i] * y[:, j] for i, j in page_powers(order)], axis=1)
+    basis.setflags(write=False)
+    return basis
+
+
+def light_terms(page_mm: tuple[float, float], around: bool = False) -> tuple[_Array, tuple[int, ...]]:
+    """Return what light on a page may look like, from its simplest shapes on.
+
+    A lens's fall-off is a sum of even powers of the distance from its axis (cos⁴ of the angle to it, and less where the
+    mount shades the rim), a projector's is smooth about another point. So after a slope and a bend come the fourth and
+    the sixth power of the distance from a centre, before the terms of third and fourth order that no axis explains, and
+    the eighth before those of fifth and sixth. A centre that is free is the page's middle and, to first order of where
+    it lies, the slopes of the power: x r², y r² with r⁴.
+
+    Returns (legendre, T) float64, each column a polynomial over the page in the terms of `page_powers`; orthogonal to
+    those before it over the page, of mean square 1.
+    """
+    half = float(np.hypot(*page_mm)) / 2
+    node, _ = np.polynomial.legendre.leggauss(_CACHED_ORDER + 2)
+    u, v = (np.asarray(axis, dtype=np.float64).ravel() for axis in np.meshgrid(node, node))
+    x, y = u * page_mm[0] / 2 / half, v * page_mm[1] / 2 / half
+    r2 = x * x + y * y
+
+    def power(order: int) -> list[_Array]:
+        return [x ** (order - j) * y**j for j in range(order + 1)]
+
+    def radial(half_power: int) -> list[_Array]:
+        return [x * r2 ** (half_power - 1), y * r2 ** (half_power - 1), r2**half_power]
+
+    # Of third order two terms besides x r² and y r², of fourth four besides r⁴, and so on.
+    groups = (
+        [power(0), power(1), power(2), power(3)]
+        if around
+        else [
+            power(0), power(1), power(2), radial(2), radial(3), power(3)[:2], power(4)[:4], radial(4),
+            [*power(5)[:4], *power(6)[:6]],
+        ]
+    )  # fmt: skip
+    columns = np.stack([column for group in groups for column in group], axis=1)
+    powers = page_powers(_CACHED_ORDER)
+    along, across = (
+        np.asarray(np.polynomial.legendre.legvander(axis, _CACHED_ORDER), dtype=np.float64) for axis in (u, v)
+    )
+    basis = np.stack([along[:, i] * across[:, j] for i, j in powers], axis=1)
+    norm = np.sqrt([1 / ((2 * i + 1) * (2 * j + 1)) for i, j in powers])
+    exact = np.asarray(np.linalg.lstsq(basis, columns, rcond=None)[0], dtype=np.float64)
+    orthogonal, triangle = np.linalg.qr(exact * norm[:, None])
+    terms = orthogonal * np.sign(np.diag(triangle)) / norm[:, None]
+    return np.ascontiguousarray(terms), tuple(np.cumsum([len(group) for group in groups]).tolist())
+
+
+def code_powers(degree: int) -> list[tuple[int, int, int]]:
+    """Return the degrees in red, green and blue of each term of a polynomial in codes of total degree `degree`.
+
+    >>> code_powers(1)
+    [(0, 0, 0), (0, 0, 1), (0, 1, 0), (1, 0, 0)]
+    """
+    return [(i, j, k) for i in range(degree + 1) for j in range(degree + 1 - i) for k in range(degree + 1 - i - j)]
+
+
+def code_polynomial(rgb: npt.ArrayLike, degree: int) -> _Array:
+    """Return the basis of printed codes: products of three Legendre polynomials, codes 0 … 255 taken to −1 … 1.
+
+    `rgb`: (C, 3) int printed codes, 0 … 255. `degree`: total degree. Returns (C, terms) float64, terms as in
+    `code_powers`.
+    """
+    unit = 2 * np.asarray(rgb, dtype=np.float64) / 255 - 1
+    axes = [np.asarray(np.polynomial.legendre.legvander(unit[:, axis], degree), dtype=np.float64) for axis in range(3)]
+    return np.stack([axes[0][:, i] * axes[1][:, j] * axes[2][:, k] for i, j, k in code_powers(degree)], axis=-1)
+
+
+@compiled
+def _fill_combinations(basis: _Array, factors: _Array, out: _Array) -> None:
+    """Fill out (3, N) with the sums over k of factors[c, k] · basis[k, n]; basis (K, N), factors (3, K); float64."""
+    out[:] = 0
+    for start in range(0, basis.shape[1], _POINTS_AT_A_TIME):
+        end = min(start + _POINTS_AT_A_TIME, basis.shape[1])
+        for term in range(basis.shape[0]):
+            line = basis[term, start:end]
+            for channel in range(3):
+                factor = factors[channel, term]
+                if factor != 0:
+                    sums = out[channel, start:end]
+                    for point in range(end - start):
+                        sums[point] += factor * line[point]
+
+
+@compiled
+def _weighted_fit(design: _Array, values: _Array, weights: _Array) -> _Array:
+    """Return the x (K,) that minimises Σ w (values − design x)²; design (N, K), values and weights (N,), float64."""
+    gram, solution = _normal_equations(design, values, weights)
+    _solve_positive_definite(gram, solution)
+    return solution
+
+
+@compiled
+def _robust_fit(design: _Array, values: _Array, rounds: int) -> tuple[_Array, _Array, _Array]:
+    """Return solution (K,), weights (N,) and residuals (N,) of a fit that outliers do not move.
+
+    Least squares by the normal equations, reweighted by Tukey's biweight.
+
+    `design`: (N, K) float64, C order. `values`: (N,) float64.
+    """
+    count, unknowns = design.shape
+    weights, residual = np.ones(count), values.copy()
+    solution = np.zeros(unknowns)
+    for _ in range(rounds):
+        solution = _weighted_fit(design, values, weights)
+        for point in range(count):
+            predicted = 0.0
+            for i in range(unknowns):
+                predicted += design[point, i] * solution[i]
+            residual[point] = values[point] - predicted
+        scale = MAD_TO_SIGMA * np.median(np.abs(residual)) + 1e-9
+        for point in range(count):
+            inside = max(1 - (residual[point] / (_CUT * scale)) ** 2, 0.0)
+            weights[point] = inside * inside
+    return solution, weights, residual
+
+
+@compiled
+def _held_out_squares(design: _Array, values: _Array, weights: _Array, counts: npt.NDArray[np.int64]) -> _Array:
+    """Return, for fits by the first counts[m] columns, the weighted mean (M,) of squared errors at points left out.
+
+    Each point as predicted by the fit to all others: its residual over 1 − its leverage (R. D. Cook, S. Weisberg,
+    *Residuals and Influence in Regression*, section 2.2), so that no fit is made twice. Of nested fits the leverages
+    are sums of one row of the design in the coordinates in which the largest fit's normal matrix is 1.
+
+    `design`, `values`, `weights`: (N, K), (N,) and (N,) float64, C order. `counts`: (M,) int64, rising, K at most.
+    """
+    points, unknowns = design.shape
+    gram, right = _normal_equations(design, values, weights)
+    _factorise(gram)
+    _solve_lower(gram, right)
+    squares, row = np.zeros(len(counts)), np.zeros(unknowns)
+    total = 0.0
+    for point in range(points):
+        total += weights[point]
+        if weights[point] == 0:
+            continue
+        leverage, predicted, column = 0.0, 0.0, 0
+        for fit in range(len(counts)):
+            while column < counts[fit]:
+                value = design[point, column]
+                for k in range(column):
+                    value -= gram[column, k] * row[k]
+                value /= gram[column, column]
+                row[column] = value
+                leverage += weights[point] * value * value
+                predicted += value * right[column]
+                column += 1
+            error = (values[point] - predicted) / max(1 - leverage, 1e-3)
+            squares[fit] += weights[point] * error * error
+    return squares / max(total, 1e-300)
+
+
+@compiled
+def _normal_equations(design: _Array, values: _Array, weights: _Array) -> tuple[_Array, _Array]:
+    """Return the lower half of the normal matrix (K, K), its ridge added, and the right side (K,)."""
+    count, unknowns = design.shape
+    gram, right = np.zeros((unknowns, unknowns)), np.zeros(unknowns)
+    for point in range(count):
+        line = design[point]
+        for i in range(unknowns):
+            weighted = weights[point] * line[i]
+            right[i] += weighted * values[point]
+            for j in range(i + 1):
+                gram[i, j] += weighted * line[j]
+    trace = 0.0
+    for i in range(unknowns):
+        trace += gram[i, i]
+    for i in range(unknowns):
+        gram[i, i] += _RIDGE * max(trace / unknowns, 1e-30)
+    return gram, right
+
+
+@compiled
+def _factorise(gram: _Array) -> None:
+    """Replace the lower half of a positive definite matrix by its Cholesky factor."""
+    unknowns = len(gram)
+    for j in range(unknowns):
+        for k in range(j):
+            for i in range(j, unknowns):
+                gram[i, j] -= gram[i, k] * gram[j, k]
+        pivot = np.sqrt(max(gram[j, j], 1e-300))
+        for i in range(j, unknowns):
+            gram[i, j] /= pivot
+
+
+@compiled
+def _solve_lower(factor: _Array, solution: _Array) -> None:
+    """Replace a right side by the solution, given a lower triangle."""
+    for i in range(len(solution)):
+        for k in range(i):
+            solution[i] -= factor[i, k] * solution[k]
+        solution[i] /= factor[i, i]
+
+
+@compiled
+def _solve_positive_definite(gram: _Array, solution: _Array) -> None:
+    """Replace a right side by the solution, given the lower half of a positive definite matrix (Cholesky)."""
+    unknowns = len(solution)
+    _factorise(gram)
+    _solve_lower(gram, solution)
+    for i in range(unknowns - 1, -1, -1):
+        for k in range(i + 1, unknowns):
+            solution[i] -= gram[k, i] * solution[k]
+        solution[i] /= gram[i, i]

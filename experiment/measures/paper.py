@@ -1,12 +1,13 @@
-"""What bare paper shows in a frame: the shape of the light over the print, and the ground truth.
+"""What bare paper shows in a frame: the flat field (the shape of the light over the print) and the ground truth.
 
 - The flat field is fitted to the frame's white references, channel by channel. The ground truth of a light is what is
-  left of them when it is divided out, and comes from the very frame of the light's samples.
+  left of them when it is divided out, and comes from the very frame of the light's samples. The field's mean over the
+  centres of the chart's cells is 1, so that dividing it out leaves the table's mean level as it was.
 - Which terms it has is decided by references held out: each as the fit to all others predicts it, so that a term stays
-  that foretells references which it has not seen, and none that describes their noise. A criterion on the fit's own
+  that forecasts references which it has not seen, and none that describes their noise. A criterion on the fit's own
   residuals (BIC) did worse where it matters: a corner at half of the centre's light is shown by few references, and
   their misfit is outvoted by the price of the terms that it needs.
-- What the terms may be is what lenses and projectors do (`experiment.measures.polynomials.light_terms`).
+- What the terms may be is what lenses and projectors do (`experiment.measures.least_squares.light_terms`).
 - A lens darkens its corners in all channels alike, so that in a frame without a base the channels first have one shape,
   from their sum, and then each its own on it. Other frames have that frame's shape as base, and one too dark to show a
   shape of its own keeps it.
@@ -20,11 +21,23 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from experiment.measures.flat_field import LEAST_FIELD, FlatField
-from experiment.measures.least_squares import held_out_squares, linear_combinations, robust_least_squares
-from experiment.measures.polynomials import light_terms, order_of, page_polynomial, page_powers
+from experiment.measures.least_squares import (
+    held_out_squares,
+    light_terms,
+    linear_combinations,
+    order_of,
+    page_polynomial,
+    page_powers,
+    product,
+    robust_least_squares,
+)
 from foundation.errors import QualityError
 from foundation.robust import sigma_of
+
+LEAST_FIELD = 0.05
+"""Where a polynomial that is extrapolated falls below this share of the mean light, the field is taken to be this:
+samples are divided by it, and no print is lit so unevenly."""
+
 
 MAX_ORDER = 8
 """Highest order of a frame's flat field: light whose corners have 42 to 52 % of the centre's needs the sixth power of
@@ -38,7 +51,7 @@ MIN_REFERENCES = 6
 """White references that a frame must show (judgement): with fewer, their mean has no error that means anything."""
 
 REFERENCES_A_TERM = 3
-"""With fewer references for each term, a fit foretells none of them."""
+"""With fewer references for each term, a fit forecasts none of them."""
 
 JUDGING_A_TERM = 12
 """References for each term of the fit that tells which are covered or dirty: with three, the terms describe a stain of
@@ -71,6 +84,44 @@ _EXACT = 1e-9
 """Coefficients of terms below this are rounding errors of their computation."""
 
 _Array = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class FlatField:
+    """The shape of the light over the print, mean 1 over the cells' centres.
+
+    - `page_mm`: width and height of the page.
+    - `coefficients`: for each channel, the factors whose product the shape is: each (terms,) float64, of some total
+      order.
+    """
+
+    page_mm: tuple[float, float]
+    coefficients: tuple[tuple[_Array, ...], tuple[_Array, ...], tuple[_Array, ...]]
+
+    @classmethod
+    def uniform(cls, page_mm: tuple[float, float]) -> FlatField:
+        """Return the field that is 1 everywhere on a page of that width and height."""
+        return cls(page_mm, ((), (), ()))
+
+    def at(self, points_mm: npt.ArrayLike) -> _Array:
+        """Return the field (N, 3) float64 at points (N, 2) mm, > 0; 1 is its mean over the cells."""
+        points = np.asarray(points_mm, dtype=np.float64).reshape(-1, 2)
+        shape = np.ones((len(points), 3))
+        for channel, factors in enumerate(self.coefficients):
+            for factor in factors:
+                shape[:, channel] *= product(page_polynomial(points, self.page_mm, order_of(len(factor))), factor)
+        return np.maximum(shape, LEAST_FIELD)
+
+    def orders(self) -> tuple[int, ...]:
+        """Return the total order of each channel's last factor, which was fitted on the frame itself."""
+        return tuple(order_of(len(factors[-1])) if factors else 0 for factors in self.coefficients)
+
+    def parameters(self) -> list[list[list[float]]]:
+        """Return the coefficients for `lut.json`: [channel][factor][term], seven significant digits."""
+        return [
+            [[float(f"{value:.7g}") for value in factor.tolist()] for factor in factors]
+            for factors in self.coefficients
+        ]
 
 
 @dataclass(frozen=True)
@@ -234,7 +285,7 @@ def _best_fit(
     judging: int,
     light: _Array | None = None,
 ) -> tuple[_Array, _Array]:
-    """Return solution (terms,) and weights (N,), 0 … 1, of the fit that foretells references best.
+    """Return solution (terms,) and weights (N,), 0 … 1, of the fit that forecasts references best.
 
     `basis`: (N, T) float64, the terms. `known`: (N,) float64, the base's shape. `values`: (N,) float64 counts above
     black. `light`: (N,) float64, relative light by which the references' noise is known; the base's shape if not given.

@@ -5,6 +5,7 @@ Rules that hold inside:
 - A frame counts as taken when its raw file is complete on disk (written, flushed, renamed) *and* its journal row is
   committed, in that order. Whatever a crash leaves between the two is set aside, never counted, never deleted.
 - The journal (`experiment.session.journal`) is the truth; `frames.csv` is derived from it.
+- A raw file may be downloaded in one thread and made whole in another (`IncomingFile`).
 - Nothing here touches a device; readers of a session need nothing else from this package than its folder, plan and
   journal, the chart and the illuminations.
 """
@@ -13,27 +14,42 @@ from __future__ import annotations
 
 import csv
 import io
+import sys
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 from drivers.camera import CapturedFrame
 from drivers.presenter import Colour
 from experiment.chart.model import Chart, load_chart
-from experiment.lights.illuminations import Illumination, load_illuminations, save_illuminations
-from experiment.session.incoming import IncomingFile, ReceivedFile
+from experiment.lights import Illumination, load_illuminations, save_illuminations
 from experiment.session.journal import JOURNAL_FILE, PATIENCE_S, Journal, time_text
-from experiment.session.journal_schema import MOST_BYTES
-from experiment.session.judgement import Judgement
-from experiment.session.mending.retaking import BAD, lights_text, newest_report, parse_lights
-from experiment.session.mending.verification import require_frames_folder, unsound_files
+from experiment.session.journal_file import MOST_BYTES
 from experiment.session.plan import SessionStep
-from experiment.session.records import FrameRecord
-from foundation.errors import FormatError, InputError
-from foundation.files import is_partial, reading_error, require_free, storage_error, whole_folder, write_whole
+from experiment.session.records import FrameRecord, Judgement
+from experiment.session.repair import (
+    BAD,
+    lights_text,
+    newest_report,
+    parse_lights,
+    require_frames_folder,
+    unsound_files,
+)
+from foundation.errors import DeviceError, FormatError, InputError
+from foundation.files import (
+    is_partial,
+    reading_error,
+    require_free,
+    storage_error,
+    whole_file,
+    whole_folder,
+    write_whole,
+)
 from foundation.foreign_folders import require_plain_folder
+from foundation.hashing import stream_sha256
 from foundation.held_folders import held_folder
 
 FRAME_COLUMNS = ("kind", "illumination", "file", "sha256", "taken_at", "exposure_s", "verdict")
@@ -285,6 +301,67 @@ class Session:
                 path.rename(target)
                 moved.append(target)
         return moved
+
+
+@dataclass(frozen=True)
+class ReceivedFile:
+    """A raw file that is complete on the disk, not yet counted."""
+
+    path: Path
+    size: int
+    sha256: str
+    captured: CapturedFrame
+
+
+class _Abandoned(Exception):
+    """Ends a file that is not wanted."""
+
+
+class IncomingFile:
+    """A raw file in the making under a hidden name; gone at the end of a `with` block unless it was completed."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._final = path
+        # A folder that is gone means a disk that was unmounted: what lies under its name is another one.
+        self._file = whole_file(path, lambda: self._final, make=False)
+        self._open = True
+        self.stream: BinaryIO = self._file.__enter__()
+
+    def __enter__(self) -> IncomingFile:
+        return self
+
+    def __exit__(self, kind: Any, error: Any, trace: Any) -> None:
+        if error is None:
+            self.abandon()
+        else:
+            self._leave(kind, error, trace)
+
+    def complete(self, captured: CapturedFrame) -> ReceivedFile:
+        """Check the size, hash, flush and rename the file; from any thread."""
+        try:
+            size = self.stream.seek(0, 2)
+            if size != captured.size or size == 0:
+                raise DeviceError(
+                    f"{captured.name}: the camera says {captured.size} bytes, {size} arrived; the frame is taken again"
+                )
+            self.stream.seek(0)
+            sha256 = stream_sha256(self.stream)
+            self._final = self._path.with_name(self._path.name + Path(captured.name).suffix.lower())
+        except BaseException:
+            self._leave(*sys.exc_info())
+            raise
+        self._leave(None, None, None)
+        return ReceivedFile(self._final, size, sha256, captured)
+
+    def abandon(self) -> None:
+        """Remove the file unless it was completed; a second call does nothing."""
+        self._leave(_Abandoned, _Abandoned(), None)
+
+    def _leave(self, kind: Any, error: Any, trace: Any) -> None:
+        if self._open:
+            self._open = False
+            self._file.__exit__(kind, error, trace)
 
 
 def session_exists(folder: Path) -> bool:

@@ -208,8 +208,8 @@ def signs_of_life(
 
     def waits() -> bool:
         with suppress(CropError):
-            told = newest()
-            return told is not None and told.state != "running"
+            heartbeat = newest()
+            return heartbeat is not None and heartbeat.state != "running"
         return False
 
     def alive() -> None:

@@ -26,7 +26,7 @@ from drivers.presenter import Colour
 from experiment.session.heartbeat import Heartbeat, Process, RunState, SessionPlace
 from experiment.session.journal_file import (
     JOURNAL_VERSION,
-    LockPatience,
+    LockRetry,
     close_after_run,
     create_file,
     open_for_run,
@@ -34,7 +34,6 @@ from experiment.session.journal_file import (
     reading_error,
     writing_error,
 )
-from experiment.session.judgement import AttemptDetails, Check, Judgement
 from experiment.session.plan import KINDS, FrameKind, SessionStep
 from experiment.session.records import (
     ACCEPTED,
@@ -43,7 +42,10 @@ from experiment.session.records import (
     VOIDED,
     AcceptedFile,
     Attempt,
+    AttemptDetails,
+    Check,
     FrameRecord,
+    Judgement,
     SessionEvent,
 )
 from foundation.errors import FormatError, counted
@@ -51,10 +53,10 @@ from foundation.errors import FormatError, counted
 JOURNAL_FILE = "journal.sqlite"
 """Name of the journal in a session's folder."""
 
-AMONG = "IN (SELECT value FROM json_each(?))"
+_AMONG = "IN (SELECT value FROM json_each(?))"
 """Condition on numbers that are given as a JSON list, however many there are."""
 
-PLACE = "place"
+_PLACE = "place"
 """Key of the record that says which folder the signs of life are given for."""
 
 PATIENCE_S = 600.0
@@ -65,22 +67,22 @@ default (`sequence.patience_s`)."""
 class Journal:
     """An open journal; close it after use. Used from one thread.
 
-    `patience`: with which other programs are waited for; None for a reader, for whom SQLite waits.
+    `retry`: with which other programs are waited for; None for a reader, for whom SQLite waits.
     """
 
     def __init__(
-        self, path: Path, connection: sqlite3.Connection, version: int, patience: LockPatience | None = None
+        self, path: Path, connection: sqlite3.Connection, version: int, retry: LockRetry | None = None
     ) -> None:
         self._path = path
         self._connection = connection
         self._version = version
-        self._writes = patience is not None
-        self._patience = patience or LockPatience(path, 0, lambda sentence: None)
+        self._writes = retry is not None
+        self._retry = retry or LockRetry(path, 0, lambda sentence: None)
 
     @staticmethod
     def create(path: Path, steps: Sequence[SessionStep]) -> None:
         """Write a new journal with the plan and nothing else."""
-        alone = LockPatience(path, 0, lambda sentence: None)
+        alone = LockRetry(path, 0, lambda sentence: None)
         with closing(Journal(path, create_file(path), JOURNAL_VERSION, alone)) as journal:
             journal.add_steps(steps)
 
@@ -97,8 +99,8 @@ class Journal:
         announce: Callable[[str], object] = lambda sentence: None,
     ) -> Journal:
         """Open a journal to write it; one of an older version gets what it lacks."""
-        patience = LockPatience(path, patience_s, announce)
-        return cls(path, open_for_run(path, patience), JOURNAL_VERSION, patience)
+        retry = LockRetry(path, patience_s, announce)
+        return cls(path, open_for_run(path, retry), JOURNAL_VERSION, retry)
 
     def close(self) -> None:
         """Release the file; a second call does nothing."""
@@ -107,9 +109,16 @@ class Journal:
         else:
             self._connection.close()
 
-    def be_patient(self, patience_s: float, announce: Callable[[str], object]) -> None:
-        """Change how long a write waits and who is told; see `open_for_run`."""
-        self._patience = LockPatience(self._path, patience_s, announce)
+    def retry_locked(self, patience_s: float, announce: Callable[[str], object]) -> None:
+        """Change how long a write waits for other programs, and who is told that it does; see `open_for_run`."""
+        self._retry = LockRetry(self._path, patience_s, announce)
+
+    @contextmanager
+    def one_moment(self) -> Generator[None]:
+        """Let all that is read inside be of one moment: a verdict is never seen without its checks."""
+        self._rows("BEGIN")
+        yield
+        self._rows("ROLLBACK")
 
     def steps(self) -> tuple[SessionStep, ...]:
         """Return the plan, in taking order."""
@@ -208,7 +217,7 @@ class Journal:
         own, at, place = Process.own(), datetime.now(UTC), SessionPlace.of(self._path)
         with self._writing():
             if place is not None:
-                self._connection.execute("INSERT OR REPLACE INTO records VALUES (?, ?)", (PLACE, place.to_text()))
+                self._connection.execute("INSERT OR REPLACE INTO records VALUES (?, ?)", (_PLACE, place.to_text()))
             self._connection.execute(
                 "INSERT OR REPLACE INTO heartbeat VALUES (1, ?, ?, ?, ?, ?, ?, ?, ?)",
                 (time_text(at), own.pid, own.started, own.host, own.boot, state, sentence, time_text(until)),
@@ -221,7 +230,7 @@ class Journal:
 
     def records(self) -> dict[str, str]:
         """Return what the session was taken with, by key."""
-        return dict(self._newer_rows(f"SELECT key, text FROM records WHERE key <> '{PLACE}' ORDER BY key"))
+        return dict(self._newer_rows(f"SELECT key, text FROM records WHERE key <> '{_PLACE}' ORDER BY key"))
 
     def heartbeat(self) -> Heartbeat | None:
         """Return the newest sign of life; None if none was ever given."""
@@ -229,7 +238,7 @@ class Journal:
         if not rows:
             return None
         at, *process, state, sentence, until = rows[0]
-        said = self._newer_rows(f"SELECT text FROM records WHERE key = '{PLACE}'")
+        said = self._newer_rows(f"SELECT text FROM records WHERE key = '{_PLACE}'")
         place = SessionPlace.from_text(said[0][0]) if said else None
         begun, due = datetime.fromisoformat(at), datetime.fromisoformat(until)
         return Heartbeat(begun, Process(*process), state, sentence, due, place)
@@ -237,29 +246,21 @@ class Journal:
     def attempts(self) -> list[Attempt]:
         """Return every attempt, oldest first."""
         rows = self._rows(
-            "SELECT id, step, kind, illumination, file, started_at, ended_at, verdict, reason, sha256 IS NOT NULL"
+            "SELECT id, step, kind, illumination, file, started_at, ended_at, taken_at, verdict, reason"
             " FROM attempts ORDER BY id"
         )
         return [
             Attempt(
-                row[0],
-                row[1],
-                self._kind(row[2]),
-                row[3],
-                row[4],
-                datetime.fromisoformat(row[5]),
-                datetime.fromisoformat(row[6]) if row[6] else None,
-                row[7],
-                row[8],
-                bool(row[9]),
+                *(number, step, self._kind(kind), light, file),
+                *(datetime.fromisoformat(started_at), _time(ended_at), _time(taken_at), verdict, reason),
             )
-            for row in rows
+            for number, step, kind, light, file, started_at, ended_at, taken_at, verdict, reason in rows
         ]
 
     def events(self) -> list[SessionEvent]:
         """Return every event, oldest first."""
-        rows = self._rows("SELECT at, what, detail FROM events ORDER BY id")
-        return [SessionEvent(datetime.fromisoformat(row[0]), row[1], row[2]) for row in rows]
+        rows = self._rows("SELECT at, what, detail, id FROM events ORDER BY id")
+        return [SessionEvent(datetime.fromisoformat(at), *event) for at, *event in rows]
 
     def details(self, attempts: Sequence[int] | None = None) -> dict[int, AttemptDetails]:
         """Return what is kept of attempts, those of these numbers or all, by number, oldest first; see `begin`.
@@ -268,7 +269,7 @@ class Journal:
         """
         among, numbers = "", tuple[str, ...]()
         if attempts is not None:
-            among, numbers = f"AND attempt {AMONG}", (json.dumps(list(attempts)),)
+            among, numbers = f"AND attempt {_AMONG}", (json.dumps(list(attempts)),)
         seen: dict[int, tuple[float, float, float]] = {
             attempt: (red, green, blue)
             for attempt, red, green, blue in self._newer_rows(
@@ -322,19 +323,14 @@ class Journal:
             "SELECT step, kind, illumination, file, sha256, taken_at, exposure_s, verdict, reason, id FROM attempts"
             " WHERE sha256 IS NOT NULL ORDER BY step, id"
         )
-        newest = {row[0]: row[3] for row in rows if row[7] == ACCEPTED}
+        newest = {step: attempt for step, *_, verdict, _, attempt in rows if verdict == ACCEPTED}
         return [
             FrameRecord(
-                self._kind(row[1]),
-                row[2],
-                row[3],
-                row[4],
-                datetime.fromisoformat(row[5]),
-                row[6],
-                _verdict_text(row[7], row[8], newest.get(row[0], row[3]) == row[3]),
-                row[9],
+                *(self._kind(kind), light, file, sha256, datetime.fromisoformat(taken_at), exposure_s),
+                _verdict_text(verdict, reason, newest.get(step, attempt) == attempt),
+                attempt,
             )
-            for row in rows
+            for step, kind, light, file, sha256, taken_at, exposure_s, verdict, reason, attempt in rows
         ]
 
     def _kind(self, kind: str) -> FrameKind:
@@ -352,7 +348,7 @@ class Journal:
     def _rows(self, query: str, values: tuple[Any, ...] = ()) -> list[Any]:
         """Return all rows at once, so that nothing is held once they are read."""
         try:
-            return self._patience.insist(lambda: self._connection.execute(query, values).fetchall())
+            return self._retry.run(lambda: self._connection.execute(query, values).fetchall())
         except sqlite3.DatabaseError as error:
             raise reading_error(self._path, error) from error
 
@@ -360,9 +356,9 @@ class Journal:
     def _writing(self) -> Generator[None]:
         """Make what is written inside one transaction, which is on the disk when the block ends."""
         try:
-            self._patience.insist(lambda: self._connection.execute("BEGIN IMMEDIATE"))
+            self._retry.run(lambda: self._connection.execute("BEGIN IMMEDIATE"))
             yield
-            self._patience.insist(lambda: self._connection.execute("COMMIT"))
+            self._retry.run(lambda: self._connection.execute("COMMIT"))
         except sqlite3.DatabaseError as error:
             raise writing_error(self._path, error) from error
         finally:
@@ -374,6 +370,10 @@ class Journal:
 def time_text(at: datetime) -> str:
     """Return a time as journal and `frames.csv` have it: ISO 8601 with microseconds and zone."""
     return at.isoformat(timespec="microseconds")
+
+
+def _time(text: str | None) -> datetime | None:
+    return datetime.fromisoformat(text) if text else None
 
 
 def _verdict_text(verdict: str, reason: str, newest: bool) -> str:

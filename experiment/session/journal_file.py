@@ -1,4 +1,4 @@
-"""The file of a session's journal: its tables, and how it is opened, so that readers and the run never stop each other.
+"""The file of a session's journal: its tables, what may stand in them, and how it is opened by a run and its readers.
 
 Rules that hold inside:
 
@@ -7,6 +7,9 @@ Rules that hold inside:
 - A reader creates, migrates and changes nothing. What cannot be read in place without doing so (a journal copied with
   its `-wal`, one in a folder that cannot be written) is read from a copy in memory.
 - Where write-ahead mode does not work (file systems of a network share no memory) the journal stays in the older mode.
+- A session may be a stranger's, and an SQLite file can hold more than rows: views that never end, triggers that delete,
+  columns that are computed, text where a number is meant, names of files outside. All that is refused when the journal
+  is opened, so that nothing behind this has to expect it.
 
 Sources: sqlite.org/wal.html, in particular "Read-Only Databases" and "Disadvantages"; sqlite.org/lockingv3.html.
 """
@@ -24,14 +27,13 @@ import time
 from collections.abc import Callable
 from contextlib import closing, suppress
 from pathlib import Path
-from typing import TypeVar
+from typing import Final, TypeVar
 from urllib.parse import quote
 
-from experiment.session.journal_schema import MOST_BYTES, limit_values, require_plain_schema, require_sound_rows
 from foundation.errors import FormatError, InputError, StorageError
 from foundation.files import disk_remedy_of, partial_path, storage_error, sync_folder
 from foundation.files import reading_error as file_reading_error
-from foundation.foreign_folders import require_plain_folder
+from foundation.foreign_folders import is_inside_name, require_plain_folder
 
 _T = TypeVar("_T")
 _log = logging.getLogger(__name__)
@@ -48,6 +50,12 @@ TRY_S = 1.0
 READING_LIMIT_S = 10.0
 """How long a reader waits where the journal is not in write-ahead mode: a commit takes milliseconds, a disk may stall
 for seconds."""
+
+MOST_VALUE_BYTES: Final = 64 << 20
+"""Longest text, blob or row that SQLite makes of a journal: what the judge keeps of a frame is some 100 kilobytes."""
+
+MOST_BYTES: Final = {"chart.json": 256 << 20, "illuminations.csv": 16 << 20, "session.toml": 1 << 20}
+"""Largest sizes of what is read whole beside a journal: forty times those of 707 lights and 32 768 colours."""
 
 _VERSION_1 = """
 CREATE TABLE attempts (
@@ -92,9 +100,6 @@ CREATE TABLE IF NOT EXISTS heartbeat (
 CREATE TABLE IF NOT EXISTS records (key TEXT PRIMARY KEY, text TEXT NOT NULL);
 """
 
-_TABLES = {1: {"attempts", "plan", "events"}}
-_TABLES[2] = _TABLES[1] | {"checks", "measurements", "timings", "heartbeat", "records"}
-
 _CANNOT_IN_PLACE = {sqlite3.SQLITE_CANTOPEN, sqlite3.SQLITE_READONLY}
 """What SQLite answers where it would have to write in order to read."""
 
@@ -115,7 +120,7 @@ class HeldJournalError(StorageError):
     """Another program held the journal for as long as a write waits: waiting once more would only double that."""
 
 
-class LockPatience:
+class LockRetry:
     """Waits while another program holds the journal."""
 
     def __init__(self, path: Path, seconds: float, announce: Callable[[str], object]) -> None:
@@ -123,18 +128,18 @@ class LockPatience:
         self._seconds = seconds
         self._announce = announce
 
-    def insist(self, attempt: Callable[[], _T]) -> _T:
+    def run(self, attempt: Callable[[], _T]) -> _T:
         """Return what `attempt` returns, after trying it again while another program holds the journal."""
-        begun, told = time.monotonic(), False
+        begun, announced = time.monotonic(), False
         while True:
             try:
                 return attempt()
             except sqlite3.OperationalError as error:
                 if not is_busy(error) or time.monotonic() - begun >= self._seconds:
                     raise
-                if not told:
+                if not announced:
                     self._announce(f"another program holds {self._path}; the run goes on when it has finished")
-                    told = True
+                    announced = True
 
 
 def is_busy(error: sqlite3.DatabaseError) -> bool:
@@ -166,24 +171,24 @@ def open_to_read(path: Path) -> tuple[sqlite3.Connection, int]:
         raise reading_error(path, error) from error
 
 
-def open_for_run(path: Path, patience: LockPatience) -> sqlite3.Connection:
+def open_for_run(path: Path, retry: LockRetry) -> sqlite3.Connection:
     """Return a connection that writes, after bringing the journal up to this version and into write-ahead mode.
 
     The caller holds the session's folder, so that no other run is at work. Who else writes is waited for.
     """
     require_plain_folder(path.parent, MOST_BYTES)
     try:
-        connection = patience.insist(lambda: _connect(path, "rw"))
-        version = patience.insist(lambda: _checked(path, connection))
+        connection = retry.run(lambda: _connect(path, "rw"))
+        version = retry.run(lambda: _checked(path, connection))
     except (OSError, sqlite3.DatabaseError) as error:
         raise reading_error(path, error) from error
     try:
         with suppress(OSError):  # Left by a run that was killed while it made a copy.
             partial_path(path).unlink(missing_ok=True)
         if not _on_network(path):
-            connection = _in_write_ahead(path, connection, patience)
+            connection = _in_write_ahead(path, connection, retry)
         if version < JOURNAL_VERSION:
-            patience.insist(lambda: _execute_all(connection, _VERSION_2, JOURNAL_VERSION))
+            retry.run(lambda: _execute_all(connection, _VERSION_2, JOURNAL_VERSION))
     except OSError as error:
         connection.close()
         raise storage_error(path, error) from error
@@ -201,86 +206,6 @@ def close_after_run(connection: sqlite3.Connection) -> None:
         pass  # Somebody reads it, the disk is gone, or it is closed: the next run or reader copes with what is there.
     finally:
         connection.close()
-
-
-def reading_error(path: Path, error: OSError | sqlite3.DatabaseError) -> FormatError | StorageError:
-    """Return why a journal cannot be read, and what helps.
-
-    SQLite calls a file damaged whose disk does not read it, and a copy must not take the place of a sound journal: so
-    the disk is tried, and the file checked again.
-    """
-    if isinstance(error, OSError):
-        return file_reading_error(path, error, "check its permissions")
-    if is_busy(error):
-        return FormatError(f"cannot read {path}: {error}; see that no other program holds it")
-    code = _primary_code(error)
-    fault = _disk_fault(path)
-    # Where permissions are in the way, the disk is not.
-    openable = os.access(path, os.R_OK) or (fault is not None and disk_remedy_of(fault) is not None)
-    failed = code == sqlite3.SQLITE_IOERR or (code == sqlite3.SQLITE_CANTOPEN and openable)
-    if fault is not None and (failed or fault.errno not in _READABLE_FAULTS):
-        return file_reading_error(path, fault, "check the permissions of its folder")
-    if failed or (_is_damage(error) and _is_sound(path)):
-        return StorageError(
-            f"cannot read {path}: {error}, and its disk did not say why; check the disk and its cable, then run the "
-            "same command again"
-        )
-    if not _is_damage(error):
-        return FormatError(f"cannot read {path}: {error}; check its permissions and the disk")
-    return FormatError(f"{path} is damaged: {error}; restore it from a copy")
-
-
-def writing_error(path: Path, error: sqlite3.DatabaseError) -> FormatError | InputError | StorageError:
-    """Return why a journal cannot be written, and what helps; the disk itself is asked what ails it."""
-    if is_busy(error):
-        return HeldJournalError(
-            f"cannot write {path}: {error}; end the other program that holds the session, then run the same command "
-            "again"
-        )
-    if (fault := _disk_fault(path)) is not None:
-        return storage_error(path, fault)
-    if _primary_code(error) == sqlite3.SQLITE_FULL:
-        remedy = "free space"
-    elif _primary_code(error) in (sqlite3.SQLITE_READONLY, sqlite3.SQLITE_PERM, sqlite3.SQLITE_CANTOPEN):
-        remedy = "see that the folder may be written and the disk is there"
-    elif _is_damage(error) and not _is_sound(path):
-        return FormatError(f"{path} is damaged: {error}; restore it from a copy")
-    else:
-        remedy = "check the disk and its cable"
-    return StorageError(f"cannot write {path}: {error}; {remedy}, then run the same command again")
-
-
-def _disk_fault(path: Path) -> OSError | None:
-    """Return what the disk answers when something is written beside the journal; None if it does not mind."""
-    try:
-        # Without a name, so that nothing is left behind.
-        with tempfile.TemporaryFile(dir=path.parent, buffering=0) as stream:
-            stream.write(bytes(_PROBE_BYTES))
-            os.fsync(stream.fileno())
-    except OSError as error:
-        return error
-    return None
-
-
-def _is_damage(error: sqlite3.DatabaseError) -> bool:
-    return _primary_code(error) in (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB)
-
-
-def _is_sound(path: Path) -> bool:
-    """Return whether a journal that was called damaged is whole, read once more."""
-    try:
-        with closing(_connect(path, "ro")) as connection:
-            return connection.execute("PRAGMA quick_check(1)").fetchall() == [("ok",)]
-    except sqlite3.DatabaseError:
-        return False
-
-
-def _primary_code(error: sqlite3.DatabaseError) -> int:
-    return getattr(error, "sqlite_errorcode", 0) & 0xFF
-
-
-def _beside(path: Path, suffix: str) -> Path:
-    return path.with_name(path.name + suffix)
 
 
 def _connect(path: Path, mode: str) -> sqlite3.Connection:
@@ -363,44 +288,7 @@ def _is_write_ahead(path: Path) -> bool:
         return stream.read(20)[18:] == b"\x02\x02"
 
 
-def _checked(path: Path, connection: sqlite3.Connection) -> int:
-    """Return the journal's version; close the connection and refuse what is not known or lacks a table."""
-    try:
-        limit_values(connection)
-        require_plain_schema(path, connection)
-        version = connection.execute("PRAGMA user_version").fetchone()[0]
-        tables = {name for (name,) in connection.execute("SELECT name FROM sqlite_master WHERE type = 'table'")}
-        if version not in READABLE:
-            raise FormatError(
-                f"{path} is of version {version}, this software reads {READABLE[0]} and {READABLE[-1]}; "
-                "use the software that wrote it"
-            )
-        if lacking := _TABLES[version] - tables:
-            raise FormatError(
-                f"{path} is damaged: it lacks its table {' and '.join(sorted(lacking))}; restore it from a copy"
-            )
-        require_sound_rows(path, connection, version)
-    except BaseException:
-        connection.close()
-        raise
-    return version
-
-
-def _execute_all(connection: sqlite3.Connection, statements: str, version: int) -> None:
-    """Execute statements and set the version, all or nothing."""
-    connection.execute("BEGIN IMMEDIATE")
-    try:
-        for statement in statements.split(";"):
-            connection.execute(statement)
-        connection.execute(f"PRAGMA user_version = {version}")
-        connection.execute("COMMIT")
-    except BaseException:
-        if connection.in_transaction:
-            connection.execute("ROLLBACK")
-        raise
-
-
-def _in_write_ahead(path: Path, connection: sqlite3.Connection, patience: LockPatience) -> sqlite3.Connection:
+def _in_write_ahead(path: Path, connection: sqlite3.Connection, retry: LockRetry) -> sqlite3.Connection:
     """Return a connection in write-ahead mode, where the file system allows it.
 
     The mode cannot be changed while somebody reads. A reader who will not end keeps the file that he has, under no
@@ -413,7 +301,7 @@ def _in_write_ahead(path: Path, connection: sqlite3.Connection, patience: LockPa
             raise
         copy = partial_path(path)
         # No other writer may be at work meanwhile.
-        patience.insist(lambda: connection.execute("BEGIN IMMEDIATE"))
+        retry.run(lambda: connection.execute("BEGIN IMMEDIATE"))
         with closing(_connect(path, "ro")) as source, closing(_connect(copy, "rwc")) as target:
             source.backup(target)
         connection.execute("ROLLBACK")
@@ -440,3 +328,243 @@ def file_system_of(path: Path) -> str:
     place = path.resolve()
     holding = [(len(at), kind) for _, at, kind, *_ in mounts if place.is_relative_to(at.replace("\\040", " "))]
     return max(holding, default=(0, ""))[1]
+
+
+def _beside(path: Path, suffix: str) -> Path:
+    return path.with_name(path.name + suffix)
+
+
+def _execute_all(connection: sqlite3.Connection, statements: str, version: int) -> None:
+    """Execute statements and set the version, all or nothing."""
+    connection.execute("BEGIN IMMEDIATE")
+    try:
+        for statement in statements.split(";"):
+            connection.execute(statement)
+        connection.execute(f"PRAGMA user_version = {version}")
+        connection.execute("COMMIT")
+    except BaseException:
+        if connection.in_transaction:
+            connection.execute("ROLLBACK")
+        raise
+
+
+def _checked(path: Path, connection: sqlite3.Connection) -> int:
+    """Return the journal's version; close the connection and refuse what is not known or lacks a table."""
+    try:
+        # Bounds what SQLite makes of a stranger's file, and lets nothing in its schema do more than hold rows.
+        connection.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, MOST_VALUE_BYTES)
+        connection.execute("PRAGMA trusted_schema = OFF")
+        _require_plain_schema(path, connection)
+        version = connection.execute("PRAGMA user_version").fetchone()[0]
+        tables = {name for (name,) in connection.execute("SELECT name FROM sqlite_master WHERE type = 'table'")}
+        if version not in READABLE:
+            raise FormatError(
+                f"{path} is of version {version}, this software reads {READABLE[0]} and {READABLE[-1]}; "
+                "use the software that wrote it"
+            )
+        if lacking := set(_tables_of(version)) - tables:
+            raise FormatError(
+                f"{path} is damaged: it lacks its table {' and '.join(sorted(lacking))}; restore it from a copy"
+            )
+        require_sound_rows(path, connection, version)
+    except BaseException:
+        connection.close()
+        raise
+    return version
+
+
+def reading_error(path: Path, error: OSError | sqlite3.DatabaseError) -> FormatError | StorageError:
+    """Return why a journal cannot be read, and what helps.
+
+    SQLite calls a file damaged whose disk does not read it, and a copy must not take the place of a sound journal: so
+    the disk is tried, and the file checked again.
+    """
+    if isinstance(error, OSError):
+        return file_reading_error(path, error, "check its permissions")
+    if is_busy(error):
+        return FormatError(f"cannot read {path}: {error}; see that no other program holds it")
+    code = _primary_code(error)
+    fault = _disk_fault(path)
+    # Where permissions are in the way, the disk is not.
+    openable = os.access(path, os.R_OK) or (fault is not None and disk_remedy_of(fault) is not None)
+    failed = code == sqlite3.SQLITE_IOERR or (code == sqlite3.SQLITE_CANTOPEN and openable)
+    if fault is not None and (failed or fault.errno not in _READABLE_FAULTS):
+        return file_reading_error(path, fault, "check the permissions of its folder")
+    if failed or (_is_damage(error) and _is_sound(path)):
+        return StorageError(
+            f"cannot read {path}: {error}, and its disk did not say why; check the disk and its cable, then run the "
+            "same command again"
+        )
+    if not _is_damage(error):
+        return FormatError(f"cannot read {path}: {error}; check its permissions and the disk")
+    return FormatError(f"{path} is damaged: {error}; restore it from a copy")
+
+
+def writing_error(path: Path, error: sqlite3.DatabaseError) -> FormatError | InputError | StorageError:
+    """Return why a journal cannot be written, and what helps; the disk itself is asked what ails it."""
+    if is_busy(error):
+        return HeldJournalError(
+            f"cannot write {path}: {error}; end the other program that holds the session, then run the same command "
+            "again"
+        )
+    if (fault := _disk_fault(path)) is not None:
+        return storage_error(path, fault)
+    if _primary_code(error) == sqlite3.SQLITE_FULL:
+        remedy = "free space"
+    elif _primary_code(error) in (sqlite3.SQLITE_READONLY, sqlite3.SQLITE_PERM, sqlite3.SQLITE_CANTOPEN):
+        remedy = "see that the folder may be written and the disk is there"
+    elif _is_damage(error) and not _is_sound(path):
+        return FormatError(f"{path} is damaged: {error}; restore it from a copy")
+    else:
+        remedy = "check the disk and its cable"
+    return StorageError(f"cannot write {path}: {error}; {remedy}, then run the same command again")
+
+
+def _disk_fault(path: Path) -> OSError | None:
+    """Return what the disk answers when something is written beside the journal; None if it does not mind."""
+    try:
+        # Without a name, so that nothing is left behind.
+        with tempfile.TemporaryFile(dir=path.parent, buffering=0) as stream:
+            stream.write(bytes(_PROBE_BYTES))
+            os.fsync(stream.fileno())
+    except OSError as error:
+        return error
+    return None
+
+
+def _is_damage(error: sqlite3.DatabaseError) -> bool:
+    return _primary_code(error) in (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB)
+
+
+def _is_sound(path: Path) -> bool:
+    """Return whether a journal that was called damaged is whole, read once more."""
+    try:
+        with closing(_connect(path, "ro")) as connection:
+            return connection.execute("PRAGMA quick_check(1)").fetchall() == [("ok",)]
+    except sqlite3.DatabaseError:
+        return False
+
+
+def _primary_code(error: sqlite3.DatabaseError) -> int:
+    return getattr(error, "sqlite_errorcode", 0) & 0xFF
+
+
+_DAMAGED: Final = "it is damaged, or not to be trusted; restore it from a copy"
+
+_WHOLE = "typeof({0}) = 'integer' AND {0} BETWEEN 0 AND 1000000000"
+_MAYBE_WHOLE = "({0} IS NULL OR " + _WHOLE + ")"
+_CODE = "typeof({0}) = 'integer' AND {0} BETWEEN 0 AND 255"
+_SIZE = "({0} IS NULL OR (typeof({0}) = 'integer' AND {0} >= 0))"
+_TEXT = "typeof({0}) = 'text' AND length({0}) < 100000"
+_MAYBE_TEXT = "({0} IS NULL OR " + _TEXT + ")"
+_REAL = "typeof({0}) IN ('real', 'integer') AND abs({0}) < 9e300"
+_MAYBE_REAL = "({0} IS NULL OR typeof({0}) IN ('real', 'integer'))"
+_MOMENT = "[0-9][0-9][0-9][0-9]-[01][0-9]-[0-3][0-9]T[0-2][0-9]:[0-5][0-9]:[0-5][0-9]"
+_ZONE = "[+-][0-9][0-9]:[0-9][0-9]"
+_FORMS = f"{{0}} GLOB '{_MOMENT}.{6 * '[0-9]'}{_ZONE}' OR {{0}} GLOB '{_MOMENT}{_ZONE}'"
+# SQLite ends a text at a zero byte, takes 30 February for 2 March, and knows the zones that there are.
+_TIME = (
+    f"typeof({{0}}) = 'text' AND ({_FORMS}) AND length(CAST({{0}} AS BLOB)) = length({{0}}) "
+    "AND {0} BETWEEN '1970' AND '9999' AND datetime({0}) IS NOT NULL "
+    "AND strftime('%Y-%m-%dT%H:%M:%S', substr({0}, 1, 19), '+0 seconds') = substr({0}, 1, 19)"
+)
+_MAYBE_TIME = "({0} IS NULL OR {0} = '' OR (" + _TIME + "))"
+_SHA256 = "({0} IS NULL OR (typeof({0}) = 'text' AND length({0}) <= 64 AND {0} NOT GLOB '*[^0-9a-f]*'))"
+
+_COLUMNS: Final = {
+    "plan": {
+        "step": _WHOLE,
+        "kind": _TEXT,
+        "illumination": _MAYBE_WHOLE,
+        "red": _CODE,
+        "green": _CODE,
+        "blue": _CODE,
+    },
+    "attempts": {
+        "id": _WHOLE,
+        "step": _WHOLE,
+        "kind": _TEXT,
+        "illumination": _MAYBE_WHOLE,
+        "file": _TEXT,
+        "started_at": _TIME,
+        "ended_at": _MAYBE_TIME,
+        "taken_at": _MAYBE_TIME,
+        "exposure_s": _MAYBE_REAL,
+        "size": _SIZE,
+        "sha256": _SHA256,
+        "verdict": _MAYBE_TEXT,
+        "reason": _TEXT,
+    },
+    "events": {"id": _WHOLE, "at": _TIME, "what": _TEXT, "detail": _TEXT},
+    "checks": {
+        "attempt": _WHOLE,
+        "position": _WHOLE,
+        "name": _TEXT,
+        "value": _MAYBE_REAL,
+        "low": _MAYBE_REAL,
+        "high": _MAYBE_REAL,
+        "unit": _TEXT,
+        "reason": _TEXT,
+    },
+    "measurements": {
+        "attempt": _WHOLE,
+        "red": _MAYBE_REAL,
+        "green": _MAYBE_REAL,
+        "blue": _MAYBE_REAL,
+        "data": "typeof({0}) = 'blob'",
+        "voids": _WHOLE,
+        "lasting": _WHOLE,
+    },
+    "timings": {"attempt": _WHOLE, "name": _TEXT, "seconds": _REAL},
+    "heartbeat": {
+        "id": _WHOLE,
+        "at": _TIME,
+        "pid": "typeof({0}) = 'integer'",
+        "started": _TEXT,
+        "host": _TEXT,
+        "boot": _TEXT,
+        "state": _TEXT,
+        "sentence": _TEXT,
+        "until": _TIME,
+    },
+    "records": {"key": _TEXT, "text": _TEXT},
+}
+"""What a row must fulfil, by table (those of version 1 first) and column; times as `datetime.fromisoformat` reads
+them."""
+
+_TOGETHER: Final = {
+    # A frame that has a hash was taken at a time with an exposure (0 where nobody knows), and has a verdict.
+    "attempts": "(sha256 IS NULL OR (taken_at <> '' AND exposure_s BETWEEN 0 AND 1e9 AND size IS NOT NULL "
+    "AND verdict IS NOT NULL))",
+    "measurements": "(red IS NULL OR (green IS NOT NULL AND blue IS NOT NULL))",
+}
+
+
+def _tables_of(version: int) -> list[str]:
+    return list(_COLUMNS)[: 3 if version == 1 else None]
+
+
+def _require_plain_schema(path: Path, connection: sqlite3.Connection) -> None:
+    """Refuse a journal with views, triggers, virtual tables or computed columns; a FormatError names it."""
+    for kind, name, sql in connection.execute("SELECT type, name, sql FROM sqlite_master").fetchall():
+        plain = kind == "table" and not str(sql or "").lstrip().upper().startswith("CREATE VIRTUAL")
+        # SQLite makes an index of each primary key, without a text.
+        if not (plain or (kind == "index" and sql is None)):
+            raise FormatError(f"{path} holds the {kind} {str(name)[:80]!r}, which no journal has; {_DAMAGED}")
+
+
+def require_sound_rows(path: Path, connection: sqlite3.Connection, version: int) -> None:
+    """Refuse a journal with values that no run writes; costs milliseconds."""
+    for table in _tables_of(version):
+        columns = {row[1]: row[6] for row in connection.execute(f"PRAGMA table_xinfo({table})")}
+        lacking = _COLUMNS[table].keys() - columns.keys()
+        if lacking or any(columns.values()):
+            raise FormatError(f"{path}: the columns of {table} are not those of a journal; {_DAMAGED}")
+        sound = " AND ".join([f"({form.format(column)})" for column, form in _COLUMNS[table].items()])
+        together = _TOGETHER.get(table, "1")
+        query = f"SELECT COUNT(*) FROM {table} WHERE ({sound} AND {together}) IS NOT TRUE"
+        if found := connection.execute(query).fetchone()[0]:
+            raise FormatError(f"{path}: {found} rows of {table} hold values that no run writes; {_DAMAGED}")
+    for (file,) in connection.execute("SELECT DISTINCT file FROM attempts"):
+        if not is_inside_name(file):
+            raise FormatError(f"{path} names the file {file[:200]!r}, which is none of the session; {_DAMAGED}")

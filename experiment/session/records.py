@@ -1,16 +1,22 @@
-"""The rows of a session's journal as values: frames that count, attempts, events, and the words of verdicts.
+"""What a session's journal keeps, as values: attempts, frames that count, events, and what is said of a frame.
 
-And where the preview is that belongs to a row.
+A `Judgement` holds the things looked at, each with its number, its limits and its reason, and what follows. What is
+measured, and by which limits, is the affair of whoever judges (`FrameJudge`); the journal keeps a judgement whole, so
+that every refusal can be read again with its numbers, and so that a run that is taken up again knows what the frames
+before looked like. From the attempts follows how long a session will still take.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import dataclass
+import statistics
+from collections import deque
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
 from datetime import datetime
 from pathlib import Path
+from typing import Protocol, runtime_checkable
 
-from experiment.session.plan import FrameKind
+from experiment.session.plan import FrameKind, SessionStep
 
 ACCEPTED = "accepted"
 """Verdict of a frame that may be used."""
@@ -23,6 +29,147 @@ FAILED = "failed"
 
 VOIDED = "voided"
 """Verdict of a frame that was accepted and must not be used: what was found out later says why."""
+
+
+RECENT = 50
+"""Attempts by which the time left is told: enough that retakes and references do not sway their median, few enough to
+follow a change of the settings."""
+
+
+@dataclass(frozen=True)
+class Check:
+    """One thing looked at in a frame.
+
+    - `name`: what was looked at: "exposure", "light", "movement", "dark", "file", "screen" and so on.
+    - `value`: what was found, in `unit`; None if it cannot be told in a number.
+    - `low`, `high`: limits of `value`; None where that side is open.
+    - `unit`: "%", "px", "DN"; empty for a pure number.
+    - `reason`: empty if the frame passed. Else the cause and its remedy, one sentence.
+    """
+
+    name: str
+    value: float | None = None
+    low: float | None = None
+    high: float | None = None
+    unit: str = ""
+    reason: str = ""
+
+    @property
+    def passed(self) -> bool:
+        """Whether nothing is wrong."""
+        return not self.reason
+
+    @property
+    def is_beyond(self) -> bool:
+        """Whether the value lies outside its limits: it may follow from another check's cause, or be followed."""
+        if self.value is None:
+            return False
+        return (self.low is not None and self.value < self.low) or (self.high is not None and self.value > self.high)
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """What is said of one frame.
+
+    - `checks`: everything that was looked at, in the order in which causes are to be named.
+    - `seen`: camera RGB of the paper above black, counts; None if it was not measured.
+    - `measurement`: what the judge needs of this frame later, opaque to all others.
+    - `preview`: the frame as JPEG for the eye; empty if there is none.
+    - `voids`: what was taken before cannot be trusted: of a refused reference all since the last good one, of another
+      refused frame all since the run began, or since its last pause for something lasting.
+    - `lasting`: taking the frame again will not help before somebody has removed the cause.
+    """
+
+    checks: tuple[Check, ...]
+    seen: tuple[float, float, float] | None = None
+    measurement: bytes = b""
+    preview: bytes = b""
+    voids: bool = False
+    lasting: bool = False
+
+    @classmethod
+    def of_reason(cls, name: str, reason: str | None) -> Judgement:
+        """Return the judgement of a single check without a number; the frame is accepted if the reason is None."""
+        return cls((Check(name, reason=reason or ""),))
+
+    @property
+    def accepted(self) -> bool:
+        """Whether the frame may be used: no check has a reason against it."""
+        return all(check.passed for check in self.checks)
+
+    @property
+    def reason(self) -> str:
+        """The first reason against the frame; empty if it is accepted."""
+        return next((check.reason for check in self.checks if check.reason), "")
+
+
+class FrameJudge(Protocol):
+    """Judges the frames of a session as they are taken.
+
+    Both methods are called from one thread, never two at once, and in the order in which the frames were taken.
+    """
+
+    def judge(self, file: Path, step: SessionStep) -> Judgement:
+        """Return what is said of a raw file that is complete on the disk."""
+        ...
+
+    def recall(self, step: SessionStep, measurement: bytes, accepted: bool) -> None:
+        """Take in a frame of an earlier run: the `measurement` of its judgement, and whether it still counts.
+
+        Called for all of them before the first frame is judged.
+        """
+        ...
+
+
+@runtime_checkable
+class OutlastsPauses(Protocol):
+    """A judge that takes pauses of a run into account."""
+
+    def after_pause(self) -> None:
+        """Take in that the run paused for something lasting, and that what is judged next links it to what was before.
+
+        Called when everything that was taken before is judged, and when nothing is being judged.
+        """
+        ...
+
+
+@dataclass(frozen=True)
+class Attempt:
+    """One try at a step as the journal has it.
+
+    Times are those of the lab's clock, None where it has not come so far. The verdict is None while it is under way, or
+    if it was cut off.
+    """
+
+    id: int
+    step: int
+    kind: FrameKind
+    illumination: int | None
+    file: str
+    started_at: datetime
+    ended_at: datetime | None
+    taken_at: datetime | None
+    verdict: str | None
+    reason: str
+
+    @property
+    def has_frame(self) -> bool:
+        """Whether a raw file came of it; the name of one that failed may be that of the next try."""
+        return self.taken_at is not None
+
+
+@dataclass(frozen=True)
+class AttemptDetails:
+    """What a journal keeps of an attempt beside its row.
+
+    - `seen`: camera RGB of the paper above black, counts; None if it was not measured.
+    - `checks`: what was looked at, in the judge's order.
+    - `timings`: seconds of each part of it, by name.
+    """
+
+    seen: tuple[float, float, float] | None = None
+    checks: tuple[Check, ...] = ()
+    timings: Mapping[str, float] = field(default_factory=dict[str, float])
 
 
 @dataclass(frozen=True)
@@ -62,22 +209,13 @@ class AcceptedFile:
 
 
 @dataclass(frozen=True)
-class Attempt:
-    """One try at a step as the journal has it.
+class SessionEvent:
+    """What happened at some time that is no frame: start, stop, warm-up, a device's fault."""
 
-    `verdict` is None while it is under way, or if it was cut off; `has_frame` is whether a raw file came of it.
-    """
-
-    id: int
-    step: int
-    kind: FrameKind
-    illumination: int | None
-    file: str
-    started_at: datetime
-    ended_at: datetime | None
-    verdict: str | None
-    reason: str
-    has_frame: bool
+    at: datetime
+    what: str
+    detail: str
+    number: int
 
 
 def last_moment(attempts: Iterable[Attempt]) -> datetime | None:
@@ -86,18 +224,52 @@ def last_moment(attempts: Iterable[Attempt]) -> datetime | None:
     return max(ends, default=None)
 
 
-@dataclass(frozen=True)
-class SessionEvent:
-    """What happened at some time that is no frame: start, stop, warm-up, a device's fault."""
-
-    at: datetime
-    what: str
-    detail: str
-
-
 def preview_path(folder: Path, file: str) -> Path:
     """Return where the preview of a raw file is, if there is one; `folder` is the session, `file` as in the journal.
 
     Only the name of `file` counts, so that no row of a journal leads out of `previews/`.
     """
     return folder / "previews" / f"{Path(file).stem}.jpg"
+
+
+@dataclass(frozen=True)
+class TimedAttempt:
+    """How long after the one before an attempt came, seconds, None behind a pause; and whether it gave its frame."""
+
+    seconds: float | None
+    gained: bool
+
+
+def time_left(attempts: Iterable[TimedAttempt], left: int) -> float | None:
+    """Return how long the frames that are left will take, seconds; None while that is unknown.
+
+    Each frame costs as many attempts as frames have cost lately, retakes and references included; each attempt the
+    median interval, so that a pause does not count for ever.
+
+    `attempts`: those that are judged, oldest first; the newest `RECENT` count.
+
+    Examples
+    --------
+    >>> night = [TimedAttempt(seconds, gained=seconds != 7) for seconds in (None, 5, 300, 5, 7, 7)]
+    >>> time_left(night, left=10)
+    105.0
+    """
+    if not left:
+        return 0.0
+    recent = deque(attempts, RECENT)
+    intervals = [attempt.seconds for attempt in recent if attempt.seconds is not None]
+    gained = sum(attempt.gained for attempt in recent)
+    if not intervals or not gained:
+        return None
+    return statistics.median(intervals) * len(recent) / gained * left
+
+
+def duration_text(seconds: float | None) -> str:
+    """Return seconds as ``2 h 05 min``, ``3 min 20 s`` or ``45 s``; ``unknown`` for None."""
+    if seconds is None:
+        return "unknown"
+    minutes, rest = divmod(round(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    if hours:
+        return f"{hours} h {minutes:02d} min"
+    return f"{minutes} min {rest:02d} s" if minutes else f"{rest} s"

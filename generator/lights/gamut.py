@@ -236,7 +236,7 @@ def black_body(lut: Lut, cct_k: float) -> Mixture:
     """Return the light of a black body between those of the table: its two neighbours, in proportion by mired.
 
     The temperature says what was asked of the projector, which shows three primaries in the proportion that looks, to
-    the CIE 1931 standard observer, like the black body (`experiment.lights.illuminations.blackbody_light`). The camera
+    the CIE 1931 standard observer, like the black body (`experiment.lights.blackbody_light`). The camera
     is not that observer: its white under this light is what the ground truth says, and not what the black body's own
     spectrum would give. So a temperature names one of the table's lights, or one between, and is no measurement by the
     camera.

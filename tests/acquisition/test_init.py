@@ -9,7 +9,7 @@ import pytest
 from acquisition.cli import main
 from experiment.chart.layout import design_chart
 from experiment.config import load_lab
-from experiment.lights.illuminations import load_illuminations, plan_illuminations, save_illuminations
+from experiment.lights import load_illuminations, plan_illuminations, save_illuminations
 
 
 def begun(folder: Path) -> Path:

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from acquisition.cli import main
-from experiment.session.judgement import Check
+from experiment.session.records import Check
 from tests.acquisition.monitor.made_up import MadeUpRun
 
 ENDED = """

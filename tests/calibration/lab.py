@@ -19,7 +19,7 @@ from drivers.raw.rawfile import Mosaic, read_raw
 from experiment.chart.layout import A_SERIES_MM, design_chart
 from experiment.chart.model import Chart
 from experiment.chart.printing import drawing
-from experiment.lights.illuminations import Illumination, plan_illuminations
+from experiment.lights import Illumination, plan_illuminations
 from experiment.session.folder import Session
 from experiment.session.plan import SessionStep
 from experiment.session.records import ACCEPTED

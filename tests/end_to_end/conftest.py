@@ -11,7 +11,7 @@ import pytest
 
 from drivers.presenter import Colour
 from experiment.chart.layout import design_chart
-from experiment.lights.illuminations import Illumination, save_illuminations
+from experiment.lights import Illumination, save_illuminations
 
 LIGHTS = (
     Illumination(0, "uniform", None, Colour(255, 0, 0)),

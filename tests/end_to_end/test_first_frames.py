@@ -14,7 +14,7 @@ import pytest
 from acquisition.run.run import run_session
 from experiment.chart.layout import design_chart
 from experiment.config import load_lab
-from experiment.lights.illuminations import plan_illuminations, save_illuminations
+from experiment.lights import plan_illuminations, save_illuminations
 from experiment.session.folder import Session
 from experiment.session.records import ACCEPTED, Attempt
 from foundation.errors import InputError, QualityError

@@ -17,7 +17,7 @@ from acquisition.run.rig.simulated import sheet, simulated_body, simulated_room
 from calibration.table.lut import Lut, open_lut
 from experiment.chart.model import load_chart
 from experiment.config import load_lab
-from experiment.lights.illuminations import load_illuminations
+from experiment.lights import load_illuminations
 from experiment.session.folder import Session
 from foundation.errors import FormatError
 from sim.world.world import World

@@ -13,9 +13,9 @@ from acquisition.monitor.server import open_monitor
 from acquisition.run.run import run_session
 from experiment.chart.model import Chart, load_chart
 from experiment.config import load_lab
-from experiment.lights.illuminations import Illumination, load_illuminations
+from experiment.lights import Illumination, load_illuminations
 from experiment.session.folder import Session
-from experiment.session.mending.redaction import held_secrets
+from experiment.session.repair import held_secrets
 from tests.found_texts import files_with
 
 pytestmark = pytest.mark.slow
@@ -81,7 +81,7 @@ def test_no_file_of_a_session_and_its_table_holds_a_secret(
     assert command("acquisition.cli", "run", lab, session, "--dry-run") == 0
     assert command("calibration.cli", session, public / "lut") in (0, 4)
     with open_monitor(session, 0) as server:
-        shown = server.page.text + json.dumps(server.watch.state(""), default=str)
+        shown = server.page[0] + json.dumps(server.watch.state(""), default=str)
     seen.append(files_with(public, PASSWORD, TOKEN))
     assert len(seen) > 6
     assert not any(seen)

@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 
 from acquisition.cli import main
-from acquisition.monitor.head import Head
-from acquisition.monitor.watching import SessionWatch
+from acquisition.monitor.feed import SessionWatch
+from acquisition.monitor.view import Head
 
 pytestmark = pytest.mark.slow
 

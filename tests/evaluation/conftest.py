@@ -12,7 +12,7 @@ from calibration.table.lut import open_lut
 from calibration.table.provenance import Provenance
 from calibration.table.writer import LutWriter
 from drivers.presenter import Colour
-from experiment.lights.illuminations import Illumination
+from experiment.lights import Illumination
 from generator.dataset.making import DatasetOptions, generate_dataset
 from generator.pictures.sources import random_scenes
 from tests.evaluation.real_images import Collection, collections

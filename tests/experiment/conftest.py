@@ -6,7 +6,7 @@ import pytest
 
 from experiment.chart.layout import design_chart
 from experiment.chart.model import Chart
-from experiment.lights.illuminations import Illumination, plan_illuminations
+from experiment.lights import Illumination, plan_illuminations
 
 
 @pytest.fixture(scope="session")

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from experiment.lights.illuminations import CCTS_K, blackbody_light, shown_colour
+from experiment.lights import CCTS_K, blackbody_light, shown_colour
 from foundation.colorimetry import (
     XYZ_TO_SRGB,
     angles_deg,

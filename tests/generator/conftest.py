@@ -14,7 +14,7 @@ from calibration.table.lut import Lut, open_lut
 from calibration.table.provenance import Provenance, Unfit
 from calibration.table.writer import LutWriter
 from drivers.presenter import Colour
-from experiment.lights.illuminations import Illumination
+from experiment.lights import Illumination
 from generator import philox
 
 SAMPLES = 25

@@ -20,7 +20,7 @@ from typer.main import get_command
 
 from acquisition.run.planning.work import planned_steps
 from experiment.config import load_lab
-from experiment.lights.illuminations import plan_illuminations
+from experiment.lights import plan_illuminations
 from tests.house_commands import COMMANDS
 
 ROOT = Path(__file__).parents[2]

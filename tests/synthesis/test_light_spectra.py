@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from experiment.lights.illuminations import blackbody_light, shown_colour
+from experiment.lights import blackbody_light, shown_colour
 from foundation.errors import FormatError, InputError
 from sim.world.room import WAVELENGTHS_NM
 from synthesis.lamps import illuminations_of, parse_spectra, read_lights

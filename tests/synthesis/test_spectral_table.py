@@ -13,7 +13,7 @@ from PIL import Image
 from calibration.table.lut import Lut, open_lut
 from calibration.table.verification import find_faults
 from evaluation.datasets.generated import open_generated
-from experiment.lights.illuminations import load_illuminations
+from experiment.lights import load_illuminations
 from foundation.errors import FormatError, InputError
 from generator.cli import main as generate
 from generator.lights.choices import parse_light

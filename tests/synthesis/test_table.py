@@ -16,7 +16,7 @@ import pytest
 from calibration.pipeline.build import build
 from calibration.table.lut import Lut, open_lut
 from calibration.table.verification import find_faults
-from experiment.lights.illuminations import plan_illuminations
+from experiment.lights import plan_illuminations
 from foundation.errors import InputError, QualityError, StorageError
 from sim.world.room import Room
 from sim.world.sensors import BODIES

@@ -19,12 +19,11 @@ from acquisition.check.taking import Shot
 from experiment.chart.model import Chart
 from experiment.framing.planes import frame_black
 from experiment.framing.sharpness import blur_px
-from experiment.lights.illuminations import Illumination
+from experiment.lights import Illumination
 from experiment.limits.bleed import bleed
 from experiment.limits.table import ONLY_OF_A_SESSION, TABLE_LIMITS, TableOutcome
 from experiment.measures.paper import Paper, PaperReader
-from experiment.measures.reflections import added_light
-from experiment.measures.stains import Stains, find_stains
+from experiment.measures.stains import Stains, added_light, find_stains
 from foundation.colorimetry import angles_deg, decode_srgb
 from foundation.errors import QualityError
 

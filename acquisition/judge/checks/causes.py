@@ -10,8 +10,8 @@ import numpy as np
 
 from acquisition.judge import limits
 from acquisition.judge.known.knowledge import Knowledge, is_brightest_grey
-from experiment.session.judgement import Check
 from experiment.session.plan import SessionStep
+from experiment.session.records import Check
 
 _CAUSES = (
     "file", "camera", "settings", "data", "repeated", "clipping", "exposure", "chart", "movement", "blur", "rows",

@@ -11,7 +11,7 @@ from acquisition.judge import limits
 from acquisition.judge.known.basis import Basis, FrameLight, Residuals
 from acquisition.judge.known.knowledge import Seen
 from acquisition.judge.measured.measuring import SEGMENTS, TILE_COLUMNS, TILE_ROWS, Measured
-from experiment.session.judgement import Check
+from experiment.session.records import Check
 from foundation.robust import sigma_of
 
 _DARKER = -0.1

@@ -10,8 +10,8 @@ from acquisition.judge.known.knowledge import Knowledge
 from acquisition.judge.measured.measuring import Measured
 from drivers.raw.rawfile import Mosaic
 from experiment.config import LabSettings
-from experiment.session.judgement import Check
 from experiment.session.plan import SessionStep
+from experiment.session.records import Check
 
 
 def judge_file(

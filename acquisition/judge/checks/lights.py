@@ -17,7 +17,6 @@ from acquisition.judge import limits
 from acquisition.judge.known.basis import FrameLight
 from acquisition.judge.known.knowledge import Knowledge, Leaning, Seen, combined
 from acquisition.judge.known.response import Codes, Fit, ProjectorModel
-from experiment.session.judgement import Check
 from experiment.session.plan import SessionStep
 from foundation.colorimetry import angles_deg, decode_srgb
 

@@ -13,7 +13,7 @@ from acquisition.judge.measured.measuring import Measured
 from drivers.raw.rawfile import Mosaic
 from experiment.config import JudgeSettings
 from experiment.framing.planes import CHANNELS, Channel
-from experiment.session.judgement import Check
+from experiment.session.records import Check
 
 UNTOLD_PX: npt.NDArray[np.float64] = np.full(2, np.nan)
 """Place of a chart in a frame that is too dark to tell."""
@@ -80,7 +80,7 @@ def judge_movement(
     checks = [Check("movement", round(moved, 3), None, judge.moved_px, "px", reason)]
     if paper < limits.BLUR_DIM_DN:
         return [*checks, Check("blur", None, None, judge.blur_px, "px")], place
-    softer = float(np.sign(shift.softer_px2) * np.sqrt(abs(shift.softer_px2)))
+    softer = float(np.sign(shift.blur_growth_px2) * np.sqrt(abs(shift.blur_growth_px2)))
     blurred = ""
     low = -limits.SHARPER * judge.blur_px
     if not low <= softer <= judge.blur_px:

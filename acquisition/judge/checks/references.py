@@ -15,8 +15,8 @@ from acquisition.judge.known.knowledge import Knowledge
 from acquisition.judge.measured.frame import Frame
 from acquisition.judge.measured.measuring import TILE_COLUMNS, TILE_ROWS, Measured
 from experiment.config import JudgeSettings
-from experiment.session.judgement import Check
 from experiment.session.plan import SessionStep
+from experiment.session.records import Check
 
 _SIGMAS = 6.0
 """Standard deviations of a mean's noise that no change is made of."""

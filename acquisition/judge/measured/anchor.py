@@ -13,11 +13,10 @@ import numpy.typing as npt
 
 from drivers.raw.rawfile import Mosaic
 from experiment.chart.model import Chart
-from experiment.framing.finding import Framing, find_chart
+from experiment.framing.finding import FoundTag, Framing, find_chart, find_tags
 from experiment.framing.homography import project
 from experiment.framing.movement import Shift, gauge_boxes, gauges_of, shift_between
 from experiment.framing.planes import CHANNELS, Channel, Plane, plane_of, strongest_plane
-from experiment.framing.tags import FoundTag, find_tags
 
 _TEXTURE_PX = 32
 """Side of a textured place that stands for a tag."""

@@ -19,10 +19,9 @@ import numpy.typing as npt
 
 from acquisition.judge.measured.anchor import Anchor
 from acquisition.judge.measured.measuring import FramePlaces, Measured, Noise
-from experiment.framing.finding import Framing
+from experiment.framing.field import FoundField
+from experiment.framing.finding import FoundTag, Framing
 from experiment.framing.planes import CHANNELS, Channel, Plane
-from experiment.framing.tagless_field import FoundField
-from experiment.framing.tags import FoundTag
 
 VERSION = 1
 """Of the format of the bytes."""

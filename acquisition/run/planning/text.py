@@ -11,7 +11,7 @@ from acquisition.run.planning.work import Work
 from acquisition.run.shutter import holds_whole_turns, period_s, wheel_of
 from experiment.config import LabSettings
 from experiment.session.plan import KINDS
-from experiment.session.progress import duration_text
+from experiment.session.records import duration_text
 from foundation.errors import counted
 from foundation.secret_texts import target_label
 

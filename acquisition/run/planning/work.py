@@ -15,7 +15,7 @@ from typing import Any, Final
 from drivers.presenter import BLACK
 from experiment.chart.model import Chart, load_chart
 from experiment.config import LabSettings, parse_lab
-from experiment.lights.illuminations import Illumination, load_illuminations
+from experiment.lights import Illumination, load_illuminations
 from experiment.session.folder import Session, session_exists
 from experiment.session.plan import RESPONSE, SessionStep, plan_steps
 from foundation.errors import ConfigurationError

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 
 from acquisition.run.taking.agenda import step_name
 from experiment.config import JudgeSettings
-from experiment.session.judgement import Check, Judgement
 from experiment.session.plan import SessionStep
+from experiment.session.records import Check, Judgement
 
 
 def followed_changes(

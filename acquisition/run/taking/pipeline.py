@@ -36,9 +36,8 @@ from acquisition.run.taking.saving import FilledFile, Saved, Saver, download
 from drivers.presenter import ReadsBack
 from experiment.config import LabSettings
 from experiment.session.folder import Session
-from experiment.session.judgement import Check, Judgement
 from experiment.session.plan import REFERENCES, SessionStep
-from experiment.session.records import ACCEPTED
+from experiment.session.records import ACCEPTED, Check, Judgement
 from foundation.console import Ending
 from foundation.errors import CropError, DeviceError, QualityError, StorageError, counted
 

@@ -18,9 +18,8 @@ from drivers.camera import CameraIdentity
 from drivers.projector import ProjectorIdentity
 from experiment.config import LabSettings
 from experiment.session.folder import Session
-from experiment.session.plan import SessionStep, tie_steps
-from experiment.session.progress import duration_text
-from experiment.session.records import ACCEPTED, Attempt
+from experiment.session.plan import SessionStep, link_steps
+from experiment.session.records import ACCEPTED, Attempt, duration_text
 from foundation.clock import Clock, SteadyClock
 from foundation.errors import DeviceRefused, first_of
 from foundation.version import software
@@ -95,7 +94,7 @@ def tie(session: Session) -> tuple[int, ...]:
     taken = [attempt for attempt in session.journal.attempts() if attempt.verdict == ACCEPTED]
     if not taken or all(step.kind != "response" for step in session.steps):
         return ()
-    ties = tie_steps(session.steps[-1].number + 1)
+    ties = link_steps(session.steps[-1].number + 1)
     unfinished = _unfinished(session.steps[-len(ties) :], ties, taken)
     return tuple(step.number for step in unfinished) if unfinished else _added(session, ties)
 
@@ -109,7 +108,7 @@ def white_first(session: Session) -> tuple[int, ...]:
     measured = any(step.kind == "white" and accepted for step, _, _, accepted in session.journal.measurements())
     if measured or not session.journal.accepted_files():
         return ()
-    return _added(session, tie_steps(session.steps[-1].number + 1, response=False))
+    return _added(session, link_steps(session.steps[-1].number + 1, response=False))
 
 
 def _added(session: Session, ties: Sequence[SessionStep]) -> tuple[int, ...]:

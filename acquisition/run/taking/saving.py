@@ -13,11 +13,9 @@ from dataclasses import dataclass, replace
 from typing import Self
 
 from drivers.camera import Camera, CapturedFrame
-from experiment.session.folder import Session
-from experiment.session.incoming import IncomingFile, ReceivedFile
-from experiment.session.judgement import Check, FrameJudge, Judgement, OutlastsPauses
+from experiment.session.folder import IncomingFile, ReceivedFile, Session
 from experiment.session.plan import SessionStep
-from experiment.session.records import preview_path
+from experiment.session.records import Check, FrameJudge, Judgement, OutlastsPauses, preview_path
 from foundation.errors import CropError, DeviceError
 from foundation.files import write_whole
 

@@ -13,7 +13,7 @@ from acquisition.check.check import CheckOptions, check_lab
 from acquisition.check.findings import CheckReport
 from experiment.chart.layout import design_chart
 from experiment.config import load_lab
-from experiment.lights.illuminations import plan_illuminations, save_illuminations
+from experiment.lights import plan_illuminations, save_illuminations
 
 Check = Callable[..., CheckReport]
 

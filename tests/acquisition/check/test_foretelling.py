@@ -27,9 +27,9 @@ from drivers.presenter import BLACK, WHITE
 from drivers.raw.rawfile import Mosaic, read_raw
 from experiment.chart.layout import paper_chart
 from experiment.framing.finding import find_chart
-from experiment.lights.illuminations import plan_illuminations
+from experiment.lights import plan_illuminations
 from experiment.limits.table import ONLY_OF_A_SESSION, TABLE_LIMITS
-from experiment.measures.sensor_range import saturation
+from experiment.measures.sensor import saturation
 from experiment.session.folder import Session
 from experiment.session.plan import SessionStep
 from foundation.errors import QualityError, RegistrationError

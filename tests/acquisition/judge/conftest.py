@@ -20,8 +20,7 @@ from drivers.presenter import BLACK, Colour
 from experiment.chart.layout import design_chart
 from experiment.chart.model import Chart
 from experiment.config import LabSettings, parse_lab
-from experiment.lights.illuminations import Illumination, plan_illuminations
-from experiment.session.judgement import Judgement
+from experiment.lights import Illumination, plan_illuminations
 from experiment.session.plan import RESPONSE, SessionStep, plan_steps
 from sim.camera.film import write_dng
 from sim.world.disturbances import AnyDisturbance, Disturbances, Moment

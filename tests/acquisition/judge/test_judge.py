@@ -13,8 +13,8 @@ from acquisition.judge.judge import LiveJudge
 from acquisition.judge.known.knowledge import Leaning
 from drivers.camera import ExposureSettings
 from drivers.presenter import BLACK, WHITE, Colour
-from experiment.session.judgement import Check, Judgement
-from experiment.session.plan import SessionStep, tie_steps
+from experiment.session.plan import SessionStep, link_steps
+from experiment.session.records import Check, Judgement
 from sim.world.disturbances import (
     AmbientStep,
     Bump,
@@ -270,7 +270,7 @@ def test_somebody_who_passes_while_a_chart_that_moved_is_shown_the_primaries_is_
     for step, judgement in zip(lab.steps, first, strict=False):
         resumed.judge.recall(step, judgement.measurement, True)
     elsewhere, hand = Bump(px=6.7), Person(place=(0.7, 0.6, 0.82, 0.78), left=0.3)
-    ties = tie_steps(500)
+    ties = link_steps(500)
     said = [resumed.take(step, elsewhere, *([hand] if step.number == 502 else [])) for step in ties[:4]]
     assert [judgement.voids for judgement in said] == [False, False, False, True]
     again = [resumed.take(step, elsewhere) for step in (*ties, resumed.light(*SKY))]
@@ -282,7 +282,7 @@ def test_a_session_whose_measurements_are_lost_goes_on(taught: Bench, tmp_path: 
     lab.world = taught.world
     for step in lab.steps[:2]:
         lab.judge.recall(step, b"of another version", True)
-    said = [lab.take(step).reason for step in (*tie_steps(500), lab.light(*SKY), DARK_STEP, lab.light(*SKY))]
+    said = [lab.take(step).reason for step in (*link_steps(500), lab.light(*SKY), DARK_STEP, lab.light(*SKY))]
     assert said == [""] * 9
     assert lab.judge.knowledge.modelled
 
@@ -301,7 +301,7 @@ def test_a_run_taken_up_again_knows_what_was_seen(taught: Bench, tmp_path: Path)
     assert resumed.judge.knowledge.modelled
     # A day later the lamp is 3 % weaker: drift, no other light.
     weaker = LampStep(percent=-3)
-    ties = [resumed.take(step, weaker) for step in tie_steps(500)]
+    ties = [resumed.take(step, weaker) for step in link_steps(500)]
     assert [tie.reason for tie in ties] == [""] * 6
     assert check(ties[0], "lamp").value == pytest.approx(-3, abs=0.8)
     assert resumed.take(resumed.light(*SKY), weaker).accepted
@@ -311,7 +311,7 @@ def test_a_run_taken_up_again_knows_what_was_seen(taught: Bench, tmp_path: Path)
     for step, measurement in kept:
         another.judge.recall(step, measurement, True)
     # Another lamp is told before the first light is taken under it.
-    tie = another.take(tie_steps(500)[0], LampStep(percent=-21))
+    tie = another.take(link_steps(500)[0], LampStep(percent=-21))
     assert cause(tie) == "white drift"
     assert tie.lasting
 
@@ -323,7 +323,7 @@ def test_a_chart_that_moved_between_runs_is_told_and_followed(taught: Bench, tmp
     for step in first.steps[:-2]:
         resumed.judge.recall(step, first.take(step).measurement, True)
     elsewhere = Bump(px=6.7, direction_deg=-27)
-    said = [resumed.take(step, elsewhere) for step in tie_steps(500)]
+    said = [resumed.take(step, elsewhere) for step in link_steps(500)]
     assert all(judgement.accepted for judgement in said), [judgement.reason for judgement in said]
     assert check(said[0], "movement").value == pytest.approx(6.7, abs=0.3)
     later = resumed.take(resumed.light(*SKY), elsewhere)

@@ -12,8 +12,8 @@ from typing import Any
 import pytest
 
 from acquisition.cli import main
-from acquisition.monitor import report
-from acquisition.monitor.report import save_report, write_session_report
+from acquisition.monitor import page
+from acquisition.monitor.page import write_session_report
 from experiment.session.journal import Journal
 from foundation.errors import FormatError, StorageError
 from tests.acquisition.monitor.made_up import MadeUpRun
@@ -41,7 +41,7 @@ def data_of(path: Path) -> dict[str, Any]:
 
 def test_it_holds_the_session_and_its_pictures(run: MadeUpRun, tmp_path: Path) -> None:
     path = tmp_path / "out" / "night.html"
-    save_report(run.folder, path)
+    write_session_report(run.folder, path)
     data = data_of(path)
     assert [frame["verdict"] for frame in data["frames"]].count("accepted") == 5
     assert data["frames"][3]["reason"] == f"{SCRIPT}; close the door"
@@ -68,8 +68,8 @@ def test_pictures_are_bounded_and_those_of_refused_frames_go_first(
     run: MadeUpRun, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     bound = int(3.5 * max(path.stat().st_size for path in (run.folder / "previews").iterdir()))
-    monkeypatch.setattr(report, "MOST_PICTURES_BYTES", bound)
-    save_report(run.folder, tmp_path / "night.html")
+    monkeypatch.setattr(page, "MOST_PICTURES_BYTES", bound)
+    write_session_report(run.folder, tmp_path / "night.html")
     pictures = data_of(tmp_path / "night.html")["pictures"]
     assert list(pictures)[:2] == ["4", "6"]
     assert 3 <= len(pictures) < 6
@@ -78,7 +78,7 @@ def test_pictures_are_bounded_and_those_of_refused_frames_go_first(
 
 @pytest.mark.parametrize("count", [0, 1, 2, 7, 100])
 def test_any_number_of_pictures_is_spread_over_the_night(count: int) -> None:
-    places = report._spread(count)  # pyright: ignore[reportPrivateUsage]
+    places = page._spread(count)  # pyright: ignore[reportPrivateUsage]
     assert sorted(places) == list(range(count))
     if count == 100:
         first = sorted(places[:10])
@@ -88,7 +88,7 @@ def test_any_number_of_pictures_is_spread_over_the_night(count: int) -> None:
 def test_a_picture_that_is_gone_or_none_is_left_out(run: MadeUpRun, tmp_path: Path) -> None:
     for preview in (run.folder / "previews").iterdir():
         preview.write_bytes(b"no picture")
-    save_report(run.folder, tmp_path / "night.html")
+    write_session_report(run.folder, tmp_path / "night.html")
     assert data_of(tmp_path / "night.html")["pictures"] == {}
 
 
@@ -103,14 +103,14 @@ def test_the_command_writes_it_into_the_session_or_where_it_is_told(
 
 def test_without_a_session_there_is_no_report(tmp_path: Path) -> None:
     with pytest.raises(FormatError):
-        save_report(tmp_path, tmp_path / "x.html")
+        write_session_report(tmp_path, tmp_path / "x.html")
 
 
 def test_a_full_disk_is_said_and_leaves_the_session_as_it_was(run: MadeUpRun, monkeypatch: pytest.MonkeyPatch) -> None:
     def full(path: Path, data: object) -> None:
         raise StorageError(f"cannot write {path}: no space")
 
-    monkeypatch.setattr(report, "write_whole", full)
+    monkeypatch.setattr(page, "write_whole", full)
     assert main(["report", str(run.folder)]) == StorageError.exit_code
     assert not (run.folder / "report.html").exists()
 
@@ -118,6 +118,6 @@ def test_a_full_disk_is_said_and_leaves_the_session_as_it_was(run: MadeUpRun, mo
 def test_a_journal_without_any_attempt_makes_a_report_too(tmp_path: Path) -> None:
     made = MadeUpRun.begin(tmp_path / "empty")
     made.journal.close()
-    save_report(made.folder, tmp_path / "x.html")
+    write_session_report(made.folder, tmp_path / "x.html")
     assert data_of(tmp_path / "x.html")["head"]["done"] == 0
     Journal.open(made.folder / "journal.sqlite").close()

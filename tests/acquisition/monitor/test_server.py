@@ -1,10 +1,17 @@
-"""The monitor's server: what it answers, to whom, and what it never does."""
+"""The monitor's server: what it answers, to whom, and what it never does.
+
+Who may look, and at what.
+
+The QR code in the terminal is read by a reader of such codes.
+"""
 
 from __future__ import annotations
 
 import gzip
 import http.client
+import ipaddress
 import json
+import re
 import shutil
 import socket
 import sys
@@ -16,13 +23,109 @@ from http.server import ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
 
+import cv2
+import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from acquisition.cli import main
-from acquisition.monitor import access, server
-from acquisition.monitor.server import MonitorServer, open_monitor
+from acquisition.monitor import server
+from acquisition.monitor.server import (
+    Access,
+    MonitorServer,
+    Refusal,
+    Request,
+    is_loopback,
+    open_monitor,
+    qr_text,
+    reachable_addresses,
+)
 from foundation.errors import FormatError, InputError
 from tests.acquisition.monitor.made_up import MadeUpRun, jpeg
+
+OPEN = Access("", frozenset({"localhost"}))
+CLOSED = Access("secret", frozenset({"localhost"}))
+
+
+@pytest.mark.parametrize(
+    ("target", "request_"),
+    [
+        ("/", Request("page")),
+        ("/?", Request("page")),
+        ("/state.json", Request("state")),
+        ("/state.json?since=a.1.b&x=1", Request("state", since="a.1.b")),
+        ("/frame/12.jpg?1", Request("frame", attempt=12)),
+        ("/status.json", Request("status")),
+    ],
+)
+def test_the_four_addresses(target: str, request_: Request) -> None:
+    assert OPEN.judge(target, "localhost") == request_
+    assert CLOSED.judge(f"/secret{target}", "localhost") == request_
+
+
+@pytest.mark.parametrize("target", ["/frame/١.jpg", "/frame/1.jpg\n", "//[", "/%", "", "http://localhost/", "*"])
+def test_what_is_no_address_is_refused(target: str) -> None:
+    answer = OPEN.judge(target, "localhost")
+    assert answer == Request("page") if target == "" else isinstance(answer, Refusal)
+
+
+@given(st.text(max_size=40), st.text(max_size=20))
+def test_without_the_token_nothing_is_shown(target: str, host: str) -> None:
+    for asked in (target, f"/{target}", "/" + target.replace("secret", "")):
+        assert isinstance(CLOSED.judge(asked, host), Refusal) or asked.startswith("/secret/")
+
+
+@given(st.text(max_size=60))
+def test_only_numbers_and_own_names_are_known(host: str) -> None:
+    answer = OPEN.judge("/", host)
+    if answer == Request("page"):
+        name = host.lower().partition(":")[0] if not host.startswith("[") else host[1:].partition("]")[0]
+        assert name == "localhost" or ipaddress.ip_address(name)
+
+
+def test_a_token_is_asked_for_wherever_others_reach_it() -> None:
+    assert Access.to("127.0.0.1").token == ""
+    assert Access.to("localhost").token == ""
+    assert Access.to("::1").token == ""
+    for host in ("0.0.0.0", "::", "192.168.1.7", socket.gethostname() + ".example"):
+        assert len(Access.to(host).token) >= 22
+    assert not is_loopback("127.0.0.1.example")
+
+
+def test_where_others_reach_it() -> None:
+    assert reachable_addresses("192.168.1.7") == ("192.168.1.7",)
+    assert reachable_addresses("fd00::7") == ("[fd00::7]",)
+    assert reachable_addresses("lab.local") == ("lab.local",)
+    assert all(name and "0.0.0.0" not in name for name in reachable_addresses("0.0.0.0"))
+
+
+def test_without_a_network_it_goes_by_its_name(monkeypatch: pytest.MonkeyPatch) -> None:
+    def unreachable(self: socket.socket, address: object) -> None:
+        raise OSError("Network is unreachable")
+
+    monkeypatch.setattr(socket.socket, "connect", unreachable)
+    assert reachable_addresses("0.0.0.0") == (socket.gethostname(),)
+
+
+ADDRESS = "http://192.168.178.123:8707/abcdefghijklmnopqrstuv/"
+
+
+def test_a_reader_finds_the_address_in_what_is_printed() -> None:
+    lines = [re.sub(r"\x1b\[[0-9;]*m", "", line) for line in qr_text(ADDRESS).splitlines()]
+    assert len({len(line) for line in lines}) == 1
+    light = {"█": (1, 1), "▀": (1, 0), "▄": (0, 1), " ": (0, 0)}
+    rows = [[light[character][half] for character in line] for line in lines for half in (0, 1)]
+    picture = np.kron(np.array(rows, np.uint8) * 255, np.ones((8, 8), np.uint8))
+    assert cv2.QRCodeDetector().detectAndDecode(picture)[0] == ADDRESS
+    # ISO/IEC 18004, 6.3.8: four light modules on each side.
+    assert all(all(row[:4]) and all(row[-4:]) for row in rows)
+    assert all(all(row) for row in rows[:4] + rows[-4:])
+
+
+def test_it_fits_a_terminal_of_80_columns() -> None:
+    assert max(len(re.sub(r"\x1b\[[0-9;]*m", "", line)) for line in qr_text(ADDRESS).splitlines()) <= 80
+
 
 SCRIPT = "<script>alert(1)</script>"
 
@@ -334,7 +437,7 @@ def test_the_address_for_a_phone_is_printed_with_a_warning_and_as_a_code(
         return ("192.168.1.7",)
 
     monkeypatch.setattr(ThreadingHTTPServer, "serve_forever", interrupted)
-    monkeypatch.setattr(access, "reachable_addresses", addresses)
+    monkeypatch.setattr(server, "reachable_addresses", addresses)
     monkeypatch.setattr(sys.stdout, "isatty", lambda: True)
     assert main(["monitor", str(run.folder), "--port", "0", "--host", "0.0.0.0"]) == 0
     printed = capsys.readouterr()

@@ -29,11 +29,11 @@ from drivers.ptp.transaction import Transport
 from drivers.ptp.usb import UsbTransport
 from experiment.chart.layout import design_chart
 from experiment.config import LabSettings
-from experiment.lights.illuminations import Illumination
+from experiment.lights import Illumination
 from experiment.session.folder import Session
 from experiment.session.journal import Journal
-from experiment.session.judgement import Judgement
 from experiment.session.plan import SessionStep, plan_steps
+from experiment.session.records import Judgement
 from foundation.errors import CropError, DeviceError, LinkClosed, StorageError
 from sim.buses.ptp import MemoryPipes
 from sim.buses.responder import Responder

@@ -17,7 +17,7 @@ from drivers.presenter import BLACK, Colour
 from drivers.projector import Power
 from experiment.chart.layout import design_chart
 from experiment.config import LabSettings
-from experiment.lights.illuminations import Illumination
+from experiment.lights import Illumination
 from experiment.session.folder import Session
 from experiment.session.plan import plan_steps
 from foundation.errors import DeviceError

@@ -9,7 +9,7 @@ import pytest
 
 from acquisition.run.taking.agenda import GIVEN_UP_IN_A_ROW, Agenda, unclosed_kinds
 from drivers.presenter import BLACK, WHITE, Colour
-from experiment.lights.illuminations import Illumination
+from experiment.lights import Illumination
 from experiment.session.plan import FrameKind, SessionStep, plan_steps
 
 STEPS = plan_steps([Illumination(n, "uniform", None, Colour(255, n, 0)) for n in range(4)], 2)

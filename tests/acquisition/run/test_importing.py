@@ -13,7 +13,7 @@ from acquisition.cli import main
 from acquisition.run.importing import Imported, import_session
 from drivers.presenter import Colour
 from experiment.chart.layout import design_chart
-from experiment.lights.illuminations import Illumination, save_illuminations
+from experiment.lights import Illumination, save_illuminations
 from experiment.session.folder import FRAME_COLUMNS, Session
 from foundation.errors import FormatError
 from tests.json_of import json_of

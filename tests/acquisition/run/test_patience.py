@@ -20,7 +20,7 @@ from drivers.ptp.session import OperationDeclined
 from drivers.raw.rawfile import read_raw
 from experiment.chart.layout import design_chart
 from experiment.config import LabSettings
-from experiment.lights.illuminations import Illumination
+from experiment.lights import Illumination
 from experiment.session.folder import Session
 from experiment.session.journal_file import HeldJournalError
 from experiment.session.plan import plan_steps

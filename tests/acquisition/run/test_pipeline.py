@@ -16,10 +16,10 @@ from acquisition.run.sequencer import RunOutcome, take_session
 from acquisition.run.taking.pipeline import Taken
 from drivers.presenter import BLACK, WHITE, Colour
 from drivers.projector import Power
-from experiment.lights.illuminations import Illumination
+from experiment.lights import Illumination
 from experiment.session.folder import Session
-from experiment.session.judgement import Check, Judgement
-from experiment.session.plan import SessionStep, tie_steps
+from experiment.session.plan import SessionStep, link_steps
+from experiment.session.records import Check, Judgement
 from foundation.console import Ending
 from foundation.errors import DeviceError, DeviceFault, LinkTimeout, QualityError, StorageError
 from tests.acquisition.run.scripted import DOWNLOAD_S, EXPOSE_S, GLARE, LIGHTS, NIGHT, SETTINGS, TURNED, WELL, Lab
@@ -210,7 +210,7 @@ class TestRefusals:
         with pytest.raises(KeyboardInterrupt):
             run(lab, ScriptedJudge(), ending=ending, observe=end_after(3))
         before = len(lab.taken())
-        ties = tie_steps(lab.session.steps[-1].number + 1)
+        ties = link_steps(lab.session.steps[-1].number + 1)
         lab.session.add_steps(ties)
         judge = ScriptedJudge({3: refused("somebody passed", voids=True)})
         assert run(lab, judge, first=tuple(step.number for step in ties)).complete
@@ -343,7 +343,7 @@ class TestFaults:
         if place == "download":
             monkeypatch.setattr(Session, "incoming", full(Session.incoming))
         elif place == "save":
-            from experiment.session.incoming import IncomingFile
+            from experiment.session.folder import IncomingFile
 
             monkeypatch.setattr(IncomingFile, "complete", full(IncomingFile.complete, IncomingFile.abandon))
         elif place == "commit":
@@ -362,7 +362,7 @@ class TestFaults:
             assert lab.camera.captures == 7, "the frame in the camera was not lost"
 
     def test_a_disk_that_never_saves_ends_the_run(self, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-        from experiment.session.incoming import IncomingFile
+        from experiment.session.folder import IncomingFile
 
         lab = Lab(folder)
         broken = failing(StorageError("Input/output error"), calls=range(100_000))

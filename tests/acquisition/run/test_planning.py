@@ -26,7 +26,7 @@ from drivers.presenter import Colour
 from drivers.projector import Power, Severity
 from experiment.chart.layout import design_chart
 from experiment.config import LabSettings, load_lab
-from experiment.lights.illuminations import Illumination, save_illuminations
+from experiment.lights import Illumination, save_illuminations
 from experiment.session.folder import Session
 from experiment.session.plan import plan_steps
 from foundation.errors import ConfigurationError, CropError, DeviceError, DeviceFault, DeviceRefused, StorageError

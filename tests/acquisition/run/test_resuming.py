@@ -15,17 +15,17 @@ from drivers.camera import CameraIdentity, CapturedFrame
 from drivers.presenter import Colour
 from drivers.projector import ProjectorIdentity
 from experiment.config import LabSettings
-from experiment.lights.illuminations import Illumination
+from experiment.lights import Illumination
 from experiment.session.folder import Session
 from experiment.session.journal import Journal
-from experiment.session.judgement import Judgement
-from experiment.session.plan import plan_steps, tie_steps
+from experiment.session.plan import link_steps, plan_steps
+from experiment.session.records import Judgement
 from foundation.console import Ending
 from foundation.errors import DeviceRefused
 from tests.acquisition.run.scripted import LIGHTS, SETTINGS, Lab
 
 RESPONSE = (Colour(250, 0, 0), Colour(0, 250, 0))
-TIES = [step.colour for step in tie_steps(0)]
+TIES = [step.colour for step in link_steps(0)]
 
 
 @pytest.fixture

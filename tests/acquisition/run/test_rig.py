@@ -14,7 +14,7 @@ from acquisition.run.run import run_session
 from drivers.raw.rawfile import read_raw
 from experiment.chart.layout import design_chart
 from experiment.config import LabSettings, SimulatedSettings, load_lab, parse_lab
-from experiment.lights.illuminations import plan_illuminations, save_illuminations
+from experiment.lights import plan_illuminations, save_illuminations
 from experiment.session.folder import Session
 from foundation.clock import Clock
 from foundation.errors import ConfigurationError

@@ -7,8 +7,8 @@ import pytest
 from acquisition.run.taking.pipeline import Taken
 from acquisition.run.terminal import Terminal, TimeLeft, verdict_line
 from drivers.presenter import Colour
-from experiment.session.judgement import Check, Judgement
 from experiment.session.plan import SessionStep
+from experiment.session.records import Check, Judgement
 
 STEP = SessionStep(7, "light", 5, Colour(1, 2, 3))
 

@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from drivers.camera import ExposureSettings
 from drivers.presenter import Colour
-from experiment.lights.illuminations import Illumination
+from experiment.lights import Illumination
 from experiment.session.folder import Session
 from experiment.session.plan import SessionStep
 from sim.camera.film import write_dng

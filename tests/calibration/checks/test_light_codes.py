@@ -14,7 +14,7 @@ from calibration.checks.light_codes import CodeAgreement, code_agreement
 from calibration.pipeline.build import build
 from calibration.verdict.thresholds import THRESHOLDS
 from calibration.verdict.verdict import judge
-from experiment.lights.illuminations import plan_illuminations
+from experiment.lights import plan_illuminations
 from experiment.session.plan import SessionStep
 from foundation.colorimetry import angles_deg, decode_srgb
 from foundation.errors import FormatError

@@ -26,7 +26,7 @@ from drivers.camera import ExposureSettings
 from drivers.presenter import BLACK, WHITE
 from experiment.chart.layout import A_SERIES_MM, design_chart
 from experiment.chart.model import Chart
-from experiment.measures.polynomials import order_of, page_polynomial
+from experiment.measures.least_squares import order_of, page_polynomial
 from experiment.session.folder import Session
 from experiment.session.plan import SessionStep, plan_steps
 from foundation.errors import FormatError, InputError, QualityError, RegistrationError

@@ -16,10 +16,10 @@ from calibration.report.report_json import report_json
 from calibration.report.summary import summary
 from calibration.verdict.result import BuildResult
 from drivers.presenter import WHITE, Colour
-from experiment.lights.illuminations import Illumination
+from experiment.lights import Illumination
 from experiment.session.folder import Session
-from experiment.session.mending.retaking import lights_text
 from experiment.session.plan import SessionStep
+from experiment.session.repair import lights_text
 from foundation.errors import QualityError
 from sim.camera.film import write_dng
 from sim.world.room import Room

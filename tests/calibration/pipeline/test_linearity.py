@@ -19,7 +19,7 @@ from calibration.table.verification import find_faults
 from calibration.verdict.result import BuildResult
 from drivers.camera import ExposureSettings
 from drivers.presenter import WHITE
-from experiment.measures.linearity import deviations
+from experiment.measures.sensor import deviations
 from experiment.session.folder import Session
 from foundation.errors import FormatError, InputError
 from sim.world.room import Room

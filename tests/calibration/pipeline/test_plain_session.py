@@ -15,8 +15,8 @@ from calibration.report.report import write_report
 from calibration.table.lut import open_lut
 from drivers.presenter import Colour
 from experiment.chart.layout import A_SERIES_MM, design_chart, paper_chart
-from experiment.framing.tagless_field import field_mm
-from experiment.lights.illuminations import Illumination
+from experiment.framing.field import field_mm
+from experiment.lights import Illumination
 from experiment.session.plan import SessionStep
 from experiment.session.records import ACCEPTED
 from sim.world.room import Room

@@ -14,10 +14,9 @@ import pytest
 from calibration.pipeline.build import build
 from calibration.report.report import write_report
 from drivers.camera import CapturedFrame
-from experiment.session.folder import Session
-from experiment.session.incoming import ReceivedFile
-from experiment.session.judgement import Judgement
+from experiment.session.folder import ReceivedFile, Session
 from experiment.session.plan import SessionStep, plan_steps
+from experiment.session.records import Judgement
 from foundation.errors import FormatError, InputError, QualityError
 from tests.calibration.lab import LIGHTS, SETTINGS, TAKEN_AT, Lab, Paint, take
 

@@ -18,8 +18,7 @@ from calibration.report.summary import summary
 from calibration.table.lut import open_lut
 from calibration.verdict.result import BuildResult
 from drivers.presenter import BLACK
-from experiment.measures.flat_field import FlatField
-from experiment.measures.paper import Paper
+from experiment.measures.paper import FlatField, Paper
 from experiment.session.folder import Session
 from experiment.session.plan import SessionStep
 from foundation.errors import FormatError

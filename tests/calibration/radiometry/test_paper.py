@@ -9,8 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from calibration.radiometry.corrections import corrections
-from experiment.measures.flat_field import FlatField
-from experiment.measures.paper import MAX_ORDER_AROUND, Paper, PaperReader
+from experiment.measures.paper import MAX_ORDER_AROUND, FlatField, Paper, PaperReader
 from foundation.errors import QualityError
 
 PAGE = (400.0, 300.0)

@@ -12,9 +12,8 @@ import pytest
 from calibration.pipeline.build import build
 from calibration.radiometry.primaries import Primaries, pure_lights
 from calibration.table.lut import open_lut
-from experiment.lights.illuminations import plan_illuminations
-from experiment.measures.flat_field import FlatField
-from experiment.measures.paper import Paper, PaperReader
+from experiment.lights import plan_illuminations
+from experiment.measures.paper import FlatField, Paper, PaperReader
 from sim.world.room import Room
 from tests.calibration.lab import SETTINGS, hang, renumbered, take
 

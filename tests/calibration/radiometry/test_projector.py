@@ -7,7 +7,7 @@ import pytest
 
 from calibration.radiometry.projector import additivity, drift_gains
 from drivers.presenter import Colour
-from experiment.lights.illuminations import Illumination
+from experiment.lights import Illumination
 
 PRIMARIES = ((255, 0, 0), (0, 255, 0), (0, 0, 255))
 

@@ -10,7 +10,7 @@ import pytest
 
 from drivers.camera import ExposureSettings
 from drivers.presenter import WHITE
-from experiment.measures.sensor_range import black_drift, saturation
+from experiment.measures.sensor import black_drift, saturation
 from tests.calibration.lab import Lab
 
 

@@ -14,8 +14,8 @@ from drivers.presenter import WHITE, Colour
 from drivers.raw.rawfile import Mosaic
 from experiment.chart.layout import paper_chart
 from experiment.chart.model import Chart
+from experiment.framing.field import field_mm
 from experiment.framing.planes import CHANNELS
-from experiment.framing.tagless_field import field_mm
 from experiment.limits.table import TABLE_LIMITS
 from foundation.errors import RegistrationError
 from sim.world.room import Room

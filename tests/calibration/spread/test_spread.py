@@ -26,7 +26,7 @@ from calibration.spread.printed_grid import PAD, PARTS, printed_grid, unsuitable
 from calibration.spread.surroundings import FrameLevels, Surroundings, UsualLight, far_taps
 from experiment.chart.layout import A_SERIES_MM, design_chart, paper_chart
 from experiment.chart.model import Chart
-from experiment.measures.flat_field import FlatField
+from experiment.measures.paper import FlatField
 from foundation.colorimetry import angles_deg
 
 pytestmark = pytest.mark.slow

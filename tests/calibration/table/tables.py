@@ -11,7 +11,7 @@ from calibration.table.lut import Lut, open_lut
 from calibration.table.provenance import Provenance
 from calibration.table.source_frames import SourceFrame, frames_sha256
 from calibration.table.writer import LutWriter
-from experiment.lights.illuminations import plan_illuminations
+from experiment.lights import plan_illuminations
 
 LIGHTS = plan_illuminations(1, (2500, 6500))
 FRAMES = [SourceFrame("white", None, "frames/0000_white.dng", "00" * 32)] + [

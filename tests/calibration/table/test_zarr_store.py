@@ -23,7 +23,7 @@ from calibration.table.source_frames import SourceFrame
 from calibration.table.writer import LutWriter
 from calibration.table.zarr_store import SHARD_LIGHTS, fetch, publish
 from drivers.presenter import Colour
-from experiment.lights.illuminations import Illumination
+from experiment.lights import Illumination
 from foundation.errors import FormatError, InputError, StorageError
 
 LIGHTS = SHARD_LIGHTS + 3

@@ -23,7 +23,7 @@ from drivers.display import fullscreen
 from drivers.display.fullscreen import Display, FullScreen, choose_display, identify_displays, list_displays
 from drivers.display.x11 import XScreen, is_dark
 from drivers.presenter import BLACK, WHITE, Colour
-from experiment.lights.illuminations import plan_illuminations
+from experiment.lights import plan_illuminations
 from foundation.errors import ConfigurationError, DeviceError
 from sim.clock import SimulatedClock
 from tests.contracts.presenter import Bench, PresenterContract

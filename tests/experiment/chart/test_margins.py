@@ -12,9 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from experiment.chart.layout import design_chart, paper_chart
-from experiment.chart.margins import Margins, bar_boxes, edge_boxes, margin_marks, star_boxes, text_boxes
+from experiment.chart.margins import Margins, bar_boxes, edge_boxes, margin_marks, star_boxes, text_boxes, whole_px
 from experiment.chart.model import Chart
-from experiment.chart.pixels import whole_px
 from experiment.chart.printing import drawing, field_drawing
 
 pytestmark = pytest.mark.slow

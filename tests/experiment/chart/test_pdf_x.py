@@ -24,9 +24,9 @@ import tifffile
 from PIL import Image, ImageCms
 
 from experiment.chart.layout import design_chart
+from experiment.chart.pdf_x import srgb_display_profile, srgb_output_profile
 from experiment.chart.printing import save_pdf, save_tiff
 from experiment.chart.proof import save_proof
-from experiment.chart.rgb_profiles import srgb_display_profile, srgb_output_profile
 
 NAMESPACES = {
     "rdf": "http://www.w3.org/1999/02/22-rdf-syntax-ns#",

@@ -1,4 +1,7 @@
-"""The print: every edge on its pixel, every colour exact, true size, and tags that an independent library reads."""
+"""The print: every edge on its pixel, every colour exact, true size, and tags that an independent library reads.
+
+The proof page and the instructions: true size, readable tags, greys of the right codes.
+"""
 
 from __future__ import annotations
 
@@ -20,10 +23,81 @@ from pyapriltags import Detector
 
 from experiment.chart.layout import design_chart, paper_chart
 from experiment.chart.model import Chart, Tag
-from experiment.chart.printing import drawing, label, preview, save_pdf, save_preview, save_tiff, tag_modules
+from experiment.chart.printing import drawing, field_px, label, preview, save_pdf, save_preview, save_tiff, tag_modules
+from experiment.chart.proof import WEDGE_CODES, instructions, proof_drawing, save_proof
 from foundation.errors import InputError, StorageError
 
 pytestmark = pytest.mark.slow
+
+PX_MM = 25.4 / 600
+
+
+def drawn(path: Path, dpi: int, *options: str) -> npt.NDArray[np.uint8]:
+    """(H, W, 3) RGB of a PDF's page as poppler draws it."""
+    renderer = shutil.which("pdftoppm")
+    if renderer is None:
+        pytest.skip("pdftoppm (poppler) is not installed, and nothing else here draws a PDF")
+    picture = path.with_suffix("")
+    subprocess.run([renderer, "-r", str(dpi), *options, "-singlefile", "-png", path, picture], check=True)
+    image = cv2.imread(str(picture.with_suffix(".png")))
+    assert image is not None
+    return image[:, :, ::-1].astype(np.uint8)
+
+
+def test_the_proof_is_one_a4_page_with_tags_at_true_size(a0: Chart, tmp_path: Path) -> None:
+    path = tmp_path / "proof.pdf"
+    save_proof(a0, path)
+    box = re.search(rb"/MediaBox \[([\d. ]+)\]", path.read_bytes())
+    assert box is not None
+    # ISO 216: 297 × 210 mm.
+    assert [float(value) * 25.4 / 72 for value in box[1].split()] == pytest.approx([0, 0, 297, 210], abs=1e-3)
+    assert len(re.findall(rb"/Type /Page\b", path.read_bytes())) == 1
+    assert b"/ICCBased" not in path.read_bytes()
+    picture = drawn(path, 200)
+    assert abs(picture.shape[1] - 297 * 200 / 25.4) <= 1
+    found = detect(picture)
+    assert sorted(found) == [0, 1]
+    shift = found[0][0] * 25.4 / 200 - a0.tags[0].corners_mm[0]
+    for number in (0, 1):
+        np.testing.assert_allclose(found[number] * 25.4 / 200 - shift, a0.tags[number].corners_mm, atol=0.1)
+
+
+def test_both_halves_of_the_greys_have_the_codes(a7: Chart, tmp_path: Path) -> None:
+    save_proof(a7, tmp_path / "proof.pdf")
+    picture = drawn(tmp_path / "proof.pdf", 254)
+    middles = (360 * PX_MM + 8 * (np.arange(len(WEDGE_CODES)) + 0.5)) * 10
+    for y_mm in (140, 146):
+        row = picture[y_mm * 10, np.rint(middles).astype(int)]
+        np.testing.assert_array_equal(row, np.array(WEDGE_CODES)[:, None].repeat(3, axis=1))
+
+
+@pytest.mark.parametrize("chart", [design_chart(1), design_chart(5, "A2"), paper_chart()], ids=["A7", "A2", "paper"])
+def test_the_piece_is_the_sheet_s_own(chart: Chart) -> None:
+    proof, sheet = proof_drawing(chart), drawing(chart)
+    assert (proof.rectangles_mm >= 0).all()
+    assert (proof.rectangles_mm[:, 2:] <= proof.page_mm).all()
+    assert proof.tiles > 0
+    shift = (np.array([360, 330]) - field_px(chart)[:2]) * PX_MM
+    known = {(*box, *code) for box, code in zip(sheet.rectangles_mm.round(3).tolist(), sheet.rgb.tolist(), strict=True)}
+    tiles = (proof.rectangles_mm[-proof.tiles :] - np.tile(shift, 2)).round(3)
+    assert all(
+        (*box, *code) in known for box, code in zip(tiles.tolist(), proof.rgb[-proof.tiles :].tolist(), strict=True)
+    )
+    # The piece does not reach the greys below it.
+    assert proof.rectangles_mm[-proof.tiles :, 3].max() < 130
+
+
+def test_the_instructions_tell_the_sheet_s_own_sizes(a0: Chart, a7: Chart) -> None:
+    text = instructions(a0)
+    assert "1189 × 841 mm" in text
+    assert "28087 × 19866 pixels" in text
+    assert "0 and 1100 below the field are 1100 mm apart, 0 and 800 on its left 800 mm" in text
+    assert a0.sha256[:16] in text
+    for word in ("NO COLOUR MANAGEMENT", "100 %", "Matte", "no varnish, no lamination", "Flat"):
+        assert word in text
+    assert "chart.tif" not in instructions(a0, tiff=False)
+    assert "as their numbers say" in instructions(a7)
+    assert max(len(line) for line in text.splitlines()) <= 120
 
 
 def detect(picture: npt.NDArray[np.uint8]) -> dict[int, npt.NDArray[np.float64]]:
@@ -205,21 +279,11 @@ def test_the_pdf_has_the_page_s_size_and_no_profile(a7: Chart, tmp_path: Path) -
 
 
 def test_the_pdf_shows_what_the_tiff_shows(a7: Chart, tiff: Path, tmp_path: Path) -> None:
-    renderer = shutil.which("pdftoppm")
-    if renderer is None:
-        pytest.skip("pdftoppm (poppler) is not installed, and nothing else here draws a PDF")
     save_pdf(a7, tmp_path / "chart.pdf")
-    subprocess.run(
-        [renderer, "-r", "600", "-aa", "no", "-aaVector", "no", "-png", tmp_path / "chart.pdf", tmp_path / "drawn"],
-        check=True,
-    )
-    (path,) = tmp_path.glob("drawn*.png")
-    drawn = cv2.imread(str(path))
-    assert drawn is not None
-    expected = tifffile.imread(tiff)
+    seen, expected = drawn(tmp_path / "chart.pdf", 600, "-aa", "no", "-aaVector", "no"), tifffile.imread(tiff)
     # Every pixel, marks too: nothing is shifted, and no hairline of paper shows between cells.
-    np.testing.assert_array_equal(drawn[: expected.shape[0], : expected.shape[1], ::-1], expected)
-    assert sorted(detect(drawn.astype(np.uint8))) == [0, 1, 2, 3]
+    np.testing.assert_array_equal(seen[: expected.shape[0], : expected.shape[1]], expected)
+    assert sorted(detect(seen)) == [0, 1, 2, 3]
 
 
 def test_the_label_tells_charts_apart(a7: Chart) -> None:
@@ -233,20 +297,13 @@ def test_the_label_tells_charts_apart(a7: Chart) -> None:
 
 
 def test_no_hairline_between_cells_at_a_coarse_resolution(tmp_path: Path) -> None:
-    renderer = shutil.which("pdftoppm")
-    if renderer is None:
-        pytest.skip("pdftoppm (poppler) is not installed, and nothing else here draws a PDF")
     # Cells of 108 × 152 pixels whose edges fall on pixels of the rendering: here hairlines of bare paper showed.
     chart = paper_chart()
     save_pdf(chart, tmp_path / "chart.pdf")
-    subprocess.run(
-        [renderer, "-r", "100", "-png", "-singlefile", tmp_path / "chart.pdf", tmp_path / "drawn"], check=True
-    )
-    drawn = cv2.imread(str(tmp_path / "drawn.png"))
-    assert drawn is not None
+    seen = drawn(tmp_path / "chart.pdf", 100)
     low = np.ceil(chart.centres_mm.min(axis=0) * 100 / 25.4).astype(int)
     high = np.floor(chart.centres_mm.max(axis=0) * 100 / 25.4).astype(int)
-    assert not (drawn[low[1] : high[1], low[0] : high[0]] == 255).all(axis=2).any()
+    assert not (seen[low[1] : high[1], low[0] : high[0]] == 255).all(axis=2).any()
 
 
 @pytest.mark.parametrize(("number", "word"), [(0, 0xD5D628584), (1, 0xD97F18B49), (2, 0xDD280910E)])

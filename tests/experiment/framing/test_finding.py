@@ -3,87 +3,42 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from datetime import UTC, datetime
-from functools import cache
-from io import BytesIO
 from pathlib import Path
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 import pytest
 
-from drivers.camera import ExposureSettings
 from drivers.presenter import BLACK, WHITE, Colour
 from drivers.raw.rawfile import Mosaic, read_raw
-from experiment.chart.layout import A_SERIES_MM, design_chart
 from experiment.chart.model import Chart
-from experiment.chart.printing import drawing
-from experiment.framing.finding import find_chart
+from experiment.framing.finding import find_chart, find_tags
 from experiment.framing.movement import shift_between
 from experiment.framing.planes import CHANNELS, Plane, channel_offset_px, phases, plane_of, strongest_plane
 from experiment.framing.sharpness import blur_px
-from experiment.framing.tags import find_tags
 from foundation.errors import RegistrationError
-from sim.camera.film import write_dng
-from sim.world.rendering import Print
 from sim.world.room import Room
-from sim.world.sensors import BODIES
-from sim.world.world import World
+from tests.calibration.lab import Lab, hang
 from tests.data_files import available
 
 pytestmark = pytest.mark.slow
 
-SETTINGS = ExposureSettings(iso=100, aperture=8.0, shutter_s=0.5)
 FLAT = Room(waviness_mm=0.0, tilt_deg=0, pan_deg=0, k1=0, k2=0, p1=0, p2=0)
 
 
-CHART = design_chart(3, A_SERIES_MM["A5"], 1)
-
-
-@cache
-def sheet() -> Print:
-    picture = drawing(CHART)
-    return Print(picture.page_mm, picture.rectangles_mm, picture.rgb)
-
-
-def world_of(room: Room) -> World:
-    return World(sheet(), BODIES["Test"], room)
-
-
-def frame_of(world: World, folder: Path, colour: Colour = WHITE, key: int = 1) -> Mosaic:
-    stream = BytesIO()
-    write_dng(
-        stream,
-        world.expose(colour, SETTINGS, key=(key,)),
-        world.body,
-        settings=SETTINGS,
-        taken_at=datetime(2024, 3, 1, tzinfo=UTC),
-    )
-    path = folder / f"{key}.dng"
-    path.write_bytes(stream.getvalue())
-    return read_raw(path)
-
-
-def truth(world: World, mosaic: Mosaic, points_mm: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
-    visible = world.body.visible
-    aside = np.array([mosaic.visible.left - visible.left, mosaic.visible.top - visible.top]) / 2
-    return world.project(points_mm) - aside
+@pytest.fixture(scope="module")
+def lab() -> Lab:
+    return hang()
 
 
 @pytest.fixture(scope="module")
-def chart() -> Chart:
-    return CHART
+def chart(lab: Lab) -> Chart:
+    return lab.chart
 
 
 @pytest.fixture(scope="module")
-def world() -> World:
-    return world_of(Room(waviness_mm=0.5))
-
-
-@pytest.fixture(scope="module")
-def white(world: World, tmp_path_factory: pytest.TempPathFactory) -> Mosaic:
-    return frame_of(world, tmp_path_factory.mktemp("white"))
+def white(lab: Lab, tmp_path_factory: pytest.TempPathFactory) -> Mosaic:
+    return lab.mosaic(tmp_path_factory.mktemp("white"))
 
 
 @pytest.mark.parametrize(
@@ -107,22 +62,20 @@ def test_red_and_blue_lie_a_quarter_pixel_aside(
 @pytest.mark.parametrize(
     ("colour", "channel"), [(Colour(255, 0, 0), "R"), (Colour(0, 255, 0), "G"), (Colour(0, 0, 255), "B")]
 )
-def test_corners_are_true_in_every_colour(
-    chart: Chart, world: World, tmp_path: Path, colour: Colour, channel: str
-) -> None:
-    mosaic = frame_of(world, tmp_path, colour)
+def test_corners_are_true_in_every_colour(chart: Chart, lab: Lab, tmp_path: Path, colour: Colour, channel: str) -> None:
+    mosaic = lab.mosaic(tmp_path, colour)
     framing = find_chart(mosaic, chart)
     assert framing.plane.channel == channel
     assert framing.complete
     corners_mm = {tag.id: tag.corners_mm for tag in chart.tags}
-    error = np.concatenate([tag.corners_px - truth(world, mosaic, corners_mm[tag.id]) for tag in framing.tags])
+    error = np.concatenate([tag.corners_px - lab.truth_px(corners_mm[tag.id], mosaic) for tag in framing.tags])
     # A wrong corner order is tens of pixels off, a forgotten half or quarter pixel shows in the mean.
     assert np.abs(error.mean(axis=0)).max() < 0.1
     assert np.sqrt((error**2).sum(axis=1).mean()) < 0.3
 
 
 def test_pose_is_told(chart: Chart, tmp_path: Path) -> None:
-    mosaic = frame_of(world_of(replace(FLAT, fill=0.8, roll_deg=180.0)), tmp_path)
+    mosaic = hang(room=replace(FLAT, fill=0.8, roll_deg=180.0)).mosaic(tmp_path)
     framing = find_chart(mosaic, chart)
     assert framing.fill == pytest.approx(0.8, abs=0.01)
     assert abs(framing.rotation_deg) == pytest.approx(180, abs=0.5)
@@ -134,22 +87,22 @@ def test_pose_is_told(chart: Chart, tmp_path: Path) -> None:
     ("blur", "roll_deg", "good_to"), [(0.4, 0.0, 0.02), (0.6, 1.7, 0.02), (0.9, 180.6, 0.02), (1.2, 0.0, 0.06)]
 )
 def test_blur_is_measured(chart: Chart, tmp_path: Path, blur: float, roll_deg: float, good_to: float) -> None:
-    mosaic = frame_of(world_of(replace(FLAT, blur_px=blur, roll_deg=roll_deg)), tmp_path)
+    mosaic = hang(room=replace(FLAT, blur_px=blur, roll_deg=roll_deg)).mosaic(tmp_path)
     # A photosite is half a pixel wide (σ = 0.5/√12) and the two greens lie 0.25 px to either side.
     expected = float(np.sqrt(blur**2 + 0.25 / 12 + 0.25**2))
     assert blur_px(find_chart(mosaic, chart)) == pytest.approx(expected, abs=good_to)
 
 
 def test_blur_of_red_lacks_the_greens_spacing(chart: Chart, tmp_path: Path) -> None:
-    mosaic = frame_of(world_of(replace(FLAT, blur_px=0.6)), tmp_path, Colour(255, 0, 0))
+    mosaic = hang(room=replace(FLAT, blur_px=0.6)).mosaic(tmp_path, Colour(255, 0, 0))
     expected = float(np.sqrt(0.6**2 + 0.25 / 12))
     assert blur_px(find_chart(mosaic, chart)) == pytest.approx(expected, abs=0.02)
 
 
 @pytest.mark.parametrize("colour", [WHITE, Colour(255, 0, 0), Colour(0, 0, 255), Colour(60, 60, 60)])
-def test_a_still_chart_does_not_move(chart: Chart, world: World, white: Mosaic, tmp_path: Path, colour: Colour) -> None:
+def test_a_still_chart_does_not_move(chart: Chart, lab: Lab, white: Mosaic, tmp_path: Path, colour: Colour) -> None:
     framing = find_chart(white, chart)
-    later = strongest_plane(frame_of(world, tmp_path, colour, key=2))
+    later = strongest_plane(lab.mosaic(tmp_path, colour, key=2))
     shift = shift_between(plane_of(white, later.channel), framing, later)
     assert shift.gauges == len(chart.tags)
     assert shift.largest_px < 0.02
@@ -171,8 +124,8 @@ def test_a_leap_is_not_measured_as_a_step(chart: Chart, white: Mosaic) -> None:
     assert shift_between(plane, find_chart(white, chart), Plane("G", values, plane.offset_px)).gauges == 0
 
 
-def test_a_dark_frame_is_called_dark(chart: Chart, world: World, tmp_path: Path) -> None:
-    mosaic = frame_of(world, tmp_path, BLACK)
+def test_a_dark_frame_is_called_dark(chart: Chart, lab: Lab, tmp_path: Path) -> None:
+    mosaic = lab.mosaic(tmp_path, BLACK)
     with pytest.raises(RegistrationError, match=r"frame 7 is dark: .* expose longer"):
         find_chart(mosaic, chart, "frame 7")
 

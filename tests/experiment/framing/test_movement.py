@@ -122,4 +122,4 @@ def test_a_softer_frame_is_measured(tmp_path: Path, colour: Colour, blur_px: flo
     later = strongest_plane(soft.mosaic(tmp_path, colour, key=2))
     shift = shift_between(plane_of(before, later.channel), find_chart(before, sharp.chart), later)
     true = blur_px**2 - 0.5**2
-    assert shift.softer_px2 == pytest.approx(true, rel=0.35, abs=0.05)
+    assert shift.blur_growth_px2 == pytest.approx(true, rel=0.35, abs=0.05)

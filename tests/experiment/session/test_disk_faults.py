@@ -16,10 +16,10 @@ import pytest
 from drivers.camera import CapturedFrame
 from drivers.presenter import Colour
 from experiment.chart.layout import design_chart
-from experiment.lights.illuminations import Illumination
+from experiment.lights import Illumination
 from experiment.session.folder import Session
-from experiment.session.judgement import Judgement
 from experiment.session.plan import plan_steps
+from experiment.session.records import Judgement
 from foundation.errors import FormatError, StorageError
 from tests.failing_calls import DISK_FAULTS, FailingCalls, failing_calls, why_not
 

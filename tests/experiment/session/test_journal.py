@@ -1,22 +1,68 @@
-"""The journal of a session: what is written is there after the program, and what is no journal is said to be none."""
+"""The journal of a session: what is written is there after the program, and what is no journal is said to be none.
+
+Times that a journal may hold: those that every reader of it can read and compare, and no others.
+"""
 
 from __future__ import annotations
 
 import sqlite3
+from collections.abc import Generator
 from contextlib import closing
-from datetime import UTC, datetime, timedelta
+from datetime import UTC, datetime, timedelta, timezone
 from pathlib import Path
 
 import pytest
 
 from drivers.presenter import Colour
-from experiment.lights.illuminations import Illumination
+from experiment.lights import Illumination
 from experiment.session import journal_file
-from experiment.session.journal import Journal
-from experiment.session.judgement import Judgement
+from experiment.session.journal import Journal, time_text
+from experiment.session.journal_file import JOURNAL_VERSION, create_file, require_sound_rows
 from experiment.session.plan import plan_steps
-from experiment.session.records import ACCEPTED, FAILED, AcceptedFile, SessionEvent
+from experiment.session.records import ACCEPTED, FAILED, AcceptedFile, Judgement, SessionEvent
 from foundation.errors import FormatError, StorageError
+
+
+@pytest.fixture
+def journal(tmp_path: Path) -> Generator[sqlite3.Connection]:
+    with closing(create_file(tmp_path / "journal.sqlite")) as connection:
+        yield connection
+
+
+def require_time(journal: sqlite3.Connection, text: str) -> None:
+    journal.execute("INSERT INTO events (at, what, detail) VALUES (?, 'start', '')", (text,))
+    require_sound_rows(Path("journal.sqlite"), journal, JOURNAL_VERSION)
+
+
+@pytest.mark.parametrize("zone", [UTC, timezone(timedelta(hours=5, minutes=45)), timezone(timedelta(hours=-8))])
+@pytest.mark.parametrize("microsecond", [0, 1, 250000])
+def test_times_that_are_written_may_stand_in_a_journal(
+    journal: sqlite3.Connection, zone: timezone, microsecond: int
+) -> None:
+    at = datetime(2028, 2, 29, 23, 59, 59, microsecond, zone)
+    require_time(journal, time_text(at))
+    require_time(journal, at.replace(microsecond=0).isoformat())
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "2026-01-01T00:00:06.000000",
+        "2026-01-01T00:00:06.00\x00000+00:00",
+        "2026-01-01T00:00:06.000000+00:00\x00",
+        "2026-02-30T00:00:06.000000+00:00",
+        "2026-01-01T24:00:06.000000+00:00",
+        "2026-01-01T00:00:06.000000+25:00",
+        "0000-01-01T00:00:06.000000+00:00",
+        "9999-12-31T23:59:59.000000-08:00",
+        "2026-01-01",
+        "",
+    ],
+)
+def test_times_that_a_reader_could_not_compare_are_refused(journal: sqlite3.Connection, text: str) -> None:
+    with pytest.raises(FormatError, match="1 rows of events hold values that no run writes"):
+        require_time(journal, text)
+
 
 LIGHTS = (Illumination(0, "uniform", None, Colour(255, 0, 0)),)
 STEPS = plan_steps(LIGHTS, 2)
@@ -58,7 +104,7 @@ def test_what_is_written_is_read_again(path: Path) -> None:
         assert attempts[0].ended_at == NOW + timedelta(seconds=2)
         assert attempts[1].reason == "the cable came off"
         assert journal.accepted_files() == [AcceptedFile(1, 0, None, "frames/1.cr2", 10, "00")]
-        assert journal.events() == [SessionEvent(NOW, "start", "4 of 4 frames to take")]
+        assert journal.events() == [SessionEvent(NOW, "start", "4 of 4 frames to take", 1)]
 
 
 def test_frames_come_in_the_order_of_the_plan_refused_ones_with_their_reason(path: Path) -> None:
@@ -71,6 +117,17 @@ def test_frames_come_in_the_order_of_the_plan_refused_ones_with_their_reason(pat
         assert [frame.accepted for frame in journal.frames()] == [False, True]
         assert journal.kept_files(STEPS[0]) == 1, "an attempt without a raw file keeps none"
         assert journal.attempts()[again - 1].verdict is None
+
+
+def test_what_is_read_at_one_moment_fits_together(path: Path) -> None:
+    with closing(Journal.open_for_run(path)) as run:
+        run.note(NOW, "start")
+        with closing(Journal.open(path)) as reader:
+            with reader.one_moment():
+                assert len(reader.events()) == 1
+                run.note(NOW, "stop")
+                assert len(reader.events()) == 1
+            assert [event.what for event in reader.events()] == ["start", "stop"]
 
 
 def test_a_journal_that_cannot_be_written_says_what_helps(path: Path) -> None:

@@ -18,7 +18,7 @@ from pathlib import Path
 import pytest
 
 from drivers.presenter import Colour
-from experiment.lights.illuminations import Illumination
+from experiment.lights import Illumination
 from experiment.session import journal_file
 from experiment.session.journal import Journal
 from experiment.session.plan import plan_steps
@@ -125,7 +125,7 @@ def test_another_writer_is_waited_for(path: Path, monkeypatch: pytest.MonkeyPatc
             said.append(sentence)
             let_go(other)
 
-        journal.be_patient(60, announce)
+        journal.retry_locked(60, announce)
         journal.note(NOW, "written")
     assert said == [f"another program holds {path}; the run goes on when it has finished"]
     assert whats(path) == ["written"]
@@ -174,7 +174,7 @@ def test_where_machines_share_no_memory_a_reader_is_waited_for(path: Path, monke
                 said.append(sentence)
                 let_go(reader)
 
-            journal.be_patient(60, announce)
+            journal.retry_locked(60, announce)
             journal.note(NOW, "written")
     assert len(said) == 1
     assert whats(path) == ["written"]

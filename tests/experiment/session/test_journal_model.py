@@ -19,10 +19,10 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from drivers.presenter import Colour
-from experiment.lights.illuminations import Illumination
+from experiment.lights import Illumination
 from experiment.session.journal import Journal
-from experiment.session.judgement import AttemptDetails, Check, Judgement
-from experiment.session.plan import SessionStep, plan_steps, tie_steps
+from experiment.session.plan import SessionStep, link_steps, plan_steps
+from experiment.session.records import AttemptDetails, Check, Judgement
 
 pytestmark = pytest.mark.slow
 
@@ -111,7 +111,7 @@ def apply(what: str, value: Any, journal: Journal, model: Model, at: datetime) -
         journal.beat(value, "", at)
         model.state = value
     elif what == "add":
-        more = tie_steps(len(model.steps))
+        more = link_steps(len(model.steps))
         journal.add_steps(more)
         model.steps += more
 
@@ -175,7 +175,7 @@ KILLED = """
 import os, signal, sqlite3, sys
 from pathlib import Path
 from experiment.session.journal import Journal
-from tests.acquisition.session.test_journal_model import night
+from tests.experiment.session.test_journal_model import night
 
 statements = 0
 
@@ -222,7 +222,7 @@ def night(journal: Journal) -> list[Callable[[], object]]:
         lambda: journal.begin(STEPS[1], "frames/1", BEGUN),
         lambda: commit(2),
         lambda: journal.void([1], BEGUN, "moved"),
-        lambda: journal.add_steps(tie_steps(len(STEPS))),
+        lambda: journal.add_steps(link_steps(len(STEPS))),
     ]
 
 

@@ -14,9 +14,9 @@ from acquisition.cli import main
 from drivers.camera import CapturedFrame
 from drivers.presenter import Colour
 from experiment.chart.layout import design_chart
-from experiment.lights.illuminations import Illumination, save_illuminations
+from experiment.lights import Illumination, save_illuminations
 from experiment.session.folder import Session
-from experiment.session.judgement import Judgement
+from experiment.session.records import Judgement
 from foundation.errors import FormatError
 
 NOW = datetime(2026, 1, 1, 9, 30, tzinfo=UTC)

@@ -1,10 +1,25 @@
-"""The plan of a session: which frames, in which order."""
+"""The plan of a session: which frames, in which order.
+
+Durations as people read them.
+"""
 
 from __future__ import annotations
 
+import pytest
+
 from drivers.presenter import BLACK, WHITE, Colour
-from experiment.lights.illuminations import Illumination
-from experiment.session.plan import RESPONSE, SessionStep, plan_steps, tie_steps
+from experiment.lights import Illumination
+from experiment.session.plan import RESPONSE, SessionStep, link_steps, plan_steps
+from experiment.session.records import duration_text
+
+
+@pytest.mark.parametrize(
+    ("seconds", "text"),
+    [(None, "unknown"), (0, "0 s"), (59.6, "1 min 00 s"), (200, "3 min 20 s"), (7500, "2 h 05 min")],
+)
+def test_durations_read_well(seconds: float | None, text: str) -> None:
+    assert duration_text(seconds) == text
+
 
 LIGHTS = tuple(Illumination(number, "uniform", None, Colour(255, number, 0)) for number in range(5))
 
@@ -47,7 +62,7 @@ def test_response_frames_come_after_the_first_pair_and_are_taken_for_nothing_els
 
 
 def test_the_steps_that_tie_a_run_to_the_one_before_go_on_in_number() -> None:
-    steps = tie_steps(40)
+    steps = link_steps(40)
     assert [step.number for step in steps] == [40, 41, 42, 43, 44, 45]
     assert [step.colour for step in steps] == [
         Colour(250, 250, 250),

@@ -18,10 +18,10 @@ from drivers.camera import CapturedFrame
 from drivers.presenter import Colour
 from experiment.chart.layout import design_chart
 from experiment.config import LabSettings
-from experiment.lights.illuminations import Illumination
+from experiment.lights import Illumination
 from experiment.session.folder import Session
-from experiment.session.judgement import Check, Judgement
 from experiment.session.plan import plan_steps
+from experiment.session.records import Check, Judgement
 from generator.dataset.making import DatasetOptions, generate_dataset
 from generator.lights.choices import ListedLights, SimultaneousLights
 from generator.masks.request import parse_masks

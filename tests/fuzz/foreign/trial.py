@@ -18,15 +18,14 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from acquisition.monitor.reading import read_session
+from acquisition.monitor.view import read_session
 from acquisition.status import status_json, status_lines
 from calibration.table.description import describe
 from calibration.table.lut import open_lut
 from calibration.table.verification import find_faults
 from calibration.table.zarr_store import fetch
 from experiment.session.folder import Session
-from experiment.session.mending.redaction import held_secrets
-from experiment.session.mending.verification import unsound_files
+from experiment.session.repair import held_secrets, unsound_files
 from foundation.errors import CropError
 from generator.dataset.reader import open_dataset
 from generator.dataset.verification import file_faults

@@ -14,7 +14,7 @@ from scipy.stats import f as f_distribution
 from calibration.pipeline.build import build
 from calibration.table.lut import Lut, open_lut
 from drivers.presenter import Colour
-from experiment.lights.illuminations import Illumination
+from experiment.lights import Illumination
 from foundation.colorimetry import angles_deg
 from generator.lights.gamut import Gamut
 from generator.lights.lighting import Mixture, plain

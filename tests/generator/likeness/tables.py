@@ -11,7 +11,7 @@ from calibration.table.lut import Lut, open_lut
 from calibration.table.provenance import Provenance
 from calibration.table.writer import LutWriter
 from drivers.presenter import Colour
-from experiment.lights.illuminations import Illumination
+from experiment.lights import Illumination
 
 SPECTRA: dict[int, tuple[float, float, float]] = {0: (9, 5, 2), 1: (7, 6, 4), 2: (5, 6, 6), 3: (3, 5, 9), 4: (4, 9, 3)}
 """Light in three bands, by the blue code that the projector shows."""

@@ -13,7 +13,7 @@ from calibration.table.lut import Lut, open_lut
 from calibration.table.provenance import Provenance
 from calibration.table.writer import LutWriter
 from drivers.presenter import Colour
-from experiment.lights.illuminations import Illumination
+from experiment.lights import Illumination
 
 BITS = 3
 """Bits a channel of the tables: 512 colours."""

@@ -17,7 +17,7 @@ from calibration.table.writer import LutWriter
 from drivers.presenter import Colour
 from evaluation.datasets.generated import open_generated
 from evaluation.scene import SceneSet
-from experiment.lights.illuminations import Illumination
+from experiment.lights import Illumination
 from foundation.colorimetry import decode_srgb
 from generator.dataset.making import DatasetOptions, generate_dataset
 from generator.lights.choices import LightChoice, ListedLights

@@ -12,19 +12,17 @@ from hypothesis import strategies as st
 
 from acquisition.cli import main
 from drivers.presenter import Colour
-from experiment.lights.illuminations import (
+from experiment.lights import (
     Illumination,
-    encode_srgb,
     illuminations_to_csv,
     load_illuminations,
     parse_ccts,
     plan_illuminations,
+    plot_illuminations,
     save_illuminations,
     shown_colour,
     uniform_lights,
 )
-from experiment.lights.plots import plot_illuminations
-from foundation.colorimetry import decode_srgb
 from foundation.errors import FormatError, InputError
 
 HEADER = "index,kind,cct_k,red,green,blue\n"
@@ -123,21 +121,6 @@ def test_a_smaller_plan() -> None:
     assert codes(few[-1:])[0] == pytest.approx((255, 248, 254), abs=1.5)
     assert [light.kind for light in plan_illuminations(0, (5000,))] == ["blackbody"]
     assert codes(plan_illuminations(1, ())) == [(0, 255, 0), (0, 0, 255), (255, 0, 0)]
-
-
-@pytest.mark.parametrize(
-    ("code", "linear"),
-    # Golden points of IEC 61966-2-1, worked out by hand from its two branches.
-    [(0, 0.0), (1, 1 / 255 / 12.92), (10, 10 / 255 / 12.92), (128, 0.215861), (188, 0.502886), (255, 1.0)],
-)
-def test_srgb_by_the_standard(code: int, linear: float) -> None:
-    assert float(decode_srgb(code / 255)) == pytest.approx(linear, abs=1e-6)
-    assert float(encode_srgb(linear)) * 255 == pytest.approx(code, abs=1e-3)
-
-
-@given(st.floats(0, 1))
-def test_srgb_there_and_back(linear: float) -> None:
-    assert float(decode_srgb(encode_srgb(linear))) == pytest.approx(linear, abs=1e-6)
 
 
 def test_a_light_is_shown_at_its_brightest() -> None:

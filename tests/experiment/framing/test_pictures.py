@@ -12,9 +12,9 @@ import pytest
 from drivers.raw.rawfile import read_raw
 from experiment.chart.layout import design_chart, paper_chart
 from experiment.chart.model import Chart
-from experiment.framing.annotated import annotated_png
+from experiment.framing.field import field_mm
 from experiment.framing.finding import find_chart
-from experiment.framing.tagless_field import field_mm
+from experiment.framing.pictures import annotated_png
 from sim.world.room import Room
 from tests.calibration.lab import hang_chart
 from tests.data_files import shipped

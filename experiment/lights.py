@@ -1,4 +1,4 @@
-"""The lights of an experiment, as many as the paper's 707, and their file `illuminations.csv`.
+"""The lights of an experiment, as many as the paper's 707, their file `illuminations.csv`, and the figure of them.
 
 The paper (section 3.1) asks for chromaticities spread uniformly and for black bodies but gives no recipe. Ours: the
 points of a triangular grid r = i/n, b = j/n, g = 1 − r − b in linear light, and black bodies from 2000 K to 10 000 K;
@@ -13,15 +13,15 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
 
 from drivers.presenter import Colour
-from foundation.colorimetry import encode_srgb, linear_srgb, planck, xyz_of
+from foundation.colorimetry import decode_srgb, encode_srgb, linear_srgb, planck, xyz_of
 from foundation.errors import FormatError, InputError
-from foundation.files import reading_error, write_whole
+from foundation.files import reading_error, whole_file, write_whole
 
 Kind = Literal["uniform", "blackbody", "spectrum"]
 COLUMNS = ("index", "kind", "cct_k", "red", "green", "blue")
@@ -38,6 +38,13 @@ CCTS_K = tuple(range(2000, 10001, 200))
 
 MOST_CCTS = 10_000
 """Most temperatures that a text may name: more are a mistake in the step."""
+
+
+FORMATS = ("png", "pdf", "svg")
+"""Endings of a figure's file name, and Matplotlib's names of these formats."""
+
+_NAMED_CCTS_K = (2000, 3000, 4000, 6000, 10000)
+"""Temperatures that the figure names, kelvin: few enough for their names not to touch."""
 
 
 @dataclass(frozen=True)
@@ -185,3 +192,72 @@ def _require_kelvin(ccts: Sequence[float], given: str) -> None:
     for cct_k in ccts:
         if not 1000 <= cct_k <= 100_000:
             raise InputError(f"{given}: {cct_k:g} K is not within 1000 … 100 000 K")
+
+
+def plot_illuminations(illuminations: Sequence[Illumination], path: Path) -> None:
+    """Plot the rb-chromaticities of lights (paper, section 3.1), each point in the colour of its light.
+
+    Chromaticities are those of the linear light that a projector with the sRGB transfer function sends out:
+    r = R / (R + G + B) and b = B / (R + G + B) of the decoded codes. A light without any light is left out.
+    """
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    ending = path.suffix.lower().removeprefix(".")
+    if ending not in FORMATS:
+        raise InputError(f"a figure cannot be written as {path.name}; end its name with .{', .'.join(FORMATS)}")
+    lit = [light for light in illuminations if any(light.codes)]
+    codes = np.array([light.codes for light in lit]).reshape(-1, 3) / 255
+    linear = decode_srgb(codes)
+    r, _, b = (linear / linear.sum(axis=1, keepdims=True)).T
+    black_body = np.array([light.kind == "blackbody" for light in lit], dtype=np.bool_)
+
+    # Matplotlib's own types leave the keyword arguments of every method unknown.
+    figure: Any = Figure(figsize=(7.2, 6.8), layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.add_subplot()
+    axes.plot([0, 1, 0, 0], [0, 0, 1, 0], color="0.75", linewidth=0.8, zorder=1)
+    axes.scatter(
+        r[~black_body],
+        b[~black_body],
+        s=22,
+        c=codes[~black_body],
+        edgecolors="0.55",
+        linewidths=0.3,
+        zorder=2,
+        label=f"uniform ({int((~black_body).sum())})",
+    )
+    axes.scatter(
+        r[black_body],
+        b[black_body],
+        s=34,
+        c=codes[black_body],
+        marker="D",
+        edgecolors="black",
+        linewidths=0.9,
+        zorder=3,
+        label=f"black bodies ({int(black_body.sum())})",
+    )
+    for light, x, y in zip(lit, r, b, strict=True):
+        if light.cct_k in _NAMED_CCTS_K:
+            # Named outside the triangle, so that no light is hidden.
+            away = (1.04 - float(x) - float(y)) / 2
+            axes.annotate(
+                f"{light.cct_k:g} K",
+                (float(x), float(y)),
+                xytext=(float(x) + away, float(y) + away),
+                fontsize=9,
+                arrowprops={"arrowstyle": "-", "color": "0.3", "linewidth": 0.7, "shrinkA": 0, "shrinkB": 4},
+                zorder=4,
+            )
+    axes.set_xlabel("r")
+    axes.set_ylabel("b")
+    axes.set_xlim(-0.03, 1.03)
+    axes.set_ylim(-0.03, 1.03)
+    axes.set_aspect("equal")
+    axes.legend(loc="upper right", frameon=False)
+    axes.set_title(f"rb-chromaticities of {len(lit)} illuminations")
+    # The day of writing is kept out of the file, so that the same lights give the same PNG.
+    metadata = {"png": {"Software": None}, "pdf": {"CreationDate": None}, "svg": {"Date": None}}[ending]
+    with whole_file(path) as stream:
+        figure.savefig(stream, format=ending, dpi=150, metadata=metadata)

@@ -16,12 +16,11 @@ import pytest
 from drivers.camera import CapturedFrame
 from drivers.presenter import Colour
 from experiment.chart.layout import design_chart
-from experiment.lights.illuminations import Illumination
+from experiment.lights import Illumination
 from experiment.session.folder import Session
-from experiment.session.judgement import Judgement
-from experiment.session.mending.retaking import lights_text, parse_lights
-from experiment.session.mending.verification import MOST_UNREADABLE
 from experiment.session.plan import plan_steps
+from experiment.session.records import Judgement
+from experiment.session.repair import MOST_UNREADABLE, lights_text, parse_lights
 from foundation.errors import FormatError, InputError, StorageError
 
 LIGHTS = tuple(Illumination(number, "uniform", None, Colour(255, number, 0)) for number in range(5))
@@ -110,13 +109,13 @@ def test_the_newest_sound_frame_stays_where_a_newer_one_is_gone(session: Session
     assert verdicts(session, 3) == ["accepted", "voided"]
 
 
-def unreadable(names: Sequence[str], monkeypatch: pytest.MonkeyPatch) -> None:
+def unreadable(names: Sequence[str], monkeypatch: pytest.MonkeyPatch, code: int = errno.EIO) -> None:
     """Let the disk fail at files of these names."""
     real = Path.open
 
     def fail(path: Path, mode: str = "r") -> object:
         if path.name in names:
-            raise OSError(errno.EIO, "Input/output error", str(path))
+            raise OSError(code, os.strerror(code), str(path))
         return real(path, mode)
 
     monkeypatch.setattr(Path, "open", fail)
@@ -133,12 +132,21 @@ def test_a_frame_in_bad_sectors_is_taken_again_and_its_file_stays(
     assert (session.frames_folder / "0003_light_001.cr2").read_bytes() == b"frame 0003_light_001"
 
 
-def test_frames_that_cannot_be_read_are_not_given_up(session: Session, monkeypatch: pytest.MonkeyPatch) -> None:
-    """So many are not bad sectors: the disk fails, and what is on it may be sound."""
-    names = [Path(frame.file).name for frame in session.journal.accepted_files()][: MOST_UNREADABLE + 1]
+@pytest.mark.parametrize(
+    ("code", "count", "said"),
+    [
+        (errno.EIO, MOST_UNREADABLE + 1, rf" and 3 more: {os.strerror(errno.EIO)}; check the disk"),
+        (errno.EACCES, 1, rf": {os.strerror(errno.EACCES)}; check the disk, its cable and the permissions"),
+    ],
+)
+def test_frames_that_may_be_sound_are_not_given_up(
+    session: Session, monkeypatch: pytest.MonkeyPatch, code: int, count: int, said: str
+) -> None:
+    """So many are not bad sectors, and permissions say nothing of the files."""
+    names = [Path(frame.file).name for frame in session.journal.accepted_files()][:count]
     with monkeypatch.context() as patched:
-        unreadable(names, patched)
-        with pytest.raises(StorageError, match=rf"{names[0]} and 3 more: Input/output error; check the disk"):
+        unreadable(names, patched, code)
+        with pytest.raises(StorageError, match=f"{names[0]}{said}"):
             session.verify()
     assert session.done_steps() == set(range(9))
 

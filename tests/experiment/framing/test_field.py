@@ -1,12 +1,13 @@
-"""A chart without tags: its field found by outline and colours, on frames of the simulated room and on real ones."""
+"""A chart without tags: its field found by outline and colours, on frames of the simulated room and on real ones.
+
+Corners given by hand: read as raw pixels, and refused where no field can be.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from datetime import UTC, datetime
 from functools import cache
-from io import BytesIO
 from pathlib import Path
 
 import cv2
@@ -14,45 +15,27 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from drivers.camera import ExposureSettings
 from drivers.presenter import BLACK, WHITE, Colour
 from drivers.raw.rawfile import Mosaic, read_raw
 from experiment.chart.layout import design_chart, paper_chart
 from experiment.chart.model import Chart
-from experiment.chart.printing import drawing
+from experiment.framing.field import FoundField, corners_text, field_mm, find_field, parse_corners, refine_edges
 from experiment.framing.finding import find_chart
-from experiment.framing.outline import refine_edges
 from experiment.framing.planes import CHANNELS, Plane, plane_of
 from experiment.framing.sharpness import blur_px
-from experiment.framing.tagless_field import FoundField, field_mm, find_field
 from foundation.errors import CropError, InputError, RegistrationError
-from sim.camera.film import write_dng
-from sim.world.rendering import Print
 from sim.world.room import Room
-from sim.world.sensors import BODIES
-from sim.world.world import World
+from tests.calibration.lab import Lab, hang_chart
 from tests.data_files import available
 
 pytestmark = pytest.mark.slow
 
-SETTINGS = ExposureSettings(iso=100, aperture=8.0, shutter_s=0.5)
 CHART = paper_chart("A6", 3)
 
 
 @cache
-def world_of(room: Room) -> World:
-    picture = drawing(CHART)
-    return World(Print(picture.page_mm, picture.rectangles_mm, picture.rgb), BODIES["Test"], room)
-
-
-def frame_of(folder: Path, room: Room, colour: Colour = WHITE) -> Mosaic:
-    stream = BytesIO()
-    world = world_of(room)
-    counts = world.expose(colour, SETTINGS, key=(1,))
-    write_dng(stream, counts, world.body, settings=SETTINGS, taken_at=datetime(2024, 3, 1, tzinfo=UTC))
-    path = folder / "frame.dng"
-    path.write_bytes(stream.getvalue())
-    return read_raw(path)
+def lab_of(room: Room) -> Lab:
+    return hang_chart(CHART, "Test", room)
 
 
 def planes_of(mosaic: Mosaic) -> list[Plane]:
@@ -60,10 +43,7 @@ def planes_of(mosaic: Mosaic) -> list[Plane]:
 
 
 def truth(room: Room, mosaic: Mosaic, points_mm: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
-    world = world_of(room)
-    visible = world.body.visible
-    aside = np.array([mosaic.visible.left - visible.left, mosaic.visible.top - visible.top]) / 2
-    return world.project(points_mm) - aside
+    return lab_of(room).truth_px(points_mm, mosaic)
 
 
 def across(room: Room, mosaic: Mosaic, chart: Chart = CHART) -> npt.NDArray[np.float64]:
@@ -77,12 +57,12 @@ UPRIGHT = Room(waviness_mm=0.5)
 
 @pytest.fixture(scope="module")
 def white(tmp_path_factory: pytest.TempPathFactory) -> Mosaic:
-    return frame_of(tmp_path_factory.mktemp("white"), UPRIGHT)
+    return lab_of(UPRIGHT).mosaic(tmp_path_factory.mktemp("white"))
 
 
 @pytest.mark.parametrize("colour", [WHITE, Colour(110, 70, 20), Colour(0, 0, 255), Colour(0, 255, 0)])
 def test_the_outline_is_where_the_cells_end(tmp_path: Path, colour: Colour) -> None:
-    off = across(UPRIGHT, frame_of(tmp_path, UPRIGHT, colour))
+    off = across(UPRIGHT, lab_of(UPRIGHT).mosaic(tmp_path, colour))
     assert len(off) > 300
     assert np.abs(np.median(off)) < 0.1
     # A tenth may be drawn to the rulers and targets in the margin, a third of a pixel from the field here.
@@ -92,7 +72,7 @@ def test_the_outline_is_where_the_cells_end(tmp_path: Path, colour: Colour) -> N
 @pytest.mark.parametrize("roll", [0.0, 180.0, 90.0, -90.0, 30.0])
 def test_which_way_up_is_told_by_the_colours(tmp_path: Path, roll: float) -> None:
     room = Room(waviness_mm=0.5, roll_deg=roll, fill=0.6)
-    mosaic = frame_of(tmp_path, room)
+    mosaic = lab_of(room).mosaic(tmp_path)
     framing = find_chart(mosaic, CHART)
     assert framing.field is not None
     assert framing.field.corners_px == pytest.approx(truth(room, mosaic, field_mm(CHART)), abs=0.7)
@@ -105,7 +85,7 @@ def test_blur_is_measured_on_the_outline(tmp_path: Path) -> None:
     room = Room(waviness_mm=0, tilt_deg=0, pan_deg=0, k1=0, k2=0, p1=0, p2=0, blur_px=0.8)
     # A photosite is half a pixel wide (σ = 0.5/√12) and the two greens lie 0.25 px to either side.
     expected = float(np.sqrt(0.8**2 + 0.25 / 12 + 0.25**2))
-    assert blur_px(find_chart(frame_of(tmp_path, room), CHART)) == pytest.approx(expected, abs=0.06)
+    assert blur_px(find_chart(lab_of(room).mosaic(tmp_path), CHART)) == pytest.approx(expected, abs=0.06)
 
 
 def test_a_mirror_is_called_a_mirror(white: Mosaic) -> None:
@@ -115,7 +95,7 @@ def test_a_mirror_is_called_a_mirror(white: Mosaic) -> None:
 
 
 def test_a_light_that_does_not_tell_which_way_up_is_not_guessed_at(tmp_path: Path) -> None:
-    mosaic = frame_of(tmp_path, UPRIGHT, Colour(255, 0, 0))
+    mosaic = lab_of(UPRIGHT).mosaic(tmp_path, Colour(255, 0, 0))
     with pytest.raises(RegistrationError, match="it is not certain which way up it hangs; take a white frame"):
         find_chart(mosaic, CHART)
     # Known from another frame of the session, or given.
@@ -133,7 +113,7 @@ def test_another_order_of_colours_is_told_apart(white: Mosaic) -> None:
 
 def test_a_dark_frame_is_called_dark(tmp_path: Path) -> None:
     with pytest.raises(RegistrationError, match="frame 3 is dark"):
-        find_chart(frame_of(tmp_path, UPRIGHT, BLACK), CHART, "frame 3")
+        find_chart(lab_of(UPRIGHT).mosaic(tmp_path, BLACK), CHART, "frame 3")
 
 
 def test_half_a_chart_is_not_a_chart(white: Mosaic) -> None:
@@ -220,12 +200,12 @@ def test_marks_in_the_margin_do_not_draw_the_refined_edge(white: Mosaic) -> None
 
 def test_each_colour_s_edge_is_where_the_lens_shows_it(tmp_path: Path) -> None:
     room = Room(waviness_mm=0.5, lateral_red_px=1.0, lateral_blue_px=-1.0)
-    mosaic = frame_of(tmp_path, room)
+    mosaic = lab_of(room).mosaic(tmp_path)
     field = find_field(planes_of(mosaic), CHART, "the frame")
     places, heights = refine_edges(planes_of(mosaic), field.outline_px, field.normals, 0.58)
     green = truth(room, mosaic, field.outline_mm)
     for of_channel, height, channel in zip(places, heights, CHANNELS, strict=True):
-        shift = world_of(room).project(field.outline_mm, channel) - world_of(room).project(field.outline_mm)
+        shift = lab_of(room).world.project(field.outline_mm, channel) - lab_of(room).world.project(field.outline_mm)
         assert channel == "G" or np.abs((shift * field.normals).sum(axis=1)).max() > 0.3
         off = ((of_channel - green - shift) * field.normals).sum(axis=1)[height > 0]
         assert len(off) > 300
@@ -260,3 +240,33 @@ def test_a_curled_corner_is_of_the_outline_and_marks_in_the_margin_are_not() -> 
     off = field.off_run_px(across[:, None] * normals)
     assert off[~marks].max() < 0.2
     assert off[marks].min() > 2.5
+
+
+GOOD = ("101,51", "3000.5,60", "2990,1900", "95,1890")
+
+
+def test_raw_pixels_become_half_size_ones() -> None:
+    # Raw pixels 0 and 1 make the half-size pixel 0: its middle lies at raw 0.5.
+    assert parse_corners(GOOD)[:2] == ((50.25, 25.25), (1500.0, 29.75))
+    assert corners_text(parse_corners(GOOD)) == "101,51 3000,60 2990,1900 95,1890"
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        (GOOD[:3], "3 corners are given"),
+        ((*GOOD, "1,1"), "5 corners are given"),
+        ((*GOOD[:3], "session"), "'session' is no corner"),
+        ((*GOOD[:3], "95"), "'95' is no corner"),
+        ((*GOOD[:3], "95,nan"), "'95,nan' is no corner"),
+        ((*GOOD[:3], "1,2,3"), "'1,2,3' is no corner"),
+        ((GOOD[0], GOOD[2], GOOD[1], GOOD[3]), "no convex quadrilateral"),
+        (("0,0", "1000,0", "500,100", "500,1000"), "no convex quadrilateral"),
+        ((GOOD[0],) * 4, "no convex quadrilateral"),
+        (GOOD[::-1], "counter-clockwise"),
+        (("0,0", "1000,0", "1000,100", "0,100"), "at least 192 expected"),
+    ],
+)
+def test_what_cannot_be_corners_is_refused(given: Sequence[str], message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        parse_corners(given)

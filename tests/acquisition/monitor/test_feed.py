@@ -11,10 +11,9 @@ from typing import Any
 
 import pytest
 
-from acquisition.monitor.encoding import place_of, planned_places
-from acquisition.monitor.watching import SessionWatch
+from acquisition.monitor.feed import SessionWatch, place_of, planned_places
 from experiment.session.journal import Journal
-from experiment.session.plan import tie_steps
+from experiment.session.plan import link_steps
 from tests.acquisition.monitor.made_up import LIGHTS, MadeUpRun
 
 
@@ -115,14 +114,14 @@ def test_nothing_new_is_nothing_told_and_the_journal_is_not_opened(
     run: MadeUpRun, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     watch = SessionWatch(run.folder)
-    monkeypatch.setattr("acquisition.monitor.watching.FRESH_S", 0.0)
+    monkeypatch.setattr("acquisition.monitor.feed.FRESH_S", 0.0)
     cursor = told(watch)["cursor"]
     assert watch.state(cursor) is None
 
     def opened(*_: object) -> None:
         raise AssertionError("opened")
 
-    monkeypatch.setattr("acquisition.monitor.watching.read_session", opened)
+    monkeypatch.setattr("acquisition.monitor.feed.read_session", opened)
     assert watch.state(cursor) is None
 
 
@@ -146,13 +145,13 @@ def test_a_failed_try_has_no_picture_even_if_the_next_bears_its_name(run: MadeUp
     by_id = {frame["id"]: frame for frame in told(watch)["frames"]}
     assert "preview" not in by_id[failed]
     assert "preview" in by_id[taken]
-    assert watch.picture(failed) is None
+    assert watch.picture(failed) == b""
 
 
 def test_more_steps_or_another_device_are_told_as_a_whole(run: MadeUpRun) -> None:
     watch = SessionWatch(run.folder)
     state = told(watch)
-    added = tie_steps(len(run.steps))
+    added = link_steps(len(run.steps))
     run.journal.add_steps(added)
     more = told(watch, state["cursor"])
     assert [step[0] for step in more["session"]["steps"]] == [step.number for step in (*run.steps, *added)]
@@ -172,6 +171,21 @@ def test_an_older_copy_put_back_is_told_as_a_whole(run: MadeUpRun, tmp_path: Pat
     assert len(state["frames"]) == 5
     (run.folder / "journal.sqlite").write_bytes(older.read_bytes())
     assert len(told(watch, state["cursor"])["frames"]) == 4
+
+
+def test_another_attempt_of_a_known_number_is_read_again(run: MadeUpRun, tmp_path: Path) -> None:
+    """As where an older copy was put back and taken up between two looks."""
+    run.journal.close()
+    older = (run.folder / "journal.sqlite").read_bytes()
+    run.journal = Journal.open_for_run(run.folder / "journal.sqlite")
+    assert run.take(run.steps[4]) == 5
+    run.journal.close()
+    watch = SessionWatch(run.folder)
+    cursor = told(watch)["cursor"]
+    (run.folder / "journal.sqlite").write_bytes(older)
+    run.journal = Journal.open_for_run(run.folder / "journal.sqlite")
+    assert run.take(run.steps[5]) == 5
+    assert told(watch, cursor)["frames"][-1]["step"] == 5
 
 
 def test_a_journal_of_the_first_version_is_shown(run: MadeUpRun) -> None:

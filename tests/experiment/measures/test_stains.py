@@ -6,8 +6,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from experiment.measures.reflections import added_light, light_of_spot, spots_of
-from experiment.measures.stains import Stains, find_stains
+from experiment.measures.stains import Stains, added_light, find_stains, light_of_spot, spots_of
 
 _Array = npt.NDArray[np.float64]
 SIDE = 16

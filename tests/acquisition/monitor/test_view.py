@@ -10,8 +10,7 @@ from datetime import UTC, datetime, timedelta
 
 import pytest
 
-from acquisition.monitor.head import Head, head_of
-from acquisition.monitor.rows import AttemptView, with_seconds
+from acquisition.monitor.view import AttemptView, Head, SessionView, head_of, with_seconds
 from experiment.session.heartbeat import Heartbeat, Process, RunState, SessionPlace
 from experiment.session.plan import plan_steps
 from tests.acquisition.monitor.made_up import LIGHTS
@@ -26,7 +25,7 @@ def attempts(count: int, verdict: str | None = "accepted", seconds: float = 5.0)
     """Return attempts at the first steps, the newest a moment ago."""
     begun = [NOW - timedelta(seconds=seconds * (count - number)) for number in range(count)]
     views = [
-        AttemptView(number + 1, number, f"frames/{number}.cr2", at, at, at, verdict, "")
+        AttemptView(number + 1, number, "white", None, f"frames/{number}.cr2", at, at, at, verdict, "")
         for number, at in enumerate(begun)
     ]
     return with_seconds(views, [])
@@ -37,8 +36,14 @@ def heartbeat(state: RunState, *, ago: float = 2.0, within: float = 10.0, proces
     return Heartbeat(at, process, state, f"{state} as it should", at + timedelta(seconds=within))
 
 
-def head(views: Sequence[AttemptView], beat: Heartbeat | None, alive: bool | None = True, now: datetime = NOW) -> Head:
-    return head_of(STEPS, views, beat, now, process_alive=alive, name="night")
+def head(
+    views: Sequence[AttemptView],
+    beat: Heartbeat | None,
+    alive: bool | None = True,
+    now: datetime = NOW,
+    here: SessionPlace | None = None,
+) -> Head:
+    return head_of(SessionView("night", "night", STEPS, (), {}, tuple(views), (), beat, here), now, alive)
 
 
 @pytest.mark.parametrize("state", ["running", "waiting", "paused"])
@@ -56,12 +61,7 @@ def test_time_left_is_that_of_the_frames_left() -> None:
 
 
 def test_where_the_labs_time_is_another_no_time_of_day_is_told() -> None:
-    simulated = [
-        AttemptView(
-            one.id, one.step, one.file, one.started_at - timedelta(days=40), None, None, one.verdict, "", seconds=5.0
-        )
-        for one in attempts(3)
-    ]
+    simulated = [replace(one, started_at=one.started_at - timedelta(days=40), taken_at=None) for one in attempts(3)]
     stands = head(simulated, heartbeat("running"))
     assert stands.remaining_s == 25.0
     assert stands.eta is None
@@ -79,14 +79,14 @@ def test_a_killed_run_is_told_at_once_where_it_ran() -> None:
 def test_a_copy_of_a_session_is_no_run(alive: bool | None) -> None:
     there, here = SessionPlace("/data/night", 5, 10, 11, 0), SessionPlace("/backup/night", 5, 20, 21, 0)
     beat = replace(heartbeat("running"), place=there)
-    stands = head_of(STEPS, attempts(3), beat, NOW, process_alive=alive, name="night", here=here)
+    stands = head(attempts(3), beat, alive, here=here)
     assert (stands.state, stands.alive, stands.eta) == ("copy", False, None)
     assert "/data/night" in stands.sentence
-    stands = head_of(STEPS, attempts(8), beat, NOW, process_alive=alive, name="night", here=here)
+    stands = head(attempts(8), beat, alive, here=here)
     assert stands.state == "complete", "all frames are in the copy, too"
     ended = replace(beat, state="ended")
-    assert head_of(STEPS, attempts(3), ended, NOW, process_alive=alive, name="night", here=here).state == "incomplete"
-    where_it_is = head_of(STEPS, attempts(3), beat, NOW, process_alive=True, name="night", here=there)
+    assert head(attempts(3), ended, alive, here=here).state == "incomplete"
+    where_it_is = head(attempts(3), beat, here=there)
     assert where_it_is.state == "running"
 
 
@@ -136,7 +136,7 @@ def test_refused_failed_and_voided_are_told_apart_and_none_of_them_counts() -> N
 
 
 def test_a_frame_of_a_step_that_the_plan_does_not_have_does_not_count() -> None:
-    stray = AttemptView(1, 99, "frames/x.cr2", NOW, NOW, NOW, "accepted", "")
+    stray = replace(attempts(1)[0], step=99)
     assert head([stray], heartbeat("running")).done == 0
 
 
