@@ -3,36 +3,155 @@
 Rules that hold inside:
 
 - A frame is decoded once and measured once (`acquisition.judge.measured`); what it is compared with is one frozen
-  value (`acquisition.judge.known.knowledge`), which each frame replaces.
+  value (`acquisition.judge.state`), which each frame replaces.
 - Every check (`acquisition.judge.checks`) has its number and its limits, also where it passes; one that cannot tell has
   no number.
 - A cause is named once: what follows from it (a chart that moved does not look like its old picture) has no reason.
+
+What is found of a frame: its checks in their order, its light, and which parts of it deviate.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 
-from acquisition.judge.checks.causes import is_lasting, named_once, voids_others
-from acquisition.judge.checks.evenness import judge_evenness
-from acquisition.judge.checks.references import MOST_RESTARTS, judge_first_frames
-from acquisition.judge.known.knowledge import Examined, Knowledge
-from acquisition.judge.looking import is_compared, look
-from acquisition.judge.measured.frame import Frame
-from drivers.raw.rawfile import read_raw
+from acquisition.judge.checks import (
+    MOST_RESTARTS,
+    UNTOLD_PX,
+    best_channel,
+    has_moved_far,
+    is_lasting,
+    judge_dark,
+    judge_file,
+    judge_first_frames,
+    judge_first_primary,
+    judge_movement,
+    judge_white,
+    named_once,
+    voids_others,
+)
+from acquisition.judge.light import FrameLight
+from acquisition.judge.light_checks import judge_evenness, judge_light
+from acquisition.judge.measure import Anchor, Frame, measure
+from acquisition.judge.state import Examined, JudgeState, Leaning, is_brightest_grey, primary_of
+from drivers.raw.rawfile import Mosaic, read_raw
 from experiment.chart.model import Chart
 from experiment.config import LabSettings
-from experiment.framing.planes import frame_black
+from experiment.framing.planes import frame_black, phases
 from experiment.framing.previews import preview_jpeg
 from experiment.lights.illuminations import Illumination
 from experiment.session.judgement import Check, Judgement
 from experiment.session.plan import REFERENCES, SessionStep
-from foundation.errors import FormatError
+from foundation.errors import FormatError, RegistrationError
+
+_UNFOUNDED = (
+    "no frame of each primary, or none of black, is accepted, from which it is known what this light should look like; "
+    "see why those were refused"
+)
+
+
+@dataclass(frozen=True, eq=False)
+class FrameFindings:
+    """What was found of a frame: checks, light, tiles that deviate, brightness."""
+
+    frame: Frame
+    checks: tuple[Check, ...]
+    light: FrameLight | None = None
+    off: npt.NDArray[np.bool_] | None = None
+    brightness: float = float("nan")
+    stepped: bool = False
+    leaning: Leaning = field(default_factory=Leaning)
+
+
+def look(
+    known: JudgeState,
+    mosaic: Mosaic,
+    black: npt.NDArray[np.float64],
+    step: SessionStep,
+    settings: LabSettings,
+    chart: Chart | None,
+    plan: Sequence[tuple[int, int, int]],
+) -> FrameFindings:
+    """Return what is found of a frame of a step.
+
+    `mosaic`, `black`: the frame and its black level, (2, 2) float64 counts. `chart`: the print before the camera; None
+    where none is looked for.
+    """
+    measured = measure(mosaic, black)
+    frame = Frame(measured, np.full(3, np.nan), UNTOLD_PX)
+    checks = [*judge_file(known, mosaic, measured, step, settings)]
+    if any(check.reason for check in checks):
+        return FrameFindings(frame, tuple(checks))
+    if known.awaits_primaries and (step.kind == "light" or (step.kind == "response" and not is_compared(step))):
+        return FrameFindings(frame, (*checks, Check("light", reason=_UNFOUNDED)))
+    anchor = known.anchor
+    if step.kind != "dark" and (anchor is None or (known.rested and has_moved_far(known, mosaic, black, measured))):
+        # The first lit frame is white; of a run taken up again it is the first in which the chart lies elsewhere.
+        try:
+            anchor = Anchor.of(mosaic, black, chart)
+        except RegistrationError as error:
+            return FrameFindings(frame, (*checks, Check("chart", reason=str(error))))
+        checks.append(Check("chart", float(len(anchor.framing.tags) or len(anchor.paper))))
+        moved = None if known.anchor is None else known.anchor.displacement(mosaic, black, best_channel(measured)[0])
+        if moved is not None:
+            checks.append(Check("movement", round(float(np.hypot(*moved)), 3), None, None, "px"))
+        known = replace(known, basis=None) if known.anchor is not None else known
+        frame = replace(frame, anchor=anchor, moved_px=np.zeros(2))
+    if anchor is not None:
+        frame = replace(frame, paper=anchor.paper_level(mosaic, black, phases(mosaic)))
+    if step.kind == "dark":
+        dark = judge_dark(known, measured, settings.judge.dark_percent, settings.judge.ambient_percent)
+        light = None if known.basis is None else known.basis.light(measured)
+        return FrameFindings(frame, (*checks, *dark), light)
+    if frame.anchor is None and anchor is not None:
+        movement, moved = judge_movement(known, anchor, mosaic, black, frame, settings.judge)
+        checks += movement
+        frame = replace(frame, moved_px=moved)
+    looked = _look_at_light(known, frame, step, settings, plan)
+    if step.kind == "white":
+        checks.append(judge_white(known.first_white, frame))
+    if is_brightest_grey(step):
+        checks.append(judge_white(known.first_grey, frame))
+    return replace(looked, checks=(*checks, *looked.checks))
+
+
+def _look_at_light(
+    known: JudgeState, frame: Frame, step: SessionStep, settings: LabSettings, plan: Sequence[tuple[int, int, int]]
+) -> FrameFindings:
+    """Return what is found of the light of a lit frame, and of its evenness."""
+    measured = frame.measured
+    primary = primary_of(step.colour.codes) if step.kind == "response" else None
+    checks: list[Check] = []
+    if primary is not None and not known.modelled:
+        checks.append(judge_first_primary(known, measured, primary))
+    if known.basis is None:
+        return FrameFindings(frame, tuple(checks))
+    light = known.basis.light(measured)
+    if not known.modelled and step.kind == "response":
+        # A primary alone is not what the camera's colours under white describe.
+        return FrameFindings(frame, tuple(checks), light)
+    moved = frame.moved_px if not np.isnan(frame.moved_px).any() else known.moved_px
+    before = known.recent[-1] if known.recent else None
+    evenness = judge_evenness(known.basis, light, measured, np.zeros(2) if moved is None else moved, before)
+    judge = settings.judge
+    verdict = judge_light(known, step, light, plan, judge.light_deg, judge.drift_percent)
+    checks += [*evenness.checks, *verdict.checks]
+    if step.kind == "white" and known.modelled:
+        checks.append(Check("additivity", round(100 * known.model.overlap, 2), None, None, "%"))
+    return FrameFindings(
+        frame, tuple(checks), light, evenness.off, verdict.brightness, verdict.stepped, verdict.leaning
+    )
+
+
+def is_compared(step: SessionStep) -> bool:
+    """Return whether later frames are held against the frame of a step, so that all of it is kept."""
+    return step.kind in REFERENCES or (step.kind == "response" and primary_of(step.colour.codes) is not None)
+
 
 _BESIDE = "it was under way when the frames before it were found to contradict each other; they are taken again first"
 
@@ -44,11 +163,11 @@ class LiveJudge:
         self._settings = settings
         self._chart = chart if settings.judge.chart else None
         self._plan = tuple(dict.fromkeys(light.codes for light in illuminations))
-        self._known = self._base = Knowledge()
+        self._known = self._base = JudgeState()
         self._fresh = True
 
     @property
-    def knowledge(self) -> Knowledge:
+    def knowledge(self) -> JudgeState:
         """What is known so far."""
         return self._known
 
@@ -122,7 +241,7 @@ class LiveJudge:
         )
 
 
-def _judge_basis(known: Knowledge, following: Knowledge) -> Check | None:
+def _judge_basis(known: JudgeState, following: JudgeState) -> Check | None:
     """Return why frames of the primaries that are now known make no picture of the white or grey one; None if they do.
 
     Each of them alone tells nothing of a part that is covered; all that follows would be held against it.
@@ -142,7 +261,7 @@ def _judge_basis(known: Knowledge, following: Knowledge) -> Check | None:
     )
 
 
-def _shown_white(known: Knowledge, frame: Frame) -> npt.NDArray[np.float64]:
+def _shown_white(known: JudgeState, frame: Frame) -> npt.NDArray[np.float64]:
     """Return what a preview shows as white: paper in the first white frame, else in this one."""
     first = frame.paper if known.first_white is None else known.first_white.paper
     return np.full(3, max(frame.measured.brightest_dn, 1.0)) if np.isnan(first).any() else np.maximum(first, 1.0)

@@ -8,21 +8,26 @@ from pathlib import Path
 
 from acquisition.judge.judge import LiveJudge
 from acquisition.monitor.report import write_session_report
-from acquisition.run.patience import TRY_S
-from acquisition.run.planning.dry_run import checked_plan
-from acquisition.run.planning.work import planned_steps, require_same
+from acquisition.run.devices import Devices
+from acquisition.run.pipeline import Taken
+from acquisition.run.plan import checked_plan, planned_steps, require_same
+from acquisition.run.queue import link_runs, white_first
+from acquisition.run.retry import TRY_S
 from acquisition.run.rig.opening import open_rig
 from acquisition.run.sequencer import RunOutcome, take_session
-from acquisition.run.taking.pipeline import Taken
-from acquisition.run.taking.resuming import check_frames, clock_note, require_same_devices, tie, white_first
+from drivers.camera import CameraIdentity
+from drivers.projector import ProjectorIdentity
 from experiment.chart.model import load_chart
 from experiment.config import LabSettings
 from experiment.lights.illuminations import load_illuminations
 from experiment.session.folder import Session, busy_sentence, session_exists
 from experiment.session.heartbeat import signs_of_life
 from experiment.session.mending.redaction import secrets_warning
+from experiment.session.progress import duration_text
+from foundation.clock import Clock, SteadyClock
 from foundation.console import Ending
-from foundation.errors import CropError, InputError
+from foundation.errors import CropError, DeviceRefused, InputError, first_of
+from foundation.version import software
 
 
 def run_session(
@@ -64,7 +69,7 @@ def run_session(
         require_same_devices(session, devices, settings)
         if note := clock_note(session, devices.clock):
             announce(note)
-        first = tie(session) or white_first(session)
+        first = link_runs(session) or white_first(session)
         total = len(session.steps)
         observe(len(session.done_steps()), total)
         # When the screen is dark and the journal at rest.
@@ -112,3 +117,63 @@ def _begun(settings: LabSettings, folder: Path) -> Session:
         if session_exists(folder):
             raise InputError(busy_sentence(folder)) from None
         raise
+
+
+def check_frames(
+    session: Session,
+    observe: Callable[[int, int], None] = lambda done, total: None,
+    announce: Callable[[str], object] = lambda sentence: None,
+) -> None:
+    """Hold every accepted frame against its hash; what is damaged is voided, and said."""
+    if not session.journal.accepted_files():
+        return
+    damaged = session.verify(observe)
+    if damaged:
+        announce(f"voided: {first_of(damaged, 5)}")
+
+
+def require_same_devices(session: Session, devices: Devices, settings: LabSettings) -> None:
+    """Require that camera and projector are those that the session was begun with; note those of a new one."""
+    known = session.journal.records()
+    names = {"camera": _camera_name(devices.camera.identity())}
+    if devices.projector is not None:
+        names["projector"] = _projector_name(devices.projector.identity())
+    if settings.rig == "lab":
+        light = settings.lab.light
+        names["screen"] = " ".join(
+            str(part) for part in (light.shown_by, light.display, light.host) if part is not None
+        )
+    for what, name in names.items():
+        before = known.get(what, name)
+        if before != name:
+            raise DeviceRefused(
+                f"{session.folder} was begun with the {what} {before}, and now there is {name}: frames of both would "
+                f"not make one table; connect the {what} of before, or begin a new session"
+            )
+    for what, name in {**names, "software": software()}.items():
+        if known.get(what) != name:
+            session.journal.record(what, name)
+
+
+def clock_note(session: Session, clock: Clock) -> str:
+    """Return what to say where the machine's clock is behind the session's last frame, with the remedy.
+
+    Else nothing.
+    """
+    if not isinstance(clock, SteadyClock) or not clock.behind_s:
+        return ""
+    return (
+        f"clock: it is {duration_text(clock.behind_s)} behind the last frame of {session.folder}, or was ahead when "
+        "that was taken; the session's time goes on from there, so that its frames stay in their order; set the "
+        "machine's clock right"
+    )
+
+
+def _camera_name(body: CameraIdentity) -> str:
+    """Return a camera's name; its firmware may be brought up to date between two runs."""
+    return f"{body.maker} {body.model}, serial number {body.serial}"
+
+
+def _projector_name(projector: ProjectorIdentity) -> str:
+    """Return a projector's name; what somebody called it in its menu may change."""
+    return f"{projector.maker} {projector.model}".strip() or "of an unknown maker"

@@ -210,7 +210,7 @@ def test_a_table_of_another_version_is_named(built: Path, lut: Lut, tmp_path: Pa
 
 
 def test_a_session_without_frames_is_said(built: Path, run: Run, capsys: pytest.CaptureFixture[str]) -> None:
-    from acquisition.run.planning.work import planned_steps
+    from acquisition.run.plan import planned_steps
 
     settings = load_lab(built / "LAB.toml")
     lights = load_illuminations(settings.illuminations)

@@ -1,25 +1,31 @@
-"""The real lab: every device that LAB.toml names, opened over its cable."""
+"""The real lab: every device that LAB.toml names, opened over its cable.
+
+What is attached to this machine and reachable from it, for the operator to choose from.
+"""
 
 from __future__ import annotations
 
 import uuid
+from collections.abc import Callable, Generator, Iterable
 from contextlib import ExitStack
+from dataclasses import dataclass
 
-from acquisition.run.asking import ask_all
-from acquisition.run.devices import Devices
+from acquisition.run.devices import Devices, ask_all
 from acquisition.run.shutter import require_whole_turns
 from drivers.camera import Camera
 from drivers.canon.camera import CanonEos
-from drivers.display.fullscreen import FullScreen
+from drivers.display.displays import list_displays
+from drivers.display.fullscreen import FullScreen, identify_displays
 from drivers.display.jvc import PORT as JVC_PORT
 from drivers.display.jvc import JvcFlatField
 from drivers.display.lightcrafter import LightCrafter, find_lightcrafter
 from drivers.gphoto2_camera.camera import Gphoto2Camera
 from drivers.links.pipes import UsbPipes
-from drivers.links.serial import SerialLink
+from drivers.links.serial import SerialLink, list_serial_ports
 from drivers.links.tcp import TcpLink
-from drivers.links.usb import open_usb
+from drivers.links.usb import list_devices, open_usb
 from drivers.pjlink.projector import PjLinkProjector
+from drivers.pjlink.search import search
 from drivers.pjlink.wire import PORT as PJLINK_PORT
 from drivers.presenter import Presenter
 from drivers.projector import Projector
@@ -31,7 +37,37 @@ from experiment.config import CameraCable, LabSettings, LightSource, ProjectorCa
 from experiment.session.folder import Session
 from experiment.session.records import last_moment
 from foundation.clock import Clock, SteadyClock, SystemClock
-from foundation.errors import ConfigurationError
+from foundation.errors import ConfigurationError, CropError
+
+__all__ = ["Attached", "attached_devices", "identify_displays"]
+
+
+@dataclass(frozen=True)
+class Attached:
+    """What of one kind is attached or reachable: `kind` in the plural, what was found, or why it could not be asked."""
+
+    kind: str
+    found: tuple[str, ...]
+    trouble: str = ""
+
+
+def attached_devices(search_s: float) -> Generator[Attached]:
+    """Yield what is attached and reachable, kind by kind; a kind that cannot be asked says why."""
+    yield _attached("cameras on USB", lambda: [str(device) for device in list_devices()])
+    yield _attached("serial ports", list_serial_ports)
+    yield _attached("displays", lambda: [str(display) for display in list_displays()])
+    if search_s > 0:
+        yield _attached(
+            "projectors by PJLink", lambda: [f"{found.host}, MAC {found.mac}" for found in search(search_s)]
+        )
+
+
+def _attached(kind: str, ask: Callable[[], Iterable[str]]) -> Attached:
+    try:
+        return Attached(kind, tuple(ask()))
+    except CropError as error:
+        return Attached(kind, (), str(error))
+
 
 CONNECT_S = 5.0
 """How long a projector may take to accept a connection; on a lab's network it takes milliseconds."""

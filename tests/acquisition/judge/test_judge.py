@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from acquisition.judge.checks.lights import crept
 from acquisition.judge.judge import LiveJudge
-from acquisition.judge.known.knowledge import Leaning
+from acquisition.judge.light_checks import crept
+from acquisition.judge.state import Leaning
 from drivers.camera import ExposureSettings
 from drivers.presenter import BLACK, WHITE, Colour
 from experiment.session.judgement import Check, Judgement

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from acquisition.run.taking.agenda import GIVEN_UP_IN_A_ROW, Agenda, unclosed_kinds
+from acquisition.run.queue import GIVEN_UP_IN_A_ROW, StepQueue, unclosed_kinds
 from drivers.presenter import BLACK, WHITE, Colour
 from experiment.lights.illuminations import Illumination
 from experiment.session.plan import FrameKind, SessionStep, plan_steps
@@ -16,7 +16,7 @@ STEPS = plan_steps([Illumination(n, "uniform", None, Colour(255, n, 0)) for n in
 """white 0, dark 1, light 2, 3, white 4, dark 5, light 6, 7, white 8, dark 9."""
 
 
-def agenda_of(done: Collection[int], attempts: int = 3, **more: Any) -> Agenda:
+def agenda_of(done: Collection[int], attempts: int = 3, **more: Any) -> StepQueue:
     """Return an agenda of `STEPS` that puts closing references behind them, from 10 on."""
     behind: list[SessionStep] = []
 
@@ -24,10 +24,10 @@ def agenda_of(done: Collection[int], attempts: int = 3, **more: Any) -> Agenda:
         behind.append(SessionStep(len(STEPS) + len(behind), kind, None, WHITE if kind == "white" else BLACK))
         return behind[-1]
 
-    return Agenda(STEPS, done, attempts, append=append, **more)
+    return StepQueue(STEPS, done, attempts, append=append, **more)
 
 
-def take(agenda: Agenda, refused: dict[int, int] | None = None) -> list[int]:
+def take(agenda: StepQueue, refused: dict[int, int] | None = None) -> list[int]:
     """Take all that is listed, one after another; `refused` maps steps to how often they are. Return the steps."""
     left, taken = dict(refused or {}), list[int]()
     while (step := agenda.next()) is not None:
@@ -42,14 +42,14 @@ def take(agenda: Agenda, refused: dict[int, int] | None = None) -> list[int]:
 
 
 def test_open_steps_come_in_the_plans_order() -> None:
-    agenda = Agenda(STEPS, {0, 1, 3}, 3)
+    agenda = StepQueue(STEPS, {0, 1, 3}, 3)
     assert len(agenda) == 7
     assert take(agenda) == [2, 4, 5, 6, 7, 8, 9]
     assert len(agenda) == 0
 
 
 def test_what_is_under_way_is_not_taken_twice() -> None:
-    agenda = Agenda(STEPS, set(), 3)
+    agenda = StepQueue(STEPS, set(), 3)
     first = begun(agenda)
     assert begun(agenda).number == 1
     agenda.refuse(first, "too dark")
@@ -57,7 +57,7 @@ def test_what_is_under_way_is_not_taken_twice() -> None:
     assert begun(agenda).number == 2
 
 
-def begun(agenda: Agenda) -> SessionStep:
+def begun(agenda: StepQueue) -> SessionStep:
     """Return the next step, begun."""
     step = agenda.next()
     assert step is not None
@@ -66,14 +66,14 @@ def begun(agenda: Agenda) -> SessionStep:
 
 
 def test_a_step_without_a_try_left_waits_for_the_next_run() -> None:
-    agenda = Agenda(STEPS, set(), 3)
+    agenda = StepQueue(STEPS, set(), 3)
     assert take(agenda, {2: 9}) == [0, 1, 2, 2, 2, 3, 4, 5, 6, 7, 8, 9]
     assert agenda.given_up == ("light 0: dark",)
     assert len(agenda) == 1
 
 
 def test_a_fault_of_a_device_is_no_try() -> None:
-    agenda = Agenda(STEPS, set(), 1)
+    agenda = StepQueue(STEPS, set(), 1)
     agenda.withdraw(begun(agenda))
     assert take(agenda) == list(range(10))
 
@@ -92,7 +92,7 @@ def test_lights_of_an_earlier_run_are_closed_too() -> None:
 
 
 def test_a_reference_that_voids_is_probed_before_what_it_voids() -> None:
-    agenda = Agenda(STEPS, {0, 1, 2, 3}, 3)
+    agenda = StepQueue(STEPS, {0, 1, 2, 3}, 3)
     white = begun(agenda)
     assert white.number == 4
     agenda.refuse(white, "the picture is stuck", before_others=True)
@@ -101,7 +101,7 @@ def test_a_reference_that_voids_is_probed_before_what_it_voids() -> None:
 
 
 def test_first_frames_that_are_voided_come_before_all_others_with_all_their_tries() -> None:
-    agenda = Agenda(STEPS, {0, 1, 2, 8, 9}, 2, first=(8,))
+    agenda = StepQueue(STEPS, {0, 1, 2, 8, 9}, 2, first=(8,))
     agenda.accept(begun(agenda))
     agenda.refuse(begun(agenda), "somebody passed")
     agenda.begin_with([STEPS[9], STEPS[8], STEPS[3]])
@@ -139,7 +139,7 @@ def test_the_last_lights_that_are_voided_are_closed_again() -> None:
 
 
 def test_frames_are_not_voided_for_ever() -> None:
-    agenda = Agenda(STEPS, set(), 2)
+    agenda = StepQueue(STEPS, set(), 2)
     for _ in range(2):
         for _ in range(4):
             agenda.accept(begun(agenda))
@@ -149,7 +149,7 @@ def test_frames_are_not_voided_for_ever() -> None:
 
 
 def test_some_steps_given_up_in_a_row_are_a_lasting_cause() -> None:
-    agenda = Agenda(STEPS, set(), 1)
+    agenda = StepQueue(STEPS, set(), 1)
     for number in range(GIVEN_UP_IN_A_ROW):
         assert not agenda.is_stuck
         agenda.refuse(begun(agenda), f"{number}")
@@ -161,7 +161,7 @@ def test_some_steps_given_up_in_a_row_are_a_lasting_cause() -> None:
 
 @pytest.mark.parametrize(("kind", "stuck"), [("dark", True), ("white", False)])
 def test_a_dark_frame_shows_nothing_of_the_light(kind: str, stuck: bool) -> None:
-    agenda = Agenda(STEPS, {0, 1, 2, 3, 6, 7, 8, 9}, 1)
+    agenda = StepQueue(STEPS, {0, 1, 2, 3, 6, 7, 8, 9}, 1)
     steps = {step.kind: step for step in (begun(agenda), begun(agenda))}
     for step in STEPS[2:4]:
         agenda.void([step.number], "")
@@ -174,5 +174,5 @@ def test_a_dark_frame_shows_nothing_of_the_light(kind: str, stuck: bool) -> None
 
 
 def test_what_comes_first_comes_first_though_it_was_done() -> None:
-    agenda = Agenda(STEPS, set(range(9)), 3, first=[4, 1])
+    agenda = StepQueue(STEPS, set(range(9)), 3, first=[4, 1])
     assert take(agenda) == [4, 1, 9]

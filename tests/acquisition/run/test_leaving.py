@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from acquisition.run.devices import Devices
-from acquisition.run.leaving import OBEYS_S, RunEnd, end_of, lamp_fate, leave_lab
+from acquisition.run.lamp import OBEYS_S, RunEnd, lamp_fate, leave_lab
 from drivers.presenter import BLACK, Colour
 from drivers.projector import Power
 from experiment.config import SequenceSettings
@@ -43,12 +43,6 @@ def test_the_lamp_s_fate_is_decided_and_said(end: RunEnd, settings: SequenceSett
     assert ("was switched off" in sentence) == (power is OFF)
     assert ("burns on" in sentence) == (power is ON and end is not RunEnd.INTERRUPTED)
     assert ("left as it is" in sentence) == (end is RunEnd.INTERRUPTED)
-
-
-def test_what_ended_a_run_is_known_by_what_it_raised() -> None:
-    assert end_of(KeyboardInterrupt()) is RunEnd.INTERRUPTED
-    assert end_of(StorageError("full")) is RunEnd.UNFINISHED
-    assert end_of(AssertionError()) is RunEnd.UNFINISHED
 
 
 @pytest.mark.parametrize(("lost", "said"), [(2, "it was switched off"), (3, "it could not be switched off: no answer")])

@@ -1,4 +1,4 @@
-"""Patience in simulated time: what fails is waited for, told as it is now, and never waited for too long."""
+"""RetryPolicy in simulated time: what fails is waited for, told as it is now, and never waited for too long."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from acquisition.run.patience import PAUSE_S, RETRY_S, Patience
+from acquisition.run.retry import PAUSE_S, RETRY_S, RetryPolicy
 from acquisition.run.rig.opening import open_rig
 from drivers.camera import keep_awake
 from drivers.presenter import WHITE
@@ -39,7 +39,7 @@ from sim.clock import SimulatedClock
 
 @dataclass
 class Room:
-    """Patience with everything that it tells, and something that is broken until a time."""
+    """RetryPolicy with everything that it tells, and something that is broken until a time."""
 
     limit_s: float = 600.0
     clock: SimulatedClock = field(default_factory=SimulatedClock)
@@ -49,8 +49,8 @@ class Room:
     tries: list[float] = field(default_factory=list[float])
 
     @property
-    def patience(self) -> Patience:
-        return Patience(
+    def patience(self) -> RetryPolicy:
+        return RetryPolicy(
             self.clock,
             self.limit_s,
             lambda what, sentence: self.said.append((what, sentence)),
@@ -170,7 +170,7 @@ def test_another_device_that_fails_meanwhile_waits_its_turn() -> None:
     def asleep() -> None:
         raise LinkTimeout("the camera does not answer")
 
-    patience = Patience(room.clock, 600, idle=asleep)
+    patience = RetryPolicy(room.clock, 600, idle=asleep)
     assert patience.attempt(room.broken(until(100, DeviceError("covered"))), "the screen") == "done"
 
 
@@ -237,7 +237,7 @@ def test_an_interruption_ends_a_pause_at_once() -> None:
         if room.clock.monotonic() > 60:
             raise KeyboardInterrupt
 
-    patience = Patience(room.clock, math.inf, beat=stop)
+    patience = RetryPolicy(room.clock, math.inf, on_wait=stop)
     with pytest.raises(KeyboardInterrupt):
         patience.attempt(room.broken(lambda now: DeviceError("covered")), "the screen")
     assert room.clock.monotonic() < 60 + 2 * PAUSE_S
@@ -255,7 +255,7 @@ def test_a_full_disk_takes_the_notes_of_its_pause_when_there_is_space() -> None:
     def beat(state: str, sentence: str, within_s: float) -> None:
         raise StorageError("the disk is full")
 
-    patience = Patience(room.clock, 600, report, beat=beat)
+    patience = RetryPolicy(room.clock, 600, report, on_wait=beat)
     assert patience.attempt(room.broken(full), "the disk") == "done"
     assert room.words == ["retry", "paused", "resumed"]
 
@@ -292,7 +292,7 @@ def test_a_full_disk_never_loses_the_frame_in_the_camera(tmp_path: Path) -> None
             if clock.monotonic() > 300:
                 resource.setrlimit(resource.RLIMIT_FSIZE, limits)
 
-        patience = Patience(clock, 600, lambda what, sentence: said.append(f"{what}: {sentence}"), idle)
+        patience = RetryPolicy(clock, 600, lambda what, sentence: said.append(f"{what}: {sentence}"), idle)
         try:
             resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, limits[1]))
             received = patience.attempt(lambda: session.receive("0000_white", camera.download), "the disk")
@@ -313,7 +313,7 @@ def test_a_journal_that_another_program_held_for_the_whole_patience_is_not_waite
     clock = SimulatedClock()
     begun = clock.monotonic()
     with pytest.raises(StorageError, match="database is locked"):
-        Patience(clock, 600).attempt(held, "the disk")
+        RetryPolicy(clock, 600).attempt(held, "the disk")
     assert clock.monotonic() == begun
 
 
@@ -336,5 +336,5 @@ def test_a_wait_can_be_broken_off_and_a_try_cannot() -> None:
         raise DeviceFault("it is off; switch it on")
 
     with pytest.raises(KeyboardInterrupt):
-        Patience(clock, 600, idle=idle, breakable=breakable).attempt(action, "the screen")
+        RetryPolicy(clock, 600, idle=idle, breakable=breakable).attempt(action, "the screen")
     assert set(seen) == {("tries", 0), ("waits", 1)}

@@ -15,12 +15,21 @@ import pytest
 
 from acquisition.cli import main
 from acquisition.run.devices import Devices
-from acquisition.run.planning.answers import Answers, ask
-from acquisition.run.planning.dry_run import dry_run
-from acquisition.run.planning.plan import RunPlan, make_plan
-from acquisition.run.planning.sizes import MEGAPIXELS, SPARE_BYTES, free_bytes_at, needed_bytes
-from acquisition.run.planning.text import plan_lines
-from acquisition.run.planning.work import Work, order_of, outline
+from acquisition.run.plan import (
+    MEGAPIXELS,
+    SPARE_BYTES,
+    Answers,
+    RunPlan,
+    Work,
+    ask,
+    dry_run,
+    free_bytes_at,
+    make_plan,
+    needed_bytes,
+    order_of,
+    outline,
+    plan_lines,
+)
 from drivers.camera import CameraIdentity, ExposureSettings, Supplies
 from drivers.presenter import Colour
 from drivers.projector import Power, Severity

@@ -7,7 +7,7 @@ from unittest.mock import Mock
 
 import pytest
 
-from acquisition.run.rig.attached import attached_devices
+from acquisition.run.rig.lab import attached_devices
 from acquisition.run.rig.opening import open_rig
 from acquisition.run.rig.simulated import simulated_body, simulated_room
 from acquisition.run.run import run_session

@@ -18,11 +18,8 @@ import numpy as np
 import numpy.typing as npt
 
 from acquisition.judge import limits
-from acquisition.judge.known.basis import Basis, FrameLight
-from acquisition.judge.known.response import Codes, ProjectorModel
-from acquisition.judge.measured.anchor import Anchor
-from acquisition.judge.measured.frame import Frame
-from acquisition.judge.measured.measuring import Measured
+from acquisition.judge.light import Basis, Codes, FrameLight, ProjectorModel
+from acquisition.judge.measure import Anchor, Frame, Measured
 from experiment.session.plan import PRIMARIES, REFERENCES, TOP, SessionStep
 
 RECENT = 6
@@ -95,7 +92,7 @@ class Examined:
 
 
 @dataclass(frozen=True, eq=False)
-class Knowledge:
+class JudgeState:
     """All that is known.
 
     - `anchor`: the chart's place.
@@ -164,7 +161,7 @@ class Knowledge:
         """Whether lights cannot be foretold only because frames that this run asked for were refused."""
         return self.asked and not self.modelled and not self.lost
 
-    def paused(self) -> Knowledge:
+    def paused(self) -> JudgeState:
         """Return what is known after a pause of the run: the lamp may be at another level, the chart elsewhere."""
         if self.rested or not self.digests:
             return self
@@ -181,7 +178,7 @@ class Knowledge:
             begun_with=None,
         )
 
-    def begun_anew(self, base: Knowledge) -> Knowledge:
+    def begun_anew(self, base: JudgeState) -> JudgeState:
         """Return what is known where the first frames cannot be trusted: no more than `base`, before them."""
         return replace(
             base,
@@ -193,7 +190,7 @@ class Knowledge:
             expected=self.begun_with,
         )
 
-    def after(self, step: SessionStep, found: Examined) -> Knowledge:
+    def after(self, step: SessionStep, found: Examined) -> JudgeState:
         """Return what is known after a frame of a step."""
         frame, codes = found.frame, step.colour.codes
         seen = Seen(codes, frame.measured, None if found.light is None else found.light.amounts)
@@ -243,7 +240,7 @@ class Knowledge:
             model = model.learn(light.amounts, one.codes, light.covariance)
         return model
 
-    def _anchored(self, anchor: Anchor) -> Knowledge:
+    def _anchored(self, anchor: Anchor) -> JudgeState:
         """Return what is known where the chart lies elsewhere: pictures of another place are no basis any more."""
         again = self.anchor is not None
         return replace(
@@ -255,7 +252,7 @@ class Knowledge:
             primaries=(None, None, None) if again else self.primaries,
         )
 
-    def _referenced(self, step: SessionStep, frame: Frame) -> Knowledge:
+    def _referenced(self, step: SessionStep, frame: Frame) -> JudgeState:
         """Return what is known with a frame that later ones are compared with."""
         measured = frame.measured
         known = self
@@ -278,7 +275,7 @@ class Knowledge:
             known = replace(known, primaries=(of[0], of[1], of[2]))
         return known._based(step)
 
-    def _based(self, step: SessionStep) -> Knowledge:
+    def _based(self, step: SessionStep) -> JudgeState:
         """Return what is known with the best basis that the frames so far give."""
         red, green, blue = self.primaries
         if self.dark is None:

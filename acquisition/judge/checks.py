@@ -1,0 +1,442 @@
+"""Whether a raw file is of the session's camera, exposed as asked, whole, and a frame that was not given before.
+
+Whether the chart lies where it lay, and is as sharp.
+
+Whether a dark frame is dark and as dark as before, how far white has drifted, and whether first frames agree.
+
+Which of a frame's faults is named as the cause, and what it means for the frames around it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from types import MappingProxyType
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from acquisition.judge import limits
+from acquisition.judge.exposure import Exposure, disagreement, refusal
+from acquisition.judge.light import BLACK_DN
+from acquisition.judge.light_checks import same_light
+from acquisition.judge.measure import TILE_COLUMNS, TILE_ROWS, Anchor, Frame, Measured
+from acquisition.judge.state import JudgeState, is_brightest_grey
+from drivers.raw.rawfile import Mosaic
+from experiment.config import JudgeSettings, LabSettings
+from experiment.framing.planes import CHANNELS, Channel
+from experiment.session.judgement import Check
+from experiment.session.plan import SessionStep
+
+
+def judge_file(
+    known: JudgeState, mosaic: Mosaic, measured: Measured, step: SessionStep, settings: LabSettings
+) -> tuple[Check, ...]:
+    """Return what is said of a frame's file and exposure, before anything is looked for in its picture."""
+    return (
+        *_judge_origin(known, mosaic, measured, settings),
+        _judge_repeated(known, measured, settings),
+        *_judge_exposure(known, measured, step, settings),
+    )
+
+
+def _judge_origin(
+    known: JudgeState, mosaic: Mosaic, measured: Measured, settings: LabSettings
+) -> tuple[Check, Check, Check]:
+    """Return whether the file is of the session's camera, exposed as asked, and whole."""
+    first = known.first
+    reason = ""
+    if first is not None:
+        size = (measured.places.rows, measured.places.columns)
+        for what, before, now in (
+            ("frame size in half-size pixels", f"{first.places.columns}×{first.places.rows}", f"{size[1]}×{size[0]}"),
+            ("camera", first.camera, measured.camera),
+            ("serial number", first.serial, measured.serial),
+        ):
+            if before and now and before != now and not reason:
+                reason = (
+                    f"the {what} is {now}, and {before} in the session's first frame; connect the camera that the "
+                    "session was begun with, set to its full raw format"
+                )
+    differs = None if settings.rig == "imported" else disagreement(mosaic, settings.camera.exposure)
+    empty = ""
+    if measured.empty > limits.EMPTY_SHARE:
+        empty = (
+            f"{measured.empty:.2%} of the photosites have no count, {limits.EMPTY_SHARE:.3%} allowed; part of the file "
+            "was lost on its way: check the cable and the memory card"
+        )
+    return (
+        Check("camera", reason=reason),
+        Check("settings", reason=differs or ""),
+        Check("data", round(100 * measured.empty, 4), None, 100 * limits.EMPTY_SHARE, "%", empty),
+    )
+
+
+def _judge_repeated(known: JudgeState, measured: Measured, settings: LabSettings) -> Check:
+    """Return whether the camera gave a frame again that it gave before: its noise is the same."""
+    if settings.rig == "replay":
+        # A recording has one frame of a light, and gives it as often as it is asked.
+        return Check("repeated")
+    reason = "the camera handed out a frame that it had given before; check its cable and its memory card"
+    if measured.digest in known.digests:
+        return Check("repeated", 0.0, limits.SAME_NOISE, None, "", reason)
+    values = [_independence(measured, seen.measured) for seen in known.recent]
+    told = [value for value in values if value is not None]
+    if not told:
+        return Check("repeated")
+    least = min(told)
+    low = least < limits.SAME_NOISE
+    return Check("repeated", round(least, 3), limits.SAME_NOISE, None, "", reason if low else "")
+
+
+def _independence(one: Measured, other: Measured) -> float | None:
+    """Return the noise of two frames' difference over that of independent ones; None where noise is too small."""
+    if one.samples.shape != other.samples.shape or len(one.samples) == 0:
+        return None
+    a, b = one.samples.astype(np.float64), other.samples.astype(np.float64)
+    ours, theirs = a[:, 0] - a[:, 1], b[:, 0] - b[:, 1]
+    # By the differences of the two greens of a block, from which colour and light drop out.
+    spread = [float(np.clip(np.abs(d - np.median(d)), 0, 4 * np.median(np.abs(d)) + 3).std()) for d in (ours, theirs)]
+    if min(spread) < limits.LEAST_NOISE:
+        return None
+    ours, theirs = (np.clip(d - np.median(d), -(q := 4 * float(np.median(np.abs(d))) + 3), q) for d in (ours, theirs))
+    correlation = float((ours * theirs).mean() / (ours.std() * theirs.std()))
+    return float(np.sqrt(max(1 - max(correlation, 0.0) ** 2, 0.0)))
+
+
+def _judge_exposure(
+    known: JudgeState, measured: Measured, step: SessionStep, settings: LabSettings
+) -> tuple[Check, Check]:
+    exposure = Exposure(measured.clipped, measured.brightest_dn, measured.range_dn)
+    # Where white is known, a dark frame is held against it.
+    free = step.kind == "dark" and known.white is not None
+    reason = "" if free else refusal(exposure, step.kind, settings.limits) or ""
+    clipped = 100 * measured.clipped > settings.limits.clipped_percent and step.kind != "dark"
+    allowed = None if step.kind == "dark" else settings.limits.clipped_percent
+    return (
+        Check("clipping", round(100 * measured.clipped, 4), None, allowed, "%", reason if clipped else ""),
+        Check("exposure", round(100 * exposure.level, 2), None, None, "%", "" if clipped else reason),
+    )
+
+
+UNTOLD_PX: npt.NDArray[np.float64] = np.full(2, np.nan)
+"""Place of a chart in a frame that is too dark to tell."""
+
+_UNRECOGNISED = (
+    "the chart is not recognised where it was: it is covered, out of focus, or has moved by more than its tags show; "
+    "look at the picture, and put camera and chart back"
+)
+
+
+def best_channel(measured: Measured) -> tuple[Channel, float]:
+    """Return the channel with the best signal to noise, and its mean level, counts above black."""
+    level = np.maximum(measured.level, 0)
+    best = int((level / np.sqrt(measured.noise.variance(level))).argmax())
+    return CHANNELS[best], float(level[best])
+
+
+def has_moved_far(known: JudgeState, mosaic: Mosaic, black: npt.NDArray[np.float64], measured: Measured) -> bool:
+    """Return whether the chart lies elsewhere than in the earlier run; `black` (2, 2) float64 counts of the frame."""
+    assert known.anchor is not None
+    channel, level = best_channel(measured)
+    if level < limits.DIM_DN / 2:
+        return False
+    shift = known.anchor.shift(mosaic, black, channel)
+    return shift.gauges == 0 or shift.length_px > limits.MOVED_FOLLOWED_PX
+
+
+def judge_movement(
+    known: JudgeState,
+    anchor: Anchor,
+    mosaic: Mosaic,
+    black: npt.NDArray[np.float64],
+    frame: Frame,
+    judge: JudgeSettings,
+) -> tuple[list[Check], npt.NDArray[np.float64]]:
+    """Return whether the chart has moved or is softer than in the anchor's frame, and where it lies from there.
+
+    `mosaic`, `black`, `frame`: the frame, its black level (2, 2) float64 counts, and what was measured of it. Returns
+    (2,) float64 px right and down from the anchor's frame; NaN where that is not told.
+    """
+    channel, _ = best_channel(frame.measured)
+    paper = _paper_in(frame, channel)
+    if paper < limits.DIM_DN:
+        return [
+            Check("movement", None, None, judge.moved_px, "px"),
+            Check("blur", None, None, judge.blur_px, "px"),
+        ], UNTOLD_PX
+    shift = anchor.shift(mosaic, black, channel)
+    if shift.gauges == 0:
+        far = anchor.displacement(mosaic, black, channel)
+        if far is None:
+            return [Check("movement", None, None, judge.moved_px, "px", _UNRECOGNISED)], UNTOLD_PX
+        return [Check("movement", round(float(np.hypot(*far)), 3), None, judge.moved_px, "px", _moved(far))], np.array(
+            far
+        )
+    place = np.array([shift.dx, shift.dy])
+    at = known.moved_px if known.moved_px is not None else np.zeros(2)
+    moved = float(np.hypot(*(place - at)))
+    reason = ""
+    if moved > judge.moved_px:
+        steady = float(np.hypot(*(place - np.array(known.candidate[1:])))) <= limits.STEADY_PX
+        followed = steady and float(np.hypot(*place)) <= limits.MOVED_FOLLOWED_PX
+        reason = "" if followed or known.rested else _moved((float(place[0] - at[0]), float(place[1] - at[1])))
+    checks = [Check("movement", round(moved, 3), None, judge.moved_px, "px", reason)]
+    if paper < limits.BLUR_DIM_DN:
+        return [*checks, Check("blur", None, None, judge.blur_px, "px")], place
+    softer = float(np.sign(shift.softer_px2) * np.sqrt(abs(shift.softer_px2)))
+    blurred = ""
+    low = -limits.SHARPER * judge.blur_px
+    if not low <= softer <= judge.blur_px:
+        blurred = (
+            f"the frame is {'softer' if softer > 0 else 'sharper'} than the first white frame by a blur of "
+            f"{abs(softer):.2f} px, {judge.blur_px:g} px allowed; was the focus touched, is autofocus or stabilisation "
+            "on, or does something shake?"
+        )
+    return [*checks, Check("blur", round(softer, 3), low, judge.blur_px, "px", blurred)], place
+
+
+def _moved(by: tuple[float, float]) -> str:
+    x, y = by
+    return (
+        f"the chart has moved by {np.hypot(x, y):.2f} px in the picture ({x:+.2f} right, {y:+.2f} down); was camera or "
+        "chart touched? fix them, and let nobody walk about"
+    )
+
+
+def _paper_in(frame: Frame, channel: Channel) -> float:
+    paper = float(frame.paper[CHANNELS.index(channel)])
+    return 0.0 if np.isnan(paper) else paper
+
+
+_SIGMAS = 6.0
+"""Standard deviations of a mean's noise that no change is made of."""
+
+_TILES = 16
+"""Tiles that are averaged before their change in the dark is looked at: a lamp in a corner lights as many."""
+
+MOST_RESTARTS: Final = 2
+"""How often first frames are taken again at once because others contradict them: what passes does so within a minute,
+and what comes back for the third time wants somebody who looks."""
+
+_CONTRADICTIONS: Final = ("movement", "blur", "rows", "uniformity", "light", "ambient", "lamp")
+"""Checks that hold a frame against those before it."""
+
+_STALE_LEAST = 0.02
+"""Amount of light in a dark frame, of a primary, from which on the frame before may be what is seen."""
+
+
+def judge_dark(known: JudgeState, frame: Measured, dark_percent: float, ambient_percent: float) -> tuple[Check, ...]:
+    """Return whether a dark frame is dark, and changed by no more than `ambient_percent` of white since the first.
+
+    Both limits are per cent of what white gives in the same place and channel; the change is that of the region, one of
+    24, that changed most, so that a lamp in a corner shows.
+    """
+    if known.white is None:
+        return (Check("dark"),)
+    white = known.white.tiles - (0 if known.dark is None else known.dark.tiles)
+    # Of a tile that white hardly lights, such as a black backdrop, against a third of the mean.
+    scale = np.maximum(white, np.maximum(white.mean(axis=0) / 3, 1.0))
+    level = 100 * frame.tiles / scale
+    value = float(max(level.mean(axis=0).max(), np.percentile(level, 94)))
+    stale = ""
+    before = known.recent[-1] if known.recent else None
+    if value > dark_percent and known.basis is not None and before is not None and before.amounts is not None:
+        amounts = known.basis.light(frame).amounts
+        if amounts.max() > _STALE_LEAST and same_light(amounts, before.amounts, 0.003) < 2 * limits.STALE_SIGMAS:
+            stale = (
+                "the dark frame shows the light of the frame before; does the screen stand still, or is "
+                "sequence.settle_s too short?"
+            )
+    reason = ""
+    if value > dark_percent:
+        reason = stale or (
+            f"the dark frame has {value:.1f} % of white, {dark_percent:g} % allowed; is another light on, or the "
+            "projector's picture not black?"
+        )
+    checks = [Check("light" if stale else "dark", round(value, 3), None, dark_percent, "%", reason)]
+    first = known.first_dark
+    if first is not None and not reason:
+        changed = _by_region(100 * (frame.tiles - first.tiles) / scale)
+        noise = 100 * float(np.sqrt(frame.noise.variance(frame.level).max() / frame.places.tile_blocks.mean()))
+        noise /= float(scale.min()) * _TILES**0.5
+        drift = float(np.abs(changed).max())
+        black = 100 * BLACK_DN / float(scale.min())
+        limit = max(ambient_percent, _SIGMAS * 2**0.5 * float(np.hypot(noise, black)))
+        # Without a masked border the black level is a constant of the file's, and its drift looks like light.
+        if not frame.black_measured:
+            limit = max(limit, 100 * 8.0 / float(scale.min()))
+        reason = ""
+        if drift > limit:
+            more = "more" if changed.mean() > 0 else "less"
+            reason = (
+                f"the room is not as dark as in the first dark frame: {drift:.2f} % of white {more}, {limit:.2g} % "
+                "allowed; was a lamp or a display switched, or does daylight come in?"
+            )
+        checks.append(Check("ambient", round(drift, 3), None, round(limit, 3), "%", reason))
+    return tuple(checks)
+
+
+def _by_region(tiles: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    """Return means (24, 3) of 4×4 tiles each of tiles (T, 3)."""
+    side = round(_TILES**0.5)
+    grid = tiles.reshape(TILE_ROWS // side, side, TILE_COLUMNS // side, side, 3)
+    return np.asarray(grid.mean(axis=(1, 3))).reshape(-1, 3)
+
+
+def judge_white(first: Frame | None, frame: Frame) -> Check:
+    """Return how far paper is from that of the session's first frame of this light, white or the brightest grey."""
+    if first is None or np.isnan(frame.paper).any() or np.isnan(first.paper).any():
+        return Check("white drift")
+    drift = float(100 * (frame.paper.sum() / max(first.paper.sum(), 1.0) - 1))
+    reason = ""
+    if abs(drift) > limits.LAMP_TOTAL:
+        reason = (
+            f"paper white is {drift:+.0f} % from the session's first frame, {limits.LAMP_TOTAL:g} % allowed; let "
+            "the lamp warm up, or begin a new session"
+        )
+    return Check("white drift", round(drift, 2), -limits.LAMP_TOTAL, limits.LAMP_TOTAL, "%", reason)
+
+
+def judge_first_primary(known: JudgeState, frame: Measured, primary: int) -> Check:
+    """Return whether the first frame of a primary shows it: against white, its own channel is the brightest.
+
+    Of a frame's three channels none sees another's primary better than its own, whatever the camera.
+    """
+    if known.white is None:
+        return Check("light")
+    dark = np.zeros(3) if known.dark is None else known.dark.level
+    share = (frame.level - dark) / np.maximum(known.white.level - dark, 1.0)
+    name = ("red", "green", "blue")[primary]
+    reason = ""
+    if int(share.argmax()) != primary or share[primary] < 0.1:
+        seen = (
+            "nearly black" if share.max() < 0.1 else f"more {('red', 'green', 'blue')[int(share.argmax())]} than that"
+        )
+        reason = (
+            f"{name} alone was ordered, and the frame is {seen}; does the screen stand still, or are the colours of "
+            "the cable or of the picture mode exchanged?"
+        )
+    elif share.min() > 0.9:
+        reason = (
+            f"{name} alone was ordered, and the frame is as bright as white everywhere; does the screen stand still?"
+        )
+    return Check("light", round(100 * float(share[primary]), 1), 10.0, None, "%", reason)
+
+
+def judge_first_frames(known: JudgeState, step: SessionStep, cause: Check | None, judge: JudgeSettings) -> Check | None:
+    """Return why the first frames of a session or run cannot be trusted; None where nothing speaks against them.
+
+    What they show is learnt, and only later frames tell that one of them was the odd one: a step whose frame is refused
+    twice contradicts them, and before the first light white is held against what all others foretell.
+
+    `cause`: the check that refuses the frame; None where it is accepted.
+    """
+    if not known.founding or all(not any(one.codes) for one in known.first_frames):
+        return None
+    why = cause
+    if cause is None:
+        why = _odd_white(known, judge) if step.kind == "light" else None
+    elif cause.name not in _CONTRADICTIONS or step.number not in known.doubted:
+        why = None
+    elif known.awaits_primaries and cause.value is None:
+        # What it should look like is not known yet.
+        why = None
+    if why is None:
+        return None
+    odd = f"{why.reason}; one of the first frames may be the odd one, white, dark or a primary"
+    if known.restarts < MOST_RESTARTS:
+        return replace(why, reason=f"{odd}: they are taken again")
+    return replace(
+        why,
+        reason=f"{odd}: they were taken {known.restarts + 1} times and do not agree; see that lamp, room light and "
+        "focus are steady. They are taken again after the pause, or by the same command later",
+    )
+
+
+def _odd_white(known: JudgeState, judge: JudgeSettings) -> Check | None:
+    """Return why the first white frame is not what the frames behind it foretell; None where it is."""
+    white = next((one.measured for one in known.first_frames if one.codes == (255, 255, 255)), None)
+    model = known.without_white()
+    if white is None or model is None or known.basis is None:
+        return None
+    light = known.basis.light(white)
+    fit = model.compare(light.amounts, (255, 255, 255), light.covariance)
+    limit = max(judge.light_deg, fit.angle_limit(limits.LIGHT_SIGMAS))
+    if fit.angle_deg > limit:
+        said = f"the first white frame is {fit.angle_deg:.1f}° from the light that greys and primaries foretell"
+        return Check("light", round(fit.angle_deg, 3), None, round(limit, 3), "°", said)
+    room = max(judge.drift_percent / 100, limits.BRIGHTNESS_SIGMAS * fit.brightness_sd)
+    if abs(fit.brightness) > room:
+        percent = 100 * float(np.expm1(fit.brightness))
+        said = f"the first white frame is {percent:+.1f} % as bright as greys and primaries foretell"
+        return Check("lamp", round(percent, 2), round(-100 * room, 2), round(100 * room, 2), "%", said)
+    return None
+
+
+_CAUSES = (
+    "file", "camera", "settings", "data", "repeated", "clipping", "exposure", "chart", "movement", "blur", "rows",
+    "uniformity", "light", "ambient", "lamp", "dark", "white drift", "additivity",
+)  # fmt: skip
+"""Checks in the order in which they are named as the cause: what comes first explains what comes after."""
+
+_AT_ONCE = ("camera", "chart")
+"""Causes that taking the frame again never mends."""
+
+_HIDDEN = ("ambient", "dark")
+"""Causes that a reference shows and the lights between may hide: what was taken since the last good one is in doubt."""
+
+_BY_MODEL = ("light", "uniformity", "rows", "lamp", "white drift")
+"""Causes that each light shows by itself, where frames of the primaries say what it should look like."""
+
+_FOLLOWS: Mapping[str, frozenset[str]] = MappingProxyType(
+    {
+        "movement": frozenset({"rows", "uniformity", "blur", "light", "lamp", "white drift"}),
+        "rows": frozenset({"movement", "uniformity", "blur", "light", "lamp", "white drift", "ambient"}),
+        "uniformity": frozenset({"rows", "movement", "blur", "light", "lamp", "white drift", "ambient"}),
+        "blur": frozenset({"rows", "uniformity"}),
+        "light": frozenset({"lamp", "ambient", "white drift"}),
+        "ambient": frozenset({"light", "lamp", "uniformity"}),
+    }
+)
+"""What a cause brings about besides itself."""
+
+_ROWS_STAND_PX = 0.7
+"""Blur, px, below which rows show what belongs into them (simulated: none deviates at 0.75 px): rows that do not are
+what made edges look softer, and no blur."""
+
+
+def named_once(checks: Sequence[Check]) -> tuple[Check, ...]:
+    """Return the checks in the order in which causes are named, what follows from the first cause without a reason."""
+    # Blur is measured on tags and on rows, a light's ambient share besides its colour: what is wrong is kept.
+    one = {check.name: check for check in sorted(checks, key=lambda check: bool(check.reason))}
+    order = sorted(one.values(), key=lambda check: _CAUSES.index(check.name))
+    reasons = [check.name for check in order if check.reason]
+    if "movement" in reasons and len(reasons) > 1:
+        movement = next(check for check in order if check.name == "movement")
+        # Tags that are not recognised have a cause; tags that moved are one.
+        if movement.value is None:
+            reasons.remove("movement")
+    blur = one.get("blur")
+    if "rows" in reasons and "blur" in reasons and blur is not None and abs(blur.value or np.inf) < _ROWS_STAND_PX:
+        reasons.remove("blur")
+        one["blur"] = replace(blur, reason="")
+        order = [one[check.name] for check in order]
+    cause = reasons[0] if reasons else ""
+    follows = _FOLLOWS.get(cause, frozenset())
+    return tuple(replace(check, reason="") if check.name in follows else check for check in order)
+
+
+def voids_others(known: JudgeState, cause: str) -> bool:
+    """Return whether a reference that is refused for a cause puts what was taken since the last good one in doubt."""
+    return cause in _HIDDEN or cause in known.untold or (cause in _BY_MODEL and not known.modelled)
+
+
+def is_lasting(known: JudgeState, step: SessionStep, cause: str) -> bool:
+    """Return whether taking the frame again will not help; `known` includes it."""
+    # A lamp that is another one at the beginning of a run would cost every light up to the next white frame.
+    another = cause == "white drift" and is_brightest_grey(step)
+    # Of a session's first frame the exposure is too long, and a second one is no shorter.
+    overexposed = cause == "clipping" and known.white is None
+    return another or overexposed or cause in _AT_ONCE or known.refused[1] >= limits.LASTING_FRAMES
