@@ -1,16 +1,13 @@
-"""Whether a raw file is of the session's camera, exposed as asked, whole, and a frame that was not given before.
+"""What is asked of a frame besides its light: file, camera, exposure, the chart's place, darkness, drift.
 
-Whether the chart lies where it lay, and is as sharp.
-
-Whether a dark frame is dark and as dark as before, how far white has drifted, and whether first frames agree.
-
-Which of a frame's faults is named as the cause, and what it means for the frames around it.
+Each check has its number and its limits, also where it passes, and the sentence that a person is told where it fails.
+`CAUSES` says which of a frame's faults is named, and what it means for the frames around it.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from types import MappingProxyType
 from typing import Final
 
@@ -375,32 +372,48 @@ def _odd_white(known: JudgeState, judge: JudgeSettings) -> Check | None:
     return None
 
 
-_CAUSES = (
-    "file", "camera", "settings", "data", "repeated", "clipping", "exposure", "chart", "movement", "blur", "rows",
-    "uniformity", "light", "ambient", "lamp", "dark", "white drift", "additivity",
-)  # fmt: skip
-"""Checks in the order in which they are named as the cause: what comes first explains what comes after."""
+@dataclass(frozen=True)
+class Cause:
+    """What is known of a check that refuses a frame.
 
-_AT_ONCE = ("camera", "chart")
-"""Causes that taking the frame again never mends."""
+    - `explains`: checks that it brings about besides itself.
+    - `lasts`: whether taking the frame again never helps.
+    - `is_hidden`: whether a reference shows it and the lights between may hide it: what was taken since the last good
+      reference is in doubt.
+    - `in_each_light`: whether each light shows it by itself, where frames of the primaries say how it should look.
+    """
 
-_HIDDEN = ("ambient", "dark")
-"""Causes that a reference shows and the lights between may hide: what was taken since the last good one is in doubt."""
+    explains: frozenset[str] = frozenset()
+    lasts: bool = False
+    is_hidden: bool = False
+    in_each_light: bool = False
 
-_BY_MODEL = ("light", "uniformity", "rows", "lamp", "white drift")
-"""Causes that each light shows by itself, where frames of the primaries say what it should look like."""
 
-_FOLLOWS: Mapping[str, frozenset[str]] = MappingProxyType(
+_OF_THE_LIGHT = frozenset({"uniformity", "blur", "light", "lamp", "white drift"})
+
+CAUSES: Mapping[str, Cause] = MappingProxyType(
     {
-        "movement": frozenset({"rows", "uniformity", "blur", "light", "lamp", "white drift"}),
-        "rows": frozenset({"movement", "uniformity", "blur", "light", "lamp", "white drift", "ambient"}),
-        "uniformity": frozenset({"rows", "movement", "blur", "light", "lamp", "white drift", "ambient"}),
-        "blur": frozenset({"rows", "uniformity"}),
-        "light": frozenset({"lamp", "ambient", "white drift"}),
-        "ambient": frozenset({"light", "lamp", "uniformity"}),
+        "file": Cause(),
+        "camera": Cause(lasts=True),
+        "settings": Cause(),
+        "data": Cause(),
+        "repeated": Cause(),
+        "clipping": Cause(),
+        "exposure": Cause(),
+        "chart": Cause(lasts=True),
+        "movement": Cause(_OF_THE_LIGHT | {"rows"}),
+        "blur": Cause(frozenset({"rows", "uniformity"})),
+        "rows": Cause(_OF_THE_LIGHT | {"movement", "ambient"}, in_each_light=True),
+        "uniformity": Cause(_OF_THE_LIGHT - {"uniformity"} | {"rows", "movement", "ambient"}, in_each_light=True),
+        "light": Cause(frozenset({"lamp", "ambient", "white drift"}), in_each_light=True),
+        "ambient": Cause(frozenset({"light", "lamp", "uniformity"}), is_hidden=True),
+        "lamp": Cause(in_each_light=True),
+        "dark": Cause(is_hidden=True),
+        "white drift": Cause(in_each_light=True),
+        "additivity": Cause(),
     }
 )
-"""What a cause brings about besides itself."""
+"""Checks in the order in which they are named as the cause: what comes first explains what comes after."""
 
 _ROWS_STAND_PX = 0.7
 """Blur, px, below which rows show what belongs into them (simulated: none deviates at 0.75 px): rows that do not are
@@ -411,7 +424,8 @@ def named_once(checks: Sequence[Check]) -> tuple[Check, ...]:
     """Return the checks in the order in which causes are named, what follows from the first cause without a reason."""
     # Blur is measured on tags and on rows, a light's ambient share besides its colour: what is wrong is kept.
     one = {check.name: check for check in sorted(checks, key=lambda check: bool(check.reason))}
-    order = sorted(one.values(), key=lambda check: _CAUSES.index(check.name))
+    places = list(CAUSES)
+    order = sorted(one.values(), key=lambda check: places.index(check.name))
     reasons = [check.name for check in order if check.reason]
     if "movement" in reasons and len(reasons) > 1:
         movement = next(check for check in order if check.name == "movement")
@@ -423,14 +437,14 @@ def named_once(checks: Sequence[Check]) -> tuple[Check, ...]:
         reasons.remove("blur")
         one["blur"] = replace(blur, reason="")
         order = [one[check.name] for check in order]
-    cause = reasons[0] if reasons else ""
-    follows = _FOLLOWS.get(cause, frozenset())
+    follows = CAUSES[reasons[0]].explains if reasons else frozenset[str]()
     return tuple(replace(check, reason="") if check.name in follows else check for check in order)
 
 
 def voids_others(known: JudgeState, cause: str) -> bool:
     """Return whether a reference that is refused for a cause puts what was taken since the last good one in doubt."""
-    return cause in _HIDDEN or cause in known.untold or (cause in _BY_MODEL and not known.modelled)
+    hidden = CAUSES[cause].is_hidden or (CAUSES[cause].in_each_light and not known.modelled)
+    return hidden or cause in known.untold
 
 
 def is_lasting(known: JudgeState, step: SessionStep, cause: str) -> bool:
@@ -439,4 +453,4 @@ def is_lasting(known: JudgeState, step: SessionStep, cause: str) -> bool:
     another = cause == "white drift" and is_brightest_grey(step)
     # Of a session's first frame the exposure is too long, and a second one is no shorter.
     overexposed = cause == "clipping" and known.white is None
-    return another or overexposed or cause in _AT_ONCE or known.refused[1] >= limits.LASTING_FRAMES
+    return another or overexposed or CAUSES[cause].lasts or known.refused[1] >= limits.LASTING_FRAMES

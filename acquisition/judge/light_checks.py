@@ -1,16 +1,14 @@
-"""Whether a frame shows the light that was ordered, and which other one it shows if not.
+"""Whether a frame shows the light that was ordered, and shows it everywhere.
 
-The amounts of the three primaries in a frame are compared with those that the codes foretell. The lamp's level is left
+The amounts of the three primaries in a frame are compared with those predicted from the codes. The lamp's level is left
 free for the colour, and judged by itself. A light that is not the one ordered is held against everything else that it
 could be: the light of the frame before, another one of the plan, the ordered one and light from elsewhere.
-
-Whether the whole frame shows one light: nothing covered, no half of another picture, no rows that are not theirs.
+Tiles and rows that show another light than the whole frame are covered, half of another picture, or damaged.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
 
 import numpy as np
 import numpy.typing as npt
@@ -18,7 +16,7 @@ import numpy.typing as npt
 from acquisition.judge import limits
 from acquisition.judge.light import Basis, Codes, Fit, FrameLight, ProjectorModel, Residuals
 from acquisition.judge.measure import SEGMENTS, TILE_COLUMNS, TILE_ROWS, Measured
-from acquisition.judge.state import JudgeState, Leaning, Seen, combined
+from acquisition.judge.state import JudgeState, LampSeen, Leaning, Seen, combined
 from experiment.session.judgement import Check
 from experiment.session.plan import SessionStep
 from foundation.angles import angles_deg
@@ -34,16 +32,6 @@ _SAME_FLOOR = 4e-4
 _Array = npt.NDArray[np.float64]
 
 
-@dataclass(frozen=True)
-class LightVerdict:
-    """What is said of a light: the checks, the lamp's level over the one expected, and what is kept of it."""
-
-    checks: tuple[Check, ...]
-    brightness: float = float("nan")
-    stepped: bool = False
-    leaning: Leaning = field(default_factory=Leaning)
-
-
 def judge_light(
     known: JudgeState,
     step: SessionStep,
@@ -51,12 +39,12 @@ def judge_light(
     plan: Sequence[Codes],
     angle_deg: float,
     drift_percent: float,
-) -> LightVerdict:
-    """Return whether a lit frame shows what its step asks for."""
+) -> tuple[tuple[Check, ...], LampSeen]:
+    """Return whether a lit frame shows what its step asks for, and what it shows of the lamp."""
     codes = step.colour.codes
     before = known.recent[-1] if known.recent else None
     if not known.modelled:
-        return LightVerdict((_without_model(light, codes, before),))
+        return (_without_model(light, codes, before),), LampSeen()
     model = known.model
     fit = model.compare(light.amounts, codes, light.covariance)
     limit = max(angle_deg, fit.angle_limit(limits.LIGHT_SIGMAS))
@@ -84,7 +72,7 @@ def judge_light(
         Check("light", round(fit.angle_deg, 3), None, round(limit, 3), "°", "" if added else reason),
         Check("lamp", round(percent, 2), round(-100 * room, 2), round(100 * room, 2), "%", lamp),
     )
-    return LightVerdict(checks, fit.brightness, stepped, leaning)
+    return checks, LampSeen(fit.brightness, stepped, leaning)
 
 
 def crept(leaning: Leaning, drift: float) -> tuple[str, float]:
@@ -200,8 +188,8 @@ def _near(model: ProjectorModel, amounts: _Array, plan: Sequence[Codes], most: i
     """Return the codes whose amounts, by the tone curves alone, are nearest."""
     curves = model.curves()
     table = np.array(plan)
-    foretold = np.stack([curves[primary, table[:, primary]] for primary in range(3)], axis=-1)
-    off = np.linalg.norm(foretold - amounts, axis=1)
+    predicted = np.stack([curves[primary, table[:, primary]] for primary in range(3)], axis=-1)
+    off = np.linalg.norm(predicted - amounts, axis=1)
     return [plan[k] for k in np.argsort(off, kind="stable")[:most].tolist()]
 
 
@@ -325,18 +313,10 @@ _EDGE = 0.15
 """Relative deviation of a row for each px that the chart lies sideways: cells at a strip's ends are others."""
 
 
-@dataclass(frozen=True, eq=False)
-class Evenness:
-    """The checks, and which tiles (T,) bool deviate, to be drawn."""
-
-    checks: tuple[Check, ...]
-    off: npt.NDArray[np.bool_]
-
-
 def judge_evenness(
     basis: Basis, light: FrameLight, frame: Measured, moved_px: _Array, before: Seen | None = None
-) -> Evenness:
-    """Return whether a lit frame shows one light everywhere.
+) -> tuple[list[Check], npt.NDArray[np.bool_]]:
+    """Return whether a lit frame shows one light everywhere, and which tiles (T,) deviate, to be drawn.
 
     `moved_px`: (2,) how far the chart lies from its place in the basis. `before`: the frame before, whose light may
     still be seen in a part; None where there is none.
@@ -358,7 +338,7 @@ def judge_evenness(
     checks = [Check("uniformity", round(value, 2), None, round(limit, 2), "%", reason)]
     if len(frame.strips):
         checks += _judge_rows(basis, light, frame, moved_px, bool(reason))
-    return Evenness(tuple(checks), off if reason else np.zeros_like(off))
+    return checks, off if reason else np.zeros_like(off)
 
 
 def _share_of_before(

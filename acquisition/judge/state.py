@@ -60,6 +60,20 @@ class Leaning:
         return Leaning((*newer.lamp, *self.lamp)[:LEANING], (*newer.added, *self.added)[:LEANING])
 
 
+@dataclass(frozen=True)
+class LampSeen:
+    """What a frame shows of the lamp.
+
+    - `brightness`: its level over the one expected (logarithm); NaN where that is not known.
+    - `stepped`: whether the frame is accepted at another level than expected.
+    - `leaning`: how its light was off, however little.
+    """
+
+    brightness: float = float("nan")
+    stepped: bool = False
+    leaning: Leaning = field(default_factory=Leaning)
+
+
 def combined(values: Sequence[tuple[float, float]]) -> tuple[float, float]:
     """Return the weighted mean of values with standard deviations, and its own; (0, inf) of none."""
     weights = [sd**-2 for _, sd in values]
@@ -77,18 +91,14 @@ class Examined:
     - `light`: its light, where a basis is known.
     - `accepted`: whether it may be used.
     - `cause`: name of the check that refused it; empty if none did.
-    - `brightness`: level of the lamp over the one expected (logarithm); NaN where that is not known.
-    - `stepped`: whether it was accepted at another level of the lamp than expected.
-    - `leaning`: how its light was off, however little.
+    - `lamp`: what it showed of the lamp.
     """
 
     frame: Frame
     light: FrameLight | None
     accepted: bool
     cause: str = ""
-    brightness: float = float("nan")
-    stepped: bool = False
-    leaning: Leaning = field(default_factory=Leaning)
+    lamp: LampSeen = field(default_factory=LampSeen)
 
 
 @dataclass(frozen=True, eq=False)
@@ -202,7 +212,7 @@ class JudgeState:
         )
         if not found.accepted:
             count = self.refused[1] + 1 if found.cause == self.refused[0] else 1
-            lamp = found.brightness if found.cause == "lamp" else float("nan")
+            lamp = found.lamp.brightness if found.cause == "lamp" else float("nan")
             x, y = frame.moved_px.tolist() if found.cause == "movement" else (float("nan"), float("nan"))
             doubted = self.doubted | {step.number}
             return replace(known, refused=(found.cause, count), candidate=(lamp, x, y), doubted=doubted)
@@ -215,7 +225,7 @@ class JudgeState:
             known = replace(known, founding=False, first_frames=(), restarts=0)
         if step.kind != "dark":
             # After a step of the lamp nothing before it counts any more.
-            leaning = Leaning() if found.stepped or known.rested else known.leaning.then(found.leaning)
+            leaning = Leaning() if found.lamp.stepped or known.rested else known.leaning.then(found.lamp.leaning)
             known = replace(known, rested=False, leaning=leaning)
         steady = float(np.hypot(*(frame.moved_px - np.array(self.candidate[1:])))) <= limits.STEADY_PX
         if not np.isnan(frame.moved_px).any() and (self.moved_px is None or self.rested or steady):
@@ -225,7 +235,7 @@ class JudgeState:
         known = known._referenced(step, frame)
         # A frame that makes the basis has been learnt from with it.
         if found.light is not None and self.modelled and known.modelled and step.kind != "dark":
-            model = known.model.stepped(found.brightness) if found.stepped else known.model
+            model = known.model.stepped(found.lamp.brightness) if found.lamp.stepped else known.model
             known = replace(known, model=model.learn(found.light.amounts, codes, found.light.covariance))
         return known
 
