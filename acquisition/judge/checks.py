@@ -28,21 +28,21 @@ from experiment.session.plan import SessionStep
 
 
 def judge_file(
-    known: JudgeState, mosaic: Mosaic, measured: Measured, step: SessionStep, settings: LabSettings
+    state: JudgeState, mosaic: Mosaic, measured: Measured, step: SessionStep, settings: LabSettings
 ) -> tuple[Check, ...]:
     """Return what is said of a frame's file and exposure, before anything is looked for in its picture."""
     return (
-        *_judge_origin(known, mosaic, measured, settings),
-        _judge_repeated(known, measured, settings),
-        *_judge_exposure(known, measured, step, settings),
+        *_judge_origin(state, mosaic, measured, settings),
+        _judge_repeated(state, measured, settings),
+        *_judge_exposure(state, measured, step, settings),
     )
 
 
 def _judge_origin(
-    known: JudgeState, mosaic: Mosaic, measured: Measured, settings: LabSettings
+    state: JudgeState, mosaic: Mosaic, measured: Measured, settings: LabSettings
 ) -> tuple[Check, Check, Check]:
     """Return whether the file is of the session's camera, exposed as asked, and whole."""
-    first = known.first
+    first = state.first
     reason = ""
     if first is not None:
         size = (measured.places.rows, measured.places.columns)
@@ -70,15 +70,15 @@ def _judge_origin(
     )
 
 
-def _judge_repeated(known: JudgeState, measured: Measured, settings: LabSettings) -> Check:
+def _judge_repeated(state: JudgeState, measured: Measured, settings: LabSettings) -> Check:
     """Return whether the camera gave a frame again that it gave before: its noise is the same."""
     if settings.rig == "replay":
         # A recording has one frame of a light, and gives it as often as it is asked.
         return Check("repeated")
     reason = "the camera handed out a frame that it had given before; check its cable and its memory card"
-    if measured.digest in known.digests:
+    if measured.digest in state.digests:
         return Check("repeated", 0.0, limits.SAME_NOISE, None, "", reason)
-    values = [_independence(measured, seen.measured) for seen in known.recent]
+    values = [_independence(measured, seen.measured) for seen in state.recent]
     told = [value for value in values if value is not None]
     if not told:
         return Check("repeated")
@@ -103,11 +103,11 @@ def _independence(one: Measured, other: Measured) -> float | None:
 
 
 def _judge_exposure(
-    known: JudgeState, measured: Measured, step: SessionStep, settings: LabSettings
+    state: JudgeState, measured: Measured, step: SessionStep, settings: LabSettings
 ) -> tuple[Check, Check]:
     exposure = Exposure(measured.clipped, measured.brightest_dn, measured.range_dn)
     # Where white is known, a dark frame is held against it.
-    free = step.kind == "dark" and known.white is not None
+    free = step.kind == "dark" and state.white is not None
     reason = "" if free else refusal(exposure, step.kind, settings.limits) or ""
     clipped = 100 * measured.clipped > settings.limits.clipped_percent and step.kind != "dark"
     allowed = None if step.kind == "dark" else settings.limits.clipped_percent
@@ -117,7 +117,7 @@ def _judge_exposure(
     )
 
 
-UNTOLD_PX: npt.NDArray[np.float64] = np.full(2, np.nan)
+UNKNOWN_PLACE: npt.NDArray[np.float64] = np.full(2, np.nan)
 """Place of a chart in a frame that is too dark to tell."""
 
 _UNRECOGNISED = (
@@ -133,18 +133,18 @@ def best_channel(measured: Measured) -> tuple[Channel, float]:
     return CHANNELS[best], float(level[best])
 
 
-def has_moved_far(known: JudgeState, mosaic: Mosaic, black: npt.NDArray[np.float64], measured: Measured) -> bool:
+def has_moved_far(state: JudgeState, mosaic: Mosaic, black: npt.NDArray[np.float64], measured: Measured) -> bool:
     """Return whether the chart lies elsewhere than in the earlier run; `black` (2, 2) float64 counts of the frame."""
-    assert known.anchor is not None
+    assert state.anchor is not None
     channel, level = best_channel(measured)
     if level < limits.DIM_DN / 2:
         return False
-    shift = known.anchor.shift(mosaic, black, channel)
+    shift = state.anchor.shift(mosaic, black, channel)
     return shift.gauges == 0 or shift.length_px > limits.MOVED_FOLLOWED_PX
 
 
 def judge_movement(
-    known: JudgeState,
+    state: JudgeState,
     anchor: Anchor,
     mosaic: Mosaic,
     black: npt.NDArray[np.float64],
@@ -162,23 +162,23 @@ def judge_movement(
         return [
             Check("movement", None, None, judge.moved_px, "px"),
             Check("blur", None, None, judge.blur_px, "px"),
-        ], UNTOLD_PX
+        ], UNKNOWN_PLACE
     shift = anchor.shift(mosaic, black, channel)
     if shift.gauges == 0:
         far = anchor.displacement(mosaic, black, channel)
         if far is None:
-            return [Check("movement", None, None, judge.moved_px, "px", _UNRECOGNISED)], UNTOLD_PX
+            return [Check("movement", None, None, judge.moved_px, "px", _UNRECOGNISED)], UNKNOWN_PLACE
         return [Check("movement", round(float(np.hypot(*far)), 3), None, judge.moved_px, "px", _moved(far))], np.array(
             far
         )
     place = np.array([shift.dx, shift.dy])
-    at = known.moved_px if known.moved_px is not None else np.zeros(2)
+    at = state.moved_px if state.moved_px is not None else np.zeros(2)
     moved = float(np.hypot(*(place - at)))
     reason = ""
     if moved > judge.moved_px:
-        steady = float(np.hypot(*(place - np.array(known.candidate[1:])))) <= limits.STEADY_PX
+        steady = float(np.hypot(*(place - np.array(state.candidate[1:])))) <= limits.STEADY_PX
         followed = steady and float(np.hypot(*place)) <= limits.MOVED_FOLLOWED_PX
-        reason = "" if followed or known.rested else _moved((float(place[0] - at[0]), float(place[1] - at[1])))
+        reason = "" if followed or state.rested else _moved((float(place[0] - at[0]), float(place[1] - at[1])))
     checks = [Check("movement", round(moved, 3), None, judge.moved_px, "px", reason)]
     if paper < limits.BLUR_DIM_DN:
         return [*checks, Check("blur", None, None, judge.blur_px, "px")], place
@@ -224,23 +224,23 @@ _STALE_LEAST = 0.02
 """Amount of light in a dark frame, of a primary, from which on the frame before may be what is seen."""
 
 
-def judge_dark(known: JudgeState, frame: Measured, dark_percent: float, ambient_percent: float) -> tuple[Check, ...]:
+def judge_dark(state: JudgeState, frame: Measured, dark_percent: float, ambient_percent: float) -> tuple[Check, ...]:
     """Return whether a dark frame is dark, and changed by no more than `ambient_percent` of white since the first.
 
     Both limits are per cent of what white gives in the same place and channel; the change is that of the region, one of
     24, that changed most, so that a lamp in a corner shows.
     """
-    if known.white is None:
+    if state.white is None:
         return (Check("dark"),)
-    white = known.white.tiles - (0 if known.dark is None else known.dark.tiles)
+    white = state.white.tiles - (0 if state.dark is None else state.dark.tiles)
     # Of a tile that white hardly lights, such as a black backdrop, against a third of the mean.
     scale = np.maximum(white, np.maximum(white.mean(axis=0) / 3, 1.0))
     level = 100 * frame.tiles / scale
     value = float(max(level.mean(axis=0).max(), np.percentile(level, 94)))
     stale = ""
-    before = known.recent[-1] if known.recent else None
-    if value > dark_percent and known.basis is not None and before is not None and before.amounts is not None:
-        amounts = known.basis.light(frame).amounts
+    before = state.recent[-1] if state.recent else None
+    if value > dark_percent and state.basis is not None and before is not None and before.amounts is not None:
+        amounts = state.basis.light(frame).amounts
         if amounts.max() > _STALE_LEAST and same_light(amounts, before.amounts, 0.003) < 2 * limits.STALE_SIGMAS:
             stale = (
                 "the dark frame shows the light of the frame before; does the screen stand still, or is "
@@ -253,7 +253,7 @@ def judge_dark(known: JudgeState, frame: Measured, dark_percent: float, ambient_
             "projector's picture not black?"
         )
     checks = [Check("light" if stale else "dark", round(value, 3), None, dark_percent, "%", reason)]
-    first = known.first_dark
+    first = state.first_dark
     if first is not None and not reason:
         changed = _by_region(100 * (frame.tiles - first.tiles) / scale)
         noise = 100 * float(np.sqrt(frame.noise.variance(frame.level).max() / frame.places.tile_blocks.mean()))
@@ -296,15 +296,15 @@ def judge_white(first: Frame | None, frame: Frame) -> Check:
     return Check("white drift", round(drift, 2), -limits.LAMP_TOTAL, limits.LAMP_TOTAL, "%", reason)
 
 
-def judge_first_primary(known: JudgeState, frame: Measured, primary: int) -> Check:
+def judge_first_primary(state: JudgeState, frame: Measured, primary: int) -> Check:
     """Return whether the first frame of a primary shows it: against white, its own channel is the brightest.
 
     Of a frame's three channels none sees another's primary better than its own, whatever the camera.
     """
-    if known.white is None:
+    if state.white is None:
         return Check("light")
-    dark = np.zeros(3) if known.dark is None else known.dark.level
-    share = (frame.level - dark) / np.maximum(known.white.level - dark, 1.0)
+    dark = np.zeros(3) if state.dark is None else state.dark.level
+    share = (frame.level - dark) / np.maximum(state.white.level - dark, 1.0)
     name = ("red", "green", "blue")[primary]
     reason = ""
     if int(share.argmax()) != primary or share[primary] < 0.1:
@@ -322,43 +322,43 @@ def judge_first_primary(known: JudgeState, frame: Measured, primary: int) -> Che
     return Check("light", round(100 * float(share[primary]), 1), 10.0, None, "%", reason)
 
 
-def judge_first_frames(known: JudgeState, step: SessionStep, cause: Check | None, judge: JudgeSettings) -> Check | None:
+def judge_first_frames(state: JudgeState, step: SessionStep, cause: Check | None, judge: JudgeSettings) -> Check | None:
     """Return why the first frames of a session or run cannot be trusted; None where nothing speaks against them.
 
     What they show is learnt, and only later frames tell that one of them was the odd one: a step whose frame is refused
-    twice contradicts them, and before the first light white is held against what all others foretell.
+    twice contradicts them, and before the first light white is held against what all others predict.
 
     `cause`: the check that refuses the frame; None where it is accepted.
     """
-    if not known.founding or all(not any(one.codes) for one in known.first_frames):
+    if not state.founding or all(not any(one.codes) for one in state.first_frames):
         return None
     why = cause
     if cause is None:
-        why = _odd_white(known, judge) if step.kind == "light" else None
-    elif cause.name not in _CONTRADICTIONS or step.number not in known.doubted:
+        why = _odd_white(state, judge) if step.kind == "light" else None
+    elif cause.name not in _CONTRADICTIONS or step.number not in state.doubted:
         why = None
-    elif known.awaits_primaries and cause.value is None:
+    elif state.awaits_primaries and cause.value is None:
         # What it should look like is not known yet.
         why = None
     if why is None:
         return None
     odd = f"{why.reason}; one of the first frames may be the odd one, white, dark or a primary"
-    if known.restarts < MOST_RESTARTS:
+    if state.restarts < MOST_RESTARTS:
         return replace(why, reason=f"{odd}: they are taken again")
     return replace(
         why,
-        reason=f"{odd}: they were taken {known.restarts + 1} times and do not agree; see that lamp, room light and "
+        reason=f"{odd}: they were taken {state.restarts + 1} times and do not agree; see that lamp, room light and "
         "focus are steady. They are taken again after the pause, or by the same command later",
     )
 
 
-def _odd_white(known: JudgeState, judge: JudgeSettings) -> Check | None:
-    """Return why the first white frame is not what the frames behind it foretell; None where it is."""
-    white = next((one.measured for one in known.first_frames if one.codes == (255, 255, 255)), None)
-    model = known.without_white()
-    if white is None or model is None or known.basis is None:
+def _odd_white(state: JudgeState, judge: JudgeSettings) -> Check | None:
+    """Return why the first white frame is not what the frames behind it predict; None where it is."""
+    white = next((one.measured for one in state.first_frames if one.codes == (255, 255, 255)), None)
+    model = state.without_white()
+    if white is None or model is None or state.basis is None:
         return None
-    light = known.basis.light(white)
+    light = state.basis.light(white)
     fit = model.compare(light.amounts, (255, 255, 255), light.covariance)
     limit = max(judge.light_deg, fit.angle_limit(limits.LIGHT_SIGMAS))
     if fit.angle_deg > limit:
@@ -441,16 +441,16 @@ def named_once(checks: Sequence[Check]) -> tuple[Check, ...]:
     return tuple(replace(check, reason="") if check.name in follows else check for check in order)
 
 
-def voids_others(known: JudgeState, cause: str) -> bool:
+def voids_others(state: JudgeState, cause: str) -> bool:
     """Return whether a reference that is refused for a cause puts what was taken since the last good one in doubt."""
-    hidden = CAUSES[cause].is_hidden or (CAUSES[cause].in_each_light and not known.modelled)
-    return hidden or cause in known.untold
+    hidden = CAUSES[cause].is_hidden or (CAUSES[cause].in_each_light and not state.modelled)
+    return hidden or cause in state.untold
 
 
-def is_lasting(known: JudgeState, step: SessionStep, cause: str) -> bool:
-    """Return whether taking the frame again will not help; `known` includes it."""
+def is_lasting(state: JudgeState, step: SessionStep, cause: str) -> bool:
+    """Return whether taking the frame again will not help; `state` includes it."""
     # A lamp that is another one at the beginning of a run would cost every light up to the next white frame.
     another = cause == "white drift" and is_brightest_grey(step)
     # Of a session's first frame the exposure is too long, and a second one is no shorter.
-    overexposed = cause == "clipping" and known.white is None
-    return another or overexposed or CAUSES[cause].lasts or known.refused[1] >= limits.LASTING_FRAMES
+    overexposed = cause == "clipping" and state.white is None
+    return another or overexposed or CAUSES[cause].lasts or state.refused[1] >= limits.LASTING_FRAMES

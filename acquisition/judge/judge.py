@@ -20,7 +20,7 @@ import numpy.typing as npt
 
 from acquisition.judge.checks import (
     MOST_RESTARTS,
-    UNTOLD_PX,
+    UNKNOWN_PLACE,
     best_channel,
     has_moved_far,
     is_lasting,
@@ -138,66 +138,66 @@ class LiveJudge:
 
     def _look(self, mosaic: Mosaic, black: npt.NDArray[np.float64], step: SessionStep) -> Findings:
         """Return what is found of a frame of a step; `black` (2, 2) float64 counts is its black level."""
-        known, settings = self._state, self._settings
+        state, settings = self._state, self._settings
         measured = measure(mosaic, black)
-        frame = Frame(measured, np.full(3, np.nan), UNTOLD_PX)
-        checks = [*judge_file(known, mosaic, measured, step, settings)]
+        frame = Frame(measured, np.full(3, np.nan), UNKNOWN_PLACE)
+        checks = [*judge_file(state, mosaic, measured, step, settings)]
         if any(check.reason for check in checks):
             return Findings(frame, tuple(checks))
-        if known.awaits_primaries and (step.kind == "light" or (step.kind == "response" and not is_compared(step))):
+        if state.awaits_primaries and (step.kind == "light" or (step.kind == "response" and not is_compared(step))):
             return Findings(frame, (*checks, Check("light", reason=_UNFOUNDED)))
-        anchor = known.anchor
-        if step.kind != "dark" and (anchor is None or (known.rested and has_moved_far(known, mosaic, black, measured))):
+        anchor = state.anchor
+        if step.kind != "dark" and (anchor is None or (state.rested and has_moved_far(state, mosaic, black, measured))):
             # The first lit frame is white; of a run taken up again it is the first in which the chart lies elsewhere.
             try:
                 anchor = Anchor.of(mosaic, black, self._chart)
             except RegistrationError as error:
                 return Findings(frame, (*checks, Check("chart", reason=str(error))))
             checks.append(Check("chart", float(len(anchor.framing.tags) or len(anchor.paper))))
-            if known.anchor is not None:
-                moved = known.anchor.displacement(mosaic, black, best_channel(measured)[0])
+            if state.anchor is not None:
+                moved = state.anchor.displacement(mosaic, black, best_channel(measured)[0])
                 if moved is not None:
                     checks.append(Check("movement", round(float(np.hypot(*moved)), 3), None, None, "px"))
-                known = replace(known, basis=None)
+                state = replace(state, basis=None)
             frame = replace(frame, anchor=anchor, moved_px=np.zeros(2))
         if anchor is not None:
             frame = replace(frame, paper=anchor.paper_level(mosaic, black, phases(mosaic)))
         if step.kind == "dark":
-            dark = judge_dark(known, measured, settings.judge.dark_percent, settings.judge.ambient_percent)
-            light = None if known.basis is None else known.basis.light(measured)
+            dark = judge_dark(state, measured, settings.judge.dark_percent, settings.judge.ambient_percent)
+            light = None if state.basis is None else state.basis.light(measured)
             return Findings(frame, (*checks, *dark), light)
         if frame.anchor is None and anchor is not None:
-            movement, place = judge_movement(known, anchor, mosaic, black, frame, settings.judge)
+            movement, place = judge_movement(state, anchor, mosaic, black, frame, settings.judge)
             checks += movement
             frame = replace(frame, moved_px=place)
         if step.kind == "white":
-            checks.append(judge_white(known.first_white, frame))
+            checks.append(judge_white(state.first_white, frame))
         if is_brightest_grey(step):
-            checks.append(judge_white(known.first_grey, frame))
-        of_light = self._look_at_light(known, frame, step)
+            checks.append(judge_white(state.first_grey, frame))
+        of_light = self._look_at_light(state, frame, step)
         return replace(of_light, checks=(*checks, *of_light.checks))
 
-    def _look_at_light(self, known: JudgeState, frame: Frame, step: SessionStep) -> Findings:
+    def _look_at_light(self, state: JudgeState, frame: Frame, step: SessionStep) -> Findings:
         """Return what is found of the light of a lit frame, and of its evenness."""
         measured = frame.measured
         primary = primary_of(step.colour.codes) if step.kind == "response" else None
         checks: list[Check] = []
-        if primary is not None and not known.modelled:
-            checks.append(judge_first_primary(known, measured, primary))
-        if known.basis is None:
+        if primary is not None and not state.modelled:
+            checks.append(judge_first_primary(state, measured, primary))
+        if state.basis is None:
             return Findings(frame, tuple(checks))
-        light = known.basis.light(measured)
-        if not known.modelled and step.kind == "response":
+        light = state.basis.light(measured)
+        if not state.modelled and step.kind == "response":
             # A primary alone is not what the camera's colours under white describe.
             return Findings(frame, tuple(checks), light)
-        moved = frame.moved_px if not np.isnan(frame.moved_px).any() else known.moved_px
-        before = known.recent[-1] if known.recent else None
-        evenness, off = judge_evenness(known.basis, light, measured, np.zeros(2) if moved is None else moved, before)
+        moved = frame.moved_px if not np.isnan(frame.moved_px).any() else state.moved_px
+        before = state.recent[-1] if state.recent else None
+        evenness, off = judge_evenness(state.basis, light, measured, np.zeros(2) if moved is None else moved, before)
         judge = self._settings.judge
-        of_light, lamp = judge_light(known, step, light, self._plan, judge.light_deg, judge.drift_percent)
+        of_light, lamp = judge_light(state, step, light, self._plan, judge.light_deg, judge.drift_percent)
         checks += [*evenness, *of_light]
-        if step.kind == "white" and known.modelled:
-            checks.append(Check("additivity", round(100 * known.model.overlap, 2), None, None, "%"))
+        if step.kind == "white" and state.modelled:
+            checks.append(Check("additivity", round(100 * state.model.overlap, 2), None, None, "%"))
         return Findings(frame, tuple(checks), light, off, lamp)
 
     def _preview(
@@ -230,15 +230,15 @@ def _seen(paper: npt.NDArray[np.float64]) -> tuple[float, float, float] | None:
     return None if np.isnan(paper).any() else (red, green, blue)
 
 
-def _judge_basis(known: JudgeState, following: JudgeState) -> Check | None:
+def _judge_basis(state: JudgeState, following: JudgeState) -> Check | None:
     """Return why frames of the primaries that are now known make no picture of the white or grey one; None if they do.
 
     Each of them alone tells nothing of a part that is covered; all that follows would be held against it.
     """
-    if known.modelled or not following.modelled or known.witness is None or following.basis is None:
+    if state.modelled or not following.modelled or state.witness is None or following.basis is None:
         return None
     moved = np.zeros(2) if following.moved_px is None else following.moved_px
-    checks, _ = judge_evenness(following.basis, following.basis.light(known.witness), known.witness, moved)
+    checks, _ = judge_evenness(following.basis, following.basis.light(state.witness), state.witness, moved)
     if all(check.passed for check in checks):
         return None
     uneven = next((check for check in checks if check.name == "uniformity"), Check("uniformity"))

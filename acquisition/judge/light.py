@@ -1,21 +1,19 @@
-"""What a projector makes of its codes: learnt from response frames, refined by every light that was accepted.
+"""The light of a frame as amounts of the projector's three primaries, and which amounts codes should give.
 
-The light of a frame is described by the amounts of the three primaries, each 1 at its code of `TOP`. The logarithm of
-an amount is a power law of its code, plus a smooth deviation (the tone curve), plus what light is added where primaries
-overlap (a wheel with white, yellow, cyan or magenta segments, "brilliant colour"), plus the lamp's level. All of it is
-one linear Gaussian state, known with a covariance, which every accepted frame improves; a prediction therefore has an
+A tile's counts are its counts in the dark, plus the amount of each primary times its counts under that primary alone
+(`Basis`). The three amounts are fitted to all tiles at once, robustly, so that a person before a quarter of the chart
+does not change them; what they leave is a map of places that another light, or none, falls on. Sessions without frames
+of the primaries have white alone: the camera's own three colours then stand for them, coarsely.
+
+Each amount is 1 at its code of `TOP` (`ProjectorModel`). Its logarithm is a power law of its code, plus a smooth
+deviation (the tone curve), plus what light is added where primaries overlap (a wheel with white, yellow, cyan or
+magenta segments, "brilliant colour"), plus the lamp's level. All of it is one linear Gaussian state, known with a
+covariance, learnt from response frames and refined by every light that was accepted; a prediction therefore has an
 uncertainty, which is large before the response frames, and honest where light does not add.
 
 Sources: C. E. Rasmussen, C. K. I. Williams, "Gaussian Processes for Machine Learning", 2006, eq. 2.22 to 2.26 (tone
 curves are Gaussian processes on nodes); Kalman's filter in Joseph's form with a linearised overlap (extended). Overlap
 as in `calibration.checks.light_codes`: functions of the least of two and of three codes.
-
-The picture as a sum of the pictures of the three primaries: amounts of light, and where a frame is none such sum.
-
-A tile's counts are its counts in the dark, plus the amount of each primary times its counts under that primary alone.
-The three amounts are fitted to all tiles at once, robustly, so that a person before a quarter of the chart does not
-change them; what they leave is a map of places that another light, or none, falls on. Sessions without frames of the
-primaries have white alone: the camera's own three colours then stand for them, coarsely.
 
 T tiles, S strips.
 """

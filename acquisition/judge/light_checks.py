@@ -33,7 +33,7 @@ _Array = npt.NDArray[np.float64]
 
 
 def judge_light(
-    known: JudgeState,
+    state: JudgeState,
     step: SessionStep,
     light: FrameLight,
     plan: Sequence[Codes],
@@ -42,28 +42,28 @@ def judge_light(
 ) -> tuple[tuple[Check, ...], LampSeen]:
     """Return whether a lit frame shows what its step asks for, and what it shows of the lamp."""
     codes = step.colour.codes
-    before = known.recent[-1] if known.recent else None
-    if not known.modelled:
+    before = state.recent[-1] if state.recent else None
+    if not state.modelled:
         return (_without_model(light, codes, before),), LampSeen()
-    model = known.model
+    model = state.model
     fit = model.compare(light.amounts, codes, light.covariance)
     limit = max(angle_deg, fit.angle_limit(limits.LIGHT_SIGMAS))
     wrong = fit.angle_deg > limit
     room = max(drift_percent / 100, limits.BRIGHTNESS_SIGMAS * fit.brightness_sd)
     reason, added = "", 0.0
     if wrong or fit.distance > limits.STALE_SIGMAS or abs(fit.brightness) > room:
-        reason, added = _cause(model, light, codes, before, plan, fit, wrong, room, known.refused[0] == "light")
+        reason, added = _cause(model, light, codes, before, plan, fit, wrong, room, state.refused[0] == "light")
     stepped = False
     lamp = ""
     if not reason and abs(fit.brightness) > room:
-        level = known.candidate[0]
+        level = state.candidate[0]
         # Shown twice alike, and small: the lamp has another level now, and each light has a ground truth of its own.
         stepped = abs(fit.brightness) <= limits.LAMP_FOLLOWED and abs(fit.brightness - level) <= room / 2
         lamp = "" if stepped else _brightness_reason(fit.brightness)
     percent = 100 * float(np.expm1(fit.brightness))
     leaning = Leaning(((fit.brightness, fit.brightness_sd),), (_added(model, light, codes),))
-    if not reason and not lamp and not stepped and not known.rested:
-        lamp, added = crept(known.leaning.then(leaning), drift_percent / 100)
+    if not reason and not lamp and not stepped and not state.rested:
+        lamp, added = crept(state.leaning.then(leaning), drift_percent / 100)
         reason = _ambient_reason(added) if added else ""
     ambient = (Check("ambient", round(100 * added, 2), None, None, "%", reason),) if added else ()
     # Where another cause changes the light, its brightness is none of the lamp's.

@@ -1,25 +1,19 @@
-"""What is measured of a decoded frame: light at all places, noise, exposure, who took it.
+"""What is measured of a decoded frame: light at all places, noise, exposure, who took it; and where the chart lay.
 
-Rules that hold inside:
-
-- One pass over the counts and a few thousand photosites besides; everything that is judged later is in `Measured`, and
-  nothing in it depends on other frames.
-- Every photosite of the visible area counts towards one tile and one strip, so that nothing escapes between places.
-
-Places are in 2×2 blocks of the mosaic ("half-size pixels"). T = 384 tiles, S strips of rows (four a row of blocks), M
-blocks that are sampled.
-
-Where the chart lay in the first white frame, and how far it has moved, and blurred, since.
-
-The gauges are the chart's tags, or the outline of its field, or, where no chart is looked for, the places of most
-texture (`experiment.framing.movement`); the frame is kept around them alone. Half-size pixels.
-
-A frame as the judge keeps it: what was measured, where the chart was, and the bytes that the journal keeps of it.
+`Measured` is what one pass over the counts and a few thousand photosites besides give; everything that is judged later
+is in it, and nothing in it depends on other frames. Every photosite of the visible area counts towards one tile and one
+strip, so that nothing escapes between places. `Anchor` is the chart's place in the first white frame, from which later
+frames tell how far it has moved, and blurred: its gauges are the chart's tags, or the outline of its field, or, where
+no chart is looked for, the places of most texture (`experiment.framing.movement`); the frame is kept around them alone.
+`Frame` is both, and the bytes that the journal keeps of it.
 
 Format of the bytes (version 1): a zip archive of arrays as `numpy.savez` writes it, without pickled objects. `facts` is
 UTF-8 JSON as uint8; `tiles` (T, 3) float32; `strips` (S, 3) float32 or empty; an anchor's arrays begin with `anchor_`.
 Samples of noise are not kept: the digest knows a frame again. Bytes of another version are passed over: the judge then
 begins anew, as at a session's start.
+
+Places are in 2×2 blocks of the mosaic ("half-size pixels"). T = 384 tiles, S strips of rows (four a row of blocks), M
+blocks that are sampled.
 """
 
 from __future__ import annotations

@@ -1,18 +1,10 @@
-"""What a run has to do, known from files alone: the frames that are left, in which order, of which chart and lights.
+"""The plan of a run: what it takes, needs and finds, and what would end it before its end.
 
-A session that is there is read and not changed; one that is not is not made.
-
-How many bytes a run needs, and how many there are.
-
-What the devices say before a run; nothing is set, lit, released or shown for it.
-
-The plan of a run: what it takes, needs and finds, and what would end it before its end.
-
-A fault would end the run, and has its remedy; a doubt may. What is estimated says what it rests on.
-
-The plan of a run as text, a line for each thing that is planned, asked, doubted or wrong.
-
-A dry run: every device opened and asked, nothing lit, released, shown or written.
+Made before anything moves, printed by a dry run, required by a run, in this order: the frames that are left, from files
+alone (`Work`); how large and how long they are (`Estimate`); what the devices say, of which nothing is set, lit,
+released or shown for it (`Answers`); all of it together (`RunPlan`), and as text (`plan_lines`). A session that is
+there is read and not changed; one that is not is not made. A fault would end the run, and has its remedy; a doubt may.
+What is estimated says what it rests on.
 """
 
 from __future__ import annotations
@@ -105,25 +97,21 @@ def planned_steps(settings: LabSettings, lights: Sequence[Illumination]) -> tupl
     return plan_steps(lights, sequence.reference_every, seed=seed, response=RESPONSE if settings.judge.response else ())
 
 
-def outline(settings: LabSettings, folder: Path) -> Work:
-    """Return what a run has to do, from the files that the settings name and the session that is there."""
-    chart, lights = load_chart(settings.chart), load_illuminations(settings.illuminations)
-    lights_sha256 = file_sha256(settings.illuminations)
-    if not session_exists(folder):
-        steps = planned_steps(settings, lights)
-        return Work(folder, True, steps, frozenset(), order_of(steps, settings), chart, lights, lights_sha256)
-    with Session.open(folder) as session:
-        return work_left(session, settings)
+def outline(settings: LabSettings, folder: Path, session: Session | None) -> Work:
+    """Return what a run has to do, new in `folder`, or with a session that it takes up.
 
-
-def work_left(session: Session, settings: LabSettings) -> Work:
-    """Return what a run has to do that takes up an open session; its own frames tell their times and sizes."""
+    Frames that were taken tell their times and sizes.
+    """
+    if session is None:
+        chart, lights = load_chart(settings.chart), load_illuminations(settings.illuminations)
+        steps, sha256 = planned_steps(settings, lights), file_sha256(settings.illuminations)
+        return Work(folder, True, steps, frozenset(), order_of(steps, settings), chart, lights, sha256)
     require_same(session, settings)
     taken = [frame.taken_at for frame in sorted(session.frames(), key=lambda frame: frame.attempt)]
     gaps = [(after - before).total_seconds() for before, after in pairwise(taken) if after >= before]
     sizes = [frame.size for frame in session.journal.accepted_files()]
     return Work(
-        session.folder,
+        folder,
         False,
         session.steps,
         frozenset(session.done_steps() & {step.number for step in session.steps}),
@@ -160,12 +148,20 @@ def require_same(session: Session, settings: LabSettings) -> None:
         )
 
 
+def _value(settings: LabSettings, key: str) -> Any:
+    value: Any = settings.model_dump()
+    for part in key.split("."):
+        value = value[part]
+    return value
+
+
 def order_of(steps: Sequence[SessionStep], settings: LabSettings) -> str:
     """Return in words in which order a plan shows its lights; a session that was begun keeps its own."""
     shown = [step.illumination for step in steps if step.illumination is not None]
     sequence = settings.sequence
     # Which light is at which place of the list decides, not its codes.
-    wanted = [step.illumination for step in plan_steps(_places(shown), 1, seed=sequence.seed) if step.kind == "light"]
+    places = [Illumination(index, "uniform", None, BLACK) for index in sorted(shown)]
+    wanted = [step.illumination for step in plan_steps(places, 1, seed=sequence.seed) if step.kind == "light"]
     if shown == wanted and sequence.order == "shuffled":
         return f"shuffled by seed {sequence.seed}"
     if shown == sorted(shown):
@@ -175,17 +171,6 @@ def order_of(steps: Sequence[SessionStep], settings: LabSettings) -> str:
     if shown == wanted:
         return f"shuffled by seed {sequence.seed}, as the session was begun; {settings.file} says listed"
     return "shuffled by another seed, as the session was begun"
-
-
-def _places(shown: Sequence[int]) -> list[Illumination]:
-    return [Illumination(index, "uniform", None, BLACK) for index in sorted(shown)]
-
-
-def _value(settings: LabSettings, key: str) -> Any:
-    value: Any = settings.model_dump()
-    for part in key.split("."):
-        value = value[part]
-    return value
 
 
 RETAKEN_SHARE: Final = 0.1
@@ -621,9 +606,8 @@ def _turns(settings: LabSettings) -> str:
 def dry_run(settings: LabSettings, folder: Path) -> RunPlan:
     """Return the plan of the run that `settings` and `folder` would begin; devices that cannot be opened are faults."""
     with ExitStack() as opened:
-        work, session = outline(settings, folder), None
-        if not work.new:
-            session = opened.enter_context(Session.open(folder))
+        session = opened.enter_context(Session.open(folder)) if session_exists(folder) else None
+        work = outline(settings, folder, session)
         try:
             devices = opened.enter_context(open_rig(settings, work.chart, session))
         except CropError as fault:
@@ -631,12 +615,10 @@ def dry_run(settings: LabSettings, folder: Path) -> RunPlan:
         return make_plan(settings, work, ask(devices), free_bytes_at(folder), known_frame_bytes(settings))
 
 
-def checked_plan(settings: LabSettings, folder: Path, session: Session | None, devices: Devices) -> RunPlan:
-    """Return the plan of a run whose devices are open and have not moved.
+def require_plan(settings: LabSettings, folder: Path, session: Session | None, devices: Devices) -> None:
+    """Refuse a run, whose devices are open and have not moved, that could not be brought to its end.
 
     `session`: what is taken up; None where a new one is to be made in `folder`.
     """
-    work = outline(settings, folder) if session is None else work_left(session, settings)
-    plan = make_plan(settings, work, ask(devices), free_bytes_at(folder), known_frame_bytes(settings))
-    plan.require()
-    return plan
+    work = outline(settings, folder, session)
+    make_plan(settings, work, ask(devices), free_bytes_at(folder), known_frame_bytes(settings)).require()

@@ -1,4 +1,11 @@
-"""From LAB.toml to a session on disk: creates it or takes it up, opens the rig, hands both to the sequencer."""
+"""From LAB.toml to a session on disk: creates it or takes it up, opens the rig, hands both to the sequencer.
+
+Rules that hold inside for a session that is taken up:
+
+- Files are held against their hashes before a device is opened: what is damaged is taken again.
+- A session has one camera and one projector: a table of two sensors, even of the same model, is a table of none, and
+  nothing in the frames says so. There is no option to go on with another one.
+"""
 
 from __future__ import annotations
 
@@ -10,13 +17,11 @@ from acquisition.judge.judge import LiveJudge
 from acquisition.monitor.report import write_session_report
 from acquisition.run.devices import Devices
 from acquisition.run.pipeline import Taken
-from acquisition.run.plan import checked_plan, planned_steps, require_same
+from acquisition.run.plan import planned_steps, require_plan, require_same
 from acquisition.run.queue import link_runs, white_first
 from acquisition.run.retry import TRY_S
 from acquisition.run.rig.opening import open_rig
 from acquisition.run.sequencer import RunOutcome, take_session
-from drivers.camera import CameraIdentity
-from drivers.projector import ProjectorIdentity
 from experiment.chart.model import load_chart
 from experiment.config import LabSettings
 from experiment.lights.illuminations import load_illuminations
@@ -62,7 +67,7 @@ def run_session(
                 return RunOutcome(total, 0, ())
         chart = load_chart(settings.chart) if session is None else session.chart
         devices = opened.enter_context(open_rig(settings, chart, session))
-        checked_plan(settings, folder, session, devices)
+        require_plan(settings, folder, session, devices)
         if session is None:
             session = opened.enter_context(_begun(settings, folder))
             session.journal.be_patient(settings.sequence.patience_s, announce)
@@ -135,9 +140,12 @@ def check_frames(
 def require_same_devices(session: Session, devices: Devices, settings: LabSettings) -> None:
     """Require that camera and projector are those that the session was begun with; note those of a new one."""
     known = session.journal.records()
-    names = {"camera": _camera_name(devices.camera.identity())}
+    body = devices.camera.identity()
+    # Its firmware may be brought up to date between two runs, and the name in a projector's menu may change.
+    names = {"camera": f"{body.maker} {body.model}, serial number {body.serial}"}
     if devices.projector is not None:
-        names["projector"] = _projector_name(devices.projector.identity())
+        projector = devices.projector.identity()
+        names["projector"] = f"{projector.maker} {projector.model}".strip() or "of an unknown maker"
     if settings.rig == "lab":
         light = settings.lab.light
         names["screen"] = " ".join(
@@ -167,13 +175,3 @@ def clock_note(session: Session, clock: Clock) -> str:
         "that was taken; the session's time goes on from there, so that its frames stay in their order; set the "
         "machine's clock right"
     )
-
-
-def _camera_name(body: CameraIdentity) -> str:
-    """Return a camera's name; its firmware may be brought up to date between two runs."""
-    return f"{body.maker} {body.model}, serial number {body.serial}"
-
-
-def _projector_name(projector: ProjectorIdentity) -> str:
-    """Return a projector's name; what somebody called it in its menu may change."""
-    return f"{projector.maker} {projector.model}".strip() or "of an unknown maker"

@@ -11,6 +11,7 @@ import re
 import signal
 import sqlite3
 from collections.abc import Callable
+from dataclasses import replace
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
@@ -18,14 +19,18 @@ from typing import Any
 import pytest
 
 from acquisition.cli import main
+from acquisition.run.rig.opening import open_rig
 from acquisition.run.run import run_session
+from drivers.camera import capture
 from drivers.canon.camera import CanonEos
 from drivers.pjlink.projector import PjLinkProjector
 from drivers.raw.rawfile import read_raw
+from experiment.chart.model import load_chart
 from experiment.config import load_lab
 from experiment.session.folder import Session
 from experiment.session.journal import Journal
 from foundation.errors import StorageError
+from sim.camera.eos_bodies import EOS_BODIES
 
 pytestmark = pytest.mark.slow
 
@@ -255,7 +260,10 @@ def test_two_programs_do_not_take_the_same_session(lab: Path) -> None:
     assert "another program" in said
 
 
-def test_a_journal_that_another_program_holds_is_waited_for_as_long_as_the_settings_say(lab: Path) -> None:
+def test_a_journal_that_another_program_holds_is_waited_for_as_long_as_the_settings_say(
+    lab: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("experiment.session.journal_file.TRY_S", 0.01)
     lab.write_text(lab.read_text().replace("[sequence]", "[sequence]\npatience_s = 0"))
     folder = lab.parent / "session"
     others: list[sqlite3.Connection] = []
@@ -307,16 +315,14 @@ def test_a_replay_with_another_exposure_is_told_the_recordings(
     assert "was taken with 0.5 s" in capsys.readouterr().err
 
 
-def test_a_series_longer_than_a_battery_lasts(lab: Path) -> None:
-    from acquisition.run.rig.opening import open_rig
-    from drivers.camera import capture
-    from experiment.chart.model import load_chart
-
+def test_a_series_longer_than_a_battery_lasts(lab: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     settings = load_lab(lab)
+    few = {name: replace(body, shots_per_charge=4) for name, body in EOS_BODIES.items()}
+    monkeypatch.setattr("acquisition.run.rig.simulated.EOS_BODIES", few)
     with open_rig(settings, load_chart(settings.chart)) as devices:
         devices.camera.configure(settings.camera.exposure)
-        frames = {capture(devices.camera, io.BytesIO()).name for _ in range(430)}
-    assert len(frames) == 430
+        frames = {capture(devices.camera, io.BytesIO()).name for _ in range(9)}
+    assert len(frames) == 9
 
 
 @pytest.mark.parametrize(("shutter_s", "code"), [(0.02, 0), (1.3, 4)])

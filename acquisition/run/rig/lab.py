@@ -1,7 +1,4 @@
-"""The real lab: every device that LAB.toml names, opened over its cable.
-
-What is attached to this machine and reachable from it, for the operator to choose from.
-"""
+"""The real lab: every device that LAB.toml names, opened over its cable; and what there is to choose from."""
 
 from __future__ import annotations
 
@@ -9,6 +6,7 @@ import uuid
 from collections.abc import Callable, Generator, Iterable
 from contextlib import ExitStack
 from dataclasses import dataclass
+from functools import partial
 
 from acquisition.run.devices import Devices, ask_all
 from acquisition.run.shutter import require_whole_turns
@@ -20,7 +18,6 @@ from drivers.display.jvc import PORT as JVC_PORT
 from drivers.display.jvc import JvcFlatField
 from drivers.display.lightcrafter import LightCrafter, find_lightcrafter
 from drivers.gphoto2_camera.camera import Gphoto2Camera
-from drivers.links.pipes import UsbPipes
 from drivers.links.serial import SerialLink, list_serial_ports
 from drivers.links.tcp import TcpLink
 from drivers.links.usb import list_devices, open_usb
@@ -40,33 +37,6 @@ from foundation.clock import Clock, SteadyClock, SystemClock
 from foundation.errors import ConfigurationError, CropError
 
 __all__ = ["Attached", "attached_devices", "identify_displays"]
-
-
-@dataclass(frozen=True)
-class Attached:
-    """What of one kind is attached or reachable: `kind` in the plural, what was found, or why it could not be asked."""
-
-    kind: str
-    found: tuple[str, ...]
-    trouble: str = ""
-
-
-def attached_devices(search_s: float) -> Generator[Attached]:
-    """Yield what is attached and reachable, kind by kind; a kind that cannot be asked says why."""
-    yield _attached("cameras on USB", lambda: [str(device) for device in list_devices()])
-    yield _attached("serial ports", list_serial_ports)
-    yield _attached("displays", lambda: [str(display) for display in list_displays()])
-    if search_s > 0:
-        yield _attached(
-            "projectors by PJLink", lambda: [f"{found.host}, MAC {found.mac}" for found in search(search_s)]
-        )
-
-
-def _attached(kind: str, ask: Callable[[], Iterable[str]]) -> Attached:
-    try:
-        return Attached(kind, tuple(ask()))
-    except CropError as error:
-        return Attached(kind, (), str(error))
 
 
 CONNECT_S = 5.0
@@ -117,7 +87,8 @@ def session_clock(session: Session | None) -> SteadyClock:
 def _lab_camera(cable: CameraCable, clock: Clock, file: str) -> Camera:
     match cable.connection:
         case "usb":
-            return CanonEos(lambda: UsbTransport(_usb_pipes(cable), clock), clock)
+            usb = partial(open_usb, vendor=VENDOR_CANON_USB, serial=cable.serial, port=cable.usb_port)
+            return CanonEos(lambda: UsbTransport(usb(), clock), clock)
         case "ptpip":
             host = _required(cable.host, "lab.camera.host", "the camera's address", file)
             # A body remembers the computers it was paired with by this number.
@@ -130,10 +101,6 @@ def _lab_camera(cable: CameraCable, clock: Clock, file: str) -> Camera:
             )
         case "gphoto2":
             return Gphoto2Camera(cable.gphoto2_port, cable.gphoto2_model, clock)
-
-
-def _usb_pipes(cable: CameraCable) -> UsbPipes:
-    return open_usb(vendor=VENDOR_CANON_USB, serial=cable.serial, port=cable.usb_port)
 
 
 def _lab_projector(cable: ProjectorCable, clock: Clock, file: str) -> Projector | None:
@@ -179,3 +146,30 @@ def _required(value: str | None, key: str, what: str, file: str) -> str:
     if value is None:
         raise ConfigurationError(f"{file}: {key} is missing; name {what}, acquire devices lists what is there")
     return value
+
+
+@dataclass(frozen=True)
+class Attached:
+    """What of one kind is attached or reachable: `kind` in the plural, what was found, or why it could not be asked."""
+
+    kind: str
+    found: tuple[str, ...]
+    trouble: str = ""
+
+
+def attached_devices(search_s: float) -> Generator[Attached]:
+    """Yield what is attached and reachable, kind by kind; a kind that cannot be asked says why."""
+    yield _attached("cameras on USB", lambda: [str(device) for device in list_devices()])
+    yield _attached("serial ports", list_serial_ports)
+    yield _attached("displays", lambda: [str(display) for display in list_displays()])
+    if search_s > 0:
+        yield _attached(
+            "projectors by PJLink", lambda: [f"{found.host}, MAC {found.mac}" for found in search(search_s)]
+        )
+
+
+def _attached(kind: str, ask: Callable[[], Iterable[str]]) -> Attached:
+    try:
+        return Attached(kind, tuple(ask()))
+    except CropError as error:
+        return Attached(kind, (), str(error))

@@ -415,8 +415,8 @@ class TestDryRun:
         settings = load_lab(lab)
         Session.create(night, settings.to_toml(), CHART, LIGHTS[:4], plan_steps(LIGHTS[:4], 25)).close()
         lab.write_text(lab.read_text() + "[camera]\niso = 400\n")
-        with pytest.raises(ConfigurationError, match="was begun with camera"):
-            outline(load_lab(lab), night)
+        with Session.open(night) as session, pytest.raises(ConfigurationError, match="was begun with camera"):
+            outline(load_lab(lab), night, session)
 
     def test_a_rig_that_cannot_be_opened_is_a_fault_of_the_plan(self, lab: Path) -> None:
         lab.write_text(lab.read_text().replace('"Test"', '"Box"'))
@@ -445,8 +445,8 @@ def test_the_times_of_a_session_are_those_between_its_frames(tmp_path: Path, lab
     settings = load_lab(lab)
     with Session.open(night) as session:
         taken = sorted(frame.taken_at for frame in session.frames())
+        frame_s = outline(settings, night, session).frame_s
     gaps = sorted(after - before for before, after in pairwise(taken))
-    frame_s = outline(settings, night).frame_s
     assert frame_s is not None
     assert timedelta(seconds=frame_s) == gaps[len(gaps) // 2]
 
