@@ -9,12 +9,14 @@ Tiles and rows that show another light than the whole frame are covered, half of
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
 
 from acquisition.judge import limits
-from acquisition.judge.light import Basis, Codes, Fit, FrameLight, ProjectorModel, Residuals
+from acquisition.judge.light import Basis, Codes, Fit, FrameLight, Prediction, ProjectorModel, Residuals
 from acquisition.judge.measure import SEGMENTS, TILE_COLUMNS, TILE_ROWS, Measured
 from acquisition.judge.state import JudgeState, LampSeen, Leaning, Seen, combined
 from experiment.session.judgement import Check
@@ -28,6 +30,9 @@ _SAME_SD = 0.0015
 
 _SAME_FLOOR = 4e-4
 """The same of amounts without light, of a full primary."""
+
+_NEAREST = 12
+"""Lights of the plan that are compared in full with one that is not the one ordered."""
 
 _Array = npt.NDArray[np.float64]
 
@@ -45,14 +50,14 @@ def judge_light(
     before = state.recent[-1] if state.recent else None
     if not state.modelled:
         return (_without_model(light, codes, before),), LampSeen()
-    model = state.model
-    fit = model.compare(light.amounts, codes, light.covariance)
+    seen = _SeenLight(state.model, light, codes, before, plan)
+    fit = seen.fit
     limit = max(angle_deg, fit.angle_limit(limits.LIGHT_SIGMAS))
-    wrong = fit.angle_deg > limit
     room = max(drift_percent / 100, limits.BRIGHTNESS_SIGMAS * fit.brightness_sd)
+    wrong = fit.angle_deg > limit
     reason, added = "", 0.0
     if wrong or fit.distance > limits.STALE_SIGMAS or abs(fit.brightness) > room:
-        reason, added = _cause(model, light, codes, before, plan, fit, wrong, room, state.refused[0] == "light")
+        reason, added = seen.cause(wrong, room, again=state.refused[0] == "light")
     stepped = False
     lamp = ""
     if not reason and abs(fit.brightness) > room:
@@ -61,7 +66,7 @@ def judge_light(
         stepped = abs(fit.brightness) <= limits.LAMP_FOLLOWED and abs(fit.brightness - level) <= room / 2
         lamp = "" if stepped else _brightness_reason(fit.brightness)
     percent = 100 * float(np.expm1(fit.brightness))
-    leaning = Leaning(((fit.brightness, fit.brightness_sd),), (_added(model, light, codes),))
+    leaning = Leaning(((fit.brightness, fit.brightness_sd),), (seen.neutral_light(),))
     if not reason and not lamp and not stepped and not state.rested:
         lamp, added = crept(state.leaning.then(leaning), drift_percent / 100)
         reason = _ambient_reason(added) if added else ""
@@ -97,144 +102,157 @@ def same_light(one: _Array, other: _Array, scatter: float) -> float:
     return float(np.sqrt(((one - other) ** 2 / variance).sum()))
 
 
-def _cause(
-    model: ProjectorModel,
-    light: FrameLight,
-    codes: Codes,
-    before: Seen | None,
-    plan: Sequence[Codes],
-    fit: Fit,
-    wrong: bool,
-    room: float,
-    followed: bool,
-) -> tuple[str, float]:
-    """Return why a light is not the one ordered, empty where it is but its lamp, and how much light is added to it."""
-    squared = fit.distance**2 + (fit.brightness / fit.brightness_sd) ** 2
-    if before is not None and before.amounts is not None and before.codes != codes:
-        same = same_light(light.amounts, before.amounts, model.chroma_sd)
-        if same < limits.LIGHT_SIGMAS and squared - same**2 > limits.STALE_ADVANTAGE:
+@dataclass(frozen=True, eq=False)
+class _SeenLight:
+    """The light of a frame, held against the one that was ordered by `codes`, and against what else it may be.
+
+    - `before`: the frame before; None where there is none.
+    - `plan`: codes of all lights that may be shown.
+    """
+
+    model: ProjectorModel
+    light: FrameLight
+    codes: Codes
+    before: Seen | None
+    plan: Sequence[Codes]
+
+    @cached_property
+    def expected(self) -> Prediction:
+        """The amounts that were ordered."""
+        return self.model.predict(self.codes)
+
+    @cached_property
+    def fit(self) -> Fit:
+        """How well the light agrees with the one ordered."""
+        return self.model.compare(self.light.amounts, self.codes, self.light.covariance)
+
+    def cause(self, wrong: bool, room: float, *, again: bool) -> tuple[str, float]:
+        """Return why it is not the one ordered, empty where it is but its lamp, and how much light is added to it.
+
+        `wrong`: whether its colour is off by more than its limit. `room`: change of the lamp's level that is allowed.
+        `again`: whether the frame before was refused for its light, too.
+        """
+        fit = self.fit
+        squared = fit.distance**2 + (fit.brightness / fit.brightness_sd) ** 2
+        same = self._off_before()
+        changed = self.before is not None and self.before.codes != self.codes
+        fits_before = same < limits.LIGHT_SIGMAS and squared - same**2 > limits.STALE_ADVANTAGE
+        if self.before is not None and changed and fits_before:
+            return _stale_reason(self.before, self.codes), 0.0
+        remains, ambient = self._added_of(self.before), self._added_of(None)
+        if wrong and remains is not None and (ambient is None or remains[1] + 9 < ambient[1]):
+            elsewhere = ", or does light from elsewhere fall on the chart?" if self._coloured() else ""
             return (
-                f"the light of the frame before, {_named(before.codes)}, is still seen, {_named(codes)} was ordered; "
-                "does the screen stand still, or is sequence.settle_s too short?",
+                f"{100 * remains[0]:.1f} % of the light of the frame before remain in this one; let the picture settle "
+                f"for longer (sequence.settle_s), and switch dynamic contrast and frame interpolation off{elsewhere}",
                 0.0,
             )
-    remains = _added_of(model, light, codes, before)
-    ambient = _added_of(model, light, codes, None)
-    if wrong and remains is not None and (ambient is None or remains[1] + 9 < ambient[1]):
-        elsewhere = ", or does light from elsewhere fall on the chart?" if _coloured(model, light, codes) else ""
-        return (
-            f"{100 * remains[0]:.1f} % of the light of the frame before remain in this one; let the picture settle for "
-            f"longer (sequence.settle_s), and switch dynamic contrast and frame interpolation off{elsewhere}",
-            0.0,
-        )
-    if wrong:
-        if ambient is not None:
-            return _ambient_reason(ambient[0]), ambient[0]
-        other = _other(model, light, codes, plan, squared)
-        coloured = 0.0 if other else _coloured(model, light, codes)
-        if coloured:
-            return _ambient_reason(coloured), coloured
-        again = before is not None and before.amounts is not None and before.codes == codes and followed
-        if again and not other and fit.angle_deg <= limits.LIGHT_FOLLOWED_DEG:
-            assert before is not None
-            assert before.amounts is not None
-            if same_light(light.amounts, before.amounts, model.chroma_sd) < limits.LIGHT_SIGMAS:
+        if wrong:
+            if ambient is not None:
+                return _ambient_reason(ambient[0]), ambient[0]
+            other = self._other(squared)
+            coloured = 0.0 if other else self._coloured()
+            if coloured:
+                return _ambient_reason(coloured), coloured
+            repeated = again and not changed and same < limits.LIGHT_SIGMAS
+            if repeated and not other and fit.angle_deg <= limits.LIGHT_FOLLOWED_DEG:
                 return "", 0.0
-        return other or _wrong_reason(model, light, codes), 0.0
-    if fit.brightness > room and ambient is not None and ambient[1] + 9 < fit.distance**2:
-        return _ambient_reason(ambient[0]), ambient[0]
-    if fit.distance > limits.STALE_SIGMAS:
-        return _other(model, light, codes, plan, squared), 0.0
-    return "", 0.0
+            return other or self._wrong_reason(), 0.0
+        if fit.brightness > room and ambient is not None and ambient[1] + 9 < fit.distance**2:
+            return _ambient_reason(ambient[0]), ambient[0]
+        if fit.distance > limits.STALE_SIGMAS:
+            return self._other(squared), 0.0
+        return "", 0.0
 
+    def neutral_light(self) -> tuple[float, float]:
+        """Return how much neutral light, of white, is added to the one ordered, and its standard deviation."""
+        h, neutral = self.expected.amounts, np.ones(3)
+        scatter = self.model.brightness_sd**2 * np.outer(h, h)
+        weight = np.linalg.inv(self.expected.with_lamp + self.light.covariance + scatter)
+        power = float(neutral @ weight @ neutral)
+        return float(neutral @ weight @ (self.light.amounts - h)) / power, power**-0.5
 
-def _wrong_reason(model: ProjectorModel, light: FrameLight, codes: Codes) -> str:
-    expected = model.predict(codes).amounts
-    parts = ", ".join(
-        f"{name} {100 * seen:.1f} % instead of {100 * wanted:.1f} %"
-        for name, seen, wanted in zip(("red", "green", "blue"), light.amounts, expected, strict=True)
-    )
-    return (
-        f"the light is not the one ordered, {_named(codes)}: {parts} of the primaries; look for what covers the "
-        "picture or changes its colours, a pop-up, a screen saver, a picture mode"
-    )
+    def _off_before(self) -> float:
+        """Return by how many standard deviations the light of the frame before is another; infinite if not known."""
+        if self.before is None or self.before.amounts is None:
+            return np.inf
+        return same_light(self.light.amounts, self.before.amounts, self.model.chroma_sd)
 
+    def _wrong_reason(self) -> str:
+        parts = ", ".join(
+            f"{name} {100 * seen:.1f} % instead of {100 * wanted:.1f} %"
+            for name, seen, wanted in zip(
+                ("red", "green", "blue"), self.light.amounts, self.expected.amounts, strict=True
+            )
+        )
+        return (
+            f"the light is not the one ordered, {_named(self.codes)}: {parts} of the primaries; look for what covers "
+            "the picture or changes its colours, a pop-up, a screen saver, a picture mode"
+        )
 
-def _other(model: ProjectorModel, light: FrameLight, codes: Codes, plan: Sequence[Codes], squared: float) -> str:
-    """Return the sentence that names the light of the plan, or black or white, that is seen instead; empty if none."""
-    # Only what is about as bright and of that colour is compared in full.
-    found: tuple[float, Codes] | None = None
-    for other in _near(model, light.amounts, [*plan, (0, 0, 0), (255, 255, 255)]):
-        if other == codes:
-            continue
-        if not any(other):
-            left = float(((light.amounts / (3 * _SAME_FLOOR)) ** 2).sum())
+    def _other(self, squared: float) -> str:
+        """Return the sentence that names the light of the plan, or black or white, that is seen; empty if none."""
+        # Only what is about as bright and of that colour is compared in full.
+        found: tuple[float, Codes] | None = None
+        for other in self._near([*self.plan, (0, 0, 0), (255, 255, 255)]):
+            if other == self.codes:
+                continue
+            if not any(other):
+                left = float(((self.light.amounts / (3 * _SAME_FLOOR)) ** 2).sum())
+            else:
+                fit = self.model.compare(self.light.amounts, other, self.light.covariance)
+                left = fit.distance**2 + (fit.brightness / (fit.brightness_sd + 0.01)) ** 2
+            if found is None or left < found[0]:
+                found = left, other
+        if found is None or squared - found[0] < limits.OTHER_ADVANTAGE or found[0] > limits.LIGHT_SIGMAS**2:
+            return ""
+        # Faint light of a colour changes a light into its neighbour.
+        why = "is the picture late, or does other light fall on the chart" if self._coloured() else ""
+        return (
+            f"another light is seen, {_named(found[1])}, {_named(self.codes)} was ordered; "
+            f"does something else draw on the screen, {why or 'or is the picture late'}?"
+        )
+
+    def _near(self, plan: Sequence[Codes]) -> list[Codes]:
+        """Return the codes whose amounts, by the tone curves alone, are nearest."""
+        curves = self.model.curves()
+        table = np.array(plan)
+        predicted = np.stack([curves[primary, table[:, primary]] for primary in range(3)], axis=-1)
+        off = np.linalg.norm(predicted - self.light.amounts, axis=1)
+        return [plan[k] for k in np.argsort(off, kind="stable")[:_NEAREST].tolist()]
+
+    def _added_of(self, of: Seen | None) -> tuple[float, float] | None:
+        """Return how much neutral light added to the one ordered, or share of another frame's, explains what is seen.
+
+        And the squared distance left; None where that is nothing, or unlikely. `of`: the other frame; None asks for
+        neutral light.
+        """
+        h = self.expected.amounts
+        if of is None:
+            more = np.ones(3)
+        elif of.amounts is None or of.codes == self.codes or not any(of.codes):
+            return None
         else:
-            fit = model.compare(light.amounts, other, light.covariance)
-            left = fit.distance**2 + (fit.brightness / (fit.brightness_sd + 0.01)) ** 2
-        if found is None or left < found[0]:
-            found = left, other
-    if found is None or squared - found[0] < limits.OTHER_ADVANTAGE or found[0] > limits.LIGHT_SIGMAS**2:
-        return ""
-    # Faint light of a colour changes a light into its neighbour.
-    why = "is the picture late, or does other light fall on the chart" if _coloured(model, light, codes) else ""
-    return (
-        f"another light is seen, {_named(found[1])}, {_named(codes)} was ordered; "
-        f"does something else draw on the screen, {why or 'or is the picture late'}?"
-    )
+            # For a share of the time the other light was there instead.
+            more = of.amounts - h
+        # The lamp is where it was, within its scatter: what is added is asked for.
+        scatter = (self.model.brightness_sd**2 + 1e-6) * np.outer(h, h)
+        weight = np.linalg.inv(self.expected.covariance + self.light.covariance + scatter)
+        power = float(more @ weight @ more)
+        added = float(more @ weight @ (self.light.amounts - h)) / power
+        off = self.light.amounts - h - added * more
+        left = float(off @ weight @ off)
+        if added <= 4 * power**-0.5 or added < 0.002 or left > limits.LIGHT_SIGMAS**2:
+            return None
+        return added, left
 
-
-def _near(model: ProjectorModel, amounts: _Array, plan: Sequence[Codes], most: int = 12) -> list[Codes]:
-    """Return the codes whose amounts, by the tone curves alone, are nearest."""
-    curves = model.curves()
-    table = np.array(plan)
-    predicted = np.stack([curves[primary, table[:, primary]] for primary in range(3)], axis=-1)
-    off = np.linalg.norm(predicted - amounts, axis=1)
-    return [plan[k] for k in np.argsort(off, kind="stable")[:most].tolist()]
-
-
-def _added(model: ProjectorModel, light: FrameLight, codes: Codes) -> tuple[float, float]:
-    """Return how much neutral light, of white, is added to the one ordered, and its standard deviation."""
-    expected, neutral = model.predict(codes), np.ones(3)
-    h = expected.amounts
-    weight = np.linalg.inv(expected.with_lamp + light.covariance + model.brightness_sd**2 * np.outer(h, h))
-    power = float(neutral @ weight @ neutral)
-    return float(neutral @ weight @ (light.amounts - h)) / power, power**-0.5
-
-
-def _added_of(model: ProjectorModel, light: FrameLight, codes: Codes, of: Seen | None) -> tuple[float, float] | None:
-    """Return how much neutral light added to the one ordered, or share of another frame's in it, explains what is seen.
-
-    And the squared distance left; None where that is nothing, or unlikely.
-    """
-    expected = model.predict(codes)
-    h = expected.amounts
-    if of is None:
-        more = np.ones(3)
-    elif of.amounts is None or of.codes == codes or not any(of.codes):
-        return None
-    else:
-        # For a share of the time the other light was there instead.
-        more = of.amounts - h
-    # The lamp is where it was, within its scatter: what is added is asked for.
-    covariance = expected.covariance + light.covariance + (model.brightness_sd**2 + 1e-6) * np.outer(h, h)
-    weight = np.linalg.inv(covariance)
-    power = float(more @ weight @ more)
-    added = float(more @ weight @ (light.amounts - h)) / power
-    off = light.amounts - h - added * more
-    left = float(off @ weight @ off)
-    if added <= 4 * power**-0.5 or added < 0.002 or left > limits.LIGHT_SIGMAS**2:
-        return None
-    return added, left
-
-
-def _coloured(model: ProjectorModel, light: FrameLight, codes: Codes) -> float:
-    """Return how much light of any colour, of white, is added to the one ordered; 0 where it is not just more light."""
-    expected = model.predict(codes)
-    off = light.amounts - expected.amounts
-    sd = np.sqrt(np.diag(expected.with_lamp + light.covariance) + (model.brightness_sd * expected.amounts) ** 2)
-    more = float(np.mean(off))
-    return more if (off > -3 * sd).all() and limits.ADDED_LEAST < more < limits.ADDED_MOST else 0.0
+    def _coloured(self) -> float:
+        """Return how much light of any colour, of white, is added to the one ordered; 0 where it is not just more."""
+        h = self.expected.amounts
+        off = self.light.amounts - h
+        variance = np.diag(self.expected.with_lamp + self.light.covariance) + (self.model.brightness_sd * h) ** 2
+        more = float(np.mean(off))
+        return more if (off > -3 * np.sqrt(variance)).all() and limits.ADDED_LEAST < more < limits.ADDED_MOST else 0.0
 
 
 def _ambient_reason(added: float) -> str:
@@ -267,11 +285,15 @@ def _without_model(light: FrameLight, codes: Codes, before: Seen | None) -> Chec
     same = same_light(light.amounts, before.amounts, 0.005)
     reason = ""
     if same < 2 * limits.STALE_SIGMAS and (away > limits.NOMINAL_DEG or brighter > 0.2):
-        reason = (
-            f"the light of the frame before, {_named(before.codes)}, is still seen, {_named(codes)} was ordered; does "
-            "the screen stand still, or is sequence.settle_s too short?"
-        )
+        reason = _stale_reason(before, codes)
     return Check("light", reason=reason)
+
+
+def _stale_reason(before: Seen, codes: Codes) -> str:
+    return (
+        f"the light of the frame before, {_named(before.codes)}, is still seen, {_named(codes)} was ordered; does the "
+        "screen stand still, or is sequence.settle_s too short?"
+    )
 
 
 def _named(codes: Codes) -> str:

@@ -204,11 +204,18 @@ def refusals(session: Path) -> list[str]:
         return [attempt.reason for attempt in taken.journal.attempts() if attempt.reason]
 
 
+QUICK = "\n[camera]\nshutter_s = 0.1\n"
+"""A short exposure."""
+QUICK_ROOM = " --room white_level_share=3.5"
+"""Of the room in which that exposure is a good one."""
+
+
 def test_what_the_how_to_says_is_what_happens(rehearsal: Rehearsal) -> None:
     """Its commands, its pop-up and what it says is worth a try: each is told by its cause, and costs no frame."""
     if shutil.which("xmessage") is None:
         pytest.skip("xmessage is not installed (Debian: x11-utils)")
-    rehearsal.serve()
+    rehearsal.serve(camera=QUICK_ROOM)
+    rehearsal.settings(lambda text: text + QUICK)
     port = int(rehearsal.replaced["4353"])
     check, run = commands("DISPLAY=:77 acquire")
     (message,) = commands("DISPLAY=:77 xmessage")
@@ -257,12 +264,6 @@ def test_what_the_how_to_says_is_what_happens(rehearsal: Rehearsal) -> None:
 def short(text: str) -> str:
     """Return the settings of three lights, without the frames that teach the judge the projector: 7 exposures of 37."""
     return text.replace("lights.csv", "three.csv") + "\n[judge]\nresponse = false\n"
-
-
-QUICK = "\n[camera]\nshutter_s = 0.1\n"
-"""A short exposure."""
-QUICK_ROOM = " --room white_level_share=3.5"
-"""Of the room in which that exposure is a good one."""
 
 
 def test_an_output_that_is_switched_off_or_over_is_waited_for(made: Path, tmp_path: Path) -> None:
