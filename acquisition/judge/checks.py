@@ -373,7 +373,7 @@ def _odd_white(state: JudgeState, judge: JudgeSettings) -> Check | None:
 
 
 @dataclass(frozen=True)
-class Cause:
+class FrameCause:
     """What is known of a check that refuses a frame.
 
     - `explains`: checks that it brings about besides itself.
@@ -391,26 +391,26 @@ class Cause:
 
 _OF_THE_LIGHT = frozenset({"uniformity", "blur", "light", "lamp", "white drift"})
 
-CAUSES: Mapping[str, Cause] = MappingProxyType(
+CAUSES: Mapping[str, FrameCause] = MappingProxyType(
     {
-        "file": Cause(),
-        "camera": Cause(lasts=True),
-        "settings": Cause(),
-        "data": Cause(),
-        "repeated": Cause(),
-        "clipping": Cause(),
-        "exposure": Cause(),
-        "chart": Cause(lasts=True),
-        "movement": Cause(_OF_THE_LIGHT | {"rows"}),
-        "blur": Cause(frozenset({"rows", "uniformity"})),
-        "rows": Cause(_OF_THE_LIGHT | {"movement", "ambient"}, in_each_light=True),
-        "uniformity": Cause(_OF_THE_LIGHT - {"uniformity"} | {"rows", "movement", "ambient"}, in_each_light=True),
-        "light": Cause(frozenset({"lamp", "ambient", "white drift"}), in_each_light=True),
-        "ambient": Cause(frozenset({"light", "lamp", "uniformity"}), is_hidden=True),
-        "lamp": Cause(in_each_light=True),
-        "dark": Cause(is_hidden=True),
-        "white drift": Cause(in_each_light=True),
-        "additivity": Cause(),
+        "file": FrameCause(),
+        "camera": FrameCause(lasts=True),
+        "settings": FrameCause(),
+        "data": FrameCause(),
+        "repeated": FrameCause(),
+        "clipping": FrameCause(),
+        "exposure": FrameCause(),
+        "chart": FrameCause(lasts=True),
+        "movement": FrameCause(_OF_THE_LIGHT | {"rows"}),
+        "blur": FrameCause(frozenset({"rows", "uniformity"})),
+        "rows": FrameCause(_OF_THE_LIGHT | {"movement", "ambient"}, in_each_light=True),
+        "uniformity": FrameCause(_OF_THE_LIGHT - {"uniformity"} | {"rows", "movement", "ambient"}, in_each_light=True),
+        "light": FrameCause(frozenset({"lamp", "ambient", "white drift"}), in_each_light=True),
+        "ambient": FrameCause(frozenset({"light", "lamp", "uniformity"}), is_hidden=True),
+        "lamp": FrameCause(in_each_light=True),
+        "dark": FrameCause(is_hidden=True),
+        "white drift": FrameCause(in_each_light=True),
+        "additivity": FrameCause(),
     }
 )
 """Checks in the order in which they are named as the cause: what comes first explains what comes after."""

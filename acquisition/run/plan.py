@@ -134,17 +134,20 @@ def require_same(session: Session, settings: LabSettings) -> None:
         old, new = _value(before, key), _value(settings, key)
         if old != new:
             raise ConfigurationError(
-                f"{session.folder} was begun with {key} = {old!r}, {settings.file} says {new!r}; "
-                "put the old value back, or name a new session folder"
+                f"{session.folder} was begun with {key} = {old!r}, {settings.file} says {new!r}",
+                remedy="put the old value back, or name a new session folder",
+                value=new,
+                expected=old,
             )
     if load_chart(settings.chart).sha256 != session.chart.sha256:
         raise ConfigurationError(
-            f"{session.folder} was begun with another chart than {settings.chart}; name that, or a new session folder"
+            f"{session.folder} was begun with another chart than {settings.chart}",
+            remedy="name that, or a new session folder",
         )
     if load_illuminations(settings.illuminations) != session.illuminations:
         raise ConfigurationError(
-            f"{session.folder} was begun with other lights than {settings.illuminations}; "
-            "name those, or a new session folder"
+            f"{session.folder} was begun with other lights than {settings.illuminations}",
+            remedy="name those, or a new session folder",
         )
 
 

@@ -56,7 +56,9 @@ def run_session(
     with ExitStack() as at_last, ExitStack() as opened:
         session = opened.enter_context(_taken_up(settings, folder, announce)) if session_exists(folder) else None
         if session is None and retake is not None:
-            raise InputError(f"{folder}: nothing was taken yet that could be taken again; leave --retake out")
+            raise InputError(
+                "nothing was taken yet that could be taken again", about=folder, remedy="leave --retake out"
+            )
         if session is not None:
             if retake is not None:
                 session.retake(retake)
@@ -156,7 +158,10 @@ def require_same_devices(session: Session, devices: Devices, settings: LabSettin
         if before != name:
             raise DeviceRefused(
                 f"{session.folder} was begun with the {what} {before}, and now there is {name}: frames of both would "
-                f"not make one table; connect the {what} of before, or begin a new session"
+                "not make one table",
+                remedy=f"connect the {what} of before, or begin a new session",
+                value=name,
+                expected=before,
             )
     for what, name in {**names, "software": software()}.items():
         if known.get(what) != name:

@@ -207,21 +207,31 @@ def test_a_display_that_cannot_be_chosen(bench: Bench, there: tuple[Display, ...
     assert all(str(display) in said for display in there)
 
 
+def no_camera(bench: Bench) -> None: ...
+
+
 def two_cameras(bench: Bench) -> None:
     bench.plug("1")
     bench.plug("2")
 
 
+def one_in_use(bench: Bench) -> None:
+    bench.bus.hold(bench.plug())
+
+
+def one_not_allowed(bench: Bench) -> None:
+    bench.bus.lock(bench.plug())
+
+
 @pytest.mark.parametrize(
     ("attach", "text", "code", "words"),
     [
-        (lambda bench: None, "", 3, ("vendor 04a9 on USB; found: none at all", "switch the camera on, check cable")),
+        (no_camera, "", 3, ("vendor 04a9 on USB; found: none at all", "switch the camera on, check cable")),
         (Bench.plug, '[lab.camera]\nserial = "2"\n', 3, ("serial number 2 on USB; found: ", "serial number 1)")),
         (two_cameras, "", 2, ("2 cameras on USB fit: ", "name one by serial number or port")),
-        (lambda bench: bench.bus.hold(bench.plug()), "", 3, ("held by another program", "gvfs-gphoto2-volume-monitor")),
-        (lambda bench: bench.bus.lock(bench.plug()), "", 3, ("opened by this user", "70-crop-cameras.rules")),
+        (one_in_use, "", 3, ("held by another program", "gvfs-gphoto2-volume-monitor")),
+        (one_not_allowed, "", 3, ("opened by this user", "70-crop-cameras.rules")),
     ],
-    ids=["none", "another", "two", "in use", "not allowed"],
 )
 def test_a_camera_on_usb_that_cannot_be_opened(
     bench: Bench, attach: Callable[[Bench], object], text: str, code: int, words: tuple[str, ...]

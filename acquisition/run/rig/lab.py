@@ -118,8 +118,9 @@ def _lab_projector(cable: ProjectorCable, clock: Clock, file: str) -> Projector 
         return spoken.network(lambda: TcpLink.connect(host, port, CONNECT_S), label=label, clock=clock)
     if cable.device is None and cable.host is not None:
         raise ConfigurationError(
-            f"{file}: lab.projector.host: {spoken.maker} projectors are reached over a serial port only; "
-            "name lab.projector.device, acquire devices lists what is there"
+            f"lab.projector.host: {spoken.maker} projectors are reached over a serial port only",
+            about=file,
+            remedy="name lab.projector.device, acquire devices lists what is there",
         )
     device = _required(cable.device, "lab.projector.device", "the serial port", file)
     return spoken.projector(
@@ -144,7 +145,8 @@ def _lab_presenter(light: LightSource, clock: Clock, file: str) -> Presenter:
 
 def _required(value: str | None, key: str, what: str, file: str) -> str:
     if value is None:
-        raise ConfigurationError(f"{file}: {key} is missing; name {what}, acquire devices lists what is there")
+        remedy = f"name {what}, acquire devices lists what is there"
+        raise ConfigurationError(f"{key} is missing", about=file, remedy=remedy, value=key)
     return value
 
 
