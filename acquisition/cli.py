@@ -222,7 +222,7 @@ def devices(
 
     Reads and writes no file.
     """
-    from acquisition.run.rig.attached import attached_devices, identify_displays
+    from acquisition.run.rig.lab import attached_devices, identify_displays
 
     for attached in attached_devices(search):
         told.append("devices", attached)
@@ -280,7 +280,7 @@ def check(
 
         given = parse_corners(corners)
     if identify:
-        from acquisition.run.rig.attached import identify_displays
+        from acquisition.run.rig.lab import identify_displays
 
         identify_displays(10.0)
     options = CheckOptions(picture, given, linearity, session)
@@ -348,8 +348,7 @@ def run(
 
 
 def _print_plan(settings: LabSettings, session: Path, retake: str | None, told: JsonOutput) -> None:
-    from acquisition.run.planning.dry_run import dry_run
-    from acquisition.run.planning.text import plan_lines
+    from acquisition.run.plan import dry_run, plan_lines
 
     if retake is not None:
         raise InputError("a dry run voids nothing; leave --retake out")

@@ -22,7 +22,7 @@ from pathlib import Path
 import numpy as np
 
 from acquisition.judge import limits
-from acquisition.judge.known.response import ProjectorModel
+from acquisition.judge.light import ProjectorModel
 from benchmarks.disturbance_trials import detection
 from benchmarks.false_alarms import false_alarms, odd_worlds
 from benchmarks.judged_labs import Lab, lab_of, rooms
@@ -86,8 +86,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
             counts = f"{tried} | {tally.at_once} | {tally.next} | {tally.missed} | {tally.misnamed}"
             print(f"| {what} | {size} | {counts} | {causes} |")
         if labs:
-            lights, following, which = neighbours(labs[0].judge.knowledge.model, labs[0].plan)
-            scatter = labs[0].judge.knowledge.model
+            lights, following, which = neighbours(labs[0].judge.state.model, labs[0].plan)
+            scatter = labs[0].judge.state.model
             print(
                 f"\nScatter learnt in the first room: {scatter.chroma_sd:.2%} of colours, {scatter.brightness_sd:.2%}."
             )

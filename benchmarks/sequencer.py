@@ -40,8 +40,8 @@ import numpy as np
 from acquisition.judge.exposure import ExposureJudge
 from acquisition.judge.judge import LiveJudge
 from acquisition.run.devices import Devices
+from acquisition.run.pipeline import Taken
 from acquisition.run.sequencer import take_session
-from acquisition.run.taking.pipeline import Taken
 from drivers.camera import CameraIdentity, CapturedFrame, ExposureSettings
 from drivers.presenter import BLACK, Colour
 from drivers.projector import Fault, Lamp, Power, ProjectorIdentity

@@ -30,8 +30,8 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 from acquisition.run.devices import Devices
+from acquisition.run.queue import StepQueue
 from acquisition.run.sequencer import take_session
-from acquisition.run.taking.agenda import Agenda
 from drivers.camera import CameraIdentity, CapturedFrame, ExposureSettings
 from drivers.presenter import BLACK, Colour
 from experiment.chart.layout import design_chart
@@ -137,7 +137,7 @@ OPERATIONS: tuple[tuple[Any, str], ...] = (
     *((Journal, name) for name in ("begin", "commit", "note", "beat", "add_steps")),
     *((SmallLab, name) for name in ("show", "verify", "expose", "download")),
     *((Session, name) for name in ("incoming", "commit", "write_frames_csv", "set_aside_strays")),
-    *((IncomingFile, "complete"), (LightJudge, "judge"), (Agenda, "accept")),
+    *((IncomingFile, "complete"), (LightJudge, "judge"), (StepQueue, "accept")),
 )
 """Where a run is killed: before or after a call."""
 

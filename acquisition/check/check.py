@@ -37,11 +37,10 @@ from acquisition.check.sensor import judge_clipping, judge_hot, judge_linearity,
 from acquisition.check.supplies import judge_disk, judge_supplies
 from acquisition.check.taking import Photographer
 from acquisition.judge.exposure import disagreement
-from acquisition.run.asking import ask_all
-from acquisition.run.devices import Devices
+from acquisition.run.devices import Devices, ask_all
 from acquisition.run.lamp import make_ready, reported_error
-from acquisition.run.patience import Patience
-from acquisition.run.planning.work import planned_steps
+from acquisition.run.plan import planned_steps
+from acquisition.run.retry import RetryPolicy
 from acquisition.run.rig.opening import open_rig
 from acquisition.run.shutter import period_s
 from drivers.camera import keep_awake
@@ -280,7 +279,7 @@ def _make_devices_ready(
         lines.append("projector   not under control: see to its lamp yourself")
         return lines, findings
     before = _state(projector)
-    patience = Patience(
+    patience = RetryPolicy(
         devices.clock, 0, lambda what, sentence: announce(f"{what}: {sentence}"), lambda: keep_awake(devices.camera)
     )
     make_ready(projector, settings.sequence, patience)

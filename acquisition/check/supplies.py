@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from acquisition.check.findings import LIMITS, Finding, judged, not_checked, percent
-from acquisition.run.planning.sizes import bytes_text, free_bytes_at, needed_bytes
+from acquisition.run.plan import bytes_text, free_bytes_at, needed_bytes
 from drivers.camera import Camera, ReportsSupplies, Supplies
 from foundation.errors import DeviceError, StorageError
 

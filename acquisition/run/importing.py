@@ -67,7 +67,7 @@ def read_frame_list(path: Path) -> tuple[list[ListedFrame], tuple[Illumination, 
     except (UnicodeDecodeError, csv.Error) as error:
         raise FormatError(f"cannot read the list of frames {path}: {error}; save it as CSV in UTF-8") from error
     if not rows or any(column not in rows[0] for column in FRAME_COLUMNS[:3]):
-        raise FormatError(f"{path}: expected frames under the columns {','.join(FRAME_COLUMNS)}")
+        raise FormatError(f"expected frames under the columns {','.join(FRAME_COLUMNS)}", about=path)
     lights = load_illuminations(path.parent / "illuminations.csv")
     frames = [
         _listed(row, f"{path}, line {number}", path.parent, len(lights))
@@ -83,23 +83,28 @@ def _listed(row: Mapping[str, str | None], where: str, folder: Path, lights: int
 
     kind = cell("kind")
     if kind not in ("light", "white", "dark"):
-        raise FormatError(f"{where}: kind is {kind!r}, expected light, white or dark")
+        raise FormatError(f"kind is {kind!r}, expected light, white or dark", about=where, value=kind)
     file = folder / cell("file")
     if not cell("file") or not file.is_file():
-        raise FormatError(f"{where}: there is no file {file}; files are named relative to the list")
+        raise FormatError(
+            f"there is no file {file}", about=where, remedy="files are named relative to the list", value=file
+        )
     try:
         illumination = int(cell("illumination")) if kind == "light" else None
         exposure_s = float(cell("exposure_s") or 0)
         taken_at = datetime.fromisoformat(cell("taken_at")) if cell("taken_at") else _modified(file)
     except ValueError as error:
-        raise FormatError(f"{where}: {error}") from error
+        raise FormatError(str(error), about=where) from error
     if illumination is not None and not 0 <= illumination < lights:
-        raise FormatError(f"{where}: illumination is {illumination}, illuminations.csv has 0 … {lights - 1}")
+        said = f"illumination is {illumination}, illuminations.csv has 0 … {lights - 1}"
+        raise FormatError(said, about=where, value=illumination)
     if not 0 <= exposure_s < math.inf:
-        raise FormatError(f"{where}: exposure_s is {exposure_s:g}, expected seconds, or nothing if it is not known")
+        said = f"exposure_s is {exposure_s:g}, expected seconds, or nothing if it is not known"
+        raise FormatError(said, about=where, value=exposure_s)
     verdict = cell("verdict")
     if verdict not in ("", ACCEPTED, REFUSED) and not verdict.startswith(f"{REFUSED}: "):
-        raise FormatError(f"{where}: verdict is {verdict!r}, expected {ACCEPTED}, {REFUSED}: REASON, or nothing")
+        said = f"verdict is {verdict!r}, expected {ACCEPTED}, {REFUSED}: REASON, or nothing"
+        raise FormatError(said, about=where, value=verdict)
     if not taken_at.tzinfo:
         taken_at = taken_at.replace(tzinfo=UTC)
     return ListedFrame(kind, illumination, file, cell("sha256").lower(), taken_at, exposure_s, verdict)
@@ -114,9 +119,8 @@ def import_session(
     loaded = load_chart(chart)
     for frame in frames:
         if frame.sha256 and file_sha256(frame.path) != frame.sha256:
-            raise FormatError(
-                f"{frame.path} is not the file that {frame_list} lists: its SHA-256 differs; copy it again"
-            )
+            said = f"{frame.path} is not the file that {frame_list} lists: its SHA-256 differs"
+            raise FormatError(said, remedy="copy it again", value=frame.path)
     settings = LabSettings(rig="imported", chart=chart, illuminations=frame_list.parent / "illuminations.csv")
     steps = [_step(number, frame, lights) for number, frame in enumerate(frames)]
     refused: list[str] = []
@@ -188,8 +192,11 @@ def _require_another_light(first: ListedFrame, frame: ListedFrame, frame_list: P
     """Refuse a raw file that is listed for two lights."""
     if first.illumination != frame.illumination:
         raise FormatError(
-            f"{frame_list}: lights {first.illumination} and {frame.illumination} have the same raw file, "
-            f"{first.path.name} and {frame.path.name}; list each light's own"
+            f"lights {first.illumination} and {frame.illumination} have the same raw file, "
+            f"{first.path.name} and {frame.path.name}",
+            about=frame_list,
+            remedy="list each light's own",
+            value=(first.illumination, frame.illumination),
         )
 
 

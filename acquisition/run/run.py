@@ -1,4 +1,11 @@
-"""From LAB.toml to a session on disk: creates it or takes it up, opens the rig, hands both to the sequencer."""
+"""From LAB.toml to a session on disk: creates it or takes it up, opens the rig, hands both to the sequencer.
+
+Rules that hold inside for a session that is taken up:
+
+- Files are held against their hashes before a device is opened: what is damaged is taken again.
+- A session has one camera and one projector: a table of two sensors, even of the same model, is a table of none, and
+  nothing in the frames says so. There is no option to go on with another one.
+"""
 
 from __future__ import annotations
 
@@ -8,21 +15,24 @@ from pathlib import Path
 
 from acquisition.judge.judge import LiveJudge
 from acquisition.monitor.page import write_session_report
-from acquisition.run.patience import TRY_S
-from acquisition.run.planning.dry_run import checked_plan
-from acquisition.run.planning.work import planned_steps, require_same
+from acquisition.run.devices import Devices
+from acquisition.run.pipeline import Taken
+from acquisition.run.plan import planned_steps, require_plan, require_same
+from acquisition.run.queue import link_runs, white_first
+from acquisition.run.retry import TRY_S
 from acquisition.run.rig.opening import open_rig
 from acquisition.run.sequencer import RunOutcome, take_session
-from acquisition.run.taking.pipeline import Taken
-from acquisition.run.taking.resuming import check_frames, clock_note, require_same_devices, tie, white_first
 from experiment.chart.model import load_chart
 from experiment.config import LabSettings
 from experiment.lights import load_illuminations
 from experiment.session.folder import Session, busy_sentence, session_exists
 from experiment.session.heartbeat import signs_of_life
+from experiment.session.records import duration_text
 from experiment.session.repair import secrets_warning
+from foundation.clock import Clock, SteadyClock
 from foundation.console import Ending
-from foundation.errors import CropError, InputError
+from foundation.errors import CropError, DeviceRefused, InputError, first_of
+from foundation.version import software
 
 
 def run_session(
@@ -46,7 +56,9 @@ def run_session(
     with ExitStack() as at_last, ExitStack() as opened:
         session = opened.enter_context(_taken_up(settings, folder, announce)) if session_exists(folder) else None
         if session is None and retake is not None:
-            raise InputError(f"{folder}: nothing was taken yet that could be taken again; leave --retake out")
+            raise InputError(
+                "nothing was taken yet that could be taken again", about=folder, remedy="leave --retake out"
+            )
         if session is not None:
             if retake is not None:
                 session.retake(retake)
@@ -57,14 +69,14 @@ def run_session(
                 return RunOutcome(total, 0, ())
         chart = load_chart(settings.chart) if session is None else session.chart
         devices = opened.enter_context(open_rig(settings, chart, session))
-        checked_plan(settings, folder, session, devices)
+        require_plan(settings, folder, session, devices)
         if session is None:
             session = opened.enter_context(_begun(settings, folder))
             session.journal.retry_locked(settings.sequence.patience_s, announce)
         require_same_devices(session, devices, settings)
         if note := clock_note(session, devices.clock):
             announce(note)
-        first = tie(session) or white_first(session)
+        first = link_runs(session) or white_first(session)
         total = len(session.steps)
         observe(len(session.done_steps()), total)
         # When the screen is dark and the journal at rest.
@@ -112,3 +124,59 @@ def _begun(settings: LabSettings, folder: Path) -> Session:
         if session_exists(folder):
             raise InputError(busy_sentence(folder)) from None
         raise
+
+
+def check_frames(
+    session: Session,
+    observe: Callable[[int, int], None] = lambda done, total: None,
+    announce: Callable[[str], object] = lambda sentence: None,
+) -> None:
+    """Hold every accepted frame against its hash; what is damaged is voided, and said."""
+    if not session.journal.accepted_files():
+        return
+    damaged = session.verify(observe)
+    if damaged:
+        announce(f"voided: {first_of(damaged, 5)}")
+
+
+def require_same_devices(session: Session, devices: Devices, settings: LabSettings) -> None:
+    """Require that camera and projector are those that the session was begun with; note those of a new one."""
+    known = session.journal.records()
+    body = devices.camera.identity()
+    # Its firmware may be brought up to date between two runs, and the name in a projector's menu may change.
+    names = {"camera": f"{body.maker} {body.model}, serial number {body.serial}"}
+    if devices.projector is not None:
+        projector = devices.projector.identity()
+        names["projector"] = f"{projector.maker} {projector.model}".strip() or "of an unknown maker"
+    if settings.rig == "lab":
+        light = settings.lab.light
+        names["screen"] = " ".join(
+            str(part) for part in (light.shown_by, light.display, light.host) if part is not None
+        )
+    for what, name in names.items():
+        before = known.get(what, name)
+        if before != name:
+            raise DeviceRefused(
+                f"{session.folder} was begun with the {what} {before}, and now there is {name}: frames of both would "
+                "not make one table",
+                remedy=f"connect the {what} of before, or begin a new session",
+                value=name,
+                expected=before,
+            )
+    for what, name in {**names, "software": software()}.items():
+        if known.get(what) != name:
+            session.journal.record(what, name)
+
+
+def clock_note(session: Session, clock: Clock) -> str:
+    """Return what to say where the machine's clock is behind the session's last frame, with the remedy.
+
+    Else nothing.
+    """
+    if not isinstance(clock, SteadyClock) or not clock.behind_s:
+        return ""
+    return (
+        f"clock: it is {duration_text(clock.behind_s)} behind the last frame of {session.folder}, or was ahead when "
+        "that was taken; the session's time goes on from there, so that its frames stay in their order; set the "
+        "machine's clock right"
+    )

@@ -13,13 +13,11 @@ from datetime import UTC, datetime, timedelta
 
 from acquisition.judge.exposure import ExposureJudge
 from acquisition.run.devices import Devices
-from acquisition.run.lamp import make_ready
-from acquisition.run.leaving import RunEnd, end_of, leave_lab
+from acquisition.run.lamp import RunEnd, leave_lab, make_ready
 from acquisition.run.notices import Notices
-from acquisition.run.patience import Patience
-from acquisition.run.taking.agenda import Agenda, unclosed_kinds
-from acquisition.run.taking.pipeline import Pipeline, Taken
-from acquisition.run.taking.saving import Saver
+from acquisition.run.pipeline import Job, Pipeline, Saver, Taken
+from acquisition.run.queue import StepQueue, unclosed_kinds
+from acquisition.run.retry import RetryPolicy
 from drivers.camera import keep_awake
 from drivers.presenter import BLACK, WHITE
 from experiment.config import LabSettings
@@ -68,36 +66,81 @@ def take_session(
 
     `judge`: looks at every frame; None looks at its exposure alone. `state`: called every few seconds of a wait with
     what is waited for and how long; the newest holds. `ending`: by which the run learns that it is to end after the
-    running frame; None for a run that nobody asks.
+    running frame; None for a run that nobody asks. `first`: numbers of steps that are taken before all others.
     """
-    notices = Notices(settings.sequence.notify, session.folder.name, announce)
-    telling = _Telling(session, devices.clock, announce, state, notices)
+    sequence = settings.sequence
+    reports = _Reports(session, devices.clock, announce, state, sequence.notify)
     asked = ending or Ending()
+    retry = RetryPolicy(
+        devices.clock,
+        sequence.patience_s,
+        reports.tell,
+        lambda: keep_awake(devices.camera),
+        reports.sign_of_life,
+        asked.at_once,
+    )
     try:
-        outcome = _taken(session, devices, settings, judge, observe, telling, asked, first)
+        for stray in session.set_aside_strays():
+            reports.tell("stray", f"{stray.name}: complete, but not in the journal; kept, not used")
+        job = Job(session, devices, settings, _open_steps(session, settings, first), retry)
+        if len(job.queue):
+            _take_open(job, judge or ExposureJudge(settings), observe, asked)
+        outcome = RunOutcome(len(session.steps), len(job.queue), job.queue.given_up)
         if asked.asked and not outcome.complete:
             raise KeyboardInterrupt
-        end = RunEnd.COMPLETE if outcome.complete else RunEnd.UNFINISHED
-        leave_lab(devices, end, settings.sequence, telling.report)
+        leave_lab(devices, RunEnd.COMPLETE if outcome.complete else RunEnd.UNFINISHED, sequence, reports.tell)
     except BaseException as error:
-        leave_lab(devices, end_of(error), settings.sequence, telling.report)
+        interrupted = isinstance(error, KeyboardInterrupt)
+        leave_lab(devices, RunEnd.INTERRUPTED if interrupted else RunEnd.UNFINISHED, sequence, reports.tell)
         # It is derived, and made anew at the next opening: the fault that is there counts.
         with suppress(StorageError):
             session.write_frames_csv()
-        telling.ended(
-            "interrupted" if isinstance(error, KeyboardInterrupt) else "ended", str(error) or "by the operator"
-        )
+        reports.end("interrupted" if interrupted else "ended", str(error) or "by the operator")
         raise
     else:
         session.write_frames_csv()
         left = f"{outcome.left} of {outcome.total} frames left"
-        telling.ended("complete" if outcome.complete else "incomplete", "; ".join([left, *outcome.refused]))
+        reports.end("complete" if outcome.complete else "incomplete", "; ".join([left, *outcome.refused]))
     finally:
-        notices.close()
+        reports.close()
     return outcome
 
 
-class _Telling:
+def _open_steps(session: Session, settings: LabSettings, first: Sequence[int]) -> StepQueue:
+    """Return the steps without an accepted frame, and what puts references behind the plan where they are needed."""
+
+    def append(kind: FrameKind) -> SessionStep:
+        step = SessionStep(session.steps[-1].number + 1, kind, None, WHITE if kind == "white" else BLACK)
+        session.add_steps([step])
+        return step
+
+    taken = [attempt.kind for attempt in session.journal.attempts() if attempt.verdict == ACCEPTED]
+    sequence = settings.sequence
+    return StepQueue(
+        session.steps,
+        session.done_steps(),
+        sequence.attempts,
+        first,
+        unclosed_kinds(taken),
+        append,
+        sequence.reference_every,
+    )
+
+
+def _take_open(job: Job, judge: FrameJudge, observe: Callable[[Taken], object], ending: Ending) -> None:
+    """Make the devices ready, and take what is open."""
+    devices, settings, journal = job.devices, job.settings, job.session.journal
+    journal.note(devices.clock.now(), "start", f"{len(job.queue)} of {len(job.session.steps)} frames to take")
+    devices.camera.configure(settings.camera.exposure)
+    for step, _, measurement, accepted in journal.measurements():
+        judge.recall(step, measurement, accepted)
+    if devices.projector is not None:
+        make_ready(devices.projector, settings.sequence, job.retry)
+    with Saver(job.session, judge) as saver:
+        Pipeline(job, saver, observe, ending).run()
+
+
+class _Reports:
     """Where words of a run go: terminal, journal, whoever is notified."""
 
     def __init__(
@@ -106,15 +149,15 @@ class _Telling:
         clock: Clock,
         announce: Callable[[str], object],
         state: Callable[[str], object],
-        notices: Notices,
+        notify: str,
     ) -> None:
         self._journal = session.journal
         self._clock = clock
         self._announce = announce
         self._state = state
-        self._notices = notices
+        self._notices = Notices(notify, session.folder.name, announce)
 
-    def report(self, what: str, sentence: str, /) -> None:
+    def tell(self, what: str, sentence: str, /) -> None:
         """Tell what happens."""
         self._announce(f"{what}: {sentence}")
         if what in NOTIFIED:
@@ -122,61 +165,18 @@ class _Telling:
         if what != VOIDED:  # the journal notes that with the rows that it changes
             self._journal.note(self._clock.now(), what, sentence)
 
-    def beat(self, what: str, sentence: str, within_s: float, /) -> None:
-        """Leave a sign of life."""
-        doing: RunState = "paused" if what == "paused" else "waiting" if what == "waiting" else "running"
-        if doing != "running":
-            self._state(sentence)
+    def sign_of_life(self, what: str, sentence: str, within_s: float, /) -> None:
+        """Say that the run waits, and for what."""
+        doing: RunState = "paused" if what == "paused" else "waiting"
+        self._state(sentence)
         self._journal.beat(doing, sentence, datetime.now(UTC) + timedelta(seconds=within_s))
 
-    def ended(self, how: str, sentence: str) -> None:
+    def end(self, how: str, sentence: str) -> None:
         """Note why the run is over; a disk that cannot take that is told of already."""
         self._notices.tell(how, sentence, datetime.now(UTC))
         with suppress(StorageError):
             self._journal.note(self._clock.now(), how, sentence)
 
-
-def _taken(
-    session: Session,
-    devices: Devices,
-    settings: LabSettings,
-    judge: FrameJudge | None,
-    observe: Callable[[Taken], object],
-    telling: _Telling,
-    ending: Ending,
-    first: Sequence[int],
-) -> RunOutcome:
-    """Make the devices ready, and take what is open."""
-    clock, journal = devices.clock, session.journal
-    patience = Patience(
-        clock,
-        settings.sequence.patience_s,
-        telling.report,
-        lambda: keep_awake(devices.camera),
-        telling.beat,
-        ending.at_once,
-    )
-    for stray in session.set_aside_strays():
-        telling.report("stray", f"{stray.name}: complete, but not in the journal; kept, not used")
-
-    def append(kind: FrameKind) -> SessionStep:
-        step = SessionStep(session.steps[-1].number + 1, kind, None, WHITE if kind == "white" else BLACK)
-        session.add_steps([step])
-        return step
-
-    taken = [attempt.kind for attempt in journal.attempts() if attempt.verdict == ACCEPTED]
-    attempts = settings.sequence.attempts
-    every = settings.sequence.reference_every
-    agenda = Agenda(session.steps, session.done_steps(), attempts, first, unclosed_kinds(taken), append, every)
-    if not len(agenda):
-        return RunOutcome(len(session.steps), 0, ())
-    journal.note(clock.now(), "start", f"{len(agenda)} of {len(session.steps)} frames to take")
-    devices.camera.configure(settings.camera.exposure)
-    used = judge or ExposureJudge(settings)
-    for step, _, measurement, accepted in journal.measurements():
-        used.recall(step, measurement, accepted)
-    if devices.projector is not None:
-        make_ready(devices.projector, settings.sequence, patience)
-    with Saver(session, used) as saver:
-        Pipeline(session, devices, settings, agenda, saver, patience, observe, ending).run()
-    return RunOutcome(len(session.steps), len(agenda), agenda.given_up)
+    def close(self) -> None:
+        """Let the last notices be delivered."""
+        self._notices.close()

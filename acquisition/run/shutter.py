@@ -59,6 +59,9 @@ def require_whole_turns(camera: CameraSettings, projector: ProjectorCable) -> No
         unit, of, key = "pictures", "the projector", "refresh_hz"
     raise ConfigurationError(
         f"camera.shutter_s = {shutter:g} is {shutter / period:.2f} {unit} of {of} ({1 / period:g} a second), and a "
-        f"frame must hold whole {unit}; set it to {near or f'a multiple of {period:.4g}'} s, better 0.5 s or more, or "
-        f"correct lab.projector.{key}"
+        f"frame must hold whole {unit}",
+        remedy=f"set it to {near or f'a multiple of {period:.4g}'} s, better 0.5 s or more, or correct "
+        f"lab.projector.{key}",
+        value=shutter,
+        expected=(below, above),
     )

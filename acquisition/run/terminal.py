@@ -13,8 +13,8 @@ from collections.abc import Callable
 from types import TracebackType
 from typing import Self
 
-from acquisition.run.taking.agenda import step_name
-from acquisition.run.taking.pipeline import Taken
+from acquisition.run.pipeline import Taken
+from acquisition.run.queue import step_name
 from experiment.session.records import RECENT, Check, Judgement, TimedAttempt, duration_text, time_left
 
 SHOWN = ("light", "movement", "blur", "white drift", "dark", "ambient", "exposure")

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import csv
 import hashlib
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
+from acquisition.cli import main
 from drivers.presenter import Colour
 from experiment.chart.layout import design_chart
 from experiment.lights import Illumination, save_illuminations
@@ -34,14 +36,34 @@ seed = 7
 """
 
 
+def make_lab(folder: Path) -> Path:
+    """Write a LAB.toml with chart and lights beside it, and return its path."""
+    design_chart(bits=2, seed=3).save(folder / "chart.json")
+    save_illuminations(LIGHTS, folder / "illuminations.csv")
+    path = folder / "LAB.toml"
+    path.write_text(LAB)
+    return path
+
+
 @pytest.fixture
 def lab(tmp_path: Path) -> Path:
     """Return the path of a LAB.toml whose chart and lights lie beside it."""
-    design_chart(bits=2, seed=3).save(tmp_path / "chart.json")
-    save_illuminations(LIGHTS, tmp_path / "illuminations.csv")
-    path = tmp_path / "LAB.toml"
-    path.write_text(LAB)
-    return path
+    return make_lab(tmp_path)
+
+
+@pytest.fixture(scope="session")
+def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return the session that `acquire run` takes in such a lab; it is read only."""
+    lab = make_lab(tmp_path_factory.mktemp("undisturbed"))
+    session = lab.parent / "session"
+    assert main(["run", str(lab), str(session)]) == 0
+    return session
+
+
+@pytest.fixture
+def session(lab: Path, undisturbed: Path) -> Path:
+    """Return the lab's complete session, a copy that may be changed."""
+    return shutil.copytree(undisturbed, lab.parent / "session")
 
 
 @pytest.fixture

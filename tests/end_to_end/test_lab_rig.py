@@ -7,13 +7,10 @@ those of `rig = "simulated"` with the same seed.
 
 from __future__ import annotations
 
-import importlib.util
-import sys
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
-from types import ModuleType
 
 import numpy as np
 import pytest
@@ -41,6 +38,7 @@ from sim.projectors.pjlink import serve_pjlink
 from sim.projectors.projector import Screen, SimulatedPresenter, SimulatedProjector
 from sim.projectors.serial import PEERS, BenqPeer, EpsonPeer
 from sim.world.world import World
+from tests.drivers.display.x_servers import virtual_screen
 from tests.found_texts import files_with
 
 pytestmark = pytest.mark.slow
@@ -61,30 +59,16 @@ def simulated_display(display: str | int | None, clock: Clock) -> SimulatedPrese
     return SimulatedPresenter(Screen(), clock)
 
 
-@pytest.fixture(scope="module")
-def x_servers() -> ModuleType:
-    """Return the module that runs X servers; it stands with the tests of the display."""
-    path = Path(__file__).parents[1] / "drivers" / "display" / "x_servers.py"
-    spec = importlib.util.spec_from_file_location("x_servers_for_the_lab", path)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    # dataclasses look their module up by name.
-    sys.modules[spec.name] = module
-    spec.loader.exec_module(module)
-    return module
-
-
 @pytest.mark.parametrize("cables", ["network", "usb and serial"])
 def test_a_real_lab_takes_the_frames_of_the_simulated_one(
-    lab: Path, cables: str, monkeypatch: pytest.MonkeyPatch, x_servers: ModuleType
+    lab: Path, cables: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     folder = lab.parent
     lab.write_text(lab.read_text() + ROOM)
     settings = load_lab(lab)
     assert run_session(settings, folder / "simulated", lambda done, total: None).complete
     with ExitStack() as opened:
-        screen = opened.enter_context(x_servers.virtual_screen(folder, "320x240"))
+        screen = opened.enter_context(virtual_screen(folder, "320x240"))
         monkeypatch.setenv("DISPLAY", screen.display)
         monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import re
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -109,18 +109,9 @@ def free_port() -> int:
         return server.address[1]
 
 
-def test_an_unknown_language(bench: Bench) -> None:
-    code, said = bench.told('[lab.projector]\ncontrol = "klingon"\n')
-    assert code == 2
-    assert "lab.projector.control = 'klingon'" in said
-    assert "'pjlink', 'epson', 'benq', 'optoma' or 'nec'" in said
-
-
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ('control = "pjlink"', "lab.projector.host is missing; name the projector's address"),
-        ('control = "nec"', "lab.projector.device is missing; name the serial port, acquire devices lists"),
         ('control = "optoma"\nhost = "127.0.0.1"', "Optoma projectors are reached over a serial port only"),
         ('control = "nec"\nbaud = 12345678901\ndevice = "{port}"', "choose another speed"),
     ],
@@ -214,43 +205,39 @@ def test_a_display_that_cannot_be_chosen(bench: Bench, there: tuple[Display, ...
     assert all(str(display) in said for display in there)
 
 
-def test_no_camera_on_usb(bench: Bench) -> None:
-    code, said = bench.told("")
-    assert code == 3
-    assert "no camera with vendor 04a9 on USB; found: none at all: switch the camera on, check cable" in said
+def no_camera(bench: Bench) -> None: ...
 
 
-def test_another_camera_than_the_one_named(bench: Bench) -> None:
-    bench.plug("1")
-    code, said = bench.told('[lab.camera]\nserial = "2"\n')
-    assert code == 3
-    assert "serial number 2 on USB; found: " in said
-    assert "serial number 1)" in said
-
-
-def test_two_cameras_and_none_named(bench: Bench) -> None:
+def two_cameras(bench: Bench) -> None:
     bench.plug("1")
     bench.plug("2")
-    code, said = bench.told("")
-    assert code == 2
-    assert "2 cameras on USB fit: " in said
-    assert "name one by serial number or port" in said
 
 
-def test_a_camera_in_use(bench: Bench) -> None:
+def one_in_use(bench: Bench) -> None:
     bench.bus.hold(bench.plug())
-    code, said = bench.told("")
-    assert code == 3
-    assert "is held by another program" in said
-    assert "gvfs-gphoto2-volume-monitor" in said
 
 
-def test_a_camera_without_permission(bench: Bench) -> None:
+def one_not_allowed(bench: Bench) -> None:
     bench.bus.lock(bench.plug())
-    code, said = bench.told("")
-    assert code == 3
-    assert "may not be opened by this user" in said
-    assert "70-crop-cameras.rules" in said
+
+
+@pytest.mark.parametrize(
+    ("attach", "text", "code", "words"),
+    [
+        (no_camera, "", 3, ("vendor 04a9 on USB; found: none at all", "switch the camera on, check cable")),
+        (Bench.plug, '[lab.camera]\nserial = "2"\n', 3, ("serial number 2 on USB; found: ", "serial number 1)")),
+        (two_cameras, "", 2, ("2 cameras on USB fit: ", "name one by serial number or port")),
+        (one_in_use, "", 3, ("held by another program", "gvfs-gphoto2-volume-monitor")),
+        (one_not_allowed, "", 3, ("opened by this user", "70-crop-cameras.rules")),
+    ],
+)
+def test_a_camera_on_usb_that_cannot_be_opened(
+    bench: Bench, attach: Callable[[Bench], object], text: str, code: int, words: tuple[str, ...]
+) -> None:
+    attach(bench)
+    found, said = bench.told(text)
+    assert found == code
+    assert all(word in said for word in words)
 
 
 def test_what_answers_at_the_cameras_port_is_none(bench: Bench) -> None:

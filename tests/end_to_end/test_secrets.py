@@ -27,6 +27,8 @@ LAB = """
 rig = "simulated"
 chart = "chart/chart.json"
 illuminations = "illuminations.csv"
+[judge]
+response = false
 [sequence]
 notify = "{notify}"
 [simulated]

@@ -114,14 +114,14 @@ def test_a_session_that_another_run_makes_meanwhile_is_not_to_be_removed(
     lab: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     folder = lab.parent / "session"
-    real = runs.checked_plan
+    real = runs.require_plan
 
     def meanwhile(*given: Any) -> object:
-        monkeypatch.setattr(runs, "checked_plan", real)
+        monkeypatch.setattr(runs, "require_plan", real)
         assert run("run", lab, folder) == 0
         return real(*given)
 
-    monkeypatch.setattr(runs, "checked_plan", meanwhile)
+    monkeypatch.setattr(runs, "require_plan", meanwhile)
     with pytest.raises(InputError, match="is being taken by another program; wait for it"):
         run_session(load_lab(lab), folder, lambda done, total: None)
     assert counted_once(folder)

@@ -2,58 +2,72 @@
 
 from __future__ import annotations
 
+import contextlib
 import io
+import itertools
+import multiprocessing
 import os
 import re
 import signal
 import sqlite3
-import subprocess
-import sys
 from collections.abc import Callable
+from dataclasses import replace
+from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from acquisition.cli import main
+from acquisition.run.rig.opening import open_rig
 from acquisition.run.run import run_session
+from drivers.camera import capture
 from drivers.canon.camera import CanonEos
 from drivers.pjlink.projector import PjLinkProjector
 from drivers.raw.rawfile import read_raw
+from experiment.chart.model import load_chart
 from experiment.config import load_lab
 from experiment.session.folder import Session
+from experiment.session.journal import Journal
 from foundation.errors import StorageError
+from sim.camera.bodies import EOS_BODIES
 
 pytestmark = pytest.mark.slow
 
 Hashes = Callable[[Path], dict[tuple[str, str], list[str]]]
 
-KILLER = """
-import os, signal, sys
-from acquisition.cli import main
-import experiment.session.folder, experiment.session.journal, foundation.files
+FORKS = multiprocessing.get_context("forkserver")
+"""Programs beside this one, without waiting for their imports each time."""
+FORKS.set_forkserver_preload([__name__, "acquisition.run.run", "acquisition.run.terminal", "sim.camera.eos"])
 
-place, count = sys.argv[1], int(sys.argv[2])
-owner, name = {
-    "renaming": (foundation.files.Path, "replace"),
-    "committing": (experiment.session.folder.Session, "commit"),
-    "deriving": (experiment.session.folder.Session, "write_frames_csv"),
-    "beginning": (experiment.session.journal.Journal, "begin"),
-}[place]
-real = getattr(owner, name)
+PLACES = {
+    "renaming": (Path, "replace"),
+    "committing": (Session, "commit"),
+    "deriving": (Session, "write_frames_csv"),
+    "beginning": (Journal, "begin"),
+}
 
-def deadly(*args, **kwargs):
-    global count
-    if "frames" not in str(args[0]) and place == "renaming":
-        return real(*args, **kwargs)
-    count -= 1
-    if count == 0:
-        os.kill(os.getpid(), signal.SIGKILL)
-    return real(*args, **kwargs)
 
-setattr(owner, name, deadly)
-sys.exit(main(sys.argv[3:]))
-"""
+def run_until_killed(place: str, count: int, *arguments: str) -> None:
+    """Run `acquire`; the process is killed before the `count`-th call at a place."""
+    owner, name = PLACES[place]
+    real, left = getattr(owner, name), itertools.count(count, -1)
+
+    def deadly(*given: Any, **named: Any) -> Any:
+        if (place != "renaming" or "frames" in str(given[0])) and next(left) == 1:
+            os.kill(os.getpid(), signal.SIGKILL)
+        return real(*given, **named)
+
+    setattr(owner, name, deadly)
+    main(arguments)
+
+
+def run_to_pipe(answer: Connection, *arguments: str) -> None:
+    """Run `acquire` and send its exit code and what it says on stderr."""
+    said = io.StringIO()
+    with contextlib.redirect_stderr(said):
+        code = main(arguments)
+    answer.send((code, said.getvalue()))
 
 
 def run(*arguments: object) -> int:
@@ -61,11 +75,9 @@ def run(*arguments: object) -> int:
 
 
 def test_a_session_holds_every_frame_of_the_plan(
-    lab: Path, frame_hashes: Hashes, capsys: pytest.CaptureFixture[str]
+    lab: Path, session: Path, frame_hashes: Hashes, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    folder = lab.parent / "session"
-    assert run("run", lab, folder) == 0
-    hashes = frame_hashes(folder)
+    hashes = frame_hashes(session)
     assert {key: len(files) for key, files in hashes.items()} == {
         ("light", "0"): 1,
         ("light", "1"): 1,
@@ -77,30 +89,28 @@ def test_a_session_holds_every_frame_of_the_plan(
     everything = [digest for files in hashes.values() for digest in files]
     assert len(set(everything)) == len(everything), "two frames have the same noise"
     capsys.readouterr()
-    assert run("status", folder) == 0
+    assert run("status", session) == 0
     assert "10 of 10" in capsys.readouterr().out
-    assert run("run", lab, folder) == 0, "a complete session is complete again"
+    assert run("run", lab, session) == 0, "a complete session is complete again"
 
 
 @pytest.mark.parametrize(("place", "count"), [("renaming", 1), ("committing", 4), ("deriving", 2), ("beginning", 8)])
-def test_a_killed_session_ends_in_the_same_frames(lab: Path, frame_hashes: Hashes, place: str, count: int) -> None:
-    undisturbed, killed = lab.parent / "undisturbed", lab.parent / "killed"
-    assert run("run", lab, undisturbed) == 0
-    done = subprocess.run(
-        [sys.executable, "-c", KILLER, place, str(count), "run", str(lab), str(killed)],
-        capture_output=True,
-        check=False,
-    )
-    assert done.returncode == -signal.SIGKILL, done.stderr
+def test_a_killed_session_ends_in_the_same_frames(
+    lab: Path, undisturbed: Path, frame_hashes: Hashes, place: str, count: int
+) -> None:
+    killed = lab.parent / "killed"
+    program = FORKS.Process(target=run_until_killed, args=(place, count, "run", str(lab), str(killed)))
+    program.start()
+    program.join()
+    assert program.exitcode == -signal.SIGKILL
     assert run("run", lab, killed) == 0
     assert frame_hashes(killed) == frame_hashes(undisturbed)
     assert (killed / "frames.csv").read_text() == (undisturbed / "frames.csv").read_text()
     assert not list(killed.rglob(".*partial*"))
 
 
-def test_ctrl_c_at_every_frame_ends_in_the_same_frames(lab: Path, frame_hashes: Hashes) -> None:
-    undisturbed, interrupted = lab.parent / "undisturbed", lab.parent / "interrupted"
-    assert run("run", lab, undisturbed) == 0
+def test_ctrl_c_at_every_frame_ends_in_the_same_frames(lab: Path, undisturbed: Path, frame_hashes: Hashes) -> None:
+    interrupted = lab.parent / "interrupted"
     settings = load_lab(lab)
     for _ in range(50):
         last: list[int] = []
@@ -118,13 +128,12 @@ def test_ctrl_c_at_every_frame_ends_in_the_same_frames(lab: Path, frame_hashes: 
     assert frame_hashes(interrupted) == frame_hashes(undisturbed)
 
 
-def test_a_replayed_session_has_the_same_bytes(lab: Path, frame_hashes: Hashes) -> None:
-    recorded, replayed = lab.parent / "recorded", lab.parent / "replayed"
-    assert run("run", lab, recorded) == 0
+def test_a_replayed_session_has_the_same_bytes(lab: Path, session: Path, frame_hashes: Hashes) -> None:
+    replayed = lab.parent / "replayed"
     text = lab.read_text().replace('"simulated"', '"replay"')
-    lab.write_text(text + '[replay]\nsession = "recorded"\n')
+    lab.write_text(text + '[replay]\nsession = "session"\n')
     assert run("run", lab, replayed) == 0
-    assert frame_hashes(replayed) == frame_hashes(recorded)
+    assert frame_hashes(replayed) == frame_hashes(session)
 
 
 @pytest.mark.parametrize(("text", "said"), [(None, "No such file"), ("garbage", "expected lights under the columns")])
@@ -176,21 +185,21 @@ def test_a_run_that_is_told_to_end_closes_its_devices(
     assert run("run", lab, session) == 0
 
 
-def test_an_imported_session_has_the_same_frames(lab: Path, frame_hashes: Hashes) -> None:
-    taken, imported = lab.parent / "taken", lab.parent / "imported"
-    assert run("run", lab, taken) == 0
-    rows = (taken / "frames.csv").read_text().replace(",accepted", ",")
-    (taken / "list.csv").write_text(rows)
-    assert run("import", taken / "list.csv", lab.parent / "chart.json", imported) == 0
-    assert frame_hashes(imported) == frame_hashes(taken)
+def test_an_imported_session_has_the_same_frames(lab: Path, session: Path, frame_hashes: Hashes) -> None:
+    imported = lab.parent / "imported"
+    rows = (session / "frames.csv").read_text().replace(",accepted", ",")
+    (session / "list.csv").write_text(rows)
+    assert run("import", session / "list.csv", lab.parent / "chart.json", imported) == 0
+    assert frame_hashes(imported) == frame_hashes(session)
 
 
-def test_an_import_of_a_damaged_file_leaves_nothing(lab: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    taken, imported = lab.parent / "taken", lab.parent / "imported"
-    assert run("run", lab, taken) == 0
-    victim = next((taken / "frames").glob("*light_002*"))
+def test_an_import_of_a_damaged_file_leaves_nothing(
+    lab: Path, session: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    imported = lab.parent / "imported"
+    victim = next((session / "frames").glob("*light_002*"))
     victim.write_bytes(victim.read_bytes()[:-10])
-    assert run("import", taken / "frames.csv", lab.parent / "chart.json", imported) == 2
+    assert run("import", session / "frames.csv", lab.parent / "chart.json", imported) == 2
     assert victim.name in capsys.readouterr().err
     assert not imported.exists()
 
@@ -203,15 +212,13 @@ def test_an_import_of_a_damaged_file_leaves_nothing(lab: Path, capsys: pytest.Ca
     ],
 )
 def test_a_session_is_not_continued_with_other_settings(
-    lab: Path, capsys: pytest.CaptureFixture[str], change: str, expected: str
+    lab: Path, session: Path, capsys: pytest.CaptureFixture[str], change: str, expected: str
 ) -> None:
-    folder = lab.parent / "session"
-    assert run("run", lab, folder) == 0
-    before = (folder / "frames.csv").read_bytes()
+    before = (session / "frames.csv").read_bytes()
     lab.write_text(lab.read_text() + change)
-    assert run("run", lab, folder) == 2
+    assert run("run", lab, session) == 2
     assert expected in capsys.readouterr().err
-    assert (folder / "frames.csv").read_bytes() == before
+    assert (session / "frames.csv").read_bytes() == before
 
 
 def test_a_foreign_folder_is_left_alone(lab: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -239,19 +246,24 @@ def test_overexposed_frames_are_refused_and_said(lab: Path, capsys: pytest.Captu
 def test_two_programs_do_not_take_the_same_session(lab: Path) -> None:
     settings = load_lab(lab)
     folder = lab.parent / "session"
-    code = f"import sys\nfrom acquisition.cli import main\nsys.exit(main(['run', {str(lab)!r}, {str(folder)!r}]))"
-    answers: list[subprocess.CompletedProcess[str]] = []
+    ours, theirs = FORKS.Pipe()
 
     def meanwhile(done: int, total: int) -> None:
-        if done == 2 and not answers:
-            answers.append(subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False))
+        if done == 2 and not ours.poll():
+            program = FORKS.Process(target=run_to_pipe, args=(theirs, "run", str(lab), str(folder)))
+            program.start()
+            program.join()
 
     assert run_session(settings, folder, meanwhile).complete
-    assert answers[0].returncode == 2
-    assert "another program" in answers[0].stderr
+    code, said = ours.recv()
+    assert code == 2
+    assert "another program" in said
 
 
-def test_a_journal_that_another_program_holds_is_waited_for_as_long_as_the_settings_say(lab: Path) -> None:
+def test_a_journal_that_another_program_holds_is_waited_for_as_long_as_the_settings_say(
+    lab: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("experiment.session.journal_file.TRY_S", 0.01)
     lab.write_text(lab.read_text().replace("[sequence]", "[sequence]\npatience_s = 0"))
     folder = lab.parent / "session"
     others: list[sqlite3.Connection] = []
@@ -294,24 +306,23 @@ def test_a_full_disk_costs_nothing_taken(
     assert all(set(files) <= set(after[key]) for key, files in kept.items())
 
 
-def test_a_replay_with_another_exposure_is_told_the_recordings(lab: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert run("run", lab, lab.parent / "recorded") == 0
+def test_a_replay_with_another_exposure_is_told_the_recordings(
+    lab: Path, session: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     text = lab.read_text().replace('"simulated"', '"replay"')
-    lab.write_text(text + '[replay]\nsession = "recorded"\n[camera]\nshutter_s = 1.0\n')
+    lab.write_text(text + '[replay]\nsession = "session"\n[camera]\nshutter_s = 1.0\n')
     assert run("run", lab, lab.parent / "replayed") == 3
     assert "was taken with 0.5 s" in capsys.readouterr().err
 
 
-def test_a_series_longer_than_a_battery_lasts(lab: Path) -> None:
-    from acquisition.run.rig.opening import open_rig
-    from drivers.camera import capture
-    from experiment.chart.model import load_chart
-
+def test_a_series_longer_than_a_battery_lasts(lab: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     settings = load_lab(lab)
+    few = {name: replace(body, shots_per_charge=4) for name, body in EOS_BODIES.items()}
+    monkeypatch.setattr("acquisition.run.rig.simulated.EOS_BODIES", few)
     with open_rig(settings, load_chart(settings.chart)) as devices:
         devices.camera.configure(settings.camera.exposure)
-        frames = {capture(devices.camera, io.BytesIO()).name for _ in range(430)}
-    assert len(frames) == 430
+        frames = {capture(devices.camera, io.BytesIO()).name for _ in range(9)}
+    assert len(frames) == 9
 
 
 @pytest.mark.parametrize(("shutter_s", "code"), [(0.02, 0), (1.3, 4)])

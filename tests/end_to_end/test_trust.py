@@ -189,7 +189,7 @@ def test_a_chart_moved_by_a_cell_is_followed(lab: Lab, tmp_path: Path) -> None:
     assert wrong(errors) < 0.05
 
 
-@pytest.mark.parametrize(("left", "when"), [(0.05, later), (0.05, once), (0.7, once), (0.85, once)])
+@pytest.mark.parametrize(("left", "when"), [(0.05, later), (0.85, once)])
 def test_a_hand_in_the_light_is_refused(
     lab: Lab, tmp_path: Path, left: float, when: Callable[[SessionStep], bool]
 ) -> None:
@@ -222,7 +222,7 @@ def test_a_lamp_that_flickers_is_reported_and_harms_no_colour(lab: Lab, tmp_path
     assert result.verdict.outcome != "refuse"
 
 
-@pytest.mark.parametrize(("blur_px", "when"), [(3.0, later), (1.5, later), (1.15, once), (2.5, once)])
+@pytest.mark.parametrize(("blur_px", "when"), [(3.0, later), (1.5, later), (1.15, once)])
 def test_a_focus_that_is_lost_midway_is_refused(
     lab: Lab, tmp_path: Path, blur_px: float, when: Callable[[SessionStep], bool]
 ) -> None:

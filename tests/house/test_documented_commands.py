@@ -18,7 +18,7 @@ from typing import Any
 import pytest
 from typer.main import get_command
 
-from acquisition.run.planning.work import planned_steps
+from acquisition.run.plan import planned_steps
 from experiment.config import load_lab
 from experiment.lights import plan_illuminations
 from tests.house_commands import COMMANDS

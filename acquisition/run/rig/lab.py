@@ -1,25 +1,27 @@
-"""The real lab: every device that LAB.toml names, opened over its cable."""
+"""The real lab: every device that LAB.toml names, opened over its cable; and what there is to choose from."""
 
 from __future__ import annotations
 
 import uuid
+from collections.abc import Callable, Generator, Iterable
 from contextlib import ExitStack
+from dataclasses import dataclass
+from functools import partial
 
-from acquisition.run.asking import ask_all
-from acquisition.run.devices import Devices
+from acquisition.run.devices import Devices, ask_all
 from acquisition.run.shutter import require_whole_turns
 from drivers.camera import Camera
 from drivers.canon.camera import CanonEos
-from drivers.display.fullscreen import FullScreen
+from drivers.display.fullscreen import FullScreen, identify_displays, list_displays
 from drivers.display.jvc import PORT as JVC_PORT
 from drivers.display.jvc import JvcFlatField
 from drivers.display.lightcrafter import LightCrafter, find_lightcrafter
 from drivers.gphoto2_camera import Gphoto2Camera
-from drivers.links.link import UsbPipes
 from drivers.links.network import TcpLink
-from drivers.links.serial import SerialLink
-from drivers.links.usb import open_usb
+from drivers.links.serial import SerialLink, list_serial_ports
+from drivers.links.usb import list_devices, open_usb
 from drivers.pjlink.projector import PjLinkProjector
+from drivers.pjlink.search import search
 from drivers.pjlink.wire import PORT as PJLINK_PORT
 from drivers.presenter import Presenter
 from drivers.projector import Projector
@@ -31,7 +33,10 @@ from experiment.config import CameraCable, LabSettings, LightSource, ProjectorCa
 from experiment.session.folder import Session
 from experiment.session.records import last_moment
 from foundation.clock import Clock, SteadyClock, SystemClock
-from foundation.errors import ConfigurationError
+from foundation.errors import ConfigurationError, CropError
+
+__all__ = ["Attached", "attached_devices", "identify_displays"]
+
 
 CONNECT_S = 5.0
 """How long a projector may take to accept a connection; on a lab's network it takes milliseconds."""
@@ -81,7 +86,8 @@ def session_clock(session: Session | None) -> SteadyClock:
 def _lab_camera(cable: CameraCable, clock: Clock, file: str) -> Camera:
     match cable.connection:
         case "usb":
-            return CanonEos(lambda: UsbTransport(_usb_pipes(cable), clock), clock)
+            usb = partial(open_usb, vendor=VENDOR_CANON_USB, serial=cable.serial, port=cable.usb_port)
+            return CanonEos(lambda: UsbTransport(usb(), clock), clock)
         case "ptpip":
             host = _required(cable.host, "lab.camera.host", "the camera's address", file)
             # A body remembers the computers it was paired with by this number.
@@ -94,10 +100,6 @@ def _lab_camera(cable: CameraCable, clock: Clock, file: str) -> Camera:
             )
         case "gphoto2":
             return Gphoto2Camera(cable.gphoto2_port, cable.gphoto2_model, clock)
-
-
-def _usb_pipes(cable: CameraCable) -> UsbPipes:
-    return open_usb(vendor=VENDOR_CANON_USB, serial=cable.serial, port=cable.usb_port)
 
 
 def _lab_projector(cable: ProjectorCable, clock: Clock, file: str) -> Projector | None:
@@ -115,8 +117,9 @@ def _lab_projector(cable: ProjectorCable, clock: Clock, file: str) -> Projector 
         return spoken.network(lambda: TcpLink.connect(host, port, CONNECT_S), label=label, clock=clock)
     if cable.device is None and cable.host is not None:
         raise ConfigurationError(
-            f"{file}: lab.projector.host: {spoken.maker} projectors are reached over a serial port only; "
-            "name lab.projector.device, acquire devices lists what is there"
+            f"lab.projector.host: {spoken.maker} projectors are reached over a serial port only",
+            about=file,
+            remedy="name lab.projector.device, acquire devices lists what is there",
         )
     device = _required(cable.device, "lab.projector.device", "the serial port", file)
     return spoken.projector(
@@ -141,5 +144,33 @@ def _lab_presenter(light: LightSource, clock: Clock, file: str) -> Presenter:
 
 def _required(value: str | None, key: str, what: str, file: str) -> str:
     if value is None:
-        raise ConfigurationError(f"{file}: {key} is missing; name {what}, acquire devices lists what is there")
+        remedy = f"name {what}, acquire devices lists what is there"
+        raise ConfigurationError(f"{key} is missing", about=file, remedy=remedy, value=key)
     return value
+
+
+@dataclass(frozen=True)
+class Attached:
+    """What of one kind is attached or reachable: `kind` in the plural, what was found, or why it could not be asked."""
+
+    kind: str
+    found: tuple[str, ...]
+    trouble: str = ""
+
+
+def attached_devices(search_s: float) -> Generator[Attached]:
+    """Yield what is attached and reachable, kind by kind; a kind that cannot be asked says why."""
+    yield _attached("cameras on USB", lambda: [str(device) for device in list_devices()])
+    yield _attached("serial ports", list_serial_ports)
+    yield _attached("displays", lambda: [str(display) for display in list_displays()])
+    if search_s > 0:
+        yield _attached(
+            "projectors by PJLink", lambda: [f"{found.host}, MAC {found.mac}" for found in search(search_s)]
+        )
+
+
+def _attached(kind: str, ask: Callable[[], Iterable[str]]) -> Attached:
+    try:
+        return Attached(kind, tuple(ask()))
+    except CropError as error:
+        return Attached(kind, (), str(error))

@@ -87,7 +87,8 @@ def simulated_body(settings: LabSettings) -> Body:
     name, changes = settings.simulated.body, settings.simulated.camera or {}
     if name not in BODIES and name not in known_sensitivities() and not Path(name).is_file():
         known = ", ".join([*sorted(BODIES), *known_sensitivities()])
-        raise ConfigurationError(f"{settings.file}: simulated.body = {name!r}: known are {known}")
+        said = f"simulated.body = {name!r}: known are {known}"
+        raise ConfigurationError(said, about=settings.file, value=name)
     return find_body(name, changes, settings.file, "simulated.camera")
 
 

@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from acquisition.judge.checks.lights import crept
 from acquisition.judge.judge import LiveJudge
-from acquisition.judge.known.knowledge import Leaning
+from acquisition.judge.light_checks import crept
+from acquisition.judge.state import Leaning
 from drivers.camera import ExposureSettings
 from drivers.presenter import BLACK, WHITE, Colour
 from experiment.session.plan import SessionStep, link_steps
@@ -284,7 +284,7 @@ def test_a_session_whose_measurements_are_lost_goes_on(taught: Bench, tmp_path: 
         lab.judge.recall(step, b"of another version", True)
     said = [lab.take(step).reason for step in (*link_steps(500), lab.light(*SKY), DARK_STEP, lab.light(*SKY))]
     assert said == [""] * 9
-    assert lab.judge.knowledge.modelled
+    assert lab.judge.state.modelled
 
 
 def test_a_run_taken_up_again_knows_what_was_seen(taught: Bench, tmp_path: Path) -> None:
@@ -298,7 +298,7 @@ def test_a_run_taken_up_again_knows_what_was_seen(taught: Bench, tmp_path: Path)
     resumed = replace(first, judge=LiveJudge(first.settings, first.chart, first.lights))
     for step, measurement in kept:
         resumed.judge.recall(step, measurement, True)
-    assert resumed.judge.knowledge.modelled
+    assert resumed.judge.state.modelled
     # A day later the lamp is 3 % weaker: drift, no other light.
     weaker = LampStep(percent=-3)
     ties = [resumed.take(step, weaker) for step in link_steps(500)]

@@ -59,22 +59,26 @@ def test_listed_frames_make_a_session(folder: Path) -> None:
 
 def test_two_lights_of_one_file_leave_nothing(folder: Path) -> None:
     (folder / "2.cr2").write_bytes((folder / "0.cr2").read_bytes())
-    with pytest.raises(FormatError, match=r"list\.csv: lights 0 and 2 have the same raw file, 0\.cr2 and 2\.cr2; list"):
+    with pytest.raises(FormatError, match=r"0\.cr2 and 2\.cr2") as caught:
         import_rows(folder, [light(0), light(1), light(2)])
+    assert (caught.value.about, caught.value.value) == (folder / "list.csv", (0, 2))
     assert not (folder / "session").exists()
 
 
 @pytest.mark.parametrize("exposure_s", ["nan", "inf", "-5"])
 def test_an_exposure_that_is_no_time_is_refused(folder: Path, exposure_s: str) -> None:
-    with pytest.raises(FormatError, match=rf"list\.csv, line 3: exposure_s is {exposure_s}, expected seconds"):
+    with pytest.raises(FormatError, match="exposure_s") as caught:
         import_rows(folder, [light(0), light(1, exposure_s=exposure_s)])
+    assert str(caught.value.about).endswith("list.csv, line 3")
+    assert str(caught.value.value) == str(float(exposure_s))
     assert not (folder / "session").exists()
 
 
 @pytest.mark.parametrize("verdict", ["ok", "Accepted", "rubbish", "refused:dark"])
 def test_a_verdict_that_is_none_is_refused(folder: Path, verdict: str) -> None:
-    with pytest.raises(FormatError, match=f"line 2: verdict is '{verdict}', expected accepted, refused: REASON, or"):
+    with pytest.raises(FormatError, match="line 2: verdict") as caught:
         import_rows(folder, [light(0, verdict=verdict)])
+    assert caught.value.value == verdict
 
 
 def test_a_refusal_without_a_reason_is_one(folder: Path) -> None:

@@ -1,4 +1,7 @@
-"""The lamp in simulated time: lit, warm, watched; and what a projector in trouble makes the run say."""
+"""The lamp in simulated time: lit, warm, watched; and what a projector in trouble makes the run say.
+
+On every end the screen goes black and the lamp's fate is decided and said; nothing of it hides why a run ended.
+"""
 
 from __future__ import annotations
 
@@ -9,20 +12,138 @@ from typing import cast
 
 import pytest
 
-from acquisition.run.lamp import POWER_LIMIT_S, RELIGHT_S, HealthWatch, await_health, make_ready, require_healthy
-from acquisition.run.patience import PAUSE_S, Patience
+from acquisition.run.devices import Devices
+from acquisition.run.lamp import (
+    OBEYS_S,
+    POWER_LIMIT_S,
+    RELIGHT_S,
+    HealthWatch,
+    RunEnd,
+    await_health,
+    health_fault,
+    lamp_fate,
+    leave_lab,
+    make_ready,
+)
+from acquisition.run.retry import PAUSE_S, RetryPolicy
 from drivers.links.link import Link
 from drivers.pjlink.projector import PjLinkProjector
 from drivers.pjlink.wire import NoResolution
+from drivers.presenter import BLACK, Colour
 from drivers.projector import Fault, Lamp, Power, Projector, Severity
 from drivers.serial_projectors.optoma import OptomaProjector
 from experiment.config import SequenceSettings
-from foundation.errors import DeviceFault, LinkClosed, LinkTimeout
+from foundation.errors import DeviceError, DeviceFault, LinkClosed, LinkTimeout, StorageError
 from sim.buses.serial import SerialPeerLink
 from sim.clock import SimulatedClock
 from sim.projectors.pjlink import PjLinkPeer, memory_link
 from sim.projectors.projector import SimulatedProjector
 from sim.projectors.serial import OptomaPeer
+from tests.acquisition.run.scripted import Screen, ScriptedCamera
+
+ON, OFF = Power.ON, Power.COOLING
+
+
+@pytest.mark.parametrize(
+    ("end", "settings", "power"),
+    [
+        (RunEnd.COMPLETE, SequenceSettings(), OFF),
+        (RunEnd.COMPLETE, SequenceSettings(switch_off=False), ON),
+        (RunEnd.COMPLETE, SequenceSettings(lamp_if_unfinished="on"), OFF),
+        (RunEnd.UNFINISHED, SequenceSettings(), OFF),
+        (RunEnd.UNFINISHED, SequenceSettings(switch_off=False), OFF),
+        (RunEnd.UNFINISHED, SequenceSettings(lamp_if_unfinished="on"), ON),
+        (RunEnd.INTERRUPTED, SequenceSettings(), ON),
+        (RunEnd.INTERRUPTED, SequenceSettings(switch_off=False, lamp_if_unfinished="on"), ON),
+    ],
+)
+def test_the_lamp_s_fate_is_decided_and_said(end: RunEnd, settings: SequenceSettings, power: Power) -> None:
+    clock = SimulatedClock()
+    projector, screen = SimulatedProjector(clock, power=ON), Screen()
+    said: list[tuple[str, str]] = []
+    devices = Devices(ScriptedCamera(screen, clock, {}), screen, projector, clock)
+    leave_lab(devices, end, settings, lambda what, sentence: said.append((what, sentence)))
+    assert projector.power() is power
+    assert screen.shown == [BLACK]
+    ((what, sentence),) = said
+    assert what == "lamp"
+    assert ("was switched off" in sentence) == (power is OFF)
+    assert ("burns on" in sentence) == (power is ON and end is not RunEnd.INTERRUPTED)
+    assert ("left as it is" in sentence) == (end is RunEnd.INTERRUPTED)
+
+
+@pytest.mark.parametrize(("lost", "said"), [(2, "it was switched off"), (3, "it could not be switched off: no answer")])
+def test_an_answer_that_is_lost_does_not_let_the_lamp_burn(lost: int, said: str) -> None:
+    class Deaf(SimulatedProjector):
+        asked = 0
+
+        def power(self) -> Power:
+            type(self).asked += 1
+            if type(self).asked <= lost:
+                raise DeviceError("no answer")
+            return super().power()
+
+    clock = SimulatedClock()
+    sentence = lamp_fate(Deaf(clock, power=ON), RunEnd.COMPLETE, SequenceSettings(), clock)
+    assert sentence.startswith(said)
+
+
+def test_a_lamp_that_is_out_is_left_alone() -> None:
+    class Untouched(SimulatedProjector):
+        def switch_off(self) -> None:
+            raise AssertionError
+
+    clock = SimulatedClock()
+    said = lamp_fate(Untouched(clock), RunEnd.COMPLETE, SequenceSettings(), clock)
+    assert said == "it is out already: the projector is in standby"
+
+
+def test_a_lamp_that_does_not_obey_is_said_to_burn() -> None:
+    class Deaf(SimulatedProjector):
+        def switch_off(self) -> None: ...
+
+    clock = SimulatedClock()
+    said = lamp_fate(Deaf(clock, power=ON), RunEnd.COMPLETE, SequenceSettings(), clock)
+    assert "burns on though the projector was told" in said
+    assert "by hand" in said
+    assert clock.monotonic() <= OBEYS_S + 1
+
+
+@pytest.mark.parametrize("end", RunEnd)
+def test_a_projector_out_of_reach_hides_nothing(end: RunEnd) -> None:
+    class Gone(SimulatedProjector):
+        def power(self) -> Power:
+            raise LinkClosed("nothing listens at 192.168.1.30:4352")
+
+    clock = SimulatedClock()
+    said = lamp_fate(Gone(clock, power=ON), end, SequenceSettings(), clock)
+    assert ("nothing listens" in said) == (end is not RunEnd.INTERRUPTED)
+    assert "by hand" in said
+    assert lamp_fate(None, end, SequenceSettings(), clock).endswith("by hand")
+
+
+def test_a_screen_that_fails_and_a_full_disk_raise_nothing() -> None:
+    class Broken(Screen):
+        def show(self, colour: Colour) -> None:
+            raise DeviceError("the display is gone")
+
+    clock, screen = SimulatedClock(), Broken()
+    projector = SimulatedProjector(clock, power=ON)
+    said: list[str] = []
+
+    def report(what: str, sentence: str) -> None:
+        said.append(f"{what}: {sentence}")
+        raise StorageError("the disk is full")
+
+    leave_lab(
+        Devices(ScriptedCamera(screen, clock, {}), screen, projector, clock),
+        RunEnd.COMPLETE,
+        SequenceSettings(),
+        report,
+    )
+    assert said == ["screen: it could not be made black: the display is gone", "lamp: it was switched off"]
+    assert projector.power() is OFF
+
 
 SEQUENCE = SequenceSettings(warm_up_s=600)
 
@@ -72,14 +193,14 @@ class Room:
             self.cable.close()
 
     @property
-    def patience(self) -> Patience:
+    def retry(self) -> RetryPolicy:
         def report(what: str, sentence: str) -> None:
             self.said.append((self.clock.monotonic(), what, sentence))
 
         def beat(state: str, sentence: str, within_s: float) -> None:
             self.beats.append((self.clock.monotonic(), sentence))
 
-        return Patience(self.clock, self.limit_s, report, beat=beat)
+        return RetryPolicy(self.clock, self.limit_s, report, on_wait=beat)
 
     @property
     def words(self) -> list[str]:
@@ -89,8 +210,8 @@ class Room:
         self.clock.due.append((seconds, action))
 
 
-def no_patience(clock: SimulatedClock) -> Patience:
-    return Patience(clock, 0)
+def no_time(clock: SimulatedClock) -> RetryPolicy:
+    return RetryPolicy(clock, 0)
 
 
 @pytest.mark.parametrize(("fault", "said"), [("frozen", "frozen"), ("unplugged", "no signal")])
@@ -99,26 +220,25 @@ def test_a_picture_that_does_not_follow_is_noticed(fault: str, said: str) -> Non
     beamer = SimulatedProjector(clock, power=Power.ON)
     peer = PjLinkPeer(beamer)
     projector = PjLinkProjector(lambda: memory_link(peer), clock=clock)
-    require_healthy(projector)
+    assert health_fault(projector) is None
     if fault == "frozen":
         beamer.set_frozen(True)
     else:
         beamer.signal = NoResolution.NO_SIGNAL
-    with pytest.raises(DeviceFault, match=said):
-        require_healthy(projector)
+    assert said in str(health_fault(projector))
 
 
 def test_a_cold_lamp_is_lit_and_given_its_minutes() -> None:
     clock = SimulatedClock()
     projector = SimulatedProjector(clock)
-    make_ready(projector, SEQUENCE, no_patience(clock))
+    make_ready(projector, SEQUENCE, no_time(clock))
     assert projector.power() is Power.ON
     assert clock.monotonic() >= 600 + projector.traits.warm_up_s
 
 
 def test_a_warm_lamp_is_not_waited_for() -> None:
     clock = SimulatedClock()
-    make_ready(SimulatedProjector(clock, power=Power.ON), SEQUENCE, no_patience(clock))
+    make_ready(SimulatedProjector(clock, power=Power.ON), SEQUENCE, no_time(clock))
     assert clock.monotonic() == 0
 
 
@@ -129,7 +249,7 @@ def test_a_warm_lamp_is_not_waited_for_though_the_answer_takes_its_time() -> Non
             return super().power()
 
     clock = SimulatedClock()
-    make_ready(Slow(clock, power=Power.ON), SEQUENCE, no_patience(clock))
+    make_ready(Slow(clock, power=Power.ON), SEQUENCE, no_time(clock))
     assert clock.monotonic() < 1
 
 
@@ -142,7 +262,7 @@ def test_a_projector_deaf_while_its_lamp_is_struck_is_waited_for() -> None:
 
     clock = SimulatedClock()
     projector = Deaf(clock)
-    make_ready(projector, SEQUENCE, no_patience(clock))
+    make_ready(projector, SEQUENCE, no_time(clock))
     assert clock.monotonic() >= 600 + projector.traits.warm_up_s
 
 
@@ -153,7 +273,7 @@ def test_a_projector_that_cannot_tell_its_mute_is_told() -> None:
     make_ready(
         OptomaProjector(lambda: SerialPeerLink(OptomaPeer(device, answers_mute=False)), clock=clock),
         SequenceSettings(),
-        no_patience(clock),
+        no_time(clock),
     )
     assert not device.muted()
 
@@ -165,13 +285,13 @@ def test_a_lamp_that_never_lights_is_given_up() -> None:
 
     clock = SimulatedClock()
     with pytest.raises(DeviceFault, match="standby"):
-        make_ready(Dead(clock), SequenceSettings(), no_patience(clock))
+        make_ready(Dead(clock), SequenceSettings(), no_time(clock))
     assert clock.monotonic() <= POWER_LIMIT_S + 2
 
 
 def test_the_minutes_of_a_warm_up_are_counted_down() -> None:
     room = Room(Power.STANDBY)
-    make_ready(room.projector, SEQUENCE, room.patience)
+    make_ready(room.projector, SEQUENCE, room.retry)
     assert room.words == ["warming up"]
     assert room.said[0][2] == "the lamp was just lit; waiting 10 min 00 s until its colour is steady"
     assert any("the lamp is being lit" in sentence for _, sentence in room.beats)
@@ -192,7 +312,7 @@ def test_a_lamp_that_goes_out_while_it_warms_up_gets_all_its_minutes_again() -> 
 
     room.at(400, room.pull)
     room.at(lit_again, relit)
-    make_ready(room.projector, SEQUENCE, room.patience)
+    make_ready(room.projector, SEQUENCE, room.retry)
     assert room.words == ["warming up", "retry", "paused", "resumed", "warming up"]
     assert room.clock.monotonic() >= lit_again + SEQUENCE.warm_up_s
 
@@ -201,7 +321,7 @@ def test_a_picture_muted_while_the_lamp_warms_up_costs_no_minutes() -> None:
     room = Room(Power.STANDBY)
     room.at(200, lambda: room.device.set_muted(True))
     room.at(300, lambda: room.device.set_muted(False))
-    make_ready(room.projector, SEQUENCE, room.patience)
+    make_ready(room.projector, SEQUENCE, room.retry)
     assert room.words == ["warming up", "retry", "paused", "resumed"]
     assert room.clock.monotonic() <= 600 + room.device.traits.warm_up_s + 2 * PAUSE_S
 
@@ -217,7 +337,7 @@ def test_a_projector_that_came_back_in_standby_is_said_to_be_so() -> None:
     room.at(60, power_back)
     room.at(200, lambda: room.device.switch_on())
     room.clock.sleep(0)
-    await_health(room.projector, SEQUENCE, room.patience)
+    await_health(room.projector, SEQUENCE, room.retry)
     assert room.words == ["retry", "paused", "still paused", "still paused", "warming up", "resumed"]
     assert "nothing listens" in room.said[1][2]
     assert "standby" in room.said[2][2]
@@ -235,7 +355,7 @@ def test_who_was_out_of_reach_for_long_may_have_lost_its_power(away_s: float, wa
     room = Room()
     room.pull()
     room.at(away_s, lambda: room.pull(False))
-    await_health(room.projector, SEQUENCE, room.patience)
+    await_health(room.projector, SEQUENCE, room.retry)
     assert ("warming up" in room.words) == warms
 
 
@@ -257,7 +377,7 @@ def test_a_lamp_reported_dark_while_power_is_on_is_no_warm_lamp() -> None:
     projector = Dark(clock, power=Power.ON)
     clock.due.append((30.0, replaced))
     said: list[str] = []
-    await_health(projector, SEQUENCE, Patience(clock, 600, lambda what, sentence: said.append(what)))
+    await_health(projector, SEQUENCE, RetryPolicy(clock, 600, lambda what, sentence: said.append(what)))
     assert said == ["retry", "paused", "warming up", "resumed"]
 
 
@@ -265,7 +385,7 @@ def test_a_projector_unreachable_at_the_start_is_waited_for() -> None:
     room = Room()
     room.pull()
     room.at(100, lambda: room.pull(False))
-    make_ready(room.projector, SEQUENCE, room.patience)
+    make_ready(room.projector, SEQUENCE, room.retry)
     assert room.words == ["retry", "paused", "resumed"]
 
 
@@ -273,7 +393,7 @@ def test_a_picture_muted_for_good_ends_the_run_with_its_cause() -> None:
     room = Room()
     room.device.set_muted(True)
     with pytest.raises(DeviceFault, match=r"muted; .*; the run waited 10 min 00 s"):
-        await_health(room.projector, SEQUENCE, room.patience)
+        await_health(room.projector, SEQUENCE, room.retry)
     assert room.clock.monotonic() == pytest.approx(600)
 
 

@@ -10,6 +10,7 @@ import shlex
 import socket
 import sys
 import threading
+import time
 from collections.abc import Generator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -190,8 +191,9 @@ class TestCommand:
         assert "within 0.5 s" in warning
         for number in numbers.read_text().split():
             # It is gone, or what is left of it waits to be read by init.
-            stat = Path(f"/proc/{number}/stat")
-            assert not stat.exists() or stat.read_text().rpartition(")")[2].split()[0] in "ZX"
+            stat, until = Path(f"/proc/{number}/stat"), time.monotonic() + 10
+            while stat.exists() and stat.read_text().rpartition(")")[2].split()[0] not in "ZX":
+                assert time.monotonic() < until
 
 
 def test_telling_takes_no_time_and_loses_what_nobody_takes() -> None:

@@ -11,9 +11,9 @@ from typing import Any
 
 import pytest
 
-from acquisition.run.patience import PAUSE_S
+from acquisition.run.pipeline import Taken
+from acquisition.run.retry import PAUSE_S
 from acquisition.run.sequencer import RunOutcome, take_session
-from acquisition.run.taking.pipeline import Taken
 from drivers.presenter import BLACK, WHITE, Colour
 from drivers.projector import Power
 from experiment.lights import Illumination
@@ -444,6 +444,7 @@ class TestEnding:
         assert said == ["ending after this frame; press Ctrl-C again to end at once"]
         assert lab.verdicts() == ["accepted"] * 3, "what was exposed is downloaded, saved, judged, in the journal"
         assert (folder / "frames.csv").read_text().count("accepted") == 3
+        assert lab.projector.power() is Power.ON, "somebody is there, and may go on at once"
         assert run(lab).complete
         assert lab.verdicts() == ["accepted"] * 6
 

@@ -10,9 +10,9 @@ import pytest
 
 from acquisition.run.devices import Devices
 from acquisition.run.lamp import RELIGHT_S
-from acquisition.run.patience import PAUSE_S
+from acquisition.run.pipeline import Taken
+from acquisition.run.retry import PAUSE_S
 from acquisition.run.sequencer import take_session
-from acquisition.run.taking.pipeline import Taken
 from drivers.links.link import Link
 from drivers.pjlink.projector import PjLinkProjector
 from drivers.projector import Power

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from acquisition.run.taking.pipeline import Taken
+from acquisition.run.pipeline import Taken
 from acquisition.run.terminal import Terminal, TimeLeft, verdict_line
 from drivers.presenter import Colour
 from experiment.session.plan import SessionStep

@@ -13,9 +13,9 @@ import pytest
 
 from acquisition.judge.exposure import ExposureJudge
 from acquisition.run.devices import Devices
+from acquisition.run.queue import StepQueue
 from acquisition.run.rig.opening import open_rig
 from acquisition.run.sequencer import take_session
-from acquisition.run.taking.agenda import Agenda
 from drivers.camera import Camera, CapturedFrame
 from drivers.presenter import BLACK, Colour, Presenter
 from experiment.chart.layout import design_chart
@@ -180,9 +180,9 @@ def watched(session: Session, watch: Watch, patch: pytest.MonkeyPatch) -> Genera
     """Yield the simulated lab's devices, and let `watch` follow what session and sequencer do."""
     journal = session.journal
     begin, commit, fail, void = journal.begin, session.commit, journal.fail, journal.void
-    following = Agenda.next
+    following = StepQueue.next
 
-    def wanting(agenda: Agenda) -> SessionStep | None:
+    def wanting(agenda: StepQueue) -> SessionStep | None:
         step = following(agenda)
         watch.wanted = -1 if step is None else step.number
         return step
@@ -208,7 +208,7 @@ def watched(session: Session, watch: Watch, patch: pytest.MonkeyPatch) -> Genera
             watch.enter(watch.attempts[attempt], StepState.VOIDED)
 
     with patch.context() as patched, open_rig(SETTINGS, session.chart, session) as devices:
-        patched.setattr(Agenda, "next", wanting)
+        patched.setattr(StepQueue, "next", wanting)
         patched.setattr(journal, "begin", beginning)
         patched.setattr(session, "commit", committing)
         patched.setattr(journal, "fail", failing)

@@ -1,20 +1,19 @@
-"""One patience for camera, screen, projector and disk: what fails is waited for until it is mended, and said.
+"""How camera, screen, projector and disk are waited for: what fails is tried again until it works or the time is over.
 
-How the sequencer uses it::
+How it is used::
 
-    patience = Patience(clock, settings.sequence.patience_s, report, idle, beat)
-    released_at = patience.attempt(camera.expose, "the camera", idle=False)
-    patience.attempt(lambda: presenter.show(colour), "the screen")
-    patience.attempt(lambda: journal.begin(step, file, clock.now()), "the disk")
+    retry = RetryPolicy(clock, settings.sequence.patience_s, report, idle, on_wait)
+    retry.attempt(lambda: presenter.show(colour), "the screen")
+    retry.attempt(lambda: journal.begin(step, file, clock.now()), "the disk")
 
 or, where a try is more than one call::
 
-    pause = patience.pause("the camera", idle=False)
+    pause = retry.pause("the camera", idle=False)
     while True:
         try:
             frame = …
         except DeviceError as fault:
-            pause.wait(fault)  # returns after some seconds for the next try; raises when patience ends
+            pause.wait(fault)  # returns after some seconds for the next try; raises when the time is over
         else:
             pause.over()  # says that the run goes on, if it had said that it paused
             break
@@ -24,10 +23,11 @@ Rules that hold inside:
 - The first failure is tried again after a second (`retry`), so that what passes at once pauses nothing. What lasts
   pauses the run (`paused`) with the cause that holds *now*; another cause is told as soon as it is there (`still
   paused`); with other digits it is no other. `resumed` ends it.
-- Every few seconds of a pause come a beat, with cause and countdown, and `idle`, for the devices that are not at fault.
-- When patience ends, the error is of the first cause's class and names it first; what held at last is added.
+- Every few seconds of a pause come `on_wait`, with cause and countdown, and `idle`, for devices that are not at fault.
+- When the time is over, the error is of the first cause's class and names it first; what held at last is added.
 - Nothing that is told may end the run: a full disk, which cannot take the note of a pause, gets it when there is space.
-- What is no `CropError` passes through at once: Ctrl-C ends a pause; `beat` and `idle` may raise `KeyboardInterrupt`.
+- What is no `CropError` passes through at once: Ctrl-C ends a pause; `on_wait` and `idle` may raise
+  `KeyboardInterrupt`.
 """
 
 from __future__ import annotations
@@ -67,7 +67,7 @@ class Report(Protocol):
         ...
 
 
-class Beat(Protocol):
+class WaitCallback(Protocol):
     """Where signs of life of a wait go: the journal's heartbeat, and a line on the terminal."""
 
     def __call__(self, state: str, sentence: str, within_s: float, /) -> None:
@@ -80,11 +80,12 @@ def is_curable(fault: CropError) -> bool:
     return isinstance(fault, DeviceError | StorageError) and not isinstance(fault, HeldJournalError)
 
 
-class Patience:
+class RetryPolicy:
     """How long, and how, a run waits for what fails.
 
     `idle`: keeps the other devices awake; called every few seconds. Its `DeviceError` is left to the device's own next
-    use. `beat`: told every few seconds of a wait, with the time left in the sentence.
+    use. `on_wait`: told every few seconds of a wait, with the time left in the sentence.
+    `breakable`: a block in which somebody's request ends the run at once, put around every wait.
     """
 
     def __init__(
@@ -93,13 +94,13 @@ class Patience:
         limit_s: float,
         report: Report = lambda what, sentence: None,
         idle: Callable[[], None] = lambda: None,
-        beat: Beat = lambda state, sentence, within_s: None,
+        on_wait: WaitCallback = lambda state, sentence, within_s: None,
         breakable: Callable[[], AbstractContextManager[None]] = nullcontext,
     ) -> None:
         self.clock = clock
         self.limit_s = limit_s
         self.breakable = breakable
-        self._tell, self._idle, self._beat = report, idle, beat
+        self._tell, self._idle, self._on_wait = report, idle, on_wait
         self._untold: list[tuple[str, str]] = []
 
     def attempt(
@@ -110,7 +111,7 @@ class Patience:
         curable: Callable[[CropError], bool] = is_curable,
         idle: bool = True,
     ) -> _Result:
-        """Return what `action` returns, tried until it succeeds or patience ends."""
+        """Return what `action` returns, tried until it succeeds or the time is over."""
         pause = self.pause(name, idle=idle)
         while True:
             try:
@@ -135,98 +136,87 @@ class Patience:
                 self._tell(*self._untold[0])
                 self._untold.pop(0)
 
-    def wait(self, seconds: float, state: str, sentence: Callable[[float], str], *, idle: bool = True) -> None:
-        """Let `seconds` pass, with a beat every few of them.
-
-        `sentence`: given the seconds left, returns what the beat says.
-        """
+    def wait(self, seconds: float, state: str, sentence: Callable[[], str], *, idle: bool = True) -> None:
+        """Let `seconds` pass; what `sentence` returns is told every few of them."""
         until = self.clock.monotonic() + seconds
         while (left := until - self.clock.monotonic()) >= _INSTANT_S:
-            self.beat(state, sentence(left), 2 * PAUSE_S + TRY_S * idle)
+            self.sign_of_life(state, sentence(), 2 * PAUSE_S + TRY_S * idle)
             self.clock.sleep(min(left, PAUSE_S))
             if idle:
                 with suppress(DeviceError):
                     self._idle()
 
-    def beat(self, state: str, sentence: str, within_s: float) -> None:
-        """Give a sign of life; a disk that cannot take it does not matter."""
+    def sign_of_life(self, state: str, sentence: str, within_s: float) -> None:
+        """Tell what is waited for; a disk that cannot take it does not matter."""
         with suppress(StorageError):
-            self._beat(state, sentence, within_s)
+            self._on_wait(state, sentence, within_s)
 
 
 class Pause:
-    """The wait for one thing that fails; given by `Patience.pause`."""
+    """The wait for one thing that fails; given by `RetryPolicy.pause`."""
 
-    def __init__(self, patience: Patience, name: str, idle: bool) -> None:
-        self._patience = patience
+    def __init__(self, policy: RetryPolicy, name: str, idle: bool) -> None:
+        self._policy = policy
         self._name = name
         self._idle = idle
-        self._begun_trying = patience.clock.monotonic()
+        self._begun_trying = policy.clock.monotonic()
         self._first: CropError | None = None
         self._failed_at = self._begun_trying
         self._told = ""
 
-    @property
-    def first(self) -> CropError | None:
-        """The first fault; None where nothing has failed."""
-        return self._first
-
-    @property
-    def lasted_s(self) -> float:
-        """Seconds since the first failure; 0 where nothing has failed."""
-        return 0.0 if self._first is None else self._patience.clock.monotonic() - self._failed_at
-
     def wait(self, fault: CropError) -> None:
         """Say what holds now, and return when it is time for the next try."""
-        with self._patience.breakable():
+        with self._policy.breakable():
             self._wait(fault)
 
     def _wait(self, fault: CropError) -> None:
-        patience = self._patience
-        now = patience.clock.monotonic()
+        policy = self._policy
+        now = policy.clock.monotonic()
+        first = self._first or fault
         again = self._first is not None
-        if self._first is None:
+        if not again:
             self._first, self._failed_at = fault, now
-        left = patience.limit_s - (now - self._failed_at)
+        left = policy.limit_s - (now - self._failed_at)
         if left < _INSTANT_S:
-            raise self._ended(fault) from fault
+            raise self._ended(first, fault) from fault
         if not again and now - self._begun_trying < SLOW_S:
-            patience.report("retry", f"{_named(self._name, fault)}")
-            patience.clock.sleep(min(RETRY_S, left))
+            policy.report("retry", _named(self._name, fault))
+            policy.clock.sleep(min(RETRY_S, left))
             return
         kind = _kind(fault)
         if kind != self._told:
-            how_long = "for as long as it takes" if math.isinf(patience.limit_s) else f"up to {duration_text(left)}"
-            patience.report(
+            how_long = "for as long as it takes" if math.isinf(policy.limit_s) else f"up to {duration_text(left)}"
+            policy.report(
                 "still paused" if self._told else "paused",
                 f"{_named(self._name, fault)} (the run waits {how_long}, and goes on by itself)",
             )
             self._told = kind
-        patience.wait(min(PAUSE_S, left), "paused", lambda rest: self._countdown(fault), idle=self._idle)
-        patience.beat("paused", self._countdown(fault), TRY_S)
+        policy.wait(min(PAUSE_S, left), "paused", lambda: self._countdown(fault), idle=self._idle)
+        policy.sign_of_life("paused", self._countdown(fault), TRY_S)
 
     def over(self) -> None:
         """Say that the run goes on, where it had said that it paused."""
         if self._told:
             are = "are" if self._name.endswith("s") else "is"
-            lasted = duration_text(self.lasted_s)
-            self._patience.report("resumed", f"{self._name} {are} ready again after a pause of {lasted}")
+            lasted = duration_text(self._lasted_s())
+            self._policy.report("resumed", f"{self._name} {are} ready again after a pause of {lasted}")
+
+    def _lasted_s(self) -> float:
+        return self._policy.clock.monotonic() - self._failed_at
 
     def _countdown(self, fault: CropError) -> str:
-        left = self._patience.limit_s - self.lasted_s
+        left = self._policy.limit_s - self._lasted_s()
         end = "waits for as long as it takes" if math.isinf(left) else f"ends in {duration_text(max(left, 0))}"
-        return f"{_named(self._name, fault)} (paused for {duration_text(self.lasted_s)}; goes on by itself, {end})"
+        return f"{_named(self._name, fault)} (paused for {duration_text(self._lasted_s())}; goes on by itself, {end})"
 
-    def _ended(self, fault: CropError) -> CropError:
-        assert self._first is not None
-        first = self._first
-        if not self._patience.limit_s:
+    def _ended(self, first: CropError, fault: CropError) -> CropError:
+        if not self._policy.limit_s:
             return first
         at_last = "" if _kind(fault) == _kind(first) else f"; at last: {fault}"
-        waited = duration_text(self._patience.limit_s)
+        waited = duration_text(self._policy.limit_s)
         return _family(first)(
-            f"{_named(self._name, first)}{at_last}; the run waited {waited} for that and ended: when it is mended run "
-            "the same command again"
+            f"{_named(self._name, first)}{at_last}",
+            remedy=f"the run waited {waited} for that and ended: when it is mended run the same command again",
         )
 
 

@@ -15,12 +15,21 @@ import pytest
 
 from acquisition.cli import main
 from acquisition.run.devices import Devices
-from acquisition.run.planning.answers import Answers, ask
-from acquisition.run.planning.dry_run import dry_run
-from acquisition.run.planning.plan import RunPlan, make_plan
-from acquisition.run.planning.sizes import MEGAPIXELS, SPARE_BYTES, free_bytes_at, needed_bytes
-from acquisition.run.planning.text import plan_lines
-from acquisition.run.planning.work import Work, order_of, outline
+from acquisition.run.plan import (
+    MEGAPIXELS,
+    SPARE_BYTES,
+    Answers,
+    RunPlan,
+    Work,
+    ask,
+    dry_run,
+    free_bytes_at,
+    make_plan,
+    needed_bytes,
+    order_of,
+    outline,
+    plan_lines,
+)
 from drivers.camera import CameraIdentity, ExposureSettings, Supplies
 from drivers.presenter import Colour
 from drivers.projector import Power, Severity
@@ -406,8 +415,8 @@ class TestDryRun:
         settings = load_lab(lab)
         Session.create(night, settings.to_toml(), CHART, LIGHTS[:4], plan_steps(LIGHTS[:4], 25)).close()
         lab.write_text(lab.read_text() + "[camera]\niso = 400\n")
-        with pytest.raises(ConfigurationError, match="was begun with camera"):
-            outline(load_lab(lab), night)
+        with Session.open(night) as session, pytest.raises(ConfigurationError, match="was begun with camera"):
+            outline(load_lab(lab), night, session)
 
     def test_a_rig_that_cannot_be_opened_is_a_fault_of_the_plan(self, lab: Path) -> None:
         lab.write_text(lab.read_text().replace('"Test"', '"Box"'))
@@ -436,8 +445,8 @@ def test_the_times_of_a_session_are_those_between_its_frames(tmp_path: Path, lab
     settings = load_lab(lab)
     with Session.open(night) as session:
         taken = sorted(frame.taken_at for frame in session.frames())
+        frame_s = outline(settings, night, session).frame_s
     gaps = sorted(after - before for before, after in pairwise(taken))
-    frame_s = outline(settings, night).frame_s
     assert frame_s is not None
     assert timedelta(seconds=frame_s) == gaps[len(gaps) // 2]
 

@@ -18,11 +18,8 @@ import numpy as np
 import numpy.typing as npt
 
 from acquisition.judge import limits
-from acquisition.judge.known.basis import Basis, FrameLight
-from acquisition.judge.known.response import Codes, ProjectorModel
-from acquisition.judge.measured.anchor import Anchor
-from acquisition.judge.measured.frame import Frame
-from acquisition.judge.measured.measuring import Measured
+from acquisition.judge.light import Basis, Codes, FrameLight, ProjectorModel
+from acquisition.judge.measure import Anchor, Frame, Measured
 from experiment.session.plan import PRIMARIES, REFERENCES, TOP, SessionStep
 
 RECENT = 6
@@ -32,7 +29,7 @@ LEANING = 3
 """Frames whose small deviations are taken together; more would take a drift that is followed for a step."""
 
 _GREYS = 4
-"""Frames of mixed light from which on white is foretold without its own: the tone curve's value, slope and bend, and
+"""Frames of mixed light from which on white is predicted without its own: the tone curve's value, slope and bend, and
 one that tells whether they agree."""
 
 _Array = npt.NDArray[np.float64]
@@ -63,6 +60,20 @@ class Leaning:
         return Leaning((*newer.lamp, *self.lamp)[:LEANING], (*newer.added, *self.added)[:LEANING])
 
 
+@dataclass(frozen=True)
+class LampSeen:
+    """What a frame shows of the lamp.
+
+    - `brightness`: its level over the one expected (logarithm); NaN where that is not known.
+    - `stepped`: whether the frame is accepted at another level than expected.
+    - `leaning`: how its light was off, however little.
+    """
+
+    brightness: float = float("nan")
+    stepped: bool = False
+    leaning: Leaning = field(default_factory=Leaning)
+
+
 def combined(values: Sequence[tuple[float, float]]) -> tuple[float, float]:
     """Return the weighted mean of values with standard deviations, and its own; (0, inf) of none."""
     weights = [sd**-2 for _, sd in values]
@@ -80,22 +91,18 @@ class Examined:
     - `light`: its light, where a basis is known.
     - `accepted`: whether it may be used.
     - `cause`: name of the check that refused it; empty if none did.
-    - `brightness`: level of the lamp over the one expected (logarithm); NaN where that is not known.
-    - `stepped`: whether it was accepted at another level of the lamp than expected.
-    - `leaning`: how its light was off, however little.
+    - `lamp`: what it showed of the lamp.
     """
 
     frame: Frame
     light: FrameLight | None
     accepted: bool
     cause: str = ""
-    brightness: float = float("nan")
-    stepped: bool = False
-    leaning: Leaning = field(default_factory=Leaning)
+    lamp: LampSeen = field(default_factory=LampSeen)
 
 
 @dataclass(frozen=True, eq=False)
-class Knowledge:
+class JudgeState:
     """All that is known.
 
     - `anchor`: the chart's place.
@@ -156,15 +163,15 @@ class Knowledge:
 
     @property
     def modelled(self) -> bool:
-        """Whether amounts are those of the projector's primaries, so that codes foretell them."""
+        """Whether amounts are those of the projector's primaries, so that codes predict them."""
         return self.basis is not None and self.basis.of_primaries
 
     @property
     def awaits_primaries(self) -> bool:
-        """Whether lights cannot be foretold only because frames that this run asked for were refused."""
+        """Whether lights cannot be predicted only because frames that this run asked for were refused."""
         return self.asked and not self.modelled and not self.lost
 
-    def paused(self) -> Knowledge:
+    def paused(self) -> JudgeState:
         """Return what is known after a pause of the run: the lamp may be at another level, the chart elsewhere."""
         if self.rested or not self.digests:
             return self
@@ -181,7 +188,7 @@ class Knowledge:
             begun_with=None,
         )
 
-    def begun_anew(self, base: Knowledge) -> Knowledge:
+    def begun_anew(self, base: JudgeState) -> JudgeState:
         """Return what is known where the first frames cannot be trusted: no more than `base`, before them."""
         return replace(
             base,
@@ -193,11 +200,11 @@ class Knowledge:
             expected=self.begun_with,
         )
 
-    def after(self, step: SessionStep, found: Examined) -> Knowledge:
+    def after(self, step: SessionStep, found: Examined) -> JudgeState:
         """Return what is known after a frame of a step."""
         frame, codes = found.frame, step.colour.codes
         seen = Seen(codes, frame.measured, None if found.light is None else found.light.amounts)
-        known = replace(
+        state = replace(
             self,
             recent=(*self.recent, seen)[-RECENT:],
             digests=self.digests | {frame.measured.digest},
@@ -205,32 +212,32 @@ class Knowledge:
         )
         if not found.accepted:
             count = self.refused[1] + 1 if found.cause == self.refused[0] else 1
-            lamp = found.brightness if found.cause == "lamp" else float("nan")
+            lamp = found.lamp.brightness if found.cause == "lamp" else float("nan")
             x, y = frame.moved_px.tolist() if found.cause == "movement" else (float("nan"), float("nan"))
             doubted = self.doubted | {step.number}
-            return replace(known, refused=(found.cause, count), candidate=(lamp, x, y), doubted=doubted)
-        known = replace(known, refused=("", 0), candidate=(float("nan"),) * 3, first=self.first or frame.measured)
-        if known.founding:
-            begun_with = step.number if known.begun_with is None else known.begun_with
-            doubted = known.doubted - {step.number}
-            known = replace(known, doubted=doubted, begun_with=begun_with, first_frames=(*known.first_frames, seen))
-        if step.kind == "light" and not known.doubted:
-            known = replace(known, founding=False, first_frames=(), restarts=0)
+            return replace(state, refused=(found.cause, count), candidate=(lamp, x, y), doubted=doubted)
+        state = replace(state, refused=("", 0), candidate=(float("nan"),) * 3, first=self.first or frame.measured)
+        if state.founding:
+            begun_with = step.number if state.begun_with is None else state.begun_with
+            doubted = state.doubted - {step.number}
+            state = replace(state, doubted=doubted, begun_with=begun_with, first_frames=(*state.first_frames, seen))
+        if step.kind == "light" and not state.doubted:
+            state = replace(state, founding=False, first_frames=(), restarts=0)
         if step.kind != "dark":
             # After a step of the lamp nothing before it counts any more.
-            leaning = Leaning() if found.stepped or known.rested else known.leaning.then(found.leaning)
-            known = replace(known, rested=False, leaning=leaning)
+            leaning = Leaning() if found.lamp.stepped or state.rested else state.leaning.then(found.lamp.leaning)
+            state = replace(state, rested=False, leaning=leaning)
         steady = float(np.hypot(*(frame.moved_px - np.array(self.candidate[1:])))) <= limits.STEADY_PX
         if not np.isnan(frame.moved_px).any() and (self.moved_px is None or self.rested or steady):
-            known = replace(known, moved_px=frame.moved_px)
+            state = replace(state, moved_px=frame.moved_px)
         if frame.anchor is not None:
-            known = known._anchored(frame.anchor)
-        known = known._referenced(step, frame)
+            state = state._anchored(frame.anchor)
+        state = state._referenced(step, frame)
         # A frame that makes the basis has been learnt from with it.
-        if found.light is not None and self.modelled and known.modelled and step.kind != "dark":
-            model = known.model.stepped(found.brightness) if found.stepped else known.model
-            known = replace(known, model=model.learn(found.light.amounts, codes, found.light.covariance))
-        return known
+        if found.light is not None and self.modelled and state.modelled and step.kind != "dark":
+            model = state.model.stepped(found.lamp.brightness) if found.lamp.stepped else state.model
+            state = replace(state, model=model.learn(found.light.amounts, codes, found.light.covariance))
+        return state
 
     def without_white(self) -> ProjectorModel | None:
         """Return what the first frames say of the projector without the white one; None where they are too few."""
@@ -243,7 +250,7 @@ class Knowledge:
             model = model.learn(light.amounts, one.codes, light.covariance)
         return model
 
-    def _anchored(self, anchor: Anchor) -> Knowledge:
+    def _anchored(self, anchor: Anchor) -> JudgeState:
         """Return what is known where the chart lies elsewhere: pictures of another place are no basis any more."""
         again = self.anchor is not None
         return replace(
@@ -255,30 +262,30 @@ class Knowledge:
             primaries=(None, None, None) if again else self.primaries,
         )
 
-    def _referenced(self, step: SessionStep, frame: Frame) -> Knowledge:
+    def _referenced(self, step: SessionStep, frame: Frame) -> JudgeState:
         """Return what is known with a frame that later ones are compared with."""
         measured = frame.measured
-        known = self
+        state = self
         if step.kind in REFERENCES:
-            known = replace(known, untold=frozenset())
+            state = replace(state, untold=frozenset())
         if step.kind == "white":
-            known = replace(known, white=measured, first_white=self.first_white or frame, moved_on=False)
+            state = replace(state, white=measured, first_white=self.first_white or frame, moved_on=False)
         if step.kind == "dark":
-            known = replace(known, dark=measured, first_dark=self.first_dark or measured)
-            if known.basis is not None and known.basis.of_primaries:
-                known = replace(known, basis=known.basis.with_dark(measured))
+            state = replace(state, dark=measured, first_dark=self.first_dark or measured)
+            if state.basis is not None and state.basis.of_primaries:
+                state = replace(state, basis=state.basis.with_dark(measured))
         primary = primary_of(step.colour.codes)
         if is_brightest_grey(step):
-            known = replace(known, first_grey=self.first_grey or frame)
+            state = replace(state, first_grey=self.first_grey or frame)
         if not self.modelled and (step.kind == "white" or (step.kind == "response" and primary is None)):
-            known = replace(known, witness=measured)
+            state = replace(state, witness=measured)
         if step.kind == "response" and primary is not None and len(measured.strips):
-            of: list[Measured | None] = list(known.primaries)
+            of: list[Measured | None] = list(state.primaries)
             of[primary] = measured
-            known = replace(known, primaries=(of[0], of[1], of[2]))
-        return known._based(step)
+            state = replace(state, primaries=(of[0], of[1], of[2]))
+        return state._based(step)
 
-    def _based(self, step: SessionStep) -> Knowledge:
+    def _based(self, step: SessionStep) -> JudgeState:
         """Return what is known with the best basis that the frames so far give."""
         red, green, blue = self.primaries
         if self.dark is None:

@@ -1,7 +1,8 @@
 """Which frame is taken next: the plan's open steps, what must be taken again, and what closes a run.
 
-A value that changes: no device, no clock, no file. The pipeline (`acquisition.run.taking.pipeline`) asks it for the
-next step and tells it how each ended.
+`StepQueue` is a value that changes: no device, no clock, no file. The pipeline (`acquisition.run.pipeline`) asks it for
+the next step and tells it how each ended. What a run that is taken up shows first is put into the session's plan by
+`link_runs` and `white_first`.
 
 Rules that hold inside:
 
@@ -18,14 +19,16 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Sequence
 
-from experiment.session.plan import REFERENCES, FrameKind, SessionStep
+from experiment.session.folder import Session
+from experiment.session.plan import REFERENCES, FrameKind, SessionStep, link_steps
+from experiment.session.records import ACCEPTED, Attempt
 
 GIVEN_UP_IN_A_ROW = 3
 """Steps given up one after another after which going on makes no sense: something lasting is wrong. One may be chance,
 and two neighbours may share a cause that passes."""
 
 
-class Agenda:
+class StepQueue:
     """The steps of a session that are still to be taken in this run.
 
     `append`: given a reference's kind, puts one behind the plan and returns it; None: nothing is put there.
@@ -210,3 +213,48 @@ def unclosed_kinds(taken: Iterable[str]) -> frozenset[str]:
 def step_name(step: SessionStep) -> str:
     """Return what a sentence calls a step."""
     return f"light {step.illumination}" if step.illumination is not None else f"{step.kind} frame {step.number}"
+
+
+def link_runs(session: Session) -> tuple[int, ...]:
+    """Put the frames that link this run to those before into the plan; return the numbers of their steps.
+
+    They are some by which the projector is known, so that a chart, a camera or a lamp that changed between the runs is
+    seen before the first light is taken.
+
+    A set that an earlier run left unfinished is taken again: the chart may have been moved since. Nothing is added
+    where nothing was taken yet, or the session does not know its projector by frames of its primaries.
+    """
+    taken = [attempt for attempt in session.journal.attempts() if attempt.verdict == ACCEPTED]
+    if not taken or all(step.kind != "response" for step in session.steps):
+        return ()
+    links = link_steps(session.steps[-1].number + 1)
+    unfinished = _unfinished(session.steps[-len(links) :], links, taken)
+    return tuple(step.number for step in unfinished) if unfinished else _added(session, links)
+
+
+def white_first(session: Session) -> tuple[int, ...]:
+    """Put a white and a dark frame into the plan where no white frame was measured; return the numbers of their steps.
+
+    The frames of journals of version 1 were not measured: the judge would have nothing to hold the first lights
+    against. Nothing is added where nothing was taken yet.
+    """
+    measured = any(step.kind == "white" and accepted for step, _, _, accepted in session.journal.measurements())
+    if measured or not session.journal.accepted_files():
+        return ()
+    return _added(session, link_steps(session.steps[-1].number + 1, response=False))
+
+
+def _added(session: Session, steps: Sequence[SessionStep]) -> tuple[int, ...]:
+    session.add_steps(steps)
+    return tuple(step.number for step in steps)
+
+
+def _unfinished(
+    tail: Sequence[SessionStep], links: Sequence[SessionStep], taken: Sequence[Attempt]
+) -> Sequence[SessionStep]:
+    """Return the last steps of the plan where they are links behind which nothing was taken; else nothing."""
+    if [(step.kind, step.colour) for step in tail] != [(step.kind, step.colour) for step in links]:
+        return ()
+    numbers = {step.number for step in tail}
+    done = {attempt.step for attempt in taken if attempt.step in numbers}
+    return tail if not done or taken[-1].step in numbers else ()

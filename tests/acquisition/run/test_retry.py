@@ -1,4 +1,4 @@
-"""Patience in simulated time: what fails is waited for, told as it is now, and never waited for too long."""
+"""RetryPolicy in simulated time: what fails is waited for, told as it is now, and never waited for too long."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from acquisition.run.patience import PAUSE_S, RETRY_S, Patience
+from acquisition.run.retry import PAUSE_S, RETRY_S, RetryPolicy
 from acquisition.run.rig.opening import open_rig
 from drivers.camera import keep_awake
 from drivers.presenter import WHITE
@@ -39,7 +39,7 @@ from sim.clock import SimulatedClock
 
 @dataclass
 class Room:
-    """Patience with everything that it tells, and something that is broken until a time."""
+    """RetryPolicy with everything that it tells, and something that is broken until a time."""
 
     limit_s: float = 600.0
     clock: SimulatedClock = field(default_factory=SimulatedClock)
@@ -49,8 +49,8 @@ class Room:
     tries: list[float] = field(default_factory=list[float])
 
     @property
-    def patience(self) -> Patience:
-        return Patience(
+    def retry(self) -> RetryPolicy:
+        return RetryPolicy(
             self.clock,
             self.limit_s,
             lambda what, sentence: self.said.append((what, sentence)),
@@ -83,7 +83,7 @@ def until(end_s: float, fault: CropError) -> Callable[[float], CropError | None]
 
 def test_what_works_says_nothing() -> None:
     room = Room()
-    assert room.patience.attempt(room.broken(lambda now: None), "the camera") == "done"
+    assert room.retry.attempt(room.broken(lambda now: None), "the camera") == "done"
     assert room.said == []
     assert room.beats == []
     assert room.clock.monotonic() == 0
@@ -92,7 +92,7 @@ def test_what_works_says_nothing() -> None:
 def test_a_notification_of_less_than_a_second_pauses_nothing() -> None:
     room = Room()
     covered = DeviceError("the screen shows (255, 136, 0)")
-    assert room.patience.attempt(room.broken(until(0.9, covered)), "the screen") == "done"
+    assert room.retry.attempt(room.broken(until(0.9, covered)), "the screen") == "done"
     assert room.words == ["retry"]
     assert room.clock.monotonic() == RETRY_S
 
@@ -100,7 +100,7 @@ def test_a_notification_of_less_than_a_second_pauses_nothing() -> None:
 @pytest.mark.parametrize("length_s", [3, 20, 590])
 def test_what_lasts_pauses_and_goes_on_by_itself(length_s: float) -> None:
     room = Room()
-    assert room.patience.attempt(room.broken(until(length_s, DeviceError("covered"))), "the screen") == "done"
+    assert room.retry.attempt(room.broken(until(length_s, DeviceError("covered"))), "the screen") == "done"
     assert room.words == ["retry", "paused", "resumed"]
     assert room.said[1][1] == "the screen: covered (the run waits up to 9 min 59 s, and goes on by itself)"
     assert "the screen is ready again after a pause of" in room.said[2][1]
@@ -115,7 +115,7 @@ def test_the_cause_that_holds_now_is_told() -> None:
             return LinkClosed("nothing listens at 192.168.1.30:4352")
         return DeviceFault("the projector is in standby") if now < 120 else None
 
-    room.patience.attempt(room.broken(causes), "the projector")
+    room.retry.attempt(room.broken(causes), "the projector")
     assert room.words == ["retry", "paused", "still paused", "resumed"]
     assert "standby" in room.said[2][1]
     assert all("listens" in sentence for at, _, sentence, _ in room.beats if at < 60)
@@ -124,13 +124,13 @@ def test_the_cause_that_holds_now_is_told() -> None:
 
 def test_a_cause_with_other_numbers_is_the_same_cause() -> None:
     room = Room()
-    room.patience.attempt(room.broken(lambda now: DeviceError(f"{now:g} of 8 pixels") if now < 99 else None), "it")
+    room.retry.attempt(room.broken(lambda now: DeviceError(f"{now:g} of 8 pixels") if now < 99 else None), "it")
     assert room.words == ["retry", "paused", "resumed"]
 
 
 def test_a_countdown_comes_every_few_seconds() -> None:
     room = Room()
-    room.patience.attempt(room.broken(until(300, DeviceError("covered"))), "the screen")
+    room.retry.attempt(room.broken(until(300, DeviceError("covered"))), "the screen")
     times = [at for at, *_ in room.beats]
     assert times[0] <= RETRY_S
     assert max(after - before for before, after in pairwise(times)) <= PAUSE_S
@@ -144,23 +144,23 @@ def test_a_countdown_comes_every_few_seconds() -> None:
 
 def test_each_beat_promises_the_next_one() -> None:
     room = Room()
-    room.patience.attempt(room.broken(until(100, DeviceError("gone")), takes_s=70), "the camera", idle=False)
+    room.retry.attempt(room.broken(until(100, DeviceError("gone")), takes_s=70), "the camera", idle=False)
     for (before, _, _, within_s), (after, *_) in pairwise(room.beats):
         assert after - before <= within_s
 
 
 def test_what_was_tried_for_long_already_pauses_at_once() -> None:
     room = Room()
-    room.patience.attempt(room.broken(until(100, DeviceError("no camera on USB")), takes_s=60), "the camera")
+    room.retry.attempt(room.broken(until(100, DeviceError("no camera on USB")), takes_s=60), "the camera")
     assert room.words == ["paused", "resumed"]
 
 
 def test_other_devices_are_kept_awake_meanwhile() -> None:
     room = Room()
-    room.patience.attempt(room.broken(until(100, DeviceError("covered"))), "the screen")
+    room.retry.attempt(room.broken(until(100, DeviceError("covered"))), "the screen")
     assert max(after - before for before, after in pairwise(room.idled)) <= 10
     room = Room()
-    room.patience.attempt(room.broken(until(100, DeviceError("gone"))), "the camera", idle=False)
+    room.retry.attempt(room.broken(until(100, DeviceError("gone"))), "the camera", idle=False)
     assert room.idled == []
 
 
@@ -170,8 +170,8 @@ def test_another_device_that_fails_meanwhile_waits_its_turn() -> None:
     def asleep() -> None:
         raise LinkTimeout("the camera does not answer")
 
-    patience = Patience(room.clock, 600, idle=asleep)
-    assert patience.attempt(room.broken(until(100, DeviceError("covered"))), "the screen") == "done"
+    retry = RetryPolicy(room.clock, 600, idle=asleep)
+    assert retry.attempt(room.broken(until(100, DeviceError("covered"))), "the screen") == "done"
 
 
 @pytest.mark.parametrize("limit_s", [0.1, 0.3, 1.0, 600.0, 601.7])
@@ -182,7 +182,7 @@ def test_patience_ends_in_time_with_the_first_cause(limit_s: float) -> None:
         return LinkClosed("cable pulled at 12 s") if now == 0 else DeviceError("no camera on USB")
 
     with pytest.raises(LinkClosed) as caught:
-        room.patience.attempt(room.broken(causes), "the camera")
+        room.retry.attempt(room.broken(causes), "the camera")
     message = str(caught.value)
     assert message.startswith("the camera: cable pulled at 12 s; at last: no camera on USB; the run waited")
     assert message.endswith("run the same command again")
@@ -195,7 +195,7 @@ def test_without_patience_the_first_fault_is_the_end() -> None:
     room = Room(0.0)
     fault = DeviceError("covered")
     with pytest.raises(DeviceError) as caught:
-        room.patience.attempt(room.broken(lambda now: fault), "the screen")
+        room.retry.attempt(room.broken(lambda now: fault), "the screen")
     assert caught.value is fault
     assert len(room.tries) == 1
 
@@ -203,7 +203,7 @@ def test_without_patience_the_first_fault_is_the_end() -> None:
 def test_patience_without_end() -> None:
     room = Room(math.inf)
     week = 7 * 24 * 3600
-    assert room.patience.attempt(room.broken(until(week, DeviceError("gone")), 600), "the camera") == "done"
+    assert room.retry.attempt(room.broken(until(week, DeviceError("gone")), 600), "the camera") == "done"
     assert "for as long as it takes" in room.said[0][1]
     assert "waits for as long as it takes" in room.beats[-1][2]
 
@@ -212,10 +212,10 @@ def test_what_waiting_does_not_cure_is_raised_at_once() -> None:
     room = Room()
     fault = ConfigurationError("no such display")
     with pytest.raises(ConfigurationError) as caught:
-        room.patience.attempt(room.broken(lambda now: fault), "the screen")
+        room.retry.attempt(room.broken(lambda now: fault), "the screen")
     assert caught.value is fault
     with pytest.raises(DeviceRefused):
-        room.patience.attempt(
+        room.retry.attempt(
             room.broken(lambda now: DeviceRefused("ISO 42 is not offered")),
             "the camera",
             curable=lambda fault: not isinstance(fault, DeviceRefused),
@@ -226,7 +226,7 @@ def test_what_waiting_does_not_cure_is_raised_at_once() -> None:
 def test_a_class_that_wants_more_than_a_sentence_becomes_its_family() -> None:
     room = Room(5.0)
     with pytest.raises(DeviceRefused, match="busy") as caught:
-        room.patience.attempt(room.broken(lambda now: OperationDeclined("busy", 0x2019)), "the camera")
+        room.retry.attempt(room.broken(lambda now: OperationDeclined("busy", 0x2019)), "the camera")
     assert type(caught.value) is DeviceRefused
 
 
@@ -237,9 +237,9 @@ def test_an_interruption_ends_a_pause_at_once() -> None:
         if room.clock.monotonic() > 60:
             raise KeyboardInterrupt
 
-    patience = Patience(room.clock, math.inf, beat=stop)
+    retry = RetryPolicy(room.clock, math.inf, on_wait=stop)
     with pytest.raises(KeyboardInterrupt):
-        patience.attempt(room.broken(lambda now: DeviceError("covered")), "the screen")
+        retry.attempt(room.broken(lambda now: DeviceError("covered")), "the screen")
     assert room.clock.monotonic() < 60 + 2 * PAUSE_S
 
 
@@ -255,17 +255,17 @@ def test_a_full_disk_takes_the_notes_of_its_pause_when_there_is_space() -> None:
     def beat(state: str, sentence: str, within_s: float) -> None:
         raise StorageError("the disk is full")
 
-    patience = Patience(room.clock, 600, report, beat=beat)
-    assert patience.attempt(room.broken(full), "the disk") == "done"
+    retry = RetryPolicy(room.clock, 600, report, on_wait=beat)
+    assert retry.attempt(room.broken(full), "the disk") == "done"
     assert room.words == ["retry", "paused", "resumed"]
 
 
 def test_two_pauses_have_each_their_time() -> None:
     room = Room(60.0)
-    patience = room.patience
+    retry = room.retry
     for _ in range(3):
         begun = room.clock.monotonic()
-        assert patience.attempt(room.broken(until(begun + 50, DeviceError("covered"))), "the screen") == "done"
+        assert retry.attempt(room.broken(until(begun + 50, DeviceError("covered"))), "the screen") == "done"
     assert room.words == ["retry", "paused", "resumed"] * 3
 
 
@@ -292,10 +292,10 @@ def test_a_full_disk_never_loses_the_frame_in_the_camera(tmp_path: Path) -> None
             if clock.monotonic() > 300:
                 resource.setrlimit(resource.RLIMIT_FSIZE, limits)
 
-        patience = Patience(clock, 600, lambda what, sentence: said.append(f"{what}: {sentence}"), idle)
+        retry = RetryPolicy(clock, 600, lambda what, sentence: said.append(f"{what}: {sentence}"), idle)
         try:
             resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, limits[1]))
-            received = patience.attempt(lambda: session.receive("0000_white", camera.download), "the disk")
+            received = retry.attempt(lambda: session.receive("0000_white", camera.download), "the disk")
         finally:
             resource.setrlimit(resource.RLIMIT_FSIZE, limits)
             signal.signal(signal.SIGXFSZ, handler)
@@ -313,7 +313,7 @@ def test_a_journal_that_another_program_held_for_the_whole_patience_is_not_waite
     clock = SimulatedClock()
     begun = clock.monotonic()
     with pytest.raises(StorageError, match="database is locked"):
-        Patience(clock, 600).attempt(held, "the disk")
+        RetryPolicy(clock, 600).attempt(held, "the disk")
     assert clock.monotonic() == begun
 
 
@@ -336,5 +336,5 @@ def test_a_wait_can_be_broken_off_and_a_try_cannot() -> None:
         raise DeviceFault("it is off; switch it on")
 
     with pytest.raises(KeyboardInterrupt):
-        Patience(clock, 600, idle=idle, breakable=breakable).attempt(action, "the screen")
+        RetryPolicy(clock, 600, idle=idle, breakable=breakable).attempt(action, "the screen")
     assert set(seen) == {("tries", 0), ("waits", 1)}

@@ -8,9 +8,10 @@ from pathlib import Path
 
 import pytest
 
+from acquisition.run.queue import link_runs
 from acquisition.run.rig.lab import session_clock
+from acquisition.run.run import check_frames, clock_note, require_same_devices
 from acquisition.run.sequencer import take_session
-from acquisition.run.taking.resuming import check_frames, clock_note, require_same_devices, tie
 from drivers.camera import CameraIdentity, CapturedFrame
 from drivers.presenter import Colour
 from drivers.projector import ProjectorIdentity
@@ -79,20 +80,20 @@ def test_a_damaged_frame_is_said_and_taken_again(folder: Path) -> None:
 
 def test_nothing_is_tied_to_nothing(folder: Path) -> None:
     lab = lab_with_response(folder)
-    assert tie(lab.session) == ()
+    assert link_runs(lab.session) == ()
     assert take_session(lab.session, lab.devices, SETTINGS).complete
 
 
 def test_a_session_that_does_not_know_its_projector_is_not_tied(folder: Path) -> None:
     lab = Lab(folder)
     interrupt_after(lab, 3)
-    assert tie(lab.session) == ()
+    assert link_runs(lab.session) == ()
 
 
 def test_a_run_that_is_taken_up_shows_the_ties_first(folder: Path) -> None:
     lab = lab_with_response(folder)
     interrupt_after(lab, 5)
-    first = tie(lab.session)
+    first = link_runs(lab.session)
     assert first == (8, 9, 10, 11, 12, 13)
     lab.camera.exposed.clear()
     assert take_session(lab.session, lab.devices, SETTINGS, first=first).complete
@@ -103,13 +104,13 @@ def test_a_run_that_is_taken_up_shows_the_ties_first(folder: Path) -> None:
 def test_ties_that_were_interrupted_are_taken_anew(folder: Path) -> None:
     lab = lab_with_response(folder)
     interrupt_after(lab, 5)
-    interrupt_after(lab, 2, tie(lab.session))
-    again = tie(lab.session)
+    interrupt_after(lab, 2, link_runs(lab.session))
+    again = link_runs(lab.session)
     assert again == (8, 9, 10, 11, 12, 13), "no further steps"
     lab.camera.exposed.clear()
     interrupt_after(lab, 7, again)
     assert lab.camera.exposed[:6] == TIES, "those that were taken are taken again: the chart may have moved since"
-    assert tie(lab.session) == (14, 15, 16, 17, 18, 19), "behind another light they are new"
+    assert link_runs(lab.session) == (14, 15, 16, 17, 18, 19), "behind another light they are new"
 
 
 def test_another_camera_or_projector_is_refused(folder: Path) -> None:
@@ -118,14 +119,16 @@ def test_another_camera_or_projector_is_refused(folder: Path) -> None:
     require_same_devices(lab.session, lab.devices, SETTINGS)
     assert lab.session.journal.records()["camera"] == "Canon Test, serial number 1"
     lab.projector.identity = lambda: ProjectorIdentity("Epson", "EB", "hall")  # type: ignore[method-assign]
-    with pytest.raises(DeviceRefused, match=r"begun with the projector .*, and now there is Epson EB"):
+    with pytest.raises(DeviceRefused, match="the projector") as caught:
         require_same_devices(lab.session, lab.devices, SETTINGS)
     lab.projector = None  # type: ignore[assignment]
     lab.camera.identity = lambda: CameraIdentity("Canon", "Test", "2")  # type: ignore[method-assign]
-    with pytest.raises(
-        DeviceRefused, match=r"serial number 1, and now there is Canon Test, serial number 2: .*new session"
-    ):
+    assert caught.value.value == "Epson EB"
+    with pytest.raises(DeviceRefused) as caught:
         require_same_devices(lab.session, lab.devices, SETTINGS)
+    assert caught.value.expected == "Canon Test, serial number 1"
+    assert caught.value.value == "Canon Test, serial number 2"
+    assert "new session" in caught.value.remedy
 
 
 def test_firmware_and_the_projectors_own_name_may_change(folder: Path) -> None:
@@ -143,8 +146,9 @@ def test_another_screen_of_a_real_lab_is_refused(folder: Path) -> None:
     require_same_devices(lab.session, lab.devices, one)
     light = one.lab.light.model_copy(update={"display": "HDMI-2"})
     other = one.model_copy(update={"lab": one.lab.model_copy(update={"light": light})})
-    with pytest.raises(DeviceRefused, match="the screen display, and now there is display HDMI-2"):
+    with pytest.raises(DeviceRefused, match="the screen") as caught:
         require_same_devices(lab.session, lab.devices, other)
+    assert (caught.value.expected, caught.value.value) == ("display", "display HDMI-2")
 
 
 def test_lights_taken_again_are_closed_by_a_pair_behind_the_plan(folder: Path) -> None:

@@ -1,0 +1,592 @@
+"""What is measured of a decoded frame: light at all places, noise, exposure, who took it; and where the chart lay.
+
+`Measured` is what one pass over the counts and a few thousand photosites besides give; everything that is judged later
+is in it, and nothing in it depends on other frames. Every photosite of the visible area counts towards one tile and one
+strip, so that nothing escapes between places. `Anchor` is the chart's place in the first white frame, from which later
+frames tell how far it has moved, and blurred: its gauges are the chart's tags, or the outline of its field, or, where
+no chart is looked for, the places of most texture (`experiment.framing.movement`); the frame is kept around them alone.
+`Frame` is both, and the bytes that the journal keeps of it.
+
+Format of the bytes (version 1): a zip archive of arrays as `numpy.savez` writes it, without pickled objects. `facts` is
+UTF-8 JSON as uint8; `tiles` (T, 3) float32; `strips` (S, 3) float32 or empty; an anchor's arrays begin with `anchor_`.
+Samples of noise are not kept: the digest knows a frame again. Bytes of another version are passed over: the judge then
+begins anew, as at a session's start.
+
+Places are in 2×2 blocks of the mosaic ("half-size pixels"). T = 384 tiles, S strips of rows (four a row of blocks), M
+blocks that are sampled.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+import zipfile
+from dataclasses import dataclass, replace
+from functools import cached_property
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from acquisition.judge.exposure import BRIGHTEST_PERCENTILE
+from drivers.raw.rawfile import Mosaic
+from experiment.chart.model import Chart
+from experiment.framing.field import FoundField
+from experiment.framing.finding import FoundTag, Framing, find_chart, find_tags
+from experiment.framing.homography import project
+from experiment.framing.movement import Shift, gauge_boxes, gauges_of, shift_between
+from experiment.framing.planes import (
+    CHANNELS,
+    CLIPPING_SHARE,
+    Channel,
+    Plane,
+    frame_black,
+    phases,
+    plane_of,
+    strongest_plane,
+)
+from foundation.compiled import compiled
+
+TILE_COLUMNS, TILE_ROWS = 24, 16
+"""Tiles over a frame of 3 : 2: 384 squares of 108 px on an EOS 550D, each about a hundred cells of the chart, so that
+their mean is known to 0.1 % and a hand covers several."""
+
+SEGMENTS = 4
+"""Strips along a row: 650 px on an EOS 550D, 65 cells, whose mean differs from row of cells to row of cells."""
+
+SAMPLES = 8192
+"""Blocks whose photosites are kept to compare the noise of two frames: correlations are then known to 1 %."""
+
+_EMPTY_SHARE = 0.5
+"""Counts below this share of black are none of a sensor: its noise reaches down by some tens, black is hundreds."""
+
+_LEAST_BLACK = 64.0
+"""Counts of black below which nothing can be said of counts below it: Nikon's older bodies subtract it themselves."""
+
+_NOISE_BINS = 6
+"""Levels at which noise is measured: enough for a straight line, with a thousand blocks each."""
+
+_INNER = 0.3
+"""Share of a level's blocks, those with the least differences, from which its noise is taken."""
+
+_INNER_SIGMAS = 0.3853
+"""Standard deviations within which that share of normal deviates lies: Φ⁻¹(0.65)."""
+
+_Array = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class FramePlaces:
+    """The places of a frame of `rows` × `columns` blocks."""
+
+    rows: int
+    columns: int
+
+    @cached_property
+    def x_edges(self) -> npt.NDArray[np.int64]:
+        """(25,) columns of blocks at which the tiles begin, and the end."""
+        return np.linspace(0, self.columns, TILE_COLUMNS + 1).round().astype(np.int64)
+
+    @cached_property
+    def y_edges(self) -> npt.NDArray[np.int64]:
+        """(17,) rows of blocks at which the tiles begin, and the end."""
+        return np.linspace(0, self.rows, TILE_ROWS + 1).round().astype(np.int64)
+
+    @cached_property
+    def tile_blocks(self) -> npt.NDArray[np.float64]:
+        """(384, 1) float64, blocks in each tile, row by row."""
+        return np.outer(np.diff(self.y_edges), np.diff(self.x_edges)).reshape(-1, 1).astype(np.float64)
+
+    @cached_property
+    def sampled(self) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
+        """Rows (M,) and columns (M,) of blocks spread evenly, and without a lattice, over the frame."""
+        chosen = np.random.default_rng(7).choice(self.rows * self.columns, min(SAMPLES, self.rows * self.columns))
+        chosen.sort()
+        return chosen // self.columns, chosen % self.columns
+
+    def tile_box(self, tile: int) -> tuple[int, int, int, int]:
+        """Return left, top, right, bottom (exclusive) of a tile, in blocks."""
+        row, column = divmod(tile, TILE_COLUMNS)
+        x, y = self.x_edges, self.y_edges
+        return int(x[column]), int(y[row]), int(x[column + 1]), int(y[row + 1])
+
+
+@dataclass(frozen=True, eq=False)
+class Sums:
+    """Mean counts at the places of a frame.
+
+    - `tiles`: (384, 4) float64, mean count of each tile, row by row, for the four positions of the block, row by row.
+    - `strips`: (rows, 4, 4) float64, of each row of blocks and segment, likewise.
+    - `clipped`, `empty`: photosites at or above the clipping level, and those that no light and no darkness gives.
+    """
+
+    tiles: npt.NDArray[np.float64]
+    strips: npt.NDArray[np.float64]
+    clipped: int
+    empty: int
+
+
+def sum_counts(counts: npt.NDArray[np.uint16], places: FramePlaces, clipping: float, floor: float) -> Sums:
+    """Return the mean counts at all places, in one pass.
+
+    `counts`: (H, W) uint16, the visible area.
+    """
+    sums = np.zeros((places.rows, TILE_COLUMNS, 4), dtype=np.int64)
+    top = min(int(np.ceil(clipping)), 65535)
+    tallies = np.zeros(2, dtype=np.int64)
+    _sum_rows(counts, places.x_edges, top, max(int(floor), 0), sums, tallies)
+    tiles = np.add.reduceat(sums, places.y_edges[:-1], axis=0).reshape(-1, 4) / places.tile_blocks
+    ends = np.arange(0, TILE_COLUMNS, TILE_COLUMNS // SEGMENTS)
+    widths = np.add.reduceat(np.diff(places.x_edges), ends)
+    strips = np.add.reduceat(sums, ends, axis=1) / widths[:, None]
+    return Sums(tiles, strips, int(tallies[0]), int(tallies[1]))
+
+
+@dataclass(frozen=True, eq=False)
+class Noise:
+    """Photon transfer of a frame: the variance of a photosite is `floor` + `slope` × counts above black, DN²."""
+
+    floor: float
+    slope: float
+
+    def variance(self, level: npt.ArrayLike) -> _Array:
+        """Return the variance (...) float64, DN², of a photosite at levels (...), counts above black."""
+        return self.floor + self.slope * np.maximum(np.asarray(level, dtype=np.float64), 0)
+
+
+@dataclass(frozen=True, eq=False)
+class Measured:
+    """A frame as it was measured.
+
+    - `tiles`: (T, 3) float64, mean R, G, B of each tile, counts above black.
+    - `strips`: (S, 3) float64, of each strip, likewise.
+    - `samples`: (M, 2) uint16, counts of both greens of the sampled blocks.
+    - `digest`: of the counts of all sampled blocks: equal for no two frames that a sensor took.
+    - `noise`: photon transfer, by the differences of the greens; it contains the photosites' own differences.
+    - `black`: mean black level of the frame, counts.
+    - `black_measured`: whether the frame has a masked border to measure it in.
+    - `range_dn`: saturation minus black.
+    - `brightest_dn`: brightest counts above black, of the brightest channel.
+    - `clipped`, `empty`: shares of photosites 0 … 1: near saturation, and without any count.
+    - `camera`, `serial`: as the file states them; empty where it does not.
+    """
+
+    tiles: _Array
+    strips: _Array
+    samples: npt.NDArray[np.uint16]
+    digest: bytes
+    noise: Noise
+    black: float
+    black_measured: bool
+    range_dn: float
+    brightest_dn: float
+    clipped: float
+    empty: float
+    camera: str
+    serial: str
+    places: FramePlaces
+
+    @property
+    def level(self) -> _Array:
+        """(3,) float64, mean of all tiles, counts above black."""
+        return np.asarray(self.tiles.mean(axis=0))
+
+
+def measure(mosaic: Mosaic, black: _Array | None = None) -> Measured:
+    """Return what is measured of a frame; `black` (2, 2) float64 counts if it is known already."""
+    blocks = mosaic.block_planes()
+    places = FramePlaces(int(blocks.shape[2]), int(blocks.shape[3]))
+    black = frame_black(mosaic) if black is None else black
+    mean_black = float(black.mean())
+    floor = _EMPTY_SHARE * mean_black if mean_black >= _LEAST_BLACK else 0.0
+    sums = sum_counts(mosaic.counts, places, CLIPPING_SHARE * mosaic.white_level, floor)
+    rows, columns = places.sampled
+    sampled = np.stack([blocks[r, c][rows, columns] for r in range(2) for c in range(2)], axis=-1)
+    of = phases(mosaic)
+    greens = [2 * r + c for r, c in of["G"]]
+    pair = sampled[:, greens]
+    bright = max(
+        float(np.percentile(sampled[:, 2 * r + c], BRIGHTEST_PERCENTILE) - black[r, c]) for places_of in of.values()
+        for r, c in places_of
+    )  # fmt: skip
+    tiles, strips = (_channels(means - black.ravel(), of) for means in (sums.tiles, sums.strips))
+    return Measured(
+        tiles=tiles,
+        strips=strips.reshape(-1, 3),
+        samples=pair,
+        digest=hashlib.blake2b(sampled.tobytes(), digest_size=16).digest(),
+        noise=_noise(pair.astype(np.float64) - [black[place] for place in of["G"]]),
+        black=mean_black,
+        black_measured=bool(mosaic.masked),
+        range_dn=float(mosaic.white_level - mean_black),
+        brightest_dn=bright,
+        clipped=sums.clipped / mosaic.counts.size,
+        empty=sums.empty / mosaic.counts.size,
+        camera=mosaic.camera,
+        serial=mosaic.serial,
+        places=places,
+    )
+
+
+def strip_blocks(places: FramePlaces) -> float:
+    """Return how many blocks a strip has, on average."""
+    return places.columns / SEGMENTS
+
+
+def _channels(means: _Array, of: dict[Channel, tuple[tuple[int, int], ...]]) -> _Array:
+    """Return R, G, B (..., 3) of the four positions of the block (..., 4)."""
+    return np.stack([np.mean([means[..., 2 * r + c] for r, c in of[channel]], axis=0) for channel in CHANNELS], axis=-1)
+
+
+def _noise(greens: _Array) -> Noise:
+    """Return the photon transfer of pairs of greens (M, 2), counts above black, of the same block."""
+    level = greens.mean(axis=1)
+    difference = greens[:, 0] - greens[:, 1]
+    edges = np.quantile(level, np.linspace(0, 1, _NOISE_BINS + 1))
+    at: list[float] = []
+    variance: list[float] = []
+    for low, high in pairwise(edges.tolist()):
+        chosen = (level >= low) & (level <= high)
+        seen = difference[chosen]
+        centred = np.abs(seen - np.median(seen))
+        # Blocks across an edge between two cells differ by more than noise, and where cells are small they are many.
+        spread = float(np.quantile(centred, _INNER)) / _INNER_SIGMAS
+        at.append(float(np.median(level[chosen])))
+        variance.append(spread**2 / 2)
+    # The darkest blocks show the read noise, the brighter ones what light adds, each with a weight that noise gives it.
+    x, y = np.maximum(np.array(at), 0), np.maximum(np.array(variance), 1e-3)
+    design = np.column_stack([np.ones_like(x), x]) / y[:, None]
+    floor, slope = np.linalg.lstsq(design, np.ones_like(y), rcond=None)[0].tolist()
+    if slope <= 0:
+        return Noise(float(y.mean()), 0.0)
+    if floor <= 0:
+        return Noise(float(y.min()) / 2, float(np.mean(y / np.maximum(x, 1))))
+    return Noise(float(floor), float(slope))
+
+
+@compiled
+def _sum_rows(
+    counts: npt.NDArray[np.uint16],
+    x_edges: npt.NDArray[np.int64],
+    top: int,
+    floor: int,
+    sums: npt.NDArray[np.int64],
+    tallies: npt.NDArray[np.int64],
+) -> None:
+    """Write sums (rows, tiles, 4) int64 of counts (H, W) between column edges; tally (2,) clipped and empty."""
+    clipped, empty = 0, 0
+    for row in range(sums.shape[0]):
+        for part in range(2):
+            line = counts[2 * row + part]
+            for tile in range(sums.shape[1]):
+                left, right = np.uint32(0), np.uint32(0)
+                high, low = np.uint32(0), np.uint32(0)
+                for block in range(x_edges[tile], x_edges[tile + 1]):
+                    one, two = line[2 * block], line[2 * block + 1]
+                    left += np.uint32(one)
+                    right += np.uint32(two)
+                    high += np.uint32(one >= top) + np.uint32(two >= top)
+                    low += np.uint32(one < floor) + np.uint32(two < floor)
+                sums[row, tile, 2 * part] = left
+                sums[row, tile, 2 * part + 1] = right
+                clipped += high
+                empty += low
+    tallies[0] = clipped
+    tallies[1] = empty
+
+
+_TEXTURE_PX = 32
+"""Side of a textured place that stands for a tag."""
+
+_TEXTURES = (4, 2)
+"""Textured places along the frame's width and height: as many as gauges are measured."""
+
+_PAPER_REACH_PX = 4
+"""How far from where a plane print would have it a white reference is looked for: lens and waves move it as far."""
+
+_PAPER_LEVEL = 0.7
+"""Share of the brightest references' light that a place must have to be paper: the field falls off to about that."""
+
+_MOST_PAPER = 300
+"""White references that are looked at: their mean is good to 0.1 % where one is to 2 %."""
+
+
+@dataclass(frozen=True, eq=False)
+class Anchor:
+    """The chart's place in a white frame.
+
+    - `framing`: its tags, or its field, or places of texture that stand for tags.
+    - `gauges`: the frame around them, of each channel, counts above black; 0 elsewhere.
+    - `paper`: (N, 2) int64, columns and rows of blocks in the middle of bare paper.
+    - `of_chart`: whether the chart was found; else the places are just textured ones.
+    """
+
+    framing: Framing
+    gauges: dict[Channel, Plane]
+    paper: npt.NDArray[np.int64]
+    of_chart: bool
+
+    @classmethod
+    def of(cls, mosaic: Mosaic, black: _Array, chart: Chart | None) -> Anchor:
+        """Return the anchor of a white frame; `black` (2, 2) float64 counts, `chart` None if none is looked for."""
+        if chart is None:
+            plane = strongest_plane(mosaic, black)
+            framing = _textures(plane)
+            paper = _brightest(plane.values)
+        else:
+            framing = find_chart(mosaic, chart, "the white frame")
+            whites = np.array([reference.centre_mm for reference in chart.white_references]).reshape(-1, 2)
+            paper = _paper(framing.plane.values, project(framing.homography, whites[:_MOST_PAPER]))
+        gauges: dict[Channel, Plane] = {c: gauges_of(mosaic, c, black, framing) for c in CHANNELS}
+        # The whole plane is let go: only the gauges' surroundings are ever looked at again.
+        kept = replace(framing, plane=gauges[framing.plane.channel])
+        return cls(kept, gauges, paper, chart is not None)
+
+    def shift(self, mosaic: Mosaic, black: _Array, channel: Channel) -> Shift:
+        """Return how far the chart has moved, and how much softer it is, in a later frame's colour.
+
+        `black` (2, 2) float64 counts, of that frame.
+        """
+        return shift_between(self.gauges[channel], self.framing, gauges_of(mosaic, channel, black, self.framing))
+
+    def displacement(self, mosaic: Mosaic, black: _Array, channel: Channel) -> tuple[float, float] | None:
+        """Return how far the tags have moved however far that is, px right and down; None where they are not seen.
+
+        `black` (2, 2) float64 counts, of the frame.
+        """
+        if not self.of_chart or not self.framing.tags:
+            return None
+        found = {tag.id: tag.centre_px for tag in find_tags(plane_of(mosaic, channel, black))}
+        moved = [found[tag.id] - tag.centre_px for tag in self.framing.tags if tag.id in found]
+        if len(moved) < max(2, len(self.framing.tags) // 4):
+            return None
+        dx, dy = np.median(np.array(moved), axis=0).tolist()
+        return dx, dy
+
+    def paper_level(self, mosaic: Mosaic, black: _Array, phases: dict[Channel, tuple[tuple[int, int], ...]]) -> _Array:
+        """Return (3,) float64: camera RGB of bare paper above `black` (2, 2) float64, median over all its places."""
+        blocks = mosaic.block_planes()
+        x, y = self.paper.T
+        around = [(dy, dx) for dy in (-1, 0, 1) for dx in (-1, 0, 1)]
+        level = np.empty(3)
+        for number, channel in enumerate(CHANNELS):
+            seen = [
+                np.mean([blocks[place][y + dy, x + dx] for dy, dx in around], axis=0) - black[place]
+                for place in phases[channel]
+            ]
+            # The median of the places: a hand before some of them does not count.
+            level[number] = np.median(np.mean(seen, axis=0)) if len(x) else np.nan
+        return level
+
+    @property
+    def outlines(self) -> tuple[_Array, ...]:
+        """(K, 2) float64 each, px: outlines of the tags, or of the field; none where no chart is looked for."""
+        if not self.of_chart:
+            return ()
+        field = self.framing.field
+        return tuple(tag.corners_px for tag in self.framing.tags) if field is None else (field.corners_px,)
+
+    def boxes(self) -> list[tuple[int, int, int, int]]:
+        """Return what of the gauges' planes is not 0: left, top, right, bottom (exclusive)."""
+        height, width = self.framing.plane.values.shape
+        return [(x0, y0, min(x1, width), min(y1, height)) for x0, y0, x1, y1 in gauge_boxes(self.framing)]
+
+
+def _paper(values: npt.NDArray[np.float32], places: _Array) -> npt.NDArray[np.int64]:
+    """Return (N, 2) the brightest 3×3 neighbourhoods near places (N, 2) px, if they are as bright as paper."""
+    import cv2
+
+    height, width = values.shape
+    reach = _PAPER_REACH_PX
+    at = places.round().astype(np.int64)
+    inside = ((at > reach + 1) & (at < (width - reach - 2, height - reach - 2))).all(axis=1)
+    found: list[tuple[int, int]] = []
+    levels: list[float] = []
+    for x, y in at[inside].tolist():
+        crop = cv2.blur(values[y - reach - 1 : y + reach + 2, x - reach - 1 : x + reach + 2], (3, 3))[1:-1, 1:-1]
+        row, column = divmod(int(crop.argmax()), crop.shape[1])
+        found.append((x - reach + column, y - reach + row))
+        levels.append(float(crop[row, column]))
+    if not found:
+        return _brightest(values)
+    bright = np.array(levels) > _PAPER_LEVEL * np.percentile(levels, 90)
+    return np.array(found, dtype=np.int64)[bright]
+
+
+def _brightest(values: npt.NDArray[np.float32]) -> npt.NDArray[np.int64]:
+    """Return (N, 2) the brightest 3×3 neighbourhoods of the parts of a plane, those as bright as the brightest."""
+    import cv2
+
+    smooth = cv2.blur(values, (3, 3))
+    height, width = smooth.shape
+    found: list[tuple[int, int]] = []
+    levels: list[float] = []
+    for top in range(2, height - height // 12, height // 12):
+        for left in range(2, width - width // 16, width // 16):
+            part = smooth[top : top + height // 12 - 2, left : left + width // 16 - 2]
+            row, column = divmod(int(part.argmax()), part.shape[1])
+            found.append((left + column, top + row))
+            levels.append(float(part[row, column]))
+    bright = np.array(levels) > _PAPER_LEVEL * np.percentile(levels, 90)
+    return np.array(found, dtype=np.int64)[bright]
+
+
+def _textures(plane: Plane) -> Framing:
+    """Return a framing whose tags are the places of most texture, one in each part of the frame."""
+    import cv2
+
+    values = plane.values
+    height, width = values.shape
+    energy = cv2.boxFilter(cv2.Laplacian(values, cv2.CV_32F) ** 2, -1, (_TEXTURE_PX, _TEXTURE_PX))
+    tags: list[FoundTag] = []
+    margin = 2 * _TEXTURE_PX
+    half = _TEXTURE_PX / 2
+    across, down = _TEXTURES
+    for row in range(down):
+        for column in range(across):
+            top, bottom = (max(margin, row * height // down), min(height - margin, (row + 1) * height // down))
+            left, right = (max(margin, column * width // across), min(width - margin, (column + 1) * width // across))
+            if bottom <= top or right <= left:
+                continue
+            part = energy[top:bottom, left:right]
+            y, x = divmod(int(part.argmax()), part.shape[1])
+            middle = np.array([left + x, top + y]) + plane.offset_px
+            corners = np.array([(-half, -half), (half, -half), (half, half), (-half, half)])
+            tags.append(FoundTag(len(tags), corners + middle, 0.0))
+    return Framing(plane, tuple(tags), (), np.eye(3), 0.0, float("nan"), 1.0, True, 0.0)
+
+
+VERSION = 1
+"""Of the format of the bytes."""
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """A frame that was measured.
+
+    - `measured`: its light; `strips` may be empty where they were not kept.
+    - `paper`: (3,) float64, camera RGB of bare paper above black; NaN where no paper is known.
+    - `moved_px`: (2,) how far the chart lay from the anchor, right and down; NaN where it could not be told.
+    - `anchor`: the chart's place, if this frame is the one to compare with from now on.
+    """
+
+    measured: Measured
+    paper: _Array
+    moved_px: _Array
+    anchor: Anchor | None = None
+
+    def to_bytes(self, with_strips: bool) -> bytes:
+        """Return the bytes that `of_bytes` reads; strips are kept for frames that others are compared with."""
+        frame = self.measured
+        facts: dict[str, Any] = {
+            "version": VERSION,
+            "places": [frame.places.rows, frame.places.columns],
+            "digest": frame.digest.hex(),
+            "noise": [frame.noise.floor, frame.noise.slope],
+            "black": [frame.black, frame.black_measured],
+            "levels": [frame.range_dn, frame.brightest_dn, frame.clipped, frame.empty],
+            "camera": [frame.camera, frame.serial],
+            "paper": self.paper.tolist(),
+            "moved_px": self.moved_px.tolist(),
+        }
+        arrays: dict[str, npt.NDArray[Any]] = {
+            "tiles": frame.tiles.astype(np.float32),
+            "strips": (frame.strips if with_strips else frame.strips[:0]).astype(np.float32),
+        }
+        if self.anchor is not None:
+            arrays |= _anchor_arrays(self.anchor)
+            facts["anchor"] = [self.anchor.of_chart, self.anchor.framing.plane.channel]
+        arrays["facts"] = np.frombuffer(json.dumps(facts).encode(), dtype=np.uint8)
+        stream = io.BytesIO()
+        np.savez(stream, **arrays)  # pyright: ignore[reportArgumentType]
+        return stream.getvalue()
+
+    @classmethod
+    def of_bytes(cls, data: bytes) -> Frame | None:
+        """Return the frame of bytes that `to_bytes` made; None where they are of another version, or damaged."""
+        try:
+            with np.load(io.BytesIO(data), allow_pickle=False) as arrays:
+                facts = json.loads(bytes(arrays["facts"]))
+                if facts["version"] != VERSION:
+                    return None
+                rows, columns = facts["places"]
+                measured = Measured(
+                    tiles=arrays["tiles"].astype(np.float64),
+                    strips=arrays["strips"].astype(np.float64),
+                    samples=np.empty((0, 2), dtype=np.uint16),
+                    digest=bytes.fromhex(facts["digest"]),
+                    noise=Noise(*facts["noise"]),
+                    black=facts["black"][0],
+                    black_measured=facts["black"][1],
+                    range_dn=facts["levels"][0],
+                    brightest_dn=facts["levels"][1],
+                    clipped=facts["levels"][2],
+                    empty=facts["levels"][3],
+                    camera=facts["camera"][0],
+                    serial=facts["camera"][1],
+                    places=FramePlaces(rows, columns),
+                )
+                anchor = _anchor(arrays, facts["anchor"], (rows, columns)) if "anchor" in facts else None
+                return cls(measured, np.array(facts["paper"]), np.array(facts["moved_px"]), anchor)
+        except (KeyError, ValueError, TypeError, OSError, EOFError, zipfile.BadZipFile):
+            return None
+
+
+def _anchor_arrays(anchor: Anchor) -> dict[str, npt.NDArray[Any]]:
+    framing = anchor.framing
+    arrays: dict[str, npt.NDArray[Any]] = {
+        "anchor_paper": anchor.paper,
+        "anchor_ids": np.array([tag.id for tag in framing.tags], dtype=np.int64),
+        "anchor_corners": np.array([tag.corners_px for tag in framing.tags]).reshape(-1, 4, 2),
+        "anchor_homography": framing.homography,
+        "anchor_pose": np.array([framing.residual_px, framing.module_px, framing.fill, framing.rotation_deg]),
+        "anchor_inside": np.array([framing.inside]),
+        "anchor_offsets": np.array([anchor.gauges[channel].offset_px for channel in CHANNELS]),
+    }
+    for channel in CHANNELS:
+        values = anchor.gauges[channel].values
+        crops = [values[y0:y1, x0:x1].ravel() for x0, y0, x1, y1 in anchor.boxes()]
+        arrays[f"anchor_{channel}"] = np.concatenate(crops) if crops else np.empty(0, dtype=np.float32)
+    if framing.field is not None:
+        field = framing.field
+        arrays |= {
+            "anchor_field": field.homography,
+            "anchor_field_corners": field.corners_px,
+            "anchor_outline": np.stack([field.outline_mm, field.outline_px, field.normals]),
+            "anchor_explained": np.array([field.explained]),
+        }
+    return arrays
+
+
+def _anchor(arrays: Any, facts: list[Any], shape: tuple[int, int]) -> Anchor:
+    field: FoundField | None = None
+    if "anchor_field" in arrays:
+        outline_mm, outline_px, normals = arrays["anchor_outline"]
+        field = FoundField(
+            arrays["anchor_field_corners"], arrays["anchor_field"], outline_mm, outline_px, normals,
+            float(arrays["anchor_explained"][0]),
+        )  # fmt: skip
+    tags = tuple(
+        FoundTag(int(number), corners, 0.0)
+        for number, corners in zip(arrays["anchor_ids"], arrays["anchor_corners"], strict=True)
+    )
+    residual, module, fill, turned = arrays["anchor_pose"].tolist()
+    of_chart, searched = facts
+    gauges: dict[Channel, Plane] = {
+        channel: Plane(channel, np.zeros(shape, dtype=np.float32), (float(offset[0]), float(offset[1])))
+        for channel, offset in zip(CHANNELS, arrays["anchor_offsets"], strict=True)
+    }
+    framing = Framing(
+        gauges[searched], tags, (), arrays["anchor_homography"], residual, module, fill,
+        bool(arrays["anchor_inside"][0]), turned, field,
+    )  # fmt: skip
+    anchor = Anchor(framing, gauges, arrays["anchor_paper"], of_chart)
+    for channel in CHANNELS:
+        values, crops, begin = gauges[channel].values, arrays[f"anchor_{channel}"], 0
+        for x0, y0, x1, y1 in anchor.boxes():
+            size = (y1 - y0) * (x1 - x0)
+            values[y0:y1, x0:x1] = crops[begin : begin + size].reshape(y1 - y0, x1 - x0)
+            begin += size
+    return anchor

@@ -1,0 +1,583 @@
+"""A frame's way: while one is downloaded the next light settles, while one is exposed the last is judged.
+
+Order of a frame n, on one thread for the devices and one that saves and judges::
+
+    devices   settle n | begin n | expose n | screen? | show n+1 | projector? | download n | collect n-1 | settle …
+    saving             |        judge n-1                                     | hash, flush, rename, judge n …
+
+`Pipeline` moves the devices, `Saver` completes and judges files in the other thread, `Verdicts` lets frames count and
+draws what follows for others, `LastingCause` waits for what would refuse every frame.
+
+Rules that hold inside:
+
+- Settling counts from when the light was shown, so that it passes during the download and while verdicts are awaited.
+- The verdict of n is collected after the download of n+1, never earlier, and so before n+2 is exposed. The rule does
+  not depend on how fast anything is: a session in simulated time is the same each time.
+- The saving thread touches no device and no journal. The order on the disk is write, flush, rename; a frame counts when
+  its row is committed, which happens on the devices' thread, in the order of taking.
+- An attempt's row gets `started_at` when its light was shown and `ended_at` when the exposure was over and the light
+  could change: what they enclose are parts of the run's time that do not overlap, though the work on the frames does.
+- A light that is shown and not taken, because a refused one came first, leaves no row.
+- What fails is waited for (`acquisition.run.retry`) when no frame waits in the camera that could be saved first.
+"""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from collections.abc import Callable, Collection, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from datetime import datetime
+from functools import partial
+from typing import Self, TypeVar
+
+from acquisition.run.devices import Devices
+from acquisition.run.lamp import HealthWatch, await_health
+from acquisition.run.queue import StepQueue, link_runs, step_name
+from acquisition.run.retry import Pause, RetryPolicy, is_curable
+from drivers.presenter import ReadsBack
+from experiment.config import JudgeSettings, LabSettings
+from experiment.session.folder import ReceivedFile, Session
+from experiment.session.plan import REFERENCES, SessionStep
+from experiment.session.records import ACCEPTED, Check, FrameJudge, Judgement, OutlastsPauses, preview_path
+from foundation.console import Ending
+from foundation.errors import CropError, DeviceError, QualityError, StorageError, counted
+from foundation.files import write_whole
+
+AHEAD = 1
+"""Frames whose verdict is not known when the next is exposed: that of the one before has an exposure and a download to
+come in, several times what judging takes; more would only be lost where one is refused."""
+
+DOWNLOADS = 2
+"""Tries at fetching a frame before it is exposed again: a driver has renewed its connection several times by then."""
+
+PROBE_S = 5.0
+"""Between the second and the third try at a frame that is refused for something lasting; the second comes at once, each
+later pause is twice the one before."""
+
+LONGEST_PROBE_S = 300.0
+"""Between two such tries at most: each leaves a refused file of 25 MB, and an operator can wait for five minutes."""
+
+PROMISE = "ending after this frame; press Ctrl-C again to end at once"
+"""What somebody is told who asks a run to end."""
+
+_CAMERA, _SCREEN, _DISK = "the camera", "the screen", "the disk"
+
+_Result = TypeVar("_Result")
+
+
+@dataclass(frozen=True)
+class Job:
+    """What a run has from its first frame to its last."""
+
+    session: Session
+    devices: Devices
+    settings: LabSettings
+    queue: StepQueue
+    retry: RetryPolicy
+
+    def on_disk(self, action: Callable[[], _Result]) -> _Result:
+        """Return what `action` returns; while the disk is full or gone, it is waited for."""
+        return self.retry.attempt(action, _DISK)
+
+
+@dataclass(frozen=True)
+class Taken:
+    """A frame that was taken and judged; `left` steps of the plan are without an accepted frame now."""
+
+    step: SessionStep
+    judgement: Judgement
+    left: int
+
+
+@dataclass(frozen=True)
+class ShownLight:
+    """A step whose light is on the screen since `since`, seconds of the clock; to show it took `show_s`."""
+
+    step: SessionStep
+    shown_at: datetime
+    since: float
+    show_s: float
+
+
+@dataclass(frozen=True)
+class Exposed:
+    """A frame that is in the camera or beyond it; `checks` are what the devices say of it.
+
+    `number` is that of its attempt in the journal, `stem` its file's name without suffix.
+    """
+
+    step: SessionStep
+    number: int
+    stem: str
+    over_at: datetime
+    checks: tuple[Check, ...]
+    timings: Mapping[str, float]
+
+
+@dataclass(frozen=True)
+class Saved:
+    """A raw file that is complete on the disk, and what was seen in it.
+
+    - `save_s`, `judge_s`: seconds of this machine's time that hashing, flushing and renaming took, and judging.
+    - `preview_fault`: why its preview could not be written; empty where it was, or there is none.
+    """
+
+    received: ReceivedFile
+    judgement: Judgement
+    save_s: float
+    judge_s: float
+    preview_fault: str = ""
+
+
+class Pipeline:
+    """Takes what the job's queue lists, and journals it."""
+
+    def __init__(self, job: Job, saver: Saver, observe: Callable[[Taken], object], ending: Ending) -> None:
+        self._job, self._saver, self._observe, self._ending = job, saver, observe, ending
+        self._lasting = LastingCause(job, saver)
+        self._verdicts = Verdicts(job, self._lasting)
+        projector = job.devices.projector
+        self._health = None if projector is None else HealthWatch(projector, job.devices.clock)
+        self._under_way: deque[tuple[Exposed, Future[Saved]]] = deque()
+        self._pauses: dict[str, Pause] = {}
+
+    def run(self) -> None:
+        """Take frames until the queue is empty or the end was asked for.
+
+        Whatever ends it, frames that the camera has given are completed, judged and journalled first.
+        """
+        try:
+            with self._ending.finishing(PROMISE):
+                light = self._next_light()
+                while light is not None:
+                    light = self._take(light)
+        except BaseException as error:
+            self._salvage(error)
+            raise
+
+    def _next_light(self) -> ShownLight | None:
+        """Show the next light; wait for verdicts where it depends on them; None where nothing more is to be taken."""
+        while not self._ending.asked:
+            if self._lasting.is_found:
+                self._collect(0)
+                self._lasting.wait()
+            step = self._job.queue.next()
+            if step is not None:
+                return self._job.retry.attempt(partial(self._show, step), _SCREEN)
+            if not self._under_way:
+                return None
+            self._collect(0)
+        self._collect(0)
+        return None
+
+    def _take(self, light: ShownLight) -> ShownLight | None:
+        """Take the frame of the light that is on the screen; return the next one that is."""
+        settling_s = self._settle(light)
+        if self._ending.asked:
+            return self._next_light()
+        frame = self._expose(light, settling_s)
+        if frame is None:
+            return self._next_light()
+        # While it is doubtful whether frames can be had at all, one is taken at a time.
+        ahead = 0 if self._lasting.is_probed else AHEAD
+        following = self._show_following() if ahead else None
+        frame = replace(frame, checks=(*frame.checks, *self._projector_check(frame.step)))
+        self._hand_over(frame)
+        self._collect(ahead)
+        if not all(check.passed for check in frame.checks):
+            # What ails a device now decides whether the next frame makes sense.
+            self._collect(0)
+            if self._job.devices.projector is not None:
+                with self._ending.at_once():
+                    await_health(self._job.devices.projector, self._job.settings.sequence, self._job.retry)
+        elif following is not None and not self._lasting.is_found and self._job.queue.next() == following.step:
+            return following
+        return self._next_light()
+
+    def _show(self, step: SessionStep) -> ShownLight:
+        clock = self._job.devices.clock
+        shown_at, begun = clock.now(), clock.monotonic()
+        self._job.devices.presenter.show(step.colour)
+        since = clock.monotonic()
+        return ShownLight(step, shown_at, since, since - begun)
+
+    def _show_following(self) -> ShownLight | None:
+        """Show the next light if it is known; a presenter that fails is met when no frame waits in the camera."""
+        step = None if self._ending.asked else self._job.queue.next()
+        if step is None:
+            return None
+        try:
+            return self._show(step)
+        except DeviceError:
+            return None
+
+    def _settle(self, light: ShownLight) -> float:
+        """Let the rest of the settling pass; return how long that took."""
+        clock = self._job.devices.clock
+        rest = self._job.settings.sequence.settle_s - (clock.monotonic() - light.since)
+        if rest > 0:
+            clock.sleep(rest)
+        return max(rest, 0.0)
+
+    def _expose(self, light: ShownLight, settling_s: float) -> Exposed | None:
+        """Release the shutter; None where the camera failed, and was waited for."""
+        clock, step, journal = self._job.devices.clock, light.step, self._job.session.journal
+        kept = journal.kept_files(step)
+        stem = step.stem if kept == 0 else f"{step.stem}_try{kept + 1}"
+        number = self._job.on_disk(lambda: journal.begin(step, f"frames/{stem}", light.shown_at))
+        self._job.queue.begin(step)
+        begun = clock.monotonic()
+        try:
+            self._job.devices.camera.expose()
+        except DeviceError as error:
+            self._give_up(step, number, error)
+            self._pause_for(_CAMERA, error)
+            return None
+        timings = {"show": light.show_s, "settle": settling_s, "expose": clock.monotonic() - begun}
+        return Exposed(step, number, stem, clock.now(), self._screen_check(step), timings)
+
+    def _screen_check(self, step: SessionStep) -> tuple[Check, ...]:
+        """Ask the screen whether it still shows the light, before it may change."""
+        presenter = self._job.devices.presenter
+        if not isinstance(presenter, ReadsBack):
+            return ()
+        try:
+            presenter.verify(step.colour)
+        except DeviceError as error:
+            return (Check("screen", reason=str(error)),)
+        return (Check("screen"),)
+
+    def _projector_check(self, step: SessionStep) -> tuple[Check, ...]:
+        """Ask the projector for its health; it answers while the next light settles."""
+        if self._health is None:
+            return ()
+        fault = self._health.fault(thorough=step.kind == "dark")
+        return (Check("projector", reason="" if fault is None else str(fault)),)
+
+    def _hand_over(self, frame: Exposed) -> None:
+        """Fetch the frame from the camera and hand it to the saving thread; a frame that is lost is exposed again."""
+        clock = self._job.devices.clock
+        begun = clock.monotonic()
+        try:
+            complete = self._fetch(frame)
+        except DeviceError as error:
+            self._give_up(frame.step, frame.number, error)
+            self._pause_for(_CAMERA, error)
+            return
+        self._clear_pause(_CAMERA)
+        frame = replace(frame, timings={**frame.timings, "download": clock.monotonic() - begun})
+        self._under_way.append((frame, self._saver.submit(complete, frame)))
+
+    def _fetch(self, frame: Exposed) -> Callable[[], ReceivedFile]:
+        """Let the camera write the frame under a hidden name; return what completes the file.
+
+        What a full disk cannot take stays in the camera.
+        """
+        download = partial(_download, self._job, frame.stem)
+        for _ in range(DOWNLOADS - 1):
+            try:
+                return self._job.retry.attempt(download, _DISK, curable=_is_of_disk)
+            except DeviceError as error:
+                self._job.retry.report("retry", f"{step_name(frame.step)}: {error}")
+        return self._job.retry.attempt(download, _DISK, curable=_is_of_disk)
+
+    def _collect(self, keep: int) -> None:
+        """Journal the frames whose verdicts are due, oldest first, until `keep` are left to wait for."""
+        while len(self._under_way) > keep:
+            frame, awaited = self._under_way.popleft()
+            begun = time.perf_counter()
+            try:
+                saved = awaited.result()
+            except (DeviceError, StorageError) as error:
+                self._give_up(frame.step, frame.number, error)
+                self._pause_for(_DISK, error)
+                continue
+            self._clear_pause(_DISK)
+            timings = {"save": saved.save_s, "judge": saved.judge_s, "waited": time.perf_counter() - begun}
+            frame = replace(frame, timings={**frame.timings, **timings})
+            if self._health is not None and not saved.judgement.accepted:
+                self._health.suspect()
+            self._verdicts.take_in(frame, saved, [later for later, _ in self._under_way])
+            self._observe(Taken(frame.step, saved.judgement, len(self._job.queue)))
+
+    def _give_up(self, step: SessionStep, number: int, error: CropError) -> None:
+        """Note an attempt that gave no frame, by no fault of what was to be photographed."""
+        self._job.queue.withdraw(step)
+        self._collect(0)
+        now = self._job.devices.clock.now()
+        self._job.on_disk(lambda: self._job.session.journal.fail(number, now, str(error)))
+
+    def _pause_for(self, name: str, fault: CropError) -> None:
+        """Wait for a camera or disk that lost a frame; the pause lasts until a frame came through."""
+        self._pauses.setdefault(name, self._job.retry.pause(name, idle=name != _CAMERA)).wait(fault)
+
+    def _clear_pause(self, name: str) -> None:
+        if (pause := self._pauses.pop(name, None)) is not None:
+            pause.over()
+
+    def _salvage(self, error: BaseException) -> None:
+        """Journal what the camera has given, whatever ended the run; a further fault does not hide the first."""
+        while self._under_way:
+            try:
+                self._collect(0)
+            except CropError as further:
+                error.add_note(f"then: {further}")
+
+
+def _is_of_disk(fault: CropError) -> bool:
+    return isinstance(fault, StorageError) and is_curable(fault)
+
+
+def _download(job: Job, stem: str) -> Callable[[], ReceivedFile]:
+    """Let the camera write the frame exposed last into `frames/`, under a hidden name; return what completes it."""
+    incoming = job.session.incoming(stem)
+    try:
+        captured = job.devices.camera.download(incoming.stream)
+        size = incoming.stream.seek(0, 2)
+        if size != captured.size or size == 0:
+            # Found here and not when the file is completed: the body may hold the frame still.
+            raise DeviceError(f"{captured.name}: the camera says {captured.size} bytes, {size} arrived")
+    except BaseException:
+        with incoming:
+            raise
+    return partial(incoming.complete, captured)
+
+
+class Saver:
+    """The thread that completes files and judges them, one after another; use it in a `with` block.
+
+    At its end it waits for what was handed to it: a file that the camera has given is completed, whatever happens.
+    """
+
+    def __init__(self, session: Session, judge: FrameJudge) -> None:
+        self._session = session
+        self._judge = judge
+        self._thread = ThreadPoolExecutor(1, "saving")
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._thread.shutdown(wait=True)
+
+    def submit(self, complete: Callable[[], ReceivedFile], frame: Exposed) -> Future[Saved]:
+        """Hand over a frame's file, completed by `complete`; the result comes when all before it have."""
+        return self._thread.submit(self._save, complete, frame)
+
+    def after_pause(self) -> None:
+        """Tell the judge of a pause, if it wants to know; every file that was handed over must be judged."""
+        if isinstance(self._judge, OutlastsPauses):
+            self._judge.after_pause()
+
+    def _save(self, complete: Callable[[], ReceivedFile], frame: Exposed) -> Saved:
+        begun = time.perf_counter()
+        received = complete()
+        saved = time.perf_counter()
+        judgement, preview_fault = Judgement(frame.checks), ""
+        if judgement.accepted:
+            seen = self._judge.judge(received.path, frame.step)
+            judgement = replace(seen, checks=(*frame.checks, *seen.checks), preview=b"")
+            if seen.preview:
+                # It is derived and may be lost; flushing it would cost the devices' thread as much as a row.
+                try:
+                    write_whole(preview_path(self._session.folder, received.path.name), seen.preview)
+                except CropError as error:
+                    preview_fault = str(error)
+        return Saved(received, judgement, saved - begun, time.perf_counter() - saved, preview_fault)
+
+
+class Verdicts:
+    """Lets frames count or not, in the order of taking, and draws what follows for those before and behind them."""
+
+    def __init__(self, job: Job, lasting: LastingCause) -> None:
+        self._job, self._lasting = job, lasting
+        self._voided_ahead: dict[int, str] = {}
+        self._lacks_previews = False
+
+    def take_in(self, frame: Exposed, saved: Saved, under_way: Sequence[Exposed]) -> None:
+        """Journal a verdict; `under_way`: the frames behind it, whose verdicts are not known."""
+        job, step, judgement = self._job, frame.step, saved.judgement
+        job.on_disk(
+            lambda: job.session.commit(
+                frame.number,
+                saved.received,
+                judgement,
+                frame.timings,
+                exposure_s=job.settings.camera.shutter_s,
+                ended_at=frame.over_at,
+            )
+        )
+        if saved.preview_fault and not self._lacks_previews:
+            self._lacks_previews = True
+            job.retry.report("preview", f"{saved.preview_fault}; frames count without, and more is not said of it")
+        voided = self._voided_ahead.pop(frame.number, "")
+        if judgement.accepted and voided:
+            job.queue.withdraw(step)
+            self._void((frame.number,), voided)
+        elif judgement.accepted:
+            job.queue.accept(step)
+            for what, sentence in _followed_changes(step, judgement, job.session.steps, job.settings.judge):
+                job.retry.report(what, sentence)
+            self._lasting.accepted(step)
+        else:
+            self._refuse(step, judgement)
+        if judgement.voids and step.kind in REFERENCES:
+            self._void_since_reference(frame, judgement.reason, under_way)
+        elif judgement.voids:
+            self._void_first_frames(frame, judgement.reason, under_way)
+
+    def _refuse(self, step: SessionStep, judgement: Judgement) -> None:
+        queue = self._job.queue
+        first = judgement.lasting or (judgement.voids and step.kind in REFERENCES)
+        again = queue.refuse(step, judgement.reason, before_others=first)
+        # What would be taken again without a good reference would be voided again, all night.
+        in_vain = judgement.voids and not again
+        pauses = judgement.lasting or queue.is_stuck or self._lasting.is_probed or in_vain
+        after = "it is tried again after a pause" if pauses else "it is left for the next run"
+        then = "it is taken again" if again else after
+        sentence = f"{step_name(step)}: {judgement.reason}"
+        self._job.retry.report("refused", f"{sentence} ({then})")
+        if pauses:
+            self._lasting.found(sentence, step)
+
+    def _void_since_reference(self, refused: Exposed, why: str, under_way: Sequence[Exposed]) -> None:
+        """Void what was taken since the last good reference of the refused one's kind, frames under way included.
+
+        A reference of another kind stays that was taken beside the good one, before any light.
+        """
+        queue, kind = self._job.queue, refused.step.kind
+        reason = f"taken between a good reference and {step_name(refused.step)}, which was refused: {why}"
+        since: dict[int, int] = {}
+        for attempt in self._job.session.journal.attempts():
+            if attempt.verdict == ACCEPTED and attempt.id < refused.number:
+                if attempt.kind == kind:
+                    since.clear()
+                elif since or attempt.kind not in REFERENCES:
+                    since[attempt.id] = attempt.step
+        queue.void(since.values(), reason)
+        if queue.is_stuck:
+            self._lasting.found(reason, None)
+        self._void(since, reason)
+        self._void_ahead(under_way, reason)
+
+    def _void_first_frames(self, refused: Exposed, why: str, under_way: Sequence[Exposed]) -> None:
+        """Void what this run has taken, since its last pause for something lasting: by that others are judged."""
+        reason = f"the first frames contradict {step_name(refused.step)}: {why}"
+        since = {
+            attempt.id: attempt.step
+            for attempt in self._job.session.journal.attempts()
+            if attempt.verdict == ACCEPTED and self._lasting.last_before < attempt.id < refused.number
+        }
+        self._void(since, reason)
+        # The refused one, and what is under way, are taken again in their places among them.
+        again = {refused.step.number, *since.values(), *(frame.step.number for frame in under_way)}
+        self._job.queue.begin_with(step for step in self._job.session.steps if step.number in again)
+        self._void_ahead(under_way, reason)
+
+    def _void_ahead(self, under_way: Sequence[Exposed], reason: str) -> None:
+        """Void frames that have left the camera when they are known to be accepted."""
+        self._voided_ahead.update({frame.number: reason for frame in under_way})
+
+    def _void(self, attempts: Collection[int], reason: str) -> None:
+        if not attempts:
+            return
+        now = self._job.devices.clock.now()
+        self._job.on_disk(lambda: self._job.session.journal.void(tuple(attempts), now, reason))
+        self._job.retry.report("voided", f"{counted(len(attempts), 'frame')}, to be taken again: {reason}")
+
+
+class LastingCause:
+    """What would refuse every frame: waited for, and tried again at growing intervals until a frame shows it is over.
+
+    - `last_before`: the newest attempt from before the run, or from before its last pause for something lasting.
+    """
+
+    def __init__(self, job: Job, saver: Saver) -> None:
+        self._job, self._saver = job, saver
+        self.last_before = max((attempt.id for attempt in job.session.journal.attempts()), default=0)
+        self._sentence = ""
+        self._step: SessionStep | None = None
+        self._probing: tuple[Pause, float] | None = None
+
+    @property
+    def is_found(self) -> bool:
+        """Whether the run must wait before its next frame."""
+        return bool(self._sentence)
+
+    @property
+    def is_probed(self) -> bool:
+        """Whether it was waited for, and no frame has shown yet that it is over."""
+        return self._probing is not None
+
+    def found(self, sentence: str, step: SessionStep | None) -> None:
+        """Note the cause, and the step whose frame it refused; None where it voided those of others."""
+        self._sentence, self._step = sentence, step
+
+    def wait(self) -> None:
+        """Let time pass for somebody to remove the cause, then let the frames be tried again."""
+        fault, self._sentence = QualityError(self._sentence), ""
+        pause, pause_s = self._probing or (self._job.retry.pause("the frames"), 0.0)
+        clock = self._job.devices.clock
+        until = clock.monotonic() + pause_s
+        pause.wait(fault)
+        while clock.monotonic() < until:
+            pause.wait(fault)
+        self._probing = pause, min(max(2 * pause_s, PROBE_S), LONGEST_PROBE_S)
+        self._job.queue.retry()
+        if self._step is not None and self._step.kind != "dark":
+            self._link()
+
+    def accepted(self, step: SessionStep) -> None:
+        """Note an accepted frame, which may show that the cause is gone.
+
+        What links runs is accepted at another level of the lamp, and a dark frame where no light reaches the chart.
+        """
+        if self._probing is None:
+            return
+        if self._step is None:
+            is_over = step.kind != "dark"
+        else:
+            is_over = step.kind == "light" or step.number == self._step.number
+        if is_over:
+            self._probing[0].over()
+            self._probing = None
+
+    def _link(self) -> None:
+        """Take the frames first that link what follows to what was taken: what lasted may have changed for good."""
+        job = self._job
+        attempts = job.on_disk(job.session.journal.attempts)
+        if any(attempt.kind == "light" and attempt.verdict == ACCEPTED for attempt in attempts):
+            numbers = job.on_disk(lambda: link_runs(job.session))
+            job.queue.begin_with(step for step in job.session.steps if step.number in numbers)
+        self.last_before = attempts[-1].id
+        self._saver.after_pause()
+
+
+def _followed_changes(
+    step: SessionStep, judgement: Judgement, steps: Sequence[SessionStep], judge: JudgeSettings
+) -> list[tuple[str, str]]:
+    """Return what is said of changes that a run follows: words (``moved``, ``level``), each with a sentence."""
+    values = {check.name: check.value for check in judgement.checks if check.value is not None}
+    said: list[tuple[str, str]] = []
+    moved_px = values.get("movement", 0.0)
+    if moved_px > judge.moved_px:
+        sentence = (
+            f"{step_name(step)}: the chart lies {moved_px:.2f} px from where it was; the run goes on with its new "
+            "place, and build-lut follows it with a remark. Fix camera and print; to have all lights of one place, "
+            "begin a new session"
+        )
+        said.append(("moved", sentence))
+    percent = values.get("lamp", 0.0)
+    # A step of the lamp that was shown twice is beyond its limit. Frames that link runs have wide limits.
+    stepped = any(check.name == "lamp" and check.is_beyond for check in judgement.checks)
+    links = step.kind == "response" and any(one.kind == "light" and one.number < step.number for one in steps)
+    if stepped or (links and abs(percent) > judge.drift_percent):
+        more = "stronger" if percent > 0 else "weaker"
+        sentence = (
+            f"{step_name(step)}: the light is {abs(percent):.1f} % {more} than in the frames before; the run goes "
+            "on at the new level, and build-lut follows it by the white frames"
+        )
+        said.append(("level", sentence))
+    return said
