@@ -424,11 +424,11 @@ def _compare(
 def _print_result(result: BuildResult, told: JsonOutput) -> None:
     """Print the figures that matter most, the remarks, and the verdict; or add all that `report.json` holds."""
     if told.asked:
-        from calibration.report.report_json import report_json
+        from calibration.report.report import report_json
 
         told.add(**report_json(result))
         return
-    from calibration.report.summary import summary
+    from calibration.report.page import summary
     from calibration.verdict.wording import remark
 
     rows = [row for row in summary(result.figures) if row.brief]

@@ -11,30 +11,25 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from calibration.causes.cause import UNKNOWN
-from calibration.causes.evidence import Evidence
-from calibration.causes.light_evidence import (
-    brightness_evidence,
-    camera_evidence,
-    dark_evidence,
-    iso_evidence,
-    light_evidence,
-    name_evidence,
-    stray_evidence,
-)
-from calibration.causes.place_evidence import (
+from calibration.causes.gathering import (
     MOST_PLACES,
     Gathered,
     PrintPlace,
     block_evidence,
+    brightness_evidence,
+    camera_evidence,
+    dark_evidence,
     disturbed_evidence,
+    iso_evidence,
     lens_evidence,
+    light_evidence,
+    name_evidence,
     print_evidence,
     reference_evidence,
+    stray_evidence,
 )
-from calibration.causes.rules import RULES, Decision, decide
-from calibration.figures.frame_figures import FrameFigures
-from calibration.figures.table_figures import TableFigures
+from calibration.causes.rules import RULES, UNKNOWN, Decision, Evidence, decide
+from calibration.measurements import FrameMeasurements, TableMeasurements
 from calibration.sampling.windows import bleed
 from experiment.session.records import FrameRecord
 
@@ -67,7 +62,7 @@ class ProbableCause:
         return self.decision.cause.mends == "frames" and bool(self.frames)
 
 
-def explain(figure: str, limit: float, figures: TableFigures) -> ProbableCause | None:
+def explain(figure: str, limit: float, figures: TableMeasurements) -> ProbableCause | None:
     """Return why a figure is beyond its limit; None for a figure that explains itself, such as the size of a cell."""
     gather = _GATHERERS.get(figure)
     if gather is None:
@@ -81,7 +76,7 @@ def explain(figure: str, limit: float, figures: TableFigures) -> ProbableCause |
     return found if found.is_known else _as_another(found, figures)
 
 
-def _as_another(unknown: ProbableCause, figures: TableFigures) -> ProbableCause:
+def _as_another(unknown: ProbableCause, figures: TableMeasurements) -> ProbableCause:
     """Return a finding with the cause of a figure that it goes with, in the same frames; as it is where there is none.
 
     What lies on the print in a frame spreads its cells; a light that bears another's name has another's brightness.
@@ -102,7 +97,7 @@ def explained_figures() -> tuple[str, ...]:
     return tuple(_GATHERERS)
 
 
-def added_bleed(figures: TableFigures, frame: FrameFigures) -> float:
+def added_bleed(figures: TableMeasurements, frame: FrameMeasurements) -> float:
     """Return how much more light a frame's worst sample has from beyond its cell than that of the registered frame."""
     registration, window = figures.registration, figures.cells.window
     return bleed(registration.cell_px, frame.blur_px, window) - bleed(
@@ -110,19 +105,19 @@ def added_bleed(figures: TableFigures, frame: FrameFigures) -> float:
     )
 
 
-def _place_in_frame(figures: TableFigures, limit: float) -> Gathered | None:
+def _place_in_frame(figures: TableMeasurements, limit: float) -> Gathered | None:
     worst = _worst(figures, lambda frame: frame.consistency.block)
     if worst is None:
         return None
     return block_evidence(figures, worst, limit, added_bleed(figures, worst))
 
 
-def _small_place(figures: TableFigures, limit: float) -> Gathered | None:
+def _small_place(figures: TableMeasurements, limit: float) -> Gathered | None:
     worst = max(figures.frames, key=lambda frame: len(frame.consistency.disturbed))
     return disturbed_evidence(figures, added_bleed(figures, worst))
 
 
-def _all_cells(figures: TableFigures, limit: float) -> Gathered | None:
+def _all_cells(figures: TableMeasurements, limit: float) -> Gathered | None:
     worst = _worst(figures, lambda frame: frame.consistency.scatter)
     if worst is None:
         return None
@@ -130,7 +125,7 @@ def _all_cells(figures: TableFigures, limit: float) -> Gathered | None:
     return _of_frames(figures, worst, beyond)
 
 
-def _softer(figures: TableFigures, limit: float) -> Gathered | None:
+def _softer(figures: TableMeasurements, limit: float) -> Gathered | None:
     worst = _worst(figures, lambda frame: frame.blur_px)
     if worst is None:
         return None
@@ -138,14 +133,14 @@ def _softer(figures: TableFigures, limit: float) -> Gathered | None:
     return _of_frames(figures, worst, beyond)
 
 
-def _moved(figures: TableFigures, limit: float) -> Gathered | None:
+def _moved(figures: TableMeasurements, limit: float) -> Gathered | None:
     anew = [frame for frame in figures.frames if frame.reregistered]
     if not anew:
         return None
     return _of_frames(figures, max(anew, key=lambda frame: frame.shift.length_px), anew)
 
 
-def _found(figures: TableFigures, limit: float) -> Gathered:
+def _found(figures: TableMeasurements, limit: float) -> Gathered:
     registered = figures.registered_frame
     gathered = _of_frames(figures, registered, [registered])
     # What lay on the print is seen by its references, where other white frames show them without it.
@@ -153,7 +148,7 @@ def _found(figures: TableFigures, limit: float) -> Gathered:
     return Gathered(Evidence(**gathered.evidence.known() | known), gathered.frames, places)
 
 
-def _noisy(figures: TableFigures, limit: float) -> Gathered | None:
+def _noisy(figures: TableMeasurements, limit: float) -> Gathered | None:
     noisy, stains = np.asarray(figures.sensor.transfer.noisy), figures.cells.stains
     concerned = np.flatnonzero(noisy.any(axis=-1) if noisy.ndim > 1 else noisy)
     spotted = stains.stained | stains.doubtful
@@ -169,12 +164,12 @@ def _noisy(figures: TableFigures, limit: float) -> Gathered | None:
     return Gathered(Evidence(**known | lens_evidence(figures) | {"hot": hot}), frames, places)
 
 
-def _additivity(figures: TableFigures, limit: float) -> Gathered | None:
+def _additivity(figures: TableMeasurements, limit: float) -> Gathered | None:
     light = light_evidence(figures, limit)
     return light if light.frames else name_evidence(figures, _OFF_CODES_DEG)
 
 
-def _drift(figures: TableFigures, limit: float) -> Gathered | None:
+def _drift(figures: TableMeasurements, limit: float) -> Gathered | None:
     light = light_evidence(figures, limit)
     worst = max(figures.white_frames, key=lambda frame: frame.consistency.block, default=None)
     if worst is None or light.frames or not worst.consistency.block > _DISTURBED:
@@ -184,7 +179,7 @@ def _drift(figures: TableFigures, limit: float) -> Gathered | None:
     return Gathered(Evidence(**known), block.frames, block.places)
 
 
-def _of_frames(figures: TableFigures, worst: FrameFigures, beyond: list[FrameFigures]) -> Gathered:
+def _of_frames(figures: TableMeasurements, worst: FrameMeasurements, beyond: list[FrameMeasurements]) -> Gathered:
     """Return what is known of a frame as a whole; `beyond` are all frames that show it."""
     frames, ordered = figures.frames, sorted(beyond, key=lambda frame: frame is not worst)
     evidence = Evidence(
@@ -200,7 +195,7 @@ def _of_frames(figures: TableFigures, worst: FrameFigures, beyond: list[FrameFig
     return Gathered(evidence, () if whole else tuple(frame.record for frame in ordered), ())
 
 
-def _worst(figures: TableFigures, value: Callable[[FrameFigures], float]) -> FrameFigures | None:
+def _worst(figures: TableMeasurements, value: Callable[[FrameMeasurements], float]) -> FrameMeasurements | None:
     return max(figures.frames, key=value, default=None)
 
 
@@ -222,7 +217,7 @@ _GOES_WITH: dict[str, tuple[tuple[str, float], ...]] = {
 """Figures that others move along: each with those whose cause it shares where it has none of its own, and from which on
 these are looked at."""
 
-_GATHERERS: dict[str, Callable[[TableFigures, float], Gathered | None]] = {
+_GATHERERS: dict[str, Callable[[TableMeasurements, float], Gathered | None]] = {
     "unlike_block": _place_in_frame,
     "disturbed_cells": _small_place,
     "unlike_scatter": _all_cells,

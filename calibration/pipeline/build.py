@@ -22,8 +22,7 @@ from typing import Any
 
 import numpy as np
 
-from calibration.figures.linearity_figures import LinearityFigures
-from calibration.figures.table_figures import TableFigures
+from calibration.measurements import LinearityMeasurements, TableMeasurements
 from calibration.pipeline.baseline import baseline_of, with_lens, with_primaries
 from calibration.pipeline.checkpoint import Checkpoint, UnfinishedTable, unfinished_table
 from calibration.pipeline.collecting import check_figures, table_figures
@@ -250,7 +249,7 @@ class _BuildState:
     taken: IntakeState
     writer: LutWriter
     camera: str
-    linearity: LinearityFigures | None
+    linearity: LinearityMeasurements | None
 
 
 def _take_in_all(job: _Job, checkpoint: Checkpoint | None) -> _BuildState:
@@ -335,7 +334,7 @@ def _correct_drift(writer: LutWriter, drift: DriftCorrection) -> None:
         writer.put(light, corrected(writer.get(light), gain))
 
 
-def _write_table(work: _BuildState, figures: TableFigures) -> None:
+def _write_table(work: _BuildState, figures: TableMeasurements) -> None:
     """Write all of the table but its samples, which are there, and its report."""
     session, records, lights, greys = work.intake.session, work.taken.records, figures.lights, figures.greys
     by_light = {frame.record.illumination: frame for frame in figures.frames if frame.record.kind == "light"}

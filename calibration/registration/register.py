@@ -27,6 +27,7 @@ from calibration.registration.lateral_colour import LateralColour
 from calibration.registration.lens import Lens, fit_lens
 from calibration.registration.matching import Anchors, Matcher, not_this_chart
 from calibration.registration.registration import Registration
+from calibration.sampling.windows import largest_blur_px
 from drivers.raw.rawfile import Mosaic
 from experiment.chart.model import Chart
 from experiment.framing.finding import Framing, find_chart
@@ -36,7 +37,6 @@ from experiment.framing.planes import CHANNELS, Plane, frame_black, plane_of
 from experiment.framing.sharpness import blur_px
 from experiment.framing.tagless_field import FoundField, field_mm
 from experiment.framing.visibility import MIN_CELL_PX
-from experiment.limits.bleed import largest_blur_px
 from foundation.errors import RegistrationError
 from foundation.robust import sigma_of
 

@@ -46,7 +46,7 @@ OF_SUMMARY: Final[dict[str, Group]] = {
     **dict.fromkeys(("Noise of a sample", "Photon transfer", "Samples at 0"), "noise"),
     "Standard error of the ground truth": "truth",
 }
-"""Group of rows of `calibration.report.summary`, by name; all others are geometry."""
+"""Group of rows of `calibration.report.page`, by name; all others are geometry."""
 
 
 def group_of_row(name: str) -> Group:

@@ -12,9 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from calibration.causes.place_evidence import PrintPlace
-from calibration.figures.frame_figures import FrameFigures
-from calibration.figures.table_figures import TableFigures
+from calibration.causes.gathering import PrintPlace
+from calibration.measurements import FrameMeasurements, TableMeasurements
 from calibration.report.groups import Group
 from calibration.verdict.thresholds import THRESHOLDS
 from experiment.chart.model import Chart
@@ -54,12 +53,12 @@ class Worst:
         return f"{_TITLES.get(self.figure, self.figure)}: {self.what}"
 
 
-def worst_of(figures: TableFigures, chart: Chart) -> tuple[Worst, ...]:
+def worst_of(figures: TableMeasurements, chart: Chart) -> tuple[Worst, ...]:
     """Return where the worst of each figure is that has one, in the order of the groups."""
     return (*_of_geometry(figures, chart), *_of_lights(figures), *_of_cells(figures, chart), *_of_truth(figures))
 
 
-def cell_sides_px(figures: TableFigures, chart: Chart) -> npt.NDArray[np.float64]:
+def cell_sides_px(figures: TableMeasurements, chart: Chart) -> npt.NDArray[np.float64]:
     """Return the shorter side of each cell (N,) float64 half-size px, in the chart's order."""
     to_pixels = figures.registration.to_pixels
     half = np.array(chart.cell_mm) / 2
@@ -70,7 +69,7 @@ def cell_sides_px(figures: TableFigures, chart: Chart) -> npt.NDArray[np.float64
     return np.asarray(np.min(sides, axis=0))
 
 
-def _of_geometry(figures: TableFigures, chart: Chart) -> list[Worst]:
+def _of_geometry(figures: TableMeasurements, chart: Chart) -> list[Worst]:
     registration, file = figures.registration, figures.session.registered_file
     sides = cell_sides_px(figures, chart)
     smallest = int(np.argmin(sides))
@@ -96,7 +95,7 @@ def _of_geometry(figures: TableFigures, chart: Chart) -> list[Worst]:
     return found
 
 
-def _of_lights(figures: TableFigures) -> list[Worst]:
+def _of_lights(figures: TableMeasurements) -> list[Worst]:
     lights, found = figures.lights, list[Worst]()
     if lights.off_codes_deg is not None and lights.off_codes_deg.any():
         light = int(np.argmax(lights.off_codes_deg))
@@ -108,7 +107,7 @@ def _of_lights(figures: TableFigures) -> list[Worst]:
     return found
 
 
-def _of_cells(figures: TableFigures, chart: Chart) -> list[Worst]:
+def _of_cells(figures: TableMeasurements, chart: Chart) -> list[Worst]:
     """Return the worst of frames against the print, and of the print."""
     found: list[Worst] = []
     scattered = _extreme(figures, lambda frame: frame.consistency.scatter)
@@ -138,7 +137,7 @@ def _of_cells(figures: TableFigures, chart: Chart) -> list[Worst]:
     return found
 
 
-def _of_truth(figures: TableFigures) -> list[Worst]:
+def _of_truth(figures: TableMeasurements) -> list[Worst]:
     lights = figures.lights
     fewest = _extreme(figures, lambda frame: -float(frame.paper.references))
     found = [Worst("references_used", "truth", f"{fewest.paper.references} used", fewest.record.file)]
@@ -153,12 +152,12 @@ def _of_truth(figures: TableFigures) -> list[Worst]:
     return found
 
 
-def _extreme(figures: TableFigures, value: Callable[[FrameFigures], float]) -> FrameFigures:
+def _extreme(figures: TableMeasurements, value: Callable[[FrameMeasurements], float]) -> FrameMeasurements:
     """Return the frame with the largest value, the first of equals."""
     return max(figures.frames, key=value)
 
 
-def _light(figures: TableFigures, figure: str, group: Group, light: int, what: str) -> Worst:
+def _light(figures: TableMeasurements, figure: str, group: Group, light: int, what: str) -> Worst:
     frames = (frame.record for frame in figures.frames if frame.record.illumination == light)
     record = next(frames, None)
     return Worst(figure, group, what, "" if record is None else record.file, light)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from calibration.figures.table_figures import TableFigures
+from calibration.measurements import TableMeasurements
 from calibration.verdict.verdict import Verdict
 
 
@@ -18,6 +18,6 @@ class BuildResult:
     - `lut`: the table's folder; None after a check.
     """
 
-    figures: TableFigures
+    figures: TableMeasurements
     verdict: Verdict
     lut: Path | None

@@ -12,8 +12,7 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 from calibration.causes.findings import ProbableCause, explain
-from calibration.figures.frame_figures import FrameFigures
-from calibration.figures.table_figures import TableFigures
+from calibration.measurements import FrameMeasurements, TableMeasurements
 from calibration.registration.registration import Registration
 from calibration.sampling.windows import bleed
 from calibration.verdict.verdict import JudgedValue, Verdict
@@ -31,7 +30,7 @@ def retake_command(records: Sequence[FrameRecord]) -> str:
     return COMMAND if len(numbers) < len(records) else COMMAND.replace("bad", lights_text(numbers))
 
 
-def retaken_frames(verdict: Verdict, figures: TableFigures) -> tuple[FrameRecord, ...]:
+def retaken_frames(verdict: Verdict, figures: TableMeasurements) -> tuple[FrameRecord, ...]:
     """Return the frames to be taken again, in the order taken.
 
     Those beyond a refusing limit by themselves, and those that are the cause of a refusal or a remark.
@@ -46,7 +45,7 @@ def retaken_frames(verdict: Verdict, figures: TableFigures) -> tuple[FrameRecord
     return tuple(sorted((record for record in records if record.sha256 in named), key=lambda record: record.attempt))
 
 
-def is_mended_by_retaking(verdict: Verdict, figures: TableFigures) -> bool:
+def is_mended_by_retaking(verdict: Verdict, figures: TableMeasurements) -> bool:
     """Return whether each refusal is of single frames, so that a table could be made once these are taken again."""
     found = findings(verdict, figures)
     return bool(verdict.refused) and all(
@@ -55,7 +54,7 @@ def is_mended_by_retaking(verdict: Verdict, figures: TableFigures) -> bool:
     )
 
 
-def findings(verdict: Verdict, figures: TableFigures) -> dict[str, ProbableCause]:
+def findings(verdict: Verdict, figures: TableMeasurements) -> dict[str, ProbableCause]:
     """Return what each row beyond its limit is probably caused by, by the name of the limit."""
     rows = (*verdict.refused, *verdict.remarks)
     explained = ((row.threshold.name, explain(row.threshold.name, row.threshold.accept, figures)) for row in rows)
@@ -72,7 +71,7 @@ def retake_json(records: tuple[FrameRecord, ...], registered_sha256: str, newest
     }
 
 
-def _frames_of(row: JudgedValue, figures: TableFigures) -> list[FrameRecord] | None:
+def _frames_of(row: JudgedValue, figures: TableMeasurements) -> list[FrameRecord] | None:
     """Return the frames that are beyond a row's refusing limit; None where its value is not of single frames."""
     limit = row.threshold.refuse
     if limit is None:
@@ -98,7 +97,7 @@ def _frames_of(row: JudgedValue, figures: TableFigures) -> list[FrameRecord] | N
     return beyond if len(beyond) < len(figures.frames) else None
 
 
-def white_frames_beyond(limit: float, row: JudgedValue, figures: TableFigures) -> list[FrameRecord]:
+def white_frames_beyond(limit: float, row: JudgedValue, figures: TableMeasurements) -> list[FrameRecord]:
     """Return the white frames that are further than a limit from what the lights predict, by the row's value."""
     white = figures.lights.white_frames
     if white is None:
@@ -107,7 +106,7 @@ def white_frames_beyond(limit: float, row: JudgedValue, figures: TableFigures) -
     return [frame.record for frame, value in zip(figures.white_frames, off, strict=False) if value > limit]
 
 
-def _index(frame: FrameFigures) -> int:
+def _index(frame: FrameMeasurements) -> int:
     """Return a frame's light; beyond any light for a white frame."""
     return sys.maxsize if frame.record.illumination is None else frame.record.illumination
 
@@ -117,7 +116,7 @@ def added_bleed(registration: Registration, blur_px: float, window: int) -> floa
     return bleed(registration.cell_px, blur_px, window) - bleed(registration.cell_px, registration.blur_px, window)
 
 
-_VALUES: dict[str, Callable[[FrameFigures, TableFigures], float]] = {
+_VALUES: dict[str, Callable[[FrameMeasurements, TableMeasurements], float]] = {
     "softer_bleed": lambda frame, figures: added_bleed(figures.registration, frame.blur_px, figures.cells.window),
     "unlike_scatter": lambda frame, figures: frame.consistency.scatter,
     "unlike_block": lambda frame, figures: frame.consistency.block,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from calibration.checks.frame_consistency import has_enough_cells
-from calibration.figures.table_figures import TableFigures
+from calibration.measurements import TableMeasurements
 from calibration.sampling.windows import bleed
 from calibration.spread.fitting import MOST_MISFIT
 from calibration.verdict.retaking import added_bleed
@@ -20,7 +20,7 @@ _MOST_LEFT = next(limit.accept for limit in THRESHOLDS if limit.name == "correct
 """RMS error left by the lens from which on its remark speaks of the worst cells, too."""
 
 
-def judged_values(figures: TableFigures) -> dict[str, float]:
+def judged_values(figures: TableMeasurements) -> dict[str, float]:
     """Return the values that are judged, by name; in the units of `calibration.verdict.thresholds`.
 
     Left out is what could not be measured: from one frame, on a chart without tags or with few colours, without dark
@@ -36,7 +36,7 @@ def judged_values(figures: TableFigures) -> dict[str, float]:
     }
 
 
-def _registration_values(figures: TableFigures) -> dict[str, float]:
+def _registration_values(figures: TableMeasurements) -> dict[str, float]:
     """Return how well the chart was found in the frame that was registered first."""
     registration = figures.registration
     values = {
@@ -62,7 +62,7 @@ def _registration_values(figures: TableFigures) -> dict[str, float]:
     return values
 
 
-def _cell_values(figures: TableFigures) -> dict[str, float]:
+def _cell_values(figures: TableMeasurements) -> dict[str, float]:
     """Return how many cells are unfit, or doubtful."""
     cells = figures.cells
     values = {"unfit_share": len(cells.unfit) / max(_cell_count(figures), 1)}
@@ -72,7 +72,7 @@ def _cell_values(figures: TableFigures) -> dict[str, float]:
     return values
 
 
-def _frame_values(figures: TableFigures) -> dict[str, float]:
+def _frame_values(figures: TableMeasurements) -> dict[str, float]:
     """Return the worst values over all frames, and how frames differ from each other."""
     frames, registration = figures.frames, figures.registration
     used = min((frame.paper.references for frame in frames), default=0)
@@ -108,7 +108,7 @@ def _frame_values(figures: TableFigures) -> dict[str, float]:
     return values
 
 
-def _light_values(figures: TableFigures) -> dict[str, float]:
+def _light_values(figures: TableMeasurements) -> dict[str, float]:
     """Return how well the lights are known."""
     lights = figures.lights
     paper = lights.white.max(axis=1)
@@ -142,20 +142,20 @@ def _light_values(figures: TableFigures) -> dict[str, float]:
     return values
 
 
-def _white_is_white(figures: TableFigures) -> bool:
+def _white_is_white(figures: TableMeasurements) -> bool:
     """Return whether white and the primaries are what they are called, so that they may be added up."""
     off, white = figures.lights.off_codes_deg, figures.lights.white_frames
     named = (off is None or not (off > 0).any()) and (white is None or not (white.off_deg > 0).any())
     return named and _frames_are_alike(figures)
 
 
-def _frames_are_alike(figures: TableFigures) -> bool:
+def _frames_are_alike(figures: TableMeasurements) -> bool:
     """Return whether no names are exchanged and files tell of one camera and exposure, so that frames may be added."""
     exchanged = figures.lights.codes is not None and len(figures.lights.codes.exchanges) > 0
     return not exchanged and not figures.origins.other_camera and not figures.origins.other_exposure
 
 
-def _dark_values(figures: TableFigures) -> dict[str, float]:
+def _dark_values(figures: TableMeasurements) -> dict[str, float]:
     """Return what light there is while the projector shows black, and how it changes."""
     dark, white, lights = figures.dark_frames, [frame.paper.white for frame in figures.white_frames], figures.lights
     full = np.mean(white, axis=0) if white else lights.white[int(np.argmax(lights.white.sum(axis=1)))]
@@ -167,7 +167,7 @@ def _dark_values(figures: TableFigures) -> dict[str, float]:
     return values
 
 
-def _sensor_values(figures: TableFigures) -> dict[str, float]:
+def _sensor_values(figures: TableMeasurements) -> dict[str, float]:
     """Return how the sensor answers to light."""
     sensor = figures.sensor
     values = {
@@ -179,5 +179,5 @@ def _sensor_values(figures: TableFigures) -> dict[str, float]:
     return values
 
 
-def _cell_count(figures: TableFigures) -> int:
+def _cell_count(figures: TableMeasurements) -> int:
     return len(figures.registration.mismatched_cells)

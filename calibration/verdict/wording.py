@@ -6,7 +6,7 @@ from collections import Counter
 
 from calibration.causes.findings import ProbableCause, explain
 from calibration.checks.frame_origins import ForeignFrame
-from calibration.figures.table_figures import TableFigures
+from calibration.measurements import TableMeasurements
 from calibration.verdict.retaking import (
     COMMAND,
     findings,
@@ -41,7 +41,7 @@ _REMEDIES = {
 """What helps against each cause of unfit cells (`calibration.pipeline.cell_statistics`)."""
 
 
-def refusal(verdict: Verdict, figures: TableFigures, *, reported: bool = False) -> str:
+def refusal(verdict: Verdict, figures: TableMeasurements, *, reported: bool = False) -> str:
     """Return why there is no table and what helps, in a line; of the first of the verdict's refused rows."""
     found = findings(verdict, figures)
     # What is explained explains more than what comes first.
@@ -67,7 +67,7 @@ def refusal(verdict: Verdict, figures: TableFigures, *, reported: bool = False) 
     return f"{_with_place(worst, figures)}{detail}{more}; {probably}{remedy}, and {what}"
 
 
-def remark(row: JudgedValue, figures: TableFigures) -> str:
+def remark(row: JudgedValue, figures: TableMeasurements) -> str:
     """Return a row that is remarked on: value, expectation, place, cause, remedy and command, in a line."""
     finding = explain(row.threshold.name, row.threshold.accept, figures)
     remedy, again = row.threshold.remedy, ""
@@ -93,13 +93,13 @@ def cause_text(finding: ProbableCause | None) -> str:
     return f"probably {decision.cause.says}{why}; "
 
 
-def _with_place(row: JudgedValue, figures: TableFigures) -> str:
+def _with_place(row: JudgedValue, figures: TableMeasurements) -> str:
     """Return a value against its limit, and where the worst of it is."""
     place = _place(row, figures)
     return f"{row.text()}, {place}" if place else row.text()
 
 
-def _place(row: JudgedValue, figures: TableFigures) -> str:
+def _place(row: JudgedValue, figures: TableMeasurements) -> str:
     """Return in which frame or lights the worst of a value is, and where on the print; "" where it has no place."""
     match row.threshold.name:
         case "softer_bleed":
@@ -133,7 +133,7 @@ def _place(row: JudgedValue, figures: TableFigures) -> str:
             return places_text(explain(row.threshold.name, row.threshold.accept, figures))
 
 
-def _left_by_lens(figures: TableFigures) -> str:
+def _left_by_lens(figures: TableMeasurements) -> str:
     """Return how large a veil may be, and which cells are furthest off by what the lens may have left."""
     lens = figures.lens
     found = f"{100 * lens.veil:.2f} ± {100 * lens.veil_error:.2f} % of the mean light"
@@ -143,7 +143,7 @@ def _left_by_lens(figures: TableFigures) -> str:
     )
 
 
-def _exchanges(figures: TableFigures) -> str:
+def _exchanges(figures: TableMeasurements) -> str:
     """Return which lights bear each other's names, behind a semicolon; "" where none do."""
     codes = figures.lights.codes
     if codes is None or not codes.exchanges:
@@ -159,7 +159,7 @@ def _light(index: int, count: int) -> str:
     return f"light {index}" if index < count else f"white frame {index - count}"
 
 
-def _brightness(accepted: float, figures: TableFigures) -> str:
+def _brightness(accepted: float, figures: TableMeasurements) -> str:
     """Return which lights are brighter or darker than their codes predict, the furthest off first."""
     codes = figures.lights.codes
     if codes is None:

@@ -11,7 +11,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from calibration.causes.cause import (
+from calibration.causes.findings import ProbableCause
+from calibration.causes.rules import (
     DEFOCUS,
     OBJECT_IN_FRAME,
     OTHER_EXPOSURE,
@@ -22,7 +23,6 @@ from calibration.causes.cause import (
     UNKNOWN,
     Cause,
 )
-from calibration.causes.findings import ProbableCause
 from calibration.pipeline.build import build
 from calibration.verdict.result import BuildResult
 from calibration.verdict.retaking import findings, retaken_frames

@@ -17,8 +17,8 @@ from calibration.cli import main
 from calibration.pipeline.build import build, check
 from calibration.pipeline.frames import session_sha256
 from calibration.report.groups import GROUPS, OF_THRESHOLDS
+from calibration.report.page import summary
 from calibration.report.report import write_report
-from calibration.report.summary import summary
 from calibration.report.worsts import cell_sides_px, worst_of
 from calibration.table.lut import Lut, open_lut
 from calibration.verdict.result import BuildResult

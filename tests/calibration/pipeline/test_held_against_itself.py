@@ -12,8 +12,8 @@ from pathlib import Path
 import pytest
 
 from calibration.pipeline.build import build
-from calibration.report.report_json import report_json
-from calibration.report.summary import summary
+from calibration.report.page import summary
+from calibration.report.report import report_json
 from calibration.verdict.result import BuildResult
 from drivers.presenter import WHITE, Colour
 from experiment.lights.illuminations import Illumination

@@ -11,7 +11,7 @@ from benchmarks.cases import chart_of
 from benchmarks.sessions import AS_PLANNED, FrameChange, light_named, short_plan, short_session, world_of
 from calibration.pipeline.build import build
 from calibration.pipeline.options import BuildOptions
-from calibration.report.summary import summary
+from calibration.report.page import summary
 from calibration.verdict.result import BuildResult
 from calibration.verdict.thresholds import THRESHOLDS
 from calibration.verdict.values import judged_values

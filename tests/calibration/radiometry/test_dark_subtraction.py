@@ -14,7 +14,7 @@ from calibration.cli import main
 from calibration.pipeline.build import TableProgress, append, build, check
 from calibration.pipeline.options import BuildOptions
 from calibration.radiometry.dark_subtraction import DarkLightEstimator, reflectances, winsorised_means
-from calibration.report.summary import summary
+from calibration.report.page import summary
 from calibration.table.lut import open_lut
 from calibration.verdict.result import BuildResult
 from drivers.presenter import BLACK

@@ -5,9 +5,9 @@ from __future__ import annotations
 import ast
 from pathlib import Path
 
-import calibration.report.summary as summary_module
+import calibration.report.page as summary_module
 from calibration.report.groups import GROUPS, OF_SUMMARY, OF_THRESHOLDS, QUESTIONS
-from calibration.report.style import STYLE
+from calibration.report.page import STYLE
 from calibration.verdict.thresholds import THRESHOLDS
 
 

@@ -9,10 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from calibration.causes.place_evidence import PrintPlace
+from calibration.causes.gathering import PrintPlace
 from calibration.pipeline.build import build
-from calibration.report.places import draw_places, draw_reference_residuals, reference_residuals
-from calibration.report.plots import png_of
+from calibration.report.plots import draw_places, draw_reference_residuals, png_of, reference_residuals
 from calibration.report.report import half_size, write_report
 from calibration.verdict.thresholds import THRESHOLDS
 from drivers.raw.rawfile import read_raw

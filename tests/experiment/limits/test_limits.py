@@ -5,9 +5,9 @@ from __future__ import annotations
 import pytest
 
 from acquisition.judge import limits as judge
+from calibration.sampling.windows import bleed, blur_of_bleed, largest_blur_px
 from calibration.verdict.thresholds import THRESHOLDS
 from calibration.verdict.verdict import judge as judged
-from experiment.limits.bleed import bleed, blur_of_bleed, largest_blur_px
 from experiment.limits.table import TABLE_LIMITS, TableLimit
 
 

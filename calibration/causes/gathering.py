@@ -1,4 +1,7 @@
-"""What is known of a place on the print that deviates: in which frames, how large, of which colour, added or taken."""
+"""What is known of a light that is not as it should be: exposures by the files, names, light in the dark.
+
+What is known of a place on the print that deviates: in which frames, how large, of which colour, added or taken.
+"""
 
 from __future__ import annotations
 
@@ -7,11 +10,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from calibration.causes.evidence import Evidence
-from calibration.figures.frame_figures import FrameFigures
-from calibration.figures.table_figures import TableFigures
-from calibration.sampling.windows import bleed
-from experiment.limits.bleed import WINDOW_PX
+from calibration.causes.rules import Evidence
+from calibration.measurements import FrameMeasurements, TableMeasurements
+from calibration.sampling.windows import WINDOW_PX, bleed
 from experiment.measures.reflections import cell_mm, joined_cells, light_of_spot, spot_colour, spots_of
 from experiment.measures.stains import Stains
 from experiment.session.records import FrameRecord
@@ -76,7 +77,7 @@ class Gathered:
     places: tuple[PrintPlace, ...]
 
 
-def block_evidence(figures: TableFigures, worst: FrameFigures, limit: float, softer: float) -> Gathered:
+def block_evidence(figures: TableMeasurements, worst: FrameMeasurements, limit: float, softer: float) -> Gathered:
     """Return what is known of the place that deviates most in one frame from the frame registered first.
 
     `softer`: light of neighbouring cells added by the frame's blur, a share.
@@ -122,7 +123,7 @@ def covered_deviation(off: npt.NDArray[np.float64]) -> float:
     return np.nan if mixed else float(darker.min())
 
 
-def disturbed_evidence(figures: TableFigures, softer: float) -> Gathered | None:
+def disturbed_evidence(figures: TableMeasurements, softer: float) -> Gathered | None:
     """Return what is known of the cells that something small covers in lights' frames; None where there are none.
 
     `softer`: light of neighbouring cells added by the worst frame's blur, a share.
@@ -137,7 +138,7 @@ def disturbed_evidence(figures: TableFigures, softer: float) -> Gathered | None:
     others = [frame for frame in figures.frames if frame is not first]
     whites = [frame for frame in others if frame.record.kind == "white"]
 
-    def showing(among: list[FrameFigures]) -> float:
+    def showing(among: list[FrameMeasurements]) -> float:
         same = [any(cell in cells for cell, _ in frame.consistency.disturbed) for frame in among]
         return sum(same) / max(len(among), 1)
 
@@ -160,7 +161,7 @@ def disturbed_evidence(figures: TableFigures, softer: float) -> Gathered | None:
     return Gathered(evidence, tuple(frame.record for frame in lights), tuple(places[:MOST_PLACES]))
 
 
-def print_evidence(figures: TableFigures, figure: str) -> Gathered | None:
+def print_evidence(figures: TableMeasurements, figure: str) -> Gathered | None:
     """Return what is known of the print's largest spot, of unfit cells, or of what the field leaves."""
     if figure == "reference_spread":
         return _of_references(figures)
@@ -191,7 +192,7 @@ def print_evidence(figures: TableFigures, figure: str) -> Gathered | None:
     return replace(gathered, places=(*gathered.places, *more))
 
 
-def lens_evidence(figures: TableFigures) -> dict[str, float]:
+def lens_evidence(figures: TableMeasurements) -> dict[str, float]:
     """Return what is known of what the lens brings into cells, and of the sheet's flatness, by `Evidence`'s names."""
     registration, unfit = figures.registration, figures.cells.unfit
     known = {"waves_px": registration.lens_residual_px / registration.clearance}
@@ -204,7 +205,7 @@ def lens_evidence(figures: TableFigures) -> dict[str, float]:
     return known
 
 
-def _of_spot(figures: TableFigures, stains: Stains, spot: npt.NDArray[np.int64]) -> Gathered:
+def _of_spot(figures: TableMeasurements, stains: Stains, spot: npt.NDArray[np.int64]) -> Gathered:
     """Return what is known of one spot of the print."""
     place = _place_of(stains, spot, figures.registered_frame.record.file)
     at_mm = np.array([place.x_mm, place.y_mm])
@@ -229,7 +230,7 @@ def _of_spot(figures: TableFigures, stains: Stains, spot: npt.NDArray[np.int64])
         softer=0.0,
         hot=float((hottest[spot] > 0).mean()) if len(hottest) == len(stains.places_mm) else np.nan,
     )
-    frames: list[FrameFigures] = []
+    frames: list[FrameMeasurements] = []
     if evidence.in_first == 1:
         frames = [figures.registered_frame]
     elif 0 < white_residual <= _HALF:
@@ -241,7 +242,7 @@ def _of_spot(figures: TableFigures, stains: Stains, spot: npt.NDArray[np.int64])
     return Gathered(evidence, tuple(frame.record for frame in frames), (place,))
 
 
-def _white_off(figures: TableFigures, at_mm: _Array, size_mm: float, least: float) -> list[FrameFigures]:
+def _white_off(figures: TableMeasurements, at_mm: _Array, size_mm: float, least: float) -> list[FrameMeasurements]:
     """Return the white frames whose references are off at a place by `least` or more."""
     reach = max(size_mm, 3 * cell_mm(figures.cells.stains))
     return [
@@ -252,13 +253,15 @@ def _white_off(figures: TableFigures, at_mm: _Array, size_mm: float, least: floa
     ]
 
 
-def _white_residual(figures: TableFigures, at_mm: _Array, size_mm: float, least: float) -> float:
+def _white_residual(figures: TableMeasurements, at_mm: _Array, size_mm: float, least: float) -> float:
     """Return the share of the white frames whose references are off at a place by `least` or more."""
     whites = figures.white_frames
     return len(_white_off(figures, at_mm, size_mm, least)) / len(whites) if whites else 0.0
 
 
-def reference_evidence(figures: TableFigures, frame: FrameFigures) -> tuple[dict[str, float], tuple[PrintPlace, ...]]:
+def reference_evidence(
+    figures: TableMeasurements, frame: FrameMeasurements
+) -> tuple[dict[str, float], tuple[PrintPlace, ...]]:
     """Return what a frame's references show where they deviate most, by the names of `Evidence`, and that place.
 
     Nothing where the frame is not white, there is no other white one, or they do not deviate.
@@ -269,7 +272,7 @@ def reference_evidence(figures: TableFigures, frame: FrameFigures) -> tuple[dict
         return {}, ()
     at_mm, near_mm = np.array(left.at_mm), 0.25 * float(np.hypot(*np.ptp(figures.cells.stains.places_mm, axis=0)))
 
-    def is_off(other: FrameFigures) -> bool:
+    def is_off(other: FrameMeasurements) -> bool:
         seen = other.paper.left
         apart = float(np.linalg.norm(np.array(seen.at_mm) - at_mm))
         return abs(_colour(np.array(seen.deviation))[0]) >= _HALF * abs(deviation) and apart < near_mm
@@ -285,7 +288,7 @@ def reference_evidence(figures: TableFigures, frame: FrameFigures) -> tuple[dict
     return known, (PrintPlace(frame.record.file, x, y, 0.0),)
 
 
-def _of_references(figures: TableFigures) -> Gathered | None:
+def _of_references(figures: TableMeasurements) -> Gathered | None:
     """Return what is known of the references about the flat field, in the white frame with the largest residuals."""
     whites = figures.white_frames
     if not whites:
@@ -311,7 +314,7 @@ def _of_references(figures: TableFigures) -> Gathered | None:
     return replace(gathered, evidence=Evidence(**known | gathered.evidence.known()))
 
 
-def _across_frames(figures: TableFigures, at_mm: _Array, size_mm: float, least: float) -> dict[str, float]:
+def _across_frames(figures: TableMeasurements, at_mm: _Array, size_mm: float, least: float) -> dict[str, float]:
     """Return in which frames a place differs from the frame registered first, by the names of `Evidence`."""
     first = figures.registered_frame
     others = [frame for frame in figures.frames if frame is not first]
@@ -328,7 +331,7 @@ def _across_frames(figures: TableFigures, at_mm: _Array, size_mm: float, least: 
     }
 
 
-def _showing(figures: TableFigures, at_mm: _Array, size_mm: float, least: float) -> list[FrameFigures]:
+def _showing(figures: TableMeasurements, at_mm: _Array, size_mm: float, least: float) -> list[FrameMeasurements]:
     """Return the frames that differ from the one registered first at a place, the worst first."""
     first = figures.registered_frame
     found = [
@@ -342,7 +345,7 @@ def _showing(figures: TableFigures, at_mm: _Array, size_mm: float, least: float)
     return sorted(found, key=lambda frame: -frame.consistency.block)
 
 
-def _frames_beyond(figures: TableFigures, worst: FrameFigures, limit: float) -> list[FrameFigures]:
+def _frames_beyond(figures: TableMeasurements, worst: FrameMeasurements, limit: float) -> list[FrameMeasurements]:
     beyond = [frame for frame in figures.frames if frame.consistency.block > limit]
     return sorted(beyond or [worst], key=lambda frame: -frame.consistency.block)
 
@@ -371,10 +374,103 @@ def _spot_share(stains: Stains, at_mm: _Array, size_mm: float) -> float:
     return float((stains.stained | stains.doubtful)[near].mean()) if near.any() else np.nan
 
 
-def _hot_share(figures: TableFigures, at_mm: _Array, size_mm: float) -> float:
+def _hot_share(figures: TableMeasurements, at_mm: _Array, size_mm: float) -> float:
     """Return the share of the cells about a place that hold a photosite hot in every dark frame."""
     hottest, places = figures.dark_frames.hottest, figures.cells.stains.places_mm
     if len(hottest) != len(places):
         return np.nan
     near = np.linalg.norm(places - at_mm, axis=1) < size_mm / 2
     return float((hottest[near] > 0).mean()) if near.any() else np.nan
+
+
+def light_evidence(figures: TableMeasurements, limit: float) -> Gathered:
+    """Return what is known of whites that do not add up, drift, or are not what their codes give."""
+    frames = figures.frames
+    stated = np.array([frame.exposure for frame in frames])
+    known = stated > 0
+    exposure, worst = np.nan, -1
+    if known.all() and len(frames) > 1:
+        # What most light frames have is the session's; white frames are few.
+        usual = float(np.median([frame.exposure for frame in frames if frame.record.kind == "light"] or stated))
+        ratio = stated / usual
+        worst = int(np.argmax(np.abs(np.log(ratio))))
+        exposure = float(ratio[worst])
+        beyond = [
+            frame
+            for frame, one in zip(frames, ratio.tolist(), strict=True)
+            if abs(np.log(one)) > 0.5 * abs(np.log(exposure))
+        ]
+    else:
+        beyond = []
+    evidence = Evidence(frames=float(len(frames)), exposure=exposure)
+    differs = exposure == exposure and abs(np.log(exposure)) > _SAME
+    return Gathered(evidence, tuple(frame.record for frame in beyond) if differs else (), ())
+
+
+def name_evidence(figures: TableMeasurements, limit: float) -> Gathered:
+    """Return what is known of lights whose whites are not what their codes give; `limit` as in `light_evidence`."""
+    gathered, codes = light_evidence(figures, np.inf), figures.lights.codes
+    if codes is None:
+        return gathered
+    exchanged = {light for pair in codes.exchanges for light in (pair.one, pair.other)}
+    off = figures.lights.off_codes_deg
+    far: set[int] = set() if off is None else set(np.flatnonzero(off > limit).tolist())
+    as_another = exchanged | {light for light in far if codes.seen_as[light] >= 0}
+    lights = figures.session.lights
+    whites = [frame.record for number, frame in enumerate(figures.white_frames) if lights + number in exchanged]
+    named = [frame.record for frame in figures.frames if frame.record.illumination in far | exchanged]
+    known = gathered.evidence.known() | {"off_codes_deg": float(codes.off_deg.max())}
+    if as_another:
+        known["named_right"] = 0.0
+    return Gathered(Evidence(**known), (*named, *whites), ())
+
+
+def brightness_evidence(figures: TableMeasurements, limit: float) -> Gathered:
+    """Return what is known of lights that are brighter or darker than their codes give; `limit` in `light_evidence`."""
+    gathered, codes = light_evidence(figures, limit), figures.lights.codes
+    if gathered.frames or codes is None:
+        return gathered
+    off = set(np.flatnonzero(codes.off_brightness > limit).tolist())
+    frames = tuple(frame.record for frame in figures.frames if frame.record.illumination in off)
+    return Gathered(gathered.evidence, frames, ())
+
+
+def camera_evidence(figures: TableMeasurements, limit: float) -> Gathered:
+    """Return what is known of frames of another camera or lens; `limit` as in `light_evidence`."""
+    origins = figures.origins
+    foreign = origins.other_camera or origins.other_lens
+    cameras = 1 + len({frame.found for frame in foreign})
+    evidence = Evidence(frames=float(len(figures.frames)), cameras=float(cameras))
+    return Gathered(evidence, tuple(frame.record for frame in foreign), ())
+
+
+def iso_evidence(figures: TableMeasurements, limit: float) -> Gathered:
+    """Return which frames state another ISO speed; `limit` as in `light_evidence`."""
+    frames = tuple(frame.record for frame in figures.origins.other_iso)
+    return Gathered(Evidence(frames=float(len(figures.frames)), other_iso=float(len(frames))), frames, ())
+
+
+def dark_evidence(figures: TableMeasurements, limit: float) -> Gathered:
+    """Return what is known of the light while the projector shows black; `limit` as in `light_evidence`."""
+    dark, whites = figures.dark_frames, [frame.paper.white for frame in figures.white_frames]
+    lights = figures.lights.white
+    full = np.mean(whites, axis=0) if whites else lights[int(np.argmax(lights.sum(axis=1)))]
+    room = float(np.abs(dark.light / full).max()) if np.isfinite(dark.light).all() else np.nan
+    change = float((np.ptp(dark.lights, axis=0) / full).max()) if len(dark.lights) > 1 else np.nan
+    return Gathered(Evidence(frames=float(len(dark.files)), room=room, room_change=change), (), ())
+
+
+def stray_evidence(figures: TableMeasurements, limit: float) -> Gathered:
+    """Return what is known of light that no dark frame shows, and in which frames; `limit` as in `light_evidence`."""
+    stray = figures.lights.stray
+    if stray is None:
+        return Gathered(Evidence(), (), ())
+    by_light = {frame.record.illumination: frame.record for frame in figures.frames if frame.record.kind == "light"}
+    frames = tuple(by_light[light] for light in stray.lights_beyond(limit) if light in by_light)
+    certain = float(stray.certain.max(initial=0.0))
+    evidence = Evidence(frames=float(len(figures.frames)), stray=certain, stray_primaries=stray.of_primaries)
+    return Gathered(evidence, frames, ())
+
+
+_SAME = 0.03
+"""Logarithm of two exposures' ratio up to which they are one: shutter speeds differ by a quarter, and are rounded."""
