@@ -27,7 +27,7 @@ from calibration.measurements import FrameMeasurements
 from calibration.registration.registration import Registration
 from calibration.sampling.samples import sites_at
 from calibration.table.lut import Lut
-from calibration.verdict.result import BuildResult
+from calibration.verdict import BuildResult
 from drivers.camera import CapturedFrame, ExposureSettings
 from drivers.presenter import Colour
 from drivers.raw.rawfile import read_raw

@@ -27,7 +27,7 @@ from foundation.json_output import AsJson, JsonOutput, json_output
 if TYPE_CHECKING:
     from calibration.pipeline.build import TableProgress
     from calibration.pipeline.options import BuildOptions
-    from calibration.verdict.result import BuildResult
+    from calibration.verdict import BuildResult
     from experiment.session.folder import Session
 
 app = new_app()
@@ -375,7 +375,7 @@ def _check(
     result = check(session, options, linearity, picture)
     _print_result(result, told)
     if result.verdict.refused:
-        from calibration.verdict.wording import refusal
+        from calibration.verdict import refusal
 
         raise QualityError(f"{session.folder}: {refusal(result.verdict, result.figures)}")
     print(f"{session.folder}: the chart is found and is the one expected; a table can be built")
@@ -429,7 +429,7 @@ def _print_result(result: BuildResult, told: JsonOutput) -> None:
         told.add(**report_json(result))
         return
     from calibration.report.page import summary
-    from calibration.verdict.wording import remark
+    from calibration.verdict import remark
 
     rows = [row for row in summary(result.figures) if row.brief]
     width = max(len(row.name) for row in rows) + 2

@@ -1,10 +1,7 @@
-"""The figures of one frame, and their form in a checkpoint.
+"""What was measured by a build, or by a check, in named groups of frozen values: verdict, report and table rest on it.
 
-How a sensor's counts follow the light, by a series of exposures.
-
-All figures of a build, or of a check, in named groups: what the verdict judges and report and table are made from.
-
-L lights, C colours, G levels of grey, S samples of a cell; counts are above black unless called raw.
+Nothing is judged here, nothing drawn, no file read. L lights, C colours, G levels of grey, S samples of a cell; counts
+are above black unless called raw.
 """
 
 from __future__ import annotations
@@ -28,6 +25,7 @@ from calibration.radiometry.greys import tint_deg
 from calibration.radiometry.photon_transfer import PhotonTransfer
 from calibration.radiometry.primaries import Primaries
 from calibration.registration.registration import Registration
+from calibration.sampling.windows import bleed
 from calibration.spread.correction import LensFigures
 from calibration.spread.point_spread import PointSpread
 from calibration.table.provenance import Unfit
@@ -344,6 +342,12 @@ class TableMeasurements:
         named = (frame for frame in self.frames if frame.record.file == self.session.registered_file)
         return next(named, self.frames[0])
 
+    def added_bleed(self, frame: FrameMeasurements) -> float:
+        """Return how much more light a frame's worst sample has from beyond its cell than the registered frame's."""
+        registration, window = self.registration, self.cells.window
+        own, first = (bleed(registration.cell_px, px, window) for px in (frame.blur_px, registration.blur_px))
+        return own - first
+
     @property
     def largest_shift_px(self) -> float:
         """The chart's largest movement between a frame and the registration that it was sampled by, half-size px."""
@@ -359,6 +363,24 @@ class TableMeasurements:
         """Largest relative change of paper white between white frames, over the channels."""
         whites = np.array([frame.paper.white for frame in self.white_frames])
         return float((np.ptp(whites, axis=0) / whites.mean(axis=0)).max()) if len(whites) > 1 else 0.0
+
+    @property
+    def dark_share(self) -> float:
+        """Light of bare paper while the projector shows black, of white, in the worst channel; NaN if not measured."""
+        share = np.abs(self.dark_frames.light / self._full_white).max()
+        return float(share) if np.isfinite(self.dark_frames.light).all() else float("nan")
+
+    @property
+    def dark_change(self) -> float:
+        """Change of that light between dark frames, of white; NaN of one dark frame."""
+        lights = self.dark_frames.lights
+        return float((np.ptp(lights, axis=0) / self._full_white).max()) if len(lights) > 1 else float("nan")
+
+    @property
+    def _full_white(self) -> _Array:
+        """(3,) float64 counts of bare paper under white, or under the brightest light where no white was taken."""
+        whites, lights = [frame.paper.white for frame in self.white_frames], self.lights.white
+        return np.mean(whites, axis=0) if whites else lights[int(np.argmax(lights.sum(axis=1)))]
 
 
 def direction_error_deg(white: _Array, error: _Array) -> _Array:

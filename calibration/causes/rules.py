@@ -1,25 +1,19 @@
-"""The table that decides: each rule is a cause, the figures that it may explain, and what must be known for it.
+"""Why a figure is beyond its limit: the causes there are, the evidence that is asked for, and the table that decides.
 
 Rules that hold inside:
 
-- A rule holds where every one of its conditions does; a condition is an interval, both ends included, and what is not
-  known lies in none.
+- A rule holds where every one of its conditions does; a condition is an interval, both ends included. What was not
+  measured is NaN, which lies in none.
 - The first rule that holds decides; those that rest on what files say, or dark frames show, stand before those that
   rest on what a deviation looks like.
 - Where none holds, the cause is unknown and said to be. A cause that is wrong costs a session; one that is not named
   costs a look at the report. So intervals leave gaps between causes.
-
-The causes that a remark or a refusal may name, each with what it is, what helps, and what is to be taken again.
-
-What is known of a deviation, in plain numbers, whichever figure shows it: what the table of causes decides by.
-
-What was not measured is NaN, and decides nothing. Shares are 0 … 1 unless said.
+- Figures are known by what they are about (`Subject`), never by name.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Collection
 from dataclasses import dataclass, fields
 from functools import cache
 from typing import Literal
@@ -141,19 +135,13 @@ ROOM_LIGHT = Cause(
     "darken the room, cover lamps and displays, keep daylight out",
     "session",
 )
-VEIL = Cause(
-    "veil",
-    "veiling glare: the lens spreads part of the frame's light over all of it",
-    "clean the lens, use its hood, and hang black cloth around the print",
-    "session",
-)
 UNKNOWN = Cause("unknown", "", "", "nothing")
 """What was measured does not decide; the remedy is then that of the limit."""
 
 CAUSES = (
     HOT_PHOTOSITES, OBJECT_IN_FRAME, REFLECTION, REFLECTION_IN_FRAME, STAIN, SHADOW, CURL, FALL_OFF, SPREAD, BUMP,
     DEFOCUS, ANOTHER_PRINT, WRONG_NAME,
-    OTHER_CAMERA, OTHER_EXPOSURE, ROOM_LIGHT, VEIL, UNKNOWN,
+    OTHER_CAMERA, OTHER_EXPOSURE, ROOM_LIGHT, UNKNOWN,
 )  # fmt: skip
 """All of them."""
 
@@ -202,7 +190,6 @@ class Evidence:
     - `uneven`: share of the unfit cells whose rim and middle differ.
     - `waves_px`: how far tags lie from where a flat sheet would have them, RMS, half-size px of cells of 10 px.
     - `beyond_cell`: share of the light of a window's worst sample that the lens brings from beyond its cell.
-    - `veil`: light of the whole frame that the lens spreads over each place, of paper white.
     """
 
     frames: float = NAN
@@ -240,7 +227,6 @@ class Evidence:
     uneven: float = NAN
     waves_px: float = NAN
     beyond_cell: float = NAN
-    veil: float = NAN
 
     def known(self) -> dict[str, float]:
         """Return what was measured, by name."""
@@ -274,33 +260,41 @@ class Rule:
     """One line of the table.
 
     - `cause`: what is said where it holds.
-    - `figures`: the figures that it may explain, by the names of their limits.
+    - `about`: what the figures are about that it may explain.
     - `conditions`: all of which must hold.
     - `why`: why the cause follows.
     """
 
     cause: Cause
-    figures: frozenset[str]
+    about: frozenset[Subject]
     conditions: tuple[Condition, ...]
     why: str
 
-    def holds(self, figure: str, evidence: Evidence) -> bool:
-        """Return whether it explains a figure by what is known."""
-        return figure in self.figures and all(condition.holds(evidence) for condition in self.conditions)
+    def holds(self, subject: Subject, evidence: Evidence) -> bool:
+        """Return whether it explains a figure about a subject by what is known."""
+        return subject in self.about and all(condition.holds(evidence) for condition in self.conditions)
 
 
-PLACE = frozenset({"unlike_block", "disturbed_cells"})
-COVERED = frozenset({"disturbed_cells", "unfit_share"})
-ALL_CELLS = frozenset({"unlike_scatter", "softer_bleed", "moved_anew", "noisy_share"})
-PRINT = frozenset({"doubtful_share", "unfit_share", "added_light", "reference_spread"})
-FOUND = frozenset({"agreement", "blocks_good", "tags_found"})
-SHEET = PRINT | {"noisy_share"}
-DRIFT = frozenset({"white_drift", "white_drift_deg"})
-NAMES = frozenset({"off_codes_deg", "white_frame_deg", "exchanged_lights"})
-BRIGHTNESS = frozenset({"off_brightness", "white_frame_brightness", "white_short", "other_exposure"})
-LIGHT = NAMES | BRIGHTNESS | {"additivity", "white_drift", "white_drift_deg"}
-DARK = frozenset({"leak_share", "dark_drift"})
-STRAY = frozenset({"stray_share"})
+Subject = Literal[
+    "block", "few cells", "unfit cells", "spot", "references", "frame", "movement", "noisy cells", "chart", "drift",
+    "names", "brightness", "sum", "dark", "stray", "camera", "iso",
+]  # fmt: skip
+"""What a figure beyond its limit is about: the rules ask for that, and not for its name."""
+
+
+def _about(*subjects: Subject) -> frozenset[Subject]:
+    return frozenset(subjects)
+
+
+PLACE = _about("block", "few cells")
+WHOLE_FRAME = _about("frame", "movement", "noisy cells")
+PRINT = _about("spot", "unfit cells", "references")
+SHEET = PRINT | _about("noisy cells")
+DRIFT = _about("drift")
+LIGHT = _about("names", "brightness", "sum", "drift")
+DARK = _about("dark")
+STRAY = _about("stray")
+CHART = _about("chart")
 
 _IN_ALL_FRAMES = (
     Condition("in_first", 0, 0), Condition("even_showing", 0, 0), Condition("some_whites", 0, 0),
@@ -319,7 +313,7 @@ _IN_FEW_FRAMES = (
 RULES: tuple[Rule, ...] = (
     Rule(
         OTHER_CAMERA,
-        PLACE | ALL_CELLS | PRINT | LIGHT | DARK | frozenset({"other_camera", "other_lens"}),
+        PLACE | WHOLE_FRAME | PRINT | LIGHT | DARK | _about("camera"),
         (Condition("cameras", 2, _FAR),),
         "the files name more than one camera or lens",
     ),
@@ -337,7 +331,7 @@ RULES: tuple[Rule, ...] = (
     ),
     Rule(
         OTHER_EXPOSURE,
-        frozenset({"other_iso"}),
+        _about("iso"),
         (Condition("other_iso", 1, _FAR),),
         "the file states another ISO speed than the others'",
     ),
@@ -374,37 +368,37 @@ RULES: tuple[Rule, ...] = (
     ),
     Rule(
         HOT_PHOTOSITES,
-        PLACE | PRINT | frozenset({"noisy_share"}),
+        PLACE | SHEET,
         (Condition("hot", 0.5, 1),),
         "most of the cells concerned hold a photosite that stands out in every dark frame",
     ),
     Rule(
         DEFOCUS,
-        ALL_CELLS | PLACE,
+        WHOLE_FRAME | PLACE,
         (Condition("softer", 0.003, _FAR), Condition("scatter", 0, 0.1)),
         "the tags are softer than in the frame registered first, and cells have their neighbours' light",
     ),
     Rule(
         ANOTHER_PRINT,
-        ALL_CELLS | PLACE | FOUND,
+        WHOLE_FRAME | PLACE | CHART,
         (Condition("scatter", 0.2, _FAR), Condition("softer", -_FAR, 0.012)),
         "the cells' colours are not those of their codes anywhere, though the tags are sharp",
     ),
     Rule(
         ANOTHER_PRINT,
-        FOUND,
+        CHART,
         (Condition("agreement", -1, 0.5),),
         "cells and chart have nothing in common",
     ),
     Rule(
         BUMP,
-        frozenset({"moved_anew"}),
+        _about("movement"),
         (Condition("anew", 1e-9, 1), Condition("moved_px", 0.5, _FAR), Condition("softer", -_FAR, 0.003)),
         "the tags lie elsewhere than before, as sharp",
     ),
     Rule(
         OBJECT_IN_FRAME,
-        FOUND | SHEET,
+        CHART | SHEET,
         (
             Condition("white_residual", 1e-9, 0.5),
             Condition("deviation", -1, -0.03),
@@ -426,7 +420,7 @@ RULES: tuple[Rule, ...] = (
     ),
     Rule(
         OBJECT_IN_FRAME,
-        frozenset({"unlike_block"}) | SHEET | DRIFT,
+        _about("block") | SHEET | DRIFT,
         (
             *_IN_FEW_FRAMES,
             Condition("even_showing", 1e-9, 1),
@@ -437,7 +431,7 @@ RULES: tuple[Rule, ...] = (
     ),
     Rule(
         OBJECT_IN_FRAME,
-        frozenset({"disturbed_cells"}),
+        _about("few cells"),
         (
             *_IN_FEW_FRAMES,
             Condition("even_showing", 1e-9, 1),
@@ -461,13 +455,13 @@ RULES: tuple[Rule, ...] = (
     ),
     Rule(
         OBJECT_IN_FRAME,
-        frozenset({"unlike_block"}),
+        _about("block"),
         (*_IN_FEW_FRAMES, Condition("spot", 0, 0.1), Condition("kept", -_FAR, 0.85), *_SHARP_PLACE),
         "in few frames cells of one place have light of their own colours less, and all alike",
     ),
     Rule(
         OBJECT_IN_FRAME,
-        PLACE | COVERED,
+        PLACE | _about("unfit cells"),
         (*_IN_FEW_FRAMES, Condition("spot", 0, 0.1), Condition("deviation", -1, 0), *_SHARP_PLACE),
         "one place is off in few frames, and as it should be in the others and under white",
     ),
@@ -484,7 +478,7 @@ RULES: tuple[Rule, ...] = (
     ),
     Rule(
         FALL_OFF,
-        frozenset({"reference_spread"}),
+        _about("references"),
         (Condition("radial", 0.5, 1), Condition("rim", -1, -0.005), Condition("rim_frames", 0.9, 1)),
         "what the field leaves depends on the distance from the middle alone, and the rim is darker, in all frames",
     ),
@@ -527,21 +521,15 @@ RULES: tuple[Rule, ...] = (
     ),
     Rule(
         CURL,
-        frozenset({"unfit_share"}),
+        _about("unfit cells"),
         (Condition("misplaced", 0.5, 1), Condition("waves_px", 0.3, _FAR)),
         "most of the cells concerned lie where their places are not known well enough, and tags lie beside a plane",
     ),
     Rule(
         SPREAD,
-        frozenset({"unfit_share", "noisy_share", "bleed"}),
+        _about("unfit cells", "noisy cells"),
         (Condition("beyond_cell", 0.01, _FAR), Condition("uneven", 0.5, 1)),
         "rim and middle of cells differ, and the print shows that the lens brings light from beyond them",
-    ),
-    Rule(
-        VEIL,
-        frozenset({"bleed", "correction_residual", "veil"}),
-        (Condition("veil", 0.005, _FAR),),
-        "black at the print's bright places is brighter than at its dark ones",
     ),
 )  # fmt: skip
 """The table, in the order of deciding."""
@@ -560,9 +548,9 @@ class Decision:
     follows: str = ""
 
 
-def decide(figure: str, evidence: Evidence, rules: Collection[Rule] = RULES) -> Decision:
-    """Return the cause of a figure by what is known; unknown where no rule of the table holds."""
-    for rule in rules:
-        if rule.holds(figure, evidence):
+def decide(subject: Subject, evidence: Evidence) -> Decision:
+    """Return the cause of a figure about a subject by what is known; unknown where no rule of the table holds."""
+    for rule in RULES:
+        if rule.holds(subject, evidence):
             return Decision(rule.cause, rule)
     return Decision(UNKNOWN, None)

@@ -51,12 +51,13 @@ from calibration.radiometry.greys import references_csv
 from calibration.table.file_names import REFERENCES, REPORT_FORMAT, REPORT_JSON, REPORT_PAGE, REPORT_VERSION, SAMPLES
 from calibration.table.provenance import Provenance
 from calibration.table.writer import LutWriter
-from calibration.verdict.result import BuildResult
-from calibration.verdict.retaking import COMMAND, retake_json
-from calibration.verdict.thresholds import THRESHOLDS, Threshold
-from calibration.verdict.values import judged_values
-from calibration.verdict.verdict import judge
-from calibration.verdict.wording import refusal
+from calibration.verdict import BuildResult
+from calibration.verdict import COMMAND, retake_json
+from calibration.figures.figure import Figure
+from calibration.figures.all_figures import FIGURES
+from calibration.verdict import judged_values
+from calibration.verdict import judge
+from calibration.verdict import refusal
 from experiment.framing.annotated import annotated_png
 from experiment.framing.movement import Shift
 from experiment.session.folder import Session
@@ -102,7 +103,7 @@ def build(
     report: WriteReport | None = None,
     options: BuildOptions = PAPER_OPTIONS,
     linearity: Path | None = None,
-    thresholds: Sequence[Threshold] = THRESHOLDS,
+    judged_by: Sequence[Figure] = FIGURES,
 ) -> BuildResult:
     """Build the table of a session."""
     selected = select_frames(session)
@@ -116,7 +117,7 @@ def build(
     _require_white_frames(selected, session, options)
     with unfinished_table(out) as unfinished:
         job = _Job(session, selected, options, linearity, out, unfinished, progress or _no_progress)
-        return _finish(job, _take_in_all(job, job.checkpoint()), out, report, thresholds)
+        return _finish(job, _take_in_all(job, job.checkpoint()), out, report, judged_by)
 
 
 def append(
@@ -126,7 +127,7 @@ def append(
     report: WriteReport | None = None,
     options: BuildOptions = PAPER_OPTIONS,
     linearity: Path | None = None,
-    thresholds: Sequence[Threshold] = THRESHOLDS,
+    judged_by: Sequence[Figure] = FIGURES,
 ) -> BuildResult | TableProgress:
     """Take in the frames that have come so far of a session that is being taken.
 
@@ -142,7 +143,7 @@ def append(
         checkpoint = job.checkpoint()
         if complete:
             _require_white_frames(selected, session, options)
-            return _finish(job, _take_in_all(job, checkpoint), out, report, thresholds)
+            return _finish(job, _take_in_all(job, checkpoint), out, report, judged_by)
         frames, before = len(selected.records), 0 if checkpoint is None else len(checkpoint.frames)
         if before < frames:
             job.save(_take_in_all(job, checkpoint))
@@ -155,7 +156,7 @@ def check(
     options: BuildOptions = PAPER_OPTIONS,
     linearity: Path | None = None,
     picture: Path | None = None,
-    thresholds: Sequence[Threshold] = THRESHOLDS,
+    judged_by: Sequence[Figure] = FIGURES,
 ) -> BuildResult:
     """Register a session's best frame and judge it; write nothing but a picture.
 
@@ -181,7 +182,7 @@ def check(
         taken = intake.with_dark_frame(sample_dark_frame(baseline, decode_frame(session, dark), baseline.first), taken)
     series = None if linearity is None else read_linearity(linearity, baseline)
     figures = check_figures(intake, taken, first.mosaic.camera, series)
-    return BuildResult(figures, judge(judged_values(figures), thresholds), None)
+    return BuildResult(figures, judge(judged_values(figures), judged_by), None)
 
 
 @dataclass(frozen=True, eq=False)
@@ -305,13 +306,13 @@ def _begin(job: _Job, checkpoint: Checkpoint | None, writer: LutWriter) -> _Buil
 
 
 def _finish(
-    job: _Job, work: _BuildState, out: Path, report: WriteReport | None, thresholds: Sequence[Threshold]
+    job: _Job, work: _BuildState, out: Path, report: WriteReport | None, judged_by: Sequence[Figure]
 ) -> BuildResult:
     """Judge the table, give it its name, and return the result."""
     unfinished, frames = job.unfinished, len(work.taken.figures)
     job.progress(frames, frames, "writing the report")
     figures = table_figures(work.intake, work.taken, work.camera, work.linearity)
-    result = BuildResult(figures, judge(judged_values(figures), thresholds), out)
+    result = BuildResult(figures, judge(judged_values(figures), judged_by), out)
     if figures.lights.drift is not None and not result.verdict.refused:
         _correct_drift(work.writer, figures.lights.drift)
     # The table lists the hashes of its report.

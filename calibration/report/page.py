@@ -16,7 +16,7 @@ from typing import Literal
 import numpy as np
 import numpy.typing as npt
 
-from calibration.causes.findings import ProbableCause
+from calibration.verdict import ProbableCause
 from calibration.checks.stray_light import CERTAIN
 from calibration.citation.record import OriginRecord, origin_lines
 from calibration.measurements import LightMeasurements, TableMeasurements
@@ -24,10 +24,11 @@ from calibration.report.groups import GROUPS, OF_THRESHOLDS, QUESTIONS, Group, g
 from calibration.report.worsts import Worst
 from calibration.sampling.windows import SAFE_BLEED, bleed, largest_window
 from calibration.table.provenance import Unfit
-from calibration.verdict.result import BuildResult
-from calibration.verdict.retaking import COMMAND, findings, is_mended_by_retaking, retake_command, retaken_frames
-from calibration.verdict.verdict import JudgedValue, Outcome, format_value
-from calibration.verdict.wording import places_text
+from calibration.verdict import BuildResult
+from calibration.verdict import COMMAND, findings, is_mended_by_retaking, retake_command, retaken_frames
+from calibration.figures.figure import Outcome, format_value
+from calibration.verdict import JudgedValue
+from calibration.verdict import places_text
 from experiment.framing.visibility import MIN_CELL_PX
 from experiment.measures.sensor_range import MAX_BLACK_DRIFT
 from foundation.errors import counted, first_of

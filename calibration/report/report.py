@@ -43,9 +43,9 @@ from calibration.report.plots import (
 from calibration.report.worsts import Worst, worst_of
 from calibration.sampling.windows import largest_window
 from calibration.table.file_names import REPORT_FORMAT, REPORT_JSON, REPORT_PAGE, REPORT_VERSION
-from calibration.verdict.result import BuildResult
-from calibration.verdict.retaking import findings, retake_command, retake_json, retaken_frames
-from calibration.verdict.values import judged_values
+from calibration.verdict import BuildResult
+from calibration.verdict import findings, retake_command, retake_json, retaken_frames
+from calibration.verdict import judged_values
 from drivers.raw.rawfile import read_raw
 from experiment.chart.model import Chart
 from experiment.measures.flat_field import FlatField

@@ -15,10 +15,10 @@ import numpy.typing as npt
 from calibration.causes.gathering import PrintPlace
 from calibration.measurements import FrameMeasurements, TableMeasurements
 from calibration.report.groups import Group
-from calibration.verdict.thresholds import THRESHOLDS
+from calibration.figures.all_figures import FIGURES
 from experiment.chart.model import Chart
 
-_TITLES = {threshold.name: threshold.title for threshold in THRESHOLDS}
+_TITLES = {threshold.name: threshold.title for threshold in FIGURES}
 
 
 @dataclass(frozen=True)
