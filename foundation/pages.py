@@ -136,7 +136,8 @@ def _environment(package: str) -> Environment:
         lstrip_blocks=True,
         keep_trailing_newline=True,
     )
-    made.filters.update(element=_element, unbroken=_unbroken)
+    filters: dict[str, Any] = made.filters
+    filters.update(element=_element, unbroken=_unbroken)
     return made
 
 
