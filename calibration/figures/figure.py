@@ -1,4 +1,4 @@
-"""A judged figure is one object with all that is ever asked of it; whoever judges, reports or forecasts loops over them.
+"""A judged figure is one object with all that is ever asked of it; judging, reporting and forecasting loop over them.
 
 Rules that hold inside:
 

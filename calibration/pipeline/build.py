@@ -22,6 +22,8 @@ from typing import Any
 
 import numpy as np
 
+from calibration.figures.all_figures import FIGURES
+from calibration.figures.figure import Figure
 from calibration.measurements import LinearityMeasurements, TableMeasurements
 from calibration.pipeline.baseline import baseline_of, with_lens, with_primaries
 from calibration.pipeline.checkpoint import Checkpoint, UnfinishedTable, unfinished_table
@@ -51,13 +53,7 @@ from calibration.radiometry.greys import references_csv
 from calibration.table.file_names import REFERENCES, REPORT_FORMAT, REPORT_JSON, REPORT_PAGE, REPORT_VERSION, SAMPLES
 from calibration.table.provenance import Provenance
 from calibration.table.writer import LutWriter
-from calibration.verdict import BuildResult
-from calibration.verdict import COMMAND, retake_json
-from calibration.figures.figure import Figure
-from calibration.figures.all_figures import FIGURES
-from calibration.verdict import judged_values
-from calibration.verdict import judge
-from calibration.verdict import refusal
+from calibration.verdict import COMMAND, BuildResult, judge, judged_values, refusal, retake_json
 from experiment.framing.annotated import annotated_png
 from experiment.framing.movement import Shift
 from experiment.session.folder import Session

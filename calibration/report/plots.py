@@ -1,23 +1,16 @@
-"""The pictures of the report, each drawn on a Matplotlib figure of its own and returned as PNG.
+"""The pictures of the report, each drawn on a Matplotlib figure of its own (`foundation.plots.png_of`).
 
-Matplotlib is imported where a picture is made, and through its objects only: no window, no state left behind.
+First the registered chart, the lights, the course of the session; then where samples err and the sensor's noise; then
+what is beyond a limit: the frame with its places circled, and what the field leaves of references.
 
-The pictures that a scientist looks at first beside chart and lights: where samples err, and the sensor's noise.
-
-Pictures of what is beyond its limit: the frame with the places circled, and what the field leaves of references.
-
-A mosaic becomes linear camera RGB at half size: one pixel for each 2×2 block, nothing interpolated.
-
-The paper's "simple subsampling and debayering" (section 3.3): red, the mean of both greens, blue, after the black level
-has been subtracted, each phase its own. An odd last row or column is dropped. Pixel (i, j) is the block whose
-top-left photosite is (2i, 2j); its red and blue were measured a quarter pixel beside its centre, which matters to
-registration alone.
+A frame is drawn at half size, linear camera RGB: one pixel for each 2×2 block, nothing interpolated (the paper's
+"simple subsampling and debayering", section 3.3): red, the mean of both greens, blue, after the black level has been
+subtracted, each phase its own. An odd last row or column is dropped. Pixel (i, j) is the block whose top-left photosite
+is (2i, 2j).
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -37,18 +30,11 @@ from experiment.framing.movement import STILL_PX
 from experiment.framing.planes import CHANNELS, frame_black, phases
 from experiment.measures.flat_field import FlatField
 from experiment.measures.stains import Stains
+from foundation.plots import CHANNEL_INK, FAINT, INK, MARK
 from foundation.srgb import decode_srgb
-
-INK, FAINT, MARK = "#22262b", "#8a929c", "#e8502a"
-"""Colours of text and data, of axes, and of what is marked."""
 
 WORST_CELLS = 20
 """Cells that are shown magnified: two rows of ten."""
-
-CHANNEL_INK = ("#c8382e", "#2f8f46", "#2f62c8")
-"""Colours of lines of R, G and B."""
-_DPI = 110
-"""Pictures 10 inches wide fill the page's 1100 pixels."""
 
 _PAPER_PERCENTILE = 99.5
 """What is taken for paper white: brighter are highlights and hot photosites."""
@@ -56,33 +42,6 @@ _PAPER_PERCENTILE = 99.5
 _GAMMA = 2.2
 """Exponent that stands for sRGB's curve where a picture is only looked at."""
 _Mask = npt.NDArray[np.bool_]
-
-
-def png_of(draw: Callable[..., None], *arguments: Any) -> bytes:
-    """Return the PNG of a figure that `draw(figure, *arguments)` fills, one of the functions below."""
-    import matplotlib
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    # Matplotlib's own types leave the keyword arguments of every method unknown.
-    style: Any = {
-        "font.size": 9,
-        "axes.edgecolor": FAINT,
-        "axes.labelcolor": INK,
-        "xtick.color": INK,
-        "ytick.color": INK,
-        "axes.spines.top": False,
-        "axes.spines.right": False,
-        "axes.titlesize": 10,
-    }
-    library: Any = matplotlib
-    with library.rc_context(style):
-        figure: Any = Figure(layout="constrained", dpi=_DPI)
-        FigureCanvasAgg(figure)
-        draw(figure, *arguments)
-        stream = BytesIO()
-        figure.savefig(stream, format="png")
-    return stream.getvalue()
 
 
 def viewable(picture: _Image) -> _Image:

@@ -1,16 +1,15 @@
 """The table's report: one page that shows by eye what the figures claim, and the same figures for programs.
 
-`report.json` holds figures, limits and verdict; `report.html` opens with the verdict, what to do, and the pictures that
-are looked at first: the registered grid over the frame, the lights as planned and as the camera saw them (the paper's
-three figures of chromaticities), where cells err, and the noise. All figures follow in groups, each with its pictures.
-
-The report for programs: `report.json`, whose form is stated in docs/formats.md.
+`report.json`, whose form is stated in docs/formats.md, holds figures, limits and verdict; `report.html` opens with the
+verdict, what to do, and the pictures that are looked at first: the registered grid over the frame, the lights as
+planned and as the camera saw them (the paper's three figures of chromaticities), where cells err, and the noise. All
+figures follow in groups, each with its pictures, by the names that figures give of them (`Figure.drawing`).
 """
 
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -19,6 +18,9 @@ import numpy as np
 import numpy.typing as npt
 
 from calibration.checks.light_codes import CodeAgreement
+from calibration.figures.all_figures import BY_NAME, FIGURES
+from calibration.figures.figure import Worst
+from calibration.figures.truth import TRUTH_WORST_DEG
 from calibration.measurements import TableMeasurements
 from calibration.report.page import Picture, page
 from calibration.report.plots import (
@@ -37,21 +39,17 @@ from calibration.report.plots import (
     draw_residuals,
     draw_worst_cells,
     half_size,
-    png_of,
     reference_residuals,
 )
-from calibration.report.worsts import Worst, worst_of
 from calibration.sampling.windows import largest_window
 from calibration.table.file_names import REPORT_FORMAT, REPORT_JSON, REPORT_PAGE, REPORT_VERSION
-from calibration.verdict import BuildResult
-from calibration.verdict import findings, retake_command, retake_json, retaken_frames
-from calibration.verdict import judged_values
+from calibration.verdict import BuildResult, findings, judged_values, retake_command, retake_json, retaken_frames
 from drivers.raw.rawfile import read_raw
 from experiment.chart.model import Chart
-from experiment.measures.flat_field import FlatField
 from experiment.measures.stains import Stains
 from experiment.session.folder import Session
 from foundation.files import write_whole
+from foundation.plots import png_of
 
 PLACES = (7, 5)
 """Points across and down the page whose places are told: enough to see how it hung, and how it bent, roughly."""
@@ -81,8 +79,10 @@ def report_json(result: BuildResult) -> dict[str, Any]:
         "primaries_differ": None if primaries is None else float(f"{primaries.difference:.3g}"),
         "figures": {name: _rounded(value) for name, value in judged_values(figures).items()},
         "causes": _causes(result),
-        **retake_json(retaken_frames(verdict, figures), _registered_sha256(figures), _newest_sha256(figures)),
-        "limits": [asdict(row.threshold) | {"outcome": row.outcome} for row in verdict.rows],
+        **retake_json(
+            retaken_frames(verdict, figures), figures.registered_frame.record.sha256, _newest_sha256(figures)
+        ),
+        "limits": [row.figure.limit_json() | {"outcome": row.outcome} for row in verdict.rows],
     }
 
 
@@ -111,12 +111,6 @@ def _causes(result: BuildResult) -> list[dict[str, Any]]:
         }
         for name, found in findings(result.verdict, result.figures).items()
     ]
-
-
-def _registered_sha256(figures: TableMeasurements) -> str:
-    """Return the hash of the frame that was registered first; of another where that one is not among those measured."""
-    named = [frame for frame in figures.frames if frame.record.file == figures.session.registered_file]
-    return (named or figures.frames)[0].record.sha256
 
 
 def _newest_sha256(figures: TableMeasurements) -> str:
@@ -224,13 +218,23 @@ MOST_FRAMES = 4
 
 def write_report(result: BuildResult, session: Session, folder: Path) -> None:
     """Write `report.html` and `report.json` into a table's folder; costs some seconds."""
-    worsts = worst_of(result.figures, session.chart)
+    worsts = worst_of_figures(result.figures, session.chart)
     pictures = _pictures(result, session, worsts)
     write_whole(folder / REPORT_PAGE, page(result, pictures, _place_pictures(result, session), worsts))
     write_whole(folder / REPORT_JSON, json.dumps(report_json(result), indent=2) + "\n")
 
 
-def _pictures(result: BuildResult, session: Session, worsts: Sequence[Worst]) -> list[Picture]:
+def worst_of_figures(table: TableMeasurements, chart: Chart) -> dict[str, Worst]:
+    """Return where the worst of each figure is that has one, by name.
+
+    A number that says "worst" is of little use to whoever cannot look at it. Places are drawn on the frame that was
+    registered, frames are ringed in the course of the session, lights among the lights.
+    """
+    found = ((figure.name, figure.worst(table, chart)) for figure in FIGURES if figure.worst is not None)
+    return {name: worst for name, worst in found if worst is not None}
+
+
+def _pictures(result: BuildResult, session: Session, worsts: Mapping[str, Worst]) -> list[Picture]:
     """Return the pictures: first chart, lights, errors and noise, then those of the groups."""
     figures = result.figures
     chart, registration = session.chart, figures.registration
@@ -243,14 +247,16 @@ def _pictures(result: BuildResult, session: Session, worsts: Sequence[Worst]) ->
             "waviness. Right: the residual of each block of cells, magnified; short arrows without order are noise.",
             png_of(draw_residuals, chart, registration),
             "geometry",
+            "residuals",
         ),
         *_worst_pictures(chart, figures, frame, worsts),
         Picture(
             "The light on the print",
             "Shape of the light under the frame that was registered, from its white references; it is divided out of "
             f"samples and ground truth. Contours are 2 % apart. {_primaries_caption(figures)}",
-            png_of(draw_field, chart, _registered_field(figures)),
+            png_of(draw_field, chart, figures.registered_frame.paper.field),
             "light",
+            "field",
         ),
         *_print_picture(chart, figures.cells.stains),
         Picture(
@@ -260,6 +266,7 @@ def _pictures(result: BuildResult, session: Session, worsts: Sequence[Worst]) ->
             "off where the focus is lost, a block of them where a hand or a shadow lies on the print.",
             png_of(draw_course, figures),
             "radiometry",
+            "course",
         ),
         Picture(
             "The worst cells",
@@ -267,13 +274,14 @@ def _pictures(result: BuildResult, session: Session, worsts: Sequence[Worst]) ->
             "between its neighbours; the frame is the samples.",
             png_of(draw_worst_cells, frame, chart, registration, figures.cells.window),
             "noise",
+            "cells",
         ),
         *_residual_picture(chart, figures, frame),
     ]
 
 
 def _first_pictures(
-    result: BuildResult, session: Session, frame: npt.NDArray[np.float32], worsts: Sequence[Worst]
+    result: BuildResult, session: Session, frame: npt.NDArray[np.float32], worsts: Mapping[str, Worst]
 ) -> list[Picture]:
     """Return what a scientist looks at first: chart, lights, errors, noise."""
     figures, chart = result.figures, session.chart
@@ -281,7 +289,7 @@ def _first_pictures(
     codes = np.array([light.codes for light in session.illuminations])
     black_body = np.array([light.kind == "blackbody" for light in session.illuminations], dtype=np.bool_)
     seen = f"seen by the {figures.session.camera}"
-    truth = next((worst.light for worst in worsts if worst.figure == "truth_worst_deg"), None)
+    truth = worsts[TRUTH_WORST_DEG.name].light if TRUTH_WORST_DEG.name in worsts else None
     ringed = "" if truth is None else f" Ringed is light {truth}, whose ground truth is known worst."
     return [
         Picture(
@@ -289,33 +297,41 @@ def _first_pictures(
             f"{figures.session.registered_file}, contrast stretched, with the tags as found; below, magnified: the "
             f"outline of every cell and the pixels of its {window**2} samples, in the corners and in the middle.",
             png_of(draw_registration, frame, chart, registration, window),
+            name="chart",
         ),
         Picture(
             "The lights",
             "rb-chromaticities of the lights as projected, as the camera sees them on bare paper (the ground truth), "
             f"and the latter in their colours. Rings are black bodies.{ringed}",
             png_of(draw_chromaticities, codes, black_body, figures.lights.white, seen, truth),
+            name="lights",
         ),
         Picture(
             "Where cells err",
             "Left: how far cells and their neighbours are off their codes' colours elsewhere on the sheet. Right: how "
             "well the place of each cell is known. The worst cell of each is ringed.",
             png_of(draw_errors, figures, chart),
+            name="errors",
         ),
         Picture(
             "The noise",
             "Left: variance of one sample over its level, medians of cells of like levels and the fitted curve (read "
             "noise, photons, unequal photosites). Right: what that makes of signal over noise.",
             png_of(draw_noise, cell_noise(frame, chart, registration, window), figures.sensor.transfer, window**2),
+            name="noise",
         ),
     ]
 
 
 def _worst_pictures(
-    chart: Chart, figures: TableMeasurements, frame: npt.NDArray[np.float32], worsts: Sequence[Worst]
+    chart: Chart, figures: TableMeasurements, frame: npt.NDArray[np.float32], worsts: Mapping[str, Worst]
 ) -> list[Picture]:
     """Return the picture of the places where figures are worst."""
-    places = [(worst.label, worst.place) for worst in worsts if worst.place is not None]
+    places = [
+        (f"{BY_NAME[name].title}: {worst.what}", worst.place)
+        for name, worst in worsts.items()
+        if worst.place is not None
+    ]
     if not places:
         return []
     caption = (
@@ -323,17 +339,16 @@ def _worst_pictures(
         "beyond a limit. Worst frames are ringed in the course of the session, the worst light among the lights."
     )
     drawn = png_of(draw_places, frame, chart, figures.registration, places)
-    return [Picture("Where the worst is", caption, drawn, "geometry")]
+    return [Picture("Where the worst is", caption, drawn, "geometry", "worst")]
 
 
 def _place_pictures(result: BuildResult, session: Session) -> list[Picture]:
     """Return a picture of each frame in which something is beyond its limit at a place, which is circled."""
     by_file: dict[str, list[LabelledPlace]] = {}
-    titles = {row.threshold.name: row.threshold.title for row in result.verdict.rows}
     for name, found in findings(result.verdict, result.figures).items():
         cause = found.decision.cause.name if found.is_known else "cause not known"
         for place in found.places:
-            by_file.setdefault(place.file, []).append((f"{titles[name]}: {cause}", place))
+            by_file.setdefault(place.file, []).append((f"{BY_NAME[name].title}: {cause}", place))
     pictures: list[Picture] = []
     for file, places in list(by_file.items())[:MOST_FRAMES]:
         picture = half_size(read_raw(session.folder / file))
@@ -358,14 +373,14 @@ def _residual_picture(chart: Chart, figures: TableMeasurements, picture: npt.NDA
         "fall-off that the field does not follow."
     )
     return [
-        Picture("What the field leaves", caption, png_of(draw_reference_residuals, chart, places_mm, residual), "truth")
+        Picture(
+            "What the field leaves",
+            caption,
+            png_of(draw_reference_residuals, chart, places_mm, residual),
+            "truth",
+            "rest",
+        )
     ]
-
-
-def _registered_field(figures: TableMeasurements) -> FlatField:
-    """Return the flat field of the frame that was registered first."""
-    named = [frame for frame in figures.frames if frame.record.file == figures.session.registered_file]
-    return (named or figures.frames)[0].paper.field
 
 
 def _primaries_caption(figures: TableMeasurements) -> str:
@@ -386,4 +401,4 @@ def _print_picture(chart: Chart, stains: Stains) -> list[Picture]:
         "that deviates most. Noise is a fine grain of some tenths of a per cent; stains, folds and shadows have a "
         "shape. Crosses are cells listed for it."
     )
-    return [Picture("The print", caption, png_of(draw_print, chart, stains), "radiometry")]
+    return [Picture("The print", caption, png_of(draw_print, chart, stains), "radiometry", "print")]

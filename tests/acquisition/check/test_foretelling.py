@@ -19,11 +19,10 @@ from acquisition.check.foretelling.figures import ForetoldTable, foretell, foret
 from acquisition.check.looking import PRIMARIES, PlacedChart
 from acquisition.check.places import place_chart, window_px
 from acquisition.check.taking import Shot
-from calibration.pipeline.build import check as build_check
 from calibration.figures.all_figures import FIGURES
-from calibration.verdict import judged_values
 from calibration.figures.figure import OUTCOMES
-from calibration.verdict import judge
+from calibration.pipeline.build import check as build_check
+from calibration.verdict import judge, judged_values
 from drivers.presenter import BLACK, WHITE
 from drivers.raw.rawfile import Mosaic, read_raw
 from experiment.chart.layout import paper_chart

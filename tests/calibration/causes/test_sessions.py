@@ -11,7 +11,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from calibration.verdict import ProbableCause
 from calibration.causes.rules import (
     DEFOCUS,
     OBJECT_IN_FRAME,
@@ -23,11 +22,9 @@ from calibration.causes.rules import (
     UNKNOWN,
     Cause,
 )
-from calibration.pipeline.build import build
-from calibration.verdict import BuildResult
-from calibration.verdict import findings, retaken_frames
 from calibration.figures.all_figures import FIGURES
-from calibration.verdict import remark
+from calibration.pipeline.build import build
+from calibration.verdict import BuildResult, ProbableCause, findings, remark, retaken_frames
 from drivers.presenter import Colour
 from experiment.session.folder import Session
 from experiment.session.plan import SessionStep

@@ -11,8 +11,8 @@ import numpy.typing as npt
 import pytest
 
 from calibration.checks.light_codes import CodeAgreement, code_agreement
-from calibration.pipeline.build import build
 from calibration.figures.all_figures import FIGURES
+from calibration.pipeline.build import build
 from calibration.verdict import judge
 from experiment.lights.illuminations import plan_illuminations
 from experiment.session.plan import SessionStep

@@ -14,12 +14,12 @@ import pytest
 
 from calibration.citation.record import exposure_text
 from calibration.cli import main
+from calibration.figures.geometry import cell_sides_px
 from calibration.pipeline.build import build, check
 from calibration.pipeline.frames import session_sha256
 from calibration.report.groups import GROUPS, OF_THRESHOLDS
 from calibration.report.page import summary
-from calibration.report.report import write_report
-from calibration.report.worsts import cell_sides_px, worst_of
+from calibration.report.report import worst_of, write_report
 from calibration.table.lut import Lut, open_lut
 from calibration.verdict import BuildResult
 from drivers.camera import ExposureSettings

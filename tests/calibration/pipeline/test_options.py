@@ -17,9 +17,7 @@ from calibration.report.report import write_report
 from calibration.table.description import describe
 from calibration.table.lut import open_lut
 from calibration.table.verification import find_faults
-from calibration.verdict import judged_values
-from calibration.verdict import judge
-from calibration.verdict import remark
+from calibration.verdict import judge, judged_values, remark
 from experiment.session.folder import Session
 from foundation.errors import InputError
 

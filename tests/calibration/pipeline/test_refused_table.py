@@ -11,9 +11,9 @@ from pathlib import Path
 import pytest
 
 from calibration.cli import main
+from calibration.figures.all_figures import FIGURES
 from calibration.pipeline.build import build, check, refused_folder
 from calibration.report.report import write_report
-from calibration.figures.all_figures import FIGURES
 from calibration.verdict import judged_values
 from experiment.session.folder import Session
 from foundation.errors import QualityError

@@ -9,14 +9,11 @@ import pytest
 
 from benchmarks.cases import chart_of
 from benchmarks.sessions import AS_PLANNED, FrameChange, light_named, short_plan, short_session, world_of
+from calibration.figures.all_figures import FIGURES
 from calibration.pipeline.build import build
 from calibration.pipeline.options import BuildOptions
 from calibration.report.page import summary
-from calibration.verdict import BuildResult
-from calibration.figures.all_figures import FIGURES
-from calibration.verdict import judged_values
-from calibration.verdict import judge
-from calibration.verdict import remark
+from calibration.verdict import BuildResult, judge, judged_values, remark
 from drivers.presenter import Colour
 from experiment.session.plan import SessionStep
 from sim.world.room import Room

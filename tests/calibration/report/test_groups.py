@@ -6,9 +6,9 @@ import ast
 from pathlib import Path
 
 import calibration.report.page as summary_module
+from calibration.figures.all_figures import FIGURES
 from calibration.report.groups import GROUPS, OF_SUMMARY, OF_THRESHOLDS, QUESTIONS
 from calibration.report.page import STYLE
-from calibration.figures.all_figures import FIGURES
 
 
 def test_every_limit_has_its_group() -> None:

@@ -10,11 +10,12 @@ import numpy as np
 import pytest
 
 from calibration.causes.gathering import PrintPlace
-from calibration.pipeline.build import build
-from calibration.report.plots import draw_places, draw_reference_residuals, png_of, reference_residuals
-from calibration.report.report import half_size, write_report
 from calibration.figures.all_figures import FIGURES
+from calibration.pipeline.build import build
+from calibration.report.plots import draw_places, draw_reference_residuals, reference_residuals
+from calibration.report.report import half_size, write_report
 from drivers.raw.rawfile import read_raw
+from foundation.plots import png_of
 from tests.calibration.causes.rooms import HAND, nth_white, taken
 from tests.calibration.lab import Lab
 

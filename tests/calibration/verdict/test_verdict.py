@@ -6,9 +6,8 @@ from dataclasses import replace
 
 import pytest
 
-from calibration.figures.figure import Figure
 from calibration.figures.all_figures import FIGURES
-from calibration.figures.figure import format_value
+from calibration.figures.figure import Figure, format_value
 from calibration.verdict import judge
 
 LIMIT = Figure("x", "A figure", "px", "at most", 1.0, 2.0, "why", "source", "remedy")

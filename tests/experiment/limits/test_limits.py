@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 
 from acquisition.judge import limits as judge
-from calibration.sampling.windows import bleed, blur_of_bleed, largest_blur_px
 from calibration.figures.all_figures import FIGURES
+from calibration.sampling.windows import bleed, blur_of_bleed, largest_blur_px
 from calibration.verdict import judge as judged
 from experiment.limits.table import TABLE_LIMITS, TableLimit
 
