@@ -186,6 +186,11 @@ def not_checked(name: str, why: str, remedy: str = "") -> Finding:
     return Finding(name, "not checked", why, remedy=remedy)
 
 
+def not_checked_all(names: Iterable[str], why: str) -> list[Finding]:
+    """Return the findings of what could not be looked at for one reason."""
+    return [not_checked(name, why) for name in names]
+
+
 def worst(grades: Iterable[Grade]) -> Grade:
     """Return the worst of some grades; good of none."""
     found: list[Grade] = ["good", *grades]

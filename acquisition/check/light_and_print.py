@@ -215,25 +215,31 @@ def judge_room_light(
 
 def _worst_share(chart: Chart, points_mm: _Array, white: _Array, dark: _Array) -> tuple[float | None, str]:
     """Return the largest ratio of areas of the chart and channels, and the area's name; None where white is too dim."""
-    rows, columns = AREAS
-    at = np.clip(points_mm / chart.page_mm, 0, 1 - 1e-9)
-    area = (at[:, 1] * rows).astype(int) * columns + (at[:, 0] * columns).astype(int)
+    area = areas_of(points_mm, chart)
     best: tuple[float | None, str] = (None, "")
     with np.errstate(invalid="ignore"):
         known = white >= MEASURABLE_COUNTS
-    for number in range(rows * columns):
+    for number in range(AREAS[0] * AREAS[1]):
         for channel in range(3):
             here = known[:, channel] & (area == number) & np.isfinite(dark[:, channel])
             if here.sum() < 3:
                 continue
             share = float(np.median(dark[here, channel] / white[here, channel]))
             if best[0] is None or share > best[0]:
-                best = share, area_name(number // columns, number % columns)
+                best = share, area_name(number)
     return best
 
 
-def area_name(row: int, column: int) -> str:
+def areas_of(points_mm: _Array, chart: Chart) -> npt.NDArray[np.int64]:
+    """Return the number (N,) of the area that each point (N, 2) lies in, row by row."""
+    rows, columns = AREAS
+    across, down = np.clip(points_mm / chart.page_mm, 0, 1 - 1e-9).T
+    return (down * rows).astype(np.int64) * columns + (across * columns).astype(np.int64)
+
+
+def area_name(number: int) -> str:
     """Return where one of the areas lies: "the top left", "the middle"."""
+    row, column = divmod(number, AREAS[1])
     down = ("top", "middle", "bottom")[row]
     across = ("far left", "left", "middle", "right", "far right")[column]
     if down == across:

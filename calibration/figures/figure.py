@@ -243,7 +243,7 @@ class Figure:
 
 def worst_outcome(outcomes: Iterable[Outcome]) -> Outcome:
     """Return the worst of some outcomes; of none, that all is accepted."""
-    return max(outcomes, key=OUTCOMES.index, default="accept")
+    return max(outcomes, key=OUTCOMES.index, default=OUTCOMES[0])
 
 
 def format_value(value: float, unit: str) -> str:

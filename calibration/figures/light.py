@@ -453,7 +453,7 @@ def _white_frames_beyond(of: _OF_WHITES) -> Callable[[TableMeasurements, float],
 
     def beyond(table: TableMeasurements, limit: float) -> list[FrameRecord]:
         white = table.lights.white_frames
-        off = [] if white is None else of(white).tolist()
+        off: list[float] = [] if white is None else of(white).tolist()
         return [frame.record for frame, value in zip(table.white_frames, off, strict=False) if value > limit]
 
     return beyond
