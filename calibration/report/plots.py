@@ -359,13 +359,8 @@ def draw_worst_cells(figure: Any, picture: _Image, chart: Chart, registration: R
     `picture` is (H, W, 3) float32 counts; all parameters are those of `draw_registration`.
     """
     figure.set_size_inches(10, 3.1)
-    height, width = picture.shape[:2]
     places = registration.to_pixels(chart.centres_mm)
-    sites = sites_at(places, (height, width), window)
-    offsets = np.arange(window) - window // 2
-    at = np.flatnonzero(sites.inside)
-    samples = picture[sites.rows[at, None, None] + offsets[:, None], sites.columns[at, None, None] + offsets]
-    samples = samples.reshape(len(at), window**2, 3)
+    at, samples = _samples(picture, places, window)
     difference, sigma = rim_difference(samples, sample_noise(samples))
     score = (difference / np.maximum(sigma, 1e-6)).max(axis=1)
     shown = viewable(picture)
@@ -432,13 +427,18 @@ def cell_noise(picture: _Image, chart: Chart, registration: Registration, window
 
     `picture`: (H, W, 3) float32 counts above black, the frame at half size.
     """
+    samples = _samples(picture, registration.to_pixels(chart.centres_mm), window)[1].astype(np.float64)
+    return samples.mean(axis=1), samples.var(axis=1, ddof=1)
+
+
+def _samples(picture: _Image, places: _Array, window: int) -> tuple[npt.NDArray[np.intp], _Image]:
+    """Return which cells at places (N, 2) lie in the frame, (M,), and their samples (M, window², 3)."""
     height, width = picture.shape[:2]
-    sites = sites_at(registration.to_pixels(chart.centres_mm), (height, width), window)
+    sites = sites_at(places, (height, width), window)
     offsets = np.arange(window) - window // 2
     at = np.flatnonzero(sites.inside)
     samples = picture[sites.rows[at, None, None] + offsets[:, None], sites.columns[at, None, None] + offsets]
-    flat = samples.reshape(len(at), window**2, 3).astype(np.float64)
-    return flat.mean(axis=1), flat.var(axis=1, ddof=1)
+    return at, samples.reshape(len(at), window**2, 3)
 
 
 def draw_noise(figure: Any, noise: tuple[_Array, _Array], transfer: PhotonTransfer, samples: int) -> None:
