@@ -247,14 +247,14 @@ def judge_clipping(
     letters = [letter for letter in CHANNELS if any(blocks[p].any() for p in phases(mosaic)[letter])]
     if share > 0 and place is not None:
         where = f", most of them at {_densest(np.asarray(blocks.any(axis=(0, 1))), place)} of the chart"
-    told = f" in {', '.join(letters)}" if letters else ""
+    described = f" in {', '.join(letters)}" if letters else ""
     limit = LIMITS["clipping"]
     allowed = allowed_percent / 100
     found = judged(
         limit,
         share,
         f"{percent(share)} of a white frame's photosites at {shutter_s:.4g} s reach {percent(CLIPPING_SHARE)} "
-        f"of saturation{told}{where}",
+        f"of saturation{described}{where}",
         "expose less, and keep reflections off the chart",
         {"channels": letters},
     )
@@ -433,12 +433,12 @@ def judge_linearity(seen: _Array, times_s: Sequence[float], transfer: Transfer) 
             straight,
             not_checked("photon transfer", "noise does not rise with light"),
         ]
-    told = ", ".join(
+    described = ", ".join(
         f"{letter} {one:.2f} e⁻ a count and {two:.1f} counts ({one * two:.1f} e⁻) of read noise"
         for letter, one, two in zip(CHANNELS, gain, read, strict=True)
     )
     noise = Finding(
-        "photon transfer", "good", told, float(np.median(gain)), "e⁻ a count",
+        "photon transfer", "good", described, float(np.median(gain)), "e⁻ a count",
         details={"gain_e": gain.tolist(), "read_noise_counts": read.tolist()},
     )  # fmt: skip
     return [straight, noise]

@@ -103,8 +103,8 @@ def check_lab(
     frames = len(planned_steps(settings, lights))
     lines = [f"lights      {len(lights)} in {settings.illuminations.name}, {counted(frames, 'frame')} of a session"]
     with open_rig(settings, chart) as devices, tempfile.TemporaryDirectory() as scratch:
-        told, screen = _make_devices_ready(devices, settings, announce)
-        lines += told
+        described, screen = _make_devices_ready(devices, settings, announce)
+        lines += described
         camera = Photographer(devices, settings, Path(scratch))
         seen = look(
             camera, settings, chart, devices.camera.shutter_speeds(), period_s(settings), options.corners,

@@ -134,12 +134,12 @@ class CheckReport:
 
     def lines(self) -> tuple[str, ...]:
         """Return the report as lines for a terminal: devices, then findings, faults first."""
-        told = [
+        described = [
             f"{finding.grade:<12}{finding.name:<18}{finding.sentence()}"
             for grade in GRADES
             for finding in self.of(grade)
         ]
-        return *self.devices, *told, *self._forecast_lines()
+        return *self.devices, *described, *self._forecast_lines()
 
     def _forecast_lines(self) -> list[str]:
         if self.forecast is None:

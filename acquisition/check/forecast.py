@@ -218,11 +218,11 @@ def _unfit(table: Forecast, why_not: str) -> Finding:
     if share is None:
         return not_checked("unfit cells", why_not or "stains cannot be judged, and no other cause is seen")
     causes = {cause: part for cause, part in table.unfit.items() if part > 0}
-    told = ", ".join(f"{percent(part)} {cause}" for cause, part in causes.items())
+    described = ", ".join(f"{percent(part)} {cause}" for cause, part in causes.items())
     return judged(
         LIMITS["unfit cells"],
         share,
-        f"{percent(share)} of the cells would be unfit for use{f': {told}' if told else ''}",
+        f"{percent(share)} of the cells would be unfit for use{f': {described}' if described else ''}",
         "; ".join(_HELPS[cause] for cause in causes),
         dict(table.unfit),
     )

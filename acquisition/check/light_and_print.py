@@ -150,13 +150,14 @@ def judge_evenness(light: SmoothLight | None, chart: Chart) -> list[Finding]:
     shares = corners / centre
     channel = int(np.argmax(falloff))
     names = ("top left", "top right", "bottom right", "bottom left")
-    told = ", ".join(f"{name} {percent(share)}" for name, share in zip(names, shares[:, channel], strict=True))
+    described = ", ".join(f"{name} {percent(share)}" for name, share in zip(names, shares[:, channel], strict=True))
     each = ", ".join(f"{letter} {percent(value)}" for letter, value in zip(CHANNELS, falloff, strict=True))
     darkest = chart.centres_mm[int(np.argmin(cells[:, channel]))]
     even = judged(
         LIMITS["evenness"],
         float(falloff[channel]),
-        f"lens and projector together lose {each} over the chart; of the centre's light ({CHANNELS[channel]}) {told}",
+        f"lens and projector together lose {each} over the chart; of the centre's light ({CHANNELS[channel]}) "
+        f"{described}",
         "centre the chart in the projector's picture and zoom it out, stop the lens down, or step back and take a "
         "longer lens; one frame cannot tell which of the two it is: turn the camera, what turns with it is the lens's",
         {
@@ -289,20 +290,20 @@ def judge_flicker(whites: Sequence[_Array], shutter_s: float) -> list[Finding]:
     angle = float(angles_deg(seen, seen[0]).max())
     strongest = int(np.argmax(seen.mean(axis=0)))
     bright = float((np.ptp(seen, axis=0) / seen.mean(axis=0)).max())
-    told = f"over {len(seen)} frames of {shutter_s:.4g} s"
+    described = f"over {len(seen)} frames of {shutter_s:.4g} s"
     return [
         judged(
             LIMITS["flicker"],
             angle,
             f"white is up to {angle:.2f}° from the first one, its R/G has a standard deviation of "
-            f"{percent(float(ratio.std(ddof=1) / ratio.mean()))} {told}",
+            f"{percent(float(ratio.std(ddof=1) / ratio.mean()))} {described}",
             "expose for 0.5 s or more, and for whole turns of the colour wheel (set lab.projector.colour_wheel_hz)",
             {"red_over_green": ratio.tolist()},
         ),
         judged(
             LIMITS["brightness"],
             bright,
-            f"white changes by {percent(bright)} {told}",
+            f"white changes by {percent(bright)} {described}",
             "let the lamp warm up, switch off its eco mode and dynamic contrast, keep other light away",
             {"counts": seen[:, strongest].tolist()},
         ),
@@ -439,12 +440,12 @@ def judge_print(state: PrintState | None, chart: Chart, matched: float) -> Findi
     between = "; what lies between them is not seen on a chart of few colours" if state.by_references else ""
     if not state.spots:
         return judged(LIMITS["stains"], 0.0, f"none seen on {judged_patches} {what}{between}", "")
-    told = "; ".join(str(spot) for spot in state.spots[:4])
+    described = "; ".join(str(spot) for spot in state.spots[:4])
     more = f"; and {len(state.spots) - 4} more" if len(state.spots) > 4 else ""
     return judged(
         LIMITS["stains"],
         share,
-        f"{told}{more}, {percent(share)} of the {what}{between}",
+        f"{described}{more}, {percent(share)} of the {what}{between}",
         "clean or flatten the print there, look for a shadow on it, or print it anew",
         {
             "spots": [

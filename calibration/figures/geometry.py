@@ -70,8 +70,8 @@ def _tags_found(table: TableMeasurements) -> float | None:
 def _tags_row(table: TableMeasurements) -> SummaryRow:
     framing = table.registration.framing
     count = len(framing.tags)
-    told = f"{count} of {count + len(framing.missing)}" if framing.field is None else "the chart has none"
-    return SummaryRow("Tags found", told, "", brief=True)
+    described = f"{count} of {count + len(framing.missing)}" if framing.field is None else "the chart has none"
+    return SummaryRow("Tags found", described, "", brief=True)
 
 
 TAGS_FOUND = Figure(
@@ -148,8 +148,8 @@ BLEED = Figure(
 def _left_by_lens(table: TableMeasurements) -> float | None:
     # Smooth light that is no lens's, as a reflection, has figures of its own; few cells cannot tell it from a veil.
     spread, cells = table.point_spread, len(table.registration.mismatched_cells)
-    told = spread is None or spread.misfit <= MOST_MISFIT or cells >= _LEAST_CELLS
-    return table.lens.left if table.lens.measured and told else None
+    separable = spread is None or spread.misfit <= MOST_MISFIT or cells >= _LEAST_CELLS
+    return table.lens.left if table.lens.measured and separable else None
 
 
 def _left_in_worst_cell(table: TableMeasurements) -> float | None:
