@@ -436,10 +436,10 @@ CHECKED_SHARE = Figure(
     drawing=NOT_DRAWN, lines=(Line(230, _checked_row),),
 )  # fmt: skip
 
-_OF_WHITES = Callable[["CodeAgreement"], "npt.NDArray[np.float64]"]
+_WhiteValues = Callable[["CodeAgreement"], "npt.NDArray[np.float64]"]
 
 
-def _white_frames(of: _OF_WHITES) -> Callable[[TableMeasurements], float | None]:
+def _white_frames(of: _WhiteValues) -> Callable[[TableMeasurements], float | None]:
     """Return what measures how far white frames are from what the lights predict; None without them."""
 
     def measure(table: TableMeasurements) -> float | None:
@@ -448,7 +448,7 @@ def _white_frames(of: _OF_WHITES) -> Callable[[TableMeasurements], float | None]
     return measure
 
 
-def _white_frames_beyond(of: _OF_WHITES) -> Callable[[TableMeasurements, float], list[FrameRecord]]:
+def _white_frames_beyond(of: _WhiteValues) -> Callable[[TableMeasurements, float], list[FrameRecord]]:
     """Return what tells the white frames that are further than a limit from what the lights predict."""
 
     def beyond(table: TableMeasurements, limit: float) -> list[FrameRecord]:

@@ -49,7 +49,7 @@ if TYPE_CHECKING:
     from experiment.chart.model import Chart
     from experiment.session.records import FrameRecord
 
-_OF_FRAME = Callable[["TableMeasurements", "FrameMeasurements"], float]
+_FrameValue = Callable[["TableMeasurements", "FrameMeasurements"], float]
 
 _UNFIT_REMEDIES = {
     "outside": "bring all of the chart into the picture",
@@ -148,7 +148,7 @@ ADDED_LIGHT = Figure(
 )  # fmt: skip
 
 
-def _frames_beyond(value: _OF_FRAME) -> Callable[[TableMeasurements, float], list[FrameRecord] | None]:
+def _frames_beyond(value: _FrameValue) -> Callable[[TableMeasurements, float], list[FrameRecord] | None]:
     """Return what tells the frames beyond a limit by themselves; of all of them none is told."""
 
     def retake(table: TableMeasurements, limit: float) -> list[FrameRecord] | None:
@@ -188,7 +188,7 @@ def _most_scattered(table: TableMeasurements, chart: Chart) -> Worst | None:
     return Worst(f"{100 * scatter:.2g} %", worst.record.file) if scatter > 0 else None
 
 
-def _of_alike_frames(value: _OF_FRAME) -> Callable[[TableMeasurements], float | None]:
+def _of_alike_frames(value: _FrameValue) -> Callable[[TableMeasurements], float | None]:
     """Return what measures the largest value of a frame, on charts of enough cells to compare frames by."""
 
     def measure(table: TableMeasurements) -> float | None:
