@@ -52,12 +52,12 @@ _WARM_UP = "let the lamp warm up for longer before the session"
 
 
 def percent(value: float) -> str:
-    """Return a share for the summary."""
+    """Return a share, 0 … 1, for the summary."""
     return f"{100 * value:.2f} %"
 
 
 def percents(values: npt.NDArray[np.floating]) -> str:
-    """Return shares of R, G and B (3,) for the summary."""
+    """Return shares of R, G and B, (3,) float64, for the summary."""
     return " / ".join(f"{100 * value:.2f}" for value in values.tolist()) + " %"
 
 
