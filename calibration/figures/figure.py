@@ -244,7 +244,7 @@ class Figure:
 
 def worst_outcome(outcomes: Iterable[Outcome]) -> Outcome:
     """Return the worst of some outcomes; of none, that all is accepted."""
-    return max(outcomes, key=OUTCOMES.index, default=OUTCOMES[0])
+    return OUTCOMES[max((OUTCOMES.index(outcome) for outcome in outcomes), default=0)]
 
 
 def format_value(value: float, unit: str) -> str:
