@@ -65,6 +65,27 @@ def test_a_name_stands_in_its_figure() -> None:
         assert 1 <= len(found) <= 3, (figure.name, found)
 
 
+def test_some_figures_are_asked_more_than_others() -> None:
+    """What a check forecasts, what names frames by itself, what a refusal speaks of first, what shares a cause."""
+    assert {figure.name for figure in FIGURES if figure.forecast is not None} == {
+        "tags_found", "cell_px", "bleed", "unfit_share", "doubtful_share", "added_light", "leak_share", "additivity",
+        "grey_tint_deg", "references_used", "reference_spread", "brightest_share", "darkest_counts",
+    }  # fmt: skip
+    first = {figure.name for figure in FIGURES if figure.foremost}
+    assert first == {"other_camera", "other_exposure", "off_codes_deg", "white_frame_deg"}
+    assert {figure.name for figure in FIGURES if figure.retake is not None} == first | {
+        "softer_bleed", "unlike_scatter", "unlike_block", "off_brightness", "white_frame_brightness",
+    }  # fmt: skip
+    explained = {figure.name: figure.cause.follows for figure in FIGURES if figure.cause is not None}
+    assert len(explained) == 29
+    assert {name: follows for name, follows in explained.items() if follows} == {
+        "unfit_share": ("unlike_block",),
+        "unlike_scatter": ("unlike_block", "disturbed_cells"),
+        "disturbed_cells": ("unlike_block",),
+        "off_brightness": ("off_codes_deg", "exchanged_lights"),
+    }
+
+
 def test_a_check_that_saw_nothing_forecasts_nothing() -> None:
     nothing = CheckMeasurements()
     assert [figure.name for figure in FIGURES if figure.forecast is not None and figure.forecast(nothing)] == []
