@@ -12,30 +12,39 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 
-from acquisition.check.exposure import judge_exposure
-from acquisition.check.findings import CheckReport, Finding, not_checked
-from acquisition.check.foretelling.figures import ForetoldTable, foretell, foretell_lights, smallest_cell_px
-from acquisition.check.foretelling.findings import foretold_findings
-from acquisition.check.light import (
-    judge_evenness,
-    judge_flicker,
-    judge_primaries,
-    judge_room_light,
-)
-from acquisition.check.looking import ChartFigures, CheckFrames, look, mean_levels, measure_chart, points_of
-from acquisition.check.optics import (
+from acquisition.check.camera import (
     judge_chart,
+    judge_clipping,
+    judge_disk,
+    judge_hot,
+    judge_linearity,
+    judge_noise_reduction,
     judge_sharpness,
     judge_size,
+    judge_supplies,
     judge_tilt,
     judge_turn,
 )
-from acquisition.check.print_state import judge_print
-from acquisition.check.sensor import judge_clipping, judge_hot, judge_linearity, judge_noise_reduction
-from acquisition.check.supplies import judge_disk, judge_supplies
-from acquisition.check.taking import Photographer
+from acquisition.check.findings import CheckReport, Finding, not_checked, not_checked_all
+from acquisition.check.forecast import Forecast, darkest_counts, forecast_findings, measure_table, smallest_cell_px
+from acquisition.check.frames import (
+    ChartMeasurements,
+    CheckFrames,
+    Photographer,
+    judge_exposure,
+    look,
+    mean_levels,
+    measure_chart,
+    points_of,
+)
+from acquisition.check.light_and_print import (
+    judge_evenness,
+    judge_flicker,
+    judge_primaries,
+    judge_print,
+    judge_room_light,
+)
 from acquisition.judge.exposure import disagreement
 from acquisition.run.devices import Devices, ask_all
 from acquisition.run.lamp import make_ready, reported_error
@@ -43,6 +52,8 @@ from acquisition.run.plan import planned_steps
 from acquisition.run.retry import RetryPolicy
 from acquisition.run.rig.opening import open_rig
 from acquisition.run.shutter import period_s
+from calibration.figures.figure import CheckMeasurements
+from calibration.figures.light import ADDITIVITY, LINEARITY
 from drivers.camera import keep_awake
 from drivers.presenter import Colour, ReportsWarnings
 from drivers.projector import Power, Projector, Severity
@@ -53,10 +64,14 @@ from experiment.lights import Illumination, load_illuminations
 from foundation.errors import DeviceError, counted
 from foundation.files import write_whole
 
+LEAST_WHITE = 100.0
+"""Counts of paper under white in the weakest channel, from which on lights are compared with it."""
+
+_OF_PRIMARIES = ("brightest light", ADDITIVITY.name, "flicker", "brightness")
+"""What is judged by frames of the primaries, and of white again."""
+
 CLIPPED = "white is clipped at every shutter time that was tried"
 """Why nothing can be said of the light."""
-
-_Array = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -87,8 +102,8 @@ def check_lab(
     frames = len(planned_steps(settings, lights))
     lines = [f"lights      {len(lights)} in {settings.illuminations.name}, {counted(frames, 'frame')} of a session"]
     with open_rig(settings, chart) as devices, tempfile.TemporaryDirectory() as scratch:
-        told, screen = _make_devices_ready(devices, settings, announce)
-        lines += told
+        described, screen = _make_devices_ready(devices, settings, announce)
+        lines += described
         camera = Photographer(devices, settings, Path(scratch))
         seen = look(
             camera, settings, chart, devices.camera.shutter_speeds(), period_s(settings), options.corners,
@@ -108,9 +123,9 @@ def check_lab(
     ]
     if seen.used_s != seen.first.shutter_s:
         lines.append(f"frames      all but exposure and clipping judged at {seen.used_s:.4g} s")
-    table = _foretold(seen, chart, lights)
+    table = _forecast(seen, chart, lights)
     why_not = "the chart was not found" if seen.chart is None else "" if seen.usable else CLIPPED
-    findings += foretold_findings(table, chart, why_not)
+    findings += forecast_findings(table, chart, why_not)
     outcome = None if seen.chart is None else table.outcome
     report = CheckReport(tuple(lines), tuple(findings), outcome, table.figures, table.not_known)
     if options.picture is not None:
@@ -124,7 +139,11 @@ def _exposure_findings(seen: CheckFrames, settings: LabSettings, recorded: bool)
     findings = [
         judge_exposure(seen.trials, seen.saturation, seen.times_s, period_s(settings), recorded),
         judge_clipping(
-            seen.first, seen.saturation.counts, settings.limits.clipped_percent, seen.chart and seen.chart.place
+            seen.first.mosaic,
+            seen.first.shutter_s,
+            seen.saturation.counts,
+            settings.limits.clipped_percent,
+            seen.chart and seen.chart.place,
         ),
     ]
     differs = None if recorded else disagreement(seen.first.mosaic, settings.camera.exposure)
@@ -134,24 +153,22 @@ def _exposure_findings(seen: CheckFrames, settings: LabSettings, recorded: bool)
 
 
 def _chart_findings(
-    seen: CheckFrames, figures: ChartFigures | None, chart: Chart, options: CheckOptions
+    seen: CheckFrames, figures: ChartMeasurements | None, chart: Chart, options: CheckOptions
 ) -> list[Finding]:
     if figures is None:
         look_at = "" if options.picture is None else f"see {options.picture}"
         names = ("evenness", "colour evenness", "sharpness", "turn", "tilt", "size", "stains")
         why = "the chart was not found"
-        return [Finding("chart", "fault", seen.trouble or why, remedy=look_at), *(not_checked(n, why) for n in names)]
+        return [Finding("chart", "fault", seen.trouble or why, remedy=look_at), *not_checked_all(names, why)]
     framing, place = figures.placed.framing, figures.placed.place
-    print_found, evenness, coloured = (
-        judge_print(figures.state, chart, place.matched),
-        *judge_evenness(figures.light, chart),
-    )
+    print_found = judge_print(figures.state, chart, place.matched)
+    evenness, coloured = judge_evenness(figures.light, chart)
     if evenness.grade != "good" and print_found.grade in ("fault", "remark"):
         said = f"{print_found.said}; the light is so uneven that it may be an edge of the light"
         print_found = replace(print_found, said=said)
     lit = [print_found, evenness, coloured]
     if not seen.usable:
-        lit = [not_checked(name, CLIPPED) for name in ("stains", "evenness", "colour evenness")]
+        lit = not_checked_all(("stains", "evenness", "colour evenness"), CLIPPED)
     return [
         judge_chart(framing, chart),
         *lit,
@@ -162,33 +179,31 @@ def _chart_findings(
     ]
 
 
-def _foretold(seen: CheckFrames, chart: Chart, lights: Sequence[Illumination]) -> ForetoldTable:
+def _forecast(seen: CheckFrames, chart: Chart, lights: Sequence[Illumination]) -> Forecast:
     """Return what can be said of the table at the settings' exposure."""
     if seen.chart is None:
-        return ForetoldTable()
+        return Forecast()
     if not seen.usable:
-        return ForetoldTable({"brightest_share": 1.0})
-    saturation = seen.saturation.counts
-    table = foretell(chart, seen.chart, seen.whites, seen.dark, saturation)
-    figures = dict(table.figures)
+        return Forecast.of(CheckMeasurements(brightest_share=1.0))
+    measured = measure_table(chart, seen.chart, seen.whites, seen.dark, seen.saturation.counts)
     ratio = seen.first.shutter_s / seen.used_s
-    if "brightest_share" in figures:
-        figures["brightest_share"] *= ratio
-    if seen.primaries is not None:
-        figures |= foretell_lights(lights, seen.primaries, ratio)
-        levels = seen.primaries
-        if float(levels["white"].min()) >= 100.0:
+    if measured.brightest_share is not None:
+        measured = replace(measured, brightest_share=measured.brightest_share * ratio)
+    levels = seen.primaries
+    if levels is not None:
+        measured = replace(measured, darkest_counts=darkest_counts(lights, levels, ratio))
+        if float(levels["white"].min()) >= LEAST_WHITE:
             alone = np.sum([levels[name] for name in ("red", "green", "blue")], axis=0)
-            figures["additivity"] = float(np.abs((alone - 2 * levels["black"]) / levels["white"] - 1).max())
-    return ForetoldTable(figures, table.causes)
+            off = float(np.abs((alone - 2 * levels["black"]) / levels["white"] - 1).max())
+            measured = replace(measured, not_additive=off)
+    return Forecast.of(measured)
 
 
 def _light_findings(
-    seen: CheckFrames, figures: ChartFigures | None, chart: Chart, plan_has: bool, dark_percent: float
+    seen: CheckFrames, figures: ChartMeasurements | None, chart: Chart, plan_has: bool, dark_percent: float
 ) -> list[Finding]:
     if not seen.usable:
-        names = ("room light", "brightest light", "additivity", "flicker", "brightness")
-        return [not_checked(name, CLIPPED) for name in names]
+        return not_checked_all(("room light", *_OF_PRIMARIES), CLIPPED)
     if figures is None:
         findings = [not_checked("room light", "the chart was not found")]
     else:
@@ -202,15 +217,11 @@ def _light_findings(
         assert dark is not None
         room = judge_room_light(chart, points, white, dark, muted, seen.why_not_muted)
         findings = [_as_the_run_refuses(room, dark_percent)]
-    recorded = "a recording cannot be exposed anew"
     if seen.primaries is None:
-        names = ("brightest light", "additivity", "flicker", "brightness")
-        return [*findings, *(not_checked(name, recorded) for name in names)]
-    if float(seen.primaries["white"].min()) < 100.0:
-        names = ("brightest light", "additivity", "flicker", "brightness")
-        return [*findings, *(not_checked(name, "white is too dim") for name in names)]
-    whites = [_paper_level(shot_levels) for shot_levels in _whites(seen, figures, chart)]
-    return [*findings, *judge_primaries(seen.primaries, plan_has), *judge_flicker(whites, seen.used_s)]
+        return [*findings, *not_checked_all(_OF_PRIMARIES, "a recording cannot be exposed anew")]
+    if float(seen.primaries["white"].min()) < LEAST_WHITE:
+        return [*findings, *not_checked_all(_OF_PRIMARIES, "white is too dim")]
+    return [*findings, *judge_primaries(seen.primaries, plan_has), *judge_flicker(seen.white_levels, seen.used_s)]
 
 
 def _as_the_run_refuses(found: Finding, dark_percent: float) -> Finding:
@@ -221,21 +232,10 @@ def _as_the_run_refuses(found: Finding, dark_percent: float) -> Finding:
     return replace(found, grade="fault" if beyond else "remark", tolerable=(None, dark_percent / 100))
 
 
-def _whites(seen: CheckFrames, figures: ChartFigures | None, chart: Chart) -> list[_Array]:
-    if figures is None:
-        return [shot.brightest(99.0)[None] for shot in seen.whites]
-    points = points_of(chart)
-    return [mean_levels((shot,), figures.placed, points, seen.saturation.counts).mean for shot in seen.whites]
-
-
-def _paper_level(levels: _Array) -> _Array:
-    return np.nanmean(levels, axis=0)
-
-
 def _sensor_findings(
     seen: CheckFrames,
     timings: list[tuple[float, float]],
-    figures: ChartFigures | None,
+    figures: ChartMeasurements | None,
     chart: Chart,
     options: CheckOptions,
 ) -> list[Finding]:
@@ -254,7 +254,7 @@ def _sensor_findings(
         return findings
     if seen.series is None:
         why = "the chart was not found" if seen.chart is None else "a recording cannot be exposed anew"
-        return [*findings, not_checked("linearity", why), not_checked("photon transfer", why)]
+        return [*findings, *not_checked_all((LINEARITY.name, "photon transfer"), why)]
     series = seen.series
     return [*findings, *judge_linearity(series.seen, series.times_s, series.transfer)]
 

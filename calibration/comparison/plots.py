@@ -1,4 +1,4 @@
-"""The pictures of a comparison's page, drawn as those of a table's report are (`calibration.report.plots.png_of`)."""
+"""The pictures of a comparison's page, drawn as those of a table's report are (`foundation.plots.png_of`)."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ import numpy as np
 
 from calibration.comparison.answers import ANGLE_FLOOR_DEG, CELL_SCORE
 from calibration.comparison.values import CellDifferences, LightDifferences
-from calibration.report.plots import FAINT, INK, MARK
 from experiment.chart.model import Chart
+from foundation.plots import FAINT, INK, MARK
 
 _CHANNEL_INK = ("#c8382e", "#2f8f46", "#2f62c8")
 

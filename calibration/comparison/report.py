@@ -10,11 +10,10 @@ from pathlib import Path
 from calibration.comparison.plots import draw_cells, draw_lights, draw_map
 from calibration.comparison.values import ColourGroup, ComparedTable, NoiseAnswer, TableComparison
 from calibration.comparison.wording import cells_csv, comparison_json, geometry_text, lights_csv
-from calibration.report.page import Picture, picture_html
-from calibration.report.plots import png_of
-from calibration.report.style import STYLE
+from calibration.report.page import STYLE, Picture, picture_html
 from experiment.chart.model import Chart
 from foundation.files import whole_folder, write_whole
+from foundation.plots import png_of
 
 PICTURES = ("lights.png", "cells.png", "map.png")
 """Names of the pictures beside the page, as far as they are drawn."""

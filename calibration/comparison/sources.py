@@ -10,10 +10,10 @@ from pathlib import Path
 
 from calibration.pipeline.build import build
 from calibration.pipeline.options import BuildOptions
-from calibration.report.report_json import report_json
+from calibration.report.report import report_json
 from calibration.table.file_names import REPORT_JSON
 from calibration.table.lut import Lut, open_lut
-from calibration.verdict.result import BuildResult
+from calibration.verdict import BuildResult
 from experiment.chart.model import Chart, load_chart
 from experiment.session.folder import Session
 from experiment.session.journal import JOURNAL_FILE

@@ -22,8 +22,9 @@ from typing import Any
 
 import numpy as np
 
-from calibration.figures.linearity_figures import LinearityFigures
-from calibration.figures.table_figures import TableFigures
+from calibration.figures.all_figures import FIGURES
+from calibration.figures.figure import Figure
+from calibration.measurements import LinearityMeasurements, TableMeasurements
 from calibration.pipeline.baseline import baseline_of, with_lens, with_primaries
 from calibration.pipeline.checkpoint import Checkpoint, UnfinishedTable, unfinished_table
 from calibration.pipeline.collecting import check_figures, table_figures
@@ -52,12 +53,7 @@ from calibration.radiometry.greys import references_csv
 from calibration.table.file_names import REFERENCES, REPORT_FORMAT, REPORT_JSON, REPORT_PAGE, REPORT_VERSION, SAMPLES
 from calibration.table.provenance import Provenance
 from calibration.table.writer import LutWriter
-from calibration.verdict.result import BuildResult
-from calibration.verdict.retaking import COMMAND, retake_json
-from calibration.verdict.thresholds import THRESHOLDS, Threshold
-from calibration.verdict.values import judged_values
-from calibration.verdict.verdict import judge
-from calibration.verdict.wording import refusal
+from calibration.verdict import COMMAND, BuildResult, judge, judged_values, refusal, retake_json
 from experiment.framing.movement import Shift
 from experiment.framing.pictures import annotated_png
 from experiment.session.folder import Session
@@ -103,7 +99,7 @@ def build(
     report: WriteReport | None = None,
     options: BuildOptions = PAPER_OPTIONS,
     linearity: Path | None = None,
-    thresholds: Sequence[Threshold] = THRESHOLDS,
+    judged_by: Sequence[Figure] = FIGURES,
 ) -> BuildResult:
     """Build the table of a session."""
     selected = select_frames(session)
@@ -117,7 +113,7 @@ def build(
     _require_white_frames(selected, session, options)
     with unfinished_table(out) as unfinished:
         job = _Job(session, selected, options, linearity, out, unfinished, progress or _no_progress)
-        return _finish(job, _take_in_all(job, job.checkpoint()), out, report, thresholds)
+        return _finish(job, _take_in_all(job, job.checkpoint()), out, report, judged_by)
 
 
 def append(
@@ -127,7 +123,7 @@ def append(
     report: WriteReport | None = None,
     options: BuildOptions = PAPER_OPTIONS,
     linearity: Path | None = None,
-    thresholds: Sequence[Threshold] = THRESHOLDS,
+    judged_by: Sequence[Figure] = FIGURES,
 ) -> BuildResult | TableProgress:
     """Take in the frames that have come so far of a session that is being taken.
 
@@ -143,7 +139,7 @@ def append(
         checkpoint = job.checkpoint()
         if complete:
             _require_white_frames(selected, session, options)
-            return _finish(job, _take_in_all(job, checkpoint), out, report, thresholds)
+            return _finish(job, _take_in_all(job, checkpoint), out, report, judged_by)
         frames, before = len(selected.records), 0 if checkpoint is None else len(checkpoint.frames)
         if before < frames:
             job.save(_take_in_all(job, checkpoint))
@@ -156,7 +152,7 @@ def check(
     options: BuildOptions = PAPER_OPTIONS,
     linearity: Path | None = None,
     picture: Path | None = None,
-    thresholds: Sequence[Threshold] = THRESHOLDS,
+    judged_by: Sequence[Figure] = FIGURES,
 ) -> BuildResult:
     """Register a session's best frame and judge it; write nothing but a picture.
 
@@ -182,7 +178,7 @@ def check(
         taken = intake.with_dark_frame(sample_dark_frame(baseline, decode_frame(session, dark), baseline.first), taken)
     series = None if linearity is None else read_linearity(linearity, baseline)
     figures = check_figures(intake, taken, first.mosaic.camera, series)
-    return BuildResult(figures, judge(judged_values(figures), thresholds), None)
+    return BuildResult(figures, judge(judged_values(figures), judged_by), None)
 
 
 @dataclass(frozen=True, eq=False)
@@ -250,7 +246,7 @@ class _BuildState:
     taken: IntakeState
     writer: LutWriter
     camera: str
-    linearity: LinearityFigures | None
+    linearity: LinearityMeasurements | None
 
 
 def _take_in_all(job: _Job, checkpoint: Checkpoint | None) -> _BuildState:
@@ -306,13 +302,13 @@ def _begin(job: _Job, checkpoint: Checkpoint | None, writer: LutWriter) -> _Buil
 
 
 def _finish(
-    job: _Job, work: _BuildState, out: Path, report: WriteReport | None, thresholds: Sequence[Threshold]
+    job: _Job, work: _BuildState, out: Path, report: WriteReport | None, judged_by: Sequence[Figure]
 ) -> BuildResult:
     """Judge the table, give it its name, and return the result."""
     unfinished, frames = job.unfinished, len(work.taken.figures)
     job.progress(frames, frames, "writing the report")
     figures = table_figures(work.intake, work.taken, work.camera, work.linearity)
-    result = BuildResult(figures, judge(judged_values(figures), thresholds), out)
+    result = BuildResult(figures, judge(judged_values(figures), judged_by), out)
     if figures.lights.drift is not None and not result.verdict.refused:
         _correct_drift(work.writer, figures.lights.drift)
     # The table lists the hashes of its report.
@@ -335,7 +331,7 @@ def _correct_drift(writer: LutWriter, drift: DriftCorrection) -> None:
         writer.put(light, corrected(writer.get(light), gain))
 
 
-def _write_table(work: _BuildState, figures: TableFigures) -> None:
+def _write_table(work: _BuildState, figures: TableMeasurements) -> None:
     """Write all of the table but its samples, which are there, and its report."""
     session, records, lights, greys = work.intake.session, work.taken.records, figures.lights, figures.greys
     by_light = {frame.record.illumination: frame for frame in figures.frames if frame.record.kind == "light"}

@@ -20,7 +20,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial import cKDTree
 
-from calibration.figures.frame_figures import FrameFigures
+from calibration.measurements import FrameMeasurements
 from calibration.pipeline.measuring import MeasuredDarkFrame, MeasuredFrame
 from calibration.pipeline.registered_frame import RegisteredFrame
 from calibration.radiometry.dark_frames import DarkFrameFigures, DarkSummary, HotPixels, dark_summary, median_noise
@@ -179,7 +179,7 @@ class CellStatistics:
         level = self.even_sum.mean(axis=1, dtype=np.float64) / max(self.even_frames, 1) / field
         return find_stains(level, cells_mm, self.chart.bits, ~(self.outside | self.covered))
 
-    def unfit(self, saturation_counts: int, stains: Stains, frames: Sequence[FrameFigures]) -> tuple[Unfit, ...]:
+    def unfit(self, saturation_counts: int, stains: Stains, frames: Sequence[FrameMeasurements]) -> tuple[Unfit, ...]:
         """Return the cells not to be used, each with the first cause that applies.
 
         `saturation_counts`: raw count of saturation.
@@ -227,7 +227,7 @@ class CellStatistics:
         return tuple(found)
 
 
-def disturbed_cells(frames: Sequence[FrameFigures]) -> dict[int, list[tuple[int, float]]]:
+def disturbed_cells(frames: Sequence[FrameMeasurements]) -> dict[int, list[tuple[int, float]]]:
     """Return the lights under which something covered cells, and how far these are off; by the cells' colours.
 
     White frames' do not count: a table has no samples of them.

@@ -13,15 +13,15 @@ from calibration.checks.light_codes import CodeAgreement, code_agreement
 from calibration.checks.stray_light import StrayLight, stray_light
 from calibration.citation.serial_numbers import with_told_serials
 from calibration.citation.stated import StatedOrigin, origin_record, stated_origin
-from calibration.figures.frame_figures import FrameFigures
-from calibration.figures.linearity_figures import LinearityFigures
-from calibration.figures.table_figures import (
-    CellFigures,
-    GreyFigures,
-    LightFigures,
-    SensorFigures,
-    SessionFigures,
-    TableFigures,
+from calibration.measurements import (
+    CellMeasurements,
+    FrameMeasurements,
+    GreyMeasurements,
+    LightMeasurements,
+    LinearityMeasurements,
+    SensorMeasurements,
+    SessionMeasurements,
+    TableMeasurements,
 )
 from calibration.pipeline.baseline import Baseline, lens_figures
 from calibration.pipeline.intake import Intake, IntakeState
@@ -44,7 +44,9 @@ _FULL_CODE = 255
 _Array = npt.NDArray[np.float64]
 
 
-def table_figures(intake: Intake, taken: IntakeState, camera: str, linearity: LinearityFigures | None) -> TableFigures:
+def table_figures(
+    intake: Intake, taken: IntakeState, camera: str, linearity: LinearityMeasurements | None
+) -> TableMeasurements:
     """Return the figures of a table, all of whose frames have been taken in.
 
     `linearity`: what a series of exposures shows; None where none was given.
@@ -65,11 +67,13 @@ def table_figures(intake: Intake, taken: IntakeState, camera: str, linearity: Li
     )
 
 
-def check_figures(intake: Intake, taken: IntakeState, camera: str, linearity: LinearityFigures | None) -> TableFigures:
+def check_figures(
+    intake: Intake, taken: IntakeState, camera: str, linearity: LinearityMeasurements | None
+) -> TableMeasurements:
     """Return the figures of a check, which has taken in the frame that is registered, and a dark one where there is."""
     (frame,) = taken.frames
     with_frame = len(intake.session.illuminations) - len(intake.selected.lights_without)
-    lights = LightFigures(
+    lights = LightMeasurements(
         white=frame.paper.white[None],
         white_error=frame.paper.error[None],
         gains=np.ones((1, 3)),
@@ -97,8 +101,8 @@ def _stated(intake: Intake) -> StatedOrigin:
     return stated if given is None else replace(stated, citation=given)
 
 
-def _session_figures(session: Session, intake: Intake, camera: str, lights: int) -> SessionFigures:
-    return SessionFigures(
+def _session_figures(session: Session, intake: Intake, camera: str, lights: int) -> SessionMeasurements:
+    return SessionMeasurements(
         folder=session.folder,
         camera=camera,
         lights=lights,
@@ -109,26 +113,26 @@ def _session_figures(session: Session, intake: Intake, camera: str, lights: int)
 
 
 def _figures(
-    session: SessionFigures,
+    session: SessionMeasurements,
     baseline: Baseline,
     taken: IntakeState,
-    even: FrameFigures,
-    lights: LightFigures,
+    even: FrameMeasurements,
+    lights: LightMeasurements,
     greys: tuple[_Array, _Array],
-    linearity: LinearityFigures | None,
+    linearity: LinearityMeasurements | None,
     stated: StatedOrigin,
-) -> TableFigures:
+) -> TableMeasurements:
     statistics, saturation = taken.statistics, taken.saturation
     told = with_told_serials([one.origin for one in taken.figures], stated.citation.camera_serial)
     stains, dark = statistics.stains(_field_at_cells(baseline, even)), statistics.dark_summary()
     frames = _without_hot(taken.frames, dark.hottest, stains.places_mm)
-    return TableFigures(
+    return TableMeasurements(
         session=session,
         registration=baseline.first.registration,
         frames=frames,
         lights=lights,
-        greys=GreyFigures(baseline.points.levels.names, *greys),
-        sensor=SensorFigures(
+        greys=GreyMeasurements(baseline.points.levels.names, *greys),
+        sensor=SensorMeasurements(
             saturation_counts=saturation,
             saturation_measured=statistics.saturated(saturation),
             white_level=round(saturation - float(np.mean([frame.black.mean() for frame in taken.frames]))),
@@ -137,7 +141,7 @@ def _figures(
             linearity=linearity,
         ),
         dark_frames=dark,
-        cells=CellFigures(baseline.options.window, statistics.unfit(saturation, stains, frames), stains),
+        cells=CellMeasurements(baseline.options.window, statistics.unfit(saturation, stains, frames), stains),
         origins=origin_figures([(one.record, origin) for one, origin in zip(taken.figures, told, strict=True)]),
         origin=origin_record(stated, taken.records, [one.origin for one in taken.figures]),
         primaries=baseline.primaries,
@@ -146,13 +150,15 @@ def _figures(
     )
 
 
-def _field_at_cells(baseline: Baseline, even: FrameFigures) -> _Array:
+def _field_at_cells(baseline: Baseline, even: FrameMeasurements) -> _Array:
     """Return the field (C, 3) float64 by which the cells of a frame are evened, each by that of its own colour."""
     field = even.paper.field.at(baseline.points.cells_mm)
     return field if baseline.primaries is None else field * baseline.primaries.field_ratio(even.paper.white)
 
 
-def _without_hot(frames: tuple[FrameFigures, ...], hottest: _Array, cells_mm: _Array) -> tuple[FrameFigures, ...]:
+def _without_hot(
+    frames: tuple[FrameMeasurements, ...], hottest: _Array, cells_mm: _Array
+) -> tuple[FrameMeasurements, ...]:
     """Return frames in which no cell counts as covered for the hot photosite that it holds.
 
     `hottest` (C,) counts as of the dark frames, whenever these were taken; (0,) without any.
@@ -163,7 +169,7 @@ def _without_hot(frames: tuple[FrameFigures, ...], hottest: _Array, cells_mm: _A
     return tuple(replace(one, consistency=one.consistency.without_hot(hot, cells_mm)) for one in frames)
 
 
-def _light_figures(intake: Intake, taken: IntakeState, by_light: Sequence[FrameFigures]) -> LightFigures:
+def _light_figures(intake: Intake, taken: IntakeState, by_light: Sequence[FrameMeasurements]) -> LightMeasurements:
     """Return what was measured of the lights, whose frames are `by_light`."""
     illuminations, subtract_dark = intake.session.illuminations, intake.subtracts_dark
     error = np.array([frame.paper.error for frame in by_light])
@@ -175,7 +181,7 @@ def _light_figures(intake: Intake, taken: IntakeState, by_light: Sequence[FrameF
     full_white = whites[0].paper.white if whites else None
     told = whites[:1] if _drift_is_one(whites) else whites
     agreement = _code_agreement(illuminations, by_light, told, dark, gains if len(told) < 2 else np.ones_like(gains))
-    return LightFigures(
+    return LightMeasurements(
         white=white,
         white_error=error,
         gains=gains,
@@ -191,7 +197,7 @@ def _light_figures(intake: Intake, taken: IntakeState, by_light: Sequence[FrameF
     )
 
 
-def _drift_is_one(whites: Sequence[FrameFigures]) -> bool:
+def _drift_is_one(whites: Sequence[FrameMeasurements]) -> bool:
     """Return whether white frames differ as a lamp drifts, and not as frames of other lights or exposures do."""
     levels = np.array([frame.paper.white for frame in whites]).reshape(-1, 3)
     if len(levels) < 2:
@@ -203,8 +209,8 @@ def _drift_is_one(whites: Sequence[FrameFigures]) -> bool:
 
 def _code_agreement(
     illuminations: Sequence[Illumination],
-    by_light: Sequence[FrameFigures],
-    whites: Sequence[FrameFigures],
+    by_light: Sequence[FrameMeasurements],
+    whites: Sequence[FrameMeasurements],
     dark: _Array,
     gains: _Array,
 ) -> CodeAgreement:
@@ -225,7 +231,7 @@ def _code_agreement(
     )
 
 
-def _to_one_exposure(frames: Sequence[FrameFigures]) -> _Array:
+def _to_one_exposure(frames: Sequence[FrameMeasurements]) -> _Array:
     """Return the usual exposure over that of each frame, (N, 1) float64, as files state them; 1 where they do not."""
     exposures = np.array([frame.origin.exposure for frame in frames])
     usual = float(np.median(exposures[exposures > 0])) if (exposures > 0).any() else 1.0
@@ -234,8 +240,8 @@ def _to_one_exposure(frames: Sequence[FrameFigures]) -> _Array:
 
 def _stray_light(
     illuminations: Sequence[Illumination],
-    by_light: Sequence[FrameFigures],
-    whites: Sequence[FrameFigures],
+    by_light: Sequence[FrameMeasurements],
+    whites: Sequence[FrameMeasurements],
     dark: _Array,
     gains: _Array,
 ) -> StrayLight | None:
@@ -250,14 +256,14 @@ def _stray_light(
     return stray_light(codes, white[:lights], error[:lights], full, pure_lights(illuminations))
 
 
-def _gains(by_light: Sequence[FrameFigures], whites: Sequence[FrameFigures]) -> _Array:
+def _gains(by_light: Sequence[FrameMeasurements], whites: Sequence[FrameMeasurements]) -> _Array:
     """Return the lamp's light at each light over that in the first white frame, (L, 3) float64; ones without one."""
     if not whites:
         return np.ones((len(by_light), 3))
     return drift_gains(*_times_s(by_light, whites), np.array([frame.paper.white for frame in whites]))
 
 
-def _times_s(by_light: Sequence[FrameFigures], whites: Sequence[FrameFigures]) -> tuple[_Array, _Array]:
+def _times_s(by_light: Sequence[FrameMeasurements], whites: Sequence[FrameMeasurements]) -> tuple[_Array, _Array]:
     """Return when lights (L,) and white frames (W,) were taken, seconds since the first white frame."""
     start = whites[0].record.taken_at
     at_s, white_at_s = (

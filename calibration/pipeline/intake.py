@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from calibration.figures.frame_figures import FrameFigures
+from calibration.measurements import FrameMeasurements
 from calibration.pipeline.baseline import Baseline
 from calibration.pipeline.cell_statistics import CellStatistics
 from calibration.pipeline.frames import SelectedFrames, decode_frame
@@ -52,7 +52,7 @@ class IntakeState:
     - `dark`: what is subtracted from the frames that follow; None where nothing is.
     """
 
-    figures: tuple[FrameFigures | DarkFrameFigures, ...]
+    figures: tuple[FrameMeasurements | DarkFrameFigures, ...]
     statistics: CellStatistics
     saturation: int
     registered: RegisteredFrame
@@ -60,9 +60,9 @@ class IntakeState:
     dark: DarkLight | None
 
     @cached_property
-    def frames(self) -> tuple[FrameFigures, ...]:
+    def frames(self) -> tuple[FrameMeasurements, ...]:
         """Figures of the light and white frames."""
-        return tuple(figures for figures in self.figures if isinstance(figures, FrameFigures))
+        return tuple(figures for figures in self.figures if isinstance(figures, FrameMeasurements))
 
     @property
     def records(self) -> list[FrameRecord]:
@@ -124,7 +124,7 @@ class Intake:
         figures = tuple(
             DarkFrameFigures.from_json(record, figures)
             if record.kind == "dark"
-            else FrameFigures.from_json(record, page_mm, figures)
+            else FrameMeasurements.from_json(record, page_mm, figures)
             for record, figures in zip(self.selected.records, stored["figures"], strict=False)
         )
         registered = self.baseline.first

@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from calibration.figures.frame_figures import FrameFigures
+from calibration.measurements import FrameMeasurements
 from calibration.pipeline.baseline import Baseline, beyond_print, usable_means
 from calibration.pipeline.frames import DecodedFrame
 from calibration.pipeline.registered_frame import RegisteredFrame, sites_of
@@ -59,7 +59,7 @@ class MeasuredFrame:
       asked for.
     """
 
-    figures: FrameFigures
+    figures: FrameMeasurements
     registered: RegisteredFrame
     dark: DarkLight | None
     saturation: int
@@ -206,7 +206,7 @@ def _measured(
         kept = noise = None
     mean = patch_means(values)
     variance = baseline.transfer.variance(mean) / baseline.options.samples
-    figures = FrameFigures(
+    figures = FrameMeasurements(
         record=decoded.record,
         black=decoded.black,
         channel=decoded.strongest,

@@ -27,6 +27,7 @@ from calibration.registration.lateral_colour import LateralColour
 from calibration.registration.lens import Lens, fit_lens
 from calibration.registration.matching import Anchors, Matcher, not_this_chart
 from calibration.registration.registration import Registration
+from calibration.sampling.windows import largest_blur_px
 from drivers.raw.rawfile import Mosaic
 from experiment.chart.model import Chart
 from experiment.framing.field import SIDE_POINTS, FoundField, field_mm, refine_edges
@@ -34,7 +35,6 @@ from experiment.framing.finding import Framing, find_chart
 from experiment.framing.homography import rms
 from experiment.framing.planes import CHANNELS, Plane, frame_black, plane_of
 from experiment.framing.sharpness import MIN_CELL_PX, blur_px
-from experiment.limits.bleed import largest_blur_px
 from foundation.errors import RegistrationError
 from foundation.robust import sigma_of
 

@@ -12,10 +12,10 @@ from calibration.registration.colour_model import ColourModel
 from calibration.registration.displacement import Displacement
 from calibration.registration.lateral_colour import LateralColour
 from calibration.registration.lens import Lens
+from calibration.sampling.windows import SAMPLE_REACH_PX
 from experiment.framing.finding import Framing
 from experiment.framing.homography import rms
 from experiment.framing.planes import Channel
-from experiment.limits.bleed import SAMPLE_REACH_PX
 
 MAX_PLACE_ERROR_PX = 0.5
 """Three standard errors of the place of a cell of 10 px, at most: at 0.5 px the outermost of its 25 pixels, rounding

@@ -17,9 +17,9 @@ from functools import cached_property
 import numpy as np
 import numpy.typing as npt
 
+from calibration.sampling.windows import WINDOW_PX
 from drivers.raw.rawfile import Mosaic
 from experiment.framing.planes import CHANNELS, phases
-from experiment.limits.bleed import WINDOW_PX
 
 WINDOW = WINDOW_PX
 """Pixels along the side of a cell's window, where the user names no other: the paper's."""

@@ -29,7 +29,7 @@ Floats = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Figure:
+class BoundedFigure:
     """A number with the ends of its confidence interval; all NaN where it has none."""
 
     value: float
@@ -46,7 +46,7 @@ class RowFigures:
     """
 
     row: TransferRow
-    statistics: tuple[Figure, ...]
+    statistics: tuple[BoundedFigure, ...]
     spread: tuple[float, ...] | None
 
 
@@ -60,7 +60,7 @@ class RowRatio:
 
     row: TransferRow
     base: TransferRow
-    ratios: tuple[Figure, ...]
+    ratios: tuple[BoundedFigure, ...]
 
 
 @dataclass(frozen=True)
@@ -174,10 +174,10 @@ _PLACES: Final = range(len(STATISTICS))
 """Places of the statistics in arrays."""
 
 
-def _figure(value: float, replicates: Floats, without: Floats) -> Figure:
+def _figure(value: float, replicates: Floats, without: Floats) -> BoundedFigure:
     if not np.isfinite(value):
-        return Figure(np.nan, np.nan, np.nan)
-    return Figure(float(value), *bca(float(value), replicates, [without], LEVEL))
+        return BoundedFigure(np.nan, np.nan, np.nan)
+    return BoundedFigure(float(value), *bca(float(value), replicates, [without], LEVEL))
 
 
 def _spread(several: Sequence[ErrorSample]) -> tuple[float, ...] | None:

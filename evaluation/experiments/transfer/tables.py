@@ -6,7 +6,7 @@ import math
 from typing import Final
 
 from evaluation.experiments.bootstrap import STATISTICS
-from evaluation.experiments.transfer.figures import LEVEL, Figure, RowRatio, TransferFigures
+from evaluation.experiments.transfer.figures import LEVEL, BoundedFigure, RowRatio, TransferFigures
 from evaluation.experiments.transfer.rows import TransferRow
 from evaluation.results.tables import Table
 
@@ -147,5 +147,5 @@ def _ratio_cells(ratio: RowRatio) -> tuple[str, ...]:
     )
 
 
-def _three(figure: Figure) -> tuple[float | None, ...]:
+def _three(figure: BoundedFigure) -> tuple[float | None, ...]:
     return tuple(number if math.isfinite(number) else None for number in (figure.value, figure.low, figure.high))

@@ -10,7 +10,7 @@ import pytest
 from calibration.pipeline.build import build
 from calibration.report.report import write_report
 from calibration.table.lut import open_lut
-from calibration.verdict.values import judged_values
+from calibration.verdict import judged_values
 from drivers.presenter import WHITE, Colour
 from sim.world.rendering import PAPER
 from sim.world.room import PaperName, ProfileName, Room
@@ -85,7 +85,7 @@ def test_hot_photosites_side_by_side_are_no_object(tmp_path: Path) -> None:
     unfit = {cell.colour: cell.cause for cell in result.figures.cells.unfit}
     assert all(unfit[cell].startswith("hot") for cell in pair.tolist())
     assert set(unfit) == set(pair.tolist())
-    assert "disturbed_cells" not in {row.threshold.name for row in result.verdict.remarks}
+    assert "disturbed_cells" not in {row.figure.name for row in result.verdict.remarks}
 
 
 def test_hot_photosites_stay_in_the_samples_and_are_told(tmp_path: Path) -> None:
