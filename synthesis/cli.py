@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from calibration.citation.options import Licence, Note
+from calibration.citation import Licence, Note
 from foundation.console import EXIT_CODES, orderly_end, progress
 from foundation.json_output import JsonOutput, with_json
 from sim import cli as devices

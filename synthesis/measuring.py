@@ -12,11 +12,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from calibration.pipeline.baseline import usable_means
-from calibration.pipeline.registered_frame import ChartPoints
+from calibration.pipeline.baseline import ChartPoints, usable_means
 from calibration.radiometry.primaries import Primaries
-from calibration.sampling.patch_statistics import patch_means
-from calibration.sampling.samples import Sites, gather, gather_values
+from calibration.sampling import Sites, gather, gather_values, patch_means
 from experiment.measures.paper import MAX_ORDER, MAX_ORDER_AROUND, MIN_REFERENCES, Paper, PaperReader
 from experiment.measures.sensor_range import saturation
 from foundation.errors import QualityError

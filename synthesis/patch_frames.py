@@ -19,7 +19,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from calibration.sampling.samples import Sites
+from calibration.sampling import Sites
 from drivers.raw.rawfile import Area, Mosaic
 from sim.world.room import Room
 from sim.world.sensors import Body, HotPattern

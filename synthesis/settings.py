@@ -12,8 +12,7 @@ from typing import Annotated, Any, Final
 
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
-from calibration.sampling.samples import WINDOW
-from calibration.sampling.windows import WINDOWS
+from calibration.sampling import WINDOW, WINDOWS
 from drivers.camera import ExposureSettings
 from experiment.config import unknown_key
 from foundation.errors import ConfigurationError

@@ -8,8 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from calibration.citation.record import OriginRecord
-from calibration.citation.stated import with_changes
+from calibration.citation import OriginRecord, with_changes
 from experiment.chart.layout import design_chart
 from experiment.config import CitationSettings
 from experiment.lights.illuminations import plan_illuminations

@@ -35,7 +35,7 @@ from calibration.causes.place_evidence import (
 from calibration.causes.rules import RULES, Decision, decide
 from calibration.figures.frame_figures import FrameFigures
 from calibration.figures.table_figures import TableFigures
-from calibration.sampling.windows import bleed
+from calibration.sampling import bleed
 from experiment.session.records import FrameRecord
 
 

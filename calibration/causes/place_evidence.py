@@ -10,7 +10,7 @@ import numpy.typing as npt
 from calibration.causes.evidence import Evidence
 from calibration.figures.frame_figures import FrameFigures
 from calibration.figures.table_figures import TableFigures
-from calibration.sampling.windows import bleed
+from calibration.sampling import bleed
 from experiment.limits.bleed import WINDOW_PX
 from experiment.measures.reflections import cell_mm, joined_cells, light_of_spot, spot_colour, spots_of
 from experiment.measures.stains import Stains

@@ -15,7 +15,7 @@ import numpy.typing as npt
 from calibration.checks.frame_origins import OriginFigures
 from calibration.checks.light_codes import CodeAgreement
 from calibration.checks.stray_light import StrayLight
-from calibration.citation.record import OriginRecord
+from calibration.citation import OriginRecord
 from calibration.figures.frame_figures import FrameFigures
 from calibration.figures.linearity_figures import LinearityFigures
 from calibration.radiometry.dark_frames import DarkSummary
@@ -23,10 +23,10 @@ from calibration.radiometry.drift import DriftCorrection
 from calibration.radiometry.greys import tint_deg
 from calibration.radiometry.photon_transfer import PhotonTransfer
 from calibration.radiometry.primaries import Primaries
-from calibration.registration.registration import Registration
+from calibration.registration.register import Registration
 from calibration.spread.correction import LensFigures
-from calibration.spread.point_spread import PointSpread
-from calibration.table.provenance import Unfit
+from calibration.spread.fitting import PointSpread
+from calibration.table.lut import Unfit
 from experiment.measures.sensor_range import black_drift
 from experiment.measures.stains import Stains
 

@@ -3,29 +3,50 @@
 Rules that hold inside:
 
 - A session that lacks a light makes no table.
-- The table appears whole or not at all. Until then it is made under a hidden name (`calibration.pipeline.checkpoint`),
+- The table appears whole or not at all. Until then it is made under a hidden name (`calibration.pipeline.build`),
   and a build that was stopped, anywhere, goes on from its last checkpoint and ends in the bytes of one that was not:
   frames enter in the order taken, and what one adds depends on those before it alone.
 
 Threads read, decode and measure frames before their turn, each with what holds at that moment; where that has changed
 by the time a frame is taken in, it is measured again. The memory is that of a few frames whatever the session.
+
+An unfinished table: its hidden folder, and the checkpoint from which a later program goes on.
+
+Rules that hold inside:
+
+- The folder stands beside the table's place under a hidden name until the table is complete, so that under the final
+  name there is never a table that lacks a light.
+- A checkpoint is one file, replaced whole. It holds which frames were taken in, in what order, and all that the next
+  frame depends on. It is used only if it was made of what is asked for now, and if the samples on the disk have the
+  hashes that it holds; otherwise the work begins anew.
+- One program makes a table at a time.
+
+Frames worked on by threads, some before their turn, with the results in the frames' order.
 """
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
+import io
 import json
-from collections.abc import Callable, Sequence
+import shutil
+import zipfile
+from collections import deque
+from collections.abc import Callable, Generator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
+import numpy.typing as npt
 
 from calibration.figures.linearity_figures import LinearityFigures
 from calibration.figures.table_figures import TableFigures
-from calibration.pipeline.baseline import baseline_of, with_lens, with_primaries
-from calibration.pipeline.checkpoint import Checkpoint, UnfinishedTable, unfinished_table
+from calibration.pipeline.accumulator import EarlyMeasurement, Intake, IntakeState
+from calibration.pipeline.baseline import PAPER_OPTIONS, BuildOptions, baseline_of, with_lens, with_primaries
 from calibration.pipeline.collecting import check_figures, table_figures
 from calibration.pipeline.frames import (
     ChangedFrame,
@@ -36,7 +57,6 @@ from calibration.pipeline.frames import (
     session_sha256,
     source_frames,
 )
-from calibration.pipeline.intake import EarlyMeasurement, Intake, IntakeState
 from calibration.pipeline.linearity import read_linearity
 from calibration.pipeline.measuring import (
     MeasuredFrame,
@@ -44,13 +64,17 @@ from calibration.pipeline.measuring import (
     measure_registered_frame,
     sample_dark_frame,
 )
-from calibration.pipeline.options import PAPER_OPTIONS, BuildOptions
-from calibration.pipeline.prefetching import prefetched
-from calibration.radiometry.corrections import applied_drift, corrections
-from calibration.radiometry.drift import LEAST_WHITES, DriftCorrection, corrected
+from calibration.radiometry.drift import LEAST_WHITES, DriftCorrection, applied_drift, corrected, corrections
 from calibration.radiometry.greys import references_csv
-from calibration.table.file_names import REFERENCES, REPORT_FORMAT, REPORT_JSON, REPORT_PAGE, REPORT_VERSION, SAMPLES
-from calibration.table.provenance import Provenance
+from calibration.table.lut import (
+    REFERENCES,
+    REPORT_FORMAT,
+    REPORT_JSON,
+    REPORT_PAGE,
+    REPORT_VERSION,
+    SAMPLES,
+    Provenance,
+)
 from calibration.table.writer import LutWriter
 from calibration.verdict.result import BuildResult
 from calibration.verdict.retaking import COMMAND, retake_json
@@ -63,8 +87,144 @@ from experiment.framing.movement import Shift
 from experiment.session.folder import Session
 from experiment.session.records import FrameRecord
 from foundation.errors import FormatError, QualityError, RegistrationError, counted, first_of
-from foundation.files import write_whole
+from foundation.files import partial_path, publish_folder, require_free, storage_error, sync_folder, write_whole
+from foundation.processors import processor_count
+from foundation.trust.held_folders import LOCK_FILE, held_folder
 from foundation.version import software
+
+CHECKPOINT = "checkpoint.npz"
+"""Name of the checkpoint in the hidden folder."""
+
+_TEXT = "text"
+"""Name of the array that holds all that is no array, as JSON."""
+
+
+@dataclass(frozen=True, eq=False)
+class Checkpoint:
+    """How far a table has come.
+
+    - `identity`: what it is made of and by what; a build goes on from a checkpoint of the same identity only.
+    - `frames`: what names each frame taken in, in their order.
+    - `values`: anything JSON can hold; numbers are restored to the last bit.
+    - `arrays`: arrays of plain numbers, by name.
+    """
+
+    identity: dict[str, Any]
+    frames: list[str]
+    values: dict[str, Any]
+    arrays: dict[str, npt.NDArray[Any]]
+
+    def fits(self, identity: dict[str, Any], frames: list[str]) -> bool:
+        """Return whether a build of that identity can go on from here: these are the first of its `frames`."""
+        return self.identity == identity and bool(self.frames) and self.frames == frames[: len(self.frames)]
+
+
+class UnfinishedTable:
+    """The hidden folder of a table that is being made; made by `unfinished_table`."""
+
+    def __init__(self, folder: Path, out: Path) -> None:
+        self.folder = folder
+        self._out = out
+        self._keep = True
+
+    def load(self) -> Checkpoint | None:
+        """Return how far an earlier program came; None where there is no checkpoint that can be read."""
+        try:
+            with np.load(self.folder / CHECKPOINT, allow_pickle=False) as stored:
+                arrays: dict[str, npt.NDArray[Any]] = {name: stored[name] for name in stored.files}
+            text = json.loads(arrays.pop(_TEXT).tobytes())
+            return Checkpoint(text["identity"], text["frames"], text["values"], arrays)
+        except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile):
+            return None
+
+    def save(self, checkpoint: Checkpoint) -> None:
+        """Replace the checkpoint."""
+        content = {"identity": checkpoint.identity, "frames": checkpoint.frames, "values": checkpoint.values}
+        text = np.frombuffer(json.dumps(content).encode(), dtype=np.uint8)
+        stream = io.BytesIO()
+        np.savez(stream, allow_pickle=False, **{**checkpoint.arrays, _TEXT: text})
+        write_whole(self.folder / CHECKPOINT, stream.getvalue())
+
+    def begin_anew(self) -> None:
+        """Empty the folder."""
+        for path in self.folder.iterdir():
+            if path.name == LOCK_FILE:
+                continue
+            if path.is_dir() and not path.is_symlink():
+                shutil.rmtree(path)
+            else:
+                path.unlink()
+
+    def discard(self) -> None:
+        """Leave nothing behind when the block ends, since going on would lead to the same end."""
+        self._keep = False
+
+    def publish(self) -> None:
+        """Give the table its final name."""
+        require_free(self._out, "the table")
+        try:
+            (self.folder / CHECKPOINT).unlink(missing_ok=True)
+            sync_folder(self.folder)
+        except OSError as error:
+            raise storage_error(self._out, error) from error
+        publish_folder(self.folder, self._out, "the table")
+
+    @property
+    def worth_keeping(self) -> bool:
+        """Whether a later program could go on from here."""
+        return self._keep and (self.folder / CHECKPOINT).is_file()
+
+
+@contextmanager
+def unfinished_table(out: Path) -> Generator[UnfinishedTable]:
+    """Open, or make, the hidden folder of the table `out`; what is not published stays if it holds a checkpoint."""
+    require_free(out, "the table")
+    folder = partial_path(out)
+    busy = f"{out} is being made by another program; wait for it, or name another place"
+    with held_folder(folder, busy, of=out):
+        unfinished = UnfinishedTable(folder, out)
+        try:
+            yield unfinished
+        finally:
+            if folder.is_dir() and not unfinished.worth_keeping:
+                with contextlib.suppress(OSError):
+                    shutil.rmtree(folder)
+
+
+MOST_THREADS = 8
+"""Each thread holds a raw file and its counts, 110 MB for a 6D Mark II: more would not stay below 2 GB."""
+
+_Result = TypeVar("_Result")
+
+
+def thread_count() -> int:
+    """Return how many frames are read and measured at a time: one a processor, as far as memory allows."""
+    return min(processor_count(), MOST_THREADS)
+
+
+def prefetched(
+    work: Callable[[FrameRecord], _Result],
+    records: Sequence[FrameRecord],
+    others_wait_for: Callable[[FrameRecord], bool],
+) -> Generator[tuple[FrameRecord, _Result]]:
+    """Yield each frame with what `work` returned for it, in order, while threads work on those that follow."""
+    count = thread_count()
+    with ThreadPoolExecutor(count) as pool:
+        begun: deque[tuple[FrameRecord, Future[_Result]]] = deque()
+        todo = deque(records)
+        try:
+            while todo or begun:
+                while todo and len(begun) <= count and not any(others_wait_for(record) for record, _ in begun):
+                    record = todo.popleft()
+                    begun.append((record, pool.submit(work, record)))
+                record, future = begun[0]
+                result = future.result()
+                yield record, result
+                begun.popleft()
+        finally:
+            for _, future in begun:
+                future.cancel()
+
 
 REPORT_FILES = (REPORT_PAGE, REPORT_JSON)
 """What is kept of a refused table, where a report was written."""

@@ -11,8 +11,7 @@ import numpy.typing as npt
 from calibration.checks.frame_origins import origin_figures
 from calibration.checks.light_codes import CodeAgreement, code_agreement
 from calibration.checks.stray_light import StrayLight, stray_light
-from calibration.citation.serial_numbers import with_told_serials
-from calibration.citation.stated import StatedOrigin, origin_record, stated_origin
+from calibration.citation import StatedOrigin, origin_record, stated_origin, with_told_serials
 from calibration.figures.frame_figures import FrameFigures
 from calibration.figures.linearity_figures import LinearityFigures
 from calibration.figures.table_figures import (
@@ -23,11 +22,10 @@ from calibration.figures.table_figures import (
     SessionFigures,
     TableFigures,
 )
+from calibration.pipeline.accumulator import Intake, IntakeState
 from calibration.pipeline.baseline import Baseline, lens_figures
-from calibration.pipeline.intake import Intake, IntakeState
 from calibration.radiometry.drift import drift_correction
-from calibration.radiometry.primaries import pure_lights
-from calibration.radiometry.projector import additivity, drift_gains
+from calibration.radiometry.primaries import additivity, drift_gains, pure_lights
 from experiment.lights.illuminations import Illumination
 from experiment.session.folder import Session
 from foundation.angles import angles_deg

@@ -21,8 +21,7 @@ import numpy as np
 import numpy.typing as npt
 
 from calibration.radiometry.primaries import pure_lights
-from calibration.table.lut import Lut
-from calibration.table.source_frames import SourceFrame, frames_sha256
+from calibration.table.lut import Lut, SourceFrame, frames_sha256
 from drivers.raw.rawfile import Mosaic, decode_raw
 from experiment.framing.planes import Channel, frame_black, strongest_channel
 from experiment.measures.sensor_range import saturation

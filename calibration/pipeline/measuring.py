@@ -17,14 +17,19 @@ import numpy as np
 import numpy.typing as npt
 
 from calibration.figures.frame_figures import FrameFigures
-from calibration.pipeline.baseline import Baseline, beyond_print, usable_means
+from calibration.pipeline.baseline import Baseline, RegisteredFrame, beyond_print, sites_of, usable_means
 from calibration.pipeline.frames import DecodedFrame
-from calibration.pipeline.registered_frame import RegisteredFrame, sites_of
-from calibration.radiometry.dark_frames import DarkFrameFigures, measure_dark_frame
-from calibration.radiometry.dark_subtraction import DarkLight, winsorised_means
+from calibration.radiometry.dark_frames import DarkFrameFigures, DarkLight, measure_dark_frame, winsorised_means
 from calibration.radiometry.primaries import Primaries
-from calibration.sampling.patch_statistics import patch_means, sample_noise
-from calibration.sampling.samples import Sites, gather, gather_means, gather_values, table_values
+from calibration.sampling import (
+    Sites,
+    gather,
+    gather_means,
+    gather_values,
+    patch_means,
+    sample_noise,
+    table_values,
+)
 from calibration.spread.correction import FrameCorrection
 from calibration.spread.surroundings import FrameLevels
 from experiment.framing.movement import REREGISTER_PX, STILL_PX, Shift, gauges_of, shift_between

@@ -9,9 +9,9 @@ import numpy.typing as npt
 
 from calibration.figures.table_figures import TableFigures
 from calibration.radiometry.photon_transfer import PhotonTransfer, noise_levels
-from calibration.registration.registration import Registration
+from calibration.registration.register import Registration
 from calibration.report.plots import CHANNEL_INK, FAINT, INK, MARK
-from calibration.sampling.samples import sites_at
+from calibration.sampling import sites_at
 from experiment.chart.model import Chart
 
 _LEAST_LEVEL = 1.0

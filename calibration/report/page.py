@@ -9,12 +9,12 @@ from dataclasses import dataclass
 from typing import Literal
 
 from calibration.causes.findings import ProbableCause
-from calibration.citation.record import OriginRecord, origin_lines
+from calibration.citation import OriginRecord, origin_lines
 from calibration.report.groups import GROUPS, OF_THRESHOLDS, QUESTIONS, Group, group_of_row
 from calibration.report.style import STYLE
 from calibration.report.summary import summary
 from calibration.report.worsts import Worst
-from calibration.table.provenance import Unfit
+from calibration.table.lut import Unfit
 from calibration.verdict.result import BuildResult
 from calibration.verdict.retaking import COMMAND, findings, is_mended_by_retaking, retake_command, retaken_frames
 from calibration.verdict.verdict import JudgedValue, Outcome, format_value

@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 from calibration.causes.place_evidence import PrintPlace
 from calibration.figures.frame_figures import FrameFigures
-from calibration.registration.registration import Registration
+from calibration.registration.register import Registration
 from calibration.report.plots import FAINT, INK, MARK, viewable
 from experiment.chart.model import Chart
 

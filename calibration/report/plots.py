@@ -15,9 +15,8 @@ import numpy.typing as npt
 
 from calibration.checks.frame_consistency import has_enough_cells
 from calibration.figures.table_figures import TableFigures
-from calibration.registration.registration import Registration
-from calibration.sampling.patch_statistics import rim_difference, sample_noise
-from calibration.sampling.samples import sites_at
+from calibration.registration.register import Registration
+from calibration.sampling import rim_difference, sample_noise, sites_at
 from experiment.chart.model import Chart
 from experiment.framing.movement import STILL_PX
 from experiment.measures.flat_field import FlatField

@@ -37,7 +37,7 @@ from calibration.report.plots import (
 )
 from calibration.report.report_json import report_json
 from calibration.report.worsts import Worst, worst_of
-from calibration.table.file_names import REPORT_JSON, REPORT_PAGE
+from calibration.table.lut import REPORT_JSON, REPORT_PAGE
 from calibration.verdict.result import BuildResult
 from calibration.verdict.retaking import findings
 from drivers.raw.rawfile import read_raw

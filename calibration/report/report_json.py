@@ -10,8 +10,8 @@ import numpy.typing as npt
 
 from calibration.checks.light_codes import CodeAgreement
 from calibration.figures.table_figures import TableFigures
-from calibration.sampling.windows import largest_window
-from calibration.table.file_names import REPORT_FORMAT, REPORT_VERSION
+from calibration.sampling import largest_window
+from calibration.table.lut import REPORT_FORMAT, REPORT_VERSION
 from calibration.verdict.result import BuildResult
 from calibration.verdict.retaking import findings, retake_command, retake_json, retaken_frames
 from calibration.verdict.values import judged_values

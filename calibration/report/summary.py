@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 from calibration.checks.stray_light import CERTAIN
 from calibration.figures.table_figures import LightFigures, TableFigures
-from calibration.sampling.windows import SAFE_BLEED, bleed, largest_window
+from calibration.sampling import SAFE_BLEED, bleed, largest_window
 from experiment.framing.visibility import MIN_CELL_PX
 from experiment.measures.sensor_range import MAX_BLACK_DRIFT
 

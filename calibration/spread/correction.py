@@ -16,12 +16,30 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from calibration.registration.registration import Registration
-from calibration.sampling.samples import Sites, sites_at
-from calibration.spread.fitting import VARYING_BITS, ReferenceData, SpreadData, fit_spread, predicted_levels
-from calibration.spread.point_spread import FAR_PX, NEAR_PX, PLACES, PointSpread, kernel_of_terms, terms_of
-from calibration.spread.printed_grid import PrintedGrid
-from calibration.spread.surroundings import FrameLevels, NearLight, Surroundings, UsualLight, light_at, surroundings
+from calibration.registration.register import Registration
+from calibration.sampling import Sites, sites_at
+from calibration.spread.fitting import (
+    FAR_PX,
+    NEAR_PX,
+    PLACES,
+    VARYING_BITS,
+    PointSpread,
+    ReferenceData,
+    SpreadData,
+    fit_spread,
+    kernel_of_terms,
+    predicted_levels,
+    terms_of,
+)
+from calibration.spread.surroundings import (
+    FrameLevels,
+    NearLight,
+    PrintedGrid,
+    Surroundings,
+    UsualLight,
+    light_at,
+    surroundings,
+)
 from experiment.measures.flat_field import FlatField
 from experiment.measures.polynomials import page_polynomial, page_powers
 

@@ -14,8 +14,8 @@ from typing import Any
 from calibration.causes.findings import ProbableCause, explain
 from calibration.figures.frame_figures import FrameFigures
 from calibration.figures.table_figures import TableFigures
-from calibration.registration.registration import Registration
-from calibration.sampling.windows import bleed
+from calibration.registration.register import Registration
+from calibration.sampling import bleed
 from calibration.verdict.verdict import JudgedValue, Verdict
 from experiment.session.mending.retaking import lights_text
 from experiment.session.records import FrameRecord

@@ -6,7 +6,7 @@ import numpy as np
 
 from calibration.checks.frame_consistency import has_enough_cells
 from calibration.figures.table_figures import TableFigures
-from calibration.sampling.windows import bleed
+from calibration.sampling import bleed
 from calibration.spread.fitting import MOST_MISFIT
 from calibration.verdict.retaking import added_bleed
 from calibration.verdict.thresholds import THRESHOLDS

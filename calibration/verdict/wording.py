@@ -38,7 +38,7 @@ _REMEDIES = {
     "misplaced": "hang the print flatter",
     "uneven": "focus on the print and keep the camera still",
 }
-"""What helps against each cause of unfit cells (`calibration.pipeline.cell_statistics`)."""
+"""What helps against each cause of unfit cells (`calibration.pipeline.accumulator`)."""
 
 
 def refusal(verdict: Verdict, figures: TableFigures, *, reported: bool = False) -> str:

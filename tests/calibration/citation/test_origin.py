@@ -10,13 +10,20 @@ from pathlib import Path
 
 import pytest
 
-from calibration.citation.citing import bibtex, tex_text
-from calibration.citation.record import NOT_RECORDED, OriginRecord, origin_lines
-from calibration.citation.serial_numbers import serial_hash, with_told_serials
-from calibration.citation.stated import StatedOrigin, origin_record, with_changes
+from calibration.citation import (
+    NOT_RECORDED,
+    OriginRecord,
+    StatedOrigin,
+    bibtex,
+    origin_lines,
+    origin_record,
+    serial_hash,
+    tex_text,
+    with_changes,
+    with_told_serials,
+)
 from calibration.cli import main
-from calibration.table.lut import open_lut
-from calibration.table.provenance import parse_provenance
+from calibration.table.lut import open_lut, parse_provenance
 from drivers.raw.origin import FrameOrigin
 from experiment.config import CameraSettings, CitationSettings, parse_lab
 from experiment.session.records import FrameRecord

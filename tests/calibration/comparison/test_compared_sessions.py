@@ -9,10 +9,9 @@ from pathlib import Path
 import pytest
 
 from calibration.cli import main
-from calibration.comparison.comparing import compare
-from calibration.comparison.sources import table_of
+from calibration.comparison.comparing import compare, table_of
+from calibration.pipeline.baseline import BuildOptions
 from calibration.pipeline.build import build
-from calibration.pipeline.options import BuildOptions
 from experiment.session.folder import Session
 from sim.world.room import Room
 from tests.calibration.lab import LIGHTS, Lab, hang, take

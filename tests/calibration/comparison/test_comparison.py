@@ -13,15 +13,17 @@ import numpy.typing as npt
 import pytest
 
 from calibration.cli import main
-from calibration.comparison.comparing import compare, recorded_drift
-from calibration.comparison.geometry import geometry_difference
-from calibration.comparison.pairs import light_pairs
-from calibration.comparison.report import write_comparison
-from calibration.comparison.values import NoiseAnswer, TableComparison
-from calibration.comparison.wording import cells_csv, comparison_json, lights_csv, lines
+from calibration.comparison.comparing import (
+    NoiseAnswer,
+    TableComparison,
+    compare,
+    geometry_difference,
+    light_pairs,
+    recorded_drift,
+)
+from calibration.comparison.report import cells_csv, comparison_json, lights_csv, lines, write_comparison
 from calibration.radiometry.greys import references_csv
-from calibration.table.lut import Lut, open_lut
-from calibration.table.provenance import Provenance
+from calibration.table.lut import Lut, Provenance, open_lut
 from calibration.table.writer import LutWriter
 from drivers.presenter import Colour
 from experiment.lights.illuminations import Illumination

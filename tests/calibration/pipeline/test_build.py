@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from calibration.citation.record import exposure_text
+from calibration.citation import exposure_text
 from calibration.cli import main
 from calibration.pipeline.build import build, check
 from calibration.pipeline.frames import session_sha256

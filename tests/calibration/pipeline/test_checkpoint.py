@@ -17,8 +17,7 @@ import numpy as np
 import pytest
 
 import calibration.pipeline.build as building
-from calibration.pipeline.build import TableProgress, append, build
-from calibration.pipeline.checkpoint import CHECKPOINT, Checkpoint, unfinished_table
+from calibration.pipeline.build import CHECKPOINT, Checkpoint, TableProgress, append, build, unfinished_table
 from calibration.pipeline.frames import frame_faults
 from calibration.table.lut import open_lut
 from calibration.table.verification import find_faults
@@ -33,7 +32,7 @@ pytestmark = pytest.mark.slow
 
 KILLER = """
 import os, signal, sys
-import calibration.pipeline.build, calibration.pipeline.checkpoint, calibration.table.writer, calibration.report.report
+import calibration.pipeline.build, calibration.pipeline.build, calibration.table.writer, calibration.report.report
 from calibration.cli import main
 
 place, count = sys.argv[1], int(sys.argv[2])
@@ -41,9 +40,9 @@ calibration.pipeline.build.CHECKPOINT_EVERY = 3
 calibration.report.report.write_report = lambda *_: None
 owner, name = {
     "putting": (calibration.table.writer.LutWriter, "put"),
-    "saving": (calibration.pipeline.checkpoint.UnfinishedTable, "save"),
+    "saving": (calibration.pipeline.build.UnfinishedTable, "save"),
     "finishing": (calibration.table.writer, "write_whole"),
-    "publishing": (calibration.pipeline.checkpoint.Path, "replace"),
+    "publishing": (calibration.pipeline.build.Path, "replace"),
 }[place]
 real = getattr(owner, name)
 

@@ -10,13 +10,12 @@ import numpy as np
 import pytest
 
 from calibration.cli import main
+from calibration.pipeline.baseline import BuildOptions
 from calibration.pipeline.build import build, check
-from calibration.pipeline.options import BuildOptions
 from calibration.report.report import write_report
 from calibration.report.summary import summary as report_summary
-from calibration.table.description import describe
 from calibration.table.lut import open_lut
-from calibration.table.verification import find_faults
+from calibration.table.verification import describe, find_faults
 from calibration.verdict.values import judged_values
 from calibration.verdict.verdict import judge
 from calibration.verdict.wording import remark

@@ -9,8 +9,8 @@ import pytest
 
 from benchmarks.cases import chart_of
 from benchmarks.sessions import AS_PLANNED, FrameChange, light_named, short_plan, short_session, world_of
+from calibration.pipeline.baseline import BuildOptions
 from calibration.pipeline.build import build
-from calibration.pipeline.options import BuildOptions
 from calibration.report.summary import summary
 from calibration.verdict.result import BuildResult
 from calibration.verdict.thresholds import THRESHOLDS

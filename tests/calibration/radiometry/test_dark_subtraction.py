@@ -11,9 +11,9 @@ import numpy.typing as npt
 import pytest
 
 from calibration.cli import main
+from calibration.pipeline.baseline import BuildOptions
 from calibration.pipeline.build import TableProgress, append, build, check
-from calibration.pipeline.options import BuildOptions
-from calibration.radiometry.dark_subtraction import DarkLightEstimator, reflectances, winsorised_means
+from calibration.radiometry.dark_frames import DarkLightEstimator, reflectances, winsorised_means
 from calibration.report.summary import summary
 from calibration.table.lut import open_lut
 from calibration.verdict.result import BuildResult

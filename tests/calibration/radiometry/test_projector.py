@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from calibration.radiometry.projector import additivity, drift_gains
+from calibration.radiometry.primaries import additivity, drift_gains
 from drivers.presenter import Colour
 from experiment.lights.illuminations import Illumination
 

@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from calibration.registration.block_search import FoundBlocks, find_blocks
-from calibration.registration.raster import Raster
+from calibration.registration.tiles import FoundBlocks, Raster, find_blocks
 
 
 def test_blocks_are_found_where_they_are() -> None:

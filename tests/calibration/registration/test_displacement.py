@@ -10,8 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from calibration.registration.displacement import MOST_ROUGHNESS_PX, ROUGHNESS_PX, Displacement
-from calibration.registration.lens import Lens
+from calibration.registration.geometry import MOST_ROUGHNESS_PX, ROUGHNESS_PX, Displacement, Lens
 
 
 @settings(max_examples=20, deadline=None)

@@ -8,9 +8,8 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from calibration.registration.lateral_colour import LateralColour
-from calibration.registration.register import register
-from calibration.registration.registration import Registration
+from calibration.registration.geometry import LateralColour
+from calibration.registration.register import Registration, register
 from drivers.raw.rawfile import Mosaic
 from experiment.framing.planes import CHANNELS
 from sim.world.room import Room

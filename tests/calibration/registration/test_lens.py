@@ -6,7 +6,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from calibration.registration.lens import Lens, fit_lens
+from calibration.registration.geometry import Lens, fit_lens
 from foundation.errors import RegistrationError
 
 

@@ -7,8 +7,7 @@ import numpy.typing as npt
 import pytest
 from scipy import ndimage
 
-from calibration.registration.raster import Raster
-from calibration.registration.tile_comparison import MIN_SCORE, compare_tiles
+from calibration.registration.tiles import MIN_SCORE, Raster, compare_tiles
 
 _Float = npt.NDArray[np.float32]
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from calibration.sampling.patch_statistics import has_dead_photosite, patch_means, sample_noise, unevenness
+from calibration.sampling import has_dead_photosite, patch_means, sample_noise, unevenness
 
 
 def patches(level: float, sigma: float, count: int = 3000) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]]:

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from calibration.report.half_size import half_size
-from calibration.sampling.samples import gather, gather_values, sites_at, table_values
+from calibration.sampling import gather, gather_values, sites_at, table_values
 from tests.calibration.lab import Lab
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from calibration.sampling.windows import WINDOWS, bleed, largest_window
+from calibration.sampling import WINDOWS, bleed, largest_window
 
 pytestmark = pytest.mark.slow
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from calibration.table.provenance import Provenance
+from calibration.table.lut import Provenance
 from calibration.table.verification import find_faults
 from calibration.table.writer import LutWriter
 from foundation.errors import StorageError
