@@ -62,7 +62,7 @@ def serial_hash(camera: str, serial: str) -> str:
     return hashlib.scrypt(serial.encode(), salt=salt, n=_COST, r=_BLOCK, p=_PARALLEL, dklen=_BYTES).hex()
 
 
-def told_serials(origins: Sequence[FrameOrigin], form: SerialForm) -> Mapping[tuple[str, str], str]:
+def published_serials(origins: Sequence[FrameOrigin], form: SerialForm) -> Mapping[tuple[str, str], str]:
     """Return what is told of each body of a session, by camera and serial number, so that bodies stay apart.
 
     Where numbers are withheld, bodies are counted in the order in which they come.
@@ -75,9 +75,9 @@ def told_serials(origins: Sequence[FrameOrigin], form: SerialForm) -> Mapping[tu
     return {body: f"withheld ({number})" for number, body in enumerate(bodies, 1)}
 
 
-def with_told_serials(origins: Sequence[FrameOrigin], form: SerialForm) -> list[FrameOrigin]:
+def with_published_serials(origins: Sequence[FrameOrigin], form: SerialForm) -> list[FrameOrigin]:
     """Return what frames state, their serial numbers told as the lab chose; equal numbers stay equal."""
-    told = told_serials(origins, form)
+    told = published_serials(origins, form)
     return [replace(one, serial=told[one.camera, one.serial]) if one.serial else one for one in origins]
 
 
@@ -291,7 +291,7 @@ def _serial(stated: StatedOrigin, origins: Sequence[FrameOrigin]) -> tuple[str |
     form = stated.citation.camera_serial
     if form == "withheld":
         return None, form
-    return told_serials([FrameOrigin(camera, serial)], form)[camera, serial], form
+    return published_serials([FrameOrigin(camera, serial)], form)[camera, serial], form
 
 
 def _most(values: Sequence[Any]) -> Any:

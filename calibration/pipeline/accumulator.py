@@ -1,17 +1,11 @@
-"""Take in frames, one after another, in the order taken; what is known after each is one frozen value.
+"""What the frames taken in so far have given: one frozen value after each frame, which a checkpoint stores.
 
 Rules that hold inside:
 
-- What a frame adds depends on those before it alone, so that a build that was stopped goes on to the same bits.
+- Frames enter in the order taken. What one adds depends on those before it alone, so that a build that was stopped goes
+  on to the same bits.
 - A frame measured before its turn counts only if the frame registered last is still the one it was measured with.
 - The dark light of a frame is that of the last dark frame before it, or of the first, for frames before that.
-
-What frames show of the cells, in the order taken: evenness, highest counts, and which cells are unfit for use.
-
-Rules that hold inside:
-
-- Frames enter in the order taken, and what one adds depends on those before it alone: statistics that were stored in a
-  checkpoint and restored end in the same bits.
 - A cell that is cut off, clipped, covered or not of one colour is listed with its cause. It is never filled.
 
 C cells of S samples.
@@ -19,9 +13,8 @@ C cells of S samples.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from copy import deepcopy
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from typing import Any
 
@@ -43,7 +36,7 @@ from calibration.pipeline.measuring import (
 from calibration.radiometry.dark_frames import (
     DarkFrameFigures,
     DarkLight,
-    DarkLightEstimator,
+    DarkLightEstimate,
     DarkSummary,
     HotPixels,
     dark_summary,
@@ -52,24 +45,36 @@ from calibration.radiometry.dark_frames import (
 from calibration.registration.register import MAX_PLACE_ERROR_PX
 from calibration.sampling import has_dead_photosite, unevenness
 from calibration.table.lut import Unfit
-from experiment.chart.model import Chart
 from experiment.framing.movement import Shift
 from experiment.framing.planes import CLIPPING_SHARE
 from experiment.measures.stains import Stains, find_stains
 from experiment.session.folder import Session
 from experiment.session.records import FrameRecord
+from foundation.records import from_plain, to_plain
 
 _BRIGHTEST_PERCENTILE = 99.5
 """Of the cells' levels, what is taken for paper white: the brightest of all may be a reflection."""
 
+_BEGIN_ANEW = "begin the build anew"
+
 _Array = npt.NDArray[np.float64]
-_Mask = npt.NDArray[np.bool_]
+_Arrays = dict[str, npt.NDArray[Any]]
+
+EarlyMeasurement = MeasuredFrame | MeasuredDarkFrame | None
+"""A frame as measured before its turn; None where the chart has to be registered again in it."""
 
 
 @dataclass(frozen=True, eq=False)
-class CellStatistics:
-    """What the frames taken in so far show of the cells; each frame makes new ones.
+class Accumulator:
+    """What the frames of a session that were taken in so far have given; each frame makes a new one.
 
+    - `session`, `selected`, `baseline`: where frames are read, which, and what holds for all of them.
+    - `figures`: of each frame taken in, in order.
+    - `saturation`: raw count of saturation, the lowest that a frame shows.
+    - `registered`: the frame registered last.
+    - `dark`: what is subtracted from the frames that follow; None where nothing is.
+    - `estimate`: of the dark light; only dark frames that are subtracted enter it.
+    - `hot`: samples that stand out in every dark frame.
     - `highest`: (C,) uint16, the highest raw count of each cell.
     - `highest_at`: (C,) int64, the light under which it was reached; −1 for a white frame.
     - `outside`: (C,) bool, whether a cell was cut off in a frame.
@@ -79,117 +84,198 @@ class CellStatistics:
     - `even_sum`: (C, S, 3) float32, sum of the frames of even light, counts above black.
     - `even_noise2`: (C, 3) float64, sum of the variances of one sample in these frames, counts².
     - `even_frames`: how many they are.
-    - `hot`: samples that stand out in every dark frame.
-    - `darks`: figures of the dark frames.
     """
 
-    chart: Chart
+    session: Session
+    selected: SelectedFrames
+    baseline: Baseline
+    figures: tuple[FrameFigures | DarkFrameFigures, ...]
+    saturation: int
+    registered: RegisteredFrame
+    dark: DarkLight | None
+    estimate: DarkLightEstimate
+    hot: HotPixels
     highest: npt.NDArray[np.uint16]
     highest_at: npt.NDArray[np.int64]
-    outside: _Mask
-    covered: _Mask
+    outside: npt.NDArray[np.bool_]
+    covered: npt.NDArray[np.bool_]
     place_error: _Array
     even_sum: npt.NDArray[np.float32]
     even_noise2: _Array
     even_frames: int
-    hot: HotPixels
-    darks: tuple[DarkFrameFigures, ...]
 
     @staticmethod
-    def before_all_frames(chart: Chart, samples: int, first: RegisteredFrame) -> CellStatistics:
-        """Return the statistics before any frame is taken in."""
-        count = chart.colour_count
-        return CellStatistics(
-            chart=chart,
+    def empty(session: Session, selected: SelectedFrames, baseline: Baseline, saturation: int) -> Accumulator:
+        """Return what there is before any frame; `saturation` is the raw count that the first registered frame shows.
+
+        The dark light that frames before the first dark one get is that one's, which is read for it.
+        """
+        count, samples = baseline.chart.colour_count, baseline.options.samples
+        found = Accumulator(
+            session=session,
+            selected=selected,
+            baseline=baseline,
+            figures=(),
+            saturation=saturation,
+            registered=baseline.first,
+            dark=None,
+            estimate=baseline.dark_light_estimate(),
+            hot=HotPixels.none(count, samples),
             highest=np.zeros(count, dtype=np.uint16),
             highest_at=np.zeros(count, dtype=np.int64),
             outside=np.zeros(count, dtype=np.bool_),
-            covered=_covered_cells(chart, first),
-            place_error=_place_errors(chart, first),
+            covered=_covered_cells(baseline, baseline.first),
+            place_error=_place_errors(baseline, baseline.first),
             even_sum=np.zeros((count, samples, 3), dtype=np.float32),
             even_noise2=np.zeros((count, 3)),
             even_frames=0,
-            hot=HotPixels(count, samples),
-            darks=(),
         )
+        if not baseline.options.subtract_dark:
+            return found
+        record = next(record for record in selected.records if record.kind == "dark")
+        measured = sample_dark_frame(baseline, decode_frame(session, record), baseline.first)
+        return replace(found, dark=found._learned(measured).dark)
 
-    def with_frame(self, measured: MeasuredFrame) -> CellStatistics:
-        """Return the statistics after a light or white frame."""
+    @cached_property
+    def frames(self) -> tuple[FrameFigures, ...]:
+        """Figures of the light and white frames."""
+        return tuple(figures for figures in self.figures if isinstance(figures, FrameFigures))
+
+    @property
+    def darks(self) -> tuple[DarkFrameFigures, ...]:
+        """Figures of the dark frames."""
+        return tuple(figures for figures in self.figures if isinstance(figures, DarkFrameFigures))
+
+    @property
+    def records(self) -> list[FrameRecord]:
+        """The frames taken in."""
+        return [figures.record for figures in self.figures]
+
+    def others_wait_for(self, record: FrameRecord) -> bool:
+        """Return whether the frames after this one can be measured only when it has been taken in."""
+        return self.baseline.options.subtract_dark and record.kind == "dark"
+
+    def measure(self, record: FrameRecord) -> EarlyMeasurement:
+        """Return what a frame shows now; None where the chart has to be registered again. Thread-safe."""
+        decoded = decode_frame(self.session, record)
+        if record.kind == "dark":
+            return sample_dark_frame(self.baseline, decoded, self.registered)
+        even = self.selected.is_even(record)
+        measured = measure_frame(self.baseline, decoded, self.registered, even, self.dark)
+        return None if isinstance(measured, Shift) else measured
+
+    def with_next(
+        self, record: FrameRecord, early: EarlyMeasurement
+    ) -> tuple[Accumulator, MeasuredFrame | MeasuredDarkFrame]:
+        """Return what there is after the next frame, and that frame as measured."""
+        current = early is not None and early.registered is self.registered
+        measured, before = early if current else self.measure(record), self
+        if measured is None:
+            before, measured = self._registered_again(record)
+        if isinstance(measured, MeasuredDarkFrame):
+            return before.with_dark_frame(measured), measured
+        return before.with_frame(measured), measured
+
+    def with_frame(self, measured: MeasuredFrame) -> Accumulator:
+        """Return what there is after a light or white frame."""
         light = measured.figures.record.illumination
         brighter = measured.highest > self.highest
         after = replace(
             self,
+            figures=(*self.figures, measured.figures),
+            saturation=min(self.saturation, measured.saturation),
             highest=np.where(brighter, measured.highest, self.highest),
             highest_at=np.where(brighter, -1 if light is None else light, self.highest_at),
             outside=self.outside | ~measured.inside,
         )
-        if measured.figures.reregistered:
-            hot = deepcopy(self.hot)
-            hot.restart(median_noise(self.darks))
-            covered = self.covered | _covered_cells(self.chart, measured.registered)
-            place_error = np.maximum(self.place_error, _place_errors(self.chart, measured.registered))
-            after = replace(after, covered=covered, place_error=place_error, hot=hot)
-        if measured.samples is not None and measured.noise is not None:
-            after = replace(
-                after,
-                even_sum=self.even_sum + measured.samples,
-                even_noise2=self.even_noise2 + measured.noise**2,
-                even_frames=self.even_frames + 1,
-            )
-        return after
+        if measured.samples is None or measured.noise is None:
+            return after
+        return replace(
+            after,
+            even_sum=self.even_sum + measured.samples,
+            even_noise2=self.even_noise2 + measured.noise**2,
+            even_frames=self.even_frames + 1,
+        )
 
-    def with_dark_frame(self, measured: MeasuredDarkFrame) -> CellStatistics:
-        """Return the statistics after a dark frame."""
-        hot = deepcopy(self.hot)
-        hot.add(measured.excess)
-        return replace(self, hot=hot, darks=(*self.darks, measured.figures))
+    def with_dark_frame(self, measured: MeasuredDarkFrame) -> Accumulator:
+        """Return what there is after a dark frame."""
+        after = replace(self, figures=(*self.figures, measured.figures), hot=self.hot.with_frame(measured.excess))
+        return after._learned(measured) if self.baseline.options.subtract_dark else after
 
-    def to_arrays(self) -> dict[str, npt.NDArray[Any]]:
-        """Return what a checkpoint stores of the statistics: all but chart and figures of dark frames.
+    def _registered_again(self, record: FrameRecord) -> tuple[Accumulator, MeasuredFrame]:
+        """Return what there is once the chart is registered in this frame, and what the frame shows."""
+        decoded = decode_frame(self.session, record)
+        registered = self.baseline.register(decoded)
+        shift = movement_of(self.baseline, self.registered, registered)
+        even = self.selected.is_even(record)
+        measured = measure_registered_frame(self.baseline, decoded, registered, shift, even, self.dark)
+        after = replace(
+            self,
+            registered=registered,
+            estimate=self.estimate.restarted(),
+            hot=self.hot.restarted(median_noise(self.darks)),
+            covered=self.covered | _covered_cells(self.baseline, registered),
+            place_error=np.maximum(self.place_error, _place_errors(self.baseline, registered)),
+        )
+        return after, measured
 
-        (C,) uint16, int64 and bool, (C, S, 3) float32 and (C, 3) float64 by the attributes' names, `even_frames` as a
-        scalar int64; and what `HotPixels.to_arrays` returns.
-        """
+    def _learned(self, measured: MeasuredDarkFrame) -> Accumulator:
+        """Return what there is with a dark frame taken into the estimate of what is subtracted from those after it."""
+        points, reader = self.baseline.points, self.baseline.paper
+        means = measured.means[len(points.cells_mm) :][: len(points.whites_mm)]
+        inside = measured.registered.references.inside[: len(points.whites_mm), None]
+        paper, shape = reader.read(np.where(inside, means, np.nan), measured.figures.record.file)
+        field = np.concatenate([shape, paper.field.at(points.references_mm)])
+        estimate, dark = self.estimate.with_frame(measured.means, measured.figures.noise, paper, field)
+        return replace(self, estimate=estimate, dark=dark)
+
+    def to_json(self) -> dict[str, Any]:
+        """Return what a checkpoint stores as text; the rest is `to_arrays`."""
         return {
-            "highest": self.highest,
-            "highest_at": self.highest_at,
-            "outside": self.outside,
-            "covered": self.covered,
-            "place_error": self.place_error,
-            "even_sum": self.even_sum,
-            "even_noise2": self.even_noise2,
-            "even_frames": np.array(self.even_frames),
-            **self.hot.to_arrays(),
+            "registered": self.registered.file,
+            "figures": [
+                figures.to_json() if isinstance(figures, FrameFigures) else to_plain(figures)
+                for figures in self.figures
+            ],
         }
 
-    def from_arrays(self, stored: dict[str, npt.NDArray[Any]], darks: tuple[DarkFrameFigures, ...]) -> CellStatistics:
-        """Return statistics of the same chart from what `to_arrays` returned, and the figures of the dark frames.
+    def to_arrays(self) -> _Arrays:
+        """Return what a checkpoint stores as arrays: all arrays and counts of this value and its parts, by name."""
+        parts = {"": self, "estimate.": self.estimate, "hot.": self.hot, "dark.": self.dark}
+        return {prefix + name: each for prefix, part in parts.items() for name, each in _arrays_of(part).items()}
 
-        Each array of `stored` has the same shape and dtype as there; that is not checked.
-        """
-        hot = deepcopy(self.hot)
-        hot.restore(stored)
+    def restored(self, values: Mapping[str, Any], arrays: _Arrays) -> Accumulator:
+        """Return what was stored, by `to_json` and `to_arrays`, of a build of the same frames; this one is empty."""
+        page_mm = self.baseline.chart.page_mm
+        figures = tuple(
+            replace(from_plain(DarkFrameFigures, stored, record.file, _BEGIN_ANEW), record=record)
+            if record.kind == "dark"
+            else FrameFigures.from_json(record, page_mm, stored)
+            for record, stored in zip(self.selected.records, values["figures"], strict=False)
+        )
+        registered = self.baseline.first
+        if values["registered"] != registered.file:
+            record = next(record for record in self.selected.records if record.file == values["registered"])
+            registered = self.baseline.register(decode_frame(self.session, record))
+
+        def stored(prefix: str) -> dict[str, Any]:
+            named = {name.removeprefix(prefix): each for name, each in arrays.items() if name.startswith(prefix)}
+            return {name: each if each.ndim else each.item() for name, each in named.items() if "." not in name}
+
+        dark = stored("dark.")
         return replace(
             self,
-            highest=stored["highest"],
-            highest_at=stored["highest_at"],
-            outside=stored["outside"],
-            covered=stored["covered"],
-            place_error=stored["place_error"],
-            even_sum=stored["even_sum"],
-            even_noise2=stored["even_noise2"],
-            even_frames=int(stored["even_frames"]),
-            hot=hot,
-            darks=darks,
+            figures=figures,
+            registered=registered,
+            dark=DarkLight(**dark) if dark else None,
+            estimate=replace(self.estimate, **stored("estimate.")),
+            hot=replace(self.hot, **stored("hot.")),
+            **stored(""),
         )
 
     def dark_summary(self) -> DarkSummary:
         """Return what the dark frames show."""
         return dark_summary(self.darks, self.hot)
-
-    def saturated(self, saturation_counts: int) -> bool:
-        """Return whether a photosite of a cell reached saturation, given as a raw count."""
-        return bool((self.highest >= saturation_counts).any())
 
     def noise(self) -> _Array:
         """Return (3,) float64, median standard deviation of one sample in the even frames, of the brightest cells'."""
@@ -203,25 +289,22 @@ class CellStatistics:
         `field` (C, 3) float64 is that of a frame of even light, of each cell's own colour as far as it is known: by the
         field of paper alone, cells of one side would be off where the primaries light the print in different ways.
         """
-        cells_mm = self.chart.centres_mm[self.chart.cell_of_colour]
+        cells_mm = self.baseline.points.cells_mm
         level = self.even_sum.mean(axis=1, dtype=np.float64) / max(self.even_frames, 1) / field
-        return find_stains(level, cells_mm, self.chart.bits, ~(self.outside | self.covered))
+        return find_stains(level, cells_mm, self.baseline.chart.bits, ~(self.outside | self.covered))
 
-    def unfit(self, saturation_counts: int, stains: Stains, frames: Sequence[FrameFigures]) -> tuple[Unfit, ...]:
-        """Return the cells not to be used, each with the first cause that applies.
-
-        `saturation_counts`: raw count of saturation.
-        """
+    def unfit(self, stains: Stains, frames: Sequence[FrameFigures]) -> tuple[Unfit, ...]:
+        """Return the cells not to be used, each with the first cause that applies; `frames`: what is said of them."""
         disturbed = disturbed_cells(frames)
         lit = [(frame.consistency.alone, frame.record.illumination) for frame in frames]
         alone = {colour: light for cells, light in lit if light is not None for colour in cells}
         even, dark = max(self.even_frames, 1), self.dark_summary()
-        hottest = dark.hottest if len(dark.hottest) else np.zeros(self.chart.colour_count)
+        hottest = dark.hottest if len(dark.hottest) else np.zeros(self.baseline.chart.colour_count)
         dead = has_dead_photosite(self.even_sum / even)
         uneven = unevenness(self.even_sum / even, np.sqrt(self.even_noise2) / even)
-        allowed, samples = CLIPPING_SHARE * saturation_counts, self.even_sum.shape[1]
+        allowed, samples = CLIPPING_SHARE * self.saturation, self.even_sum.shape[1]
         found: list[Unfit] = []
-        for colour in range(self.chart.colour_count):
+        for colour in range(self.baseline.chart.colour_count):
             cause = ""
             if self.outside[colour]:
                 cause = f"outside: its {samples} pixels do not all lie in the frame"
@@ -276,192 +359,20 @@ def _disturbance(under: list[tuple[int, float]]) -> str:
     return f"under light {light}{more} it is {how}, next to cells that are far off"
 
 
-def _place_errors(chart: Chart, registered: RegisteredFrame) -> _Array:
+def _place_errors(baseline: Baseline, registered: RegisteredFrame) -> _Array:
     """Return three standard errors (C,) of the cells' places, in the order of colours, over their clearance."""
     registration = registered.registration
-    return 3 * registration.uncertainty_px(chart.centres_mm[chart.cell_of_colour]) / registration.clearance
+    return 3 * registration.uncertainty_px(baseline.points.cells_mm) / registration.clearance
 
 
-def _covered_cells(chart: Chart, registered: RegisteredFrame) -> _Mask:
+def _covered_cells(baseline: Baseline, registered: RegisteredFrame) -> npt.NDArray[np.bool_]:
     """Return the cells (C,) that do not look like the chart's, alone or with their neighbourhood."""
-    blocks, cells = registered.registration.blocks, chart.cell_of_colour
-    nearest = np.asarray(cKDTree(blocks.centres_mm).query(chart.centres_mm[cells])[1])
-    return registered.registration.mismatched_cells[cells] | ~blocks.good[nearest]
+    registration = registered.registration
+    nearest = np.asarray(cKDTree(registration.blocks.centres_mm).query(baseline.points.cells_mm)[1])
+    return registration.mismatched_cells[baseline.chart.cell_of_colour] | ~registration.blocks.good[nearest]
 
 
-EarlyMeasurement = MeasuredFrame | MeasuredDarkFrame | None
-"""A frame as measured before its turn; None where the chart has to be registered again in it."""
-
-
-@dataclass(frozen=True, eq=False)
-class IntakeState:
-    """What the frames taken in so far have given.
-
-    - `figures`: of each frame taken in, in order.
-    - `statistics`: what they show of the cells.
-    - `saturation`: raw count of saturation, the lowest that a frame shows.
-    - `registered`: the frame registered last.
-    - `estimator`: estimates the dark light; only dark frames that are subtracted enter it.
-    - `dark`: what is subtracted from the frames that follow; None where nothing is.
-    """
-
-    figures: tuple[FrameFigures | DarkFrameFigures, ...]
-    statistics: CellStatistics
-    saturation: int
-    registered: RegisteredFrame
-    estimator: DarkLightEstimator
-    dark: DarkLight | None
-
-    @cached_property
-    def frames(self) -> tuple[FrameFigures, ...]:
-        """Figures of the light and white frames."""
-        return tuple(figures for figures in self.figures if isinstance(figures, FrameFigures))
-
-    @property
-    def records(self) -> list[FrameRecord]:
-        """The frames taken in."""
-        return [figures.record for figures in self.figures]
-
-    def to_json(self) -> dict[str, Any]:
-        """Return what a checkpoint stores as text; the rest is `to_arrays`."""
-        return {
-            "saturation": self.saturation,
-            "registered": self.registered.file,
-            "figures": [figures.to_json() for figures in self.figures],
-        }
-
-    def to_arrays(self) -> dict[str, npt.NDArray[Any]]:
-        """Return what a checkpoint stores as arrays, (C, S, 3) float32 `even_sum` and others by name.
-
-        The rest stands at `CellStatistics.to_arrays` and `DarkLightEstimator.to_arrays`.
-        """
-        return {**self.statistics.to_arrays(), **self.estimator.to_arrays()}
-
-
-@dataclass(frozen=True, eq=False)
-class Intake:
-    """The frames of a session on their way into a table: what does not change while they are taken in.
-
-    - `session`: where the frames are read.
-    - `baseline`: what holds for all of them.
-    """
-
-    session: Session
-    selected: SelectedFrames
-    baseline: Baseline
-
-    @property
-    def subtracts_dark(self) -> bool:
-        """Whether the light of the dark frames is subtracted."""
-        return self.baseline.options.subtract_dark
-
-    def others_wait_for(self, record: FrameRecord) -> bool:
-        """Return whether the frames after this one can be measured only when it has been taken in."""
-        return self.subtracts_dark and record.kind == "dark"
-
-    def before_all_frames(self, saturation: int) -> IntakeState:
-        """Return the state before any frame; `saturation` is the raw count that the first registered frame shows."""
-        baseline = self.baseline
-        return IntakeState(
-            figures=(),
-            statistics=CellStatistics.before_all_frames(baseline.chart, baseline.options.samples, baseline.first),
-            saturation=saturation,
-            registered=baseline.first,
-            estimator=baseline.dark_light_estimator(),
-            dark=None,
-        )
-
-    def restored(self, stored: dict[str, Any], arrays: dict[str, npt.NDArray[Any]], begin: IntakeState) -> IntakeState:
-        """Return the state that a checkpoint stored; `arrays`: of `IntakeState.to_arrays`, (...), any dtype."""
-        page_mm = self.baseline.chart.page_mm
-        figures = tuple(
-            DarkFrameFigures.from_json(record, figures)
-            if record.kind == "dark"
-            else FrameFigures.from_json(record, page_mm, figures)
-            for record, figures in zip(self.selected.records, stored["figures"], strict=False)
-        )
-        registered = self.baseline.first
-        if stored["registered"] != registered.file:
-            record = next(record for record in self.selected.records if record.file == stored["registered"])
-            registered = self.baseline.register(decode_frame(self.session, record))
-        estimator = deepcopy(begin.estimator)
-        estimator.restore(arrays)
-        darks = tuple(dark for dark in figures if isinstance(dark, DarkFrameFigures))
-        return IntakeState(
-            figures=figures,
-            statistics=begin.statistics.from_arrays(arrays, darks),
-            saturation=int(stored["saturation"]),
-            registered=registered,
-            estimator=estimator,
-            dark=estimator.current,
-        )
-
-    def with_dark_light(self, state: IntakeState) -> IntakeState:
-        """Return the state with the dark light that frames before the first dark one get, which is that one's."""
-        if not self.subtracts_dark or state.dark is not None:
-            return state
-        record = next(record for record in self.selected.records if record.kind == "dark")
-        measured = sample_dark_frame(self.baseline, decode_frame(self.session, record), self.baseline.first)
-        return replace(state, dark=self._learn(self.baseline.dark_light_estimator(), measured))
-
-    def measure(self, record: FrameRecord, state: IntakeState) -> EarlyMeasurement:
-        """Return what a frame shows in this state; None where the chart has to be registered again. Thread-safe."""
-        decoded = decode_frame(self.session, record)
-        if record.kind == "dark":
-            return sample_dark_frame(self.baseline, decoded, state.registered)
-        even = self.selected.is_even(record)
-        measured = measure_frame(self.baseline, decoded, state.registered, even, state.dark)
-        return None if isinstance(measured, Shift) else measured
-
-    def take_in(
-        self, record: FrameRecord, early: EarlyMeasurement, state: IntakeState
-    ) -> tuple[IntakeState, MeasuredFrame | MeasuredDarkFrame]:
-        """Return the state after the next frame, and the frame as measured."""
-        current = early is not None and early.registered is state.registered
-        measured = early if current else self.measure(record, state)
-        if measured is None:
-            state, measured = self._register_again(record, state)
-        if isinstance(measured, MeasuredDarkFrame):
-            return self.with_dark_frame(measured, state), measured
-        return self.with_frame(measured, state), measured
-
-    def with_frame(self, measured: MeasuredFrame, state: IntakeState) -> IntakeState:
-        """Return the state after a light or white frame."""
-        return replace(
-            state,
-            figures=(*state.figures, measured.figures),
-            statistics=state.statistics.with_frame(measured),
-            saturation=min(state.saturation, measured.saturation),
-        )
-
-    def with_dark_frame(self, measured: MeasuredDarkFrame, state: IntakeState) -> IntakeState:
-        """Return the state after a dark frame."""
-        state = replace(
-            state,
-            figures=(*state.figures, measured.figures),
-            statistics=state.statistics.with_dark_frame(measured),
-        )
-        if not self.subtracts_dark:
-            return state
-        estimator = deepcopy(state.estimator)
-        return replace(state, estimator=estimator, dark=self._learn(estimator, measured))
-
-    def _register_again(self, record: FrameRecord, state: IntakeState) -> tuple[IntakeState, MeasuredFrame]:
-        """Return the state with the chart registered in this frame, and what the frame shows."""
-        decoded = decode_frame(self.session, record)
-        registered = self.baseline.register(decoded)
-        shift = movement_of(self.baseline, state.registered, registered)
-        estimator = deepcopy(state.estimator)
-        estimator.restart()
-        even = self.selected.is_even(record)
-        measured = measure_registered_frame(self.baseline, decoded, registered, shift, even, state.dark)
-        return replace(state, registered=registered, estimator=estimator), measured
-
-    def _learn(self, estimator: DarkLightEstimator, measured: MeasuredDarkFrame) -> DarkLight:
-        """Take a dark frame into the estimate and return what is subtracted from the frames after it."""
-        points, reader = self.baseline.points, self.baseline.paper
-        means = measured.means[len(points.cells_mm) :][: len(points.whites_mm)]
-        inside = measured.registered.references.inside[: len(points.whites_mm), None]
-        paper, shape = reader.read(np.where(inside, means, np.nan), measured.figures.record.file)
-        field = np.concatenate([shape, paper.field.at(points.references_mm)])
-        return estimator.add(measured.means, measured.figures.noise, paper, field)
+def _arrays_of(part: Any) -> _Arrays:
+    """Return the arrays and counts of a frozen value by the names of its fields; none of None."""
+    values = {} if part is None else {field.name: getattr(part, field.name) for field in fields(part)}
+    return {name: np.asarray(value) for name, value in values.items() if isinstance(value, np.ndarray | int)}

@@ -28,15 +28,14 @@ The print is assumed to be even: a sheet printed darker on one side cannot be di
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
-from typing import Any
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
 
 from calibration.checks.frame_consistency import ConsistencyCheck
 from calibration.pipeline.frames import DecodedFrame
-from calibration.radiometry.dark_frames import DarkLightEstimator, reflectances
+from calibration.radiometry.dark_frames import DarkLightEstimate, reflectances
 from calibration.radiometry.greys import GreyLevels
 from calibration.radiometry.photon_transfer import PhotonTransfer, photon_transfer
 from calibration.radiometry.primaries import Primaries
@@ -100,12 +99,6 @@ class BuildOptions:
     def samples(self) -> int:
         """Samples of each cell."""
         return self.window**2
-
-    def to_json(self) -> dict[str, Any]:
-        """Return the options as JSON can hold them, but for the citation: they are part of what samples depend on."""
-        values = asdict(replace(self, citation=None))
-        del values["citation"]
-        return values | {"corners": None if self.corners is None else [list(corner) for corner in self.corners]}
 
 
 PAPER_OPTIONS = BuildOptions()
@@ -288,7 +281,7 @@ class Baseline:
 
     - `chart`, `points`: the chart, and its points: C cells, W white and N grey references.
     - `options`: how the table is built.
-    - `layout`: the sensor's, the same in all frames.
+    - `camera`, `layout`: maker and model, and the sensor's layout, the same in all frames.
     - `first`: the frame that is registered first.
     - `whites`: (W, 3) float64 counts above black of its white references; NaN where one cannot be used.
     - `means`: (C + W + N, 3) float64 counts above black of its cells and references.
@@ -302,6 +295,7 @@ class Baseline:
     chart: Chart
     points: ChartPoints
     options: BuildOptions
+    camera: str
     layout: SensorLayout
     first: RegisteredFrame
     whites: _Array
@@ -362,12 +356,12 @@ class Baseline:
             peaks.append(highest)
         return np.concatenate(means), np.concatenate(peaks)
 
-    def dark_light_estimator(self) -> DarkLightEstimator:
+    def dark_light_estimate(self) -> DarkLightEstimate:
         """Return the estimate of the dark light before any dark frame, with the reflectances of the first frame."""
         paper, shape = self.paper.read(self.whites, self.first.file)
         field = np.concatenate([shape, paper.field.at(self.points.references_mm)])
         inside = np.concatenate([self.first.cells.inside, self.first.references.inside])
-        return DarkLightEstimator(reflectances(self.means, field, paper.white), inside, self.options.samples)
+        return DarkLightEstimate.none(reflectances(self.means, field, paper.white), inside, self.options.samples)
 
 
 def baseline_of(chart: Chart, first: DecodedFrame, options: BuildOptions = PAPER_OPTIONS) -> Baseline:
@@ -495,6 +489,7 @@ def _baseline(
         chart=chart,
         points=points,
         options=options,
+        camera=first.mosaic.camera,
         layout=SensorLayout.of(first.mosaic),
         first=registered,
         whites=whites,

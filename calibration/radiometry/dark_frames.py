@@ -26,8 +26,7 @@ Rules that hold inside:
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field
-from typing import Any
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -35,6 +34,7 @@ import numpy.typing as npt
 from drivers.raw.origin import FrameOrigin
 from experiment.measures.paper import Paper
 from experiment.session.records import FrameRecord
+from foundation.records import FloatArray
 from foundation.robust import MAD_TO_SIGMA, MEDIAN_ERROR
 
 _LEAST_WHITE = 50.0
@@ -86,71 +86,53 @@ def reflectances(seen: _Array, field: _Array, white: _Array) -> _Array:
     return found
 
 
-class DarkLightEstimator:
-    """Estimates the dark light from dark frames, one after another.
+@dataclass(frozen=True, eq=False)
+class DarkLightEstimate:
+    """What dark frames, one after another, have shown of the dark light; each makes a new one.
 
-    `reflectance`: (P, 3) of each patch. `inside`: (P,) whether a patch lies in the frame.
+    - `reflectance`: (P, 3) float64 of each patch. `inside`: (P,) bool, whether a patch lies in the frame.
+    - `samples`: of each patch.
+    - `left`: (P, 3) float64 counts, sum of what patches showed beyond the prediction.
+    - `noise`: (3,) float64 counts², sum of the variances of a patch's mean.
+    - `frames`: how many they are.
     """
 
-    def __init__(self, reflectance: _Array, inside: npt.NDArray[np.bool_], samples: int) -> None:
-        self._reflectance, self._inside, self._samples = reflectance, inside, samples
-        self._left = np.zeros_like(reflectance)
-        self._noise = np.zeros(3)
-        self._frames = 0
-        self._current: DarkLight | None = None
+    reflectance: _Array
+    inside: npt.NDArray[np.bool_]
+    samples: int
+    left: _Array
+    noise: _Array
+    frames: int
 
-    @property
-    def current(self) -> DarkLight | None:
-        """The dark light of the last dark frame; None before the first."""
-        return self._current
+    @staticmethod
+    def none(reflectance: _Array, inside: npt.NDArray[np.bool_], samples: int) -> DarkLightEstimate:
+        """Return the estimate before any dark frame, of patches with reflectances (P, 3) that are inside (P,)."""
+        return DarkLightEstimate(reflectance, inside, samples, np.zeros_like(reflectance), np.zeros(3), 0)
 
-    def restart(self) -> None:
-        """Drop what cells showed beyond the prediction: they lie on other photosites from now on."""
-        self._left[:] = 0
-        self._noise[:] = 0
-        self._frames = 0
+    def restarted(self) -> DarkLightEstimate:
+        """Return it without what cells showed beyond the prediction: they lie on other photosites from now on."""
+        return DarkLightEstimate.none(self.reflectance, self.inside, self.samples)
 
-    def add(self, means: _Array, noise: _Array, paper: Paper, field: _Array) -> DarkLight:
-        """Take in a dark frame and return what is to be subtracted from those after it.
+    def with_frame(
+        self, means: _Array, noise: _Array, paper: Paper, field: _Array
+    ) -> tuple[DarkLightEstimate, DarkLight]:
+        """Return the estimate after a dark frame, and what is to be subtracted from the frames after it.
 
         `means`: (P, 3) mean counts above black of each patch. `noise`: (3,) standard deviation of one sample. `field`:
         (P, 3) its field at the patches.
         """
-        predicted = paper.white * field * self._reflectance
-        self._left += means - predicted
-        self._noise += noise**2 / self._samples
-        self._frames += 1
-        left = self._left / self._frames
-        spread = MAD_TO_SIGMA * np.median(np.abs(left[self._inside] - np.median(left[self._inside], axis=0)), axis=0)
-        chance = self._noise / self._frames**2
+        predicted = paper.white * field * self.reflectance
+        after = replace(
+            self,
+            left=self.left + (means - predicted),
+            noise=self.noise + noise**2 / self.samples,
+            frames=self.frames + 1,
+        )
+        left = after.left / after.frames
+        spread = MAD_TO_SIGMA * np.median(np.abs(left[self.inside] - np.median(left[self.inside], axis=0)), axis=0)
+        chance = after.noise / after.frames**2
         share = np.clip(1 - chance / np.maximum(spread**2, 1e-12), 0, 1)
-        self._current = DarkLight(paper.white, (predicted + share * left).astype(np.float32), share)
-        return self._current
-
-    def to_arrays(self) -> dict[str, npt.NDArray[Any]]:
-        """Return all that is needed to go on: arrays by name; none before the first frame.
-
-        `dark_left` (P, 3) float64, `dark_noise` (3,) float64, `dark_frames` scalar int64, `dark_paper` (3,) float64,
-        `dark_patches` (P, 3) float32, `dark_share` (3,) float64.
-        """
-        if self._current is None:
-            return {}
-        return {
-            "dark_left": self._left,
-            "dark_noise": self._noise,
-            "dark_frames": np.array(self._frames),
-            "dark_paper": self._current.paper,
-            "dark_patches": self._current.patches,
-            "dark_share": self._current.share,
-        }
-
-    def restore(self, arrays: dict[str, npt.NDArray[Any]]) -> None:
-        """Go on from what `to_arrays` returned: (P, 3) and (3,) float arrays by name."""
-        if "dark_left" not in arrays:
-            return
-        self._left, self._noise = arrays["dark_left"], arrays["dark_noise"]
-        self._frames = int(arrays["dark_frames"])
-        self._current = DarkLight(arrays["dark_paper"], arrays["dark_patches"], arrays["dark_share"])
+        return after, DarkLight(paper.white, (predicted + share * left).astype(np.float32), share)
 
 
 HOT_COUNTS = 32.0
@@ -158,6 +140,9 @@ HOT_COUNTS = 32.0
 
 HOT_SIGMA = 10.0
 """Read noise alone passes 6 σ once in 2.5 million samples, a chart's."""
+
+_NEVER = 32767
+"""The excess of a sample that no dark frame has shown yet."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -196,22 +181,11 @@ class DarkFrameFigures:
     """
 
     record: FrameRecord
-    black: _Array
-    light: _Array
-    error: _Array
-    noise: _Array
+    black: FloatArray
+    light: FloatArray
+    error: FloatArray
+    noise: FloatArray
     origin: FrameOrigin = field(default_factory=FrameOrigin)
-
-    def to_json(self) -> dict[str, Any]:
-        """Return the figures as JSON can hold them; `from_json` restores them to the last bit."""
-        figures = {name: getattr(self, name).tolist() for name in ("black", "light", "error", "noise")}
-        return figures | {"origin": asdict(self.origin)}
-
-    @staticmethod
-    def from_json(record: FrameRecord, data: dict[str, Any]) -> DarkFrameFigures:
-        """Return the figures of a frame from what `to_json` returned."""
-        figures = (np.array(data[name]) for name in ("black", "light", "error", "noise"))
-        return DarkFrameFigures(record, *figures, origin=FrameOrigin(**data["origin"]))
 
 
 def measure_dark_frame(
@@ -239,25 +213,32 @@ def measure_dark_frame(
     return figures, np.clip(np.rint(excess), -32768, 32767).astype(np.int16)
 
 
+@dataclass(frozen=True, eq=False)
 class HotPixels:
-    """Accumulates, over dark frames, which samples exceed their cells' medians in every one of them."""
+    """Which samples exceed their cells' medians in every dark frame so far; each frame makes a new one.
 
-    def __init__(self, cells: int, samples: int) -> None:
-        self._shape = cells, samples, 3
-        self._least: npt.NDArray[np.int16] = np.full(self._shape, 32767, dtype=np.int16)
-        self._past = np.zeros(cells)
+    - `least`: (C, S, 3) int16 counts, the least excess of each sample since the chart was registered last.
+    - `past`: (C,) float64 counts, by how much a cell was hot before that.
+    """
 
-    def add(self, excess: npt.NDArray[np.int16]) -> None:
-        """Take in a frame; `excess` (C, S, 3) counts, as `measure_dark_frame` returned it."""
-        np.minimum(self._least, excess, out=self._least)
+    least: npt.NDArray[np.int16]
+    past: _Array
 
-    def restart(self, noise: _Array) -> None:
-        """Begin again, since cells lie on other photosites from now on; cells that were hot so far stay so.
+    @staticmethod
+    def none(cells: int, samples: int) -> HotPixels:
+        """Return what is known before any dark frame."""
+        return HotPixels(np.full((cells, samples, 3), _NEVER, dtype=np.int16), np.zeros(cells))
+
+    def with_frame(self, excess: npt.NDArray[np.int16]) -> HotPixels:
+        """Return it after a frame; `excess` (C, S, 3) counts, as `measure_dark_frame` returned it."""
+        return replace(self, least=np.minimum(self.least, excess))
+
+    def restarted(self, noise: _Array) -> HotPixels:
+        """Return it begun again, since cells lie on other photosites from now on; cells that were hot so far stay so.
 
         `noise` (3,) counts is the standard deviation of a sample.
         """
-        self._past = self.hottest(noise)
-        self._least = np.full(self._shape, 32767, dtype=np.int16)
+        return HotPixels(np.full_like(self.least, _NEVER), self.hottest(noise))
 
     def hottest(self, noise: _Array) -> _Array:
         """Return how far the hottest sample of each cell (C,) float64 exceeds its median in every frame, counts.
@@ -265,16 +246,8 @@ class HotPixels:
         0 where none does. `noise` (3,) counts is the standard deviation of a sample.
         """
         hot = np.maximum(HOT_COUNTS, HOT_SIGMA * noise)
-        seen = (self._least > hot) & (self._least < 32767)
-        return np.maximum(np.where(seen, self._least, 0).max(axis=(1, 2)).astype(np.float64), self._past)
-
-    def to_arrays(self) -> dict[str, npt.NDArray[Any]]:
-        """Return all that is needed to go on: int16 (C, S, 3) and float64 (C,) arrays by name."""
-        return {"dark_least": self._least, "dark_past": self._past}
-
-    def restore(self, arrays: dict[str, npt.NDArray[Any]]) -> None:
-        """Go on from what `to_arrays` returned: int16 (C, S, 3) and float64 (C,) arrays by name."""
-        self._least, self._past = arrays["dark_least"].copy(), arrays["dark_past"]
+        seen = (self.least > hot) & (self.least < _NEVER)
+        return np.maximum(np.where(seen, self.least, 0).max(axis=(1, 2)).astype(np.float64), self.past)
 
 
 def median_noise(frames: Sequence[DarkFrameFigures]) -> _Array:

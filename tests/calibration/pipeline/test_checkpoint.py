@@ -32,7 +32,7 @@ pytestmark = pytest.mark.slow
 
 KILLER = """
 import os, signal, sys
-import calibration.pipeline.build, calibration.pipeline.build, calibration.table.writer, calibration.report.report
+import calibration.pipeline.build, calibration.table.writer, calibration.report.report
 from calibration.cli import main
 
 place, count = sys.argv[1], int(sys.argv[2])
@@ -216,10 +216,13 @@ def test_two_programs_do_not_make_one_table(session: Session, tmp_path: Path) ->
 def test_a_checkpoint_comes_back_to_the_last_bit(tmp_path: Path) -> None:
     values = {"value": 0.1 + 0.2, "tiny": 5e-324, "nothing": None}
     with unfinished_table(tmp_path / "lut") as unfinished:
+        (unfinished.folder / "samples.npy").touch()
         unfinished.save(Checkpoint({"a": "b"}, ["x"], values, {"sum": np.array([0.1, np.inf], np.float32)}))
     assert (tmp_path / ".lut.partial").is_dir()
     with unfinished_table(tmp_path / "lut") as unfinished:
-        back = unfinished.load()
+        assert unfinished.load({"a": "c"}, ["x"]) is None
+        assert unfinished.load({"a": "b"}, ["y", "x"]) is None
+        back = unfinished.load({"a": "b"}, ["x", "y"])
         unfinished.discard()
     assert back is not None
     assert (back.identity, back.frames, back.values) == ({"a": "b"}, ["x"], values)
@@ -231,8 +234,9 @@ def test_a_checkpoint_of_another_form_is_not_gone_on_from(tmp_path: Path) -> Non
     """Versions before this one stored other keys."""
     text = np.frombuffer(b'{"identity": {"a": "b"}, "frames": ["x"], "told": {}}', dtype=np.uint8)
     with unfinished_table(tmp_path / "lut") as unfinished:
+        (unfinished.folder / "samples.npy").touch()
         np.savez(unfinished.folder / CHECKPOINT, text=text)
-        assert unfinished.load() is None
+        assert unfinished.load({"a": "b"}, ["x"]) is None
 
 
 def test_the_frames_of_a_table_are_found_again(session: Session, session_under_way: Session, tmp_path: Path) -> None:
