@@ -1,26 +1,20 @@
-"""What a table says of its own origin: camera, lens, exposure, dates, projector, authors, licence, in `lut.json`.
+"""What a table says of its own origin: camera, lens, exposure, dates, projector, authors, licence; and how it is cited.
 
-A frozen value for those who cite a table and those who make data sets of it; nothing here reads a session.
-What is not known is None and is said to be so (`NOT_RECORDED`): tables made before this was kept have none of it.
+`origin_record` makes the record of what a session and its lab state, once for a build; `lut.json` keeps it, for those
+who cite a table and those who make data sets of it. What is not known is None and is said to be so (`NOT_RECORDED`):
+tables made before this was kept have none of it.
 
-How the serial number of a camera is told to those who get a table.
+How the serial number of a camera is published. Every photograph of a body names its number, so that a published number
+ties a table to all other pictures of its owner, and to registers of sales and warranties; yet readers want to know
+whether two tables are of one body. A hash tells that alone: equal hashes, equal bodies, and whoever holds the camera
+can show that it is the one. Serial numbers are short, and a plain hash of ten digits is undone in seconds by trying
+all. So the hash is scrypt (RFC 7914), which takes some hundredths of a second and 16 MiB a try: all numbers of ten
+digits take a core twelve years and more. It is no secret from somebody who has a list of bodies to try. A lab that
+wants no trace withholds the number.
 
-Every photograph of a body names its number, so that a published number ties a table to all other pictures of its owner,
-and to registers of sales and warranties; yet readers want to know whether two tables are of one body. A hash tells that
-alone: equal hashes, equal bodies, and whoever holds the camera can show that it is the one.
-
-Serial numbers are short, and a plain hash of ten digits is undone in seconds by trying all. So the hash is scrypt (RFC
-7914), which takes some hundredths of a second and 16 MiB a try: all numbers of ten digits take a core twelve years and
-more. It is no secret from somebody who has a list of bodies to try. A lab that wants no trace withholds the number.
-
-What a session and its lab say of a table's origin, read once for a build, and the record that is made of it.
-
-Options by which commands that make tables are told what a table says of itself.
-
-How a table is cited: a BibTeX entry, made of what the table says of its origin.
-
-The entry type `misc` is that which all styles of BibTeX know (O. Patashnik, BibTeXing, 1988, section 3.1); `dataset`
-is BibLaTeX's alone. What the table does not say is left out of the entry and named in a comment, never invented.
+A citation is a BibTeX entry of type `misc`, which all styles of BibTeX know (O. Patashnik, BibTeXing, 1988, section
+3.1); `dataset` is BibLaTeX's alone. What the table does not say is left out of the entry and named in a comment, never
+invented.
 """
 
 from __future__ import annotations
@@ -54,6 +48,44 @@ all hashes, so that bodies are not recognised any longer."""
 _BYTES = 16
 """Of the hash: 128 bits never meet by chance."""
 
+NOT_RECORDED: Final = "not recorded"
+"""What stands where a table does not say something."""
+
+Rig = Literal["lab", "simulated", "replay", "imported"]
+"""What stood at the end of the cables; see `experiment.config.LabSettings`."""
+
+Line = Annotated[str, Field(max_length=500)]
+Text = Annotated[str, Field(max_length=20_000)]
+
+_SERIAL = ", serial number "
+"""What stands before the number in a journal's name of the camera."""
+
+_RIGS: tuple[Rig, ...] = ("lab", "simulated", "replay", "imported")
+
+_SETTING_RIGS = ("lab", "simulated")
+"""Rigs whose settings set the camera; of others they say nothing of the exposure."""
+
+Note = Annotated[str | None, typer.Option("--note", help="What readers of the table should know.", show_default=False)]
+Licence = Annotated[
+    str | None,
+    typer.Option(
+        "--licence", "--license", metavar="SPDX", help="Licence of the table, as CC-BY-4.0.", show_default=False
+    ),
+]
+
+KEY_DIGITS: Final = 8
+"""Digits of the table's hash in the key of its entry: two tables of one lab never share them by chance."""
+
+_SPECIAL: Final = {
+    "\\": r"\textbackslash{}",
+    "{": r"\{",
+    "}": r"\}",
+    **{sign: f"\\{sign}" for sign in "&%$#_"},
+    "~": r"\textasciitilde{}",
+    "^": r"\textasciicircum{}",
+}
+"""Characters that TeX reads as commands (D. Knuth, The TeXbook, chapter 7), and how they are printed."""
+
 
 @lru_cache(maxsize=64)
 def serial_hash(camera: str, serial: str) -> str:
@@ -79,16 +111,6 @@ def with_published_serials(origins: Sequence[FrameOrigin], form: SerialForm) -> 
     """Return what frames state, their serial numbers told as the lab chose; equal numbers stay equal."""
     told = published_serials(origins, form)
     return [replace(one, serial=told[one.camera, one.serial]) if one.serial else one for one in origins]
-
-
-NOT_RECORDED: Final = "not recorded"
-"""What stands where a table does not say something."""
-
-Rig = Literal["lab", "simulated", "replay", "imported"]
-"""What stood at the end of the cables; see `experiment.config.LabSettings`."""
-
-Line = Annotated[str, Field(max_length=500)]
-Text = Annotated[str, Field(max_length=20_000)]
 
 
 class OriginRecord(BaseModel):
@@ -199,15 +221,6 @@ def _rig_text(rig: Rig | None) -> str | None:
     return None if rig is None else words[rig]
 
 
-_SERIAL = ", serial number "
-"""What stands before the number in a journal's name of the camera."""
-
-_RIGS: tuple[Rig, ...] = ("lab", "simulated", "replay", "imported")
-
-_SETTING_RIGS = ("lab", "simulated")
-"""Rigs whose settings set the camera; of others they say nothing of the exposure."""
-
-
 @dataclass(frozen=True)
 class StatedOrigin:
     """What `session.toml` and the journal state beside the frames.
@@ -302,30 +315,6 @@ def _most(values: Sequence[Any]) -> Any:
 def _line(text: str) -> str | None:
     """Return a name as one line of bounded length; None where it is empty."""
     return " ".join(text.split())[:500] or None
-
-
-Note = Annotated[str | None, typer.Option("--note", help="What readers of the table should know.", show_default=False)]
-
-Licence = Annotated[
-    str | None,
-    typer.Option(
-        "--licence", "--license", metavar="SPDX", help="Licence of the table, as CC-BY-4.0.", show_default=False
-    ),
-]
-
-
-KEY_DIGITS: Final = 8
-"""Digits of the table's hash in the key of its entry: two tables of one lab never share them by chance."""
-
-_SPECIAL: Final = {
-    "\\": r"\textbackslash{}",
-    "{": r"\{",
-    "}": r"\}",
-    **{sign: f"\\{sign}" for sign in "&%$#_"},
-    "~": r"\textasciitilde{}",
-    "^": r"\textasciicircum{}",
-}
-"""Characters that TeX reads as commands (D. Knuth, The TeXbook, chapter 7), and how they are printed."""
 
 
 def table_title(camera: str, lights: int | None, origin: OriginRecord | None, computed: bool = False) -> str:

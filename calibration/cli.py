@@ -1,6 +1,6 @@
-"""`build-lut`: makes the table of a session, judges it, describes it, verifies it. Parse, call, print; nothing else.
+"""`build-lut`: makes the table of a session, judges it; describes, cites, verifies, matches, publishes, compares tables.
 
-What `build-lut` does with tables that are there: it describes, cites, verifies, matches and publishes.
+Parse, call, print; nothing else.
 """
 
 from __future__ import annotations
@@ -34,6 +34,8 @@ if TYPE_CHECKING:
     from calibration.pipeline.build import TableProgress
     from calibration.verdict.result import BuildResult
     from experiment.session.folder import Session
+
+app = new_app()
 
 
 def print_table(folder: Path, told: JsonOutput) -> None:
@@ -152,9 +154,6 @@ def progress_bar(beginning: str) -> Generator[Callable[[int, int, str], None]]:
     with Progress(*columns, console=Console(stderr=True), transient=True, disable=not shows_progress()) as bar:
         task = bar.add_task(beginning, total=None)
         yield lambda done, total, what: bar.update(task, completed=done, total=total, description=what)
-
-
-app = new_app()
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -1,4 +1,4 @@
-"""The samples of every cell, taken as the sensor gave them.
+"""The samples of every cell, taken as the sensor gave them, and their statistics.
 
 Rules that hold inside:
 
@@ -6,13 +6,8 @@ Rules that hold inside:
   Pixels are taken whole; nothing is interpolated, which would alter the noise that the samples are for.
 - A cell that is cut off, clipped, or not of one colour is listed with its cause. It is never filled from elsewhere.
 
-Works on the raw photosites under the cells and nowhere else: a frame need not be debayered to be sampled.
-
-Statistics of the samples of patches: means, noise, and whether a patch is of one colour and its photosites alive.
-
-A cell that is not of one colour is listed with its cause. It is never filled from elsewhere.
-
-How large a window of samples a cell allows: the light of neighbouring cells that the lens's blur mixes in.
+Works on the raw photosites under the cells and nowhere else: a frame need not be debayered to be sampled. How large a
+window may be is a matter of the light of neighbouring cells that the lens's blur mixes in.
 """
 
 from __future__ import annotations
@@ -43,6 +38,17 @@ DEAD_LEVEL = 300.0
 
 _NOISE_BINS = 32
 """Levels at which noise is read: a full chart has a thousand patches in each, a chart of 512 colours sixteen."""
+
+WINDOWS = (3, 5, 7, 9)
+"""Sides of windows, half-size px: odd, so that a cell has a middle pixel; a cell is about 10 px wide."""
+
+SAFE_BLEED = 0.002
+"""Share of a sample's light from beyond its cell that counts as none: less than half of what the verdict remarks on."""
+
+WINDOW = WINDOW_PX
+"""Pixels along the side of a cell's window, where the user names no other: the paper's."""
+
+_Array = npt.NDArray[np.float64]
 
 
 def patch_means(values: npt.NDArray[np.uint16]) -> npt.NDArray[np.float64]:
@@ -134,13 +140,6 @@ def median_of_variance(degrees: int) -> float:
     return (1 - 2 / (9 * degrees)) ** 3
 
 
-WINDOWS = (3, 5, 7, 9)
-"""Sides of windows, half-size px: odd, so that a cell has a middle pixel; a cell is about 10 px wide."""
-
-SAFE_BLEED = 0.002
-"""Share of a sample's light from beyond its cell that counts as none: less than half of what the verdict remarks on."""
-
-
 def largest_window(cell_px: float, blur_px: float) -> int:
     """Return the largest of `WINDOWS` in which no sample exceeds `SAFE_BLEED`; 0 if there is none.
 
@@ -149,12 +148,6 @@ def largest_window(cell_px: float, blur_px: float) -> int:
     `cell_px`: shorter side of a cell, half-size px. `blur_px`: σ of the blur, half-size px.
     """
     return max((window for window in WINDOWS if bleed(cell_px, blur_px, window) <= SAFE_BLEED), default=0)
-
-
-WINDOW = WINDOW_PX
-"""Pixels along the side of a cell's window, where the user names no other: the paper's."""
-
-_Array = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,33 +11,22 @@ is wrong with the frame:
   light leaves, noise itself is known badly: what it may be by chance is taken off;
 - `block`, the mean over neighbouring cells: a hand, a shadow or a reflection lies in one place. A cell that none of
   its neighbours is like, as a hot photosite makes it, counts as the one next to it in value;
-- `disturbed`, cells next to each other that are far off: what covers too few of them to move a block's mean
-  (`calibration.checks.frame_consistency`).
+- `disturbed`, cells next to each other that are far off: a finger's tip, a fly, a scrap of paper covers too few of them
+  to move a block's mean (`SmallPlaces`).
 
 What else is known of that place, so that its cause can be told (`calibration.causes`): its colour, how large it is, and
 whether light was added there, as a reflection adds it, or taken in proportion, as a shadow does.
 
+Of small places: a cell counts as far off that is beyond noise and the model's usual error, and beyond those whose codes
+are next to its own, so that it is no part of a colour that the model misses. What a polynomial cannot follow is spread
+over the print at random and a hot photosite stands alone, so that two such cells next to each other are a place; how
+many are enough follows from how many of the frame are far off at all. What touches such a place and is off by less, or
+is too dark to be compared, belongs to it. Two hot photosites side by side are a place, too: the dark frames tell them,
+and `cells_without_hot` leaves such cells out. A cell that stands alone and is off by far more is told apart: it is no
+hand, but not its colour either. A chart whose colours lie in order has its neighbours in code next to each other on the
+print: there nothing is found.
+
 Charts of 8 and 64 cells have no more cells than the polynomial has terms, or twice as many, and cannot be checked.
-
-What covers a few cells in one frame: a finger's tip, a fly, a scrap of paper.
-
-The mean over a block of cells (`calibration.checks.frame_consistency`) hides what lies on four of them. Here every
-cell of the chart is looked at by itself. A place is disturbed where cells that lie next to each other are far off in
-one frame, since what a polynomial in the code cannot follow is spread over the print as the codes are, at random, and
-a hot photosite stands alone. A cell counts as far off that is
-
-- beyond noise and the model's usual error, and
-- beyond those whose codes are next to its own, so that it is no part of a colour that the model misses.
-
-A cell that stands alone is no hand, but it is not its colour either: where it is off by far more, it is told apart.
-
-Two hot photosites in cells next to each other are a place, too: a frame of a light does not show that they are hot. The
-dark frames do, and `cells_without_hot` leaves such cells out where these are known.
-
-How many neighbours are enough follows from how many cells of the frame are far off at all. What touches such a place
-and is off by less, or is too dark to be compared, belongs to it.
-
-A chart whose colours lie in order has its neighbours in code next to each other on the print: there nothing is found.
 """
 
 from __future__ import annotations
@@ -88,6 +77,47 @@ _ALIKE = 6
 _Array = npt.NDArray[np.float64]
 _Index = npt.NDArray[np.int64]
 _Mask = npt.NDArray[np.bool_]
+
+DEGREE = 4
+"""Of the polynomial in the code: 35 terms."""
+
+LEAST_COUNTS = 60.0
+"""Mean of 25 samples that a cell is expected to have for it to be compared: good to 3 %."""
+
+CELLS = 8192
+"""Cells whose scatter and blocks are compared, at most: a quarter of a full chart, for every frame is compared."""
+
+FIT_CELLS = 1500
+"""Cells that the polynomial is fitted on, about: forty for each of its terms."""
+
+BLOCK_CELLS = 32
+"""Compared cells of a block: four times as many cells of a full chart, a square of six centimetres on A0."""
+
+LEAST_CELLS = 12
+"""Compared cells that a block must have for its mean to count."""
+
+CELLS_A_TERM = 2
+"""With fewer cells for each term, what is wrong would be fitted, or what is right not."""
+
+_ROUNDS = 3
+"""Reweighted solutions in a row, after a first with equal weights."""
+
+_CERTAIN = 4.0
+"""Standard errors that are taken off a block's mean, and off the cells' spread, before it counts: among a full chart's
+256 blocks noise alone exceeds them in one of sixty frames."""
+
+_SPREAD_ERROR2 = 1.36
+"""Variance of a standard deviation estimated by the median deviation of N normal values, over σ²/N (P. Rousseeuw and
+C. Croux, Journal of the American Statistical Association 88, 1993: an efficiency of 37 %)."""
+
+_AS_MUCH = 0.3
+"""Share of the worst block's deviation from which on a block is part of the same thing."""
+
+_BRIGHT_PERCENTILE = 99.0
+"""Of the cells' expected levels, what is taken for the brightest: bare paper is not among them."""
+
+_MODEL_ERROR, _LEAST_ERROR = 0.02, 3.0
+"""Standard error of a cell's prediction: a share of its level, and counts."""
 
 
 class SmallPlaces:
@@ -198,49 +228,9 @@ def cells_without_hot(cells: _Index, seeds: _Index, hot: _Mask, cells_mm: _Array
     return (counts[label] > 1) & ~hot[cells], seeds[own & (counts[of_seed] == 1)]
 
 
-DEGREE = 4
-"""Of the polynomial in the code: 35 terms."""
-
-LEAST_COUNTS = 60.0
-"""Mean of 25 samples that a cell is expected to have for it to be compared: good to 3 %."""
-
-CELLS = 8192
-"""Cells whose scatter and blocks are compared, at most: a quarter of a full chart, for every frame is compared."""
-
-FIT_CELLS = 1500
-"""Cells that the polynomial is fitted on, about: forty for each of its terms."""
-
-BLOCK_CELLS = 32
-"""Compared cells of a block: four times as many cells of a full chart, a square of six centimetres on A0."""
-
-LEAST_CELLS = 12
-"""Compared cells that a block must have for its mean to count."""
-
-CELLS_A_TERM = 2
-"""With fewer cells for each term, what is wrong would be fitted, or what is right not."""
-
-_ROUNDS = 3
-"""Reweighted solutions in a row, after a first with equal weights."""
-
-_CERTAIN = 4.0
-"""Standard errors that are taken off a block's mean, and off the cells' spread, before it counts: among a full chart's
-256 blocks noise alone exceeds them in one of sixty frames."""
-
-_SPREAD_ERROR2 = 1.36
-"""Variance of a standard deviation estimated by the median deviation of N normal values, over σ²/N (P. Rousseeuw and
-C. Croux, Journal of the American Statistical Association 88, 1993: an efficiency of 37 %)."""
 """Neighbours of a cell of which one at least must be as far off for it to count as it is: those of a square grid. What
 covers the print, however small, covers two cells or harms one alone; a bound by the block's own spread would leave what
 covers less than half of each block it lies in."""
-
-_AS_MUCH = 0.3
-"""Share of the worst block's deviation from which on a block is part of the same thing."""
-
-_BRIGHT_PERCENTILE = 99.0
-"""Of the cells' expected levels, what is taken for the brightest: bare paper is not among them."""
-
-_MODEL_ERROR, _LEAST_ERROR = 0.02, 3.0
-"""Standard error of a cell's prediction: a share of its level, and counts."""
 
 
 @dataclass(frozen=True)

@@ -1,11 +1,9 @@
 """Whether each light's white is what its codes give: frames that bear another light's name.
 
 The ground truth is measured and stays true whatever a light is called; its codes and temperature do not. So each white
-is held against what its codes give by all the other lights of the session and by what is known of any projector
-(`calibration.checks.light_codes`), and each statement is as certain as these are: from seven hundred lights to
-hundredths of a degree, from two lights to tens of degrees. There is no number of lights below which nothing is said.
-
-Two questions are asked:
+is held against what its codes give by all the other lights of the session and by what is known of any projector, and
+each statement is as certain as these are: from seven hundred lights to hundredths of a degree, from two lights to tens
+of degrees. There is no number of lights below which nothing is said. Two questions are asked:
 
 - Is a white off its codes? By how much beyond four standard errors.
 - Would two lights fit better if their names were exchanged? By how much more likely that is. This finds neighbours that
@@ -13,14 +11,12 @@ Two questions are asked:
   unnoticed is a figure.
 
 Where names do not fit, the lights that others are held against must not be the misnamed ones. Of many lights the
-majority decides (`fit_projector`); of few, lights are left out, and names exchanged, until the rest agree.
+majority decides; of few, lights are left out, and names exchanged, until the rest agree
+(docs/decisions/0015-lights-are-held-against-their-codes.md).
 
-Why so: `docs/decisions/0015-lights-are-held-against-their-codes.md`.
-
-What a projector makes of its codes, learnt from the whites of one session alone, however few its lights are.
-
-White under a light is the sum of what three primaries give, each as strong as a tone curve makes it of its code, and
-what is added where two or three overlap (wheels with white, yellow, cyan or magenta segments):
+The projector (`fit_projector`). White under a light is the sum of what three primaries give, each as strong as a tone
+curve makes it of its code, and what is added where two or three overlap (wheels with white, yellow, cyan or magenta
+segments):
 
     white(codes) = Σ_p P_p [f_p(code_p) + Σ_S u_Sp(m_S) f_p(m_S) + k_p],   m_S the least code of the primaries in S
 
@@ -114,8 +110,58 @@ _N = 12
 """Principal components of a tone curve that are kept: the next ones have standard deviations below .003."""
 
 _CURVES, _OVERLAPS = 4 * _N, len(_TERMS) * len(_OVERLAP_NODES)
-
 _Array = npt.NDArray[np.float64]
+
+CERTAIN = 4.0
+"""Standard errors that are taken off an angle, or a brightness, so that noise is not taken for a wrong name."""
+
+EXCHANGED = 30.0
+"""Twice the logarithm of the odds from which two names are called exchanged: a quarter of a million pairs are asked
+about in a session of 707 lights, for which 25 are taken off; what remains are odds of ten to one."""
+
+HELD_DEG = 8.0
+"""A light counts as held against its codes if no light further than this from it could bear its name unnoticed: the
+angle from which a table is refused."""
+
+_HELD_SD_DEG = 10.0
+"""Largest standard error, degrees, of what codes predict for a light to count as held: blue for red is 85° off."""
+
+_FEW = 24
+"""Lights up to which each is left out in turn where names do not fit; of more, the majority decides."""
+
+_SUSPECTS = 8
+"""Lights among which exchanged names are looked for then: those whose absence helps most."""
+
+_AS_GOOD = 9.0
+"""Misfit by which exchanged names may be worse than leaving a light out, to be believed: that takes three numbers away,
+which each have 1 on average."""
+
+_CHROMA_SD, _MOST_CHROMA_SD = 0.003, 0.012
+"""Scatter of a channel against the others, relative: what healthy lamps have, and up to where that of the session at
+hand is believed to be its own. Beyond, a colour wheel is cut, or names are wrong; both are to be said."""
+
+_BRIGHTNESS_SD, _UNTIED_SD = 0.03, 0.06
+"""Scatter of a light's brightness, relative: lamps that flicker, and where no white frames show the lamp's drift."""
+
+_HEALTHY, _HEALTHY_EACH = 8.0, 2.5
+"""Misfit up to which the names of few lights are believed, and what each light adds. In 360 random healthy rooms it was
+below 6 + 1.7 a light, and with any two names exchanged that are 6° apart above 12 + 3.3."""
+
+_FITS = 50.0
+"""Squared distance of two whites from what their exchanged codes give, above which these are none of theirs: six
+dimensions have 6 on average and once in ten million times this."""
+
+_FREE = 10.0
+"""Standard deviation of a light's brightness, relative, where only its direction counts."""
+
+_FAR = 3.0
+"""Squared distance of two predictions, over `EXCHANGED`, up to which an exchange is weighed whole: both lights would be
+off, so that twice this distance is to be expected of one."""
+
+_BLOCK_PAIRS = 20_000
+"""Pairs whose exchange is weighed at a time: a hundred megabytes."""
+
+_Whole = npt.NDArray[np.int64]
 
 
 def _x(codes: npt.ArrayLike) -> _Array:
@@ -329,57 +375,6 @@ def _model(state: _Array, given: _Codes, scale: float, rest: float) -> tuple[_Ar
     each = amounts[:, None, :] * primaries[None]
     slopes[:, :, :9] += np.einsum("lcp,cpk->lck", each, root.reshape(3, 3, 9))
     return each.sum(axis=2), slopes
-
-
-CERTAIN = 4.0
-"""Standard errors that are taken off an angle, or a brightness, so that noise is not taken for a wrong name."""
-
-EXCHANGED = 30.0
-"""Twice the logarithm of the odds from which two names are called exchanged: a quarter of a million pairs are asked
-about in a session of 707 lights, for which 25 are taken off; what remains are odds of ten to one."""
-
-HELD_DEG = 8.0
-"""A light counts as held against its codes if no light further than this from it could bear its name unnoticed: the
-angle from which a table is refused."""
-
-_HELD_SD_DEG = 10.0
-"""Largest standard error, degrees, of what codes predict for a light to count as held: blue for red is 85° off."""
-
-_FEW = 24
-"""Lights up to which each is left out in turn where names do not fit; of more, the majority decides."""
-
-_SUSPECTS = 8
-"""Lights among which exchanged names are looked for then: those whose absence helps most."""
-
-_AS_GOOD = 9.0
-"""Misfit by which exchanged names may be worse than leaving a light out, to be believed: that takes three numbers away,
-which each have 1 on average."""
-
-_CHROMA_SD, _MOST_CHROMA_SD = 0.003, 0.012
-"""Scatter of a channel against the others, relative: what healthy lamps have, and up to where that of the session at
-hand is believed to be its own. Beyond, a colour wheel is cut, or names are wrong; both are to be said."""
-
-_BRIGHTNESS_SD, _UNTIED_SD = 0.03, 0.06
-"""Scatter of a light's brightness, relative: lamps that flicker, and where no white frames show the lamp's drift."""
-
-_HEALTHY, _HEALTHY_EACH = 8.0, 2.5
-"""Misfit up to which the names of few lights are believed, and what each light adds. In 360 random healthy rooms it was
-below 6 + 1.7 a light, and with any two names exchanged that are 6° apart above 12 + 3.3."""
-
-_FITS = 50.0
-"""Squared distance of two whites from what their exchanged codes give, above which these are none of theirs: six
-dimensions have 6 on average and once in ten million times this."""
-
-_FREE = 10.0
-"""Standard deviation of a light's brightness, relative, where only its direction counts."""
-
-_FAR = 3.0
-"""Squared distance of two predictions, over `EXCHANGED`, up to which an exchange is weighed whole: both lights would be
-off, so that twice this distance is to be expected of one."""
-
-_BLOCK_PAIRS = 20_000
-"""Pairs whose exchange is weighed at a time: a hundred megabytes."""
-_Whole = npt.NDArray[np.int64]
 
 
 @dataclass(frozen=True)

@@ -1,25 +1,19 @@
-"""Compare two tables light by light, in bounded memory: a light of either is held at a time for each thread.
+"""Two tables compared light by light, in bounded memory; whether they are the same within noise; B over A, always.
 
-What noise alone predicts is taken from the tables themselves: a cell's standard error from the scatter of its own
-samples, a white's from `references.csv`. Where photosites differ in response, samples scatter by that too; it is the
-same in both tables where the chart did not move between them, so that noise then predicts a little more than there is.
+Rules that hold inside:
 
-What a comparison found, as frozen values. B over A, always: A is the first table, B the second.
+- A light of either table is held at a time for each thread. A session is compared by its table, built for the
+  comparison and thrown away (`table_of`).
+- What noise alone predicts is taken from the tables themselves: a cell's standard error from the scatter of its own
+  samples, a white's from `references.csv`. Where photosites differ in response, samples scatter by that too; it is the
+  same in both tables where the chart did not move between them, so that noise then predicts a little more than there
+  is.
+- With 700 lights and 32 768 cells any difference is significant, however small. So what is asked is not whether noise
+  is the only cause, but whether what is beyond it matters: limits are those of noise at a chance of one in a hundred
+  for the whole table, widened by what standard errors that are themselves estimated may be off, and a floor of what no
+  use of a table would notice.
 
 L common lights, C colours.
-
-Which lights of two tables correspond, and what makes a comparison of them mean less, or nothing.
-
-Whether two tables are the same within noise: three questions, each with its limits and their reasons.
-
-With 700 lights and 32 768 cells any difference is significant, however small. So what is asked is not whether noise is
-the only cause, but whether what is beyond it matters: limits are those of noise at a chance of one in a hundred for the
-whole table, widened by what standard errors that are themselves estimated may be off, and a floor of what no use of a
-table would notice.
-
-How the chart lies elsewhere in one frame than in another: shift, turn, scale, and what they leave.
-
-A table to be compared: one that is there, or one made of a session for the comparison and thrown away.
 """
 
 from __future__ import annotations
@@ -54,6 +48,56 @@ from foundation.files import storage_error, write_whole
 from foundation.processors import ordered_map, processor_count
 
 _Array = npt.NDArray[np.float64]
+
+CHANCE = 0.01
+"""With which noise alone makes any light of a whole table differ."""
+
+ERROR_OF_ERRORS = 1.3
+"""By how much the whites' standard errors may be too small: they are the scatter about a polynomial that was fitted to
+the same references, with up to a third as many terms (a factor of 1.22), from references few in number."""
+
+ANGLE_FLOOR_DEG = 0.005
+"""Angle that is called none (judgement): a two-hundredth of a good method's error of one degree."""
+
+BRIGHTNESS_FLOOR = 0.002
+"""Difference of brightness that is called none: fields that were fitted anew on another sheet leave up to 0.17 % in
+the whites of a small simulated chart; a fifth of the drift that is usual in a session."""
+
+CELL_SCORE = 1.1
+"""Root mean square of cells in units of their noise up to which noise is the cause: what is beyond is then less than
+half of the noise of a single cell of 25 samples. Sessions of one simulated room with other noise give 1.00 to 1.05."""
+
+LIGHT_SCORE = 1.3
+"""The same of one light's cells."""
+
+CELL_SIGMAS = 6.0
+"""Standard errors by which a cell's mean over all lights must differ to be named; by chance one of 5·10⁸."""
+
+CELL_FLOOR = STAINED
+"""Relative difference that it must have, too: that from which on `build-lut` calls a cell stained. Pixels are taken
+whole, so a cell of 9 px that lies a fraction of one elsewhere takes in 1.5 % more or less of a bright neighbour."""
+
+CHART_FILE = "chart.json"
+"""What was photographed, in a session's folder (docs/formats.md)."""
+
+ReportBuild = Callable[[int, int, str], None]
+"""Called with frames taken in, frames in all, and what is being done."""
+
+LEAST_COUNTS = 300.0
+"""Counts above which a cell is compared: 25 samples of 300 counts have a mean good to 1 %, and README's figures of a
+table's error are of the same cells."""
+
+MOST_THREADS = 4
+"""Each holds a light of both tables, 10 MB with 25 samples; reading the disk is what takes the time."""
+
+GROUPS = ("black", "blue", "green", "cyan", "red", "magenta", "yellow", "white")
+"""Parts of the colour cube: bits 4, 2 and 1 of the place are whether red, green and blue are in the upper half."""
+
+_LEAST_SHARE = 0.05
+"""Share of a white's largest channel from which on another channel's gain counts: fainter ones are noise."""
+
+ReportLights = Callable[[int, int], None]
+"""Called with the number of lights compared, and the number of all."""
 
 
 @dataclass(frozen=True)
@@ -304,35 +348,6 @@ def _key(light: Illumination) -> object:
     return light.kind, light.cct_k, light.codes, light.name
 
 
-CHANCE = 0.01
-"""With which noise alone makes any light of a whole table differ."""
-
-ERROR_OF_ERRORS = 1.3
-"""By how much the whites' standard errors may be too small: they are the scatter about a polynomial that was fitted to
-the same references, with up to a third as many terms (a factor of 1.22), from references few in number."""
-
-ANGLE_FLOOR_DEG = 0.005
-"""Angle that is called none (judgement): a two-hundredth of a good method's error of one degree."""
-
-BRIGHTNESS_FLOOR = 0.002
-"""Difference of brightness that is called none: fields that were fitted anew on another sheet leave up to 0.17 % in
-the whites of a small simulated chart; a fifth of the drift that is usual in a session."""
-
-CELL_SCORE = 1.1
-"""Root mean square of cells in units of their noise up to which noise is the cause: what is beyond is then less than
-half of the noise of a single cell of 25 samples. Sessions of one simulated room with other noise give 1.00 to 1.05."""
-
-LIGHT_SCORE = 1.3
-"""The same of one light's cells."""
-
-CELL_SIGMAS = 6.0
-"""Standard errors by which a cell's mean over all lights must differ to be named; by chance one of 5·10⁸."""
-
-CELL_FLOOR = STAINED
-"""Relative difference that it must have, too: that from which on `build-lut` calls a cell stained. Pixels are taken
-whole, so a cell of 9 px that lies a fraction of one elsewhere takes in 1.5 % more or less of a bright neighbour."""
-
-
 def answers_of(lights: LightDifferences, cells: CellDifferences) -> tuple[NoiseAnswer, ...]:
     """Return whether the lights' colour, their brightness, and the cells are the same within noise."""
     return _colour(lights), _brightness(lights), _cells(lights, cells)
@@ -428,13 +443,6 @@ def geometry_difference(one: _Array, other: _Array) -> GeometryDifference:
     )
 
 
-CHART_FILE = "chart.json"
-"""What was photographed, in a session's folder (docs/formats.md)."""
-
-ReportBuild = Callable[[int, int, str], None]
-"""Called with frames taken in, frames in all, and what is being done."""
-
-
 @contextmanager
 def table_of(place: Path, options: BuildOptions, progress: ReportBuild | None = None) -> Generator[Lut]:
     """Yield the table of a table's folder as it is, or of a session's, which is built as `build-lut` builds it.
@@ -463,23 +471,6 @@ def chart_of(places: Sequence[Path]) -> Chart | None:
 def _write_figures(result: BuildResult, session: Session, folder: Path) -> None:
     """Write the figures of a table without its pictures, which nobody sees."""
     write_whole(folder / REPORT_JSON, json.dumps(report_json(result)) + "\n")
-
-
-LEAST_COUNTS = 300.0
-"""Counts above which a cell is compared: 25 samples of 300 counts have a mean good to 1 %, and README's figures of a
-table's error are of the same cells."""
-
-MOST_THREADS = 4
-"""Each holds a light of both tables, 10 MB with 25 samples; reading the disk is what takes the time."""
-
-GROUPS = ("black", "blue", "green", "cyan", "red", "magenta", "yellow", "white")
-"""Parts of the colour cube: bits 4, 2 and 1 of the place are whether red, green and blue are in the upper half."""
-
-_LEAST_SHARE = 0.05
-"""Share of a white's largest channel from which on another channel's gain counts: fainter ones are noise."""
-
-ReportLights = Callable[[int, int], None]
-"""Called with the number of lights compared, and the number of all."""
 
 
 def compare(

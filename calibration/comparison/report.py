@@ -1,8 +1,6 @@
-"""The page of a comparison, and its files: `report.html`, `comparison.json`, `lights.csv`, `cells.csv`.
+"""A comparison in lines of text, for programs, and as a page with pictures and tables.
 
-A comparison in lines of text, and for programs.
-
-The pictures of a comparison's page, drawn as those of a table's report are (`calibration.report.plots.png_of`).
+The files are `report.html`, `comparison.json`, `lights.csv` and `cells.csv`.
 """
 
 from __future__ import annotations
@@ -38,6 +36,7 @@ from foundation.errors import first_of
 from foundation.files import whole_folder, write_whole
 
 FORMAT = "crop.comparison"
+
 VERSION = 1
 """`format` and `version` of `comparison.json` (docs/formats.md)."""
 
@@ -45,6 +44,10 @@ _MOST_CELLS = 100
 """Cells that are listed in the JSON; all of them are in `cells.csv`."""
 
 _ANSWERS = {True: "yes", False: "no", None: "not known"}
+_CHANNEL_INK = ("#c8382e", "#2f8f46", "#2f62c8")
+
+PICTURES = ("lights.png", "cells.png", "map.png")
+"""Names of the pictures beside the page, as far as they are drawn."""
 
 
 def lines(comparison: TableComparison) -> list[str]:
@@ -217,9 +220,6 @@ def _number(value: float) -> float | None:
     return float(f"{value:.6g}") if np.isfinite(value) else None
 
 
-_CHANNEL_INK = ("#c8382e", "#2f8f46", "#2f62c8")
-
-
 def draw_lights(figure: Any, lights: LightDifferences) -> None:
     """Draw angle, brightness and cells of every light against what noise alone gives."""
     figure.set_size_inches(10, 3.1)
@@ -283,10 +283,6 @@ def draw_map(figure: Any, chart: Chart, cells: CellDifferences) -> None:
     )  # fmt: skip
     axes.set(xlabel="mm", ylabel="mm", xlim=(0, page_w), ylim=(page_h, 0), aspect="equal")
     figure.colorbar(image, ax=axes, label="B over A, %", shrink=0.8, extend="both")
-
-
-PICTURES = ("lights.png", "cells.png", "map.png")
-"""Names of the pictures beside the page, as far as they are drawn."""
 
 
 def write_comparison(comparison: TableComparison, folder: Path, chart: Chart | None = None) -> None:

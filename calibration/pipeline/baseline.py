@@ -2,11 +2,8 @@
 
 The shape of its light is the base of all others', and its cells are what those of every frame are compared with; the
 frames of the primaries show how the field of a coloured cell differs from that of paper. A baseline does not change, so
-threads share it.
-
-What a user may choose about how a table is built; part of an unfinished table's identity.
-
-Where the chart lies, from the frame in which it was registered until it moves too far from there.
+threads share it. Here, too, is what a user may choose about how a table is built (`BuildOptions`), and where the chart
+lies from a frame in which it was registered until it moves too far from there (`RegisteredFrame`).
 
 Rules that hold inside:
 
@@ -14,15 +11,6 @@ Rules that hold inside:
 - References follow the cells, the white ones before the grey ones.
 
 C cells, W white references, N grey references; places on the print in millimetres, in frames in half-size pixels.
-
-The light on a print whose bare paper is only around its cells: read from the cells themselves.
-
-References in a margin leave the middle of a sheet to extrapolation: an error of three per cent at the worst cell, and
-no residual that shows it. The cells of the paper's arrangement lie as their codes do, in blocks that run forwards and
-backwards by turns, so that a colour's rise can be separated from the light's: the logarithm of counts is a polynomial
-in the codes and another over the page. References belong to both, as paper of its own colour.
-
-The print is assumed to be even: a sheet printed darker on one side cannot be distinguished from one lit so.
 """
 
 from __future__ import annotations
@@ -64,6 +52,29 @@ from experiment.measures.polynomials import code_polynomial, code_powers, page_p
 from foundation.errors import FormatError, InputError
 from foundation.robust import huber_weights, sigma_of
 
+_Array = npt.NDArray[np.float64]
+
+CODE_DEGREE = 8
+"""Of the polynomial in the codes, where there are cells enough: describes inks to a fraction of a per cent."""
+
+LIGHT_ORDER = 4
+"""Of the polynomial over the page, where there are cells enough."""
+
+_LEAST_CELLS_A_TERM = 5
+"""Cells for each term of the polynomial in the codes; with fewer its degree is lowered."""
+
+_LEAST_COUNTS = 10.0
+"""Counts above black below which a cell's logarithm is mostly noise."""
+
+_EVEN_COUNTS = 300.0
+"""Counts from which on a cell weighs no more by being brighter: the polynomial's own error exceeds the noise."""
+
+_PAPER_WORTH = 10.0
+"""Cells that a white reference counts for: its colour needs no polynomial."""
+
+_ROUNDS = 5
+"""Reweighted solutions in a row; Huber's weights, squared, have settled by then."""
+
 
 @dataclass(frozen=True)
 class BuildOptions:
@@ -103,9 +114,6 @@ class BuildOptions:
 
 PAPER_OPTIONS = BuildOptions()
 """The paper's options, which hold where none are given."""
-
-
-_Array = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -182,28 +190,6 @@ def sites_of(
         for places in (points.cells_mm, points.references_mm)
     )
     return cells, references
-
-
-CODE_DEGREE = 8
-"""Of the polynomial in the codes, where there are cells enough: describes inks to a fraction of a per cent."""
-
-LIGHT_ORDER = 4
-"""Of the polynomial over the page, where there are cells enough."""
-
-_LEAST_CELLS_A_TERM = 5
-"""Cells for each term of the polynomial in the codes; with fewer its degree is lowered."""
-
-_LEAST_COUNTS = 10.0
-"""Counts above black below which a cell's logarithm is mostly noise."""
-
-_EVEN_COUNTS = 300.0
-"""Counts from which on a cell weighs no more by being brighter: the polynomial's own error exceeds the noise."""
-
-_PAPER_WORTH = 10.0
-"""Cells that a white reference counts for: its colour needs no polynomial."""
-
-_ROUNDS = 5
-"""Reweighted solutions in a row; Huber's weights, squared, have settled by then."""
 
 
 def field_of_cells(

@@ -4,23 +4,15 @@ Rules that hold inside:
 
 - The projector's leak and ambient light cannot be separated and are one figure, read on bare paper.
 - They are part of every light: samples and ground truth contain them alike, so nothing is subtracted unless the user
-  asks for it (`calibration.radiometry.dark_frames`).
+  asks for it.
 - A photosite is hot when it is an outlier in every dark frame; an outlier in a single one is a cosmic ray.
+- What a dark frame adds depends on those before it alone, so that a build that was stopped goes on to the same bits.
 
-The light of the dark frames at every patch, to be subtracted: the projector's leak and the room's light.
-
-A dark frame shows it at each cell, but with the noise of a few samples: 1.2 counts in a single frame, as much as the
-light itself often is. So it is predicted, dark paper × field × the cell's reflectance, and what cells show beyond the
-prediction is added as far as it is more than noise: the share w = 1 − noise² / variance of what is left over, one for
-each channel (empirical Bayes; B. Efron and C. Morris, Journal of the American Statistical Association 68, 1973).
-
-Why so: `docs/decisions/0009-dark-light-is-predicted.md`.
-
-Rules that hold inside:
-
-- A frame's dark light is that of the last dark frame taken before it, or of the first, for frames before that.
-- The estimate after a dark frame depends on those before it alone, so that a build that was stopped goes on to the same
-  bits.
+What is subtracted is predicted (docs/decisions/0009-dark-light-is-predicted.md). A dark frame shows the light at each
+cell, but with the noise of a few samples: 1.2 counts in a single frame, as much as the light itself often is. So it is
+dark paper × field × the cell's reflectance, and what cells show beyond the prediction is added as far as it is more
+than noise: the share w = 1 − noise² / variance of what is left over, one for each channel (empirical Bayes; B. Efron
+and C. Morris, Journal of the American Statistical Association 68, 1973).
 """
 
 from __future__ import annotations
@@ -48,6 +40,15 @@ _FAR_SIGMA = 6.0
 million samples, a chart's."""
 
 _Array = npt.NDArray[np.float64]
+
+HOT_COUNTS = 32.0
+"""Counts above its patch from which a sample is hot: the signal of the darkest cells that are of use, about 30."""
+
+HOT_SIGMA = 10.0
+"""Read noise alone passes 6 σ once in 2.5 million samples, a chart's."""
+
+_NEVER = 32767
+"""The excess of a sample that no dark frame has shown yet."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,16 +134,6 @@ class DarkLightEstimate:
         chance = after.noise / after.frames**2
         share = np.clip(1 - chance / np.maximum(spread**2, 1e-12), 0, 1)
         return after, DarkLight(paper.white, (predicted + share * left).astype(np.float32), share)
-
-
-HOT_COUNTS = 32.0
-"""Counts above its patch from which a sample is hot: the signal of the darkest cells that are of use, about 30."""
-
-HOT_SIGMA = 10.0
-"""Read noise alone passes 6 σ once in 2.5 million samples, a chart's."""
-
-_NEVER = 32767
-"""The excess of a sample that no dark frame has shown yet."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,11 +1,11 @@
-"""The lamp's drift taken out of a table, so that all its lights are of one lamp; where white frames determine it.
+"""The lamp's drift taken out of a table, so that all its lights are of one lamp; and what else is done to the counts.
 
 Every light is brought to the lamp at its brightest, never to a dimmer one: samples are multiplied by one or more, so
 that integers that differed still differ afterwards, and the counts as measured come back exactly
 (`as_measured`). Samples and ground truth are divided by the same numbers, channel by channel, so that the truth of
 every image stays what it was relative to it (docs/decisions/0030-drift-is-taken-out-on-request.md).
 
-What was done to the counts of a table, in words and numbers, as `lut.json` records it.
+`corrections` says in words and numbers, for `lut.json`, what was done to the counts of a table, drift or none.
 """
 
 from __future__ import annotations
@@ -21,6 +21,14 @@ from experiment.framing.planes import CLIPPING_SHARE
 from experiment.measures.flat_field import FlatField
 
 _Array = npt.NDArray[np.float64]
+
+DIGITS = 6
+"""Decimals of the gains, as `lut.json` stores them: samples are divided by the stored number, which undoes it."""
+
+LEAST_WHITES = 2
+"""White frames that a drift needs: one shows a lamp, and not what becomes of it."""
+
+_Samples = npt.NDArray[np.uint16]
 
 
 def corrections(
@@ -116,14 +124,6 @@ def _dark_correction(subtracted: _Array) -> dict[str, Any]:
         "unit": "counts",
         "per_light": np.round(subtracted, 4).tolist(),
     }
-
-
-DIGITS = 6
-"""Decimals of the gains, as `lut.json` stores them: samples are divided by the stored number, which undoes it."""
-
-LEAST_WHITES = 2
-"""White frames that a drift needs: one shows a lamp, and not what becomes of it."""
-_Samples = npt.NDArray[np.uint16]
 
 
 @dataclass(frozen=True, eq=False)

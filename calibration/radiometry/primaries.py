@@ -1,15 +1,12 @@
-"""The flat field of coloured cells, where the projector's primaries light the print unevenly in different ways.
+"""Red, green and blue alone: the flat field of coloured cells, whether the primaries add up, and how the lamp drifts.
 
 A projector's red, green and blue do not fade alike towards the corners. The field of a light that mixes them, as bare
 paper shows it in a channel, is the mean of their fields, weighted by what paper reflects of each into that channel; a
 coloured cell reflects other shares, and its mean is another. The frames of the primaries alone show both: the field of
-each, on paper, and what each cell reflects of it. What a light is mixed of follows from its paper.
+each, on paper, and what each cell reflects of it. What a light is mixed of follows from its paper
+(`docs/decisions/0014-fields-of-the-primaries.md`).
 
-Why so: `docs/decisions/0014-fields-of-the-primaries.md`.
-
-What the whites of a session show of its projector: whether its primaries add up, and how its lamp drifts.
-
-Neither alters a table: each light's ground truth is measured in the frame of its samples.
+Additivity and drift alter no table: each light's ground truth is measured in the frame of its samples.
 """
 
 from __future__ import annotations
@@ -27,6 +24,12 @@ from experiment.measures.least_squares import product
 from experiment.measures.paper import Paper
 
 _Array = npt.NDArray[np.float64]
+
+LEAST_PAPER = 300.0
+"""Counts above black that paper must show under a primary for its field to be known well enough (judgement)."""
+
+_LARGEST = 0.2
+"""Share by which a cell's field may differ from paper's; beyond, the difference is noise and left out."""
 
 
 def additivity(
@@ -66,13 +69,6 @@ def drift_gains(at_s: _Array, white_at_s: _Array, white: _Array) -> _Array:
     for channel in range(3):
         gains[:, channel] = np.interp(at_s, white_at_s, white[:, channel] / white[0, channel])
     return gains
-
-
-LEAST_PAPER = 300.0
-"""Counts above black that paper must show under a primary for its field to be known well enough (judgement)."""
-
-_LARGEST = 0.2
-"""Share by which a cell's field may differ from paper's; beyond, the difference is noise and left out."""
 
 
 def pure_lights(illuminations: Sequence[Illumination]) -> tuple[int, int, int] | None:

@@ -1,10 +1,7 @@
-"""A model of the camera RGB of printed codes, fitted on the frame itself: neither print nor light need be known.
+"""The camera RGB of printed codes, fitted on the frame itself, and whether cells have the chart's colours by it.
 
-Counts above black, camera RGB; codes 0 … 255; millimetres on the page.
-
-Whether cells have the chart's colours where a map has them: covered or damaged cells, and a map that has slipped.
-
-Colours are camera RGB, counts above black, against those that the frame's colour model expects.
+Neither print nor light need be known for the model. Cells that do not have their colours are covered or damaged, or the
+map has slipped. Counts above black, camera RGB; codes 0 … 255; millimetres on the page.
 """
 
 from __future__ import annotations

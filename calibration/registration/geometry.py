@@ -1,23 +1,17 @@
-"""The print as a plane seen through a lens: a homography and Brown's distortion, fitted to places known on both.
+"""The map from print to frame: a lens, how a wavy sheet departs from its plane, where red and blue lie beside green.
 
-Places are half-size pixels, pixel centres at integers; millimetres on the print. Source: D. C. Brown, "Close-range
-camera calibration", 1971.
+- `Lens`: a homography and Brown's distortion, fitted to places known on both (D. C. Brown, "Close-range camera
+  calibration", 1971).
+- `Displacement`: a smooth displacement over the print, fitted to what was measured on it. Where measurements are few, a
+  sheet is taken to have heights over its plane, which move its points along the lines through the foot of the camera's
+  perpendicular, and hardly to be drawn out within it: an edge that is known across alone then tells of both directions
+  (P. H. C. Eilers and B. D. Marx, "Flexible smoothing with B-splines and penalties", Statistical Science 1996).
+- `LateralColour`: red and blue lie a ρ + b ρ³ further out than green, at ρ of the way from the frame's middle to its
+  corner. The linear term is the chromatic difference of magnification, the cubic one that of distortion (W. T. Welford,
+  "Aberrations of Optical Systems", 1986, ch. 10). Measured with the cells' map: what a channel alone would move blocks
+  of cells by, against what all channels together would.
 
-How a wavy sheet departs from a plane: a smooth displacement over the print, fitted to what was measured on it.
-
-Half-size pixels as a function of millimetres on the print. Where measurements are few, a sheet is taken to have heights
-over its plane, which move its points along the lines through the foot of the camera's perpendicular, and hardly to be
-drawn out within it: an edge that is known across alone then tells of both directions. Source: P. H. C. Eilers and B. D.
-Marx, "Flexible smoothing with B-splines and penalties", Statistical Science 1996.
-
-Lateral chromatic aberration: where red and blue see a point of the print against green.
-
-A lens magnifies colours otherwise, and bends them otherwise: red and blue lie a ρ + b ρ³ further out than green, at ρ
-of the way from the frame's middle to its corner. The linear term is the chromatic difference of magnification, the
-cubic one that of distortion (W. T. Welford, "Aberrations of Optical Systems", 1986, ch. 10). Measured with the cells'
-map: what a channel alone would move blocks of cells by, against what all channels together would.
-
-Half-size pixels, x right, y down.
+Half-size pixels, pixel centres at integers, x right, y down; millimetres on the print.
 """
 
 from __future__ import annotations
@@ -48,6 +42,45 @@ _ON_ONE_LINE = (
     "the marks of the chart that were found lie on one line, and marks spread over the sheet are expected; bring all "
     "of the chart into the frame, and uncover it"
 )
+
+ROUGHNESS_PX = 0.2
+"""Usual second difference of the displacement between knots: a wave of 2 px amplitude every 20 knots, or of 0.2 px
+every 6. Where cells measure it, shorter waves are followed as well."""
+
+MOST_ROUGHNESS_PX = 2.0
+"""The same of a sheet that waves by 6 mm every 150 mm: rougher ones are refused, and not followed."""
+
+_IN_PLANE_PX = 2.0
+"""Usual displacement, half a field from its middle, by what is no height: a lens's distortion beyond Brown's, paper
+that has grown in damp air (judgement)."""
+
+_RIDGE = 1e-3
+"""px⁻², on the diagonal: keeps knots that no measurement reaches solvable, and is nothing to a measured cell's."""
+
+_DRAWS, _SEED = 32, 20
+"""Draws from the posterior distribution: of 64 values a standard deviation is known to 9 %; always the same."""
+
+_Array = npt.NDArray[np.float64]
+
+_USUAL_PX = 2.0
+"""Shift at the frame's corner by which a term is taken to be 0 before it is measured: lenses have 0 to 1 px. It decides
+only under lights that leave a channel dark."""
+
+_MODEL_PX = 0.01
+"""Standard error of each term that no number of cells takes away: what the model of the colours leaves is alike over
+the frame (simulated frames: .003 to .009 px at the corner without aberration, .02 in a dim light)."""
+
+_ROUNDS = 4
+"""Reweighted least squares: blocks that are covered, or whose colours the model misses, end with little weight."""
+
+_HUBER = 2.0
+"""Usual misfits beyond which a block counts less."""
+
+_ONE_DIRECTION = 1e-9
+"""Share of the larger eigenvalue of an information below which the smaller is rounding, and none."""
+
+_MEDIAN_CHI2 = 3.357
+"""Median of χ² with 4 degrees of freedom: two colours, two directions."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,26 +173,6 @@ def fit_lens(
     found = lens(np.asarray(robust.x))
     left = places_px - found.to_pixels(points_mm)
     return found, left if normals is None else (left * normals).sum(axis=1, keepdims=True) * normals
-
-
-ROUGHNESS_PX = 0.2
-"""Usual second difference of the displacement between knots: a wave of 2 px amplitude every 20 knots, or of 0.2 px
-every 6. Where cells measure it, shorter waves are followed as well."""
-
-MOST_ROUGHNESS_PX = 2.0
-"""The same of a sheet that waves by 6 mm every 150 mm: rougher ones are refused, and not followed."""
-
-_IN_PLANE_PX = 2.0
-"""Usual displacement, half a field from its middle, by what is no height: a lens's distortion beyond Brown's, paper
-that has grown in damp air (judgement)."""
-
-_RIDGE = 1e-3
-"""px⁻², on the diagonal: keeps knots that no measurement reaches solvable, and is nothing to a measured cell's."""
-
-_DRAWS, _SEED = 32, 20
-"""Draws from the posterior distribution: of 64 values a standard deviation is known to 9 %; always the same."""
-
-_Array = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -340,27 +353,6 @@ def _differences(rows: int, columns: int) -> sparse.csr_array:
     xy = sparse.kron(difference(rows, 1), difference(columns, 1)) * np.sqrt(2)
     parts = (sparse.kron(whole[0], difference(columns, 2)), sparse.kron(difference(rows, 2), whole[1]), xy)
     return sparse.csr_array(sparse.vstack([sparse.csr_array(part) for part in parts]))
-
-
-_USUAL_PX = 2.0
-"""Shift at the frame's corner by which a term is taken to be 0 before it is measured: lenses have 0 to 1 px. It decides
-only under lights that leave a channel dark."""
-
-_MODEL_PX = 0.01
-"""Standard error of each term that no number of cells takes away: what the model of the colours leaves is alike over
-the frame (simulated frames: .003 to .009 px at the corner without aberration, .02 in a dim light)."""
-
-_ROUNDS = 4
-"""Reweighted least squares: blocks that are covered, or whose colours the model misses, end with little weight."""
-
-_HUBER = 2.0
-"""Usual misfits beyond which a block counts less."""
-
-_ONE_DIRECTION = 1e-9
-"""Share of the larger eigenvalue of an information below which the smaller is rounding, and none."""
-
-_MEDIAN_CHI2 = 3.357
-"""Median of χ² with 4 degrees of freedom: two colours, two directions."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,17 +1,14 @@
-"""The map from print to frame moved until both coincide: what tags and lens leave is measured on the cells themselves.
+"""The map from print to frame moved until both coincide, and how well each place is known then.
 
 Rules that hold inside:
 
 - The frame is rectified to the print, compared with the print's colours as the camera sees them (a colour model fitted
   on the frame itself), and a smooth displacement is fitted to what does not coincide.
-- First whole blocks are found where they are, by correlation (`block_search`); then all cells move together, by
-  Gauss-Newton steps (`tile_comparison`). Without the first the second locks onto the neighbouring cell.
+- First whole blocks are found where they are, by correlation (`find_blocks`); then all cells move together, by
+  Gauss-Newton steps (`compare_tiles`). Without the first the second locks onto the neighbouring cell.
 - All colours are used, each in its own place: red and blue photosites lie a quarter pixel beside the blocks' centres,
   and the lens's lateral chromatic aberration is measured with the map, which is green's.
-
-Source: B. D. Lucas and T. Kanade, "An iterative image registration technique", IJCAI 1981.
-
-How well a registration fits, block of cells by block of cells, and how well each place is known.
+- How well the map fits is said of blocks of cells, and of each place by the noise of what it was measured on.
 """
 
 from __future__ import annotations
@@ -67,6 +64,59 @@ _NOISE = 2.0
 
 _Array = npt.NDArray[np.float64]
 _Mask = npt.NDArray[np.bool_]
+
+_COARSE_BLOCKS = ((10, 1.5), (5, 1.0))
+"""Cells along the blocks that are searched for, and how far, first and then: large ones are never taken for others,
+small ones follow waves of 150 mm and curled edges to 0.2 … 0.3 px RMS, in simulated frames (of 6 mm)."""
+
+_BLOCK_CELLS = 8
+"""Cells along the window of the fine comparison: blocks of 6 leave larger errors at the worst cell, .40 px for .38."""
+
+_KNOT_CELLS = 5
+"""Cells between the displacement's knots: less than a window's, so that the spline follows what windows resolve."""
+
+_COARSE_PER_CELL = 5
+"""Raster elements along a cell where whole blocks are searched for."""
+
+_PER_CELL_PX, _LEAST_PER_CELL, _MOST_PER_CELL = 0.8, 8, 16
+"""Raster elements for each pixel of a cell in the fine comparison, and how many a cell has."""
+
+_FOLLOWED_CELLS = 12
+"""Cells along the window within which gain and offset are constant where print and frame are blurred by cells."""
+
+_WINDOW_WORTH = 4
+"""Independent measurements that such a window counts for: what the colours leave is alike over many cells."""
+
+_RIM_SIGMAS = 3.0
+"""Standard deviations of the blur by which the field's rim is left out."""
+
+_COLOURS_REPEAT = 10
+"""How many neighbouring elements the misfit of the colours is alike over, where steps of colour are all there is."""
+
+_COLOURS_SHIFT = 0.005
+"""Of a cell: standard error of places by what the model of a smooth order's colours misses. It is taken for a movement,
+alike over many cells (simulated frames: .002 to .005 RMS at cells of 8 to 23 px)."""
+
+_BLURRED_CELLS = 0.6
+"""Blur in cells at which blocks of a smooth order are compared with the chart's."""
+
+_LEAST_BLOCK_SCORE = 0.3
+"""Median correlation of the blocks that are searched for; blocks of another chart give about 0."""
+
+_COLOUR_PATCHES = 5000
+"""Patches that the colour model is fitted on: more do not improve a polynomial of some dozen terms."""
+
+_LENS_POINTS = 2000
+"""Cells that the lens is fitted to again: more do not improve a dozen parameters."""
+
+_LENS_POINT_SIGMA_PX = 0.1
+"""How well they are known then (judgement): what is lost of the displacement, .02 px, the next steps measure again."""
+
+_INTERPOLATION_PX = 0.28
+"""σ that cubic interpolation adds to a frame's edges: measured on edges of σ 0.4 to 0.7 px, less where they are softer.
+Without it in the template, the error of the cells' places is half as large again."""
+
+_Float = npt.NDArray[np.float32]
 
 
 @dataclass(frozen=True, eq=False)
@@ -217,60 +267,6 @@ def place_errors(
     asked = ndimage.maximum_filter(np.maximum(asked - _NOISE * noise, 0.0), _AROUND_CELLS)
     cells = Raster(raster.low_mm, raster.step_mm * per_cell, shape)
     return PlaceErrors(cells, np.sqrt((fitted**2 + np.square(systematic_px)).reshape(shape) + asked))
-
-
-_COARSE_BLOCKS = ((10, 1.5), (5, 1.0))
-"""Cells along the blocks that are searched for, and how far, first and then: large ones are never taken for others,
-small ones follow waves of 150 mm and curled edges to 0.2 … 0.3 px RMS, in simulated frames (of 6 mm)."""
-
-_BLOCK_CELLS = 8
-"""Cells along the window of the fine comparison: blocks of 6 leave larger errors at the worst cell, .40 px for .38."""
-
-_KNOT_CELLS = 5
-"""Cells between the displacement's knots: less than a window's, so that the spline follows what windows resolve."""
-
-_COARSE_PER_CELL = 5
-"""Raster elements along a cell where whole blocks are searched for."""
-
-_PER_CELL_PX, _LEAST_PER_CELL, _MOST_PER_CELL = 0.8, 8, 16
-"""Raster elements for each pixel of a cell in the fine comparison, and how many a cell has."""
-
-_FOLLOWED_CELLS = 12
-"""Cells along the window within which gain and offset are constant where print and frame are blurred by cells."""
-
-_WINDOW_WORTH = 4
-"""Independent measurements that such a window counts for: what the colours leave is alike over many cells."""
-
-_RIM_SIGMAS = 3.0
-"""Standard deviations of the blur by which the field's rim is left out."""
-
-_COLOURS_REPEAT = 10
-"""How many neighbouring elements the misfit of the colours is alike over, where steps of colour are all there is."""
-
-_COLOURS_SHIFT = 0.005
-"""Of a cell: standard error of places by what the model of a smooth order's colours misses. It is taken for a movement,
-alike over many cells (simulated frames: .002 to .005 RMS at cells of 8 to 23 px)."""
-
-_BLURRED_CELLS = 0.6
-"""Blur in cells at which blocks of a smooth order are compared with the chart's."""
-
-_LEAST_BLOCK_SCORE = 0.3
-"""Median correlation of the blocks that are searched for; blocks of another chart give about 0."""
-
-_COLOUR_PATCHES = 5000
-"""Patches that the colour model is fitted on: more do not improve a polynomial of some dozen terms."""
-
-_LENS_POINTS = 2000
-"""Cells that the lens is fitted to again: more do not improve a dozen parameters."""
-
-_LENS_POINT_SIGMA_PX = 0.1
-"""How well they are known then (judgement): what is lost of the displacement, .02 px, the next steps measure again."""
-
-_INTERPOLATION_PX = 0.28
-"""σ that cubic interpolation adds to a frame's edges: measured on edges of σ 0.4 to 0.7 px, less where they are softer.
-Without it in the template, the error of the cells' places is half as large again."""
-
-_Float = npt.NDArray[np.float32]
 
 
 @dataclass(frozen=True, eq=False)

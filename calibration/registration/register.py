@@ -3,16 +3,12 @@
 Rules that hold inside:
 
 - Tags give a homography and Brown's distortion and nothing finer: 35 of them cannot sample a wavy sheet. The local
-  part is measured on the cells: the frame is rectified to the print, compared with the print's colours as the camera
-  sees them (a colour model fitted on the frame itself), and a smooth displacement is fitted to what does not coincide.
+  part is measured on the cells (`calibration.registration.matching`).
 - A chart without tags has the outline of its field for that, and is then followed from coarse to fine: a map that has
   slipped by a cell is looked for, and refused.
-- All colours are used, each in its own place: red and blue photosites lie a quarter pixel beside the blocks' centres.
 - A registration that cannot be trusted is a `RegistrationError`, never a value.
 
 Places are half-size pixels, pixel centres at integers; millimetres on the print.
-
-The chart's place in a frame, as a value.
 """
 
 from __future__ import annotations
@@ -48,6 +44,45 @@ CLEARANCE_PX = 1.75
 
 _Array = npt.NDArray[np.float64]
 _Mask = npt.NDArray[np.bool_]
+
+MAX_TAG_RESIDUAL_PX = 8.0
+"""RMS of the tags against homography and distortion; 2.3 is a sheet that waves by 6 mm and curls by 10."""
+
+MIN_AGREEMENT = 0.8
+"""Least correlation of the cells' colours with those predicted; another order of cells gives about 0."""
+
+MIN_PLAIN_AGREEMENT = 0.95
+"""The same for a chart without tags, whose smooth order a model of colours can follow into a cover; 0.99 is usual."""
+
+MIN_GOOD_BLOCKS = 0.75
+"""Least share of the blocks of cells that look as the chart has them (judgement)."""
+
+MAX_BLOCK_RESIDUAL_PX = 0.5
+"""RMS displacement that blocks may still need, for cells of 10 px: twice what the samples' reach allows for, and more
+than ten times what a sheet that waves by 3 mm leaves in simulated frames."""
+
+_GAUSS_NEWTON_STEPS = 8
+"""Steps at most; each is the cost of a comparison of all cells. A flat print takes two or three, curled ones five."""
+
+_SETTLED_PX, _SETTLED_CELL_PX = 0.015, 0.15
+"""Movements of a step below which there is none to follow: RMS, and of the cell that moves most. Half of either is left
+at most: the map's own error. A curled rim comes last, when the RMS shows nothing of it."""
+
+_TAG_SIGMA_PX = 0.15
+"""Standard error of a tag's corner: 0.085 px measured in white light, .20 in a weak one."""
+
+_OUTLINE_SIGMA_PX = 0.1
+"""Standard error of a point of the outline, across it (judgement)."""
+
+_APART, _APART_PX = 5.0, 1.0
+"""Points of an outline further from its run than five of their standard deviations, and a pixel, are not of it."""
+
+_FOLLOWED_SOFTLY = (1.0, 1.0, 0.6)
+"""Blur in cells of the steps that follow a chart without tags, before its cells are looked at."""
+
+_FEW_SLIPPED, _SLIPPED_SHARE = 2, 0.015
+"""Number and share of a field's parts from which on it is refused: none looks slipped in any simulated room that is
+registered well."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,46 +165,6 @@ class Registration:
         Cells of a hundred pixels are found to a pixel, which is nothing to them.
         """
         return max(1.0, (self.cell_px / 2 - SAMPLE_REACH_PX) / CLEARANCE_PX)
-
-
-MAX_TAG_RESIDUAL_PX = 8.0
-"""RMS of the tags against homography and distortion; 2.3 is a sheet that waves by 6 mm and curls by 10."""
-
-MIN_AGREEMENT = 0.8
-"""Least correlation of the cells' colours with those predicted; another order of cells gives about 0."""
-
-MIN_PLAIN_AGREEMENT = 0.95
-"""The same for a chart without tags, whose smooth order a model of colours can follow into a cover; 0.99 is usual."""
-
-MIN_GOOD_BLOCKS = 0.75
-"""Least share of the blocks of cells that look as the chart has them (judgement)."""
-
-MAX_BLOCK_RESIDUAL_PX = 0.5
-"""RMS displacement that blocks may still need, for cells of 10 px: twice what the samples' reach allows for, and more
-than ten times what a sheet that waves by 3 mm leaves in simulated frames."""
-
-_GAUSS_NEWTON_STEPS = 8
-"""Steps at most; each is the cost of a comparison of all cells. A flat print takes two or three, curled ones five."""
-
-_SETTLED_PX, _SETTLED_CELL_PX = 0.015, 0.15
-"""Movements of a step below which there is none to follow: RMS, and of the cell that moves most. Half of either is left
-at most: the map's own error. A curled rim comes last, when the RMS shows nothing of it."""
-
-_TAG_SIGMA_PX = 0.15
-"""Standard error of a tag's corner: 0.085 px measured in white light, .20 in a weak one."""
-
-_OUTLINE_SIGMA_PX = 0.1
-"""Standard error of a point of the outline, across it (judgement)."""
-
-_APART, _APART_PX = 5.0, 1.0
-"""Points of an outline further from its run than five of their standard deviations, and a pixel, are not of it."""
-
-_FOLLOWED_SOFTLY = (1.0, 1.0, 0.6)
-"""Blur in cells of the steps that follow a chart without tags, before its cells are looked at."""
-
-_FEW_SLIPPED, _SLIPPED_SHARE = 2, 0.015
-"""Number and share of a field's parts from which on it is refused: none looks slipped in any simulated room that is
-registered well."""
 
 
 def register(

@@ -1,17 +1,12 @@
-"""A raster on the print, in which the rectified frame and the print as drawn can be compared element by element.
+"""A rectified frame compared with the print as drawn, on a raster on the print: block by block, then tile by tile.
+
+`find_blocks` finds blocks of cells where they are, by correlation, up to one and a half cells away from where a map has
+them. Without this first step the fine comparison locks onto the neighbouring cell where the sheet waves: 15 px off for
+a wave of 6 mm, in simulated frames. `compare_tiles` then says how each tile would move the map: one step of Lucas and
+Kanade's method, with gain and offset local and free, as the light and the lens's shading are, and residuals weighted by
+Huber's function (B. D. Lucas and T. Kanade, "An iterative image registration technique", IJCAI 1981).
 
 Pure geometry and sums, without lenses or colours. Elements, millimetres on the print, and half-size pixels.
-
-A rectified frame compared with the print as it should be seen: how each tile of the raster would move the map.
-
-One step of Lucas and Kanade's method, with gain and offset local and free, as the light and the lens's shading are, and
-residuals weighted by Huber's function. Source: B. D. Lucas and T. Kanade, "An iterative image registration technique",
-IJCAI 1981.
-
-Blocks of cells found where they are, by correlation, up to one and a half cells away from where a map has them.
-
-Without this first step the fine comparison (`calibration.registration.tiles`) locks onto the neighbouring
-cell where the sheet waves: 15 px off for a wave of 6 mm, in simulated frames.
 """
 
 from __future__ import annotations
@@ -32,9 +27,35 @@ _Array = npt.NDArray[np.float64]
 ToPixels = Callable[[_Array], _Array]
 """From points (N, 2) mm to places (N, 2) px."""
 
-
 _LATTICE_STRIDE = 8
 """Elements between nodes of the lattice on which maps are computed: bilinear within, they are off by < 0.001 px."""
+
+MIN_SCORE = 0.5
+"""Least correlation of a part of the frame with the print as predicted, for it to move the map (judgement)."""
+
+_LEAST_SHARE = 0.25
+"""Share of a tile's surroundings that must be comparable, for its score to mean anything (judgement)."""
+
+_Float = npt.NDArray[np.float32]
+
+_LEAST_SCORE, _LEAST_SCORE_OF_FEW = 0.3, 0.5
+"""Correlation below which a block does not count; other cells than the chart's give about 0, but for chance, which in
+blocks of few cells reaches .4."""
+
+_FEW_CELLS = 64
+"""Cells from which on a block has not few."""
+
+_NEIGHBOUR_BLOCKS = 1.6
+"""Blocks that are nearer, in units of their spacing, are neighbours: the eight around."""
+
+_MOST_DISAGREEMENT = 0.6
+"""Cells that a block may move otherwise than its neighbours: more is the neighbouring cell."""
+
+_MOVE_SIGMA_CELLS = 0.02
+"""Standard error of a block's place, in cells: a tenth of an element of the coarse raster, 0.2 px of cells of 10 px
+(simulated frames)."""
+
+_Mask = npt.NDArray[np.bool_]
 
 
 @dataclass(frozen=True, eq=False)
@@ -201,15 +222,6 @@ def tile_middles(image: npt.NDArray[np.floating], size: int) -> npt.NDArray[np.f
     return image[size // 2 :: size, size // 2 :: size][:rows, :columns]
 
 
-MIN_SCORE = 0.5
-"""Least correlation of a part of the frame with the print as predicted, for it to move the map (judgement)."""
-
-_LEAST_SHARE = 0.25
-"""Share of a tile's surroundings that must be comparable, for its score to mean anything (judgement)."""
-
-_Float = npt.NDArray[np.float32]
-
-
 @dataclass(frozen=True, eq=False)
 class TileComparison:
     """Displacements that the tiles of a raster measure.
@@ -328,25 +340,6 @@ class _LocalMean:
         mean = np.zeros_like(image)
         mean[self._inner] = box_mean(padded, self._window)[around:-around, around:-around]
         return mean
-
-
-_LEAST_SCORE, _LEAST_SCORE_OF_FEW = 0.3, 0.5
-"""Correlation below which a block does not count; other cells than the chart's give about 0, but for chance, which in
-blocks of few cells reaches .4."""
-
-_FEW_CELLS = 64
-"""Cells from which on a block has not few."""
-
-_NEIGHBOUR_BLOCKS = 1.6
-"""Blocks that are nearer, in units of their spacing, are neighbours: the eight around."""
-
-_MOST_DISAGREEMENT = 0.6
-"""Cells that a block may move otherwise than its neighbours: more is the neighbouring cell."""
-
-_MOVE_SIGMA_CELLS = 0.02
-"""Standard error of a block's place, in cells: a tenth of an element of the coarse raster, 0.2 px of cells of 10 px
-(simulated frames)."""
-_Mask = npt.NDArray[np.bool_]
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,4 +1,8 @@
-"""How much of each kernel there is: regression of what cells of known colour differ by on the light around them.
+"""The lens's point spread beside its sharp core, and how much of it there is: regression on the light around each cell.
+
+A share is that of a point's light which the lens spreads over a Gaussian of that σ, rather than where it belongs.
+Gaussians add up to any spread that falls with the distance: exponentials, Moffat's function and power laws are all
+mixtures of them. Light that the lens spreads evenly over the frame is the veil (veiling glare, ISO 9358).
 
 The colours of a chart lie in random order, so that what a cell's neighbours have is unrelated to its own code. A cell's
 own level is predicted from the six codes next to its own, which lie elsewhere on the print, less the curvature that the
@@ -13,12 +17,6 @@ Rules that hold inside:
   not: beside kernels that are proven it has its likeliest share, which `USUAL_VEIL` holds towards 0.
 
 C cells in the order of colour indices; T unknowns of a channel.
-
-The lens's point spread beside its sharp core, as a value: shares of Gaussians of rising size, and the veil.
-
-A share is that of a point's light which the lens spreads over a Gaussian of that σ, rather than where it belongs.
-Gaussians add up to any spread that falls with the distance: exponentials, Moffat's function and power laws are all
-mixtures of them. Light that the lens spreads evenly over the frame is the veil (veiling glare, ISO 9358).
 """
 
 from __future__ import annotations
@@ -56,6 +54,68 @@ LEAST_GAIN = 16.0
 together must do as much on parts of the print that they were not fitted on."""
 
 _Array = npt.NDArray[np.float64]
+
+MOST_MISFIT = 5.0
+"""Misfit from which on a veil is not told from other light; 1.5 to 3.3 in simulated rooms whose lens has a veil."""
+
+LEAST_COUNTS = 300.0
+"""Counts above black of bare paper from which on a channel of a frame is used."""
+
+USUAL_UNEVENNESS = 0.003
+"""Standard deviation of the coefficients of a smooth factor of cells' levels: errors of the fitted field and of an even
+print (chosen)."""
+
+LOOSE_UNEVENNESS = 0.03
+"""The same where several primaries light the print, each with a field of its own (chosen)."""
+
+FOLDS = 4
+"""Parts of the print, each of which is predicted from the others."""
+
+_PATCHWORK = 10
+"""Parts of the page's width that belong to one fold each, so that every fold has cells all over the print."""
+
+_FACTOR_ORDER, _INK_ORDER = 4, 2
+"""Orders over the page of smooth factors of a level, and of a density of ink (its level times its logarithm)."""
+
+_PRIOR_SHARE = 0.1
+"""Standard deviation that a share is expected to have at most: keeps kernels solvable that the windows hardly see."""
+
+USUAL_VEIL = 0.01
+"""Standard deviation of the veil that lenses have before it is measured: 0.3 to 1.5 % by ISO 9358 and ISO 18844. Where
+a print is lit so evenly that it shows no veil, this is what is known of it."""
+
+MOST_VEIL = 0.02
+"""Veil beyond which it is none where shares cannot change over the frame: the worst lens by ISO 9358, and half a
+standard error. Shoulders that grow threefold to the corners were taken for one of 4.6 %, and cells were 11 % off."""
+
+_LEVELS = 40
+"""Groups of like levels, in each of which the scatter is measured."""
+
+_HUBER = 3.0
+"""Standard deviations beyond which a cell weighs less."""
+
+_ROUNDS = 2
+"""Solutions in a row, each weighted by what the one before left."""
+
+_ROUNDING = 1e-7
+"""Step of a stored share: far below its error, far above what another order of sums changes, so that a table's bytes
+do not depend on the machine's linear algebra."""
+
+VARYING_BITS = 4
+"""Bits of a channel from which on cells are enough for shares that change over the frame."""
+
+_SMALL_SHARE = 0.002
+"""Standard deviation of how a share changes over the frame that is allowed for where cells are too few to see it: half
+of what mild shoulders of 1 % have (chosen)."""
+
+_EVEN_TERMS = 3
+"""Unknowns of a kernel that is the same all over the frame, at most: one for each channel."""
+
+FULL_BITS = 5
+"""Bits of a full chart, whose codes stand so near each other that their curvature is less than the noise of a cell."""
+
+_BESIDE = 5
+"""Codes along each side of the square in which the usual curvature across an axis is taken."""
 
 
 def kernel_names() -> list[str]:
@@ -167,69 +227,6 @@ class PointSpread:
             "gain_held_out": float(f"{self.held_out:.4g}"),
             "misfit": float(f"{self.misfit:.4g}"),
         }
-
-
-MOST_MISFIT = 5.0
-"""Misfit from which on a veil is not told from other light; 1.5 to 3.3 in simulated rooms whose lens has a veil."""
-
-LEAST_COUNTS = 300.0
-"""Counts above black of bare paper from which on a channel of a frame is used."""
-
-USUAL_UNEVENNESS = 0.003
-"""Standard deviation of the coefficients of a smooth factor of cells' levels: errors of the fitted field and of an even
-print (chosen)."""
-
-LOOSE_UNEVENNESS = 0.03
-"""The same where several primaries light the print, each with a field of its own (chosen)."""
-
-FOLDS = 4
-"""Parts of the print, each of which is predicted from the others."""
-
-_PATCHWORK = 10
-"""Parts of the page's width that belong to one fold each, so that every fold has cells all over the print."""
-
-_FACTOR_ORDER, _INK_ORDER = 4, 2
-"""Orders over the page of smooth factors of a level, and of a density of ink (its level times its logarithm)."""
-
-_PRIOR_SHARE = 0.1
-"""Standard deviation that a share is expected to have at most: keeps kernels solvable that the windows hardly see."""
-
-USUAL_VEIL = 0.01
-"""Standard deviation of the veil that lenses have before it is measured: 0.3 to 1.5 % by ISO 9358 and ISO 18844. Where
-a print is lit so evenly that it shows no veil, this is what is known of it."""
-
-MOST_VEIL = 0.02
-"""Veil beyond which it is none where shares cannot change over the frame: the worst lens by ISO 9358, and half a
-standard error. Shoulders that grow threefold to the corners were taken for one of 4.6 %, and cells were 11 % off."""
-
-_LEVELS = 40
-"""Groups of like levels, in each of which the scatter is measured."""
-
-_HUBER = 3.0
-"""Standard deviations beyond which a cell weighs less."""
-
-_ROUNDS = 2
-"""Solutions in a row, each weighted by what the one before left."""
-
-_ROUNDING = 1e-7
-"""Step of a stored share: far below its error, far above what another order of sums changes, so that a table's bytes
-do not depend on the machine's linear algebra."""
-
-VARYING_BITS = 4
-"""Bits of a channel from which on cells are enough for shares that change over the frame."""
-
-_SMALL_SHARE = 0.002
-"""Standard deviation of how a share changes over the frame that is allowed for where cells are too few to see it: half
-of what mild shoulders of 1 % have (chosen)."""
-
-_EVEN_TERMS = 3
-"""Unknowns of a kernel that is the same all over the frame, at most: one for each channel."""
-
-FULL_BITS = 5
-"""Bits of a full chart, whose codes stand so near each other that their curvature is less than the noise of a cell."""
-
-_BESIDE = 5
-"""Codes along each side of the square in which the usual curvature across an axis is taken."""
 
 
 @dataclass(frozen=True, eq=False)

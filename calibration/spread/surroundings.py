@@ -1,5 +1,8 @@
-"""The light that kernels of a point spread bring to every patch of a frame from its surroundings.
+"""What is printed around each patch, and the light that kernels of a point spread bring to it from there.
 
+- The print is a grid of slots of one size, as charts of `experiment.chart.layout` are made: every cell and reference
+  fills a slot, a tag has 4 × 4 of them and a module is two fifths of one. A patch is a cell (in the order of colour
+  indices) or a reference behind them, the white ones before the grey ones.
 - Near kernels are integrated over each slot and each of a window's pixels, where they lie in the frame, each channel's
   photosites in their own place; tags and margins in fifths of a slot.
 - Far kernels blur the print slot by slot, in which a patch's place within its slot does not matter.
@@ -7,12 +10,6 @@
   ones in the light of the place, of what lies behind the print the mean of places beside it.
 
 Half-size pixels; P patches as in `PrintedGrid`; counts above black.
-
-What is printed around each patch: cells and references in slots of one size, tags and margins in fifths of a slot.
-
-Charts of `experiment.chart.layout` are made so: every cell and reference fills a slot, a tag has 4 × 4 of them and a
-module is two fifths of one. A patch is a cell (in the order of colour indices) or a reference behind them, the white
-ones before the grey ones. Slots and millimetres on the print; knows nothing of frames.
 """
 
 from __future__ import annotations
@@ -42,6 +39,21 @@ _OFF_GRID = 0.02
 
 _Array = npt.NDArray[np.float64]
 _Index = npt.NDArray[np.int32]
+
+LEAST_BITS = 3
+"""Bits of a channel from which on a cell has neighbours in colour whose curvature can be told from chance."""
+
+_OFFSETS_PX = (-2.0, 1 / 16, 65)
+"""First, step and number of the offsets of windows that shares are tabulated at: rounding, a quarter pixel of the
+colour filters, registration and lateral colour stay within 2 px, and cubic terms of a step below 10⁻⁴ of a share."""
+
+_PITCHES = 9
+"""Sizes of slots that shares are tabulated at, over those that occur."""
+
+_FAR_REACH = 3.0
+"""Standard deviations after which a far kernel's tail, 0.3 %, is dropped; it is scaled to keep its sum."""
+
+_Float = npt.NDArray[np.float32]
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,10 +94,6 @@ def unsuitable(chart: Chart) -> str:
     if chart.bits < LEAST_BITS:
         return f"the chart has {chart.colour_count} cells; {8**LEAST_BITS} are expected, so that chance averages out"
     return "" if _fits_grid(chart) else "cells and references do not all lie on one grid of slots of their own size"
-
-
-LEAST_BITS = 3
-"""Bits of a channel from which on a cell has neighbours in colour whose curvature can be told from chance."""
 
 
 def _points(chart: Chart) -> _Array:
@@ -144,18 +152,6 @@ def printed_grid(chart: Chart) -> PrintedGrid:
         others=kinds.mean(axis=(1, 3)).astype(np.float32),
         slots_mm=np.column_stack([np.tile(slot_x, rows), np.repeat(slot_y, columns)]),
     )
-
-
-_OFFSETS_PX = (-2.0, 1 / 16, 65)
-"""First, step and number of the offsets of windows that shares are tabulated at: rounding, a quarter pixel of the
-colour filters, registration and lateral colour stay within 2 px, and cubic terms of a step below 10⁻⁴ of a share."""
-
-_PITCHES = 9
-"""Sizes of slots that shares are tabulated at, over those that occur."""
-
-_FAR_REACH = 3.0
-"""Standard deviations after which a far kernel's tail, 0.3 %, is dropped; it is scaled to keep its sum."""
-_Float = npt.NDArray[np.float32]
 
 
 @dataclass(frozen=True, eq=False)

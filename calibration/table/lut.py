@@ -1,26 +1,17 @@
 """The look-up table on disk, opened for reading; nothing about how its numbers were measured.
 
 A LUT folder holds `samples.npy` (uint16 little-endian, C order, [light, colour, sample, RGB]), `illuminations.csv`
-(the lights and their ground truth), `lut.json` (provenance), and `frames.csv` (the frames it was made from). The
-generator reads tables through this file, and nothing behind it.
+(the lights and their ground truth), `lut.json` (provenance), `frames.csv` (the frames it was made from), and
+`SHA256SUMS`. The generator reads tables through this file, and nothing behind it (docs/formats.md).
 
-Every released version of the format stays readable. Keys added since are optional.
+Rules that hold inside:
 
-What `lut.json` holds: the camera, the corrections, the unfit cells, and the hashes that name and verify a table.
-
-The raw files that a table was made from, as `frames.csv` lists them, and the hash over them that names a session.
-
-Hashes of `samples.npy`: of the whole file, and of each light's part, by which damage is traced to a light.
-
-Names of the files of a LUT folder (`docs/formats.md`).
-
-`SHA256SUMS` of a table: the hash of each of its files, held against them, and the one hash that names them all.
-
-The file has the form of `sha256sum`, so that ``sha256sum -c SHA256SUMS`` checks a table without this software, and
-``sha256sum SHA256SUMS`` gives the table's hash: whoever was told it from elsewhere has every byte of the table by it.
-
-Small files are looked at whenever a table is opened, samples when a light is first used. Tables made before the file
-was written have hashes of ground truth and samples in `lut.json`, or none at all; what they have is held against them.
+- Every released version of the format stays readable. Keys added since are optional.
+- `SHA256SUMS` has the form of `sha256sum`, so that ``sha256sum -c SHA256SUMS`` checks a table without this software,
+  and ``sha256sum SHA256SUMS`` gives the table's hash: whoever was told it from elsewhere has every byte of the table by
+  it. Tables made before it was written have hashes of ground truth and samples in `lut.json`, or none at all; what they
+  have is held against them.
+- Small files are held against their hashes whenever a table is opened, samples when a light is first used.
 """
 
 from __future__ import annotations
@@ -48,15 +39,75 @@ from foundation.hashing import file_sha256, sha256_of
 from foundation.trust.foreign_folders import require_plain_folder
 
 FORMAT: Final = "crop.lut"
+
 VERSION: Final = 1
 """The only version so far: keys that were added since are optional."""
-
 
 Sha256 = Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
 """A SHA-256 as 64 lowercase hexadecimal digits."""
 
 FileName = Annotated[str, Field(pattern=r"^[A-Za-z0-9_][A-Za-z0-9_.-]{0,99}$")]
 """Name of a file that lies in the table's own folder."""
+
+COLUMNS: Final = ("kind", "illumination", "file", "sha256")
+"""Columns of a table's `frames.csv` (docs/formats.md)."""
+
+MOST_SAMPLES: Final = 1024
+"""Samples of a cell at most: the largest window has 9×9."""
+
+PROVENANCE: Final = "lut.json"
+"""What the table was made from and how; written last, so that a folder without it is no table."""
+
+SAMPLES: Final = "samples.npy"
+"""The samples, uint16 little-endian, C order, [light, colour, sample, RGB]."""
+
+ILLUMINATIONS: Final = "illuminations.csv"
+"""The lights and their ground truth."""
+
+FRAMES: Final = "frames.csv"
+"""The raw files that the table was made from; absent in tables made before they were recorded."""
+
+REFERENCES: Final = "references.csv"
+"""The grey references under each light, where the chart has some."""
+
+REPORT_PAGE: Final = "report.html"
+"""The report for people."""
+
+REPORT_JSON: Final = "report.json"
+"""The report for programs."""
+
+SUMS: Final = "SHA256SUMS"
+"""Hashes of all other files of the table, as `sha256sum -c` reads them; absent in tables made before it was written."""
+
+REPORT_FORMAT: Final = "crop.report"
+
+REPORT_VERSION: Final = 1
+"""`format` and `version` of `report.json` (docs/formats.md)."""
+
+MOST_BYTES: Final = {
+    PROVENANCE: 64 << 20,
+    ILLUMINATIONS: 16 << 20,
+    FRAMES: 16 << 20,
+    REFERENCES: 64 << 20,
+    REPORT_JSON: 64 << 20,
+    REPORT_PAGE: 256 << 20,
+    SUMS: 64 << 10,
+}
+"""Largest sizes of a table's files but its samples: forty times those of 707 lights and 32 768 colours."""
+
+OPTIONAL: Final = frozenset({REPORT_PAGE})
+"""Files that a table may do without: no number is read from them, and a table that was fetched has none."""
+
+_LINE = re.compile(r"([0-9a-f]{64})  ([A-Za-z0-9_][A-Za-z0-9_.-]{0,99})")
+_TEXTS: Final = (ILLUMINATIONS, FRAMES, REFERENCES, REPORT_JSON, REPORT_PAGE)
+RESTORE: Final = "restore it from a copy, fetch the table again, or build it anew"
+
+WHITE_COLUMNS: Final = ("white_r", "white_g", "white_b")
+"""Columns of `illuminations.csv` with the ground truth, after those of the lights."""
+
+MOST_WHITE: Final = 1_000_000
+"""A ground truth is below this, in units of samples of 16 bits: what is larger was not measured, and its chromaticity
+might not be a number."""
 
 
 class Unfit(BaseModel):
@@ -150,10 +201,6 @@ def parse_provenance(text: bytes, path: Path) -> Provenance:
         raise FormatError(f"{path} is damaged: {where}{first['msg']}; restore it from a copy") from error
 
 
-COLUMNS: Final = ("kind", "illumination", "file", "sha256")
-"""Columns of a table's `frames.csv` (docs/formats.md)."""
-
-
 @dataclass(frozen=True)
 class SourceFrame:
     """A raw file that a table was made from.
@@ -201,10 +248,6 @@ def load_frames(path: Path) -> tuple[SourceFrame, ...]:
         )
     except (OSError, KeyError, TypeError, ValueError) as error:
         raise FormatError(f"{path} is damaged: columns {','.join(COLUMNS)} expected; build the table again") from error
-
-
-MOST_SAMPLES: Final = 1024
-"""Samples of a cell at most: the largest window has 9×9."""
 
 
 def light_sha256(samples: npt.NDArray[np.uint16]) -> str:
@@ -257,56 +300,6 @@ def samples_sha256(
     except OSError as error:
         raise FormatError(f"cannot read {path}: {error.strerror}; check the disk, or build the table again") from error
     return whole.hexdigest(), lights
-
-
-PROVENANCE: Final = "lut.json"
-"""What the table was made from and how; written last, so that a folder without it is no table."""
-
-SAMPLES: Final = "samples.npy"
-"""The samples, uint16 little-endian, C order, [light, colour, sample, RGB]."""
-
-ILLUMINATIONS: Final = "illuminations.csv"
-"""The lights and their ground truth."""
-
-FRAMES: Final = "frames.csv"
-"""The raw files that the table was made from; absent in tables made before they were recorded."""
-
-REFERENCES: Final = "references.csv"
-"""The grey references under each light, where the chart has some."""
-
-REPORT_PAGE: Final = "report.html"
-"""The report for people."""
-
-REPORT_JSON: Final = "report.json"
-"""The report for programs."""
-
-SUMS: Final = "SHA256SUMS"
-"""Hashes of all other files of the table, as `sha256sum -c` reads them; absent in tables made before it was written."""
-
-REPORT_FORMAT: Final = "crop.report"
-REPORT_VERSION: Final = 1
-"""`format` and `version` of `report.json` (docs/formats.md)."""
-
-
-MOST_BYTES: Final = {
-    PROVENANCE: 64 << 20,
-    ILLUMINATIONS: 16 << 20,
-    FRAMES: 16 << 20,
-    REFERENCES: 64 << 20,
-    REPORT_JSON: 64 << 20,
-    REPORT_PAGE: 256 << 20,
-    SUMS: 64 << 10,
-}
-"""Largest sizes of a table's files but its samples: forty times those of 707 lights and 32 768 colours."""
-
-OPTIONAL: Final = frozenset({REPORT_PAGE})
-"""Files that a table may do without: no number is read from them, and a table that was fetched has none."""
-
-_LINE = re.compile(r"([0-9a-f]{64})  ([A-Za-z0-9_][A-Za-z0-9_.-]{0,99})")
-
-_TEXTS: Final = (ILLUMINATIONS, FRAMES, REFERENCES, REPORT_JSON, REPORT_PAGE)
-
-RESTORE: Final = "restore it from a copy, fetch the table again, or build it anew"
 
 
 def sums_of(folder: Path, samples_sha256: str, provenance: str) -> str:
@@ -382,14 +375,6 @@ def require_listed(folder: Path, provenance: Provenance, lights: int) -> dict[st
     for fault in changed_files(folder, known):
         raise FormatError(f"{folder}: {fault}; {RESTORE}")
     return known
-
-
-WHITE_COLUMNS: Final = ("white_r", "white_g", "white_b")
-"""Columns of `illuminations.csv` with the ground truth, after those of the lights."""
-
-MOST_WHITE: Final = 1_000_000
-"""A ground truth is below this, in units of samples of 16 bits: what is larger was not measured, and its chromaticity
-might not be a number."""
 
 
 @dataclass(frozen=True, eq=False)

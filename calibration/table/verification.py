@@ -1,7 +1,4 @@
-"""Whether a table is as it was built, byte by byte, and whether two tables correspond number by number.
-
-What a table is and what it was made from, in lines for people to read (`build-lut --info`).
-"""
+"""What a table is, in lines for people; whether it is as it was built, byte by byte; whether two tables correspond."""
 
 from __future__ import annotations
 

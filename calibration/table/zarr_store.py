@@ -8,17 +8,13 @@ Rules that hold inside:
 
 - The attributes are completed last: an array without the attribute `whole` was never finished.
 - Nothing is overwritten but such an array.
-- Nothing that a store says of itself is believed before it fits together: sizes, names and codecs are bounded.
+- Nothing that a store says of itself is believed before it fits together. The texts say how many lights and colours
+  there are; the array's shape, its chunks and the head of `samples.npy` have to say the same. Sizes are bounded, names
+  are those of a table's files, codecs are the four of published tables: a store may name any that this machine has, and
+  a count that is only claimed would fill the disk.
 - A table that is fetched appears in its folder whole and verified, or not at all.
 
 Needs zarr, the extra `cluster`.
-
-What a store claims of a published table, believed only as far as it fits together.
-
-The metadata of the array (`zarr.json`; Zarr specification version 3, "Array metadata") hold the table's texts, which
-say how many lights and colours there are; the array's shape, its chunks and the head of `samples.npy` have to say the
-same. Sizes are bounded, names are those of a table's files, codecs are the four of published tables: a store may name
-any that this machine has, and a count that is only claimed would fill the disk.
 """
 
 from __future__ import annotations
@@ -63,6 +59,7 @@ from foundation.hashing import file_sha256
 from foundation.trust.foreign_folders import parse_json_object, require_plain_tree
 
 FORMAT: Final = "crop.lut.published"
+
 VERSION: Final = 1
 """The only version so far."""
 
@@ -73,6 +70,7 @@ MOST_LIGHTS: Final = 65_536
 """Lights of a table that is fetched, at most: a hundred times those of the paper."""
 
 _METADATA: Final = "zarr.json"
+
 _MOST_METADATA: Final = 256 << 20
 """The metadata hold all files of the table but samples and page; see `calibration.table.lut.MOST_BYTES`."""
 
@@ -84,6 +82,12 @@ _CODECS: Final = frozenset({"sharding_indexed", "bytes", "blosc", "crc32c"})
 
 HASH: Final = re.compile("[0-9a-f]{64}")
 """A SHA-256 as it is printed and given."""
+
+SHARD_LIGHTS: Final = 32
+"""Lights of one object of the store: 100 MB compressed of a full table, a size that stores and networks like."""
+
+ReportLights = Callable[[int, int], None]
+"""Called with the number of lights copied, and the number of all."""
 
 
 def reason_of(error: Exception) -> str:
@@ -206,13 +210,6 @@ def attributes_of(described: dict[str, Any] | None) -> dict[str, Any] | None:
         return None
     found = cast("dict[str, Any]", attributes)
     return found if found.get("format") == FORMAT else None
-
-
-SHARD_LIGHTS: Final = 32
-"""Lights of one object of the store: 100 MB compressed of a full table, a size that stores and networks like."""
-
-ReportLights = Callable[[int, int], None]
-"""Called with the number of lights copied, and the number of all."""
 
 
 def publish(lut: Lut, url: str, progress: ReportLights | None = None) -> None:

@@ -17,7 +17,6 @@ from calibration.cli import main
 from calibration.pipeline.build import build, check
 from calibration.pipeline.frames import session_sha256
 from calibration.report.groups import GROUPS, OF_THRESHOLDS
-from calibration.report.report import write_report
 from calibration.report.summary import summary
 from calibration.report.worsts import cell_sides_px, worst_of
 from calibration.table.lut import Lut, open_lut
@@ -46,11 +45,6 @@ def angle_deg(one: npt.NDArray[np.float64], other: npt.NDArray[np.float64]) -> f
 def codes(chart: Chart) -> npt.NDArray[np.uint8]:
     """Return the printed codes in the order of colour indices."""
     return chart.rgb[chart.cell_of_colour]
-
-
-@pytest.fixture(scope="module")
-def built(session: Session, tmp_path_factory: pytest.TempPathFactory) -> BuildResult:
-    return build(session, tmp_path_factory.mktemp("table") / "lut", report=write_report)
 
 
 @pytest.fixture(scope="module")

@@ -104,7 +104,7 @@ def misses(registration: Registration, lab: Lab, mosaic: Mosaic) -> dict[str, fl
 
 def test_every_channel_has_its_own_place(tmp_path: Path) -> None:
     room = Room(waviness_mm=1.0, lateral_red_px=1.0, lateral_blue_px=-0.6)
-    lab = hang(4, "A2", "EOS 550D", room=room)
+    lab = hang(room=room)
     mosaic = lab.mosaic(tmp_path)
     registration = register(mosaic, lab.chart)
     assert max(misses(registration, lab, mosaic).values()) < 0.04
