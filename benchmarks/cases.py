@@ -38,7 +38,7 @@ from benchmarks.sessions import (
 )
 from calibration.pipeline.build import build
 from calibration.table.lut import open_lut
-from calibration.verdict.wording import remark
+from calibration.verdict import remark
 from drivers.camera import ExposureSettings
 from drivers.presenter import WHITE, Colour
 from experiment.chart.layout import A_SERIES_MM, design_chart
@@ -448,7 +448,7 @@ def outcome_of(session: Session, folder: Path, world: World, chart: Chart, chang
     verdict = result.verdict
     says = tuple(remark(row, result.figures) for row in verdict.remarks)
     truth = compare(result, open_lut(folder), world, chart, session, changes)
-    names = tuple(row.threshold.name for row in verdict.remarks)
+    names = tuple(row.figure.name for row in verdict.remarks)
     return Outcome(verdict.outcome, names, says, truth, result.figures.lens.left if LENS_LEFT in names else 0.0)
 
 

@@ -23,11 +23,11 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from calibration.figures.frame_figures import FrameFigures
+from calibration.measurements import FrameMeasurements
 from calibration.registration.register import Registration
 from calibration.sampling import sites_at
 from calibration.table.lut import Lut
-from calibration.verdict.result import BuildResult
+from calibration.verdict import BuildResult
 from drivers.camera import CapturedFrame, ExposureSettings
 from drivers.presenter import Colour
 from drivers.raw.rawfile import read_raw
@@ -343,7 +343,7 @@ def noise_of(
 
 
 def _places_px(
-    result: BuildResult, figures: FrameFigures, world: World, change: FrameChange, cells_mm: _Array
+    result: BuildResult, figures: FrameMeasurements, world: World, change: FrameChange, cells_mm: _Array
 ) -> _Array:
     """Return (C, 2) float64: where cells were sampled in a frame, nearly, if the chart was found anew in it."""
     registration, moved_anew = result.figures.registration, any(frame.reregistered for frame in result.figures.frames)

@@ -1,4 +1,4 @@
-"""`build-lut`: makes the table of a session, judges it; describes, cites, verifies, matches, publishes, compares tables.
+"""`build-lut`: makes the table of a session, judges it; describes, verifies, matches, publishes, compares tables.
 
 Parse, call, print; nothing else.
 """
@@ -32,7 +32,7 @@ from foundation.json_output import AsJson, JsonOutput, json_output
 if TYPE_CHECKING:
     from calibration.pipeline.baseline import BuildOptions
     from calibration.pipeline.build import TableProgress
-    from calibration.verdict.result import BuildResult
+    from calibration.verdict import BuildResult
     from experiment.session.folder import Session
 
 app = new_app()
@@ -498,7 +498,7 @@ def _check(
     result = check(session, options, linearity, picture)
     _print_result(result, told)
     if result.verdict.refused:
-        from calibration.verdict.wording import refusal
+        from calibration.verdict import refusal
 
         raise QualityError(f"{session.folder}: {refusal(result.verdict, result.figures)}")
     print(f"{session.folder}: the chart is found and is the one expected; a table can be built")
@@ -546,12 +546,12 @@ def _compare(
 def _print_result(result: BuildResult, told: JsonOutput) -> None:
     """Print the figures that matter most, the remarks, and the verdict; or add all that `report.json` holds."""
     if told.asked:
-        from calibration.report.report_json import report_json
+        from calibration.report.report import report_json
 
         told.add(**report_json(result))
         return
-    from calibration.report.summary import summary
-    from calibration.verdict.wording import remark
+    from calibration.report.page import summary
+    from calibration.verdict import remark
 
     rows = [row for row in summary(result.figures) if row.brief]
     width = max(len(row.name) for row in rows) + 2

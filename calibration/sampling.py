@@ -21,7 +21,7 @@ import numpy.typing as npt
 from calibration import kernels
 from drivers.raw.rawfile import Mosaic
 from experiment.framing.planes import CHANNELS, phases
-from experiment.limits.bleed import WINDOW_PX, bleed
+from experiment.framing.sharpness import MAX_BLUR_PX
 
 UNEVEN_SHARE = 0.01
 """Difference of rim and middle, as a share of the patch, that matters (judgement)."""
@@ -44,6 +44,18 @@ WINDOWS = (3, 5, 7, 9)
 
 SAFE_BLEED = 0.002
 """Share of a sample's light from beyond its cell that counts as none: less than half of what the verdict remarks on."""
+
+WINDOW_PX = 5
+"""Pixels along the side of a cell's window, where the user names no other: the paper's (section 3.2)."""
+
+MISPLACEMENT_PX = 0.75
+"""How far a sample may lie from its place: 0.5 px of rounding and 0.25 px of registration."""
+
+SAMPLE_REACH_PX = 3.25
+"""From a cell's true centre to the outer edge of its 25 pixels: 2.5, rounding 0.5, registration 0.25."""
+
+_LEAST_BLUR_PX = 1e-3
+"""Keeps a perfectly sharp picture from dividing by 0."""
 
 WINDOW = WINDOW_PX
 """Pixels along the side of a cell's window, where the user names no other: the paper's."""
@@ -138,6 +150,35 @@ def median_of_variance(degrees: int) -> float:
     0.919
     """
     return (1 - 2 / (9 * degrees)) ** 3
+
+
+def bleed(cell_px: float, blur_px: float, window: int = WINDOW_PX) -> float:
+    """Return the share, 0 … 1, of the worst sample's light that comes from beyond its cell.
+
+    The normal integral (a Gaussian of σ `blur_px`) beyond the cell's nearest edge, for the outermost of `window` pixels
+    (2 px from the middle one of 5), misplaced by `MISPLACEMENT_PX` towards that edge.
+
+    `cell_px`: shorter side of a cell, half-size px. `blur_px`: σ of the blur, half-size px.
+    """
+    from scipy.special import ndtr
+
+    return float(ndtr(-(cell_px / 2 - window // 2 - MISPLACEMENT_PX) / max(blur_px, _LEAST_BLUR_PX)))
+
+
+def blur_of_bleed(cell_px: float, share: float, window: int = WINDOW_PX) -> float:
+    """Return the σ of the blur, half-size px, at which `bleed` is `share` (0 … 0.5); 0 where it is at any blur."""
+    from scipy.special import ndtri
+
+    return max(cell_px / 2 - window // 2 - MISPLACEMENT_PX, 0.0) / -float(ndtri(share))
+
+
+def largest_blur_px(cell_px: float) -> float:
+    """Return the σ of the blur, half-size px, up to which a chart with cells of so many px is registered.
+
+    Up to `MAX_BLUR_PX` cells of any size are found to a few hundredths of a pixel. What such a blur mixes into their
+    samples depends on the cells' size; the verdict judges it as bleed.
+    """
+    return max(MAX_BLUR_PX, (cell_px / 2 - SAMPLE_REACH_PX) / 2)
 
 
 def largest_window(cell_px: float, blur_px: float) -> int:

@@ -13,12 +13,12 @@ import numpy.typing as npt
 from acquisition.check.findings import LIMITS, Finding, Grade, amount, judged, not_checked, percent, worst
 from acquisition.check.light import AREAS, area_name
 from acquisition.check.places import ChartMap
+from calibration.sampling import bleed, largest_blur_px
 from experiment.chart.model import Chart
 from experiment.framing.finding import Framing
 from experiment.framing.homography import project
 from experiment.framing.sharpness import edge_blurs
 from experiment.framing.tags import MIN_MODULE_PX
-from experiment.limits.bleed import bleed, largest_blur_px
 
 USUAL_FOCAL_DIAGONALS = 1.3
 """Focal length over the frame's diagonal where the file states none: 35 mm on APS-C (chosen)."""

@@ -1,43 +1,243 @@
-"""The table that decides: each rule is a cause, the figures that it may explain, and what must be known for it.
+"""Why a figure is beyond its limit: the causes there are, the evidence that is asked for, and the table that decides.
 
 Rules that hold inside:
 
-- A rule holds where every one of its conditions does; a condition is an interval, both ends included, and what is not
-  known lies in none.
+- A rule holds where every one of its conditions does; a condition is an interval, both ends included. What was not
+  measured is NaN, which lies in none.
 - The first rule that holds decides; those that rest on what files say, or dark frames show, stand before those that
   rest on what a deviation looks like.
 - Where none holds, the cause is unknown and said to be. A cause that is wrong costs a session; one that is not named
   costs a look at the report. So intervals leave gaps between causes.
+- Figures are known by what they are about (`Subject`), never by name.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Collection
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
+from functools import cache
+from typing import Literal
 
-from calibration.causes.cause import (
-    ANOTHER_PRINT,
-    BUMP,
-    CURL,
-    DEFOCUS,
-    FALL_OFF,
-    HOT_PHOTOSITES,
-    OBJECT_IN_FRAME,
-    OTHER_CAMERA,
-    OTHER_EXPOSURE,
-    REFLECTION,
-    REFLECTION_IN_FRAME,
-    ROOM_LIGHT,
-    SHADOW,
-    SPREAD,
-    STAIN,
-    UNKNOWN,
-    VEIL,
-    WRONG_NAME,
-    Cause,
+Mends = Literal["frames", "session", "nothing"]
+"""What is to be taken again: the frames that are named, the whole session, or nothing, as no new frame helps."""
+
+
+@dataclass(frozen=True)
+class Cause:
+    """One probable cause.
+
+    - `name`: as in `report.json`.
+    - `says`: what it is, for a sentence that begins with "probably".
+    - `remedy`: what helps, an imperative.
+    - `mends`: what is then to be taken again.
+    """
+
+    name: str
+    says: str
+    remedy: str
+    mends: Mends
+
+
+HOT_PHOTOSITES = Cause(
+    "hot photosites",
+    "photosites that are hot, which the dark frames show too",
+    "let the camera cool, or have its pixels remapped; the cells are listed, and the table leaves them out",
+    "nothing",
 )
-from calibration.causes.evidence import Evidence
+OBJECT_IN_FRAME = Cause(
+    "hand or object in one frame",
+    "a hand, a person or an object before the print in single frames",
+    "see that nobody comes between lamp, print and camera",
+    "frames",
+)
+REFLECTION = Cause(
+    "reflection in all frames",
+    "a reflection on the print in all frames: light is added there, whatever the colour printed",
+    "turn print or projector until no lamp, window or bright wall is mirrored on it, or print on matt paper",
+    "session",
+)
+REFLECTION_IN_FRAME = Cause(
+    "reflection in one frame",
+    "a reflection on the print in single frames: a lamp, a display or daylight that is not always there",
+    "cover displays and windows, and see that nobody moves in front of what the print mirrors",
+    "frames",
+)
+STAIN = Cause(
+    "stain",
+    "a stain on the print: it takes some colours more than others, in all frames",
+    "clean the print or print it anew",
+    "session",
+)
+SHADOW = Cause(
+    "shadow or fold",
+    "a shadow, a fold or grey dirt on the print: it takes all colours alike, in all frames",
+    "look for what stands in the light there, hang the print flatter, and clean it",
+    "session",
+)
+FALL_OFF = Cause(
+    "fall-off",
+    "fall-off towards the corners that the field does not follow",
+    "stop the lens down, take a longer lens or step back, and zoom the projector's picture out",
+    "session",
+)
+CURL = Cause(
+    "curled print",
+    "a print that is curled or folded: its shape there is not known from what was measured",
+    "hang the print flatter, on a board or held at all corners",
+    "session",
+)
+SPREAD = Cause(
+    "soft lens",
+    "a lens that spreads light over several cells, so that their rims have the neighbours' colours",
+    "focus on the print, stop down to f/8, clean the lens, bring the camera nearer, or take a smaller window "
+    "(build-lut --window)",
+    "session",
+)
+BUMP = Cause(
+    "bump",
+    "print or camera were pushed",
+    "fix camera and print, and let nobody walk about; the sampling grid followed",
+    "nothing",
+)
+DEFOCUS = Cause(
+    "defocus",
+    "the frame is out of focus, or was shaken",
+    "switch off autofocus and stabilisation, focus on the print, see that nothing shakes the camera",
+    "frames",
+)
+ANOTHER_PRINT = Cause(
+    "another print",
+    "a print whose cells are not those of chart.json",
+    "name the chart.json of this print, and let it hang until the session's end",
+    "frames",
+)
+WRONG_NAME = Cause(
+    "wrong name",
+    "a frame that bears another light's name",
+    "correct the list of frames that was imported, or let the picture settle for longer (sequence.settle_s)",
+    "frames",
+)
+OTHER_CAMERA = Cause(
+    "other camera",
+    "frames of another camera or lens",
+    "take all frames of a table with one camera and one lens",
+    "frames",
+)
+OTHER_EXPOSURE = Cause(
+    "other exposure",
+    "frames of another exposure than the rest, by their files",
+    "expose all frames alike, manually: shutter, aperture and ISO speed",
+    "frames",
+)
+ROOM_LIGHT = Cause(
+    "room light",
+    "light of the room: it is there while the projector shows black",
+    "darken the room, cover lamps and displays, keep daylight out",
+    "session",
+)
+UNKNOWN = Cause("unknown", "", "", "nothing")
+"""What was measured does not decide; the remedy is then that of the limit."""
+
+CAUSES = (
+    HOT_PHOTOSITES, OBJECT_IN_FRAME, REFLECTION, REFLECTION_IN_FRAME, STAIN, SHADOW, CURL, FALL_OFF, SPREAD, BUMP,
+    DEFOCUS, ANOTHER_PRINT, WRONG_NAME,
+    OTHER_CAMERA, OTHER_EXPOSURE, ROOM_LIGHT, UNKNOWN,
+)  # fmt: skip
+"""All of them."""
+
+
+NAN = float("nan")
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """What is known of a deviation.
+
+    - `frames`: frames of the print that were compared.
+    - `showing`: share of them that show it.
+    - `even_showing`: share of the white frames, but the one compared with, that show it; 0 where there is no other.
+    - `white_residual`: share of the white frames whose references are off there by half as much or more.
+    - `some_whites`: 1 where the references of some white frames are off there and those of others not; else 0.
+    - `spot`: share of the cells there that are not of their codes' colours in the mean of the white frames.
+    - `in_first`: 1 where all frames differ at one place from the frame that they are compared with, so that it is
+      there; else 0.
+    - `share`: share of the print that deviates.
+    - `deviation`: how far the place is off, relative, with its sign: below 0 it is darker; the channel that deviates
+      most.
+    - `tint`: how differently the channels are off, over `deviation`'s size: 0 where all are off alike.
+    - `added`: light that cells have there besides their own, whatever their colour, of paper white.
+    - `kept`: share of their own light that they have.
+    - `rim`: mean residual of the outermost references, relative, with its sign.
+    - `rim_frames`: share of the white frames in which it is below −0.5 %.
+    - `radial`: share of the residuals' variance that distance from the middle explains.
+    - `hot`: share of the cells concerned that hold a photosite which is hot in every dark frame.
+    - `scatter`: spread of all cells of the frame about their codes' colours, relative.
+    - `softer`: light of neighbouring cells added by the frame's blur, in the worst sample.
+    - `moved_px`: how far the chart lies from where it was registered, half-size px.
+    - `anew`: share of the frames in which the chart had to be registered again.
+    - `agreement`: correlation of the cells with the chart where it was registered.
+    - `exposure`: exposure of the frame by its file over the other frames'.
+    - `brightness`: light of the frame over what its code gives.
+    - `off_codes_deg`: angle between a light's white and what its codes give, degrees.
+    - `named_right`: 1 where a light's white is what its codes give, 0 where it is what another light's give.
+    - `cameras`: cameras or lenses among the frames, by their files.
+    - `room`: light while the projector shows black, of white.
+    - `room_change`: change of it between dark frames, of white.
+    - `stray`: light of a primary under a code of 0 that no dark frame shows, of that primary, the worst light.
+    - `stray_primaries`: light of the primaries' frames together beyond white's, alike in each, of white.
+    - `other_iso`: frames of another ISO speed than most, by their files.
+    - `misplaced`: share of the unfit cells whose place is not known well enough.
+    - `uneven`: share of the unfit cells whose rim and middle differ.
+    - `waves_px`: how far tags lie from where a flat sheet would have them, RMS, half-size px of cells of 10 px.
+    - `beyond_cell`: share of the light of a window's worst sample that the lens brings from beyond its cell.
+    """
+
+    frames: float = NAN
+    showing: float = NAN
+    even_showing: float = NAN
+    white_residual: float = NAN
+    some_whites: float = NAN
+    spot: float = NAN
+    in_first: float = NAN
+    share: float = NAN
+    deviation: float = NAN
+    tint: float = NAN
+    added: float = NAN
+    kept: float = NAN
+    rim: float = NAN
+    rim_frames: float = NAN
+    radial: float = NAN
+    hot: float = NAN
+    scatter: float = NAN
+    softer: float = NAN
+    moved_px: float = NAN
+    anew: float = NAN
+    agreement: float = NAN
+    exposure: float = NAN
+    brightness: float = NAN
+    off_codes_deg: float = NAN
+    named_right: float = NAN
+    cameras: float = NAN
+    room: float = NAN
+    room_change: float = NAN
+    stray: float = NAN
+    stray_primaries: float = NAN
+    other_iso: float = NAN
+    misplaced: float = NAN
+    uneven: float = NAN
+    waves_px: float = NAN
+    beyond_cell: float = NAN
+
+    def known(self) -> dict[str, float]:
+        """Return what was measured, by name."""
+        return {name: value for name in evidence_names() if (value := getattr(self, name)) == value}
+
+
+@cache
+def evidence_names() -> tuple[str, ...]:
+    """Return the names of what evidence may hold, in its order."""
+    return tuple(field.name for field in fields(Evidence))
+
 
 _FAR = math.inf
 
@@ -60,33 +260,41 @@ class Rule:
     """One line of the table.
 
     - `cause`: what is said where it holds.
-    - `figures`: the figures that it may explain, by the names of their limits.
+    - `about`: what the figures are about that it may explain.
     - `conditions`: all of which must hold.
     - `why`: why the cause follows.
     """
 
     cause: Cause
-    figures: frozenset[str]
+    about: frozenset[Subject]
     conditions: tuple[Condition, ...]
     why: str
 
-    def holds(self, figure: str, evidence: Evidence) -> bool:
-        """Return whether it explains a figure by what is known."""
-        return figure in self.figures and all(condition.holds(evidence) for condition in self.conditions)
+    def holds(self, subject: Subject, evidence: Evidence) -> bool:
+        """Return whether it explains a figure about a subject by what is known."""
+        return subject in self.about and all(condition.holds(evidence) for condition in self.conditions)
 
 
-PLACE = frozenset({"unlike_block", "disturbed_cells"})
-COVERED = frozenset({"disturbed_cells", "unfit_share"})
-ALL_CELLS = frozenset({"unlike_scatter", "softer_bleed", "moved_anew", "noisy_share"})
-PRINT = frozenset({"doubtful_share", "unfit_share", "added_light", "reference_spread"})
-FOUND = frozenset({"agreement", "blocks_good", "tags_found"})
-SHEET = PRINT | {"noisy_share"}
-DRIFT = frozenset({"white_drift", "white_drift_deg"})
-NAMES = frozenset({"off_codes_deg", "white_frame_deg", "exchanged_lights"})
-BRIGHTNESS = frozenset({"off_brightness", "white_frame_brightness", "white_short", "other_exposure"})
-LIGHT = NAMES | BRIGHTNESS | {"additivity", "white_drift", "white_drift_deg"}
-DARK = frozenset({"leak_share", "dark_drift"})
-STRAY = frozenset({"stray_share"})
+Subject = Literal[
+    "block", "few cells", "unfit cells", "spot", "references", "frame", "movement", "noisy cells", "chart", "drift",
+    "names", "brightness", "sum", "dark", "stray", "camera", "iso",
+]  # fmt: skip
+"""What a figure beyond its limit is about: the rules ask for that, and not for its name."""
+
+
+def _about(*subjects: Subject) -> frozenset[Subject]:
+    return frozenset(subjects)
+
+
+PLACE = _about("block", "few cells")
+WHOLE_FRAME = _about("frame", "movement", "noisy cells")
+PRINT = _about("spot", "unfit cells", "references")
+SHEET = PRINT | _about("noisy cells")
+DRIFT = _about("drift")
+LIGHT = _about("names", "brightness", "sum", "drift")
+DARK = _about("dark")
+STRAY = _about("stray")
+CHART = _about("chart")
 
 _IN_ALL_FRAMES = (
     Condition("in_first", 0, 0), Condition("even_showing", 0, 0), Condition("some_whites", 0, 0),
@@ -105,7 +313,7 @@ _IN_FEW_FRAMES = (
 RULES: tuple[Rule, ...] = (
     Rule(
         OTHER_CAMERA,
-        PLACE | ALL_CELLS | PRINT | LIGHT | DARK | frozenset({"other_camera", "other_lens"}),
+        PLACE | WHOLE_FRAME | PRINT | LIGHT | DARK | _about("camera"),
         (Condition("cameras", 2, _FAR),),
         "the files name more than one camera or lens",
     ),
@@ -123,7 +331,7 @@ RULES: tuple[Rule, ...] = (
     ),
     Rule(
         OTHER_EXPOSURE,
-        frozenset({"other_iso"}),
+        _about("iso"),
         (Condition("other_iso", 1, _FAR),),
         "the file states another ISO speed than the others'",
     ),
@@ -160,37 +368,37 @@ RULES: tuple[Rule, ...] = (
     ),
     Rule(
         HOT_PHOTOSITES,
-        PLACE | PRINT | frozenset({"noisy_share"}),
+        PLACE | SHEET,
         (Condition("hot", 0.5, 1),),
         "most of the cells concerned hold a photosite that stands out in every dark frame",
     ),
     Rule(
         DEFOCUS,
-        ALL_CELLS | PLACE,
+        WHOLE_FRAME | PLACE,
         (Condition("softer", 0.003, _FAR), Condition("scatter", 0, 0.1)),
         "the tags are softer than in the frame registered first, and cells have their neighbours' light",
     ),
     Rule(
         ANOTHER_PRINT,
-        ALL_CELLS | PLACE | FOUND,
+        WHOLE_FRAME | PLACE | CHART,
         (Condition("scatter", 0.2, _FAR), Condition("softer", -_FAR, 0.012)),
         "the cells' colours are not those of their codes anywhere, though the tags are sharp",
     ),
     Rule(
         ANOTHER_PRINT,
-        FOUND,
+        CHART,
         (Condition("agreement", -1, 0.5),),
         "cells and chart have nothing in common",
     ),
     Rule(
         BUMP,
-        frozenset({"moved_anew"}),
+        _about("movement"),
         (Condition("anew", 1e-9, 1), Condition("moved_px", 0.5, _FAR), Condition("softer", -_FAR, 0.003)),
         "the tags lie elsewhere than before, as sharp",
     ),
     Rule(
         OBJECT_IN_FRAME,
-        FOUND | SHEET,
+        CHART | SHEET,
         (
             Condition("white_residual", 1e-9, 0.5),
             Condition("deviation", -1, -0.03),
@@ -212,7 +420,7 @@ RULES: tuple[Rule, ...] = (
     ),
     Rule(
         OBJECT_IN_FRAME,
-        frozenset({"unlike_block"}) | SHEET | DRIFT,
+        _about("block") | SHEET | DRIFT,
         (
             *_IN_FEW_FRAMES,
             Condition("even_showing", 1e-9, 1),
@@ -223,7 +431,7 @@ RULES: tuple[Rule, ...] = (
     ),
     Rule(
         OBJECT_IN_FRAME,
-        frozenset({"disturbed_cells"}),
+        _about("few cells"),
         (
             *_IN_FEW_FRAMES,
             Condition("even_showing", 1e-9, 1),
@@ -247,13 +455,13 @@ RULES: tuple[Rule, ...] = (
     ),
     Rule(
         OBJECT_IN_FRAME,
-        frozenset({"unlike_block"}),
+        _about("block"),
         (*_IN_FEW_FRAMES, Condition("spot", 0, 0.1), Condition("kept", -_FAR, 0.85), *_SHARP_PLACE),
         "in few frames cells of one place have light of their own colours less, and all alike",
     ),
     Rule(
         OBJECT_IN_FRAME,
-        PLACE | COVERED,
+        PLACE | _about("unfit cells"),
         (*_IN_FEW_FRAMES, Condition("spot", 0, 0.1), Condition("deviation", -1, 0), *_SHARP_PLACE),
         "one place is off in few frames, and as it should be in the others and under white",
     ),
@@ -270,7 +478,7 @@ RULES: tuple[Rule, ...] = (
     ),
     Rule(
         FALL_OFF,
-        frozenset({"reference_spread"}),
+        _about("references"),
         (Condition("radial", 0.5, 1), Condition("rim", -1, -0.005), Condition("rim_frames", 0.9, 1)),
         "what the field leaves depends on the distance from the middle alone, and the rim is darker, in all frames",
     ),
@@ -313,21 +521,15 @@ RULES: tuple[Rule, ...] = (
     ),
     Rule(
         CURL,
-        frozenset({"unfit_share"}),
+        _about("unfit cells"),
         (Condition("misplaced", 0.5, 1), Condition("waves_px", 0.3, _FAR)),
         "most of the cells concerned lie where their places are not known well enough, and tags lie beside a plane",
     ),
     Rule(
         SPREAD,
-        frozenset({"unfit_share", "noisy_share", "bleed"}),
+        _about("unfit cells", "noisy cells"),
         (Condition("beyond_cell", 0.01, _FAR), Condition("uneven", 0.5, 1)),
         "rim and middle of cells differ, and the print shows that the lens brings light from beyond them",
-    ),
-    Rule(
-        VEIL,
-        frozenset({"bleed", "correction_residual", "veil"}),
-        (Condition("veil", 0.005, _FAR),),
-        "black at the print's bright places is brighter than at its dark ones",
     ),
 )  # fmt: skip
 """The table, in the order of deciding."""
@@ -346,9 +548,9 @@ class Decision:
     follows: str = ""
 
 
-def decide(figure: str, evidence: Evidence, rules: Collection[Rule] = RULES) -> Decision:
-    """Return the cause of a figure by what is known; unknown where no rule of the table holds."""
-    for rule in rules:
-        if rule.holds(figure, evidence):
+def decide(subject: Subject, evidence: Evidence) -> Decision:
+    """Return the cause of a figure about a subject by what is known; unknown where no rule of the table holds."""
+    for rule in RULES:
+        if rule.holds(subject, evidence):
             return Decision(rule.cause, rule)
     return Decision(UNKNOWN, None)

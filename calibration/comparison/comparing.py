@@ -34,9 +34,9 @@ import numpy.typing as npt
 from calibration.kernels import moments
 from calibration.pipeline.baseline import BuildOptions
 from calibration.pipeline.build import build
-from calibration.report.report_json import report_json
+from calibration.report.report import report_json
 from calibration.table.lut import REFERENCES, REPORT_JSON, Lut, open_lut
-from calibration.verdict.result import BuildResult
+from calibration.verdict import BuildResult
 from experiment.chart.model import Chart, load_chart
 from experiment.lights.illuminations import Illumination
 from experiment.measures.stains import STAINED

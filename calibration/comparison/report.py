@@ -28,12 +28,11 @@ from calibration.comparison.comparing import (
     differing_cells,
     differing_lights,
 )
-from calibration.report.page import Picture, picture_html
-from calibration.report.plots import FAINT, INK, MARK, png_of
-from calibration.report.style import STYLE
+from calibration.report.page import STYLE, Picture, picture_html
 from experiment.chart.model import Chart
 from foundation.errors import first_of
 from foundation.files import whole_folder, write_whole
+from foundation.plots import FAINT, INK, MARK, png_of
 
 FORMAT = "crop.comparison"
 

@@ -1,1 +1,1 @@
-"""What was measured, as frozen values: no file is read here, nothing is judged, nothing is drawn."""
+"""The judged figures, one object each: `figure` says what one is, `all_figures` lists those of the other files."""

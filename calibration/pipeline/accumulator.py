@@ -22,7 +22,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial import cKDTree
 
-from calibration.figures.frame_figures import FrameFigures
+from calibration.measurements import FrameMeasurements
 from calibration.pipeline.baseline import Baseline, RegisteredFrame
 from calibration.pipeline.frames import SelectedFrames, decode_frame
 from calibration.pipeline.measuring import (
@@ -89,7 +89,7 @@ class Accumulator:
     session: Session
     selected: SelectedFrames
     baseline: Baseline
-    figures: tuple[FrameFigures | DarkFrameFigures, ...]
+    figures: tuple[FrameMeasurements | DarkFrameFigures, ...]
     saturation: int
     registered: RegisteredFrame
     dark: DarkLight | None
@@ -137,9 +137,9 @@ class Accumulator:
         return replace(found, dark=found._learned(measured).dark)
 
     @cached_property
-    def frames(self) -> tuple[FrameFigures, ...]:
+    def frames(self) -> tuple[FrameMeasurements, ...]:
         """Figures of the light and white frames."""
-        return tuple(figures for figures in self.figures if isinstance(figures, FrameFigures))
+        return tuple(figures for figures in self.figures if isinstance(figures, FrameMeasurements))
 
     @property
     def darks(self) -> tuple[DarkFrameFigures, ...]:
@@ -234,7 +234,7 @@ class Accumulator:
         return {
             "registered": self.registered.file,
             "figures": [
-                figures.to_json() if isinstance(figures, FrameFigures) else to_plain(figures)
+                figures.to_json() if isinstance(figures, FrameMeasurements) else to_plain(figures)
                 for figures in self.figures
             ],
         }
@@ -250,7 +250,7 @@ class Accumulator:
         figures = tuple(
             replace(from_plain(DarkFrameFigures, stored, record.file, _BEGIN_ANEW), record=record)
             if record.kind == "dark"
-            else FrameFigures.from_json(record, page_mm, stored)
+            else FrameMeasurements.from_json(record, page_mm, stored)
             for record, stored in zip(self.selected.records, values["figures"], strict=False)
         )
         registered = self.baseline.first
@@ -293,7 +293,7 @@ class Accumulator:
         level = self.even_sum.mean(axis=1, dtype=np.float64) / max(self.even_frames, 1) / field
         return find_stains(level, cells_mm, self.baseline.chart.bits, ~(self.outside | self.covered))
 
-    def unfit(self, stains: Stains, frames: Sequence[FrameFigures]) -> tuple[Unfit, ...]:
+    def unfit(self, stains: Stains, frames: Sequence[FrameMeasurements]) -> tuple[Unfit, ...]:
         """Return the cells not to be used, each with the first cause that applies; `frames`: what is said of them."""
         disturbed = disturbed_cells(frames)
         lit = [(frame.consistency.alone, frame.record.illumination) for frame in frames]
@@ -338,7 +338,7 @@ class Accumulator:
         return tuple(found)
 
 
-def disturbed_cells(frames: Sequence[FrameFigures]) -> dict[int, list[tuple[int, float]]]:
+def disturbed_cells(frames: Sequence[FrameMeasurements]) -> dict[int, list[tuple[int, float]]]:
     """Return the lights under which something covered cells, and how far these are off; by the cells' colours.
 
     White frames' do not count: a table has no samples of them.

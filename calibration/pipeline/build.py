@@ -33,8 +33,9 @@ from typing import Any, TypeVar
 import numpy as np
 import numpy.typing as npt
 
-from calibration.figures.linearity_figures import LinearityFigures
-from calibration.figures.table_figures import TableFigures
+from calibration.figures.all_figures import FIGURES
+from calibration.figures.figure import Figure
+from calibration.measurements import LinearityMeasurements, TableMeasurements
 from calibration.pipeline.accumulator import Accumulator, EarlyMeasurement
 from calibration.pipeline.baseline import PAPER_OPTIONS, BuildOptions, baseline_of, with_lens, with_primaries
 from calibration.pipeline.collecting import check_figures, table_figures
@@ -66,12 +67,7 @@ from calibration.table.lut import (
     Provenance,
 )
 from calibration.table.writer import LutWriter
-from calibration.verdict.result import BuildResult
-from calibration.verdict.retaking import COMMAND, retake_json
-from calibration.verdict.thresholds import THRESHOLDS, Threshold
-from calibration.verdict.values import judged_values
-from calibration.verdict.verdict import judge
-from calibration.verdict.wording import refusal
+from calibration.verdict import COMMAND, BuildResult, judge, judged_values, refusal, retake_json
 from experiment.framing.annotated import annotated_png
 from experiment.framing.movement import Shift
 from experiment.session.folder import Session
@@ -131,7 +127,7 @@ def build(
     report: WriteReport | None = None,
     options: BuildOptions = PAPER_OPTIONS,
     linearity: Path | None = None,
-    thresholds: Sequence[Threshold] = THRESHOLDS,
+    judged_by: Sequence[Figure] = FIGURES,
 ) -> BuildResult:
     """Build the table of a session."""
     selected = select_frames(session)
@@ -148,7 +144,7 @@ def build(
         done, writer, series = _take_in_all(session, selected, options, linearity, unfinished, show)
         show(len(done.figures), len(done.figures), "writing the report")
         figures = table_figures(done, series)
-        result = BuildResult(figures, judge(judged_values(figures), thresholds), out)
+        result = BuildResult(figures, judge(judged_values(figures), judged_by), out)
         if figures.lights.drift is not None and not result.verdict.refused:
             # A build that is killed meanwhile finds other samples than its checkpoint names, and begins anew.
             for light, gain in enumerate(figures.lights.drift.gains):
@@ -171,7 +167,7 @@ def append(
     report: WriteReport | None = None,
     options: BuildOptions = PAPER_OPTIONS,
     linearity: Path | None = None,
-    thresholds: Sequence[Threshold] = THRESHOLDS,
+    judged_by: Sequence[Figure] = FIGURES,
 ) -> BuildResult | TableProgress:
     """Take in the frames that have come so far of a session that is being taken.
 
@@ -181,7 +177,7 @@ def append(
     selected = select_frames(session)
     # The plan of a session that was put together otherwise may be empty; its lights are the plan then.
     if not selected.lights_without and {step.number for step in session.steps} <= session.done_steps():
-        return build(session, out, progress, report, options, linearity, thresholds)
+        return build(session, out, progress, report, options, linearity, judged_by)
     _require_dark_frames(session, options)
     with unfinished_table(out) as unfinished:
         stored = unfinished.load(_identity(session, selected, options), _frame_keys(selected))
@@ -199,7 +195,7 @@ def check(
     options: BuildOptions = PAPER_OPTIONS,
     linearity: Path | None = None,
     picture: Path | None = None,
-    thresholds: Sequence[Threshold] = THRESHOLDS,
+    judged_by: Sequence[Figure] = FIGURES,
 ) -> BuildResult:
     """Register a session's best frame and judge it; write nothing but a picture.
 
@@ -225,7 +221,7 @@ def check(
         done = done.with_dark_frame(sample_dark_frame(baseline, decode_frame(session, dark), baseline.first))
     series = None if linearity is None else read_linearity(linearity, baseline)
     figures = check_figures(done, series)
-    return BuildResult(figures, judge(judged_values(figures), thresholds), None)
+    return BuildResult(figures, judge(judged_values(figures), judged_by), None)
 
 
 def _take_in_all(
@@ -235,7 +231,7 @@ def _take_in_all(
     linearity: Path | None,
     unfinished: UnfinishedTable,
     progress: ReportProgress,
-) -> tuple[Accumulator, LutWriter, LinearityFigures | None]:
+) -> tuple[Accumulator, LutWriter, LinearityMeasurements | None]:
     """Return what all frames give, after taking in those that an earlier program has not, with their samples written.
 
     With them what a series of exposures shows, which is read first: it may be none.
@@ -314,7 +310,7 @@ def prefetched(
                 future.cancel()
 
 
-def _write_table(done: Accumulator, figures: TableFigures, writer: LutWriter) -> None:
+def _write_table(done: Accumulator, figures: TableMeasurements, writer: LutWriter) -> None:
     """Write all of the table but its samples, which are there, and its report."""
     session, records, lights, greys = done.session, done.records, figures.lights, figures.greys
     by_light = {frame.record.illumination: frame for frame in figures.frames if frame.record.kind == "light"}

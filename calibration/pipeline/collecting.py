@@ -12,15 +12,15 @@ from calibration.checks.frame_origins import origin_figures
 from calibration.checks.light_codes import CodeAgreement, code_agreement
 from calibration.checks.stray_light import StrayLight, stray_light
 from calibration.citation import origin_record, stated_origin, with_published_serials
-from calibration.figures.frame_figures import FrameFigures
-from calibration.figures.linearity_figures import LinearityFigures
-from calibration.figures.table_figures import (
-    CellFigures,
-    GreyFigures,
-    LightFigures,
-    SensorFigures,
-    SessionFigures,
-    TableFigures,
+from calibration.measurements import (
+    CellMeasurements,
+    FrameMeasurements,
+    GreyMeasurements,
+    LightMeasurements,
+    LinearityMeasurements,
+    SensorMeasurements,
+    SessionMeasurements,
+    TableMeasurements,
 )
 from calibration.pipeline.accumulator import Accumulator
 from calibration.pipeline.baseline import Baseline, lens_figures
@@ -41,7 +41,7 @@ _FULL_CODE = 255
 _Array = npt.NDArray[np.float64]
 
 
-def table_figures(done: Accumulator, linearity: LinearityFigures | None) -> TableFigures:
+def table_figures(done: Accumulator, linearity: LinearityMeasurements | None) -> TableMeasurements:
     """Return the figures of a table, all of whose frames have been taken in.
 
     `linearity`: what a series of exposures shows; None where none was given.
@@ -53,10 +53,10 @@ def table_figures(done: Accumulator, linearity: LinearityFigures | None) -> Tabl
     return _figures(done, even, len(by_light), _light_figures(done, by_light), greys, linearity)
 
 
-def check_figures(done: Accumulator, linearity: LinearityFigures | None) -> TableFigures:
+def check_figures(done: Accumulator, linearity: LinearityMeasurements | None) -> TableMeasurements:
     """Return the figures of a check, which has taken in the frame that is registered, and a dark one where there is."""
     (frame,) = done.frames
-    lights = LightFigures(
+    lights = LightMeasurements(
         white=frame.paper.white[None],
         white_error=frame.paper.error[None],
         gains=np.ones((1, 3)),
@@ -72,12 +72,12 @@ def check_figures(done: Accumulator, linearity: LinearityFigures | None) -> Tabl
 
 def _figures(
     done: Accumulator,
-    even: FrameFigures,
+    even: FrameMeasurements,
     lights_taken: int,
-    lights: LightFigures,
+    lights: LightMeasurements,
     greys: tuple[_Array, _Array],
-    linearity: LinearityFigures | None,
-) -> TableFigures:
+    linearity: LinearityMeasurements | None,
+) -> TableMeasurements:
     """Return all figures; `even` is the frame that shows how even cells are."""
     session, baseline, saturation = done.session, done.baseline, done.saturation
     stated = stated_origin(session)
@@ -88,8 +88,8 @@ def _figures(
     published = with_published_serials(origins, stated.citation.camera_serial)
     stains, dark = done.stains(_field_at_cells(baseline, even)), done.dark_summary()
     frames = _without_hot(done.frames, dark.hottest, stains.places_mm)
-    return TableFigures(
-        session=SessionFigures(
+    return TableMeasurements(
+        session=SessionMeasurements(
             folder=session.folder,
             camera=baseline.camera,
             lights=lights_taken,
@@ -100,8 +100,8 @@ def _figures(
         registration=baseline.first.registration,
         frames=frames,
         lights=lights,
-        greys=GreyFigures(baseline.points.levels.names, *greys),
-        sensor=SensorFigures(
+        greys=GreyMeasurements(baseline.points.levels.names, *greys),
+        sensor=SensorMeasurements(
             saturation_counts=saturation,
             saturation_measured=bool((done.highest >= saturation).any()),
             white_level=round(saturation - float(np.mean([frame.black.mean() for frame in done.frames]))),
@@ -110,7 +110,7 @@ def _figures(
             linearity=linearity,
         ),
         dark_frames=dark,
-        cells=CellFigures(baseline.options.window, done.unfit(stains, frames), stains),
+        cells=CellMeasurements(baseline.options.window, done.unfit(stains, frames), stains),
         origins=origin_figures(list(zip(done.records, published, strict=True))),
         origin=origin_record(stated, done.records, origins),
         primaries=baseline.primaries,
@@ -119,13 +119,15 @@ def _figures(
     )
 
 
-def _field_at_cells(baseline: Baseline, even: FrameFigures) -> _Array:
+def _field_at_cells(baseline: Baseline, even: FrameMeasurements) -> _Array:
     """Return the field (C, 3) float64 by which the cells of a frame are evened, each by that of its own colour."""
     field = even.paper.field.at(baseline.points.cells_mm)
     return field if baseline.primaries is None else field * baseline.primaries.field_ratio(even.paper.white)
 
 
-def _without_hot(frames: tuple[FrameFigures, ...], hottest: _Array, cells_mm: _Array) -> tuple[FrameFigures, ...]:
+def _without_hot(
+    frames: tuple[FrameMeasurements, ...], hottest: _Array, cells_mm: _Array
+) -> tuple[FrameMeasurements, ...]:
     """Return frames in which no cell counts as covered for the hot photosite that it holds.
 
     `hottest` (C,) counts as of the dark frames, whenever these were taken; (0,) without any.
@@ -136,7 +138,7 @@ def _without_hot(frames: tuple[FrameFigures, ...], hottest: _Array, cells_mm: _A
     return tuple(replace(one, consistency=one.consistency.without_hot(hot, cells_mm)) for one in frames)
 
 
-def _light_figures(done: Accumulator, by_light: Sequence[FrameFigures]) -> LightFigures:
+def _light_figures(done: Accumulator, by_light: Sequence[FrameMeasurements]) -> LightMeasurements:
     """Return what was measured of the lights, whose frames are `by_light`."""
     illuminations, options = done.session.illuminations, done.baseline.options
     error = np.array([frame.paper.error for frame in by_light])
@@ -150,7 +152,7 @@ def _light_figures(done: Accumulator, by_light: Sequence[FrameFigures]) -> Light
     agreement = _code_agreement(
         illuminations, by_light, compared, dark, gains if len(compared) < 2 else np.ones_like(gains)
     )
-    return LightFigures(
+    return LightMeasurements(
         white=white,
         white_error=error,
         gains=gains,
@@ -166,7 +168,7 @@ def _light_figures(done: Accumulator, by_light: Sequence[FrameFigures]) -> Light
     )
 
 
-def _drift_is_one(whites: Sequence[FrameFigures]) -> bool:
+def _drift_is_one(whites: Sequence[FrameMeasurements]) -> bool:
     """Return whether white frames differ as a lamp drifts, and not as frames of other lights or exposures do."""
     levels = np.array([frame.paper.white for frame in whites]).reshape(-1, 3)
     if len(levels) < 2:
@@ -178,8 +180,8 @@ def _drift_is_one(whites: Sequence[FrameFigures]) -> bool:
 
 def _code_agreement(
     illuminations: Sequence[Illumination],
-    by_light: Sequence[FrameFigures],
-    whites: Sequence[FrameFigures],
+    by_light: Sequence[FrameMeasurements],
+    whites: Sequence[FrameMeasurements],
     dark: _Array,
     gains: _Array,
 ) -> CodeAgreement:
@@ -200,7 +202,7 @@ def _code_agreement(
     )
 
 
-def _to_one_exposure(frames: Sequence[FrameFigures]) -> _Array:
+def _to_one_exposure(frames: Sequence[FrameMeasurements]) -> _Array:
     """Return the usual exposure over that of each frame, (N, 1) float64, as files state them; 1 where they do not."""
     exposures = np.array([frame.origin.exposure for frame in frames])
     usual = float(np.median(exposures[exposures > 0])) if (exposures > 0).any() else 1.0
@@ -209,8 +211,8 @@ def _to_one_exposure(frames: Sequence[FrameFigures]) -> _Array:
 
 def _stray_light(
     illuminations: Sequence[Illumination],
-    by_light: Sequence[FrameFigures],
-    whites: Sequence[FrameFigures],
+    by_light: Sequence[FrameMeasurements],
+    whites: Sequence[FrameMeasurements],
     dark: _Array,
     gains: _Array,
 ) -> StrayLight | None:
@@ -225,14 +227,14 @@ def _stray_light(
     return stray_light(codes, white[:lights], error[:lights], full, pure_lights(illuminations))
 
 
-def _gains(by_light: Sequence[FrameFigures], whites: Sequence[FrameFigures]) -> _Array:
+def _gains(by_light: Sequence[FrameMeasurements], whites: Sequence[FrameMeasurements]) -> _Array:
     """Return the lamp's light at each light over that in the first white frame, (L, 3) float64; ones without one."""
     if not whites:
         return np.ones((len(by_light), 3))
     return drift_gains(*_times_s(by_light, whites), np.array([frame.paper.white for frame in whites]))
 
 
-def _times_s(by_light: Sequence[FrameFigures], whites: Sequence[FrameFigures]) -> tuple[_Array, _Array]:
+def _times_s(by_light: Sequence[FrameMeasurements], whites: Sequence[FrameMeasurements]) -> tuple[_Array, _Array]:
     """Return when lights (L,) and white frames (W,) were taken, seconds since the first white frame."""
     start = whites[0].record.taken_at
     at_s, white_at_s = (

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from calibration.figures.linearity_figures import LinearityFigures
+from calibration.measurements import LinearityMeasurements
 from calibration.pipeline.baseline import Baseline
 from drivers.raw.rawfile import Mosaic, read_raw
 from experiment.framing.movement import REREGISTER_PX, Shift
@@ -30,7 +30,7 @@ LEAST_FRAMES = 4
 _Array = npt.NDArray[np.float64]
 
 
-def read_linearity(folder: Path, baseline: Baseline) -> LinearityFigures:
+def read_linearity(folder: Path, baseline: Baseline) -> LinearityMeasurements:
     """Return what a series of exposures shows.
 
     `folder`: raw files of the chart where the session's first registered frame has it, under one steady light, with one
@@ -79,7 +79,9 @@ def read_linearity(folder: Path, baseline: Baseline) -> LinearityFigures:
             f"{folder}: no patch is between {LOWEST:.0%} and {HIGHEST:.0%} of saturation in two frames; "
             "take the series with times less far apart, from dim to nearly saturated"
         )
-    return LinearityFigures(tuple(paths[number].name for number in order), np.array(times)[order], level, deviation)
+    return LinearityMeasurements(
+        tuple(paths[number].name for number in order), np.array(times)[order], level, deviation
+    )
 
 
 def _exposure_s(mosaic: Mosaic, path: Path) -> float:

@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from calibration.figures.frame_figures import FrameFigures
+from calibration.measurements import FrameMeasurements
 from calibration.pipeline.baseline import Baseline, RegisteredFrame, beyond_print, sites_of, usable_means
 from calibration.pipeline.frames import DecodedFrame
 from calibration.radiometry.dark_frames import DarkFrameFigures, DarkLight, measure_dark_frame, winsorised_means
@@ -51,7 +51,7 @@ class MeasuredFrame:
       asked for.
     """
 
-    figures: FrameFigures
+    figures: FrameMeasurements
     registered: RegisteredFrame
     dark: DarkLight | None
     saturation: int
@@ -202,7 +202,7 @@ def _measured(
     softer_px2 = 0.0 if reregistered else shift.softer_px2
     mean = patch_means(values)
     variance = baseline.transfer.variance(mean) / baseline.options.samples
-    figures = FrameFigures(
+    figures = FrameMeasurements(
         record=decoded.record,
         black=decoded.black,
         channel=decoded.strongest,

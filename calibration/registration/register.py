@@ -22,6 +22,7 @@ from scipy.spatial import cKDTree
 from calibration.registration.colours import ColourModel, agreement, mismatched
 from calibration.registration.geometry import Displacement, LateralColour, Lens, fit_lens
 from calibration.registration.matching import Anchors, Blocks, Matcher, PlaceErrors, not_this_chart
+from calibration.sampling import SAMPLE_REACH_PX, largest_blur_px
 from drivers.raw.rawfile import Mosaic
 from experiment.chart.model import Chart
 from experiment.framing.finding import Framing, find_chart
@@ -31,7 +32,6 @@ from experiment.framing.planes import CHANNELS, Channel, Plane, frame_black, pla
 from experiment.framing.sharpness import blur_px
 from experiment.framing.tagless_field import FoundField, field_mm
 from experiment.framing.visibility import MIN_CELL_PX
-from experiment.limits.bleed import SAMPLE_REACH_PX, largest_blur_px
 from foundation.errors import RegistrationError
 from foundation.robust import sigma_of
 

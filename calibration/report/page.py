@@ -1,220 +1,179 @@
-"""`report.html`: verdict, figures, pictures and unfit cells, all in one file that can be mailed."""
+"""`report.html`: verdict, what to do, figures in their groups, pictures and unfit cells, in one file to be mailed.
+
+The page is `templates/report.html`; here stands what it shows. Each figure's row comes from the figure.
+"""
 
 from __future__ import annotations
 
-import base64
-import html
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal
+from importlib import resources
+from typing import Any
 
-from calibration.causes.findings import ProbableCause
-from calibration.citation import OriginRecord, origin_lines
-from calibration.report.groups import GROUPS, OF_THRESHOLDS, QUESTIONS, Group, group_of_row
-from calibration.report.style import STYLE
-from calibration.report.summary import summary
-from calibration.report.worsts import Worst
-from calibration.table.lut import Unfit
-from calibration.verdict.result import BuildResult
-from calibration.verdict.retaking import COMMAND, findings, is_mended_by_retaking, retake_command, retaken_frames
-from calibration.verdict.verdict import JudgedValue, Outcome, format_value
-from calibration.verdict.wording import places_text
+from calibration.citation import origin_lines
+from calibration.figures.all_figures import BY_NAME, FIGURES
+from calibration.figures.figure import QUESTIONS, Drawing, Group, Outcome, SummaryRow, Worst
+from calibration.measurements import TableMeasurements
+from calibration.verdict import (
+    COMMAND,
+    BuildResult,
+    JudgedValue,
+    ProbableCause,
+    findings,
+    is_mended_by_retaking,
+    places_text,
+    retake_command,
+    retaken_frames,
+)
 from foundation.errors import counted, first_of
+from foundation.pages import figure, render
 
 MOST_UNFIT = 200
 """Unfit cells that are listed; all of them are in lut.json, and a page of thousands is read by nobody."""
 
-_CLASSES: dict[Outcome, str] = {"accept": "accept", "accept with remarks": "remark", "refuse": "refuse"}
-"""Classes of the style sheet, and the words of the table's first column."""
+_WORDS: dict[Outcome, str] = {"refuse": "refuse", "accept with remarks": "remark", "accept": "accept"}
+"""Outcomes, the worst first, as the page says them."""
 
-PictureGroup = Group | Literal["first"]
-
-_ORDER: tuple[Outcome, ...] = ("refuse", "accept with remarks", "accept")
-"""Outcomes, the worst first."""
+_ORDER: tuple[Outcome, ...] = tuple(_WORDS)
 
 
 @dataclass(frozen=True)
 class Picture:
     """A picture of the report, PNG, with its heading and what it shows.
 
-    `group` is the one it is folded with, or ``first`` for those that stand open on top.
+    `group` is the one it is folded with; None for those that stand open on top. `name` is what figures say of it.
     """
 
     heading: str
     caption: str
     png: bytes
-    group: PictureGroup = "first"
+    group: Group | None = None
+    name: Drawing | None = None
+
+
+@dataclass(frozen=True)
+class _Row:
+    """A judged value with what helps and where its worst is, as far as these are to be said."""
+
+    judged: JudgedValue
+    remedy: str
+    worst: str
 
 
 def page(
-    result: BuildResult, pictures: Sequence[Picture], places: Sequence[Picture] = (), worsts: Sequence[Worst] = ()
+    result: BuildResult,
+    pictures: Sequence[Picture],
+    places: Sequence[Picture] = (),
+    worsts: Mapping[str, Worst] | None = None,
 ) -> str:
-    """Return the text of `report.html`: verdict, what to do, what to look at first, then all figures in groups."""
-    session = result.figures.session
-    title = f"Table of {session.lights} lights, {session.camera}"
-    first = "".join(picture_html(picture) for picture in pictures if picture.group == "first")
-    groups = "".join(_group(group, result, pictures, worsts) for group in GROUPS)
-    return (
-        '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">'
-        '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
-        f"<title>{html.escape(title)}</title><style>{STYLE}</style></head><body>\n"
-        f'<h1>{html.escape(title)}</h1><p class="note">Session {html.escape(session.folder.name)}'
-        f"{html.escape(_rig_note(result))}</p>\n"
-        f"{_verdict(result)}{_what_to_do(result)}{_causes(result)}{''.join(map(picture_html, places))}{first}"
-        f"<h2>All figures</h2>{groups}"
-        f"{_origin(result.figures.origin)}{_unfit(result.figures.cells.unfit)}</body></html>\n"
-    )
+    """Return the text of `report.html`: verdict, what to do, what to look at first, then all figures in groups.
+
+    `places` are pictures of what is beyond a limit, `worsts` where the worst of figures is, by name.
+    """
+    table, verdict = result.figures, result.verdict
+    found, beyond = findings(verdict, table), len(verdict.refused) + len(verdict.remarks)
+    rows = [
+        _Row(row, _remedy(row, found.get(row.figure.name)), "" if worst is None else worst.where)
+        for row in sorted(verdict.rows, key=lambda row: _ORDER.index(row.outcome))
+        for worst in [(worsts or {}).get(row.figure.name)]
+    ]
+    simulated = ", taken in the simulated laboratory" if table.origin.rig == "simulated" else ""
+    return render(
+        "calibration.report",
+        "report.html",
+        title=f"Table of {table.session.lights} lights, {table.session.camera}",
+        taken=f"Session {table.session.folder.name}{simulated}",
+        words=_WORDS,
+        outcome=verdict.outcome,
+        sentence={
+            "accept": "Accepted: every figure is within its limit.",
+            "accept with remarks": f"Accepted with remarks on {len(verdict.remarks)} of {len(verdict.rows)} figures.",
+            "refuse": f"Refused: {len(verdict.refused)} of {len(verdict.rows)} figures are beyond what can be used.",
+        }[verdict.outcome],
+        usable=not verdict.refused,
+        todo=rows[:beyond],
+        again=_again(result),
+        causes=[_cause(each) for each in found.values()],
+        first=[*places, *(picture for picture in pictures if picture.group is None)],
+        drawn={picture.name for picture in pictures if picture.name is not None},
+        groups=[_group(group, rows, table, pictures) for group in QUESTIONS],
+        origin=origin_lines(table.origin),
+        unfit=table.cells.unfit,
+        most_unfit=MOST_UNFIT,
+    ).text
 
 
-def _rig_note(result: BuildResult) -> str:
-    """Return what a reader must not overlook of where the frames come from."""
-    return ", taken in the simulated laboratory" if result.figures.origin.rig == "simulated" else ""
+def summary(table: TableMeasurements, group: Group | None = None) -> list[SummaryRow]:
+    """Return the lines that say how good a table is, in their order: of all figures, or of a group's."""
+    session = table.session
+    lines = (line for one in FIGURES if group in (None, one.group) for line in one.lines)
+    found = (line.row(table) for line in sorted(lines, key=lambda line: line.place))
+    rows = [row for row in found if row is not None]
+    if group not in (None, "geometry"):
+        return rows
+    return [
+        SummaryRow("Lights", str(session.lights), "with an accepted frame"),
+        SummaryRow("Frame registered", session.registered_file, ""),
+        *rows,
+    ]
 
 
-def _verdict(result: BuildResult) -> str:
-    """Return the verdict in one sentence."""
-    verdict = result.verdict
-    sentence = {
-        "accept": "Accepted: every figure is within its limit.",
-        "accept with remarks": f"Accepted with remarks on {len(verdict.remarks)} of {len(verdict.rows)} figures.",
-        "refuse": f"Refused: {len(verdict.refused)} of {len(verdict.rows)} figures are beyond what can be used.",
-    }[verdict.outcome]
-    return f"<p class='verdict {_CLASSES[verdict.outcome]}'>{sentence}</p>"
-
-
-def _what_to_do(result: BuildResult) -> str:
-    """Return what to do about the verdict: each figure beyond its limit with its remedy, and frames to take again."""
-    verdict, found = result.verdict, findings(result.verdict, result.figures)
-    beyond = sorted((*verdict.refused, *verdict.remarks), key=lambda row: _ORDER.index(row.outcome))
-    if not beyond:
-        return "<h2>What to do</h2><p>Nothing: the table can be used. Look at the pictures once.</p>"
-    rows = "".join(
-        f"<li><b>{html.escape(row.threshold.title)}</b>, {html.escape(format_value(row.value, row.threshold.unit))} "
-        f"({html.escape(f'{row.threshold.sense} {format_value(row.threshold.accept, row.threshold.unit)}')} expected): "
-        f"{html.escape(_remedy(row, found.get(row.threshold.name)) or row.threshold.why)}</li>"
-        for row in beyond
-    )
-    use = "" if verdict.refused else "<p>The table can be used; know these when you use it, or mend them:</p>"
-    return f"<h2>What to do</h2>{use}<ul class='todo'>{rows}</ul>{_retaking(result)}"
-
-
-def _group(group: Group, result: BuildResult, pictures: Sequence[Picture], worsts: Sequence[Worst]) -> str:
+def _group(group: Group, rows: Sequence[_Row], table: TableMeasurements, pictures: Sequence[Picture]) -> dict[str, Any]:
     """Return a group of figures, folded unless something in it is beyond its limit."""
-    found = findings(result.verdict, result.figures)
-    judged = [row for row in result.verdict.rows if OF_THRESHOLDS[row.threshold.name] == group]
-    judged.sort(key=lambda row: _ORDER.index(row.outcome))
-    where = {worst.figure: worst.where for worst in worsts if worst.group == group}
-    rows = "".join(
-        _judged(row, _remedy(row, found.get(row.threshold.name)), where.get(row.threshold.name, "")) for row in judged
-    )
-    beyond = [row for row in judged if row.outcome != "accept"]
-    within = "all within their limits" if not beyond else f"{len(beyond)} beyond their limits"
-    table = (
-        "<table><tr class='head'><th></th><th>figure</th><th>measured</th><th>accepted</th><th>refused beyond</th>"
-        f"<th>what goes wrong beyond, and where the worst is</th></tr>{rows}</table>"
-        if judged
-        else ""
-    )
-    shown = "".join(picture_html(picture) for picture in pictures if picture.group == group)
-    return (
-        f"<details id='{group}'{' open' if beyond else ''}><summary>{group.capitalize()}<span class='note'>"
-        f"{counted(len(judged), 'figure')}, {within}</span></summary><p class='note'>{html.escape(QUESTIONS[group])}"
-        f"</p>{table}{_summary(result, group)}{shown}</details>"
-    )
+    own = [row for row in rows if row.judged.figure.group == group]
+    beyond = sum(row.judged.outcome != "accept" for row in own)
+    within = f"{beyond} beyond their limits" if beyond else "all within their limits"
+    return {
+        "name": group,
+        "question": QUESTIONS[group],
+        "beyond": beyond,
+        "summary": f"{counted(len(own), 'figure')}, {within}",
+        "rows": own,
+        "lines": summary(table, group),
+        "pictures": [picture for picture in pictures if picture.group == group],
+    }
 
 
-def _origin(origin: OriginRecord) -> str:
-    """Return with what, when and by whom the frames were taken."""
-    rows = "".join(
-        f"<tr><th>{html.escape(name)}</th><td>{html.escape(value)}</td></tr>" for name, value in origin_lines(origin)
-    )
-    return f"<details id='origin'><summary>Where the table comes from</summary><table>{rows}</table></details>"
-
-
-def _retaking(result: BuildResult) -> str:
-    """Return which frames are to be taken again and how; nothing where taking frames again does not help."""
+def _again(result: BuildResult) -> dict[str, Any] | None:
+    """Return which frames are to be taken again and how; None where taking frames again does not help."""
     records = retaken_frames(result.verdict, result.figures)
     if not records:
-        return ""
-    also = " What else is refused may follow from these; if not, take the session anew."
-    if is_mended_by_retaking(result.verdict, result.figures):
-        also = ""
-    names = html.escape(first_of([record.file for record in records]))
-    return f"<p>To be taken again ({counted(len(records), 'frame')}): {names}; <code>{COMMAND}</code>.{also}</p>"
+        return None
+    return {
+        "count": counted(len(records), "frame"),
+        "files": first_of([record.file for record in records]),
+        "command": COMMAND,
+        "mends": is_mended_by_retaking(result.verdict, result.figures),
+    }
 
 
 def _remedy(row: JudgedValue, found: ProbableCause | None) -> str:
     """Return what helps against what is beyond a limit; "" where nothing is."""
-    if row.outcome == "accept" or not row.threshold.remedy:
+    if row.outcome == "accept" or not row.figure.remedy:
         return ""
     if found is None:
-        return row.threshold.remedy
-    return found.decision.cause.remedy if found.is_known else f"it may help to {row.threshold.remedy}"
+        return row.figure.remedy
+    return found.decision.cause.remedy if found.is_known else f"it may help to {row.figure.remedy}"
 
 
-def _causes(result: BuildResult) -> str:
-    """Return what is beyond its limit with its probable cause, frames, place and command; nothing where nothing is."""
-    rows: list[str] = []
-    for name, found in findings(result.verdict, result.figures).items():
-        title = next(row.threshold.title for row in result.verdict.rows if row.threshold.name == name)
-        cause, rule = found.decision.cause, found.decision.rule
-        probably = (
-            "not known from what was measured" if rule is None else f"<b>{html.escape(cause.name)}</b>: {rule.why}"
-        )
-        again = f"<br><code>{retake_command(found.frames)}</code>" if found.is_of_frames else ""
-        known = ", ".join(f"{key} {value:.3g}" for key, value in found.evidence.known().items())
-        rows.append(
-            f"<tr><th>{html.escape(title)}</th><td>{probably}{again}</td><td>{html.escape(places_text(found))}</td>"
-            f"<td class='note'>{html.escape(known)}</td></tr>"
-        )
-    if not rows:
-        return ""
-    return (
-        "<h2>Probable causes</h2><table><tr class='head'><th>figure</th><th>cause</th><th>frames and place</th>"
-        f"<th>decided from</th></tr>{''.join(rows)}</table>"
-    )
+def _cause(found: ProbableCause) -> dict[str, Any]:
+    """Return a finding with its probable cause, frames, place and command."""
+    return {
+        "title": BY_NAME[found.figure].title,
+        "cause": found.decision.cause.name,
+        "rule": found.decision.rule,
+        "command": retake_command(found.frames) if found.is_of_frames else "",
+        "places": places_text(found),
+        "evidence": ", ".join(f"{key} {value:.3g}" for key, value in found.evidence.known().items()),
+    }
 
 
-def _judged(row: JudgedValue, helps: str, where: str) -> str:
-    limit, name = row.threshold, _CLASSES[row.outcome]
-    refuse = "" if limit.refuse is None else format_value(limit.refuse, limit.unit)
-    remedy = f". <b>{html.escape(helps)}</b>" if helps else ""
-    worst = f"<br>worst: {html.escape(where)}" if where else ""
-    return (
-        f"<tr><td class='{name}'>{name}</td><th>{html.escape(limit.title)}</th>"
-        f"<td class='number' data-name='measured'>{html.escape(format_value(row.value, limit.unit))}</td>"
-        f"<td class='number note' data-name='accepted'>{limit.sense} "
-        f"{html.escape(format_value(limit.accept, limit.unit))}</td>"
-        f"<td class='number note' data-name='refused beyond'>{html.escape(refuse)}</td>"
-        f"<td class='note' title='{html.escape(limit.source, quote=True)}'>{html.escape(limit.why)}{remedy}{worst}"
-        "</td></tr>"
-    )
-
-
-def _summary(result: BuildResult, group: Group) -> str:
-    rows = "".join(
-        f"<tr><th>{html.escape(row.name)}</th><td>{html.escape(row.value)}</td>"
-        f"<td class='note'>{html.escape(row.note)}</td></tr>"
-        for row in summary(result.figures)
-        if group_of_row(row.name) == group
-    )
-    return f"<h2>What was measured</h2><table>{rows}</table>" if rows else ""
+STYLE = "".join(
+    (resources.files("foundation") / "templates" / name).read_text() for name in ("colours.css", "style.css")
+)
+"""The style sheet of a page that is not made from a template."""
 
 
 def picture_html(picture: Picture) -> str:
     """Return a picture with its heading and caption as HTML; the file is part of the text."""
-    heading = html.escape(picture.heading)
-    return (
-        f"<figure class='picture'><h2>{heading}</h2><img alt='{heading}' "
-        f"src='data:image/png;base64,{base64.b64encode(picture.png).decode()}'>"
-        f"<figcaption>{html.escape(picture.caption)}</figcaption></figure>"
-    )
-
-
-def _unfit(cells: Sequence[Unfit]) -> str:
-    if not cells:
-        return "<h2>Cells unfit for use</h2><p>None.</p>"
-    listed = cells[:MOST_UNFIT]
-    rows = "".join(f"<tr><td>{cell.colour}</td><td>{html.escape(cell.cause)}</td></tr>" for cell in listed)
-    more = f"<p>and {len(cells) - MOST_UNFIT} more in lut.json</p>" if len(cells) > MOST_UNFIT else ""
-    return f"<h2>Cells unfit for use</h2><table><tr class='head'><th>colour</th><th>cause</th></tr>{rows}</table>{more}"
+    return f"<h2>{picture.heading}</h2>{figure(picture.png, picture.caption, picture.heading)}"

@@ -1,75 +1,46 @@
-"""The pictures of the report, each drawn on a Matplotlib figure of its own and returned as PNG.
+"""The pictures of the report, each drawn on a Matplotlib figure of its own (`foundation.plots.png_of`).
 
-Matplotlib is imported where a picture is made, and through its objects only: no window, no state left behind.
+First the registered chart, the lights, the course of the session; then where samples err and the sensor's noise; then
+what is beyond a limit: the frame with its places circled, and what the field leaves of references.
+
+A frame is drawn at half size, linear camera RGB: one pixel for each 2×2 block, nothing interpolated (the paper's
+"simple subsampling and debayering", section 3.3): red, the mean of both greens, blue, after the black level has been
+subtracted, each phase its own. An odd last row or column is dropped. Pixel (i, j) is the block whose top-left photosite
+is (2i, 2j).
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from io import BytesIO
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
+from calibration.causes.gathering import PrintPlace
 from calibration.checks.frame_consistency import has_enough_cells
-from calibration.figures.table_figures import TableFigures
+from calibration.measurements import FrameMeasurements, TableMeasurements
+from calibration.radiometry.photon_transfer import PhotonTransfer, noise_levels
 from calibration.registration.register import Registration
 from calibration.sampling import rim_difference, sample_noise, sites_at
+from drivers.raw.rawfile import Mosaic
 from experiment.chart.model import Chart
 from experiment.framing.movement import STILL_PX
+from experiment.framing.planes import CHANNELS, frame_black, phases
 from experiment.measures.flat_field import FlatField
 from experiment.measures.stains import Stains
+from foundation.plots import CHANNEL_INK, FAINT, INK, MARK
 from foundation.srgb import decode_srgb
-
-INK, FAINT, MARK = "#22262b", "#8a929c", "#e8502a"
-"""Colours of text and data, of axes, and of what is marked."""
 
 WORST_CELLS = 20
 """Cells that are shown magnified: two rows of ten."""
-
-CHANNEL_INK = ("#c8382e", "#2f8f46", "#2f62c8")
-"""Colours of lines of R, G and B."""
-_DPI = 110
-"""Pictures 10 inches wide fill the page's 1100 pixels."""
 
 _PAPER_PERCENTILE = 99.5
 """What is taken for paper white: brighter are highlights and hot photosites."""
 
 _GAMMA = 2.2
 """Exponent that stands for sRGB's curve where a picture is only looked at."""
-
-_Image = npt.NDArray[np.float32]
-_Array = npt.NDArray[np.float64]
 _Mask = npt.NDArray[np.bool_]
-
-
-def png_of(draw: Callable[..., None], *arguments: Any) -> bytes:
-    """Return the PNG of a figure that `draw(figure, *arguments)` fills, one of the functions below."""
-    import matplotlib
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    # Matplotlib's own types leave the keyword arguments of every method unknown.
-    style: Any = {
-        "font.size": 9,
-        "axes.edgecolor": FAINT,
-        "axes.labelcolor": INK,
-        "xtick.color": INK,
-        "ytick.color": INK,
-        "axes.spines.top": False,
-        "axes.spines.right": False,
-        "axes.titlesize": 10,
-    }
-    library: Any = matplotlib
-    with library.rc_context(style):
-        figure: Any = Figure(layout="constrained", dpi=_DPI)
-        FigureCanvasAgg(figure)
-        draw(figure, *arguments)
-        stream = BytesIO()
-        figure.savefig(stream, format="png")
-    return stream.getvalue()
 
 
 def viewable(picture: _Image) -> _Image:
@@ -297,7 +268,7 @@ def _ring(axes: Any, x: float, y: float, text: str) -> None:
     axes.annotate(text, (x, y), xytext=(8, 8), textcoords="offset points", color=MARK, fontsize=8)
 
 
-def _ring_largest(axes: Any, values: Any, figures: TableFigures, least: bool = False) -> None:
+def _ring_largest(axes: Any, values: Any, figures: TableMeasurements, least: bool = False) -> None:
     """Ring the frame of the largest value, or the least, unless all are alike; its name is that of its file."""
     seen = np.asarray(values, dtype=np.float64)
     if not len(seen) or np.ptp(seen) == 0:
@@ -306,7 +277,7 @@ def _ring_largest(axes: Any, values: Any, figures: TableFigures, least: bool = F
     _ring(axes, at, float(seen[at]), Path(figures.frames[at].record.file).stem)
 
 
-def draw_course(figure: Any, figures: TableFigures) -> None:
+def draw_course(figure: Any, figures: TableMeasurements) -> None:
     """Draw black, movement, blur, white, the cells' deviations and the references used, frame by frame.
 
     The worst frame of each is ringed and named.
@@ -353,7 +324,7 @@ def draw_course(figure: Any, figures: TableFigures) -> None:
     _draw_consistency(consistency, count, figures)
 
 
-def _draw_consistency(axes: Any, count: npt.NDArray[np.integer], figures: TableFigures) -> None:
+def _draw_consistency(axes: Any, count: npt.NDArray[np.integer], figures: TableMeasurements) -> None:
     axes.set(title="cells off their codes' colours", ylabel="%", xlabel="frame")
     if not has_enough_cells(len(figures.registration.mismatched_cells)):
         axes.text(0.5, 0.5, "too few colours to compare", ha="center", va="center", transform=axes.transAxes)
@@ -403,3 +374,209 @@ def draw_worst_cells(figure: Any, picture: _Image, chart: Chart, registration: R
         _magnified(axes, shown, places[cell], 0.95 * registration.cell_px, chart, registration, places, window)
         red, green, blue = chart.rgb[cell]
         axes.set_title(f"{red} {green} {blue}\n{score[index]:.1f} σ", fontsize=8)
+
+
+_LEAST_LEVEL = 1.0
+"""Counts from which on a level is drawn: the axes are logarithmic."""
+
+_SHOWN_PERCENTILE = 99.0
+"""Of the errors of places, where the scale ends: the outermost cells are known much worse than all others."""
+
+_Image = npt.NDArray[np.float32]
+_Array = npt.NDArray[np.float64]
+
+
+def draw_errors(figure: Any, figures: TableMeasurements, chart: Chart) -> None:
+    """Draw how far cells are off their codes' colours, and how well their places are known, over the print.
+
+    The worst cell of each is ringed. Where the first is not known, on small charts, it is left empty and says so.
+    """
+    page_w, page_h = chart.page_mm
+    figure.set_size_inches(10, 0.2 + 4.6 * page_h / page_w)
+    left, right = figure.subplots(1, 2)
+    side = 72 * 4.1 / page_w * float(np.mean(chart.cell_mm))
+    stains = figures.cells.stains
+    if stains.known:
+        off = 100 * stains.largest_deviation()
+        places = chart.centres_mm[chart.cell_of_colour]
+        limit = max(1.0, float(np.abs(off).max()))
+        image = left.scatter(
+            *places.T, c=off, s=max(side, 1.2) ** 2, marker="s", linewidths=0, cmap="RdBu", vmin=-limit, vmax=limit
+        )
+        figure.colorbar(image, ax=left, label="%, brighter is positive", shrink=0.8)
+        _mark(left, places[int(np.argmax(np.abs(off)))])
+    else:
+        left.text(0.5, 0.5, "too few colours to compare", ha="center", va="center", transform=left.transAxes)
+    error = figures.registration.uncertainty_px(chart.centres_mm)
+    image = right.scatter(
+        *chart.centres_mm.T, c=error, s=max(side, 1.2) ** 2, marker="s", linewidths=0, cmap="cividis", vmin=0,
+        vmax=max(float(np.percentile(error, _SHOWN_PERCENTILE)), 1e-3),
+    )  # fmt: skip
+    figure.colorbar(image, ax=right, label="half-size px", shrink=0.8, extend="max")
+    _mark(right, chart.centres_mm[int(np.argmax(error))])
+    left.set(title="colour of cells against their codes", ylabel="mm")
+    right.set(title="standard error of cells' places")
+    for axes in (left, right):
+        axes.set(xlabel="mm", xlim=(0, page_w), ylim=(page_h, 0), aspect="equal", facecolor="#f2f3f5")
+
+
+def _mark(axes: Any, place_mm: _Array) -> None:
+    """Ring a place on the print."""
+    axes.plot(*place_mm, "o", markersize=13, markerfacecolor="none", markeredgecolor="white", markeredgewidth=2.6)
+    axes.plot(*place_mm, "o", markersize=13, markerfacecolor="none", markeredgecolor=MARK, markeredgewidth=1.4)
+
+
+def cell_noise(picture: _Image, chart: Chart, registration: Registration, window: int) -> tuple[_Array, _Array]:
+    """Return mean and variance of the samples of each cell that is in the frame, both (N, 3) float64.
+
+    `picture`: (H, W, 3) float32 counts above black, the frame at half size.
+    """
+    height, width = picture.shape[:2]
+    sites = sites_at(registration.to_pixels(chart.centres_mm), (height, width), window)
+    offsets = np.arange(window) - window // 2
+    at = np.flatnonzero(sites.inside)
+    samples = picture[sites.rows[at, None, None] + offsets[:, None], sites.columns[at, None, None] + offsets]
+    flat = samples.reshape(len(at), window**2, 3).astype(np.float64)
+    return flat.mean(axis=1), flat.var(axis=1, ddof=1)
+
+
+def draw_noise(figure: Any, noise: tuple[_Array, _Array], transfer: PhotonTransfer, samples: int) -> None:
+    """Draw the photon-transfer curve: the variance of one sample over its level, measured and fitted.
+
+    `noise`: mean and variance of each cell, both (N, 3) float64, as `cell_noise` returns them.
+    """
+    from matplotlib.ticker import LogLocator, StrMethodFormatter
+
+    figure.set_size_inches(10, 3.9)
+    left, right = figure.subplots(1, 2)
+    level, variance = noise
+    for channel in range(3):
+        at, seen = noise_levels(level[:, channel], variance[:, channel], samples)
+        lit = (at > _LEAST_LEVEL) & (seen > 0)
+        if not lit.any():
+            continue
+        low, high = float(at[lit].min()), float(at[lit].max())
+        grid = low * (high / low) ** np.linspace(0, 1, 120)
+        model = transfer.variance(np.repeat(grid[:, None], 3, axis=1))[:, channel]
+        gain = transfer.gain_e[channel]
+        name = f"{'RGB'[channel]}: {gain:.2f} e⁻ a count, read {transfer.read_noise[channel]:.1f} counts"
+        left.loglog(at[lit], seen[lit], ".", color=CHANNEL_INK[channel], markersize=4)
+        left.loglog(grid, model, "-", color=CHANNEL_INK[channel], linewidth=0.9, label=name)
+        right.semilogx(at[lit], at[lit] / np.sqrt(seen[lit]), ".", color=CHANNEL_INK[channel], markersize=4)
+        right.semilogx(grid, grid / np.sqrt(model), "-", color=CHANNEL_INK[channel], linewidth=0.9)
+    left.set(title="variance of one sample", xlabel="counts above black", ylabel="counts²")
+    right.set(title="signal to noise of one sample", xlabel="counts above black")
+    left.legend(frameon=False, fontsize=8, labelcolor=INK)
+    for axes in (left, right):
+        axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+        axes.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
+        axes.minorticks_off()
+        axes.grid(color=FAINT, alpha=0.25, linewidth=0.5)
+
+
+_LEAST_CIRCLE = 0.012
+"""Radius of a circle at least, as a share of the page's width: one about a single cell is not seen in a thumbnail."""
+
+_WINDOW = 2
+"""Pixels about a reference's middle, to each side, that are averaged for the picture: those of the table's samples."""
+
+LabelledPlace = tuple[str, PrintPlace]
+"""What is said of a place, in few words, and the place."""
+
+
+def draw_places(figure: Any, picture: _Image, chart: Chart, registration: Registration, places: Any) -> None:
+    """Draw a frame with places circled and numbered as their list below the picture.
+
+    `picture`: (H, W, 3) float32 counts, the frame at half size.
+    """
+    height, width = picture.shape[:2]
+    numbers = {label: number for number, label in enumerate(dict.fromkeys(label for label, _ in places), 1)}
+    legend = 0.22 * len(numbers) + 0.1
+    figure.set_size_inches(10, 10 * height / width + legend)
+    axes, below = figure.subplots(2, 1, height_ratios=(10 * height / width, legend))
+    step = max(1, width // 1200)
+    axes.imshow(
+        viewable(picture)[::step, ::step],
+        extent=(-0.5, width - 0.5, height - 0.5, -0.5),
+        interpolation="antialiased",
+    )
+    turn = np.linspace(0, 2 * np.pi, 90)
+    unit = np.column_stack([np.cos(turn), np.sin(turn)])
+    # Figures that see the same thing share its circle.
+    shared: dict[tuple[float, float, float], list[int]] = {}
+    for label, place in places:
+        shared.setdefault((place.x_mm, place.y_mm, place.size_mm), []).append(numbers[label])
+    named: set[tuple[int, ...]] = set()
+    for (x_mm, y_mm, size_mm), here in shared.items():
+        radius = max(size_mm / 2 * 1.15, _LEAST_CIRCLE * chart.page_mm[0])
+        ring = registration.to_pixels(np.array([x_mm, y_mm]) + radius * unit)
+        # A white line below keeps the circle visible on every colour.
+        axes.plot(ring[:, 0], ring[:, 1], color="white", linewidth=3.4, alpha=0.9)
+        axes.plot(ring[:, 0], ring[:, 1], color=MARK, linewidth=1.8)
+        if tuple(here) not in named:
+            named.add(tuple(here))
+            x, y = ring[np.argmin(ring[:, 0] + ring[:, 1])]
+            box = {"facecolor": MARK, "edgecolor": "white", "boxstyle": "round,pad=0.25"}
+            axes.text(x, y, ", ".join(map(str, here)), color="white", weight="bold", ha="right", va="bottom", bbox=box)
+    axes.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5), xticks=[], yticks=[])
+    below.axis("off")
+    for row, (label, number) in enumerate(numbers.items()):
+        below.text(0.01, 1 - (row + 0.5) / len(numbers), f"{number}   {label}", va="center", transform=below.transAxes)
+
+
+def reference_residuals(
+    picture: _Image, places_mm: _Array, registration: Registration, frame: FrameMeasurements
+) -> _Array:
+    """Return how far references are from a frame's field, (N,) shares, in its strongest channel; NaN beyond the frame.
+
+    `picture`: (H, W, 3) float32 counts above black, the frame at half size. `places_mm`: (N, 2) float64 mm, the white
+    references.
+    """
+    height, width = picture.shape[:2]
+    columns, rows = np.rint(registration.to_pixels(places_mm)).astype(np.int64).T
+    channel = int(np.argmax(frame.paper.white))
+    inside = (columns >= _WINDOW) & (columns < width - _WINDOW) & (rows >= _WINDOW) & (rows < height - _WINDOW)
+    offsets = np.arange(-_WINDOW, _WINDOW + 1)
+    seen = np.full(len(places_mm), np.nan)
+    parts = picture[rows[inside, None, None] + offsets[:, None], columns[inside, None, None] + offsets, channel]
+    seen[inside] = parts.mean(axis=(1, 2), dtype=np.float64)
+    return seen / (frame.paper.field.at(places_mm)[:, channel] * frame.paper.white[channel]) - 1
+
+
+def draw_reference_residuals(figure: Any, chart: Chart, places_mm: _Array, residual: _Array) -> None:
+    """Draw what the field leaves of the white references, over the page and against the distance from its middle.
+
+    `places_mm`: (N, 2) float64 mm. `residual`: (N,) shares, as `reference_residuals` returned them.
+    """
+    page_w, page_h = chart.page_mm
+    figure.set_size_inches(10, 3.6)
+    left, right = figure.subplots(1, 2)
+    percent = 100 * residual
+    limit = max(1.0, float(np.nanpercentile(np.abs(percent), 99)))
+    dots = left.scatter(
+        *places_mm.T, c=percent, s=14, cmap="RdBu", vmin=-limit, vmax=limit, edgecolors=FAINT, linewidths=0.3
+    )
+    left.set(xlabel="mm", ylabel="mm", xlim=(0, page_w), ylim=(page_h, 0), aspect="equal", facecolor="#f2f3f5")
+    figure.colorbar(dots, ax=left, label="%, brighter is positive", shrink=0.8, extend="both")
+    away = np.linalg.norm(places_mm - np.array([page_w, page_h]) / 2, axis=1)
+    right.axhline(0, color=FAINT, linewidth=0.8)
+    right.plot(away, percent, ".", color=INK, markersize=3)
+    right.set(xlabel="mm from the page's middle", ylabel="%")
+    reach = max(1.0, 1.1 * float(np.nanmax(np.abs(percent))))
+    right.set_ylim(-reach, reach)
+
+
+def half_size(mosaic: Mosaic, black: npt.NDArray[np.float64] | None = None) -> npt.NDArray[np.float32]:
+    """Return a frame as linear RGB.
+
+    `black`: (2, 2) float64 counts of each position of the block; the masked border's mean if not given, or where there
+    is none, what the metadata state. Returns (H // 2, W // 2, 3) float32, counts above black; noise makes some of a
+    dark frame's negative.
+    """
+    black = frame_black(mosaic) if black is None else black
+    blocks = mosaic.block_planes()
+    image = np.empty((*blocks.shape[2:], 3), dtype=np.float32)
+    for column, channel in enumerate(CHANNELS):
+        places = phases(mosaic)[channel]
+        image[..., column] = sum(blocks[place] - np.float32(black[place]) for place in places) / np.float32(len(places))
+    return image

@@ -1,51 +1,216 @@
 """The table's report: one page that shows by eye what the figures claim, and the same figures for programs.
 
-`report.json` holds figures, limits and verdict; `report.html` opens with the verdict, what to do, and the pictures that
-are looked at first: the registered grid over the frame, the lights as planned and as the camera saw them (the paper's
-three figures of chromaticities), where cells err, and the noise. All figures follow in groups, each with its pictures.
+`report.json`, whose form is stated in docs/formats.md, holds figures, limits and verdict; `report.html` opens with the
+verdict, what to do, and the pictures that are looked at first: the registered grid over the frame, the lights as
+planned and as the camera saw them (the paper's three figures of chromaticities), where cells err, and the noise. All
+figures follow in groups, each with its pictures, by the names that figures give of them (`Figure.drawing`).
 """
 
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping
+from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from calibration.figures.table_figures import TableFigures
-from calibration.report.first_plots import cell_noise, draw_errors, draw_noise
-from calibration.report.half_size import half_size
+from calibration.checks.light_codes import CodeAgreement
+from calibration.figures.all_figures import BY_NAME, FIGURES
+from calibration.figures.figure import Worst
+from calibration.figures.truth import TRUTH_WORST_DEG
+from calibration.measurements import TableMeasurements
 from calibration.report.page import Picture, page
-from calibration.report.places import (
-    LabelledPlace,
-    draw_places,
-    draw_reference_residuals,
-    reference_residuals,
-)
 from calibration.report.plots import (
     WORST_CELLS,
+    LabelledPlace,
+    cell_noise,
     draw_chromaticities,
     draw_course,
+    draw_errors,
     draw_field,
+    draw_noise,
+    draw_places,
     draw_print,
+    draw_reference_residuals,
     draw_registration,
     draw_residuals,
     draw_worst_cells,
-    png_of,
+    half_size,
+    reference_residuals,
 )
-from calibration.report.report_json import report_json
-from calibration.report.worsts import Worst, worst_of
-from calibration.table.lut import REPORT_JSON, REPORT_PAGE
-from calibration.verdict.result import BuildResult
-from calibration.verdict.retaking import findings
+from calibration.sampling import largest_window
+from calibration.table.lut import REPORT_FORMAT, REPORT_JSON, REPORT_PAGE, REPORT_VERSION
+from calibration.verdict import BuildResult, findings, judged_values, retake_command, retake_json, retaken_frames
 from drivers.raw.rawfile import read_raw
 from experiment.chart.model import Chart
-from experiment.measures.flat_field import FlatField
 from experiment.measures.stains import Stains
 from experiment.session.folder import Session
 from foundation.files import write_whole
+from foundation.plots import png_of
+
+PLACES = (7, 5)
+"""Points across and down the page whose places are told: enough to see how it hung, and how it bent, roughly."""
+
+_Array = npt.NDArray[np.float64]
+
+
+def report_json(result: BuildResult) -> dict[str, Any]:
+    """Return the content of `report.json`: verdict, figures, and every limit with its reason."""
+    figures, verdict = result.figures, result.verdict
+    off_codes_deg, primaries = figures.lights.off_codes_deg, figures.primaries
+    return {
+        "format": REPORT_FORMAT,
+        "version": REPORT_VERSION,
+        "verdict": verdict.outcome,
+        "session": figures.session.folder.name,
+        "camera": figures.session.camera,
+        "lights": figures.session.lights,
+        "channels": _channels(figures),
+        "chart_places": _chart_places(figures),
+        "geometry": _geometry(figures),
+        "lens": figures.lens.to_json() | ({} if figures.point_spread is None else figures.point_spread.to_json()),
+        "off_codes_deg": None if off_codes_deg is None else _short(off_codes_deg),
+        "codes": None if figures.lights.codes is None else _codes(figures.lights.codes),
+        "origin": figures.origin.model_dump(mode="json"),
+        "origins": _origins(figures),
+        "primaries_differ": None if primaries is None else float(f"{primaries.difference:.3g}"),
+        "figures": {name: _rounded(value) for name, value in judged_values(figures).items()},
+        "causes": _causes(result),
+        **retake_json(
+            retaken_frames(verdict, figures), figures.registered_frame.record.sha256, _newest_sha256(figures)
+        ),
+        "limits": [row.figure.limit_json() | {"outcome": row.outcome} for row in verdict.rows],
+    }
+
+
+def _causes(result: BuildResult) -> list[dict[str, Any]]:
+    """Return what each figure beyond its limit is probably caused by, and what that was decided from."""
+    return [
+        {
+            "figure": name,
+            "cause": found.decision.cause.name,
+            "follows": found.decision.follows,
+            "why": "" if found.decision.rule is None else found.decision.rule.why,
+            "remedy": found.decision.cause.remedy,
+            "mends": found.decision.cause.mends,
+            "command": retake_command(found.frames) if found.is_of_frames else "",
+            "files": [frame.file for frame in found.frames],
+            "places": [
+                {
+                    "file": place.file,
+                    "x_mm": _rounded(place.x_mm),
+                    "y_mm": _rounded(place.y_mm),
+                    "size_mm": _rounded(place.size_mm),
+                }
+                for place in found.places
+            ],
+            "evidence": {known: _rounded(value) for known, value in found.evidence.known().items()},
+        }
+        for name, found in findings(result.verdict, result.figures).items()
+    ]
+
+
+def _newest_sha256(figures: TableMeasurements) -> str:
+    """Return the hash of the measured frame that was taken last."""
+    return max((frame.record for frame in figures.frames), key=lambda record: record.attempt).sha256
+
+
+def _chart_places(figures: TableMeasurements) -> dict[str, Any]:
+    """Return where points of the page lie in the frame that was registered first, half-size px.
+
+    Of two tables of one chart these tell how it hung elsewhere.
+    """
+    registration = figures.registration
+    width, height = registration.colours.page_mm
+    across, down = PLACES
+    points = [(x, y) for y in np.linspace(0.05, 0.95, down) * height for x in np.linspace(0.05, 0.95, across) * width]
+    return {
+        "frame": figures.session.registered_file,
+        "mm": np.round(points, 3).tolist(),
+        "px": np.round(registration.to_pixels(points), 3).tolist(),
+    }
+
+
+def _geometry(figures: TableMeasurements) -> dict[str, Any]:
+    """Return how well cells' places are known, and where red and blue lie against green, half-size px."""
+    registration = figures.registration
+    inner, outer = registration.places_known_px
+    lateral = registration.lateral
+    return {
+        "uncertainty_px": _rounded(inner),
+        "rim_uncertainty_px": _rounded(outer),
+        "lateral_corner_px": {channel: _rounded(lateral.corner_px(channel)) for channel in ("R", "B")},
+        "lateral_error_px": {channel: _rounded(lateral.corner_error_px(channel)) for channel in ("R", "B")},
+    }
+
+
+def _codes(codes: CodeAgreement) -> dict[str, Any]:
+    """Return how the lights agree with their codes, light by light."""
+    return {
+        "angle_deg": _short(codes.angle_deg),
+        "error_deg": _short(codes.error_deg),
+        "brightness": _short(codes.brightness),
+        "off_brightness": _short(codes.off_brightness),
+        "seen_as": {str(light): int(codes.seen_as[light]) for light in np.flatnonzero(codes.seen_as >= 0).tolist()},
+        "exchanges": [asdict(pair) for pair in codes.exchanges],
+        "held": int(codes.held.sum()),
+        "exchange_deg": _rounded(codes.exchange_deg),
+        "misfit": _rounded(codes.misfit),
+    }
+
+
+def _origins(figures: TableMeasurements) -> dict[str, Any]:
+    """Return which frames' files state another camera, lens or exposure than most."""
+    origins = figures.origins
+    named = {
+        "other_camera": origins.other_camera,
+        "other_lens": origins.other_lens,
+        "other_exposure": origins.other_exposure,
+    }
+    return {
+        name: [{"file": frame.record.file, "found": frame.found, "expected": frame.expected} for frame in frames]
+        for name, frames in named.items()
+    }
+
+
+def _short(values: _Array) -> list[float]:
+    return [float(f"{value:.3g}") for value in values.tolist()]
+
+
+def _channels(figures: TableMeasurements) -> dict[str, Any]:
+    """Return what is known for each channel; what could not be measured is null."""
+    transfer, dark, lights = figures.sensor.transfer, figures.dark_frames, figures.lights
+    linearity, registration = figures.sensor.linearity, figures.registration
+    return {
+        "window": figures.cells.window,
+        "largest_window": largest_window(registration.cell_px, registration.blur_px),
+        "linearity": None if linearity is None else linearity.to_json(),
+        "dark_frames": len(dark.files),
+        "dark_subtracted": lights.subtracted is not None,
+        "dark_counts": _numbers(dark.light),
+        "dark_error": _numbers(dark.error),
+        "dark_noise": _numbers(dark.noise),
+        "additivity": None if lights.additivity is None else _numbers(lights.additivity),
+        "stray": None if lights.stray is None else lights.stray.to_json(),
+        "gain_e_per_count": _numbers(transfer.gain_e),
+        "read_noise_counts": _numbers(transfer.read_noise),
+        "response_spread": _numbers(transfer.response),
+        "noisy_colours": np.flatnonzero(transfer.noisy).tolist(),
+        "grey_tint_deg": dict(zip(figures.greys.names, _numbers(figures.greys.tints_deg(lights.white)), strict=True)),
+    }
+
+
+def _numbers(values: _Array) -> list[float | None]:
+    """Return values (N,) with six significant digits; None for what is not finite, which JSON cannot hold."""
+    return [_rounded(value) if np.isfinite(value) else None for value in values.tolist()]
+
+
+def _rounded(value: float) -> float:
+    return float(f"{value:.6g}")
+
 
 MOST_FRAMES = 4
 """Frames that are drawn with their places: each is read again, and more are looked at by nobody."""
@@ -53,13 +218,23 @@ MOST_FRAMES = 4
 
 def write_report(result: BuildResult, session: Session, folder: Path) -> None:
     """Write `report.html` and `report.json` into a table's folder; costs some seconds."""
-    worsts = worst_of(result.figures, session.chart)
+    worsts = worst_of_figures(result.figures, session.chart)
     pictures = _pictures(result, session, worsts)
     write_whole(folder / REPORT_PAGE, page(result, pictures, _place_pictures(result, session), worsts))
     write_whole(folder / REPORT_JSON, json.dumps(report_json(result), indent=2) + "\n")
 
 
-def _pictures(result: BuildResult, session: Session, worsts: Sequence[Worst]) -> list[Picture]:
+def worst_of_figures(table: TableMeasurements, chart: Chart) -> dict[str, Worst]:
+    """Return where the worst of each figure is that has one, by name.
+
+    A number that says "worst" is of little use to whoever cannot look at it. Places are drawn on the frame that was
+    registered, frames are ringed in the course of the session, lights among the lights.
+    """
+    found = ((figure.name, figure.worst(table, chart)) for figure in FIGURES if figure.worst is not None)
+    return {name: worst for name, worst in found if worst is not None}
+
+
+def _pictures(result: BuildResult, session: Session, worsts: Mapping[str, Worst]) -> list[Picture]:
     """Return the pictures: first chart, lights, errors and noise, then those of the groups."""
     figures = result.figures
     chart, registration = session.chart, figures.registration
@@ -72,14 +247,16 @@ def _pictures(result: BuildResult, session: Session, worsts: Sequence[Worst]) ->
             "waviness. Right: the residual of each block of cells, magnified; short arrows without order are noise.",
             png_of(draw_residuals, chart, registration),
             "geometry",
+            "residuals",
         ),
         *_worst_pictures(chart, figures, frame, worsts),
         Picture(
             "The light on the print",
             "Shape of the light under the frame that was registered, from its white references; it is divided out of "
             f"samples and ground truth. Contours are 2 % apart. {_primaries_caption(figures)}",
-            png_of(draw_field, chart, _registered_field(figures)),
+            png_of(draw_field, chart, figures.registered_frame.paper.field),
             "light",
+            "field",
         ),
         *_print_picture(chart, figures.cells.stains),
         Picture(
@@ -89,6 +266,7 @@ def _pictures(result: BuildResult, session: Session, worsts: Sequence[Worst]) ->
             "off where the focus is lost, a block of them where a hand or a shadow lies on the print.",
             png_of(draw_course, figures),
             "radiometry",
+            "course",
         ),
         Picture(
             "The worst cells",
@@ -96,13 +274,14 @@ def _pictures(result: BuildResult, session: Session, worsts: Sequence[Worst]) ->
             "between its neighbours; the frame is the samples.",
             png_of(draw_worst_cells, frame, chart, registration, figures.cells.window),
             "noise",
+            "cells",
         ),
         *_residual_picture(chart, figures, frame),
     ]
 
 
 def _first_pictures(
-    result: BuildResult, session: Session, frame: npt.NDArray[np.float32], worsts: Sequence[Worst]
+    result: BuildResult, session: Session, frame: npt.NDArray[np.float32], worsts: Mapping[str, Worst]
 ) -> list[Picture]:
     """Return what a scientist looks at first: chart, lights, errors, noise."""
     figures, chart = result.figures, session.chart
@@ -110,7 +289,7 @@ def _first_pictures(
     codes = np.array([light.codes for light in session.illuminations])
     black_body = np.array([light.kind == "blackbody" for light in session.illuminations], dtype=np.bool_)
     seen = f"seen by the {figures.session.camera}"
-    truth = next((worst.light for worst in worsts if worst.figure == "truth_worst_deg"), None)
+    truth = worsts[TRUTH_WORST_DEG.name].light if TRUTH_WORST_DEG.name in worsts else None
     ringed = "" if truth is None else f" Ringed is light {truth}, whose ground truth is known worst."
     return [
         Picture(
@@ -118,33 +297,41 @@ def _first_pictures(
             f"{figures.session.registered_file}, contrast stretched, with the tags as found; below, magnified: the "
             f"outline of every cell and the pixels of its {window**2} samples, in the corners and in the middle.",
             png_of(draw_registration, frame, chart, registration, window),
+            name="chart",
         ),
         Picture(
             "The lights",
             "rb-chromaticities of the lights as projected, as the camera sees them on bare paper (the ground truth), "
             f"and the latter in their colours. Rings are black bodies.{ringed}",
             png_of(draw_chromaticities, codes, black_body, figures.lights.white, seen, truth),
+            name="lights",
         ),
         Picture(
             "Where cells err",
             "Left: how far cells and their neighbours are off their codes' colours elsewhere on the sheet. Right: how "
             "well the place of each cell is known. The worst cell of each is ringed.",
             png_of(draw_errors, figures, chart),
+            name="errors",
         ),
         Picture(
             "The noise",
             "Left: variance of one sample over its level, medians of cells of like levels and the fitted curve (read "
             "noise, photons, unequal photosites). Right: what that makes of signal over noise.",
             png_of(draw_noise, cell_noise(frame, chart, registration, window), figures.sensor.transfer, window**2),
+            name="noise",
         ),
     ]
 
 
 def _worst_pictures(
-    chart: Chart, figures: TableFigures, frame: npt.NDArray[np.float32], worsts: Sequence[Worst]
+    chart: Chart, figures: TableMeasurements, frame: npt.NDArray[np.float32], worsts: Mapping[str, Worst]
 ) -> list[Picture]:
     """Return the picture of the places where figures are worst."""
-    places = [(worst.label, worst.place) for worst in worsts if worst.place is not None]
+    places = [
+        (f"{BY_NAME[name].title}: {worst.what}", worst.place)
+        for name, worst in worsts.items()
+        if worst.place is not None
+    ]
     if not places:
         return []
     caption = (
@@ -152,17 +339,16 @@ def _worst_pictures(
         "beyond a limit. Worst frames are ringed in the course of the session, the worst light among the lights."
     )
     drawn = png_of(draw_places, frame, chart, figures.registration, places)
-    return [Picture("Where the worst is", caption, drawn, "geometry")]
+    return [Picture("Where the worst is", caption, drawn, "geometry", "worst")]
 
 
 def _place_pictures(result: BuildResult, session: Session) -> list[Picture]:
     """Return a picture of each frame in which something is beyond its limit at a place, which is circled."""
     by_file: dict[str, list[LabelledPlace]] = {}
-    titles = {row.threshold.name: row.threshold.title for row in result.verdict.rows}
     for name, found in findings(result.verdict, result.figures).items():
         cause = found.decision.cause.name if found.is_known else "cause not known"
         for place in found.places:
-            by_file.setdefault(place.file, []).append((f"{titles[name]}: {cause}", place))
+            by_file.setdefault(place.file, []).append((f"{BY_NAME[name].title}: {cause}", place))
     pictures: list[Picture] = []
     for file, places in list(by_file.items())[:MOST_FRAMES]:
         picture = half_size(read_raw(session.folder / file))
@@ -175,7 +361,7 @@ def _place_pictures(result: BuildResult, session: Session) -> list[Picture]:
     return pictures
 
 
-def _residual_picture(chart: Chart, figures: TableFigures, picture: npt.NDArray[np.float32]) -> list[Picture]:
+def _residual_picture(chart: Chart, figures: TableMeasurements, picture: npt.NDArray[np.float32]) -> list[Picture]:
     """Return the picture of what the field leaves of the references, none where there are none."""
     places_mm = np.array([reference.centre_mm for reference in chart.white_references], dtype=np.float64).reshape(-1, 2)
     residual = reference_residuals(picture, places_mm, figures.registration, figures.registered_frame)
@@ -187,17 +373,17 @@ def _residual_picture(chart: Chart, figures: TableFigures, picture: npt.NDArray[
         "fall-off that the field does not follow."
     )
     return [
-        Picture("What the field leaves", caption, png_of(draw_reference_residuals, chart, places_mm, residual), "truth")
+        Picture(
+            "What the field leaves",
+            caption,
+            png_of(draw_reference_residuals, chart, places_mm, residual),
+            "truth",
+            "rest",
+        )
     ]
 
 
-def _registered_field(figures: TableFigures) -> FlatField:
-    """Return the flat field of the frame that was registered first."""
-    named = [frame for frame in figures.frames if frame.record.file == figures.session.registered_file]
-    return (named or figures.frames)[0].paper.field
-
-
-def _primaries_caption(figures: TableFigures) -> str:
+def _primaries_caption(figures: TableMeasurements) -> str:
     if figures.primaries is None:
         return "No frames of red, green and blue alone show whether these light the print alike."
     return (
@@ -215,4 +401,4 @@ def _print_picture(chart: Chart, stains: Stains) -> list[Picture]:
         "that deviates most. Noise is a fine grain of some tenths of a per cent; stains, folds and shadows have a "
         "shape. Crosses are cells listed for it."
     )
-    return [Picture("The print", caption, png_of(draw_print, chart, stains), "radiometry")]
+    return [Picture("The print", caption, png_of(draw_print, chart, stains), "radiometry", "print")]

@@ -118,6 +118,11 @@ class Unfit(BaseModel):
     colour: int = Field(ge=0)
     cause: str
 
+    @property
+    def kind(self) -> str:
+        """The cause in a word, without its numbers."""
+        return self.cause.split(":")[0]
+
 
 class Provenance(BaseModel):
     """The content of `lut.json`.

@@ -7,6 +7,8 @@ import io
 from collections.abc import Sequence
 from pathlib import Path
 
+from markupsafe import Markup
+
 from evaluation.experiments.bootstrap import STATISTICS
 from evaluation.experiments.comparing import (
     Comparison,
@@ -15,10 +17,11 @@ from evaluation.experiments.comparing import (
     verdict,
 )
 from evaluation.reports.latex import tables_to_latex
-from evaluation.reports.page import Part, figure_part, heading, page, paragraph, row_part, table_part
+from evaluation.reports.page import table_part
 from evaluation.reports.scatter import FLOOR_DEG, error_scatter
 from evaluation.results.summary_tables import PAPER_COLUMNS
 from evaluation.results.tables import Table, table_to_csv
+from foundation import pages
 from foundation.errors import counted
 from foundation.files import whole_folder
 
@@ -91,8 +94,8 @@ def images_table(comparison: Comparison, count: int = 10) -> Table:
 
 def comparison_page(comparisons: Sequence[Comparison], notes: Sequence[str], level: float) -> str:
     """Return the HTML page of comparisons."""
-    parts: list[Part] = [*(paragraph(note) for note in notes)]
-    parts += [paragraph(verdict(made, level)) for made in comparisons]
+    parts: list[Markup] = [*(pages.paragraph(note) for note in notes)]
+    parts += [pages.paragraph(verdict(made, level)) for made in comparisons]
     parts.append(table_part(tests_table(comparisons)))
     for made in comparisons:
         matched = made.matched
@@ -103,11 +106,11 @@ def comparison_page(comparisons: Sequence[Comparison], notes: Sequence[str], lev
             f"with the largest differences are named. Errors below {FLOOR_DEG:g} degrees are drawn there."
         )
         parts += [
-            heading(f"{matched.names[0]} against {matched.names[1]}"),
+            pages.heading(f"{matched.names[0]} against {matched.names[1]}"),
             table_part(statistics_table(made, level)),
-            row_part([figure_part(picture, caption), table_part(images_table(made))]),
+            pages.row([pages.figure(picture, caption), table_part(images_table(made))]),
         ]
-    return page(_title(comparisons), parts)
+    return pages.page(_title(comparisons), parts)
 
 
 def write_comparisons(folder: Path, comparisons: Sequence[Comparison], notes: Sequence[str], level: float) -> None:

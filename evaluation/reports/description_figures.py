@@ -8,7 +8,7 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
-from evaluation.reports.style import FAINT, GRID, SERIES, legend_label, svg_of
+from foundation.plots import FAINT, GRID, SERIES, legend_label, svg_of
 
 _FAINTEST: Final = 0.4
 """Power of a share of cells at which it is drawn: rare colours stay visible beside frequent greys."""

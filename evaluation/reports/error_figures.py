@@ -10,8 +10,8 @@ import numpy as np
 import numpy.typing as npt
 
 from evaluation.metrics import ErrorKind, percentiles
-from evaluation.reports.style import FAINT, legend_label, series_style, svg_of
 from evaluation.results.result import Result
+from foundation.plots import FAINT, legend_label, series_style, svg_of
 
 _SHOWN_PERCENTILE = 98
 """Percentile of all methods' errors at which the axis of errors ends: a few wild ones would squeeze the others."""

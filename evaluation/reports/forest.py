@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
-from evaluation.reports.style import FAINT, INK, series_style, svg_of
+from foundation.plots import FAINT, INK, series_style, svg_of
 
 _LINE_INCHES: Final = 0.24
 """Height of a line: a label of 9 points and some air."""

@@ -7,23 +7,16 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
+from markupsafe import Markup
 
 from evaluation.metrics import ErrorKind
 from evaluation.reports.error_figures import error_curves, error_planes
-from evaluation.reports.page import (
-    Part,
-    details_part,
-    figure_part,
-    heading,
-    page,
-    paragraph,
-    row_part,
-    table_part,
-)
+from evaluation.reports.page import table_part
 from evaluation.results.result import Result
 from evaluation.results.run import Run
 from evaluation.results.summary_tables import lights_tables, summary_table
 from evaluation.results.tables import Table
+from foundation import pages
 from foundation.errors import counted
 
 WORST, MIDDLE = 3, 2
@@ -63,25 +56,25 @@ def run_page(run: Run, kind: ErrorKind, pictures: Mapping[tuple[int, int], bytes
     # What is said of images without a light holds for both tables.
     tables[1] = Table(tables[1].title, tables[1].columns, tables[1].rows)
     parts = [
-        paragraph(f"{counted(len(run.subject.images), 'image')}, read from {run.place} (layout {run.layout})."),
-        *map(paragraph, run.notes),
+        pages.paragraph(f"{counted(len(run.subject.images), 'image')}, read from {run.place} (layout {run.layout})."),
+        *map(pages.paragraph, run.notes),
         *map(table_part, tables),
         *map(table_part, lights_tables(run.subject, run.results, kind)),
-        Part(f"<p class='note'>{_DEFINITIONS}</p>\n"),
-        heading("What was done to the images"),
+        pages.note(_DEFINITIONS),
+        pages.heading("What was done to the images"),
         table_part(_treatment(run)),
-        heading("Cumulative error curves"),
-        figure_part(error_curves(run.results, kind), _curves_caption(run.results, kind), "Cumulative error curves"),
-        heading("Errors over the chromaticity plane"),
-        figure_part(
+        pages.heading("Cumulative error curves"),
+        pages.figure(error_curves(run.results, kind), _curves_caption(run.results, kind), "Cumulative error curves"),
+        pages.heading("Errors over the chromaticity plane"),
+        pages.figure(
             error_planes(run.results, run.truths, kind), _planes_caption(run.results), "Errors over chromaticities"
         ),
         *_images(run, kind, pictures),
-        heading("Methods"),
+        pages.heading("Methods"),
         table_part(_methods(run)),
-        Part(f"<p class='note'>Data set {run.data_sha256[:16]}…, {run.software}</p>\n"),
+        pages.note(f"Data set {run.data_sha256[:16]}…, {run.software}"),
     ]
-    return page(f"{run.subject.name}: {len(run.results)} method{'s' * (len(run.results) > 1)}", parts)
+    return pages.page(f"{run.subject.name}: {len(run.results)} method{'s' * (len(run.results) > 1)}", parts)
 
 
 def _treatment(run: Run) -> Table:
@@ -105,12 +98,12 @@ def _left_out(results: Sequence[Result]) -> str:
     return f" Shown are the first {MOST_SHOWN} of {len(results)} methods, without {', '.join(names)}." if names else ""
 
 
-def _images(run: Run, kind: ErrorKind, pictures: Mapping[tuple[int, int], bytes]) -> list[Part]:
+def _images(run: Run, kind: ErrorKind, pictures: Mapping[tuple[int, int], bytes]) -> list[Markup]:
     if not pictures:
         return []
     found = [
-        heading("Images"),
-        paragraph(
+        pages.heading("Images"),
+        pages.paragraph(
             "From left to right: as recorded, corrected by the estimate, corrected by the truth. Linear camera RGB "
             "without a colour matrix, the same exposure in each row, the curve of sRGB; masked pixels are grey."
             + _left_out(run.results)
@@ -123,15 +116,15 @@ def _images(run: Run, kind: ErrorKind, pictures: Mapping[tuple[int, int], bytes]
             for title, places in (("Largest errors", worst), ("Nearest to the median", middle))
             if places
             for part in (
-                heading(title, 3),
-                row_part([_image(run, number, place, kind, pictures) for place in places]),
+                pages.heading(title, 3),
+                pages.row([_image(run, number, place, kind, pictures) for place in places]),
             )
         ]
-        found.append(details_part(result.method, rows, open_at_first=number == 0))
+        found.append(pages.fold(result.method, rows, open_at_first=number == 0))
     return found
 
 
-def _image(run: Run, number: int, place: int, kind: ErrorKind, pictures: Mapping[tuple[int, int], bytes]) -> Part:
+def _image(run: Run, number: int, place: int, kind: ErrorKind, pictures: Mapping[tuple[int, int], bytes]) -> Markup:
     result, image = run.results[number], run.subject.images[place]
     cause = (result.causes or {}).get(place, "")
     words = [f"{image}: {result.errors[kind][place]:.2f}°"]
@@ -139,7 +132,7 @@ def _image(run: Run, number: int, place: int, kind: ErrorKind, pictures: Mapping
         words.append(f"{cause or 'no light'}: taken as grey")
     if run.subject.mixed[place]:
         words.append("several lights: one estimate for the whole image, the truth by pixel")
-    return figure_part(pictures[number, place], "; ".join(words), f"{image} as recorded, by {result.method}, by truth")
+    return pages.figure(pictures[number, place], "; ".join(words), f"{image} as recorded, by {result.method}, by truth")
 
 
 def _methods(run: Run) -> Table:

@@ -7,7 +7,7 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
-from evaluation.reports.style import FAINT, INK, SERIES, svg_of
+from foundation.plots import FAINT, INK, SERIES, svg_of
 
 FLOOR_DEG: Final = 0.01
 """Smaller errors are drawn here: a logarithmic axis has no zero, and no ground truth is known as well."""

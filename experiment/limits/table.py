@@ -55,7 +55,7 @@ class TableLimit:
 
     @property
     def numbers(self) -> tuple[str, Sense, float, float | None]:
-        """Unit, sense and both limits, as `calibration.verdict.thresholds.Threshold` takes them."""
+        """Unit, sense and both limits, as `calibration.figures.figure.Threshold` takes them."""
         return self.unit, self.sense, self.accept, self.refuse
 
 

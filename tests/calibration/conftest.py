@@ -8,7 +8,7 @@ import pytest
 
 from calibration.pipeline.build import build
 from calibration.report.report import write_report
-from calibration.verdict.result import BuildResult
+from calibration.verdict import BuildResult
 from experiment.session.folder import Session
 from tests.calibration.lab import LIGHTS, Lab, hang, take
 

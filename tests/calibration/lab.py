@@ -14,9 +14,9 @@ import numpy as np
 import numpy.typing as npt
 
 from benchmarks.sessions import record_session
-from calibration.report.report_json import report_json
+from calibration.report.report import report_json
 from calibration.table.lut import REPORT_JSON
-from calibration.verdict.result import BuildResult
+from calibration.verdict import BuildResult
 from drivers.camera import ExposureSettings
 from drivers.presenter import WHITE, Colour
 from drivers.raw.rawfile import Mosaic, read_raw

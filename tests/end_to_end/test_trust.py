@@ -18,7 +18,7 @@ from benchmarks.accuracy import TableErrors, beyond_noise, repeated_variance, ta
 from benchmarks.rooms import random_case
 from calibration.pipeline.build import build
 from calibration.table.lut import open_lut
-from calibration.verdict.result import BuildResult
+from calibration.verdict import BuildResult
 from drivers.camera import ExposureSettings
 from drivers.presenter import WHITE, Colour
 from experiment.session.folder import Session
@@ -184,7 +184,7 @@ def test_a_chart_moved_by_a_cell_is_followed(lab: Lab, tmp_path: Path) -> None:
     with session_of(lab, tmp_path, frame) as session:
         result, errors = compared_with_truth(lab, session, tmp_path)
     assert sum(figures.reregistered for figures in result.figures.frames) == 1
-    assert "moved_anew" in {row.threshold.name for row in result.verdict.remarks}
+    assert "moved_anew" in {row.figure.name for row in result.verdict.remarks}
     # The light moves with the picture here, so its field fits the moved frames less well.
     assert wrong(errors) < 0.05
 
@@ -209,7 +209,7 @@ def test_a_faint_shadow_is_remarked_on(lab: Lab, tmp_path: Path) -> None:
     """6 % less light on a hand's breadth is no reason to refuse a table, but to look at it."""
     with session_of(lab, tmp_path, shaded(lab, 0.94, once)) as session:
         result = build(session, tmp_path / "lut")
-    assert "unlike_block" in {row.threshold.name for row in result.verdict.remarks}
+    assert "unlike_block" in {row.figure.name for row in result.verdict.remarks}
 
 
 def test_a_lamp_that_flickers_is_reported_and_harms_no_colour(lab: Lab, tmp_path: Path) -> None:
@@ -236,7 +236,7 @@ def test_a_focus_that_softens_is_remarked_on(lab: Lab, tmp_path: Path) -> None:
     soft = hang(room=replace(lab.world.room, blur_px=0.72))
     with session_of(lab, tmp_path, swapped(lab, soft, once)) as session:
         result = build(session, tmp_path / "lut")
-    assert "softer_bleed" in {row.threshold.name for row in result.verdict.remarks}
+    assert "softer_bleed" in {row.figure.name for row in result.verdict.remarks}
 
 
 @pytest.mark.parametrize("shutter_s", [0.25, 0.8])

@@ -16,11 +16,11 @@ import numpy.typing as npt
 from acquisition.check.looking import PlacedChart, mean_levels, points_of
 from acquisition.check.places import Levels
 from acquisition.check.taking import Shot
+from calibration.sampling import bleed
 from experiment.chart.model import Chart
 from experiment.framing.planes import frame_black
 from experiment.framing.sharpness import blur_px
 from experiment.lights.illuminations import Illumination
-from experiment.limits.bleed import bleed
 from experiment.limits.table import ONLY_OF_A_SESSION, TABLE_LIMITS, TableOutcome
 from experiment.measures.paper import Paper, PaperReader
 from experiment.measures.reflections import added_light

@@ -5,14 +5,16 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from markupsafe import Markup
 
 from evaluation.experiments.describing.against import TOLERANCE, FigureCompared, compare_figures, sentence
 from evaluation.experiments.describing.description import DataDescription, figures, known_values
 from evaluation.experiments.describing.lights import energy_distance, light_distribution
 from evaluation.experiments.describing.quantities import QUANTITIES
 from evaluation.reports.description_figures import chroma_figure, lights_figure, luminance_figure, noise_figure
-from evaluation.reports.page import Part, figure_part, heading, page, paragraph, row_part, table_part
+from evaluation.reports.page import table_part
 from evaluation.results.tables import Table
+from foundation import pages
 from generator.statistics.image_numbers import CHROMA_EDGES, LUMINANCE_EDGES, log_chroma
 
 
@@ -141,25 +143,27 @@ def describe_page(one: DataDescription, other: DataDescription | None = None, se
     """Return the HTML page of a data set, or of one beside another."""
     both = (one,) if other is None else (one, other)
     names = [made.name for made in both]
-    parts: list[Part] = []
+    parts: list[Markup] = []
     if other is not None:
         pair = (one.name, other.name)
         compared = compare_figures(one, other, seed)
         alike = sum(made.verdict in ("yes", "yes?") for made in compared)
         parts.append(
-            paragraph(f"{alike} of {len(compared)} figures of {one.name} are within {TOLERANCE:.0%} of {other.name}'s.")
+            pages.paragraph(
+                f"{alike} of {len(compared)} figures of {one.name} are within {TOLERANCE:.0%} of {other.name}'s."
+            )
         )
-        parts += [paragraph(note) for note in seen_notes(one, other)]
+        parts += [pages.paragraph(note) for note in seen_notes(one, other)]
         parts += [table_part(table) for table in compared_tables(compared, pair)]
-        parts.append(heading("Figure by figure"))
-        parts += [paragraph(sentence(made, pair)) for made in compared]
-    parts += [heading("Luminance"), _luminance(both, names), heading("Chroma"), _chroma(both, names)]
-    parts += [heading("Lights"), table_part(lights_table(both)), row_part([_lights(both, names), *_noise(both)])]
+        parts.append(pages.heading("Figure by figure"))
+        parts += [pages.paragraph(sentence(made, pair)) for made in compared]
+    parts += [pages.heading("Luminance"), _luminance(both, names), pages.heading("Chroma"), _chroma(both, names)]
+    parts += [pages.heading("Lights"), table_part(lights_table(both)), pages.row([_lights(both, names), *_noise(both)])]
     for made in both:
-        parts += [heading(made.name), table_part(figures_table(made)), table_part(sizes_table(made))]
-        parts += [paragraph(f"{what}: {told}") for what, told in made.treatment.items()]
-    parts += [heading("Definitions"), table_part(_definitions())]
-    return page(" beside ".join(names), parts)
+        parts += [pages.heading(made.name), table_part(figures_table(made)), table_part(sizes_table(made))]
+        parts += [pages.paragraph(f"{what}: {told}") for what, told in made.treatment.items()]
+    parts += [pages.heading("Definitions"), table_part(_definitions())]
+    return pages.page(" beside ".join(names), parts)
 
 
 def sizes_table(description: DataDescription, count: int = 6) -> Table:
@@ -180,29 +184,29 @@ def _definitions() -> Table:
     )
 
 
-def _luminance(both: Sequence[DataDescription], names: Sequence[str]) -> Part:
+def _luminance(both: Sequence[DataDescription], names: Sequence[str]) -> Markup:
     picture = luminance_figure(names, [made.luminance for made in both], LUMINANCE_EDGES)
-    return figure_part(
+    return pages.figure(
         picture,
         "Luminance of the cells: the mean of the channels with the light divided out, over its 99th percentile in the "
         "image. Every image counts the same.",
     )
 
 
-def _chroma(both: Sequence[DataDescription], names: Sequence[str]) -> Part:
+def _chroma(both: Sequence[DataDescription], names: Sequence[str]) -> Markup:
     picture = chroma_figure(names, [made.chroma for made in both], CHROMA_EDGES)
-    return figure_part(
+    return pages.figure(
         picture,
         "Colours of the cells with the light divided out; grey is where the lines cross. The depth of colour grows "
         "with the share of cells to the power of 0.4, on one scale.",
     )
 
 
-def _lights(both: Sequence[DataDescription], names: Sequence[str]) -> Part:
-    return figure_part(lights_figure(names, [made.lights for made in both]), "The lights; of mixtures, each light.")
+def _lights(both: Sequence[DataDescription], names: Sequence[str]) -> Markup:
+    return pages.figure(lights_figure(names, [made.lights for made in both]), "The lights; of mixtures, each light.")
 
 
-def _noise(both: Sequence[DataDescription]) -> list[Part]:
+def _noise(both: Sequence[DataDescription]) -> list[Markup]:
     unit = both[0].noise_unit
     shown = [made for made in both if made.noise_unit == unit and made.noise[1].levels]
     if not shown:
@@ -213,7 +217,7 @@ def _noise(both: Sequence[DataDescription]) -> list[Part]:
         for curve in (made.noise[1] for made in shown)
     ]
     caption = "Noise of green in the flattest tenth of blocks of 8 x 8 pixels, at full size; lines: fitted curves."
-    return [figure_part(noise_figure([made.name for made in shown], measured, curves, unit), caption)]
+    return [pages.figure(noise_figure([made.name for made in shown], measured, curves, unit), caption)]
 
 
 def _seen_at(description: DataDescription) -> str:

@@ -11,7 +11,8 @@ import numpy.typing as npt
 
 from evaluation.experiments.paper.chromaticities import TableLights, rb_of
 from evaluation.experiments.paper.table1 import block_title
-from evaluation.reports.style import CSS_VARIABLES, FAINT, INK, legend_label, series_style, svg_of
+from foundation import plots
+from foundation.plots import FAINT, INK, legend_label, series_style, svg_of
 
 if TYPE_CHECKING:
     from evaluation.experiments.paper.bits import BitsResult
@@ -122,12 +123,5 @@ def _draw_chromaticities(
 
 
 def standalone(svg: bytes) -> bytes:
-    """Return an SVG of `style.svg_of` as a file of its own: with the page's colours, light or dark as the reader likes.
-
-    Examples
-    --------
-    >>> b"--paper" in standalone(b"<svg><path/></svg>")
-    True
-    """
-    style = f"<style>{CSS_VARIABLES}\nsvg {{ background: var(--paper); font-family: system-ui, sans-serif }}</style>"
-    return _PLACE.sub(rb'\1\2"', re.sub(rb"(<svg\b[^>]*>)", lambda found: found[1] + style.encode(), svg, count=1))
+    """Return an SVG of `svg_of` as a file of its own, light or dark as the reader likes."""
+    return _PLACE.sub(rb'\1\2"', plots.standalone(svg))

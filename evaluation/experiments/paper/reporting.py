@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
+from markupsafe import Markup
 
 from evaluation.experiments.paper.bits import bits_table
 from evaluation.experiments.paper.chromaticities import chromaticity_rows, coverage_table, table_lights
@@ -18,8 +19,9 @@ from evaluation.experiments.paper.hot import hot_table
 from evaluation.experiments.paper.reduction import reduction_strip, reduction_table
 from evaluation.experiments.paper.table1 import block_table, joint_table, size_table
 from evaluation.reports.latex import table_to_latex, tables_to_latex
-from evaluation.reports.page import Part, figure_part, heading, page, paragraph, table_part
+from evaluation.reports.page import table_part
 from evaluation.results.tables import Table, table_to_csv
+from foundation import pages
 from foundation.files import whole_folder
 
 if TYPE_CHECKING:
@@ -46,14 +48,14 @@ class PaperReport:
 
     title: str
     tables: tuple[Table, ...]
-    parts: tuple[Part, ...]
+    parts: tuple[Markup, ...]
     files: Mapping[str, bytes]
 
 
 def write_report(report: PaperReport, folder: Path) -> None:
     """Write a report to a new folder, whole or not at all; its page is `report.html`."""
     with whole_folder(folder, "the report") as partial:
-        (partial / "report.html").write_text(page(report.title, report.parts), encoding="utf-8")
+        (partial / "report.html").write_text(pages.page(report.title, report.parts), encoding="utf-8")
         for name, content in report.files.items():
             (partial / name).write_bytes(content)
 
@@ -83,7 +85,11 @@ def table1_report(
         "noise.csv": table_to_csv(noise).encode(),
         "print.csv": table_to_csv(prints).encode(),
     }
-    parts = [*map(paragraph, conditions), heading(f"{kind.capitalize()} error, degrees"), *map(table_part, first)]
+    parts = [
+        *map(pages.paragraph, conditions),
+        pages.heading(f"{kind.capitalize()} error, degrees"),
+        *map(table_part, first),
+    ]
     tables = [*first, noise, prints]
     if sizes:
         drawn = sizes_figure(sizes, "White-Patch")
@@ -93,14 +99,14 @@ def table1_report(
         caption = (
             "White-Patch takes the largest of all values, of which a larger image has more: of noise, and of whites."
         )
-        parts += [heading("Images of other sizes"), figure_part(drawn, caption), table_part(table)]
+        parts += [pages.heading("Images of other sizes"), pages.figure(drawn, caption), table_part(table)]
     if hot:
         table = hot_table(hot, kind)
         tables.append(table)
         files |= {"hot.csv": table_to_csv(table).encode(), "hot.tex": table_to_latex(table).encode()}
-        parts += [heading("Hot photosites"), table_part(table)]
-    parts += [heading("The tables"), table_part(noise), table_part(prints)]
-    parts += [heading(f"{other.capitalize()} error, degrees"), *map(table_part, second)]
+        parts += [pages.heading("Hot photosites"), table_part(table)]
+    parts += [pages.heading("The tables"), table_part(noise), table_part(prints)]
+    parts += [pages.heading(f"{other.capitalize()} error, degrees"), *map(table_part, second)]
     return PaperReport("Table 1: plain methods on generated data sets", tuple(tables), tuple(parts), files)
 
 
@@ -117,7 +123,7 @@ def table2_report(tables: Sequence[Table], conditions: Sequence[str]) -> PaperRe
             for name, half in zip(("real", "generated"), halves, strict=True)
         },
     }
-    parts = (*map(paragraph, conditions), *map(table_part, tables))
+    parts = (*map(pages.paragraph, conditions), *map(table_part, tables))
     return PaperReport("Table 2: trained on real and on generated images", tuple(tables), parts, files)
 
 
@@ -130,7 +136,7 @@ def bits_report(found: BitsResult, kind: ErrorKind, name: str, conditions: Seque
         "bits.csv": table_to_csv(table).encode(),
         "bits.tex": table_to_latex(table).encode(),
     }
-    parts = (*map(paragraph, conditions), figure_part(drawn, caption), table_part(table))
+    parts = (*map(pages.paragraph, conditions), pages.figure(drawn, caption), table_part(table))
     return PaperReport("The effect of colour reduction on illumination estimation", (table,), parts, files)
 
 
@@ -144,7 +150,7 @@ def reduction_report(picture: npt.NDArray[np.uint8], name: str) -> PaperReport:
     caption = f"{name} with 0 to 7 bits of each code set to zero, row by row; the tables of the paper keep 5 of 8 bits."
     files = {"reduction.png": drawn, "reduction.csv": table_to_csv(table).encode()}
     return PaperReport(
-        "Influence of colour reduction", (table,), (figure_part(drawn, caption), table_part(table)), files
+        "Influence of colour reduction", (table,), (pages.figure(drawn, caption), table_part(table)), files
     )
 
 
@@ -157,7 +163,7 @@ def chromaticities_report(luts: Sequence[Lut], sets: Sequence[Truths]) -> PaperR
         "rb-chromaticities, r = R / (R + G + B) and b = B / (R + G + B) in linear RGB of each table's camera, of the "
         "white under each light of the table; in colour the ground truths of data sets, each in its own camera's RGB."
     )
-    parts, tables = [figure_part(drawn, caption)], list[Table]()
+    parts, tables = [pages.figure(drawn, caption)], list[Table]()
     files = {
         "chromaticities.svg": standalone(drawn),
         "chromaticities.csv": table_to_csv(chromaticity_rows(luts)).encode(),

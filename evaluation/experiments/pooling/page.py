@@ -5,12 +5,15 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Final
 
+from markupsafe import Markup
+
 from evaluation.experiments.pooling.pool import Pool
 from evaluation.experiments.transfer.figures import LEVEL, RowRatio, TransferFigures
 from evaluation.experiments.transfer.tables import HEADS
 from evaluation.reports.forest import ForestLine, Interval, forest_plot
-from evaluation.reports.page import Part, figure_part, heading, page, paragraph, table_part
+from evaluation.reports.page import table_part
 from evaluation.results.tables import Table
+from foundation import pages
 from foundation.errors import counted
 from foundation.version import software
 
@@ -32,8 +35,8 @@ def pool_page(
     counts = {test: pool.tests.count(test) for test in single}
     told = ", ".join(f"{test} ({counted(count, 'image')})" for test, count in counts.items())
     images = counted(len(pool.images), "image")
-    parts: list[Part] = [
-        paragraph(
+    parts: list[Markup] = [
+        pages.paragraph(
             f"Results of {counted(len(places), 'transfer')} pooled: {whole.error} errors of {images} of {told}, each "
             "image once and with the same weight."
         ),
@@ -62,13 +65,13 @@ def pool_page(
             "Errors in parts of those of the same method with that training (the line at 1). To the left of it is "
             "better; where pictures or lights are others, the choice of them is held against it, too.",
         ),
-        heading("Tables"),
+        pages.heading("Tables"),
         *map(table_part, shown),
-        heading("Conditions"),
-        *map(paragraph, pool.notes),
-        paragraph(f"Made of {', '.join(places)}. {software()}."),
+        pages.heading("Conditions"),
+        *map(pages.paragraph, pool.notes),
+        pages.paragraph(f"Made of {', '.join(places)}. {software()}."),
     ]
-    return page(f"Transfer to {' + '.join(single)}", parts)
+    return pages.page(f"Transfer to {' + '.join(single)}", parts)
 
 
 def _forest(
@@ -78,7 +81,7 @@ def _forest(
     names: Sequence[str],
     caption: str,
     against: bool = False,
-) -> list[Part]:
+) -> list[Markup]:
     """Return a heading and a forest plot; nothing where there is no ratio.
 
     `against` says whether a line is named after what a row is held to as well.
@@ -95,7 +98,7 @@ def _forest(
         marks += " Squares: each test set by itself."
     picture = forest_plot(lines, [HEADS[place] for place in SHOWN])
     alt = f"{title}: forest plot of the ratios of {', '.join(HEADS[place] for place in SHOWN)}"
-    return [heading(title), figure_part(picture, f"{caption} {marks}", alt)]
+    return [pages.heading(title), pages.figure(picture, f"{caption} {marks}", alt)]
 
 
 def _lines(

@@ -24,13 +24,14 @@ from evaluation.experiments.transfer.tables import (
     real_ratios_table,
 )
 from evaluation.reports.latex import table_to_latex
-from evaluation.reports.page import figure_part, heading, page, paragraph, table_part
-from evaluation.reports.style import FAINT, INK, series_style, svg_of
+from evaluation.reports.page import table_part
 from evaluation.results.result import Result
 from evaluation.results.run_files import errors_csv
 from evaluation.results.tables import Table, table_to_csv
 from evaluation.scene import SceneSet
+from foundation import pages
 from foundation.files import whole_folder, write_whole
+from foundation.plots import FAINT, INK, series_style, svg_of
 from foundation.version import software
 
 
@@ -94,7 +95,7 @@ def report_page(outcome: TransferOutcome) -> str:
     """Return the report as the text of one HTML file."""
     test = outcome.test
     parts = [
-        paragraph(
+        pages.paragraph(
             f"Learned methods trained on {_training_sets(outcome)} and tested on {len(test.scenes)} images of "
             f"{test.name}{' (generated)' if is_generated(test) else ''}, beside the same methods cross-validated on "
             "these images. Each row was trained on as many images as its column says."
@@ -104,18 +105,18 @@ def report_page(outcome: TransferOutcome) -> str:
     if outcome.figures.to_real:
         picture = svg_of(_draw_ratios, outcome.figures, inches=(8.5, 1 + 0.28 * len(outcome.figures.to_real)))
         parts.append(
-            figure_part(
+            pages.figure(
                 picture,
                 f"Median error in parts of the same method's cross-validation on {test.name}, with 95 % intervals; the "
                 "vertical line is that cross-validation. Left of it a row's images train better than the test set's "
                 "own do.",
             )
         )
-    parts += [table_part(paper_ratios_table()), heading("Conditions")]
-    parts += [paragraph(note) for note in outcome.plan.notes]
-    parts += [paragraph(f"{test.name}, {what}: {sentence}.") for what, sentence in test.treatment.items()]
-    parts.append(paragraph(f"Settings: {json.dumps(dict(outcome.settings), ensure_ascii=False)}. {software()}."))
-    return page(f"Transfer to {test.name}", parts)
+    parts += [table_part(paper_ratios_table()), pages.heading("Conditions")]
+    parts += [pages.paragraph(note) for note in outcome.plan.notes]
+    parts += [pages.paragraph(f"{test.name}, {what}: {sentence}.") for what, sentence in test.treatment.items()]
+    parts.append(pages.paragraph(f"Settings: {json.dumps(dict(outcome.settings), ensure_ascii=False)}. {software()}."))
+    return pages.page(f"Transfer to {test.name}", parts)
 
 
 def _training_sets(outcome: TransferOutcome) -> str:

@@ -19,10 +19,10 @@ from acquisition.check.foretelling.figures import ForetoldTable, foretell, foret
 from acquisition.check.looking import PRIMARIES, PlacedChart
 from acquisition.check.places import place_chart, window_px
 from acquisition.check.taking import Shot
+from calibration.figures.all_figures import FIGURES
+from calibration.figures.figure import OUTCOMES
 from calibration.pipeline.build import check as build_check
-from calibration.verdict.thresholds import THRESHOLDS
-from calibration.verdict.values import judged_values
-from calibration.verdict.verdict import OUTCOMES, judge
+from calibration.verdict import judge, judged_values
 from drivers.presenter import BLACK, WHITE
 from drivers.raw.rawfile import Mosaic, read_raw
 from experiment.chart.layout import paper_chart
@@ -179,7 +179,7 @@ def _built(session: Session) -> tuple[dict[str, str] | None, dict[str, float]]:
     if "covered" in unfit:
         # What differs most is no print of this chart to the registration, and is not looked at for stains.
         del figures["doubtful_share"]
-    return {row.threshold.name: row.outcome for row in judge(figures).rows}, figures
+    return {row.figure.name: row.outcome for row in judge(figures).rows}, figures
 
 
 @pytest.fixture(scope="module")
@@ -229,8 +229,8 @@ def test_the_foretold_verdict_is_what_the_room_deserves(name: str, said: Callabl
 
 
 def test_every_figure_is_either_foretold_or_told_to_be_unknown() -> None:
-    names = {limit.name for limit in THRESHOLDS}
-    # A new threshold belongs into `TABLE_LIMITS`, where a check can know it, or into `ONLY_OF_A_SESSION`.
+    names = {limit.name for limit in FIGURES}
+    # A new figure belongs into `TABLE_LIMITS`, where a check can know it, or into `ONLY_OF_A_SESSION`.
     assert names <= set(TABLE_LIMITS) | set(ONLY_OF_A_SESSION)
     assert not set(TABLE_LIMITS) & set(ONLY_OF_A_SESSION)
 

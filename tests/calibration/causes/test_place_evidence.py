@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from calibration.causes.place_evidence import covered_deviation
+from calibration.causes.gathering import covered_deviation
 
 
 @pytest.mark.parametrize(

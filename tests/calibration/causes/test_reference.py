@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from calibration.causes.evidence import evidence_names
 from calibration.causes.reference import causes_page
+from calibration.causes.rules import evidence_names
 
 PAGE = Path(__file__).parents[3] / "docs" / "reference" / "causes.md"
 

@@ -7,7 +7,8 @@ from dataclasses import replace
 
 import pytest
 
-from calibration.causes.cause import (
+from calibration.causes.findings import explained_figures
+from calibration.causes.rules import (
     ANOTHER_PRINT,
     BUMP,
     CAUSES,
@@ -21,6 +22,7 @@ from calibration.causes.cause import (
     REFLECTION,
     REFLECTION_IN_FRAME,
     ROOM_LIGHT,
+    RULES,
     SHADOW,
     SPREAD,
     STAIN,
@@ -28,10 +30,12 @@ from calibration.causes.cause import (
     VEIL,
     WRONG_NAME,
     Cause,
+    Condition,
+    Evidence,
+    Rule,
+    decide,
+    evidence_names,
 )
-from calibration.causes.evidence import Evidence, evidence_names
-from calibration.causes.findings import explained_figures
-from calibration.causes.rules import RULES, Condition, Rule, decide
 
 PRINT = Evidence(
     frames=8, showing=0, even_showing=0, some_whites=0, in_first=0, spot=1, scatter=0.002, softer=0, share=0.03, hot=0

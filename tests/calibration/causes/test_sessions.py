@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from calibration.causes.cause import (
+from calibration.causes.rules import (
     DEFOCUS,
     OBJECT_IN_FRAME,
     OTHER_EXPOSURE,
@@ -22,12 +22,9 @@ from calibration.causes.cause import (
     UNKNOWN,
     Cause,
 )
-from calibration.causes.findings import ProbableCause
+from calibration.figures.all_figures import FIGURES
 from calibration.pipeline.build import build
-from calibration.verdict.result import BuildResult
-from calibration.verdict.retaking import findings, retaken_frames
-from calibration.verdict.thresholds import THRESHOLDS
-from calibration.verdict.wording import remark
+from calibration.verdict import BuildResult, ProbableCause, findings, remark, retaken_frames
 from drivers.presenter import Colour
 from experiment.session.folder import Session
 from experiment.session.plan import SessionStep
@@ -38,13 +35,13 @@ from tests.calibration.lab import Lab, hang
 
 pytestmark = pytest.mark.slow
 
-REMARKING = tuple(replace(limit, refuse=None) for limit in THRESHOLDS)
+REMARKING = tuple(replace(limit, refuse=None) for limit in FIGURES)
 """The limits, none of which refuses: a table is made, and all that is wrong is a remark."""
 
 
 def measured(session: Session, folder: Path) -> tuple[BuildResult, dict[str, ProbableCause]]:
     with session:
-        result = build(session, folder / "lut", thresholds=REMARKING)
+        result = build(session, folder / "lut", judged_by=REMARKING)
     return result, findings(result.verdict, result.figures)
 
 
@@ -74,7 +71,7 @@ def test_a_hand_in_one_frame_is_that_frame_s(which: str, file: str, lab: Lab, tm
     left, top, right, bottom = HAND.blobs[0].place
     assert left - 0.05 < place.x_mm / page[0] < right + 0.05
     assert top - 0.05 < place.y_mm / page[1] < bottom + 0.05
-    row = next(row for row in result.verdict.remarks if row.threshold.name == finding.figure)
+    row = next(row for row in result.verdict.remarks if row.figure.name == finding.figure)
     told = remark(row, result.figures)
     assert f"in frames/{file}.dng, about" in told
     assert "probably a hand, a person or an object before the print" in told
@@ -89,7 +86,7 @@ def test_what_covers_few_cells_costs_these_cells_and_not_the_table(lab: Lab, tmp
     light = next(light.index for light in BRIGHT if min(light.codes) > 80)
     with taken(lab, tmp_path / "session", lambda step: step.illumination == light, situation=fly) as session:
         result = build(session, tmp_path / "lut")
-    (row,) = (row for row in result.verdict.remarks if row.threshold.name == "disturbed_cells")
+    (row,) = (row for row in result.verdict.remarks if row.figure.name == "disturbed_cells")
     assert 2 <= row.value <= 12
     unfit = {cell.colour for cell in result.figures.cells.unfit if cell.cause.startswith("disturbed")}
     assert len(unfit) == row.value
@@ -120,7 +117,7 @@ def test_a_broad_glare_is_no_stain(radius: float, lab: Lab, tmp_path: Path) -> N
     result, found = measured(taken(lab, tmp_path / "session", paint=glare(lab, 0.03, radius)), tmp_path)
     assert causes(found) == {REFLECTION}
     assert not retaken_frames(result.verdict, result.figures)
-    row = next(row for row in result.verdict.remarks if row.threshold.name == "unfit_share")
+    row = next(row for row in result.verdict.remarks if row.figure.name == "unfit_share")
     assert "probably a reflection on the print in all frames" in remark(row, result.figures)
     assert "clean the print" not in remark(row, result.figures)
 
@@ -142,7 +139,7 @@ def test_dark_corners_are_no_dirt(tmp_path: Path) -> None:
     lab = hang(room=Room(waviness_mm=0.5, vignetting=0.45, projector_falloff=0.25))
     result, found = measured(taken(lab, tmp_path / "session"), tmp_path)
     assert not {"reference_spread", "doubtful_share", "unlike_block"} & {
-        row.threshold.name for row in result.verdict.remarks
+        row.figure.name for row in result.verdict.remarks
     }
     assert not causes(found)
 

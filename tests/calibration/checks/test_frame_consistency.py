@@ -14,11 +14,11 @@ import pytest
 from scipy.spatial import cKDTree
 
 from calibration.checks.frame_consistency import ConsistencyCheck, FrameConsistency, has_enough_cells
-from calibration.verdict.thresholds import THRESHOLDS
+from calibration.figures.all_figures import FIGURES
 
 pytestmark = pytest.mark.slow
 
-LIMITS = {limit.name: limit for limit in THRESHOLDS}
+LIMITS = {limit.name: limit for limit in FIGURES}
 _Array = npt.NDArray[np.float64]
 
 

@@ -11,9 +11,9 @@ import numpy.typing as npt
 import pytest
 
 from calibration.checks.light_codes import CodeAgreement, code_agreement
+from calibration.figures.all_figures import FIGURES
 from calibration.pipeline.build import build
-from calibration.verdict.thresholds import THRESHOLDS
-from calibration.verdict.verdict import judge
+from calibration.verdict import judge
 from experiment.lights.illuminations import plan_illuminations
 from experiment.session.plan import SessionStep
 from foundation.angles import angles_deg
@@ -29,7 +29,7 @@ _Array = npt.NDArray[np.float64]
 Codes = Sequence[tuple[int, int, int]]
 
 PLAN = plan_illuminations(13, (3000, 6500))
-LIMIT = next(limit for limit in THRESHOLDS if limit.name == "off_codes_deg")
+LIMIT = next(limit for limit in FIGURES if limit.name == "off_codes_deg")
 ROOMS = {
     "default": Room(),
     "bright room": Room(ambient=0.1, black_leak=0.01),

@@ -10,7 +10,7 @@ import pytest
 from calibration.cli import main
 from calibration.comparison.comparing import compare, table_of
 from calibration.pipeline.baseline import BuildOptions
-from calibration.verdict.result import BuildResult
+from calibration.verdict import BuildResult
 from sim.world.room import Room
 from tests.calibration.lab import LIGHTS, Lab, hang, take
 

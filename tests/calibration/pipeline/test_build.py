@@ -14,13 +14,14 @@ import pytest
 
 from calibration.citation import exposure_text
 from calibration.cli import main
+from calibration.figures.geometry import cell_sides_px
 from calibration.pipeline.build import build, check
 from calibration.pipeline.frames import session_sha256
 from calibration.report.groups import GROUPS, OF_THRESHOLDS
-from calibration.report.summary import summary
-from calibration.report.worsts import cell_sides_px, worst_of
+from calibration.report.page import summary
+from calibration.report.report import worst_of
 from calibration.table.lut import Lut, open_lut
-from calibration.verdict.result import BuildResult
+from calibration.verdict import BuildResult
 from drivers.camera import ExposureSettings
 from drivers.presenter import BLACK, WHITE
 from experiment.chart.layout import A_SERIES_MM, design_chart
@@ -214,7 +215,7 @@ def test_a_lamp_that_fades_is_reported_and_not_corrected(lab: Lab, tmp_path: Pat
     with take(lab, tmp_path / "session", lights, every=2, frame=frame) as session:
         result = build(session, tmp_path / "lut")
     assert result.figures.white_drift == pytest.approx(0.03, abs=0.002)
-    assert "white_drift" in {row.threshold.name for row in result.verdict.remarks}
+    assert "white_drift" in {row.figure.name for row in result.verdict.remarks}
     table = open_lut(tmp_path / "lut")
     drift = next(correction for correction in table.provenance.corrections if correction["name"] == "drift")
     assert drift["applied"] is False
@@ -241,7 +242,7 @@ def test_the_report_stands_alone(built: BuildResult) -> None:
     for row in summary(built.figures):
         assert html.escape(row.name) in page
     # A group with something beyond its limit is not folded, all others are.
-    beyond = {OF_THRESHOLDS[row.threshold.name] for row in built.verdict.rows if row.outcome != "accept"}
+    beyond = {OF_THRESHOLDS[row.figure.name] for row in built.verdict.rows if row.outcome != "accept"}
     assert set(re.findall(r"<details id='(\w+)' open", page)) == beyond
     assert f"<th>Exposure</th><td>{html.escape(exposure_text(built.figures.origin))}</td>" in page
 

@@ -21,7 +21,7 @@ from calibration.pipeline.build import CHECKPOINT, Checkpoint, TableProgress, ap
 from calibration.pipeline.frames import frame_faults
 from calibration.table.lut import open_lut
 from calibration.table.verification import find_faults
-from calibration.verdict.result import BuildResult
+from calibration.verdict import BuildResult
 from experiment.session.folder import Session
 from experiment.session.plan import SessionStep
 from foundation.errors import FormatError, InputError
@@ -202,7 +202,7 @@ def test_a_light_taken_again_is_taken_in_again(
     alter(session, change, [(other.sha256, other.file, "2"), (one.sha256, one.file, "3")])
     show(session, 100)
     # The two bear each other's names now, for which the table would be refused.
-    append(session, tmp_path / "lut", thresholds=())
+    append(session, tmp_path / "lut", judged_by=())
     lut, before = open_lut(tmp_path / "lut"), np.load(BytesIO(undisturbed["samples.npy"]))
     assert np.array_equal(lut.samples[2], before[3])
     assert np.array_equal(lut.samples[3], before[2])

@@ -109,7 +109,7 @@ def test_references_go_along_and_the_table_verifies(tables: tuple[Lut, Lut, Buil
 
 
 def test_the_verdict_judges_what_white_frames_leave_open(tables: tuple[Lut, Lut, BuildResult]) -> None:
-    rows = {row.threshold.name: row for row in tables[2].verdict.rows}
+    rows = {row.figure.name: row for row in tables[2].verdict.rows}
     assert "white_drift" not in rows
     assert rows["drift_left"].outcome == "accept"
 

@@ -12,9 +12,9 @@ from pathlib import Path
 import pytest
 
 from calibration.pipeline.build import build
-from calibration.report.report_json import report_json
-from calibration.report.summary import summary
-from calibration.verdict.result import BuildResult
+from calibration.report.page import summary
+from calibration.report.report import report_json
+from calibration.verdict import BuildResult
 from drivers.presenter import WHITE, Colour
 from experiment.lights.illuminations import Illumination
 from experiment.session.folder import Session
@@ -71,7 +71,7 @@ def refused(lab: Lab, tmp_path: Path, frame: Frame) -> tuple[str, dict[str, obje
 
 
 def remarks(result: BuildResult) -> set[str]:
-    return {row.threshold.name for row in result.verdict.remarks} & ABOUT_NAMES
+    return {row.figure.name for row in result.verdict.remarks} & ABOUT_NAMES
 
 
 def showing(lab: Lab, colours: Mapping[int, Colour]) -> Frame:

@@ -13,10 +13,10 @@ import pytest
 
 from calibration.cli import main
 from calibration.pipeline.build import build, check
-from calibration.report.summary import summary
+from calibration.report.page import summary
 from calibration.table.lut import open_lut
 from calibration.table.verification import find_faults
-from calibration.verdict.result import BuildResult
+from calibration.verdict import BuildResult
 from drivers.camera import ExposureSettings
 from drivers.presenter import WHITE
 from experiment.measures.linearity import deviations
@@ -144,7 +144,7 @@ def test_the_table_says_how_linear_its_camera_is(
 
 def test_a_sensor_that_bends_is_remarked_on(session: Session, lab: Lab, tmp_path: Path) -> None:
     result = check(session, linearity=write_series(lab, tmp_path / "series", knee))
-    row = next(row for row in result.verdict.rows if row.threshold.name == "linearity")
+    row = next(row for row in result.verdict.rows if row.figure.name == "linearity")
     assert row.outcome == "accept with remarks"
     assert 0.01 < row.value < 0.05
 

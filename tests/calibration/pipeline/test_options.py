@@ -11,13 +11,10 @@ import pytest
 from calibration.cli import main
 from calibration.pipeline.baseline import BuildOptions
 from calibration.pipeline.build import build, check
-from calibration.report.summary import summary as report_summary
+from calibration.report.page import summary as report_summary
 from calibration.table.lut import open_lut
 from calibration.table.verification import describe, find_faults
-from calibration.verdict.result import BuildResult
-from calibration.verdict.values import judged_values
-from calibration.verdict.verdict import judge
-from calibration.verdict.wording import remark
+from calibration.verdict import BuildResult, judge, judged_values, remark
 from experiment.session.folder import Session
 from foundation.errors import InputError
 
@@ -52,7 +49,7 @@ def test_three_by_three_are_the_inner_samples_of_five_by_five(
 
 def test_a_window_larger_than_the_cells_is_said(session: Session, tmp_path: Path) -> None:
     result = check(session, BuildOptions(9))
-    assert "bleed" in {row.threshold.name for row in result.verdict.refused}
+    assert "bleed" in {row.figure.name for row in result.verdict.refused}
     note = next(row.note for row in report_summary(result.figures) if row.name == "Window")
     assert note.startswith("too large: ")
     plain = next(row.note for row in report_summary(check(session).figures) if row.name == "Window")
@@ -75,12 +72,12 @@ def test_dark_cells_that_the_lens_may_have_left_wrong_are_named_with_its_veil(bu
     figures = built.figures
     lens = replace(figures.lens, measured=True, corrected=True, residual=0.008, residual_worst=0.034, worst_level=0.045)
     few = replace(figures, lens=replace(lens, veil=0.003, veil_error=0.0035), point_spread=None)
-    (row,) = (row for row in judge(judged_values(few)).remarks if row.threshold.name.startswith("correction"))
+    (row,) = (row for row in judge(judged_values(few)).remarks if row.figure.name.startswith("correction"))
     text = remark(row, few)
     assert "up to 1 % is not excluded; cells of 4.5 % of paper may be off by 3.4 %" in text
     assert "hood" in text
     # Where the mean is remarked on, it is said once.
     many = replace(few, lens=replace(few.lens, residual=0.02, residual_worst=0.06))
-    (row,) = (row for row in judge(judged_values(many)).remarks if row.threshold.name.startswith("correction"))
-    assert row.threshold.name == "correction_residual"
+    (row,) = (row for row in judge(judged_values(many)).remarks if row.figure.name.startswith("correction"))
+    assert row.figure.name == "correction_residual"
     assert "cells of 4.5 % of paper may be off by 6 %" in remark(row, many)

@@ -74,7 +74,7 @@ def test_a_bump_is_followed_and_reported(plain: Lab, tmp_path: Path, by: tuple[f
     assert worst_error(plain, tmp_path / "lut") < 0.05
     if anew:
         assert "1 frames registered again" in (tmp_path / "lut" / "report.html").read_text()
-    remarks = [row.threshold.name for row in result.verdict.remarks]
+    remarks = [row.figure.name for row in result.verdict.remarks]
     assert ("moved_anew" in remarks) == bool(anew)
 
 

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from calibration.pipeline.build import build
-from calibration.report.summary import summary
+from calibration.report.page import summary
 from calibration.table.lut import open_lut
-from calibration.verdict.values import judged_values
+from calibration.verdict import judged_values
 from drivers.presenter import WHITE, Colour
 from sim.world.drawing import PAPER
 from sim.world.profile import ProfileName
@@ -86,7 +86,7 @@ def test_hot_photosites_side_by_side_are_no_object(tmp_path: Path) -> None:
     unfit = {cell.colour: cell.cause for cell in result.figures.cells.unfit}
     assert all(unfit[cell].startswith("hot") for cell in pair.tolist())
     assert set(unfit) == set(pair.tolist())
-    assert "disturbed_cells" not in {row.threshold.name for row in result.verdict.remarks}
+    assert "disturbed_cells" not in {row.figure.name for row in result.verdict.remarks}
 
 
 def test_hot_photosites_stay_in_the_samples_and_are_told(tmp_path: Path) -> None:

@@ -11,11 +11,10 @@ from pathlib import Path
 import pytest
 
 from calibration.cli import main
+from calibration.figures.all_figures import FIGURES
 from calibration.pipeline.build import build, check, refused_folder
 from calibration.report.report import write_report
-from calibration.verdict.result import BuildResult
-from calibration.verdict.thresholds import THRESHOLDS
-from calibration.verdict.values import judged_values
+from calibration.verdict import BuildResult, judged_values
 from experiment.session.folder import Session
 from foundation.errors import QualityError
 from tests.calibration.lab import LIGHTS, Lab, take
@@ -23,7 +22,7 @@ from tests.json_of import json_of
 
 pytestmark = pytest.mark.slow
 
-STRICT = (replace(next(limit for limit in THRESHOLDS if limit.name == "darkest_counts"), refuse=60_000.0),)
+STRICT = (replace(next(limit for limit in FIGURES if limit.name == "darkest_counts"), refuse=60_000.0),)
 
 
 @pytest.fixture(scope="module")
@@ -42,7 +41,7 @@ def test_a_table_carries_its_verdict(built: BuildResult) -> None:
     # No series of exposures was given, no drift was to be taken out, and the chart is so small that the mean of what
     # the lens may leave is remarked on, which names the worst cells.
     unknown = {"linearity", "drift_left", "correction_worst"}
-    assert report["figures"].keys() == {limit.name for limit in THRESHOLDS} - unknown
+    assert report["figures"].keys() == {limit.name for limit in FIGURES} - unknown
     page = (built.lut / "report.html").read_text()
     assert "class='verdict " in page
     for limit in report["limits"]:
@@ -51,7 +50,7 @@ def test_a_table_carries_its_verdict(built: BuildResult) -> None:
 
 def test_a_refused_table_leaves_its_report_alone(short: Session, tmp_path: Path) -> None:
     with pytest.raises(QualityError, match=r"no table is made\. Bare paper under the darkest .*expose longer"):
-        build(short, tmp_path / "lut", report=write_report, thresholds=STRICT)
+        build(short, tmp_path / "lut", report=write_report, judged_by=STRICT)
     assert list(tmp_path.iterdir()) == [tmp_path / "lut.refused"] == [refused_folder(tmp_path / "lut")]
     kept = sorted(path.name for path in (tmp_path / "lut.refused").iterdir())
     assert kept == ["report.html", "report.json"]
@@ -60,7 +59,7 @@ def test_a_refused_table_leaves_its_report_alone(short: Session, tmp_path: Path)
 
 def test_a_check_is_judged_by_the_same_limits(short: Session) -> None:
     assert check(short).verdict.outcome != "refuse"
-    assert [row.threshold for row in check(short, thresholds=STRICT).verdict.refused] == list(STRICT)
+    assert [row.figure for row in check(short, judged_by=STRICT).verdict.refused] == list(STRICT)
 
 
 def test_the_command_ends_with_the_exit_code_of_a_refusal(

@@ -11,7 +11,7 @@ from calibration.pipeline.build import build
 from calibration.registration.register import register
 from calibration.report.report import write_report
 from calibration.table.lut import open_lut
-from calibration.verdict.values import judged_values
+from calibration.verdict import judged_values
 from experiment.chart.layout import design_chart
 from sim.world.room import Room
 from tests.calibration.lab import LIGHTS, SETTINGS, hang_chart, renumbered, take

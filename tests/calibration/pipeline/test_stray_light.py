@@ -9,14 +9,11 @@ import pytest
 
 from benchmarks.cases import chart_of
 from benchmarks.sessions import AS_PLANNED, FrameChange, light_named, short_plan, short_session, world_of
+from calibration.figures.all_figures import FIGURES
 from calibration.pipeline.baseline import BuildOptions
 from calibration.pipeline.build import build
-from calibration.report.summary import summary
-from calibration.verdict.result import BuildResult
-from calibration.verdict.thresholds import THRESHOLDS
-from calibration.verdict.values import judged_values
-from calibration.verdict.verdict import judge
-from calibration.verdict.wording import remark
+from calibration.report.page import summary
+from calibration.verdict import BuildResult, judge, judged_values, remark
 from drivers.presenter import Colour
 from experiment.session.plan import SessionStep
 from sim.world.room import Room
@@ -29,7 +26,7 @@ LIGHTS = {
     "red": Colour(255, 0, 0), "green": Colour(0, 255, 0), "blue": Colour(0, 0, 255), "white": Colour(255, 255, 255),
     "yellow": Colour(255, 180, 0), "warm": Colour(255, 164, 73),
 }  # fmt: skip
-REMARKING = [replace(limit, refuse=None) for limit in THRESHOLDS]
+REMARKING = [replace(limit, refuse=None) for limit in FIGURES]
 """Limits that refuse nothing, so that there are figures to look at."""
 DAYLIGHT = Situation(ambient=(0.008, 0.01, 0.012))
 
@@ -43,16 +40,16 @@ def built(folder: Path, room: Room, leaking: frozenset[str] = frozenset(), subtr
 
     world = world_of(chart, BODIES["Test"], room)
     with short_session(folder / "session", chart, world, changes, lights) as session:
-        return build(session, folder / "lut", options=BuildOptions(subtract_dark=subtract_dark), thresholds=REMARKING)
+        return build(session, folder / "lut", options=BuildOptions(subtract_dark=subtract_dark), judged_by=REMARKING)
 
 
 @pytest.mark.parametrize("leaking", [{"yellow"}, {"red", "blue", "warm"}], ids=["light", "primaries"])
 def test_light_that_no_dark_frame_shows_is_the_rooms(tmp_path: Path, leaking: set[str]) -> None:
     result = built(tmp_path, Room(seed=3), frozenset(leaking))
-    rows = {row.threshold.name: row for row in result.verdict.remarks}
+    rows = {row.figure.name: row for row in result.verdict.remarks}
     assert "stray_share" in rows
     # One per cent of white in a deep light is degrees: no table is made of it.
-    assert "stray_share" in {row.threshold.name for row in judge(judged_values(result.figures)).refused}
+    assert "stray_share" in {row.figure.name for row in judge(judged_values(result.figures)).refused}
     said = remark(rows["stray_share"], result.figures)
     assert "light of the room" in said
     stray = result.figures.lights.stray
@@ -65,7 +62,7 @@ def test_light_that_is_always_there_is_not_remarked_on_here(
     tmp_path: Path, seed: int, ambient: float, subtract: bool
 ) -> None:
     result = built(tmp_path, Room(seed=seed, ambient=ambient, veil=0.003), subtract_dark=subtract)
-    assert "stray_share" not in {row.threshold.name for row in result.verdict.remarks}
+    assert "stray_share" not in {row.figure.name for row in result.verdict.remarks}
     stray = result.figures.lights.stray
     assert stray is not None
     assert stray.share < 0.002

@@ -14,9 +14,9 @@ from calibration.cli import main
 from calibration.pipeline.baseline import BuildOptions
 from calibration.pipeline.build import TableProgress, append, build, check
 from calibration.radiometry.dark_frames import DarkLight, DarkLightEstimate, reflectances, winsorised_means
-from calibration.report.summary import summary
+from calibration.report.page import summary
 from calibration.table.lut import open_lut
-from calibration.verdict.result import BuildResult
+from calibration.verdict import BuildResult
 from drivers.presenter import BLACK
 from experiment.measures.flat_field import FlatField
 from experiment.measures.paper import Paper
@@ -134,7 +134,7 @@ def test_table_and_ground_truth_are_those_of_a_dark_room(room: Lab, subtracted: 
 def test_light_adds_when_the_dark_is_out(room: Lab, subtracted: BuildResult) -> None:
     assert subtracted.figures.lights.additivity is not None
     assert np.abs(subtracted.figures.lights.additivity).max() < 0.006
-    assert "leak_share" not in {row.threshold.name for row in subtracted.verdict.rows}
+    assert "leak_share" not in {row.figure.name for row in subtracted.verdict.rows}
     note = next(row.note for row in summary(subtracted.figures) if row.name.startswith("Light while"))
     assert note.endswith("; subtracted from samples and ground truth")
 

@@ -5,14 +5,14 @@ from __future__ import annotations
 import ast
 from pathlib import Path
 
-import calibration.report.summary as summary_module
+import calibration.report.page as summary_module
+from calibration.figures.all_figures import FIGURES
 from calibration.report.groups import GROUPS, OF_SUMMARY, OF_THRESHOLDS, QUESTIONS
-from calibration.report.style import STYLE
-from calibration.verdict.thresholds import THRESHOLDS
+from calibration.report.page import STYLE
 
 
 def test_every_limit_has_its_group() -> None:
-    assert {threshold.name for threshold in THRESHOLDS} == OF_THRESHOLDS.keys()
+    assert {figure.name for figure in FIGURES} == OF_THRESHOLDS.keys()
     assert set(OF_THRESHOLDS.values()) == set(GROUPS) == QUESTIONS.keys()
 
 

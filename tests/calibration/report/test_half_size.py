@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from calibration.report.half_size import half_size
+from calibration.report.plots import half_size
 from drivers.raw.rawfile import Area, Mosaic
 
 

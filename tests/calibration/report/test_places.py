@@ -9,13 +9,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from calibration.causes.place_evidence import PrintPlace
+from calibration.causes.gathering import PrintPlace
+from calibration.figures.all_figures import FIGURES
 from calibration.pipeline.build import build
-from calibration.report.places import draw_places, draw_reference_residuals, reference_residuals
-from calibration.report.plots import png_of
+from calibration.report.plots import draw_places, draw_reference_residuals, reference_residuals
 from calibration.report.report import half_size, write_report
-from calibration.verdict.thresholds import THRESHOLDS
 from drivers.raw.rawfile import read_raw
+from foundation.plots import png_of
 from tests.calibration.causes.rooms import HAND, nth_white, taken
 from tests.calibration.lab import Lab
 
@@ -24,12 +24,12 @@ pytestmark = pytest.mark.slow
 
 def test_the_report_names_and_circles_a_hand(lab: Lab, tmp_path: Path) -> None:
     out = tmp_path / "lut"
-    limits = [limit for limit in THRESHOLDS if limit.name == "unlike_block"]
+    limits = [limit for limit in FIGURES if limit.name == "unlike_block"]
     with (
         taken(lab, tmp_path / "session", nth_white(1), situation=HAND) as session,
         pytest.raises(Exception, match=r"in frames/0004_white\.dng, about .* probably a hand.* --retake bad"),
     ):
-        build(session, out, report=write_report, thresholds=limits)
+        build(session, out, report=write_report, judged_by=limits)
     page = (tmp_path / "lut.refused" / "report.html").read_text()
     assert "<b>hand or object in one frame</b>" in page
     assert "<h2>Where it is: 0004_white</h2><img" in page

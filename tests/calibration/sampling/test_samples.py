@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from calibration.report.half_size import half_size
+from calibration.report.plots import half_size
 from calibration.sampling import gather, gather_values, sites_at, table_values
 from tests.calibration.lab import Lab
 

@@ -17,7 +17,7 @@ def record(number: int, kind: str = "light") -> Any:
 
 def refused(name: str, limit: float) -> Any:
     """Return a verdict with one refusal."""
-    return SimpleNamespace(refused=(SimpleNamespace(threshold=SimpleNamespace(name=name, refuse=limit)),), remarks=())
+    return SimpleNamespace(refused=(SimpleNamespace(figure=SimpleNamespace(name=name, refuse=limit)),), remarks=())
 
 
 def figures(scatters: Sequence[float], exposures: Sequence[Any] = ()) -> Any:

@@ -6,10 +6,11 @@ from dataclasses import replace
 
 import pytest
 
-from calibration.verdict.thresholds import THRESHOLDS, Threshold
-from calibration.verdict.verdict import format_value, judge
+from calibration.figures.all_figures import FIGURES
+from calibration.figures.figure import Figure, format_value
+from calibration.verdict import judge
 
-LIMIT = Threshold("x", "A figure", "px", "at most", 1.0, 2.0, "why", "source", "remedy")
+LIMIT = Figure("x", "A figure", "px", "at most", 1.0, 2.0, "why", "source", "remedy")
 
 
 @pytest.mark.parametrize(
@@ -42,8 +43,8 @@ def test_the_worst_row_is_the_verdict() -> None:
 
 
 def test_every_limit_has_its_reason_and_its_order() -> None:
-    assert len({limit.name for limit in THRESHOLDS}) == len(THRESHOLDS)
-    for limit in THRESHOLDS:
+    assert len({limit.name for limit in FIGURES}) == len(FIGURES)
+    for limit in FIGURES:
         assert limit.why
         assert limit.source
         if limit.refuse is not None:

@@ -20,7 +20,7 @@ from evaluation.reports.error_figures import error_curves, error_planes
 from evaluation.reports.run_page import chosen_images, run_page
 from evaluation.results.result import Result
 from tests.evaluation.made_up import MixedWall, Wall, as_set, walls
-from tests.evaluation.reports.test_page import checked
+from tests.foundation.test_pages import checked
 
 METHODS = [GrayEdge("Gray-world", 0, 1, 0, 0), GrayEdge("White <Patch>", 0, np.inf, 0, 0)]
 

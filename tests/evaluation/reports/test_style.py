@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import re
 from html import unescape
-from typing import Any
 
 import numpy as np
 import pytest
 
 from evaluation.reports.error_figures import error_curves, error_planes
 from evaluation.reports.scatter import error_scatter
-from evaluation.reports.style import svg_of
 from evaluation.results.result import Result
 
 NAMES = ["a $\\bad{x$ b", "$y_1$", "_mine"]
@@ -36,15 +34,3 @@ def test_names_are_neither_mathematics_nor_left_out() -> None:
     scatter = texts(error_scatter(random.random(5), random.random(5), ("$a$", "_b"), {0: "im $x_1$"}))
     assert all(name in curves and name in planes for name in NAMES)
     assert {"im $x_1$", "$a$: error, degrees", "_b: error, degrees"} <= set(scatter)
-
-
-@pytest.mark.parametrize("top", [8, 90, 1e7])
-def test_logarithmic_axes_have_plain_numbers(top: float) -> None:
-    def draw(figure: Any) -> None:
-        axes = figure.add_subplot()
-        axes.plot([1, 2], [2, top])
-        axes.set_yscale("log")
-
-    found = [text for text in texts(svg_of(draw)) if text]
-    assert len(found) > 2
-    assert not [text for text in found if "$" in text]

@@ -5,14 +5,14 @@ from __future__ import annotations
 import pytest
 
 from acquisition.judge import limits as judge
-from calibration.verdict.thresholds import THRESHOLDS
-from calibration.verdict.verdict import judge as judged
-from experiment.limits.bleed import bleed, blur_of_bleed, largest_blur_px
+from calibration.figures.all_figures import FIGURES
+from calibration.sampling import bleed, blur_of_bleed, largest_blur_px
+from calibration.verdict import judge as judged
 from experiment.limits.table import TABLE_LIMITS, TableLimit
 
 
 def test_a_verdict_judges_by_the_shared_numbers() -> None:
-    found = {limit.name: limit for limit in THRESHOLDS}
+    found = {limit.name: limit for limit in FIGURES}
     for name, limit in TABLE_LIMITS.items():
         assert (found[name].unit, found[name].sense, found[name].accept, found[name].refuse) == limit.numbers, name
 

@@ -1,42 +1,71 @@
-"""The looks of pages and figures: colours of light and dark screens, and what draws a figure as SVG.
+"""Figures by Matplotlib: SVG that takes a page's colours, PNG on white, the same bytes every time.
 
 The series colours are those of M. Okabe and K. Ito, "Color universal design", 2008, which the colour-blind tell apart;
 black and yellow, which vanish on a dark and a light screen, are replaced by grey and left out. Line styles change with
-every round of the colours.
+every round of the colours. Matplotlib is imported where a figure is made, and used through its objects only: no window
+is opened and no state left behind.
 """
 
 from __future__ import annotations
 
 import re
 from collections.abc import Callable
+from importlib import resources
 from io import BytesIO
 from typing import Any
 
 INK, FAINT, GRID, PAPER = "#22262b", "#5b636d", "#e3e6ea", "#fdfdfe"
 """Colours of text, of axes and notes, of rules, and of the page itself; an SVG's are exchanged on a dark screen."""
 
-_DARK = {INK: "#e4e7eb", FAINT: "#a3abb5", GRID: "#3a4048", PAPER: "#16191d"}
-_NAMES = {INK: "ink", FAINT: "faint", GRID: "grid", PAPER: "paper"}
+MARK = "#e8502a"
+"""Colour of what is marked in a picture."""
+
+CHANNEL_INK = ("#c8382e", "#2f8f46", "#2f62c8")
+"""Colours of lines of R, G and B."""
 
 SERIES = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00", "#7f8790")
 """Colours of series, in the order of their use."""
 
-_RASTER_DPI = 180
-"""Resolution of what is drawn as a picture within an SVG, pixels an inch: sharp on a screen of twice the usual."""
-
 DASHES = ("-", "--", ":", "-.")
 """Line styles: the first for the first round of colours, and so on."""
 
+_NAMES = {INK: "ink", FAINT: "faint", GRID: "grid", PAPER: "paper"}
+"""Variables of `templates/colours.css` that the colours of an SVG become."""
 
-def _variables(colours: dict[str, str]) -> str:
-    return "; ".join(f"--{_NAMES[light]}: {colour}" for light, colour in colours.items())
+_PNG_DPI = 110
+"""Pictures 10 inches wide fill a page's 1100 pixels."""
 
+_RASTER_DPI = 180
+"""Resolution of what is drawn as a picture within an SVG, pixels an inch: sharp on a screen of twice the usual."""
 
-CSS_VARIABLES = (
-    f":root {{ color-scheme: light dark; {_variables({colour: colour for colour in _NAMES})} }}\n"
-    f"@media (prefers-color-scheme: dark) {{ :root {{ {_variables(_DARK)} }} }}"
-)
-"""The colours as CSS variables, for the style sheet of a page."""
+_STYLE = {
+    "font.size": 9,
+    "axes.edgecolor": FAINT,
+    "axes.labelcolor": INK,
+    "text.color": INK,
+    "xtick.color": FAINT,
+    "ytick.color": FAINT,
+    "xtick.labelcolor": INK,
+    "ytick.labelcolor": INK,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.titlesize": 10,
+    # Names of methods, images and data sets are the user's: "$" begins no mathematics.
+    "text.parse_math": False,
+}
+
+_SVG_STYLE = _STYLE | {
+    "axes.facecolor": "none",
+    "figure.facecolor": "none",
+    "axes.titlelocation": "left",
+    "axes.grid": True,
+    "axes.axisbelow": True,
+    "grid.color": GRID,
+    "legend.frameon": False,
+    "svg.fonttype": "none",
+    # Names of parts come from a hash; without a salt of its own each run draws another.
+    "svg.hashsalt": "crop",
+}
 
 
 def series_style(number: int) -> dict[str, str]:
@@ -61,45 +90,35 @@ def legend_label(name: str) -> str:
     return f" {name}" if name.startswith("_") else name
 
 
+def png_of(draw: Callable[..., None], *arguments: Any) -> bytes:
+    """Return the PNG of a figure that `draw(figure, *arguments)` fills and gives its size."""
+    import matplotlib
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    # Matplotlib's own types leave the keyword arguments of every method unknown.
+    library: Any = matplotlib
+    with library.rc_context(_STYLE):
+        figure: Any = Figure(layout="constrained", dpi=_PNG_DPI)
+        FigureCanvasAgg(figure)
+        draw(figure, *arguments)
+        stream = BytesIO()
+        figure.savefig(stream, format="png")
+    return stream.getvalue()
+
+
 def svg_of(draw: Callable[..., None], *arguments: Any, inches: tuple[float, float] = (7.2, 4.0)) -> bytes:
-    """Return the SVG of a figure that `draw(figure, *arguments)` fills, with Matplotlib; the same bytes every time.
+    """Return the SVG of a figure that `draw(figure, *arguments)` fills.
 
     `INK`, `FAINT`, `GRID` and `PAPER` in it become the page's colours of that name, which a dark screen exchanges, so
-    the SVG is to stand in a page (`page.figure_part`). Text stays text, as it is written: "$" begins no mathematics.
-    Logarithmic axes have plain numbers. No window is opened and no state left behind.
+    the SVG is to stand in a page (`foundation.pages.figure`). Text stays text; logarithmic axes have plain numbers.
     """
     import matplotlib
     from matplotlib.backends.backend_svg import FigureCanvasSVG
     from matplotlib.figure import Figure
 
-    # Matplotlib's own types leave the keyword arguments of every method unknown.
-    style: Any = {
-        "font.size": 9,
-        "axes.edgecolor": FAINT,
-        "axes.labelcolor": INK,
-        "axes.facecolor": "none",
-        "figure.facecolor": "none",
-        "text.color": INK,
-        "xtick.color": FAINT,
-        "ytick.color": FAINT,
-        "xtick.labelcolor": INK,
-        "ytick.labelcolor": INK,
-        "axes.spines.top": False,
-        "axes.spines.right": False,
-        "axes.titlesize": 10,
-        "axes.titlelocation": "left",
-        "axes.grid": True,
-        "axes.axisbelow": True,
-        "grid.color": GRID,
-        "legend.frameon": False,
-        "svg.fonttype": "none",
-        # Names of methods, images and data sets are the user's.
-        "text.parse_math": False,
-        # Names of parts come from a hash; without a salt of its own each run draws another.
-        "svg.hashsalt": "crop",
-    }
     library: Any = matplotlib
-    with library.rc_context(style):
+    with library.rc_context(_SVG_STYLE):
         figure: Any = Figure(figsize=inches, layout="constrained")
         FigureCanvasSVG(figure)
         draw(figure, *arguments)
@@ -110,6 +129,19 @@ def svg_of(draw: Callable[..., None], *arguments: Any, inches: tuple[float, floa
     for colour, name in _NAMES.items():
         text = re.sub(re.escape(colour), f"var(--{name})", text, flags=re.IGNORECASE)
     return text.encode()
+
+
+def standalone(svg: bytes) -> bytes:
+    """Return an SVG of `svg_of` as a file of its own: with a page's colours, light or dark as the reader likes.
+
+    Examples
+    --------
+    >>> b"--paper" in standalone(b"<svg><path/></svg>")
+    True
+    """
+    colours = (resources.files("foundation") / "templates" / "colours.css").read_text(encoding="utf-8")
+    style = f"<style>{colours}svg {{ background: var(--paper); font-family: system-ui, sans-serif }}</style>"
+    return re.sub(rb"(<svg\b[^>]*>)", lambda found: found[1] + style.encode(), svg, count=1)
 
 
 def _write_plain_numbers(figure: Any) -> None:

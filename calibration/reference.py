@@ -6,9 +6,7 @@ import inspect
 import math
 import re
 
-from calibration.causes.cause import CAUSES, UNKNOWN
-from calibration.causes.evidence import Evidence
-from calibration.causes.rules import RULES, Condition
+from calibration.causes.rules import CAUSES, RULES, UNKNOWN, Condition, Evidence
 
 _HEAD = """# Causes
 

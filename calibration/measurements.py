@@ -1,40 +1,172 @@
-"""All figures of a build, or of a check, in named groups: what the verdict judges and report and table are made from.
+"""What was measured by a build, or by a check, in named groups of frozen values: verdict, report and table rest on it.
 
-L lights, C colours, G levels of grey, S samples of a cell; counts are above black unless called raw.
+Nothing is judged here, nothing drawn, no file read. L lights, C colours, G levels of grey, S samples of a cell; counts
+are above black unless called raw.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import asdict, astuple, dataclass
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
+from calibration.checks.frame_consistency import FrameConsistency
 from calibration.checks.frame_origins import OriginFigures
 from calibration.checks.light_codes import CodeAgreement
 from calibration.checks.stray_light import StrayLight
 from calibration.citation import OriginRecord
-from calibration.figures.frame_figures import FrameFigures
-from calibration.figures.linearity_figures import LinearityFigures
 from calibration.radiometry.dark_frames import DarkSummary
 from calibration.radiometry.drift import DriftCorrection
 from calibration.radiometry.greys import tint_deg
 from calibration.radiometry.photon_transfer import PhotonTransfer
 from calibration.radiometry.primaries import Primaries
 from calibration.registration.register import Registration
+from calibration.sampling import bleed
 from calibration.spread.correction import LensFigures
 from calibration.spread.fitting import PointSpread
 from calibration.table.lut import Unfit
+from drivers.raw.origin import FrameOrigin
+from experiment.framing.movement import Shift
+from experiment.framing.planes import Channel
+from experiment.measures.flat_field import FlatField
+from experiment.measures.paper import FieldResidual, Paper
 from experiment.measures.sensor_range import black_drift
 from experiment.measures.stains import Stains
+from experiment.session.records import FrameRecord
 
 _Array = npt.NDArray[np.float64]
 
 
+@dataclass(frozen=True, eq=False)
+class FrameMeasurements:
+    """What was measured on one light or white frame.
+
+    - `black`: (2, 2) float64 counts, black level of each position of the Bayer block.
+    - `channel`: the channel in which the chart's movement was measured.
+    - `shift`: movement against the frame that was registered last.
+    - `reregistered`: whether the chart had moved so far that it was registered again in this frame.
+    - `paper`: flat field and white of bare paper.
+    - `consistency`: how much the frame differs from the print as it was first registered.
+    - `greys`, `grey_errors`: (G, 3) float64 counts above black of each level of grey, field divided out, and their
+      standard errors.
+    - `dark`: (3,) float64 counts, dark light of bare paper that was subtracted; zeros where none was.
+    - `share_at_zero`: share, 0 … 1, of the frame's samples in the table that are 0.
+    - `blur_px`: σ of the frame's blur, half-size px: that of the frame registered last, plus the change since.
+    - `exposure`: shutter time × ISO speed / f-number² by the raw file, s; 0 where it does not state them.
+    - `origin`: camera, lens and exposure as the raw file states them.
+    """
+
+    record: FrameRecord
+    black: _Array
+    channel: Channel
+    shift: Shift
+    reregistered: bool
+    paper: Paper
+    consistency: FrameConsistency
+    greys: _Array
+    grey_errors: _Array
+    dark: _Array
+    share_at_zero: float
+    blur_px: float
+    exposure: float
+    origin: FrameOrigin
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the figures, but for the record, as JSON can hold them; `from_json` restores them to the last bit."""
+        return {
+            "black": self.black.tolist(),
+            "channel": self.channel,
+            "shift": list(astuple(self.shift)),
+            "reregistered": self.reregistered,
+            "field": [[factor.tolist() for factor in factors] for factors in self.paper.field.coefficients],
+            "white": self.paper.white.tolist(),
+            "error": self.paper.error.tolist(),
+            "references": self.paper.references,
+            "spread": self.paper.spread.tolist(),
+            "left": self.paper.left.to_json(),
+            "consistency": self.consistency.to_json(),
+            "greys": self.greys.tolist(),
+            "grey_errors": self.grey_errors.tolist(),
+            "dark": self.dark.tolist(),
+            "share_at_zero": self.share_at_zero,
+            "blur_px": self.blur_px,
+            "exposure": self.exposure,
+            "origin": asdict(self.origin),
+        }
+
+    @staticmethod
+    def from_json(record: FrameRecord, page_mm: tuple[float, float], stored: dict[str, Any]) -> FrameMeasurements:
+        """Return the figures of a frame from what `to_json` returned; `page_mm` is the chart's width and height."""
+        red, green, blue = (tuple(np.array(factor) for factor in factors) for factors in stored["field"])
+        white, error, spread = (np.array(stored[name]) for name in ("white", "error", "spread"))
+        return FrameMeasurements(
+            record=record,
+            black=np.array(stored["black"]),
+            channel=stored["channel"],
+            shift=Shift(*stored["shift"]),
+            reregistered=stored["reregistered"],
+            paper=Paper(
+                FlatField(page_mm, (red, green, blue)),
+                white,
+                error,
+                stored["references"],
+                spread,
+                FieldResidual.from_json(stored["left"]),
+            ),
+            consistency=FrameConsistency.from_json(stored["consistency"]),
+            greys=np.array(stored["greys"]).reshape(-1, 3),
+            grey_errors=np.array(stored["grey_errors"]).reshape(-1, 3),
+            dark=np.array(stored["dark"]),
+            share_at_zero=stored["share_at_zero"],
+            blur_px=stored["blur_px"],
+            exposure=stored["exposure"],
+            origin=FrameOrigin(**stored["origin"]),
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class LinearityMeasurements:
+    """Deviation of counts from proportion to the light (EMVA 1288, release 4.0, linearity error).
+
+    - `files`: the frames, by rising exposure.
+    - `exposure_s`: (K,) float64 s, as the files state them.
+    - `level`: (B,) float64, shares of saturation, rising.
+    - `deviation`: (3, B) float64, relative, of R, G and B from the straight line that fits best; NaN where no patch has
+      data.
+    """
+
+    files: tuple[str, ...]
+    exposure_s: _Array
+    level: _Array
+    deviation: _Array
+
+    @property
+    def worst(self) -> float:
+        """The largest deviation, a share."""
+        return float(np.nanmax(np.abs(self.deviation)))
+
+    @property
+    def range(self) -> tuple[float, float]:
+        """The lowest and the highest share of saturation for which a channel has data."""
+        measured = np.flatnonzero(np.isfinite(self.deviation).any(axis=0))
+        return float(self.level[measured[0]]), float(self.level[measured[-1]])
+
+    def to_json(self) -> list[tuple[float, list[float | None]]]:
+        """Return each level with the deviations of R, G and B, None where there are no data; for `report.json`."""
+
+        def rounded(values: _Array) -> list[float | None]:
+            return [float(f"{value:.4g}") if np.isfinite(value) else None for value in values.tolist()]
+
+        levels = self.level.tolist()
+        return [(float(f"{level:.4g}"), rounded(self.deviation[:, number])) for number, level in enumerate(levels)]
+
+
 @dataclass(frozen=True)
-class SessionFigures:
+class SessionMeasurements:
     """What was read.
 
     - `folder`: the session's folder.
@@ -54,7 +186,7 @@ class SessionFigures:
 
 
 @dataclass(frozen=True, eq=False)
-class LightFigures:
+class LightMeasurements:
     """What was measured of the lights, light by light; a check has one row, of the frame that it read.
 
     - `white`, `white_error`: (L, 3) float64 counts, the ground truth and its standard error, in the units of the
@@ -112,7 +244,7 @@ class LightFigures:
 
 
 @dataclass(frozen=True, eq=False)
-class GreyFigures:
+class GreyMeasurements:
     """What was measured of the printed levels of grey.
 
     - `names`: of the G levels, brightest first.
@@ -136,7 +268,7 @@ class GreyFigures:
 
 
 @dataclass(frozen=True, eq=False)
-class SensorFigures:
+class SensorMeasurements:
     """What was measured of the sensor.
 
     - `saturation_counts`: raw count of saturation.
@@ -153,11 +285,11 @@ class SensorFigures:
     white_level: int
     noise: _Array
     transfer: PhotonTransfer
-    linearity: LinearityFigures | None
+    linearity: LinearityMeasurements | None
 
 
 @dataclass(frozen=True, eq=False)
-class CellFigures:
+class CellMeasurements:
     """What was found of the chart's cells.
 
     - `window`: pixels along the side of a cell's window; S = window².
@@ -171,7 +303,7 @@ class CellFigures:
 
 
 @dataclass(frozen=True, eq=False)
-class TableFigures:
+class TableMeasurements:
     """All that was measured by a build, or by a check.
 
     - `registration`: of the frame that was registered first.
@@ -185,14 +317,14 @@ class TableFigures:
     - `origin`: with what, when and by whom the frames were taken.
     """
 
-    session: SessionFigures
+    session: SessionMeasurements
     registration: Registration
-    frames: tuple[FrameFigures, ...]
-    lights: LightFigures
-    greys: GreyFigures
-    sensor: SensorFigures
+    frames: tuple[FrameMeasurements, ...]
+    lights: LightMeasurements
+    greys: GreyMeasurements
+    sensor: SensorMeasurements
     dark_frames: DarkSummary
-    cells: CellFigures
+    cells: CellMeasurements
     origins: OriginFigures
     primaries: Primaries | None
     lens: LensFigures
@@ -200,15 +332,21 @@ class TableFigures:
     origin: OriginRecord
 
     @property
-    def white_frames(self) -> tuple[FrameFigures, ...]:
+    def white_frames(self) -> tuple[FrameMeasurements, ...]:
         """The white frames, in the order taken."""
         return tuple(frame for frame in self.frames if frame.record.kind == "white")
 
     @property
-    def registered_frame(self) -> FrameFigures:
+    def registered_frame(self) -> FrameMeasurements:
         """The frame that was registered first; another where that one is not among those measured."""
         named = (frame for frame in self.frames if frame.record.file == self.session.registered_file)
         return next(named, self.frames[0])
+
+    def added_bleed(self, frame: FrameMeasurements) -> float:
+        """Return how much more light a frame's worst sample has from beyond its cell than the registered frame's."""
+        registration, window = self.registration, self.cells.window
+        own, first = (bleed(registration.cell_px, px, window) for px in (frame.blur_px, registration.blur_px))
+        return own - first
 
     @property
     def largest_shift_px(self) -> float:
@@ -225,6 +363,24 @@ class TableFigures:
         """Largest relative change of paper white between white frames, over the channels."""
         whites = np.array([frame.paper.white for frame in self.white_frames])
         return float((np.ptp(whites, axis=0) / whites.mean(axis=0)).max()) if len(whites) > 1 else 0.0
+
+    @property
+    def dark_share(self) -> float:
+        """Light of bare paper while the projector shows black, of white, in the worst channel; NaN if not measured."""
+        share = np.abs(self.dark_frames.light / self._full_white).max()
+        return float(share) if np.isfinite(self.dark_frames.light).all() else float("nan")
+
+    @property
+    def dark_change(self) -> float:
+        """Change of that light between dark frames, of white; NaN of one dark frame."""
+        lights = self.dark_frames.lights
+        return float((np.ptp(lights, axis=0) / self._full_white).max()) if len(lights) > 1 else float("nan")
+
+    @property
+    def _full_white(self) -> _Array:
+        """(3,) float64 counts of bare paper under white, or under the brightest light where no white was taken."""
+        whites, lights = [frame.paper.white for frame in self.white_frames], self.lights.white
+        return np.mean(whites, axis=0) if whites else lights[int(np.argmax(lights.sum(axis=1)))]
 
 
 def direction_error_deg(white: _Array, error: _Array) -> _Array:

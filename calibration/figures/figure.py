@@ -1,0 +1,258 @@
+"""A judged figure is one object with all that is ever asked of it; judging, reporting and forecasting loop over them.
+
+Rules that hold inside:
+
+- A figure has no default for what it may lack: what does not apply is said (`NO_CAUSE`, `ONLY_OF_A_SESSION`). One that
+  lacks a part does not import.
+- Limits stand in the figure alone; the check and the live judge take them from there.
+- A value within `accept` is accepted; between `accept` and `refuse` it is remarked on; beyond `refuse` there is no
+  table. Without `refuse` it is only ever remarked on: what it measures does not make the table wrong.
+- Where a measurement refuses by itself (`calibration.registration.register`), the number is defined there and imported.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import KW_ONLY, dataclass, field
+from typing import TYPE_CHECKING, Any, Final, Literal, get_args
+
+if TYPE_CHECKING:
+    import numpy as np
+    import numpy.typing as npt
+
+    from calibration.causes.gathering import Gathered, PrintPlace
+    from calibration.causes.rules import Subject
+    from calibration.measurements import TableMeasurements
+    from experiment.chart.model import Chart
+    from experiment.measures.paper import Paper
+    from experiment.measures.stains import Stains
+    from experiment.session.records import FrameRecord
+
+Sense = Literal["at most", "at least"]
+Outcome = Literal["accept", "accept with remarks", "refuse"]
+OUTCOMES: Final[tuple[Outcome, ...]] = get_args(Outcome)
+"""From the best to the worst."""
+
+Group = Literal["geometry", "light", "radiometry", "noise", "truth"]
+"""What a scientist asks about, one question a group of the report."""
+
+QUESTIONS: Final[dict[Group, str]] = {
+    "geometry": "Was the chart found, and does each sample lie in its cell?",
+    "light": "Is each light the one that was ordered, alone, and of one lamp?",
+    "radiometry": "Are counts proportional to light, and cells their codes' colours?",
+    "noise": "Is the noise that of light and sensor?",
+    "truth": "How well is each light's colour known?",
+}
+
+Drawing = Literal[
+    "chart", "lights", "errors", "noise", "residuals", "worst", "field", "print", "course", "cells", "rest"
+]  # fmt: skip
+"""Names of the report's pictures (`calibration.report.report`)."""
+
+JUDGEMENT: Final = "judgement"
+"""The source of a limit that nothing but experience supports."""
+
+SIMULATED: Final = "measured on simulated frames"
+"""The source of a limit found in rooms whose truth is known (`benchmarks.rooms`, `benchmarks.accuracy`)."""
+
+Range = tuple[float | None, float | None]
+"""Lowest and highest value; None where open."""
+
+_LARGE = 1000.0
+"""From here on three significant digits would be written with an exponent."""
+
+
+@dataclass(frozen=True)
+class Cause:
+    """How the cause of a figure beyond its limit is found (`calibration.causes`).
+
+    - `about`: what the figure is about, which rules ask for.
+    - `gather`: what is known of it, its frames and places, from which value on (the limit accepted).
+    - `follows`: names of figures that it moves along with: whose cause it shares where it has none of its own.
+    """
+
+    about: Subject
+    gather: Callable[[TableMeasurements, float], Gathered | None]
+    follows: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Worst:
+    """Where the worst of a figure is, whether or not it is beyond a limit.
+
+    - `what`: what is worst, in few words.
+    - `file`: the frame, relative to the session; "" where it is of no frame alone.
+    - `light`: the light's number; None where it is of no light alone.
+    - `place`: where on the print; None where it has no place.
+    """
+
+    what: str
+    file: str = ""
+    light: int | None = None
+    place: PrintPlace | None = None
+
+    @property
+    def where(self) -> str:
+        """Where it is, in words: ``light 3, frames/0009_light_003.cr2, 312, 440 mm``."""
+        light = "" if self.light is None else f"light {self.light}"
+        place = "" if self.place is None else f"{self.place.x_mm:.0f}, {self.place.y_mm:.0f} mm"
+        return ", ".join(part for part in (light, self.file, place) if part)
+
+
+@dataclass(frozen=True)
+class SummaryRow:
+    """What was measured, in words.
+
+    - `name`, `value`: what, and the number with its unit.
+    - `note`: what it means, or what is usual; may be "".
+    - `brief`: whether it is among the few that a command prints.
+    """
+
+    name: str
+    value: str
+    note: str
+    brief: bool = False
+
+
+@dataclass(frozen=True)
+class Line:
+    """A figure's line in the summary: its place among all lines, rising, and its row; None where there is nothing."""
+
+    place: int
+    row: Callable[[TableMeasurements], SummaryRow | None]
+
+
+@dataclass(frozen=True, eq=False)
+class CheckMeasurements:
+    """What the frames of `acquire check` show of a table before its session; None, or no share, where they do not.
+
+    - `tags_found`, `references_used`: shares.
+    - `cell_px`, `blur_px`: shorter side of the smallest cell, and σ of the median blur, half-size px.
+    - `unfit`: share of the cells that would be unfit, by cause: ``outside``, ``clipped``, ``stained``.
+    - `unfit_share`: share of those that are one of these.
+    - `stains`: where the print does not have its codes' colours.
+    - `paper`: flat field and white of bare paper.
+    - `tint_deg`: largest angle between a printed grey and paper.
+    - `leak`: (3,) float64, light while the projector shows black, of white.
+    - `brightest_share`, `darkest_counts`: paper under white, of saturation, and under the plan's darkest light, at the
+      settings' exposure.
+    - `not_additive`: by how much white differs from the sum of the primaries, a share.
+    """
+
+    tags_found: float | None = None
+    cell_px: float | None = None
+    blur_px: float | None = None
+    unfit: Mapping[str, float] = field(default_factory=dict[str, float])
+    unfit_share: float | None = None
+    stains: Stains | None = None
+    references_used: float | None = None
+    paper: Paper | None = None
+    tint_deg: float | None = None
+    leak: npt.NDArray[np.float64] | None = None
+    brightest_share: float | None = None
+    darkest_counts: float | None = None
+    not_additive: float | None = None
+
+
+NO_PLACE: Final = None
+NO_FRAMES: Final = None
+NO_CAUSE: Final = None
+NOT_DRAWN: Final = None
+NO_LINES: Final[tuple[Line, ...]] = ()
+OF_ITS_CAUSE: Final = None
+ONLY_OF_A_SESSION: Final = None
+
+
+@dataclass(frozen=True)
+class Figure:
+    """One figure that a table is judged by.
+
+    - `name`: as in `report.json`.
+    - `title`: the figure for people.
+    - `group`: of the report's page.
+    - `unit`: of the value and both limits; "" for a count or a plain number, "share" for 0 … 1.
+    - `sense`: on which side of the limits a value is accepted.
+    - `accept`: up to here nothing is remarked.
+    - `refuse`: beyond it no table is made; None where the value is only ever remarked on.
+    - `why`: what goes wrong beyond.
+    - `source`: where the numbers come from.
+    - `remedy`: what to do about it; "" where it depends on what was found.
+    - `measure`: the value; None where it could not be measured: from one frame, on a chart without tags or with few
+      colours, without dark frames or a series of exposures.
+    - `forecast`: the value from what a check has, where no check can know it `ONLY_OF_A_SESSION`.
+    - `worst`: where its worst is on the report's page, whatever the verdict; else `NO_PLACE`.
+    - `where`: frames, lights or place beyond the limit accepted, for a remark; else those `OF_ITS_CAUSE`.
+    - `retake`: the frames that are beyond a limit by themselves; else `NO_FRAMES`. None where all of them are.
+    - `cause`: how its cause is found; else it explains itself, `NO_CAUSE`.
+    - `drawing`: the picture that shows it; else `NOT_DRAWN`.
+    - `lines`: its lines in the summary; else `NO_LINES`.
+    - `foremost`: whether a refusal speaks of it before others, which may follow from it.
+    - `found`: what a refusal adds, and the remedy, where that depends on what was found.
+    """
+
+    name: str
+    title: str
+    group: Group
+    unit: str
+    sense: Sense
+    accept: float
+    refuse: float | None
+    _: KW_ONLY
+    why: str
+    source: str
+    remedy: str
+    measure: Callable[[TableMeasurements], float | None]
+    forecast: Callable[[CheckMeasurements], float | None] | None
+    worst: Callable[[TableMeasurements, Chart], Worst | None] | None
+    where: Callable[[TableMeasurements, float], str] | None
+    retake: Callable[[TableMeasurements, float], list[FrameRecord] | None] | None
+    cause: Cause | None
+    drawing: Drawing | None
+    lines: tuple[Line, ...]
+    foremost: bool = False
+    found: Callable[[TableMeasurements], tuple[str, str] | None] | None = None
+
+    def outcome(self, value: float) -> Outcome:
+        """Return what a value does to a table; one that is not a number is as bad as can be."""
+        sign = 1 if self.sense == "at most" else -1
+        if self.refuse is not None and not sign * value <= sign * self.refuse:
+            return "refuse"
+        return "accept" if sign * value <= sign * self.accept else "accept with remarks"
+
+    @property
+    def ranges(self) -> tuple[Range, Range]:
+        """Lowest and highest value that is accepted, and that is not refused; None where open."""
+        if self.sense == "at most":
+            return (None, self.accept), (None, self.refuse)
+        return (self.accept, None), (self.refuse, None)
+
+    def text(self, value: float) -> str:
+        """Return a value of it for people."""
+        return format_value(value, self.unit)
+
+    @property
+    def expected(self) -> str:
+        """What is accepted, for people."""
+        return f"{self.sense} {self.text(self.accept)}"
+
+    def limit_json(self) -> dict[str, Any]:
+        """Return its limit as in `report.json`."""
+        keys = ("name", "title", "unit", "sense", "accept", "refuse", "why", "source", "remedy")
+        return {key: getattr(self, key) for key in keys}
+
+
+def worst_outcome(outcomes: Iterable[Outcome]) -> Outcome:
+    """Return the worst of some outcomes; of none, that all is accepted."""
+    return max(outcomes, key=OUTCOMES.index, default="accept")
+
+
+def format_value(value: float, unit: str) -> str:
+    """Return a value for people: shares as per cent, three significant digits, two of an angle.
+
+    `unit` is that of `Figure.unit`.
+    """
+    if unit == "share":
+        return f"{100 * value:.3g} %"
+    if unit == "°":
+        return f"{value:.2g}°"
+    return f"{value:.3g} {unit}".strip() if abs(value) < _LARGE else f"{value:.0f} {unit}".strip()

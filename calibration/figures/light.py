@@ -1,0 +1,540 @@
+"""Figures of the lights: of one lamp, alone, in proportion to counts, and what their codes say."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from calibration.causes.gathering import (
+    Gathered,
+    brightness_evidence,
+    dark_evidence,
+    drift_evidence,
+    light_evidence,
+    name_evidence,
+    stray_evidence,
+)
+from calibration.checks.stray_light import CERTAIN
+from calibration.figures.figure import (
+    JUDGEMENT,
+    NO_CAUSE,
+    NO_FRAMES,
+    NO_LINES,
+    NO_PLACE,
+    NOT_DRAWN,
+    OF_ITS_CAUSE,
+    ONLY_OF_A_SESSION,
+    SIMULATED,
+    Cause,
+    Figure,
+    Line,
+    SummaryRow,
+    Worst,
+)
+from foundation.angles import angles_deg
+from foundation.errors import first_of
+
+if TYPE_CHECKING:
+    import numpy.typing as npt
+
+    from calibration.checks.light_codes import CodeAgreement
+    from calibration.measurements import FrameMeasurements, TableMeasurements
+    from experiment.chart.model import Chart
+    from experiment.session.records import FrameRecord
+
+_PAIRS = 4
+"""Pairs of exchanged lights that a remark names; the report has all."""
+
+_WARM_UP = "let the lamp warm up for longer before the session"
+
+
+def percent(value: float) -> str:
+    """Return a share for the summary."""
+    return f"{100 * value:.2f} %"
+
+
+def percents(values: npt.NDArray[np.floating]) -> str:
+    """Return shares of R, G and B (3,) for the summary."""
+    return " / ".join(f"{100 * value:.2f}" for value in values.tolist()) + " %"
+
+
+def worst_light(table: TableMeasurements, light: int, what: str) -> Worst:
+    """Return a light as where the worst of a figure is, with its frame."""
+    record = next((frame.record for frame in table.frames if frame.record.illumination == light), None)
+    return Worst(what, "" if record is None else record.file, light)
+
+
+def _are_alike(table: TableMeasurements) -> bool:
+    """Return whether no names are exchanged and files tell of one camera and exposure, so that frames may be added."""
+    exchanged = table.lights.codes is not None and len(table.lights.codes.exchanges) > 0
+    return not exchanged and not table.origins.other_camera and not table.origins.other_exposure
+
+
+def _are_named_right(table: TableMeasurements) -> bool:
+    """Return whether white and the primaries are what they are called, so that they may be added up."""
+    off, white = table.lights.off_codes_deg, table.lights.white_frames
+    named = (off is None or not (off > 0).any()) and (white is None or not (white.off_deg > 0).any())
+    return named and _are_alike(table)
+
+
+def _white_drift(table: TableMeasurements) -> float | None:
+    return table.white_drift if len(table.white_frames) > 1 and table.lights.drift is None else None
+
+
+def _drift_row(table: TableMeasurements) -> SummaryRow | None:
+    if len(table.white_frames) < 2:
+        return None
+    return SummaryRow("Drift of white", percent(table.white_drift), "between white frames; 1 % is usual", brief=True)
+
+
+WHITE_DRIFT = Figure(
+    "white_drift", "Drift of paper white between white frames", "light", "share", "at most", 0.01, 0.15,
+    why="lights taken at other times differ in brightness; each has its own ground truth, so its colour is right",
+    source=JUDGEMENT + "; 1 % between whites is usual for a warm lamp", remedy=_WARM_UP,
+    measure=_white_drift, forecast=ONLY_OF_A_SESSION,
+    worst=NO_PLACE, where=OF_ITS_CAUSE, retake=NO_FRAMES, cause=Cause("drift", drift_evidence),
+    drawing="course", lines=(Line(130, _drift_row),),
+)  # fmt: skip
+
+
+def _drift_left(table: TableMeasurements) -> float | None:
+    drift = table.lights.drift
+    return drift.left if drift is not None and len(table.white_frames) > 1 else None
+
+
+DRIFT_LEFT = Figure(
+    "drift_left", "Drift that white frames leave open, where it is taken out", "light", "share", "at most", 0.002,
+    0.005,
+    why="between two white frames the lamp jumps or flickers, and a light there is given another brightness than it "
+    "had; its own ground truth goes along, so its colour is right",
+    source=SIMULATED + ": 0.1 % of a steady drift on a small chart; a jump of 1 % leaves 0.5 %",
+    remedy="build the table without --correct-drift, let the lamp warm up, or take white frames more often "
+    "(sequence.reference_every)",
+    measure=_drift_left, forecast=ONLY_OF_A_SESSION,
+    worst=NO_PLACE, where=OF_ITS_CAUSE, retake=NO_FRAMES, cause=NO_CAUSE,
+    drawing="course", lines=NO_LINES,
+)  # fmt: skip
+
+
+def _white_drift_deg(table: TableMeasurements) -> float | None:
+    white = np.array([frame.paper.white for frame in table.white_frames])
+    return float(angles_deg(white, np.broadcast_to(white[0], white.shape)).max()) if len(white) > 1 else None
+
+
+WHITE_DRIFT_DEG = Figure(
+    "white_drift_deg", "Drift of white's colour", "light", "°", "at most", 0.2, 2.0,
+    why="the lamp's spectrum changes, not its brightness alone",
+    source=JUDGEMENT + ": a tenth of a good method's error", remedy=_WARM_UP,
+    measure=_white_drift_deg, forecast=ONLY_OF_A_SESSION,
+    worst=NO_PLACE, where=OF_ITS_CAUSE, retake=NO_FRAMES, cause=Cause("drift", drift_evidence),
+    drawing="course", lines=NO_LINES,
+)  # fmt: skip
+
+
+def _leak(table: TableMeasurements) -> float | None:
+    share = table.dark_share
+    return share if np.isfinite(share) and table.lights.subtracted is None else None
+
+
+def _dark_row(table: TableMeasurements) -> SummaryRow | None:
+    dark, white = table.dark_frames, [frame.paper.white for frame in table.white_frames]
+    if not dark.files or not white:
+        return None
+    counts = " / ".join(f"{value:.2f}" for value in dark.light.tolist())
+    done = "not subtracted" if table.lights.subtracted is None else "subtracted from samples and ground truth"
+    value = f"{counts} counts, {percents(dark.light / np.mean(white, axis=0))} of white"
+    note = f"R, G, B of leak and ambient light on bare paper, {len(dark.files)} dark frames; {done}"
+    return SummaryRow("Light while the projector shows black", value, note)
+
+
+LEAK_SHARE = Figure(
+    "leak_share", "Light while the projector shows black, relative to white", "light", "share", "at most", 0.005, 0.1,
+    why="every light contains this much of the projector's leak and the room's light, so that deep colours are paler",
+    source=JUDGEMENT + "; a contrast of 1 : 1500 leaks 0.07 %",
+    remedy="darken the room, cover lamps and displays, or have it subtracted (build-lut --subtract-dark)",
+    measure=_leak, forecast=lambda check: None if check.leak is None else float(np.abs(check.leak).max()),
+    worst=NO_PLACE, where=OF_ITS_CAUSE, retake=NO_FRAMES, cause=Cause("dark", dark_evidence),
+    drawing=NOT_DRAWN, lines=(Line(210, _dark_row),),
+)  # fmt: skip
+
+DARK_DRIFT = Figure(
+    "dark_drift", "Change of that light between dark frames, relative to white", "light", "share", "at most", 0.002,
+    0.05,
+    why="the room's light changes; what is subtracted, or part of each light, is not what was there",
+    source=JUDGEMENT + ": a hundredth of a cell of a fifth of white",
+    remedy="darken the room, and keep daylight out",
+    measure=lambda table: table.dark_change if len(table.dark_frames.lights) > 1 else None,
+    forecast=ONLY_OF_A_SESSION,
+    worst=NO_PLACE, where=OF_ITS_CAUSE, retake=NO_FRAMES, cause=Cause("dark", dark_evidence),
+    drawing=NOT_DRAWN, lines=NO_LINES,
+)  # fmt: skip
+
+
+def _stray(table: TableMeasurements) -> float | None:
+    return table.lights.stray.share if table.lights.stray is not None and _are_alike(table) else None
+
+
+def _stray_row(table: TableMeasurements) -> SummaryRow | None:
+    """Return what light single frames have beyond the dark ones, and how many lights could be asked."""
+    name, stray = "Light that no dark frame shows", table.lights.stray
+    if table.lights.codes is None:
+        return None
+    if stray is None:
+        return SummaryRow(name, "not measured", "red, green and blue alone and a dark frame show it")
+    note = (
+        f"beyond {CERTAIN:g} standard errors; {int(stray.checked.sum())} of {len(stray.certain)} lights are checked by "
+        "a code of 0, the primaries against white; of the others it is not known"
+    )
+    return SummaryRow(name, f"{percent(stray.share)} of white", note)
+
+
+STRAY_SHARE = Figure(
+    "stray_share", "Light in some frames that no dark frame shows, of white", "light", "share", "at most", 0.004, 0.01,
+    why="a light contains it, or a primary that others are made of, so that deep colours are paler under some lights "
+    "than under others; subtracting dark frames does not help",
+    source=SIMULATED + ": below 0.1 % in healthy rooms; 1 % of white makes the darkest cells 10 % brighter, and puts "
+    "deep lights 1 to 2 degrees off, which is a good method's error",
+    remedy="darken the room, see that no door, lamp or display changes during the session, switch power saving and "
+    "dynamic contrast off, and take the frames again",
+    measure=_stray, forecast=ONLY_OF_A_SESSION,
+    worst=NO_PLACE, where=OF_ITS_CAUSE, retake=NO_FRAMES, cause=Cause("stray", stray_evidence),
+    drawing=NOT_DRAWN, lines=(Line(250, _stray_row),),
+)  # fmt: skip
+
+
+def _linearity(table: TableMeasurements) -> float | None:
+    return None if table.sensor.linearity is None else table.sensor.linearity.worst
+
+
+def _linearity_row(table: TableMeasurements) -> SummaryRow:
+    linearity = table.sensor.linearity
+    if linearity is None:
+        return SummaryRow("Linearity", "not measured", "give a series of exposures of the chart with --linearity")
+    low, high = linearity.range
+    note = f"{len(linearity.files)} exposures, {low:.0%} to {high:.0%} of saturation; 1 % is usual"
+    return SummaryRow("Linearity", f"{percent(linearity.worst)} from a straight line at most", note)
+
+
+LINEARITY = Figure(
+    "linearity", "Deviation from linearity, 5 to 95 % of saturation", "radiometry", "share", "at most", 0.01, 0.05,
+    why="counts are not proportional to light, so that chromaticities change with brightness",
+    source="EMVA 1288 asks for the range; 1 % is " + JUDGEMENT,
+    remedy="expose less, switch the camera's highlight priority off, and take the series in steady light",
+    measure=_linearity, forecast=ONLY_OF_A_SESSION,
+    worst=NO_PLACE, where=OF_ITS_CAUSE, retake=NO_FRAMES, cause=NO_CAUSE,
+    drawing=NOT_DRAWN, lines=(Line(185, _linearity_row),),
+)  # fmt: skip
+
+
+def _beyond_sum(sign: int) -> Callable[[TableMeasurements], float | None]:
+    """Return what measures by how much white is above (−1) or below (1) the sum of the primaries, a share."""
+
+    def measure(table: TableMeasurements) -> float | None:
+        off = table.lights.additivity
+        return max(float((sign * off).max()), 0.0) if off is not None and _are_named_right(table) else None
+
+    return measure
+
+
+def _sum_evidence(table: TableMeasurements, limit: float) -> Gathered:
+    light = light_evidence(table, limit)
+    return light if light.frames else name_evidence(table, OFF_CODES_DEG.accept)
+
+
+def _sum_row(table: TableMeasurements) -> SummaryRow | None:
+    off = table.lights.additivity
+    note = "R, G, B, of white; 0 is additive"
+    return None if off is None else SummaryRow("Red + green + blue − white", percents(off), note)
+
+
+ADDITIVITY = Figure(
+    "additivity", "White against the sum of the primaries", "light", "share", "at most", 0.02, None,
+    why="a light cannot be predicted from its codes: the projector brightens or converts white, or frames are not what "
+    "they are called, or exposed otherwise",
+    source=JUDGEMENT + "; the drift of the lamp is taken out first",
+    remedy="switch off brilliant colour, white boost and dynamic contrast in the projector's menu",
+    measure=_beyond_sum(-1), forecast=lambda check: check.not_additive,
+    worst=NO_PLACE, where=OF_ITS_CAUSE, retake=NO_FRAMES, cause=Cause("sum", _sum_evidence),
+    drawing=NOT_DRAWN, lines=(Line(260, _sum_row),),
+)  # fmt: skip
+
+WHITE_DEFICIT = Figure(
+    "white_short", "White short of the sum of the primaries", "light", "share", "at most", 0.05, 0.3,
+    why="no wheel takes light away: a frame of white or of a primary was exposed otherwise, or the projector holds "
+    "full white back",
+    source=JUDGEMENT + "; a lamp that flickers by 1 % gives 2 %",
+    remedy="look at the exposures of these frames, and switch dynamic contrast and power saving off",
+    measure=_beyond_sum(1), forecast=ONLY_OF_A_SESSION,
+    worst=NO_PLACE, where=OF_ITS_CAUSE, retake=NO_FRAMES, cause=Cause("brightness", light_evidence),
+    drawing=NOT_DRAWN, lines=NO_LINES,
+)  # fmt: skip
+
+
+def _of_codes(value: Callable[[CodeAgreement], float]) -> Callable[[TableMeasurements], float | None]:
+    """Return what measures how lights agree with their codes; None after a check."""
+    return lambda table: None if table.lights.codes is None else value(table.lights.codes)
+
+
+def _off_codes(table: TableMeasurements) -> float | None:
+    off = table.lights.off_codes_deg
+    return None if off is None else float(off.max())
+
+
+def _furthest_off(table: TableMeasurements, chart: Chart) -> Worst | None:
+    off = table.lights.off_codes_deg
+    if off is None or not off.any():
+        return None
+    return worst_light(table, int(np.argmax(off)), f"{off.max():.2g}° off")
+
+
+def _light_name(index: int, count: int) -> str:
+    return f"light {index}" if index < count else f"white frame {index - count}"
+
+
+def _exchanges(table: TableMeasurements, accepted: float) -> str:
+    """Return which lights bear each other's names; "" where none do."""
+    codes, count = table.lights.codes, table.session.lights
+    if codes is None or not codes.exchanges:
+        return ""
+    pairs = [f"{_light_name(pair.one, count)} and {_light_name(pair.other, count)}" for pair in codes.exchanges]
+    apart = f"{codes.exchanges[0].angle_deg:.2g}° apart"
+    more = f" (and {len(pairs) - _PAIRS} pairs more)" if len(pairs) > _PAIRS else ""
+    return f"exchanged names: {', '.join(pairs[:_PAIRS])}{more}, {apart} in the first pair"
+
+
+def _off_lights(table: TableMeasurements, accepted: float) -> str:
+    lights, exchanged = table.lights.lights_off_codes(accepted), _exchanges(table, accepted)
+    return f"{len(lights)} lights: {first_of(lights)}{f'; {exchanged}' if exchanged else ''}"
+
+
+def _frames_off_codes(table: TableMeasurements, limit: float) -> list[FrameRecord]:
+    lights = set(table.lights.lights_off_codes(limit))
+    return [frame.record for frame in table.frames if frame.record.illumination in lights]
+
+
+def _codes_row(table: TableMeasurements) -> SummaryRow | None:
+    off = table.lights.off_codes_deg
+    if off is None:
+        return None
+    worst = int(np.argmax(off))
+    note = "angle between a white and what all other lights predict from its codes, beyond four standard errors"
+    return SummaryRow("Lights against their codes", f"{off[worst]:.2f}° at most, light {worst}", note)
+
+
+OFF_CODES_DEG = Figure(
+    "off_codes_deg", "White of a light against what its codes predict", "light", "°", "at most", 2.0, 8.0,
+    foremost=True,
+    why="a frame bears another light's name, or was taken before the picture changed: codes in the table are not those "
+    "of its whites",
+    source=SIMULATED + ": 0 in random healthy rooms; a list of frames shifted by a row gives 28 and more, an exchange "
+    "of two lights the angle between them",
+    remedy="correct the list of frames that was imported, let the picture settle for longer (sequence.settle_s), or "
+    "expose whole turns of the colour wheel",
+    measure=_off_codes, forecast=ONLY_OF_A_SESSION,
+    worst=_furthest_off, where=_off_lights, retake=_frames_off_codes, cause=Cause("names", name_evidence),
+    drawing="lights", lines=(Line(220, _codes_row),),
+)  # fmt: skip
+
+
+def _brightest_off(table: TableMeasurements, chart: Chart) -> Worst | None:
+    codes = table.lights.codes
+    if codes is None or not codes.off_brightness.any():
+        return None
+    light = int(np.argmax(codes.off_brightness))
+    return worst_light(table, light, f"{100 * codes.off_brightness[light]:.2g} % off")
+
+
+def _brightness_text(table: TableMeasurements, accepted: float) -> str:
+    """Return which lights are brighter or darker than their codes predict, the furthest off first."""
+    codes = table.lights.codes
+    if codes is None:
+        return ""
+    order = sorted(range(len(codes.off_brightness)), key=lambda light: -codes.off_brightness[light])
+    found = [f"light {k} by {100 * codes.brightness[k]:+.0f} %" for k in order if codes.off_brightness[k] > accepted]
+    return first_of(found)
+
+
+def _frames_off_brightness(table: TableMeasurements, limit: float) -> list[FrameRecord] | None:
+    if table.lights.codes is None:
+        return None
+    off = table.lights.codes.off_brightness
+
+    def light_of(frame: FrameMeasurements) -> int:
+        return sys.maxsize if frame.record.illumination is None else frame.record.illumination
+
+    return [frame.record for frame in table.frames if light_of(frame) < len(off) and off[light_of(frame)] > limit]
+
+
+OFF_BRIGHTNESS = Figure(
+    "off_brightness", "Brightness of a light against what its codes predict", "light", "share", "at most", 0.1, 0.3,
+    why="a frame was exposed otherwise than its file states, or another light; brightness differs between lights that "
+    "should be alike",
+    source=JUDGEMENT + ": lamps flicker by some per cent, the next shutter time is 26 % off",
+    remedy="keep one exposure for the session, and take the frames again",
+    measure=_of_codes(lambda codes: float(codes.off_brightness.max())), forecast=ONLY_OF_A_SESSION,
+    worst=_brightest_off, where=_brightness_text, retake=_frames_off_brightness,
+    cause=Cause("brightness", brightness_evidence, follows=("off_codes_deg", "exchanged_lights")),
+    drawing=NOT_DRAWN, lines=NO_LINES,
+)  # fmt: skip
+
+EXCHANGED_LIGHTS = Figure(
+    "exchanged_lights", "Pairs of lights that bear each other's names", "light", "", "at most", 0, None,
+    why="their whites fit their codes when exchanged and not as they are; each ground truth is measured and right, "
+    "but its codes and temperature are the other's",
+    source=SIMULATED + ": none in random healthy rooms, all pairs further apart than the figure below in the others",
+    remedy="correct the list of frames that was imported, or take both again",
+    measure=_of_codes(lambda codes: float(len(codes.exchanges))), forecast=ONLY_OF_A_SESSION,
+    worst=NO_PLACE, where=_exchanges, retake=NO_FRAMES, cause=Cause("names", name_evidence),
+    drawing="lights", lines=NO_LINES,
+)  # fmt: skip
+
+CODE_MISFIT = Figure(
+    "code_misfit", "Disagreement of few lights with their codes, all together", "light", "", "at most", 1.0, None,
+    why="no projector makes these whites of these codes, whichever light it is that is wrong",
+    source=SIMULATED + ": 1 is what random healthy rooms stay below; of more than 24 lights each is judged by itself",
+    remedy="look whether frames and lights belong together, and whether the lamp was steady",
+    measure=_of_codes(lambda codes: codes.misfit), forecast=ONLY_OF_A_SESSION,
+    worst=NO_PLACE, where=OF_ITS_CAUSE, retake=NO_FRAMES, cause=NO_CAUSE,
+    drawing="lights", lines=NO_LINES,
+)  # fmt: skip
+
+EXCHANGE_DEG = Figure(
+    "exchange_deg", "Angle down to which exchanged names are excluded", "light", "°", "at most", 8.0, None,
+    why="two lights less far apart than this could bear each other's names unnoticed",
+    source=SIMULATED + ": 0.3 with 707 lights, 0 with eight that lie far apart",
+    remedy="take white and the primaries along with the lights, and expose longer",
+    measure=_of_codes(lambda codes: codes.exchange_deg), forecast=ONLY_OF_A_SESSION,
+    worst=NO_PLACE, where=OF_ITS_CAUSE, retake=NO_FRAMES, cause=NO_CAUSE,
+    drawing="lights", lines=NO_LINES,
+)  # fmt: skip
+
+
+def _checked_text(table: TableMeasurements, accepted: float) -> str:
+    codes = table.lights.codes
+    return "" if codes is None else f"{int(codes.held.sum())} of {len(codes.held)}"
+
+
+def _checked_row(table: TableMeasurements) -> SummaryRow | None:
+    codes = table.lights.codes
+    if codes is None:
+        return None
+    value = f"{_checked_text(table, 0.0)}; exchanged names excluded down to {codes.exchange_deg:.2g}°"
+    note = "the others are too few, or too dim, for a wrong name to be noticed"
+    return SummaryRow("Lights held against their codes", value, note)
+
+
+CHECKED_SHARE = Figure(
+    "held_share", "Lights that could be held against their codes", "light", "share", "at least", 0.9, None,
+    why="of the others nothing says that they bear their own names",
+    source="the angle from which a wrong name is refused, beyond what codes predict of so few lights",
+    remedy="take white, red, green and blue along with the lights, and expose longer",
+    measure=_of_codes(lambda codes: float(codes.held.mean())), forecast=ONLY_OF_A_SESSION,
+    worst=NO_PLACE, where=_checked_text, retake=NO_FRAMES, cause=NO_CAUSE,
+    drawing=NOT_DRAWN, lines=(Line(230, _checked_row),),
+)  # fmt: skip
+
+_OF_WHITES = Callable[["CodeAgreement"], "npt.NDArray[np.float64]"]
+
+
+def _white_frames(of: _OF_WHITES) -> Callable[[TableMeasurements], float | None]:
+    """Return what measures how far white frames are from what the lights predict; None without them."""
+
+    def measure(table: TableMeasurements) -> float | None:
+        return None if table.lights.white_frames is None else float(of(table.lights.white_frames).max())
+
+    return measure
+
+
+def _white_frames_beyond(of: _OF_WHITES) -> Callable[[TableMeasurements, float], list[FrameRecord]]:
+    """Return what tells the white frames that are further than a limit from what the lights predict."""
+
+    def beyond(table: TableMeasurements, limit: float) -> list[FrameRecord]:
+        white = table.lights.white_frames
+        off = [] if white is None else of(white).tolist()
+        return [frame.record for frame, value in zip(table.white_frames, off, strict=False) if value > limit]
+
+    return beyond
+
+
+_beyond_deg = _white_frames_beyond(lambda white: white.off_deg)
+_beyond_brightness = _white_frames_beyond(lambda white: white.off_brightness)
+
+WHITE_FRAME_DEG = Figure(
+    "white_frame_deg", "White frame against what the lights predict", "light", "°", "at most", 2.0, 8.0, foremost=True,
+    why="the frame shows another light than white, or the lights bear wrong names",
+    source=SIMULATED + ": 0 in random healthy rooms",
+    remedy="correct the list of frames that was imported, or take the white frame again",
+    measure=_white_frames(lambda white: white.off_deg), forecast=ONLY_OF_A_SESSION,
+    worst=NO_PLACE, where=lambda table, accepted: first_of([one.file for one in _beyond_deg(table, accepted)]),
+    retake=_beyond_deg, cause=Cause("names", name_evidence),
+    drawing="course", lines=NO_LINES,
+)  # fmt: skip
+
+WHITE_FRAME_BRIGHTNESS = Figure(
+    "white_frame_brightness", "Brightness of the white frame against what the lights predict", "light", "share",
+    "at most", 0.1, 0.3,
+    why="the white frame was exposed otherwise than the lights, so that drift and stray light are read wrongly",
+    source=JUDGEMENT + ": lamps flicker by some per cent, the next shutter time is 26 % off",
+    remedy="keep one exposure for the session, and take the white frame again",
+    measure=_white_frames(lambda white: white.off_brightness), forecast=ONLY_OF_A_SESSION,
+    worst=NO_PLACE, where=lambda table, accepted: first_of([one.file for one in _beyond_brightness(table, accepted)]),
+    retake=_beyond_brightness, cause=Cause("brightness", light_evidence),
+    drawing="course", lines=NO_LINES,
+)  # fmt: skip
+
+
+def _primaries_lacking(table: TableMeasurements) -> float | None:
+    if table.lights.codes is None:
+        return None
+    alone = {light.index(max(light)) for light in table.session.codes if max(light) == sum(light) > 0}
+    return float(3 - len(alone)) if alone else 0.0
+
+
+def _fields_row(table: TableMeasurements) -> SummaryRow | None:
+    if table.primaries is not None or table.lights.codes is None:
+        return None
+    note = "no frames of red, green and blue, each alone and bright enough; coloured cells are evened by paper's"
+    return SummaryRow("Fields of the primaries", "not measured", note)
+
+
+PRIMARIES_LACKING = Figure(
+    "primaries_lacking", "Primaries without a frame of their own", "light", "", "at most", 0, None,
+    why="the fields of the primaries were not measured, so that coloured cells are evened by the field of paper",
+    source="where the primaries' fields differ by 10 %, coloured cells at corners are off by some tenths of a per cent",
+    remedy="take red, green and blue, each alone, along with the lights",
+    measure=_primaries_lacking, forecast=ONLY_OF_A_SESSION,
+    worst=NO_PLACE, where=OF_ITS_CAUSE, retake=NO_FRAMES, cause=NO_CAUSE,
+    drawing="field", lines=(Line(240, _fields_row),),
+)  # fmt: skip
+
+
+def _tint(table: TableMeasurements) -> float | None:
+    tint = table.greys.tints_deg(table.lights.white)
+    return float(np.nanmax(tint)) if tint.size and np.isfinite(tint).any() else None
+
+
+def _tint_row(table: TableMeasurements) -> SummaryRow | None:
+    if not table.greys.names:
+        return None
+    tints = zip(table.greys.names, table.greys.tints_deg(table.lights.white).tolist(), strict=True)
+    note = (
+        "angle to bare paper's camera RGB; a print through the printer's profile has 1° to 2.5°, for it is "
+        "neutral to the eye and not to the camera, one of plain ink codes 4° to 8°"
+    )
+    return SummaryRow("Tint of the greys", ", ".join(f"{name}: {angle:.2f}°" for name, angle in tints), note)
+
+
+GREY_TINT_DEG = Figure(
+    "grey_tint_deg", "Tint of the print's greys against paper", "radiometry", "°", "at most", 6.0, None,
+    why="greys are not neutral; the ground truth is paper's, so methods that rely on grey are judged by another grey",
+    source=JUDGEMENT + "; simulated prints have 1 to 2.5 through the printer's profile, 4.5 (poster paper) to 8 "
+    "(glossy) where codes are ink codes, as the publication printed them",
+    remedy="generate with --rendering colorimetric, which takes the print as it is measured; or have the chart printed "
+    "through the printer's profile (docs/printing.md)",
+    measure=_tint, forecast=lambda check: check.tint_deg,
+    worst=NO_PLACE, where=OF_ITS_CAUSE, retake=NO_FRAMES, cause=NO_CAUSE,
+    drawing=NOT_DRAWN, lines=(Line(270, _tint_row),),
+)  # fmt: skip

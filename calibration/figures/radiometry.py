@@ -1,0 +1,359 @@
+"""Figures of the print's cells, of frames against each other, and of the camera that took them."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from calibration.causes.gathering import (
+    PrintPlace,
+    block_evidence,
+    blur_evidence,
+    camera_evidence,
+    disturbed_evidence,
+    iso_evidence,
+    light_evidence,
+    movement_evidence,
+    scatter_evidence,
+    spot_evidence,
+    unfit_evidence,
+)
+from calibration.checks.frame_consistency import has_enough_cells
+from calibration.figures.figure import (
+    JUDGEMENT,
+    NO_CAUSE,
+    NO_FRAMES,
+    NO_LINES,
+    NO_PLACE,
+    NOT_DRAWN,
+    OF_ITS_CAUSE,
+    ONLY_OF_A_SESSION,
+    SIMULATED,
+    Cause,
+    CheckMeasurements,
+    Figure,
+    Line,
+    SummaryRow,
+    Worst,
+)
+from experiment.measures.reflections import added_light
+from experiment.measures.sensor_range import MAX_BLACK_DRIFT
+from foundation.errors import counted, first_of
+
+if TYPE_CHECKING:
+    from calibration.checks.frame_origins import ForeignFrame
+    from calibration.measurements import FrameMeasurements, TableMeasurements
+    from experiment.chart.model import Chart
+    from experiment.session.records import FrameRecord
+
+_OF_FRAME = Callable[["TableMeasurements", "FrameMeasurements"], float]
+
+_UNFIT_REMEDIES = {
+    "outside": "bring all of the chart into the picture",
+    "clipped": "expose less",
+    "covered": "uncover the chart",
+    "hot": "let the camera cool",
+    "dead": "have the camera's pixels remapped",
+    "stained": "clean the print or print it anew, and light it evenly",
+    "disturbed": "see that nothing comes between lamp, print and camera",
+    "unlike": "look at the cell in the frame of that light",
+    "misplaced": "hang the print flatter",
+    "uneven": "focus on the print and keep the camera still",
+}
+"""What helps against each cause of unfit cells (`calibration.pipeline.accumulator`)."""
+
+_SAME_EXPOSURE = "keep one exposure and ISO speed for the session, and take these frames again"
+
+
+def _cell_count(table: TableMeasurements) -> int:
+    return len(table.registration.mismatched_cells)
+
+
+def _most_unfit(table: TableMeasurements) -> tuple[str, str] | None:
+    """Return how many unfit cells are of the commonest kind, and what helps against that."""
+    if not table.cells.unfit:
+        return None
+    kind, count = Counter(cell.kind for cell in table.cells.unfit).most_common(1)[0]
+    return f", {count} of them {kind}", _UNFIT_REMEDIES.get(kind, "look at the report")
+
+
+def _unfit_in_check(check: CheckMeasurements) -> float | None:
+    """Return the share of unfit cells; None where stains are not known, and what is known, the least, is accepted."""
+    share = check.unfit_share
+    if share is None or (check.paper is None and UNFIT_SHARE.outcome(share) == "accept"):
+        return None
+    return share
+
+
+def _unfit_row(table: TableMeasurements) -> SummaryRow:
+    count = len(table.cells.unfit)
+    return SummaryRow("Cells unfit for use", str(count), "listed in lut.json, never filled", brief=True)
+
+
+UNFIT_SHARE = Figure(
+    "unfit_share", "Cells unfit for use", "radiometry", "share", "at most", 0.005, 0.1,
+    why="colours without samples are missing from every picture", source=JUDGEMENT, remedy="", found=_most_unfit,
+    measure=lambda table: len(table.cells.unfit) / max(_cell_count(table), 1), forecast=_unfit_in_check,
+    worst=NO_PLACE, where=OF_ITS_CAUSE, retake=NO_FRAMES,
+    cause=Cause("unfit cells", unfit_evidence, follows=("unlike_block",)),
+    drawing="print", lines=(Line(290, _unfit_row),),
+)  # fmt: skip
+
+
+def _most_deviating(table: TableMeasurements, chart: Chart) -> Worst | None:
+    stains, file = table.cells.stains, table.session.registered_file
+    if not stains.known:
+        return None
+    off = stains.largest_deviation()
+    colour = int(np.argmax(np.abs(off)))
+    x, y = chart.centres_mm[chart.cell_of_colour[colour]].tolist()
+    return Worst(f"colour {colour}, {100 * off[colour]:+.2g} %", file, place=PrintPlace(file, x, y, 0.0))
+
+
+def _doubtful_in_check(check: CheckMeasurements) -> float | None:
+    return None if check.stains is None or not check.stains.known else float(check.stains.doubtful.mean())
+
+
+DOUBTFUL_SHARE = Figure(
+    "doubtful_share", "Cells in surroundings 1 % off their codes' colours", "radiometry", "share", "at most", 0.0003,
+    None,
+    why="the print, or the light on it, is not the same there as elsewhere; from 2 % on its cells are listed as unfit",
+    source=SIMULATED + ": none on a clean flat print",
+    remedy="clean the print, hang it flatter, and look for shadows on it",
+    measure=lambda table: float(table.cells.stains.doubtful.mean()) if table.cells.stains.known else None,
+    forecast=_doubtful_in_check,
+    worst=_most_deviating, where=OF_ITS_CAUSE, retake=NO_FRAMES, cause=Cause("spot", spot_evidence),
+    drawing="print", lines=NO_LINES,
+)  # fmt: skip
+
+
+def _added_in_check(check: CheckMeasurements) -> float | None:
+    return None if check.stains is None or not check.stains.known else added_light(check.stains)
+
+
+ADDED_LIGHT = Figure(
+    "added_light", "Light added to a large part of the print, of paper white", "radiometry", "share", "at most", 0.004,
+    0.01,
+    why="it is the same on dark cells as on bright ones, and goes on beyond those that are listed as unfit",
+    source=SIMULATED + ": 0 in healthy rooms; 1 % of paper makes cells of a tenth of paper 10 % brighter, and those "
+    "of a thirtieth 30 %; a reflection of 3 % leaves a table with cells 57 % off",
+    remedy="turn print or projector until nothing is mirrored on it, or print on matt paper",
+    measure=lambda table: added_light(table.cells.stains) if table.cells.stains.known else None,
+    forecast=_added_in_check,
+    worst=NO_PLACE, where=OF_ITS_CAUSE, retake=NO_FRAMES, cause=Cause("spot", spot_evidence),
+    drawing="print", lines=NO_LINES,
+)  # fmt: skip
+
+
+def _frames_beyond(value: _OF_FRAME) -> Callable[[TableMeasurements, float], list[FrameRecord] | None]:
+    """Return what tells the frames beyond a limit by themselves; of all of them none is told."""
+
+    def retake(table: TableMeasurements, limit: float) -> list[FrameRecord] | None:
+        beyond = [frame.record for frame in table.frames if value(table, frame) > limit]
+        # Where every frame is beyond, the fault is not one of single frames.
+        return beyond if len(beyond) < len(table.frames) else None
+
+    return retake
+
+
+def _softest(table: TableMeasurements) -> FrameMeasurements:
+    return max(table.frames, key=lambda frame: frame.blur_px)
+
+
+def _softest_text(table: TableMeasurements, accepted: float) -> str:
+    return f"in {_softest(table).record.file}, whose blur is σ = {_softest(table).blur_px:.2f} px"
+
+
+SOFTER_BLEED = Figure(
+    "softer_bleed", "Light of neighbouring cells added in the most blurred frame", "geometry", "share", "at most",
+    0.003, 0.012,
+    why="a frame is out of focus, or was shaken; only white frames are checked cell by cell for such light",
+    source=SIMULATED + ": 0.9 px of blur in one frame of a session with 0.5 px give 0.8 % and cells 1.2 % off, "
+    "1.1 px 2 % and cells 4 % off",
+    remedy="switch off autofocus and stabilisation, see that nothing shakes the camera",
+    measure=lambda table: max(map(table.added_bleed, table.frames), default=0.0), forecast=ONLY_OF_A_SESSION,
+    worst=lambda table, chart: Worst(f"blur σ {_softest(table).blur_px:.2f} px", _softest(table).record.file),
+    where=_softest_text, retake=_frames_beyond(lambda table, frame: table.added_bleed(frame)),
+    cause=Cause("frame", blur_evidence),
+    drawing="course", lines=NO_LINES,
+)  # fmt: skip
+
+
+def _most_scattered(table: TableMeasurements, chart: Chart) -> Worst | None:
+    worst = max(table.frames, key=lambda frame: frame.consistency.scatter)
+    scatter = worst.consistency.scatter
+    return Worst(f"{100 * scatter:.2g} %", worst.record.file) if scatter > 0 else None
+
+
+def _of_alike_frames(value: _OF_FRAME) -> Callable[[TableMeasurements], float | None]:
+    """Return what measures the largest value of a frame, on charts of enough cells to compare frames by."""
+
+    def measure(table: TableMeasurements) -> float | None:
+        known = has_enough_cells(_cell_count(table))
+        return max((value(table, frame) for frame in table.frames), default=0.0) if known else None
+
+    return measure
+
+
+FRAME_SCATTER = Figure(
+    "unlike_scatter", "Scatter of cells about their codes' colours, worst frame", "radiometry", "share", "at most",
+    0.012, 0.03,
+    why="the frame's samples are not of their cells' colours",
+    source=SIMULATED + ": to 0.8 % beyond noise; a blur of 1.1 px gives 1.4 %, 1.5 px 5 %, another print 50 %",
+    remedy="see that nothing changes during the session",
+    measure=_of_alike_frames(lambda table, frame: frame.consistency.scatter), forecast=ONLY_OF_A_SESSION,
+    worst=_most_scattered,
+    where=lambda table, accepted: f"in {max(table.frames, key=lambda one: one.consistency.scatter).record.file}",
+    retake=_frames_beyond(lambda table, frame: frame.consistency.scatter),
+    cause=Cause("frame", scatter_evidence, follows=("unlike_block", "disturbed_cells")),
+    drawing="course", lines=NO_LINES,
+)  # fmt: skip
+
+
+def _worst_block(table: TableMeasurements, chart: Chart) -> Worst | None:
+    worst = max(table.frames, key=lambda frame: frame.consistency.block)
+    seen, file = worst.consistency, worst.record.file
+    place = PrintPlace(file, *seen.at_mm, seen.extent_mm)
+    return Worst(f"{100 * seen.block:.2g} %", file, place=place) if seen.block > 0 else None
+
+
+UNLIKE_BLOCK = Figure(
+    "unlike_block", "Deviation of the worst block of cells, worst frame", "radiometry", "share", "at most", 0.01, 0.03,
+    why="something lay, or shone, on the print in that frame or in the one compared with, and its samples contain it",
+    source=SIMULATED + ": to 0.4 % beyond noise", remedy="see that nobody comes between lamp, print and camera",
+    measure=_of_alike_frames(lambda table, frame: frame.consistency.block), forecast=ONLY_OF_A_SESSION,
+    worst=_worst_block, where=OF_ITS_CAUSE, retake=_frames_beyond(lambda table, frame: frame.consistency.block),
+    cause=Cause("block", block_evidence),
+    drawing="course", lines=NO_LINES,
+)  # fmt: skip
+
+
+def _disturbed(table: TableMeasurements) -> float | None:
+    lights = [frame for frame in table.frames if frame.record.kind == "light"]
+    found = {cell for frame in lights for cell, _ in frame.consistency.disturbed}
+    return float(len(found)) if has_enough_cells(_cell_count(table)) else None
+
+
+DISTURBED_CELLS = Figure(
+    "disturbed_cells", "Cells next to each other that are far off in a light's frame", "radiometry", "", "at most", 0,
+    None,
+    why="their samples under that light are not of their own colours; they are listed as unfit, and the other cells "
+    "are not touched",
+    source=SIMULATED + ": none in healthy rooms; two cells next to each other, five standard deviations off, are one, "
+    "unless the dark frames show them to be hot",
+    remedy="see that nothing comes between lamp, print and camera",
+    measure=_disturbed, forecast=ONLY_OF_A_SESSION,
+    worst=NO_PLACE, where=OF_ITS_CAUSE, retake=NO_FRAMES,
+    cause=Cause("few cells", disturbed_evidence, follows=("unlike_block",)),
+    drawing="worst", lines=NO_LINES,
+)  # fmt: skip
+
+
+def _registered_anew(table: TableMeasurements) -> int:
+    return sum(frame.reregistered for frame in table.frames)
+
+
+def _movement_row(table: TableMeasurements) -> SummaryRow | None:
+    if len(table.frames) < 2:
+        return None
+    moved, note = f"{table.largest_shift_px:.3f} px at most", f"{_registered_anew(table)} frames registered again"
+    return SummaryRow("Movement of the chart", moved, note, brief=True)
+
+
+REGISTERED_ANEW = Figure(
+    "moved_anew", "Frames registered again", "geometry", "", "at most", 0, None,
+    why="the chart or the camera moved between frames; the sampling grid followed", source=JUDGEMENT,
+    remedy="fix camera and print, and let nobody walk about",
+    measure=lambda table: float(_registered_anew(table)) if len(table.frames) > 1 else None,
+    forecast=ONLY_OF_A_SESSION,
+    worst=NO_PLACE, where=OF_ITS_CAUSE, retake=NO_FRAMES, cause=Cause("movement", movement_evidence),
+    drawing="course", lines=(Line(120, _movement_row),),
+)  # fmt: skip
+
+
+def _foreign(frames: tuple[ForeignFrame, ...]) -> str:
+    """Return which frames state otherwise than most, and what."""
+    if not frames:
+        return ""
+    names = first_of([frame.record.file for frame in frames])
+    return f"{counted(len(frames), 'frame')}: {names}, with {frames[0].found} instead of {frames[0].expected}"
+
+
+OTHER_CAMERA = Figure(
+    "other_camera", "Frames of another camera", "radiometry", "", "at most", 0, 0.5, foremost=True,
+    why="a table is of one camera: another body sees other colours, and another model others yet",
+    source="by definition", remedy="take these frames again with the session's camera",
+    measure=lambda table: float(len(table.origins.other_camera)), forecast=ONLY_OF_A_SESSION,
+    worst=NO_PLACE, where=lambda table, accepted: _foreign(table.origins.other_camera),
+    retake=lambda table, limit: [frame.record for frame in table.origins.other_camera],
+    cause=Cause("camera", camera_evidence),
+    drawing=NOT_DRAWN, lines=NO_LINES,
+)  # fmt: skip
+
+OTHER_LENS = Figure(
+    "other_lens", "Frames through another lens", "radiometry", "", "at most", 0, None,
+    why="lenses tint, blur and shade each in its own way", source="by definition",
+    remedy="take these frames again through the session's lens",
+    measure=lambda table: float(len(table.origins.other_lens)), forecast=ONLY_OF_A_SESSION,
+    worst=NO_PLACE, where=lambda table, accepted: _foreign(table.origins.other_lens), retake=NO_FRAMES,
+    cause=Cause("camera", camera_evidence),
+    drawing=NOT_DRAWN, lines=NO_LINES,
+)  # fmt: skip
+
+
+def _otherwise_exposed(table: TableMeasurements, limit: float) -> list[FrameRecord]:
+    others = table.origins.other_exposure
+    return [frame.record for frame in others if max(frame.ratio, 1 / frame.ratio) - 1 > limit]
+
+
+OTHER_EXPOSURE = Figure(
+    "other_exposure", "Exposure of a frame against that of most, as the files state it", "radiometry", "share",
+    "at most", 0.01, 0.1, foremost=True,
+    why="brightness would differ between lights that should be alike, and the noise with the ISO speed",
+    source="shutter times are steps of 26 % apart, and are written rounded", remedy=_SAME_EXPOSURE,
+    measure=lambda table: table.origins.exposure_difference, forecast=ONLY_OF_A_SESSION,
+    worst=NO_PLACE, where=lambda table, accepted: _foreign(table.origins.other_exposure), retake=_otherwise_exposed,
+    cause=Cause("brightness", light_evidence),
+    drawing=NOT_DRAWN, lines=NO_LINES,
+)  # fmt: skip
+
+OTHER_ISO = Figure(
+    "other_iso", "Frames of another ISO speed", "radiometry", "", "at most", 0, None,
+    why="their noise is another, and so is the count at which they saturate; their exposure is judged apart",
+    source="by definition", remedy=_SAME_EXPOSURE,
+    measure=lambda table: float(len(table.origins.other_iso)), forecast=ONLY_OF_A_SESSION,
+    worst=NO_PLACE, where=lambda table, accepted: _foreign(table.origins.other_iso), retake=NO_FRAMES,
+    cause=Cause("iso", iso_evidence),
+    drawing=NOT_DRAWN, lines=NO_LINES,
+)  # fmt: skip
+
+WHITE_FRAMES = Figure(
+    "white_frames", "White frames", "light", "", "at least", 1, None,
+    why="nothing says how the lamp drifted, whether the print has stains, or whether cells are of one colour",
+    source="by definition; from two on a drift is seen",
+    remedy="take white frames along with the lights (sequence.reference_every)",
+    measure=lambda table: float(len(table.white_frames)) if len(table.frames) > 1 else None,
+    forecast=ONLY_OF_A_SESSION,
+    worst=NO_PLACE, where=OF_ITS_CAUSE, retake=NO_FRAMES, cause=NO_CAUSE,
+    drawing="course", lines=NO_LINES,
+)  # fmt: skip
+
+
+def _black_row(table: TableMeasurements) -> SummaryRow:
+    black = np.mean([frame.black for frame in table.frames], axis=0)
+    note = f"drift {table.black_drift:.2f} counts, up to {MAX_BLACK_DRIFT:g} is usual"
+    return SummaryRow("Black level", f"{black.mean():.2f} counts", note)
+
+
+BLACK_DRIFT_COUNTS = Figure(
+    "black_drift_counts", "Drift of the black level", "radiometry", "counts", "at most", MAX_BLACK_DRIFT, 16.0,
+    why="the sensor warmed up; each frame's own black is subtracted, but an error of it shows in dark cells of about "
+    "30 counts",
+    source=JUDGEMENT, remedy="let the camera run for some minutes before the session, and rest between frames",
+    measure=lambda table: table.black_drift, forecast=ONLY_OF_A_SESSION,
+    worst=NO_PLACE, where=OF_ITS_CAUSE, retake=NO_FRAMES, cause=NO_CAUSE,
+    drawing="course", lines=(Line(140, _black_row),),
+)  # fmt: skip

@@ -1,0 +1,209 @@
+"""Figures of the noise of samples, and of how well each light's colour, the ground truth, is known."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from calibration.causes.gathering import PrintPlace, noisy_evidence, reference_evidence
+from calibration.figures.figure import (
+    JUDGEMENT,
+    NO_CAUSE,
+    NO_FRAMES,
+    NO_LINES,
+    NO_PLACE,
+    OF_ITS_CAUSE,
+    ONLY_OF_A_SESSION,
+    SIMULATED,
+    Cause,
+    Figure,
+    Line,
+    SummaryRow,
+    Worst,
+)
+from calibration.figures.light import percent, percents, worst_light
+from experiment.framing.planes import CLIPPING_SHARE, MIN_SIGNAL
+
+if TYPE_CHECKING:
+    from calibration.measurements import FrameMeasurements, TableMeasurements
+    from experiment.chart.model import Chart
+    from experiment.measures.paper import Paper
+
+
+def _noise_row(table: TableMeasurements) -> SummaryRow:
+    return SummaryRow("Noise of a sample", percents(table.sensor.noise), "R, G, B, of paper under white")
+
+
+def _at_zero_row(table: TableMeasurements) -> SummaryRow | None:
+    share = table.lights.share_at_zero
+    if not len(share):
+        return None
+    worst = int(np.argmax(share))
+    value = f"{100 * share.mean():.3f} %, {percent(share[worst])} under light {worst}"
+    note = "no light within the noise; negative values are cut to 0, which lifts the mean of such cells a little"
+    return SummaryRow("Samples at 0", value, note)
+
+
+NOISE_MISFIT = Figure(
+    "noise_misfit", "Cells' noise about the photon-transfer curve", "noise", "share", "at most", 0.3, None,
+    why="there is scatter that light and sensor do not explain: the camera smooths its raw files, or the light "
+    "flickers",
+    source="EMVA 1288 model; " + SIMULATED + ": 0.05 to 0.15", remedy="switch the camera's noise reduction off",
+    measure=lambda table: float(table.sensor.transfer.misfit.max()), forecast=ONLY_OF_A_SESSION,
+    worst=NO_PLACE, where=OF_ITS_CAUSE, retake=NO_FRAMES, cause=NO_CAUSE,
+    drawing="noise", lines=(Line(170, _noise_row), Line(200, _at_zero_row)),
+)  # fmt: skip
+
+
+def _noisiest(table: TableMeasurements, chart: Chart) -> Worst | None:
+    ratio, file = table.sensor.transfer.ratio, table.session.registered_file
+    if len(ratio) != len(chart.cell_of_colour):
+        return None
+    colour = int(np.argmax(ratio))
+    x, y = chart.centres_mm[chart.cell_of_colour[colour]].tolist()
+    what = f"colour {colour}, {ratio[colour]:.2g} times the curve's variance"
+    return Worst(what, file, place=PrintPlace(file, x, y, 0.0))
+
+
+def _transfer_row(table: TableMeasurements) -> SummaryRow:
+    transfer = table.sensor.transfer
+    gain = " / ".join(f"{value:.2f}" for value in transfer.gain_e.tolist())
+    read = " / ".join(f"{value:.1f}" for value in transfer.read_noise.tolist())
+    note = f"R, G, B of half-size pixels; {int(transfer.noisy.sum())} cells are noisier than the curve"
+    return SummaryRow("Photon transfer", f"{gain} e⁻ per count, {read} counts of read noise", note)
+
+
+NOISY_SHARE = Figure(
+    "noisy_share", "Cells noisier than their level explains", "noise", "share", "at most", 0.002, 0.1,
+    why="they are not of one colour: dirt, a fold, a neighbour's edge", source="a variance 3.5 times the model's",
+    remedy="clean the print, focus, and hang it flatter",
+    measure=lambda table: float(table.sensor.transfer.noisy.mean()), forecast=ONLY_OF_A_SESSION,
+    worst=_noisiest, where=OF_ITS_CAUSE, retake=NO_FRAMES, cause=Cause("noisy cells", noisy_evidence),
+    drawing="cells", lines=(Line(180, _transfer_row),),
+)  # fmt: skip
+
+
+def _references_used(table: TableMeasurements) -> float:
+    used = min((frame.paper.references for frame in table.frames), default=0)
+    return used / max(table.session.white_references, 1)
+
+
+def _fewest_references(table: TableMeasurements, chart: Chart) -> Worst:
+    fewest = min(table.frames, key=lambda frame: frame.paper.references)
+    return Worst(f"{fewest.paper.references} used", fewest.record.file)
+
+
+REFERENCES_USED = Figure(
+    "references_used", "White references used, worst frame", "truth", "share", "at least", 0.9, 0.3,
+    why="flat field and ground truth rest on few places", source=JUDGEMENT,
+    remedy="uncover the print, bring all of it into the picture, expose so that bare paper stays below saturation",
+    measure=_references_used, forecast=lambda check: check.references_used,
+    worst=_fewest_references, where=OF_ITS_CAUSE, retake=NO_FRAMES, cause=NO_CAUSE,
+    drawing="course", lines=NO_LINES,
+)  # fmt: skip
+
+
+def _spread(paper: Paper) -> float:
+    return float(paper.spread[int(np.argmax(paper.white))])
+
+
+def _spread_of(frame: FrameMeasurements) -> float:
+    return _spread(frame.paper)
+
+
+def _most_spread(table: TableMeasurements, chart: Chart) -> Worst | None:
+    worst = max(table.white_frames, key=_spread_of, default=None)
+    return None if worst is None else Worst(f"{100 * _spread_of(worst):.2g} %", worst.record.file)
+
+
+REFERENCE_SPREAD = Figure(
+    "reference_spread", "White references about the flat field, under white", "truth", "share", "at most", 0.01, 0.05,
+    why="what is not smooth, or falls off otherwise than lenses do, is left in the samples by the flat field",
+    source=SIMULATED + ": 0.3 % of noise and photosites' response",
+    remedy="clean or flatten the print, and look for shadows on it",
+    measure=lambda table: max(map(_spread_of, table.white_frames), default=None),
+    forecast=lambda check: None if check.paper is None else _spread(check.paper),
+    worst=_most_spread, where=OF_ITS_CAUSE, retake=NO_FRAMES, cause=Cause("references", reference_evidence),
+    drawing="rest", lines=NO_LINES,
+)  # fmt: skip
+
+
+def _error_row(table: TableMeasurements) -> SummaryRow:
+    share = table.lights.white_error / np.maximum(table.lights.white, 1e-9)
+    value = f"{percent(float(np.median(share)))} of a channel, median"
+    note = "of the mean of the white references"
+    return SummaryRow("Standard error of the ground truth", value, note, brief=True)
+
+
+TRUTH_MEDIAN_DEG = Figure(
+    "truth_median_deg", "Standard error of the ground truth, median light", "truth", "°", "at most", 0.1, 1.0,
+    why="a method's error cannot be measured finer than the ground truth is known",
+    source=JUDGEMENT + ": good methods are 1 to 2 degrees off", remedy="expose longer",
+    measure=lambda table: float(np.median(table.lights.white_error_deg)), forecast=ONLY_OF_A_SESSION,
+    worst=NO_PLACE, where=OF_ITS_CAUSE, retake=NO_FRAMES, cause=NO_CAUSE,
+    drawing="lights", lines=(Line(190, _error_row),),
+)  # fmt: skip
+
+
+def _least_known(table: TableMeasurements, chart: Chart) -> Worst | None:
+    error = table.lights.white_error_deg
+    return worst_light(table, int(np.argmax(error)), f"{error.max():.2g}°") if len(error) > 1 else None
+
+
+TRUTH_WORST_DEG = Figure(
+    "truth_worst_deg", "Standard error of the ground truth, worst light", "truth", "°", "at most", 0.5, 3.0,
+    why="under that light a method's error cannot be measured finer than the ground truth is known", source=JUDGEMENT,
+    remedy="expose longer, or leave the darkest lights out",
+    measure=lambda table: float(table.lights.white_error_deg.max()), forecast=ONLY_OF_A_SESSION,
+    worst=_least_known, where=OF_ITS_CAUSE, retake=NO_FRAMES, cause=NO_CAUSE,
+    drawing="lights", lines=NO_LINES,
+)  # fmt: skip
+
+
+def _brightest(table: TableMeasurements, chart: Chart) -> Worst | None:
+    paper = table.lights.white.max(axis=1)
+    return worst_light(table, int(np.argmax(paper)), f"{paper.max():.0f} counts") if len(paper) > 1 else None
+
+
+def _saturation_row(table: TableMeasurements) -> SummaryRow:
+    sensor = table.sensor
+    source = (
+        "measured in cells"
+        if sensor.saturation_measured
+        else "as the raw files state it, which may be too high; no photosite of a cell reached it"
+    )
+    note = f"{source}; bare paper reaches {table.lights.white.max():.0f}"
+    return SummaryRow("Saturation", f"{sensor.white_level} counts above black", note)
+
+
+BRIGHTEST_SHARE = Figure(
+    "brightest_share", "Bare paper under the brightest light, of saturation", "radiometry", "share", "at most", 0.9,
+    CLIPPING_SHARE,
+    why="the unevenness of the light carries cells into saturation",
+    source=JUDGEMENT + ": 0.8 leaves room for 20 % unevenness", remedy="expose less",
+    measure=lambda table: float(table.lights.white.max()) / table.sensor.white_level,
+    forecast=lambda check: check.brightest_share,
+    worst=_brightest, where=OF_ITS_CAUSE, retake=NO_FRAMES, cause=NO_CAUSE,
+    drawing="lights", lines=(Line(150, _saturation_row),),
+)  # fmt: skip
+
+
+def _darkest(table: TableMeasurements, chart: Chart) -> Worst | None:
+    paper = table.lights.white.max(axis=1)
+    return worst_light(table, int(np.argmin(paper)), f"{paper.min():.0f} counts") if len(paper) > 1 else None
+
+
+def _darkest_row(table: TableMeasurements) -> SummaryRow:
+    darkest = table.lights.white.max(axis=1).min()
+    return SummaryRow("Darkest light", f"{darkest:.0f} counts", "its strongest channel on bare paper")
+
+
+DARKEST_COUNTS = Figure(
+    "darkest_counts", "Bare paper under the darkest light", "radiometry", "counts", "at least", 300.0, MIN_SIGNAL,
+    why="25 samples of 300 counts have a mean good to 1 %, a print's dark colours a thirtieth of that",
+    source="photon noise at 1.8 electrons a count, 6 counts of read noise", remedy="expose longer",
+    measure=lambda table: float(table.lights.white.max(axis=1).min()), forecast=lambda check: check.darkest_counts,
+    worst=_darkest, where=OF_ITS_CAUSE, retake=NO_FRAMES, cause=NO_CAUSE,
+    drawing="lights", lines=(Line(160, _darkest_row),),
+)  # fmt: skip

@@ -1,1 +1,0 @@
-"""Whether a table may be used: figures against thresholds."""

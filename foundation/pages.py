@@ -1,0 +1,175 @@
+"""Pages as one HTML file that can be mailed: Jinja2 templates, one style sheet, figures inside, nothing fetched.
+
+A page follows the reader's choice of a light or dark screen and fits a telephone. Templates escape whatever they are
+given but what is markup already. A package keeps its own in a folder `templates`; they extend `base.html` and take
+pieces from `parts.html`, both here. Pages that are a row of headings, tables and figures need none: `page` puts them
+together. The content security policy in each page lets a browser run its own script and no other, so that a name out of
+a file cannot become code even if it reached the page as markup.
+"""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cache
+from importlib import resources
+from typing import Any, Literal
+
+from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined
+from markupsafe import Markup, escape
+
+_INTERVAL = re.compile(r"(?<=\d) – (?=[-−]?\d)")
+"""What stands between the ends of an interval in a table's cell."""
+
+
+@dataclass(frozen=True)
+class Page:
+    """A page: its text, and its content security policy for a server that sends it."""
+
+    text: str
+    policy: str
+
+
+def render(
+    package: str,
+    template: str,
+    *,
+    scripts: Sequence[str] = (),
+    styles: Sequence[str] = (),
+    connects: bool = False,
+    **values: Any,
+) -> Page:
+    """Return the page that a template of a package makes of values, among them its `title`.
+
+    `scripts` and `styles` are files beside the template, put into the page in that order, the styles after the common
+    sheet. `connects`: whether the page asks the server that it came from.
+    """
+    script = Markup("".join(_text(package, name) for name in scripts))
+    style = Markup("".join([*map(_own_text, ("colours.css", "style.css")), *(_text(package, name) for name in styles)]))
+    # A page without a script may style its elements, as figures do: nothing in it can run.
+    policy = (
+        f"default-src 'none'; {f'script-src {_hash(script)}; ' if script else ''}"
+        f"style-src {_hash(style) if script else repr('unsafe-inline')}; base-uri 'none'; form-action 'none'; "
+        f"{'''connect-src 'self'; img-src 'self' data:''' if connects else 'img-src data:'}"
+    )
+    found = _environment(package).get_template(template)
+    return Page(found.render(script=script, style=style, policy=Markup(policy), **values), policy)
+
+
+def page(title: str, parts: Sequence[Markup]) -> str:
+    r"""Return the text of an HTML file that shows the pieces made by the functions below.
+
+    Examples
+    --------
+    >>> "<h1>A &amp; B</h1>\n<p>x &lt; y</p>" in page("A & B", [paragraph("x < y")])
+    True
+    """
+    return render("foundation", "base.html", title=title, parts=parts).text
+
+
+def heading(text: str, level: int = 2) -> Markup:
+    """Return a heading; level 1 is the page's title and not to be given."""
+    return _piece("heading", text, level)
+
+
+def paragraph(text: str) -> Markup:
+    """Return a paragraph of plain text."""
+    return _piece("paragraph", text)
+
+
+def note(text: str) -> Markup:
+    """Return a paragraph in small, faint type."""
+    return _piece("note", text)
+
+
+def verdict(kind: Literal["accept", "remark", "refuse"], sentence: str) -> Markup:
+    """Return a sentence in a box of the verdict's colour."""
+    return _piece("verdict", kind, sentence)
+
+
+def table(
+    title: str,
+    heads: Sequence[str],
+    rows: Sequence[Sequence[str]],
+    numeric: Sequence[bool],
+    notes: Sequence[str] = (),
+) -> Markup:
+    """Return a table with its title and notes; it scrolls sideways where the screen is narrow.
+
+    `numeric` says of each column whether it is of numbers; an interval of numbers is not broken over two lines.
+
+    Examples
+    --------
+    >>> "<td class='number'>1.5</td>" in table("Errors", ("Algorithm", "Mean"), (("<a>", "1.5"),), (False, True))
+    True
+    """
+    return _piece("table", title, heads, rows, numeric, notes)
+
+
+def figure(picture: bytes, caption: str, alt: str | None = None) -> Markup:
+    """Return a figure of the bytes of an SVG, PNG or JPEG file; SVG stands in the page and takes its colours."""
+    return _piece("figure", picture, caption, alt)
+
+
+def row(parts: Sequence[Markup]) -> Markup:
+    """Return pieces side by side, as many as the screen is wide for."""
+    return _piece("row", parts)
+
+
+def fold(summary: str, parts: Sequence[Markup], open_at_first: bool = False) -> Markup:
+    """Return pieces that a click on their summary shows and hides."""
+    return _piece("fold", summary, parts, open_at_first)
+
+
+@cache
+def _environment(package: str) -> Environment:
+    """Return the templates of a package, and those here."""
+    packages = dict.fromkeys((package, "foundation"))
+    made = Environment(
+        loader=ChoiceLoader([PackageLoader(name) for name in packages]),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        keep_trailing_newline=True,
+    )
+    filters: dict[str, Any] = made.filters
+    filters.update(element=_element, unbroken=_unbroken)
+    return made
+
+
+def _piece(name: str, *values: Any) -> Markup:
+    module: Any = _environment("foundation").get_template("parts.html").module
+    return Markup(getattr(module, name)(*values).strip())
+
+
+@cache
+def _text(package: str, name: str) -> str:
+    return (resources.files(package) / "templates" / name).read_text(encoding="utf-8")
+
+
+def _own_text(name: str) -> str:
+    return _text("foundation", name)
+
+
+def _hash(text: str) -> str:
+    return f"'sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}'"
+
+
+def _unbroken(text: str) -> Markup:
+    return Markup(_INTERVAL.sub("\u00a0–\u00a0", escape(text)))
+
+
+def _element(picture: bytes, alt: str) -> Markup:
+    """Return the element of a picture: SVG stands in the page, PNG and JPEG as data URLs."""
+    for start, kind in ((b"\x89PNG", "png"), (b"\xff\xd8", "jpeg")):
+        if picture.startswith(start):
+            data = base64.b64encode(picture).decode()
+            return Markup("<img alt='{}' src='data:image/{};base64,{}'>").format(alt, kind, data)
+    found = re.search(r"<svg\b.*</svg>", picture.decode("utf-8", errors="replace"), re.DOTALL)
+    if not found:
+        raise ValueError(f"a picture that begins with {picture[:8]!r} is none; expected PNG, JPEG or SVG")
+    return Markup(found[0].replace("<svg", f"<svg role='img' aria-label='{escape(alt)}'", 1))

@@ -1,0 +1,167 @@
+"""Pages: one file with all in it, elements that close, text that stays text."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import re
+import sys
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from foundation import pages
+from foundation.plots import FAINT, GRID, INK, PAPER, SERIES, png_of, svg_of
+
+VOID = {"meta", "img", "br", "link"}
+
+
+class Checker(HTMLParser):
+    """Follows which elements are open, and collects text and addresses."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.text = ""
+        self.addresses: list[str] = []
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        if tag not in VOID:
+            self.open.append(tag)
+        self.addresses += [value or "" for name, value in attrs if name in ("src", "href", "xlink:href")]
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open.pop() == tag
+
+    def handle_data(self, data: str) -> None:
+        self.text += data
+
+
+def checked(text: str) -> Checker:
+    checker = Checker()
+    checker.feed(text)
+    checker.close()
+    assert not checker.open
+    return checker
+
+
+def draw(figure: Any) -> None:
+    axes = figure.subplots()
+    axes.plot([0, 1], [1, 2], color=INK, label="<series> & more")
+    axes.legend()
+
+
+def test_a_page_holds_all_and_fetches_nothing() -> None:
+    text = pages.page(
+        "A <b> & 'c'",
+        [
+            pages.heading("H & H"),
+            pages.paragraph("<script>alert(1)</script>"),
+            pages.verdict("accept", "good & well"),
+            pages.table("<t>", ("<a>", "b"), (("<x> & y", "1.00"),), (False, True), notes=("<n>",)),
+            pages.fold("more <", [pages.note("inside &")]),
+            pages.row([pages.figure(b"\x89PNG\r\n", "a 'quoted' caption"), pages.figure(svg_of(draw), "drawn")]),
+        ],
+    )
+    found = checked(text)
+    for words in (
+        "A <b> & 'c'",
+        "H & H",
+        "<script>alert(1)</script>",
+        "good & well",
+        "<x> & y",
+        "<n>",
+        "more <",
+        "inside &",
+        "a 'quoted' caption",
+        "<series> & more",
+        "1.00",
+    ):
+        assert words in found.text
+    assert all(address.startswith(("data:", "#")) for address in found.addresses)
+    assert "script-src" not in text
+    assert "default-src 'none'" in text
+
+
+def test_the_policy_lets_a_page_s_own_script_and_style_run_and_nothing_else(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = tmp_path / "pages_of_a_test" / "templates"
+    folder.mkdir(parents=True)
+    (folder.parent / "__init__.py").touch()
+    (folder / "own.html").write_text('{% extends "base.html" %}{% block content %}<p>{{ name }}</p>{% endblock %}')
+    (folder / "one.js").write_text("let a = '<';\n")
+    (folder / "two.js").write_text("a += '&';\n")
+    (folder / "own.css").write_text("p > b { color: red }\n")
+    monkeypatch.setattr(sys, "path", [str(tmp_path), *sys.path])
+    made = pages.render(
+        "pages_of_a_test", "own.html", scripts=("one.js", "two.js"), styles=("own.css",), connects=True,
+        title="T", name="<i>",
+    )  # fmt: skip
+    script, style = (re.search(f"(?s)<{name}>(.*)</{name}>", made.text) for name in ("script", "style"))
+    assert script
+    assert script[1] == "let a = '<';\na += '&';\n"
+    assert style
+    assert style[1].endswith("p > b { color: red }\n")
+    assert "<p>&lt;i&gt;</p>" in made.text
+    rules = dict(rule.strip().split(" ", 1) for rule in made.policy.split(";"))
+    assert f'content="{made.policy}"' in made.text
+    for name, text in (("script-src", script[1]), ("style-src", style[1])):
+        assert rules[name] == f"'sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}'"
+    assert rules["default-src"] == "'none'"
+    assert rules["connect-src"] == "'self'"
+
+
+def test_an_svg_takes_the_page_s_colours_and_is_the_same_each_time() -> None:
+    svg = svg_of(draw)
+    assert svg == svg_of(draw)
+    text = svg.decode().lower()
+    assert "var(--ink)" in text
+    assert not [colour for colour in (INK, FAINT, GRID, PAPER) if colour in text]
+    assert not {INK, FAINT, GRID, PAPER} & set(SERIES)
+
+
+def test_a_png_is_the_same_each_time() -> None:
+    png = png_of(draw)
+    assert png.startswith(b"\x89PNG")
+    assert png == png_of(draw)
+
+
+def test_colours_of_text_follow_the_reader_s_system() -> None:
+    light, _, dark = sheet("colours.css").partition("@media (prefers-color-scheme: dark)")
+    of_light, of_dark = (dict(re.findall(r"--(\w+): (#\w+)", part)) for part in (light, dark))
+    assert of_light.keys() == of_dark.keys()
+    assert [of_light[name] for name in ("ink", "faint", "grid", "paper")] == [INK, FAINT, GRID, PAPER]
+    # No rule names a colour of text or ground by itself; pictures keep their white one.
+    assert "#" not in sheet("style.css").replace("background: #fff", "")
+    used = set(re.findall(r"var\(--(\w+)\)", sheet("style.css")))
+    assert used <= of_light.keys()
+
+
+def sheet(name: str) -> str:
+    return (Path(pages.__file__).parent / "templates" / name).read_text(encoding="utf-8")
+
+
+def test_what_is_no_picture_is_refused() -> None:
+    with pytest.raises(ValueError, match="GIF89a"):
+        pages.figure(b"GIF89a", "")
+
+
+def test_an_interval_is_not_broken_over_two_lines() -> None:
+    shown = pages.table("Intervals", ("Method", "Mean"), (("a – b", "2.30 – 3.41"),), (False, True))
+    assert "2.30\u00a0–\u00a03.41" in shown
+    assert "a – b" in shown
+
+
+@pytest.mark.parametrize("top", [8, 90, 1e7])
+def test_logarithmic_axes_have_plain_numbers(top: float) -> None:
+    def draw_logarithmic(figure: Any) -> None:
+        axes = figure.add_subplot()
+        axes.plot([1, 2], [2, top])
+        axes.set_yscale("log")
+
+    found = [text for text in re.findall(r"(?s)<text.*?>(.*?)</text>", svg_of(draw_logarithmic).decode()) if text]
+    assert len(found) > 2
+    assert not [text for text in found if "$" in text]
