@@ -21,7 +21,6 @@ from __future__ import annotations
 
 import hashlib
 import re
-import tomllib
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -34,9 +33,8 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from drivers.raw.origin import FrameOrigin
 from experiment.config import CameraSettings, CitationSettings
-from experiment.session.folder import Session
 from experiment.session.records import FrameRecord
-from foundation.errors import CropError, InputError
+from foundation.errors import InputError
 
 SerialForm = Literal["hash", "plain", "withheld"]
 """How the serial number of a body is told (`experiment.config.CitationSettings.camera_serial`)."""
@@ -59,11 +57,6 @@ Text = Annotated[str, Field(max_length=20_000)]
 
 _SERIAL = ", serial number "
 """What stands before the number in a journal's name of the camera."""
-
-_RIGS: tuple[Rig, ...] = ("lab", "simulated", "replay", "imported")
-
-_SETTING_RIGS = ("lab", "simulated")
-"""Rigs whose settings set the camera; of others they say nothing of the exposure."""
 
 Note = Annotated[str | None, typer.Option("--note", help="What readers of the table should know.", show_default=False)]
 Licence = Annotated[
@@ -235,18 +228,6 @@ class StatedOrigin:
     rig: Rig | None
     camera: CameraSettings | None
     devices: dict[str, str]
-
-
-def stated_origin(session: Session) -> StatedOrigin:
-    """Return what a session states; what older software did not write, or is damaged, is not known."""
-    try:
-        document: dict[str, Any] = tomllib.loads(session.settings_text())
-        rig: Rig | None = next((known for known in _RIGS if known == document.get("rig")), None)
-        citation = CitationSettings.model_validate(document.get("citation", {}))
-        set_by = CameraSettings.model_validate(document["camera"]) if rig in _SETTING_RIGS else None
-    except (CropError, ValidationError, ValueError, KeyError, RecursionError):
-        return StatedOrigin(CitationSettings(), None, None, session.journal.records())
-    return StatedOrigin(citation, rig, set_by, session.journal.records())
 
 
 def with_changes(citation: CitationSettings, changes: dict[str, Any]) -> CitationSettings:

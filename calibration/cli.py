@@ -485,7 +485,8 @@ def _make(
 
 def _with_citation(options: BuildOptions, session: Session, changes: dict[str, Any]) -> BuildOptions:
     """Return the options with what was given of the table's origin in place of what the session's settings state."""
-    from calibration.citation import stated_origin, with_changes
+    from calibration.citation import with_changes
+    from calibration.pipeline.frames import stated_origin
 
     return replace(options, citation=with_changes(stated_origin(session).citation, changes)) if changes else options
 

@@ -14,28 +14,38 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from acquisition.check.exposure import judge_exposure
-from acquisition.check.findings import CheckReport, Finding, not_checked
-from acquisition.check.foretelling.figures import ForetoldTable, foretell, foretell_lights, smallest_cell_px
-from acquisition.check.foretelling.findings import foretold_findings
-from acquisition.check.light import (
-    judge_evenness,
-    judge_flicker,
-    judge_primaries,
-    judge_room_light,
-)
-from acquisition.check.looking import ChartFigures, CheckFrames, look, mean_levels, measure_chart, points_of
-from acquisition.check.optics import (
+from acquisition.check.camera import (
     judge_chart,
+    judge_clipping,
+    judge_disk,
+    judge_hot,
+    judge_linearity,
+    judge_noise_reduction,
     judge_sharpness,
     judge_size,
+    judge_supplies,
     judge_tilt,
     judge_turn,
 )
-from acquisition.check.print_state import judge_print
-from acquisition.check.sensor import judge_clipping, judge_hot, judge_linearity, judge_noise_reduction
-from acquisition.check.supplies import judge_disk, judge_supplies
-from acquisition.check.taking import Photographer
+from acquisition.check.findings import CheckReport, Finding, not_checked
+from acquisition.check.forecast import Forecast, darkest_counts, forecast_findings, measure_table, smallest_cell_px
+from acquisition.check.frames import (
+    ChartFigures,
+    CheckFrames,
+    Photographer,
+    judge_exposure,
+    look,
+    mean_levels,
+    measure_chart,
+    points_of,
+)
+from acquisition.check.light_and_print import (
+    judge_evenness,
+    judge_flicker,
+    judge_primaries,
+    judge_print,
+    judge_room_light,
+)
 from acquisition.judge.exposure import disagreement
 from acquisition.run.asking import ask_all
 from acquisition.run.devices import Devices
@@ -44,6 +54,7 @@ from acquisition.run.patience import Patience
 from acquisition.run.planning.work import planned_steps
 from acquisition.run.rig.opening import open_rig
 from acquisition.run.shutter import period_s
+from calibration.figures.figure import CheckMeasurements
 from drivers.camera import keep_awake
 from drivers.presenter import Colour, ReportsWarnings
 from drivers.projector import Power, Projector, Severity
@@ -109,9 +120,9 @@ def check_lab(
     ]
     if seen.used_s != seen.first.shutter_s:
         lines.append(f"frames      all but exposure and clipping judged at {seen.used_s:.4g} s")
-    table = _foretold(seen, chart, lights)
+    table = _forecast(seen, chart, lights)
     why_not = "the chart was not found" if seen.chart is None else "" if seen.usable else CLIPPED
-    findings += foretold_findings(table, chart, why_not)
+    findings += forecast_findings(table, chart, why_not)
     outcome = None if seen.chart is None else table.outcome
     report = CheckReport(tuple(lines), tuple(findings), outcome, table.figures, table.not_known)
     if options.picture is not None:
@@ -125,7 +136,11 @@ def _exposure_findings(seen: CheckFrames, settings: LabSettings, recorded: bool)
     findings = [
         judge_exposure(seen.trials, seen.saturation, seen.times_s, period_s(settings), recorded),
         judge_clipping(
-            seen.first, seen.saturation.counts, settings.limits.clipped_percent, seen.chart and seen.chart.place
+            seen.first.mosaic,
+            seen.first.shutter_s,
+            seen.saturation.counts,
+            settings.limits.clipped_percent,
+            seen.chart and seen.chart.place,
         ),
     ]
     differs = None if recorded else disagreement(seen.first.mosaic, settings.camera.exposure)
@@ -163,25 +178,24 @@ def _chart_findings(
     ]
 
 
-def _foretold(seen: CheckFrames, chart: Chart, lights: Sequence[Illumination]) -> ForetoldTable:
+def _forecast(seen: CheckFrames, chart: Chart, lights: Sequence[Illumination]) -> Forecast:
     """Return what can be said of the table at the settings' exposure."""
     if seen.chart is None:
-        return ForetoldTable()
+        return Forecast()
     if not seen.usable:
-        return ForetoldTable({"brightest_share": 1.0})
-    saturation = seen.saturation.counts
-    table = foretell(chart, seen.chart, seen.whites, seen.dark, saturation)
-    figures = dict(table.figures)
+        return Forecast.of(CheckMeasurements(brightest_share=1.0))
+    measured = measure_table(chart, seen.chart, seen.whites, seen.dark, seen.saturation.counts)
     ratio = seen.first.shutter_s / seen.used_s
-    if "brightest_share" in figures:
-        figures["brightest_share"] *= ratio
-    if seen.primaries is not None:
-        figures |= foretell_lights(lights, seen.primaries, ratio)
-        levels = seen.primaries
+    if measured.brightest_share is not None:
+        measured = replace(measured, brightest_share=measured.brightest_share * ratio)
+    levels = seen.primaries
+    if levels is not None:
+        measured = replace(measured, darkest_counts=darkest_counts(lights, levels, ratio))
         if float(levels["white"].min()) >= 100.0:
             alone = np.sum([levels[name] for name in ("red", "green", "blue")], axis=0)
-            figures["additivity"] = float(np.abs((alone - 2 * levels["black"]) / levels["white"] - 1).max())
-    return ForetoldTable(figures, table.causes)
+            off = float(np.abs((alone - 2 * levels["black"]) / levels["white"] - 1).max())
+            measured = replace(measured, not_additive=off)
+    return Forecast.of(measured)
 
 
 def _light_findings(

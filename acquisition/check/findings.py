@@ -7,7 +7,7 @@ Rules that hold inside:
 - What could not be looked at is `not checked`, with the reason; it is never good.
 - A finding that is not good says what to do about it.
 - What lies beyond `tolerable` is refused later, by the run or by `build-lut`, whose numbers these are
-  (`experiment.limits.table`). Where `good` is narrower than what a table is accepted with, it is a warning while
+  (`calibration.figures`). Where `good` is narrower than what a table is accepted with, it is a warning while
   something can be mended, and the limit's source says so.
 """
 
@@ -19,7 +19,11 @@ from dataclasses import asdict, dataclass, field
 from types import MappingProxyType
 from typing import Any, Literal
 
-from experiment.limits.table import TABLE_LIMITS, TableOutcome
+from calibration.figures.figure import Outcome
+from calibration.figures.geometry import BLEED, CELL_PX
+from calibration.figures.light import ADDITIVITY, GREY_TINT_DEG, LEAK_SHARE, LINEARITY, WHITE_DRIFT, WHITE_DRIFT_DEG
+from calibration.figures.radiometry import UNFIT_SHARE
+from calibration.figures.truth import BRIGHTEST_SHARE, DARKEST_COUNTS, REFERENCE_SPREAD
 
 CELL_PHOTOSITES = 100
 """Photosites under the 25 samples of a cell, each of which has four: any of them may be hot."""
@@ -115,7 +119,7 @@ class CheckReport:
 
     devices: tuple[str, ...]
     findings: tuple[Finding, ...]
-    foretold: TableOutcome | None = None
+    foretold: Outcome | None = None
     figures: Mapping[str, float] = field(default_factory=dict[str, float])
     not_known: tuple[str, ...] = ()
 
@@ -135,9 +139,9 @@ class CheckReport:
             for grade in GRADES
             for finding in self.of(grade)
         ]
-        return *self.devices, *told, *self._foretold_lines()
+        return *self.devices, *told, *self._forecast_lines()
 
-    def _foretold_lines(self) -> list[str]:
+    def _forecast_lines(self) -> list[str]:
         if self.foretold is None:
             return []
         names = ", ".join(name.replace("_", " ") for name in self.not_known)
@@ -234,14 +238,14 @@ _EARLY = "a warning while it can be mended; no table is refused for it"
 _LIMITS = (
     Limit(
         "exposure", "White under the brightest light, of measured saturation", "share", (0.6, 0.8),
-        (None, TABLE_LIMITS["brightest_share"].refuse),
+        (None, BRIGHTEST_SHARE.refuse),
         "above, lights and places of the print that are brighter clip; below, dark colours drown in noise",
         "0.8 leaves room for uneven light and the lamp's drift; each stop less doubles the noise of dark cells; a "
         "table is refused where paper clips, or its darkest light has no signal",
     ),
     Limit(
         "darkest light", "Bare paper under the plan's darkest light, foretold from the primaries", "counts",
-        *TABLE_LIMITS["darkest_counts"].ranges,
+        *DARKEST_COUNTS.ranges,
         "25 samples of 300 counts have a mean good to 1 %, a print's dark colours a thirtieth of that",
         _VERDICT,
     ),
@@ -257,7 +261,7 @@ _LIMITS = (
     ),
     Limit(
         "additivity", "White against the sum of the primaries", "share",
-        (-TABLE_LIMITS["additivity"].accept, TABLE_LIMITS["additivity"].accept), (None, None),
+        (-ADDITIVITY.accept, ADDITIVITY.accept), (None, None),
         "the projector mixes colours in its own way, so that lights are not what their codes say; "
         "the table is valid all the same",
         _VERDICT,
@@ -276,20 +280,20 @@ _LIMITS = (
     ),
     Limit(
         "references", "White references about the flat field, under white", "share",
-        *TABLE_LIMITS["reference_spread"].ranges,
+        *REFERENCE_SPREAD.ranges,
         "a reflection, a stain, a fold or a shadow is not smooth, so that the flat field leaves it in the samples",
         _VERDICT,
     ),
     Limit(
         "room light", "Paper under the black picture, of paper under white", "share",
-        (None, TABLE_LIMITS["leak_share"].accept), (None, 0.05),
+        (None, LEAK_SHARE.accept), (None, 0.05),
         "every light contains it, and the deep colours among the lights become paler",
         "good as in a table's verdict; a contrast of 1 : 1500 gives 0.07 %; the run refuses dark frames from "
         "judge.dark_percent on, half of what a table is refused for",
     ),
     Limit(
         "sharpness", "Light of neighbouring cells in the worst sample, by the blur of printed edges", "share",
-        *TABLE_LIMITS["bleed"].ranges,
+        *BLEED.ranges,
         "the samples of a cell take in light from its neighbours",
         _VERDICT + ", which go by the median of all places; the worst place is remarked on; a cell of 10 px has 0.2 % "
         "at a blur of 0.7 px and 1 % at 1 px",
@@ -305,13 +309,13 @@ _LIMITS = (
         "judgement; size and sharpness are judged by themselves; " + _EARLY,
     ),
     Limit(
-        "size", "Smallest cell", "px", *TABLE_LIMITS["cell_px"].ranges,
+        "size", "Smallest cell", "px", *CELL_PX.ranges,
         "25 samples do not lie safely inside a cell",
         "geometry: half of 5 px, 0.5 px of rounding, 0.25 px of registration, and the blur; " + _VERDICT,
     ),
     Limit(
         "unfit cells", "Cells outside the picture, clipped or stained under white", "share",
-        *TABLE_LIMITS["unfit_share"].ranges,
+        *UNFIT_SHARE.ranges,
         "colours without samples are missing from every picture",
         _VERDICT,
     ),
@@ -322,25 +326,25 @@ _LIMITS = (
         "judged by unfit cells; " + _EARLY,
     ),
     Limit(
-        "grey tint", "Tint of the print's greys against paper", "°", *TABLE_LIMITS["grey_tint_deg"].ranges,
+        "grey tint", "Tint of the print's greys against paper", "°", *GREY_TINT_DEG.ranges,
         "greys are not neutral; methods that rely on grey are judged by another grey than paper's",
         _VERDICT,
     ),
     Limit(
-        "flicker", "Angle of white from the first of repeated frames", "°", *TABLE_LIMITS["white_drift_deg"].ranges,
+        "flicker", "Angle of white from the first of repeated frames", "°", *WHITE_DRIFT_DEG.ranges,
         "frames that catch parts of a turn of the colour wheel have colours of their own",
         _VERDICT + " on a session's white frames, of which these are the first; 0.24 % of R/G at 0.5 s behind a wheel "
         "with 0.5 ms of jitter are 0.1°, 7 % at 1/60 s 3°",
     ),
     Limit(
-        "brightness", "Largest less smallest white of repeated frames", "share", *TABLE_LIMITS["white_drift"].ranges,
+        "brightness", "Largest less smallest white of repeated frames", "share", *WHITE_DRIFT.ranges,
         "the lamp is not steady, or exposures differ",
         _VERDICT + " on a session's white frames, of which these are the first",
     ),
     Limit(
         "hot photosites", "Photosites of a million that stand out in the dark", "",
-        (None, TABLE_LIMITS["unfit_share"].accept * 1e6 / CELL_PHOTOSITES),
-        (None, (TABLE_LIMITS["unfit_share"].refuse or 1.0) * 1e6 / CELL_PHOTOSITES),
+        (None, UNFIT_SHARE.accept * 1e6 / CELL_PHOTOSITES),
+        (None, (UNFIT_SHARE.refuse or 1.0) * 1e6 / CELL_PHOTOSITES),
         "each makes a cell unfit whose samples it lies under",
         "100 photosites lie under a cell's samples: 50 of a million reach 0.5 % of the cells; " + _VERDICT,
     ),
@@ -353,7 +357,7 @@ _LIMITS = (
     ),
     Limit(
         "linearity", "Deviation from proportion to light, 5 to 95 % of saturation", "share",
-        *TABLE_LIMITS["linearity"].ranges,
+        *LINEARITY.ranges,
         "chromaticities change with brightness",
         "EMVA 1288 asks for the range; " + _VERDICT,
     ),

@@ -13,9 +13,8 @@ import numpy as np
 import numpy.typing as npt
 
 from acquisition.check.findings import GRADES, CheckReport
-from acquisition.check.light import light_share
-from acquisition.check.looking import ChartFigures, CheckFrames
-from acquisition.check.print_state import Spot
+from acquisition.check.frames import ChartFigures, CheckFrames
+from acquisition.check.light_and_print import Spot, light_share
 from experiment.chart.model import Chart
 from experiment.framing.annotated import annotated_png
 from experiment.framing.sharpness import MAX_BLUR_PX

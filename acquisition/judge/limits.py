@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from typing import Final
 
-from experiment.limits.table import TABLE_LIMITS
+from calibration.figures.light import DARK_DRIFT, OFF_CODES_DEG, WHITE_DRIFT
 
 LIGHT_SIGMAS: Final = 5.5
 """Standard deviations of two degrees of freedom: exceeded by chance once in four million frames."""
@@ -64,7 +64,7 @@ photosites' own differences are large; 0.3 is a correlation of 0.9, 0 the same f
 LEAST_NOISE: Final = 0.4
 """Standard deviation of a photosite, counts, below which noise cannot tell a repeated frame: rounding remains."""
 
-ADDED_LEAST: Final = 2 * TABLE_LIMITS["dark_drift"].accept
+ADDED_LEAST: Final = 2 * DARK_DRIFT.accept
 """Light added to several frames, of white, that is called ambient: build-lut warns of half as much in dark frames,
 which show less of it."""
 
@@ -75,10 +75,10 @@ LAMP_FOLLOWED: Final = 0.055
 """Largest step of the lamp that is lived with when the frame is repeated and shows it again (logarithm, 5 %): each
 light has its own ground truth, so that brightness harms none; a larger step is a lamp that fails."""
 
-LAMP_TOTAL: Final = 100 * (TABLE_LIMITS["white_drift"].refuse or 0.0)
+LAMP_TOTAL: Final = 100 * (WHITE_DRIFT.refuse or 0.0)
 """Largest change of paper white since the session's first white frame, per cent: beyond, build-lut makes no table."""
 
-LIGHT_FOLLOWED_DEG: Final = TABLE_LIMITS["off_codes_deg"].accept
+LIGHT_FOLLOWED_DEG: Final = OFF_CODES_DEG.accept
 """Largest angle between the light seen and the one ordered that is lived with when the frame is repeated and shows it
 again, and it is no other light: the projector mixes otherwise than was learnt. build-lut warns from there on."""
 

@@ -5,9 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from acquisition.check.exposure import (
+from acquisition.check.frames import (
     TRIALS,
     Saturation,
+    Shot,
     Trial,
     best_of,
     fitting_times,
@@ -15,7 +16,6 @@ from acquisition.check.exposure import (
     measure_saturation,
     search,
 )
-from acquisition.check.taking import Shot
 from acquisition.run.shutter import ENGRAVED_S
 from drivers.presenter import WHITE
 from drivers.raw.plain_dng import Area

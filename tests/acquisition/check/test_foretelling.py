@@ -16,9 +16,8 @@ import numpy.typing as npt
 import pytest
 
 from acquisition.check.foretelling.figures import ForetoldTable, foretell, foretell_lights
-from acquisition.check.looking import PRIMARIES, PlacedChart
+from acquisition.check.frames import PRIMARIES, PlacedChart, Shot
 from acquisition.check.places import place_chart, window_px
-from acquisition.check.taking import Shot
 from calibration.figures.all_figures import FIGURES
 from calibration.figures.figure import OUTCOMES
 from calibration.pipeline.build import check as build_check

@@ -10,11 +10,16 @@ from typing import BinaryIO
 import numpy as np
 import pytest
 
-from acquisition.check.light import judge_flicker, judge_primaries, measure_light
-from acquisition.check.optics import tilt_deg
+from acquisition.check.camera import (
+    fit_transfer,
+    judge_disk,
+    judge_noise_reduction,
+    judge_supplies,
+    series_times,
+    tilt_deg,
+)
+from acquisition.check.light_and_print import judge_flicker, judge_primaries, measure_light
 from acquisition.check.places import Levels
-from acquisition.check.sensor import fit_transfer, judge_noise_reduction, series_times
-from acquisition.check.supplies import judge_disk, judge_supplies
 from drivers.camera import CameraIdentity, CapturedFrame, ExposureSettings, Supplies
 from experiment.chart.layout import design_chart
 from foundation.errors import LinkTimeout

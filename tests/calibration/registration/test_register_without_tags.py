@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
+from calibration.figures.all_figures import FIGURES
 from calibration.registration.register import register
 from drivers.presenter import WHITE, Colour
 from drivers.raw.rawfile import Mosaic
@@ -16,7 +17,6 @@ from experiment.chart.layout import paper_chart
 from experiment.chart.model import Chart
 from experiment.framing.planes import CHANNELS
 from experiment.framing.tagless_field import field_mm
-from experiment.limits.table import TABLE_LIMITS
 from foundation.errors import RegistrationError
 from sim.world.room import Room
 from tests.calibration.lab import Lab, hang_chart
@@ -76,7 +76,8 @@ def test_cells_that_the_map_does_not_follow_are_known_to_be_uncertain(tmp_path: 
     assert error.max() > 0.5, "a room in which it matters"
     uncertain = registration.uncertain(SMALL.centres_mm)
     assert uncertain[error > 0.5].all()
-    assert uncertain.mean() > (TABLE_LIMITS["unfit_share"].refuse or 1)
+    limit = next(figure for figure in FIGURES if figure.name == "unfit_share")
+    assert uncertain.mean() > (limit.refuse or 1)
 
 
 @pytest.mark.parametrize("seed", [1, 2])
