@@ -6,12 +6,12 @@ The files are `report.html`, `comparison.json`, `lights.csv` and `cells.csv`.
 from __future__ import annotations
 
 import csv
-import html
 import io
 import json
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -20,19 +20,18 @@ from calibration.comparison.comparing import (
     ANGLE_FLOOR_DEG,
     CELL_SCORE,
     CellDifferences,
-    ColourGroup,
     ComparedTable,
     LightDifferences,
-    NoiseAnswer,
     TableComparison,
     differing_cells,
     differing_lights,
 )
-from calibration.report.page import STYLE, Picture, picture_html
 from experiment.chart.model import Chart
 from foundation.errors import first_of
 from foundation.files import whole_folder, write_whole
+from foundation.pages import figure, heading, note, page, table, verdict
 from foundation.plots import FAINT, INK, MARK, png_of
+from foundation.records import to_plain
 
 FORMAT = "crop.comparison"
 
@@ -43,10 +42,13 @@ _MOST_CELLS = 100
 """Cells that are listed in the JSON; all of them are in `cells.csv`."""
 
 _ANSWERS = {True: "yes", False: "no", None: "not known"}
-_CHANNEL_INK = ("#c8382e", "#2f8f46", "#2f62c8")
 
-PICTURES = ("lights.png", "cells.png", "map.png")
-"""Names of the pictures beside the page, as far as they are drawn."""
+_VERDICTS: dict[bool | None, tuple[Literal["accept", "remark"], str]] = {
+    True: ("accept", "The same within noise."),
+    False: ("remark", "They differ by more than noise."),
+    None: ("remark", "Whether they are the same within noise cannot be said of everything."),
+}
+_CHANNEL_INK = ("#c8382e", "#2f8f46", "#2f62c8")
 
 
 def lines(comparison: TableComparison) -> list[str]:
@@ -88,12 +90,11 @@ def geometry_text(comparison: TableComparison) -> str:
 def comparison_json(comparison: TableComparison) -> dict[str, Any]:
     """Return the content of `comparison.json`; what is not known is null."""
     lights, cells = comparison.lights, comparison.cells
-    geometry = comparison.geometry
     return {
         "format": FORMAT,
         "version": VERSION,
         "same_within_noise": comparison.same,
-        "tables": [_table_json(table) for table in (comparison.one, comparison.other)],
+        "tables": [to_plain(table) for table in (comparison.one, comparison.other)],
         "warnings": list(comparison.warnings),
         "answers": [
             {"name": answer.name, "same_within_noise": answer.same, "said": answer.said}
@@ -126,33 +127,19 @@ def comparison_json(comparison: TableComparison) -> dict[str, Any]:
             }
             for group in comparison.groups
         ],
-        "geometry": None
-        if geometry is None
-        else {
-            "shift_px": list(geometry.shift_px),
-            "turned_deg": geometry.turned_deg,
-            "scale": geometry.scale,
-            "bent_px": geometry.bent_px,
-        },
+        "geometry": None if comparison.geometry is None else to_plain(comparison.geometry),
     }
 
 
 def lights_csv(comparison: TableComparison) -> str:
     """Return `lights.csv`: a row a light, B over A; empty where something is not known."""
     lights = comparison.lights
-    columns = {
-        "light": lights.one,
-        "light_of_b": lights.other,
-        "angle_deg": lights.angle_deg,
-        "angle_noise_deg": lights.angle_noise_deg,
-        "angle_score": lights.angle_score,
-        "brightness": lights.brightness,
-        "brightness_left": lights.brightness_left,
-        "brightness_noise": lights.brightness_noise,
-        "cell_rms": lights.cell_rms,
-        "cell_noise": lights.cell_noise,
-        "cell_score": lights.cell_score,
-    }
+    measured = (
+        "angle_deg", "angle_noise_deg", "angle_score", "brightness", "brightness_left", "brightness_noise", "cell_rms",
+        "cell_noise", "cell_score",
+    )  # fmt: skip
+    columns = {"light": lights.one, "light_of_b": lights.other}
+    columns |= {name: getattr(lights, name) for name in measured}
     return _csv(columns)
 
 
@@ -172,19 +159,11 @@ def cells_csv(comparison: TableComparison) -> str:
 
 
 def _described(table: ComparedTable) -> str:
-    corrected = ", the lamp's drift taken out" if table.drift_corrected else ""
-    return f"{table.place}: {table.camera}, {table.lights} lights, {table.samples} samples a cell{corrected}"
+    return f"{table.place}: {table.camera}, {table.lights} lights, {table.samples} samples a cell{_drift(table, ', ')}"
 
 
-def _table_json(table: ComparedTable) -> dict[str, Any]:
-    return {
-        "place": str(table.place),
-        "camera": table.camera,
-        "software": table.software,
-        "lights": table.lights,
-        "samples": table.samples,
-        "drift_corrected": table.drift_corrected,
-    }
+def _drift(table: ComparedTable, joint: str = "") -> str:
+    return f"{joint}the lamp's drift taken out" if table.drift_corrected else ""
 
 
 def _summary(values: npt.NDArray[np.float64]) -> dict[str, Any]:
@@ -290,43 +269,85 @@ def write_comparison(comparison: TableComparison, folder: Path, chart: Chart | N
     with whole_folder(folder, "the comparison") as partial:
         write_whole(partial / "lights.csv", lights_csv(comparison))
         write_whole(partial / "cells.csv", cells_csv(comparison))
-        for name, picture in zip(PICTURES, pictures, strict=False):
-            write_whole(partial / name, picture.png)
+        for picture in pictures:
+            write_whole(partial / picture.file, picture.png)
         write_whole(partial / "report.html", comparison_page(comparison, pictures))
         write_whole(partial / "comparison.json", json.dumps(comparison_json(comparison), indent=2) + "\n")
 
 
-def comparison_page(comparison: TableComparison, pictures: Sequence[Picture]) -> str:
+def comparison_page(comparison: TableComparison, pictures: Sequence[_Picture]) -> str:
     """Return the text of `report.html`."""
-    names = [table.place.name for table in (comparison.one, comparison.other)]
-    title = f"{names[0]} and {names[1]} compared"
-    kind, sentence = {
-        True: ("accept", "The same within noise."),
-        False: ("remark", "They differ by more than noise."),
-        None: ("remark", "Whether they are the same within noise cannot be said of everything."),
-    }[comparison.same]
-    warnings = "".join(f"<p class='note'>Note: {html.escape(warning)}.</p>" for warning in comparison.warnings)
-    return (
-        '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">'
-        '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
-        f"<title>{html.escape(title)}</title><style>{STYLE}</style></head><body>\n<h1>{html.escape(title)}</h1>"
-        f"{_tables(comparison)}<p class='verdict {kind}'>{sentence}</p>{warnings}"
-        f"<table>{''.join(map(_answer, comparison.answers))}"
-        f"<tr><td></td><th>chart in the frame</th><td class='note'>{html.escape(geometry_text(comparison))}</td></tr>"
-        f"</table>{''.join(map(picture_html, pictures))}{_colours(comparison.groups)}</body></html>\n"
+    tables = comparison.one, comparison.other
+    kind, sentence = _VERDICTS[comparison.same]
+    shown = [(heading(each.title), figure(each.png, each.caption, each.title)) for each in pictures]
+    return page(
+        f"{tables[0].place.name} and {tables[1].place.name} compared",
+        [
+            table(
+                "The tables",
+                ("", "place", "camera", "lights", "samples", "drift", "software"),
+                [
+                    (name, str(one.place), one.camera, str(one.lights), str(one.samples), _drift(one), one.software)
+                    for name, one in zip("AB", tables, strict=True)
+                ],
+                (False, False, False, True, True, False, False),
+            ),
+            verdict(kind, sentence),
+            *(note(f"Note: {warning}.") for warning in comparison.warnings),
+            table(
+                "Same within noise",
+                ("", "of", "seen"),
+                [
+                    *((_ANSWERS[answer.same], answer.name, answer.said) for answer in comparison.answers),
+                    ("", "chart in the frame", geometry_text(comparison)),
+                ],
+                (False, False, False),
+            ),
+            *(part for parts in shown for part in parts),
+            heading("By colour"),
+            table(
+                "Mean differences of cells, B over A",
+                ("cells", "number", "mean", "spread", "worst", "its colour"),
+                [
+                    (
+                        group.name,
+                        str(group.cells),
+                        f"{100 * group.mean:+.3f} %",
+                        f"{100 * group.spread:.3f} %",
+                        f"{100 * group.worst:+.2f} %",
+                        str(group.worst_colour),
+                    )
+                    for group in comparison.groups
+                    if group.cells
+                ],
+                (False, True, True, True, True, True),
+            ),
+        ],
     )
 
 
-def _pictures(comparison: TableComparison, chart: Chart | None) -> list[Picture]:
+@dataclass(frozen=True)
+class _Picture:
+    """A picture of the page, which is a file beside it, too."""
+
+    file: str
+    title: str
+    caption: str
+    png: bytes
+
+
+def _pictures(comparison: TableComparison, chart: Chart | None) -> list[_Picture]:
     found = [
-        Picture(
+        _Picture(
+            "lights.png",
             "Light by light",
             "Left: angle between the two whites, and what their standard errors alone give. Middle: brightness, as "
             "measured, and without the drift that both tables record and the median of all lights. Right: how far the "
             "cells differ in units of their noise; 1 is noise alone.",
             png_of(draw_lights, comparison.lights),
         ),
-        Picture(
+        _Picture(
+            "cells.png",
             "Cell by cell",
             "Each cell over its own light's white, B over A, mean over the lights. Right: in units of its standard "
             "error; what is wider than the line is not noise.",
@@ -335,42 +356,5 @@ def _pictures(comparison: TableComparison, chart: Chart | None) -> list[Picture]
     ]
     if chart is not None:
         caption = "The same where the cells lie. Noise is a fine grain; a stain, a shadow or another field has a shape."
-        found.append(Picture("On the print", caption, png_of(draw_map, chart, comparison.cells)))
+        found.append(_Picture("map.png", "On the print", caption, png_of(draw_map, chart, comparison.cells)))
     return found
-
-
-def _tables(comparison: TableComparison) -> str:
-    return f"<table>{_table('A', comparison.one)}{_table('B', comparison.other)}</table>"
-
-
-def _table(name: str, table: ComparedTable) -> str:
-    said = (
-        f"{table.lights} lights, {table.samples} samples a cell{', drift taken out' if table.drift_corrected else ''}"
-    )
-    return (
-        f"<tr><th>{name}</th><td>{html.escape(str(table.place))}</td><td>{html.escape(table.camera)}</td>"
-        f"<td class='note'>{html.escape(said)}; {html.escape(table.software)}</td></tr>"
-    )
-
-
-def _answer(answer: NoiseAnswer) -> str:
-    kind, word = {True: ("accept", "same"), False: ("remark", "differs"), None: ("remark", "not known")}[answer.same]
-    return (
-        f"<tr><td class='{kind}'>{word}</td><th>{html.escape(answer.name)}</th>"
-        f"<td class='note'>{html.escape(answer.said)}</td></tr>"
-    )
-
-
-def _colours(groups: Sequence[ColourGroup]) -> str:
-    rows = "".join(
-        f"<tr><th>{group.name}</th><td class='number'>{group.cells}</td>"
-        f"<td class='number'>{100 * group.mean:+.3f} %</td>"
-        f"<td class='number'>{100 * group.spread:.3f} %</td><td class='number'>{100 * group.worst:+.2f} %</td>"
-        f"<td class='note'>colour {group.worst_colour}</td></tr>"
-        for group in groups
-        if group.cells
-    )
-    return (
-        "<h2>By colour</h2><table><tr><th>cells</th><th>number</th><th>mean</th><th>spread</th><th>worst</th><th></th>"
-        f"</tr>{rows}</table>"
-    )
