@@ -37,7 +37,7 @@ from experiment.session.records import FrameRecord
 from foundation.errors import InputError
 
 SerialForm = Literal["hash", "plain", "withheld"]
-"""How the serial number of a body is told (`experiment.config.CitationSettings.camera_serial`)."""
+"""How the serial number of a body is published (`experiment.config.CitationSettings.camera_serial`)."""
 
 _COST, _BLOCK, _PARALLEL = 1 << 14, 8, 1
 """scrypt's N, r and p as RFC 7914, section 2, has them for interactive use: 16 MiB, some 40 ms. Changing one changes
@@ -88,7 +88,7 @@ def serial_hash(camera: str, serial: str) -> str:
 
 
 def published_serials(origins: Sequence[FrameOrigin], form: SerialForm) -> Mapping[tuple[str, str], str]:
-    """Return what is told of each body of a session, by camera and serial number, so that bodies stay apart.
+    """Return what is published of each body of a session, by camera and serial number, so that bodies stay apart.
 
     Where numbers are withheld, bodies are counted in the order in which they come.
     """
@@ -101,9 +101,9 @@ def published_serials(origins: Sequence[FrameOrigin], form: SerialForm) -> Mappi
 
 
 def with_published_serials(origins: Sequence[FrameOrigin], form: SerialForm) -> list[FrameOrigin]:
-    """Return what frames state, their serial numbers told as the lab chose; equal numbers stay equal."""
-    told = published_serials(origins, form)
-    return [replace(one, serial=told[one.camera, one.serial]) if one.serial else one for one in origins]
+    """Return what frames state, their serial numbers published as the lab chose; equal numbers stay equal."""
+    published = published_serials(origins, form)
+    return [replace(one, serial=published[one.camera, one.serial]) if one.serial else one for one in origins]
 
 
 class OriginRecord(BaseModel):

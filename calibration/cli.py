@@ -38,13 +38,13 @@ if TYPE_CHECKING:
 app = new_app()
 
 
-def print_table(folder: Path, told: JsonOutput) -> None:
+def print_table(folder: Path, output: JsonOutput) -> None:
     """Print what a table is and what it was made of, a line each."""
     from calibration.table.lut import open_lut
     from calibration.table.verification import describe
 
     lut = open_lut(folder)
-    told.add(
+    output.add(
         table=folder,
         sha256=lut.sha256,
         lights=len(lut.white),
@@ -56,17 +56,17 @@ def print_table(folder: Path, told: JsonOutput) -> None:
         print(f"{name + ':':17}{printable(value)}")
 
 
-def print_citation(folder: Path, told: JsonOutput) -> None:
+def print_citation(folder: Path, output: JsonOutput) -> None:
     """Print a BibTeX entry of a table."""
     from calibration.table.lut import open_lut
     from calibration.table.verification import citation_of
 
     entry = printable(citation_of(open_lut(folder)))
-    told.add(table=folder, bibtex=entry)
+    output.add(table=folder, bibtex=entry)
     print(entry, end="")
 
 
-def verify_table(folder: Path, session: Path | None, told: JsonOutput) -> None:
+def verify_table(folder: Path, session: Path | None, output: JsonOutput) -> None:
     """Hash every byte of a table again, with a session its frames too; a FormatError where anything changed."""
     from calibration.table.lut import open_lut
     from calibration.table.verification import find_faults
@@ -80,7 +80,7 @@ def verify_table(folder: Path, session: Path | None, told: JsonOutput) -> None:
 
         with Session.open(session) as opened, progress_bar("reading the frames") as progress:
             faults += frame_faults(lut, opened, progress)
-    told.add(table=folder, sha256=lut.sha256, frames=None if session is None else len(lut.frames), faults=faults)
+    output.add(table=folder, sha256=lut.sha256, frames=None if session is None else len(lut.frames), faults=faults)
     for fault in faults:
         print(fault)
     if faults:
@@ -91,19 +91,19 @@ def verify_table(folder: Path, session: Path | None, told: JsonOutput) -> None:
     print(f"{folder}: every byte is as it was built{frames}")
 
 
-def match_tables(one: Path, other: Path, told: JsonOutput) -> None:
+def match_tables(one: Path, other: Path, output: JsonOutput) -> None:
     """Print that two tables correspond number by number; a FormatError says where they do not."""
     from calibration.table.lut import open_lut
     from calibration.table.verification import require_match
 
     tables = open_lut(one), open_lut(other)
     require_match(*tables)
-    told.add(tables=[one, other], cameras=[table.provenance.camera for table in tables], match=True)
+    output.add(tables=[one, other], cameras=[table.provenance.camera for table in tables], match=True)
     cameras = " and ".join(table.provenance.camera for table in tables)
     print(f"{one} and {other} ({cameras}): colours and lights correspond number by number")
 
 
-def publish_table(folder: Path, url: str, told: JsonOutput) -> None:
+def publish_table(folder: Path, url: str, output: JsonOutput) -> None:
     """Copy a table to a store, and print how others get it."""
     from calibration.table.lut import open_lut
     from calibration.table.zarr_store import publish
@@ -111,18 +111,18 @@ def publish_table(folder: Path, url: str, told: JsonOutput) -> None:
     lut = open_lut(folder)
     with progress_bar("writing lights") as progress:
         publish(lut, url, lambda done, total: progress(done, total, "writing lights"))
-    told.add(table=folder, url=masked(url), lights=len(lut.samples), sha256=lut.sha256)
+    output.add(table=folder, url=masked(url), lights=len(lut.samples), sha256=lut.sha256)
     print(f"{masked(url)}: {len(lut.samples)} lights of {folder}; others get them by")
     print(f"build-lut --fetch {masked(url)} LUT --expect {lut.sha256}")
 
 
-def fetch_table(url: str, folder: Path, expect: str | None, told: JsonOutput) -> None:
+def fetch_table(url: str, folder: Path, expect: str | None, output: JsonOutput) -> None:
     """Copy a published table from a store, and print what is known of it."""
     from calibration.table.zarr_store import fetch
 
     with progress_bar("reading lights") as progress:
         lut = fetch(url, folder, lambda done, total: progress(done, total, "reading lights"), expect)
-    told.add(table=folder, url=masked(url), lights=len(lut.samples), sha256=lut.sha256, expected=expect is not None)
+    output.add(table=folder, url=masked(url), lights=len(lut.samples), sha256=lut.sha256, expected=expect is not None)
     print(f"{folder}: {len(lut.samples)} lights, {printable(lut.provenance.camera)}; {_vouched(lut, expect)}")
 
 
@@ -399,19 +399,19 @@ def build_lut(
         raise InputError(f"{next(name for name, value in beside.items() if value)} goes with --compare; leave it out")
     if (lut if verify else session if compare or any(reading.values()) else None) is not None:
         raise InputError(f"{given[0]} does not expect {lut or session}; leave it out")
-    with json_output("build-lut", as_json) as told:
+    with json_output("build-lut", as_json) as output:
         if info is not None:
-            print_table(info, told)
+            print_table(info, output)
         elif cite is not None:
-            print_citation(cite, told)
+            print_citation(cite, output)
         elif verify is not None:
-            verify_table(verify, session, told)
+            verify_table(verify, session, output)
         elif match is not None:
-            match_tables(*match, told)
+            match_tables(*match, output)
         elif publish is not None:
-            publish_table(*publish, told)
+            publish_table(*publish, output)
         elif fetch is not None:
-            fetch_table(*fetch, expect, told)
+            fetch_table(*fetch, expect, output)
         else:
             from calibration.pipeline.baseline import BuildOptions
             from calibration.sampling import WINDOW
@@ -428,9 +428,9 @@ def build_lut(
                 unfit = [name for name in ("--linearity", "--note", "--licence", "--author", "--serial") if made[name]]
                 if unfit:
                     raise InputError(f"{unfit[0]} is for the report of one table; leave it out of --compare")
-                _compare(*compare, options, told, out, chart)
+                _compare(*compare, options, output, out, chart)
                 return
-            _make(session, lut, check, append, options, linearity, picture, changes, told)
+            _make(session, lut, check, append, options, linearity, picture, changes, output)
 
 
 def _make(
@@ -442,7 +442,7 @@ def _make(
     linearity: Path | None,
     picture: Path | None,
     changes: dict[str, Any],
-    told: JsonOutput,
+    output: JsonOutput,
 ) -> None:
     if check and lut is not None:
         raise InputError(f"--check writes nothing, so a table's folder ({lut}) is not expected; leave one of them out")
@@ -452,7 +452,7 @@ def _make(
 
     if check:
         with Session.open(session) as opened:
-            _check(opened, _with_citation(options, opened, changes), linearity, picture, told)
+            _check(opened, _with_citation(options, opened, changes), linearity, picture, output)
         return
     if lut is None:
         raise InputError("a folder for the table is expected: build-lut SESSION LUT, or --check to judge only")
@@ -468,18 +468,18 @@ def _make(
             result = _build(opened, lut, append, _with_citation(options, opened, changes), linearity)
         except QualityError:
             # A report of an earlier build says nothing of this one.
-            if told.asked and kept.is_file() and kept.stat().st_mtime_ns != before:
-                told.add(**json.loads(kept.read_text(encoding="utf-8")))
+            if output.asked and kept.is_file() and kept.stat().st_mtime_ns != before:
+                output.add(**json.loads(kept.read_text(encoding="utf-8")))
             raise
     if isinstance(result, TableProgress):
-        told.add(table=lut, progress=result)
+        output.add(table=lut, progress=result)
         print(
             f"{lut}: {result.lights} of {result.lights_planned} lights, {result.new_frames} frames taken in now, "
             f"{result.frames} in all; run the same command again when more have come"
         )
         return
-    told.add(table=lut)
-    _print_result(result, told)
+    output.add(table=lut)
+    _print_result(result, output)
     print(f"{lut}: {result.figures.session.lights} lights, {result.figures.session.camera}; see {lut / REPORT_PAGE}")
 
 
@@ -492,12 +492,12 @@ def _with_citation(options: BuildOptions, session: Session, changes: dict[str, A
 
 
 def _check(
-    session: Session, options: BuildOptions, linearity: Path | None, picture: Path | None, told: JsonOutput
+    session: Session, options: BuildOptions, linearity: Path | None, picture: Path | None, output: JsonOutput
 ) -> None:
     from calibration.pipeline.build import check
 
     result = check(session, options, linearity, picture)
-    _print_result(result, told)
+    _print_result(result, output)
     if result.verdict.refused:
         from calibration.verdict import refusal
 
@@ -516,7 +516,7 @@ def _build(
 
 
 def _compare(
-    one: Path, other: Path, options: BuildOptions, told: JsonOutput, out: Path | None, chart: Path | None
+    one: Path, other: Path, options: BuildOptions, output: JsonOutput, out: Path | None, chart: Path | None
 ) -> None:
     from calibration.comparison.comparing import chart_of, compare, table_of
     from calibration.comparison.report import comparison_json, lines
@@ -534,8 +534,8 @@ def _compare(
         drawn = chart_of((one, other)) if chart is None else load_chart(chart)
         if drawn is not None and drawn.sha256 != a.provenance.chart_sha256:
             raise FormatError(f"{chart} is not the chart of {one}; name the chart.json that was printed")
-    if told.asked:
-        told.add(**comparison_json(found))
+    if output.asked:
+        output.add(**comparison_json(found))
     else:
         print("\n".join(lines(found)))
     if out is not None:
@@ -544,12 +544,12 @@ def _compare(
         write_comparison(found, out, drawn)
 
 
-def _print_result(result: BuildResult, told: JsonOutput) -> None:
+def _print_result(result: BuildResult, output: JsonOutput) -> None:
     """Print the figures that matter most, the remarks, and the verdict; or add all that `report.json` holds."""
-    if told.asked:
+    if output.asked:
         from calibration.report.report import report_json
 
-        told.add(**report_json(result))
+        output.add(**report_json(result))
         return
     from calibration.report.page import summary
     from calibration.verdict import remark

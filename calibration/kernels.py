@@ -351,7 +351,7 @@ def clipped_to_neighbours(values: _Array, around: _Place, out: _Array) -> None:
             value = values[place]
             known = value == value
             below, above = value if known else np.inf, value if known else -np.inf
-            # Without branches, which nobody could foretell.
+            # Without branches, which no processor could predict.
             low = min(low, max(lowest, below))
             lowest = min(lowest, below)
             high = max(high, min(highest, above))

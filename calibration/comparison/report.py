@@ -55,15 +55,15 @@ def lines(comparison: TableComparison) -> list[str]:
     """Return what a comparison found, for people: both tables, warnings, each answer, geometry, colours."""
     cells = comparison.cells
     named = [f"{name}  {_described(table)}" for name, table in (("A", comparison.one), ("B", comparison.other))]
-    told = [*named, *(f"warning: {warning}" for warning in comparison.warnings)]
-    told += [
+    found = [*named, *(f"warning: {warning}" for warning in comparison.warnings)]
+    found += [
         f"{f'{answer.name}:':24}{answer.said}\n{'':24}same within noise: {_ANSWERS[answer.same]}"
         for answer in comparison.answers
     ]
     gains = " / ".join(f"{100 * (gain - 1):+.3f} %" for gain in comparison.lights.gains.tolist())
-    told.append(f"{'B over A, R / G / B:':24}{gains}, median of the lights")
-    told.append(f"{'chart in the frame:':24}{geometry_text(comparison)}")
-    told += [
+    found.append(f"{'B over A, R / G / B:':24}{gains}, median of the lights")
+    found.append(f"{'chart in the frame:':24}{geometry_text(comparison)}")
+    found += [
         f"{f'{group.name} cells:':24}{group.cells}, mean {100 * group.mean:+.3f} %, spread {100 * group.spread:.3f} %, "
         f"worst {100 * group.worst:+.2f} % (colour {group.worst_colour})"
         for group in comparison.groups
@@ -71,8 +71,8 @@ def lines(comparison: TableComparison) -> list[str]:
     ]
     for name, unfit in (("A", cells.unfit_one), ("B", cells.unfit_other)):
         if unfit:
-            told.append(f"{f'unfit in {name} only:':24}{len(unfit)} cells: {first_of(unfit)}")
-    return [*told, f"{'Same within noise:':24}{_ANSWERS[comparison.same]}"]
+            found.append(f"{f'unfit in {name} only:':24}{len(unfit)} cells: {first_of(unfit)}")
+    return [*found, f"{'Same within noise:':24}{_ANSWERS[comparison.same]}"]
 
 
 def geometry_text(comparison: TableComparison) -> str:

@@ -89,7 +89,7 @@ def measure_frame(
     channel, framing = decoded.strongest, registered.registration.framing
     gauges = gauges_of(decoded.mosaic, channel, decoded.black, framing)
     shift = shift_between(registered.gauges[channel], framing, gauges)
-    # A turn or a change of distance moves the tags differently; moving the grid along would not mend it.
+    # A turn or a change of distance moves the tags differently; moving the grid along would not help.
     turned = shift.largest_px > shift.length_px + STILL_PX
     if shift.gauges == 0 or shift.length_px > REREGISTER_PX or turned:
         return shift
