@@ -1,21 +1,38 @@
-"""The page of causes in the documentation, written from the table: `python -m calibration.causes.reference`."""
+"""Two pages of the documentation, written from the code: `docs/reference/figures.md` and `docs/reference/causes.md`.
+
+`python -m calibration.reference` writes both anew; a test compares them.
+"""
 
 from __future__ import annotations
 
 import inspect
 import math
 import re
+from pathlib import Path
 
-from calibration.causes.rules import CAUSES, RULES, UNKNOWN, Condition, Evidence
+from calibration.causes.rules import CAUSES, RULES, UNKNOWN, Condition, Evidence, Rule
+from calibration.figures.all_figures import FIGURES
+from calibration.figures.figure import QUESTIONS, Figure
 
-_HEAD = """# Causes
+_PAGES = Path(__file__).parents[1] / "docs" / "reference"
+
+_FIGURES_HEAD = """# Figures
+
+What `build-lut` judges a table by. Within what is *accepted* nothing is said; beyond it a figure is remarked on, and
+beyond what is *refused* there is no table. `acquire check` forecasts some of them before a session, by the same limits.
+The names are those of `report.json`.
+
+*Written by `python -m calibration.reference` from `calibration/figures`.*
+"""
+
+_CAUSES_HEAD = """# Causes
 
 Each remark and refusal of `build-lut` names the frame, the place on the print, the probable cause, and what mends it.
 The cause is decided by the table below, from evidence that stands in `report.json` under `causes` and in the report
 beside each cause. The first rule that holds decides; what was not measured lies in no interval. Where no rule holds,
 the cause is said to be unknown: look at the place in the report, where it is circled.
 
-*Written by `python -m calibration.causes.reference > docs/reference/causes.md` from `calibration/causes`.*
+*Written by `python -m calibration.reference` from `calibration/causes`.*
 """
 
 _AGAIN = {
@@ -24,21 +41,47 @@ _AGAIN = {
     "nothing": "nothing",
 }
 
+_LEAST = 1e-9
+"""What stands in the table for "more than none"."""
+
+
+def figures_page() -> str:
+    """Return the page of the figures, Markdown."""
+    parts = [_FIGURES_HEAD]
+    for group, question in QUESTIONS.items():
+        parts.append(f"## {group.capitalize()}\n\n{question}\n")
+        parts.append("| figure | accepted | refused beyond | in a check | what goes wrong beyond | what helps |")
+        parts += ["|---|---|---|---|---|---|", *(_limits(one) for one in FIGURES if one.group == group), ""]
+    return "\n".join(parts)
+
+
+def _limits(one: Figure) -> str:
+    refused = "–" if one.refuse is None else one.text(one.refuse)
+    known = "–" if one.forecast is None else "yes"
+    helps = one.remedy or "what most of them are decides"
+    return f"| {one.title} (`{one.name}`) | {one.expected} | {refused} | {known} | {one.why} ({one.source}) | {helps} |"
+
 
 def causes_page() -> str:
-    """Return the page, Markdown."""
-    parts = [_HEAD, "## What helps\n", "| cause | what it is | what helps | to be taken again |\n|---|---|---|---|"]
+    """Return the page of the causes, Markdown."""
+    parts = [_CAUSES_HEAD]
+    parts += ["## What helps\n", "| cause | what it is | what helps | to be taken again |\n|---|---|---|---|"]
     parts += [
         f"| {one.name} | {one.says} | {one.remedy} | {_AGAIN[one.mends]} |" for one in CAUSES if one is not UNKNOWN
     ]
     parts += ["\n## The table\n", "| cause | figures | holds where | because |\n|---|---|---|---|"]
     for rule in RULES:
-        figures = ", ".join(f"`{figure}`" for figure in sorted(rule.figures))
+        figures = ", ".join(f"`{name}`" for name in _names(rule))
         where = ", ".join(_interval(one) for one in rule.conditions)
         parts.append(f"| {rule.cause.name} | {figures} | {where} | {rule.why} |")
     parts += ["\n## The evidence\n", "| name | what it is |\n|---|---|"]
     parts += [f"| `{name}` | {text} |" for name, text in _evidence()]
     return "\n".join(parts) + "\n"
+
+
+def _names(rule: Rule) -> list[str]:
+    """Return the names of the figures that a rule may explain."""
+    return sorted(one.name for one in FIGURES if one.cause is not None and one.cause.about in rule.about)
 
 
 def _interval(one: Condition) -> str:
@@ -54,13 +97,12 @@ def _interval(one: Condition) -> str:
 
 def _evidence() -> list[tuple[str, str]]:
     """Return each name of the evidence with what its docstring says of it."""
-    text = inspect.cleandoc(Evidence.__doc__ or "").split("----------\n", 1)[1]
-    entries = re.findall(r"^(\w+)\n((?: {4}.*\n?)+)", text, flags=re.MULTILINE)
-    return [(name, " ".join(line.strip() for line in lines.splitlines())) for name, lines in entries]
+    text = inspect.cleandoc(Evidence.__doc__ or "")
+    entries = re.findall(r"^- `(\w+)`: ((?:.*\n?)(?:  .*\n?)*)", text, flags=re.MULTILINE)
+    texts = ((name, " ".join(line.strip() for line in lines.splitlines())) for name, lines in entries)
+    return [(name, text[0].upper() + text[1:]) for name, text in texts]
 
-
-_LEAST = 1e-9
-"""What stands in the table for "more than none"."""
 
 if __name__ == "__main__":
-    print(causes_page(), end="")
+    for name, text in (("figures", figures_page()), ("causes", causes_page())):
+        (_PAGES / f"{name}.md").write_text(text, encoding="utf-8")

@@ -19,6 +19,7 @@ from acquisition.check.findings import LIMITS, Finding, Grade, Range, amount, ju
 from acquisition.check.light_and_print import AREAS, area_name
 from acquisition.check.places import ChartMap
 from acquisition.run.planning.sizes import bytes_text, free_bytes_at, needed_bytes
+from calibration.figures.light import LINEARITY
 from calibration.sampling import bleed, largest_blur_px
 from drivers.camera import Camera, ReportsSupplies, Supplies
 from drivers.raw.rawfile import Mosaic
@@ -419,15 +420,15 @@ def judge_linearity(seen: _Array, times_s: Sequence[float], transfer: Transfer) 
             not_checked(
                 name, f"{len(times_s)} shutter times bring white between 6 and 94 % of saturation, {LEAST_TIMES} needed"
             )
-            for name in ("linearity", "photon transfer")
+            for name in (LINEARITY.name, "photon transfer")
         ]
     level, deviation = deviations(seen, np.asarray(times_s, dtype=np.float64))
     if np.isnan(deviation).all():
-        return [not_checked("linearity", "no patch is bright enough in two frames of the series")]
+        return [not_checked(LINEARITY.name, "no patch is bright enough in two frames of the series")]
     off = float(np.nanmax(np.abs(deviation)))
     channel, node = np.unravel_index(int(np.nanargmax(np.abs(deviation))), deviation.shape)
     straight = judged(
-        LIMITS["linearity"],
+        LIMITS[LINEARITY.name],
         off,
         f"over {len(times_s)} times from {times_s[0]:.4g} to {times_s[-1]:.4g} s counts deviate from proportion to "
         f"light by {percent(off)} at most ({CHANNELS[int(channel)]} at {percent(float(level[node]))} of saturation; "

@@ -55,6 +55,7 @@ from acquisition.run.planning.work import planned_steps
 from acquisition.run.rig.opening import open_rig
 from acquisition.run.shutter import period_s
 from calibration.figures.figure import CheckMeasurements
+from calibration.figures.light import ADDITIVITY, LINEARITY
 from drivers.camera import keep_awake
 from drivers.presenter import Colour, ReportsWarnings
 from drivers.projector import Power, Projector, Severity
@@ -202,7 +203,7 @@ def _light_findings(
     seen: CheckFrames, figures: ChartFigures | None, chart: Chart, plan_has: bool, dark_percent: float
 ) -> list[Finding]:
     if not seen.usable:
-        names = ("room light", "brightest light", "additivity", "flicker", "brightness")
+        names = ("room light", "brightest light", ADDITIVITY.name, "flicker", "brightness")
         return [not_checked(name, CLIPPED) for name in names]
     if figures is None:
         findings = [not_checked("room light", "the chart was not found")]
@@ -219,10 +220,10 @@ def _light_findings(
         findings = [_as_the_run_refuses(room, dark_percent)]
     recorded = "a recording cannot be exposed anew"
     if seen.primaries is None:
-        names = ("brightest light", "additivity", "flicker", "brightness")
+        names = ("brightest light", ADDITIVITY.name, "flicker", "brightness")
         return [*findings, *(not_checked(name, recorded) for name in names)]
     if float(seen.primaries["white"].min()) < 100.0:
-        names = ("brightest light", "additivity", "flicker", "brightness")
+        names = ("brightest light", ADDITIVITY.name, "flicker", "brightness")
         return [*findings, *(not_checked(name, "white is too dim") for name in names)]
     whites = [_paper_level(shot_levels) for shot_levels in _whites(seen, figures, chart)]
     return [*findings, *judge_primaries(seen.primaries, plan_has), *judge_flicker(whites, seen.used_s)]
@@ -269,7 +270,7 @@ def _sensor_findings(
         return findings
     if seen.series is None:
         why = "the chart was not found" if seen.chart is None else "a recording cannot be exposed anew"
-        return [*findings, not_checked("linearity", why), not_checked("photon transfer", why)]
+        return [*findings, not_checked(LINEARITY.name, why), not_checked("photon transfer", why)]
     series = seen.series
     return [*findings, *judge_linearity(series.seen, series.times_s, series.transfer)]
 

@@ -111,7 +111,7 @@ class CheckReport:
 
     - `devices`: what answered, a line each, and what was done with it.
     - `findings`: in the order in which they were looked at.
-    - `foretold`: what `build-lut` would say, as far as these frames show it: "accept", "accept with remarks" or
+    - `forecast`: what `build-lut` would say, as far as these frames show it: "accept", "accept with remarks" or
       "refuse"; None where the chart was not found.
     - `figures`: the table's figures that are known, by their names in `report.json`.
     - `not_known`: the names of those that are known only when there are frames of a session.
@@ -119,7 +119,7 @@ class CheckReport:
 
     devices: tuple[str, ...]
     findings: tuple[Finding, ...]
-    foretold: Outcome | None = None
+    forecast: Outcome | None = None
     figures: Mapping[str, float] = field(default_factory=dict[str, float])
     not_known: tuple[str, ...] = ()
 
@@ -142,11 +142,11 @@ class CheckReport:
         return *self.devices, *told, *self._forecast_lines()
 
     def _forecast_lines(self) -> list[str]:
-        if self.foretold is None:
+        if self.forecast is None:
             return []
         names = ", ".join(name.replace("_", " ") for name in self.not_known)
         return [
-            f"table       build-lut would say {self.foretold!r} by the {len(self.figures)} figures known now",
+            f"table       build-lut would say {self.forecast!r} by the {len(self.figures)} figures known now",
             f"            not known before the session: {names}",
         ]
 
@@ -157,8 +157,8 @@ class CheckReport:
             "faults": len(self.of("fault")),
             "findings": [_plain(asdict(finding)) for finding in self.findings],
             "table": None
-            if self.foretold is None
-            else {"outcome": self.foretold, "figures": _plain(dict(self.figures)), "not_known": list(self.not_known)},
+            if self.forecast is None
+            else {"outcome": self.forecast, "figures": _plain(dict(self.figures)), "not_known": list(self.not_known)},
         }
         return json.dumps(document, indent=1, ensure_ascii=False, allow_nan=False)
 
@@ -260,7 +260,7 @@ _LIMITS = (
         "light adds: white holds every primary in full; 0.5 % is the lamp's flicker between two frames; " + _EARLY,
     ),
     Limit(
-        "additivity", "White against the sum of the primaries", "share",
+        ADDITIVITY.name, "White against the sum of the primaries", "share",
         (-ADDITIVITY.accept, ADDITIVITY.accept), (None, None),
         "the projector mixes colours in its own way, so that lights are not what their codes say; "
         "the table is valid all the same",
@@ -356,7 +356,7 @@ _LIMITS = (
         "without it a file's transfer takes as long after any exposure",
     ),
     Limit(
-        "linearity", "Deviation from proportion to light, 5 to 95 % of saturation", "share",
+        LINEARITY.name, "Deviation from proportion to light, 5 to 95 % of saturation", "share",
         *LINEARITY.ranges,
         "chromaticities change with brightness",
         "EMVA 1288 asks for the range; " + _VERDICT,

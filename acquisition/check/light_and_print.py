@@ -24,6 +24,7 @@ import numpy.typing as npt
 
 from acquisition.check.findings import LIMITS, Finding, judged, not_checked, percent
 from acquisition.check.places import Levels
+from calibration.figures.light import ADDITIVITY
 from experiment.chart.model import Chart
 from experiment.framing.planes import CHANNELS
 from experiment.measures.least_squares import least_squares, robust_least_squares
@@ -263,7 +264,7 @@ def judge_primaries(levels: Mapping[str, _Array], plan_has: bool) -> list[Findin
     signed = (alone.sum(axis=0) - 2 * black) / white - 1
     off = float(signed[int(np.argmax(np.abs(signed)))])
     additive = judged(
-        LIMITS["additivity"],
+        LIMITS[ADDITIVITY.name],
         off,
         f"the three primaries together are {percent(missing)} {'above' if off > 0 else 'below'} white",
         "switch off brilliant colour, white boost and dynamic contrast in the projector's menu",

@@ -6,7 +6,8 @@ from calibration.figures import geometry, light, radiometry, truth
 from calibration.figures.figure import Figure
 
 
-def _all() -> tuple[Figure, ...]:
+def collected() -> tuple[Figure, ...]:
+    """Return the figures of the files; a ValueError says of one that contradicts itself or another."""
     modules = (geometry, radiometry, light, truth)
     found = tuple(value for module in modules for value in vars(module).values() if isinstance(value, Figure))
     names = {figure.name for figure in found}
@@ -22,5 +23,5 @@ def _all() -> tuple[Figure, ...]:
     return found
 
 
-FIGURES: tuple[Figure, ...] = _all()
+FIGURES: tuple[Figure, ...] = collected()
 BY_NAME: dict[str, Figure] = {figure.name: figure for figure in FIGURES}

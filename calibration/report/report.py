@@ -20,6 +20,7 @@ import numpy.typing as npt
 from calibration.checks.light_codes import CodeAgreement
 from calibration.figures.all_figures import BY_NAME, FIGURES
 from calibration.figures.figure import Worst
+from calibration.figures.light import ADDITIVITY, LINEARITY
 from calibration.figures.truth import TRUTH_WORST_DEG
 from calibration.measurements import TableMeasurements
 from calibration.report.page import Picture, page
@@ -187,13 +188,13 @@ def _channels(figures: TableMeasurements) -> dict[str, Any]:
     return {
         "window": figures.cells.window,
         "largest_window": largest_window(registration.cell_px, registration.blur_px),
-        "linearity": None if linearity is None else linearity.to_json(),
+        LINEARITY.name: None if linearity is None else linearity.to_json(),
         "dark_frames": len(dark.files),
         "dark_subtracted": lights.subtracted is not None,
         "dark_counts": _numbers(dark.light),
         "dark_error": _numbers(dark.error),
         "dark_noise": _numbers(dark.noise),
-        "additivity": None if lights.additivity is None else _numbers(lights.additivity),
+        ADDITIVITY.name: None if lights.additivity is None else _numbers(lights.additivity),
         "stray": None if lights.stray is None else lights.stray.to_json(),
         "gain_e_per_count": _numbers(transfer.gain_e),
         "read_noise_counts": _numbers(transfer.read_noise),

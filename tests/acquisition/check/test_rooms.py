@@ -82,7 +82,7 @@ def test_blur_is_judged_by_what_it_does_to_cells_of_their_size(check: Check) -> 
 
 def test_what_is_not_known_yet_is_named(check: Check) -> None:
     report = check(3)
-    assert report.foretold == "accept"
+    assert report.forecast == "accept"
     assert {"white_drift", "off_codes_deg", "agreement"} <= set(report.not_known)
     assert "not known before the session: " in report.lines()[-1]
     assert ", white drift, " in report.lines()[-1]

@@ -14,12 +14,12 @@ import pytest
 
 from calibration.citation import exposure_text
 from calibration.cli import main
+from calibration.figures.figure import QUESTIONS
 from calibration.figures.geometry import cell_sides_px
 from calibration.pipeline.build import build, check
 from calibration.pipeline.frames import session_sha256
-from calibration.report.groups import GROUPS, OF_THRESHOLDS
 from calibration.report.page import summary
-from calibration.report.report import worst_of
+from calibration.report.report import worst_of_figures
 from calibration.table.lut import Lut, open_lut
 from calibration.verdict import BuildResult
 from drivers.camera import ExposureSettings
@@ -237,29 +237,32 @@ def test_the_report_stands_alone(built: BuildResult) -> None:
         "What to do", "The chart as registered", "The lights", "Where cells err", "The noise", "All figures",
     ]  # fmt: skip
     assert page.index("class='verdict ") < page.index("What to do")
-    assert re.findall(r"<details id='(\w+)'", page) == [*GROUPS, "origin"]
+    assert re.findall(r"<details id='(\w+)'", page) == [*QUESTIONS, "origin"]
     assert re.search(r"(src|href)='?http", page) is None
     for row in summary(built.figures):
-        assert html.escape(row.name) in page
+        assert row.name in html.unescape(page)
     # A group with something beyond its limit is not folded, all others are.
-    beyond = {OF_THRESHOLDS[row.figure.name] for row in built.verdict.rows if row.outcome != "accept"}
+    beyond = {row.figure.group for row in built.verdict.rows if row.outcome != "accept"}
     assert set(re.findall(r"<details id='(\w+)' open", page)) == beyond
-    assert f"<th>Exposure</th><td>{html.escape(exposure_text(built.figures.origin))}</td>" in page
+    exposure = exposure_text(built.figures.origin)
+    assert f"<th scope='row'>Exposure</th><td>{exposure}</td>" in html.unescape(page)
+    # A figure leads to the picture that shows it.
+    pictures = set(re.findall(r"<div id='(\w+)'", page))
+    assert pictures >= set(re.findall(r"href='#(\w+)'", page)) >= {"residuals", "course", "lights"}
 
 
 def test_the_worst_of_each_figure_is_somewhere(built: BuildResult, session: Session) -> None:
-    chart, found = session.chart, worst_of(built.figures, session.chart)
+    chart, found = session.chart, worst_of_figures(built.figures, session.chart)
     files = {record.file for record in session.frames()}
-    for worst in found:
+    for worst in found.values():
         assert worst.where
         assert not worst.file or worst.file in files
         if worst.place is not None:
             assert 0 <= worst.place.x_mm <= chart.page_mm[0]
             assert 0 <= worst.place.y_mm <= chart.page_mm[1]
     errors = built.figures.lights.white_error_deg
-    assert next(worst.light for worst in found if worst.figure == "truth_worst_deg") == int(np.argmax(errors))
-    by_name = {worst.figure: worst for worst in found}
-    assert by_name["bleed"].place is not None
+    assert found["truth_worst_deg"].light == int(np.argmax(errors))
+    assert found["bleed"].place is not None
     smallest = cell_sides_px(built.figures, chart).min()
     assert smallest == pytest.approx(built.figures.registration.cell_px, rel=0.1)
 

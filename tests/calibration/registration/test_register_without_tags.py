@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from calibration.figures.all_figures import FIGURES
+from calibration.figures.radiometry import UNFIT_SHARE
 from calibration.registration.register import register
 from drivers.presenter import WHITE, Colour
 from drivers.raw.rawfile import Mosaic
@@ -76,8 +76,7 @@ def test_cells_that_the_map_does_not_follow_are_known_to_be_uncertain(tmp_path: 
     assert error.max() > 0.5, "a room in which it matters"
     uncertain = registration.uncertain(SMALL.centres_mm)
     assert uncertain[error > 0.5].all()
-    limit = next(figure for figure in FIGURES if figure.name == "unfit_share")
-    assert uncertain.mean() > (limit.refuse or 1)
+    assert uncertain.mean() > (UNFIT_SHARE.refuse or 1)
 
 
 @pytest.mark.parametrize("seed", [1, 2])

@@ -1,4 +1,4 @@
-"""One rule for check and build: what the check foretells of a table is what `build-lut` says of the same frames.
+"""One rule for check and build: what the check forecasts of a table is what `build-lut` says of the same frames.
 
 Each room is photographed once, and the very frames are given to both.
 """
@@ -15,10 +15,9 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from acquisition.check.foretelling.figures import ForetoldTable, foretell, foretell_lights
+from acquisition.check.forecast import Forecast, darkest_counts, measure_table
 from acquisition.check.frames import PRIMARIES, PlacedChart, Shot
 from acquisition.check.places import place_chart, window_px
-from calibration.figures.all_figures import FIGURES
 from calibration.figures.figure import OUTCOMES
 from calibration.pipeline.build import check as build_check
 from calibration.verdict import judge, judged_values
@@ -27,7 +26,6 @@ from drivers.raw.rawfile import Mosaic, read_raw
 from experiment.chart.layout import paper_chart
 from experiment.framing.finding import find_chart
 from experiment.lights.illuminations import plan_illuminations
-from experiment.limits.table import ONLY_OF_A_SESSION, TABLE_LIMITS
 from experiment.measures.sensor_range import saturation
 from experiment.session.folder import Session
 from experiment.session.plan import SessionStep
@@ -126,7 +124,7 @@ LEAST_COVERED = 9
 class Said:
     """What both say: outcomes by figure, or None where no table could be judged at all."""
 
-    foretold: ForetoldTable | None
+    forecast: Forecast | None
     built: dict[str, str] | None
     figures: dict[str, float]
 
@@ -147,12 +145,14 @@ def say(case: Case, folder: Path) -> Said:
     for name, colour, data in (("white", WHITE, white), ("dark", BLACK, dark)):
         (folder / f"{name}.dng").write_bytes(data)
         shots.append(Shot(colour, 0.5, read_raw(folder / f"{name}.dng"), 0.0, len(data)))
-    foretold = None
+    forecast = None
     try:
         framing = find_chart(shots[0].mosaic, lab.chart, "the white frame")
         place = place_chart(framing, lab.chart)
         placed = PlacedChart(framing, place, window_px(lab.chart, place))
-        foretold = foretell(lab.chart, placed, (shots[0],), shots[1], float(saturation(shots[0].mosaic)))
+        forecast = Forecast.of(
+            measure_table(lab.chart, placed, (shots[0],), shots[1], float(saturation(shots[0].mosaic)))
+        )
     except RegistrationError:
         pass
 
@@ -162,7 +162,7 @@ def say(case: Case, folder: Path) -> Said:
     built, figures = None, dict[str, float]()
     with take(lab, folder / "session", LIGHTS[:1], frame=frame) as session:
         built, figures = _built(session)
-    return Said(foretold, built, figures)
+    return Said(forecast, built, figures)
 
 
 def _built(session: Session) -> tuple[dict[str, str] | None, dict[str, float]]:
@@ -197,16 +197,16 @@ def said(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Said]:
 @pytest.mark.parametrize("name", ROOMS)
 def test_check_and_build_agree_on_every_figure_that_both_know(name: str, said: Callable[[str], Said]) -> None:
     found = said(name)
-    if found.foretold is None or found.built is None:
+    if found.forecast is None or found.built is None:
         # Where the chart is not found, or cannot be used, both refuse.
         assert found.built is None
-        assert found.foretold is None or found.foretold.outcome == "refuse"
+        assert found.forecast is None or found.forecast.outcome == "refuse"
         return
-    ours = found.foretold.outcomes
+    ours = found.forecast.outcomes
     both = ours.keys() & found.built.keys()
     assert both >= {"cell_px", "bleed"} | (set() if ROOMS[name].tagless else {"unfit_share", "reference_spread"})
     differing = {
-        figure: (found.foretold.figures[figure], ours[figure], found.figures[figure], found.built[figure])
+        figure: (found.forecast.figures[figure], ours[figure], found.figures[figure], found.built[figure])
         for figure in both
         if ours[figure] != found.built[figure]
     }
@@ -214,9 +214,9 @@ def test_check_and_build_agree_on_every_figure_that_both_know(name: str, said: C
 
 
 @pytest.mark.parametrize("name", [name for name, case in ROOMS.items() if case.expected != "any"])
-def test_the_foretold_verdict_is_what_the_room_deserves(name: str, said: Callable[[str], Said]) -> None:
+def test_the_forecast_verdict_is_what_the_room_deserves(name: str, said: Callable[[str], Said]) -> None:
     found, expected = said(name), ROOMS[name].expected
-    outcome = "refuse" if found.foretold is None else found.foretold.outcome
+    outcome = "refuse" if found.forecast is None else found.forecast.outcome
     # No chart of so few colours shows whether the lens has a veil, and a table says so; a check does not measure it.
     known = None if found.built is None else {**found.built, "correction_residual": OUTCOMES[0]}
     built = "refuse" if known is None else max(known.values(), key=OUTCOMES.index)
@@ -227,25 +227,18 @@ def test_the_foretold_verdict_is_what_the_room_deserves(name: str, said: Callabl
         assert (outcome, built) == (expected, expected)
 
 
-def test_every_figure_is_either_foretold_or_told_to_be_unknown() -> None:
-    names = {limit.name for limit in FIGURES}
-    # A new figure belongs into `TABLE_LIMITS`, where a check can know it, or into `ONLY_OF_A_SESSION`.
-    assert names <= set(TABLE_LIMITS) | set(ONLY_OF_A_SESSION)
-    assert not set(TABLE_LIMITS) & set(ONLY_OF_A_SESSION)
-
-
 def test_what_is_not_known_is_named(said: Callable[[str], Said]) -> None:
-    table = said("sharp").foretold
+    table = said("sharp").forecast
     assert table is not None
     assert {"white_drift", "dark_drift", "off_codes_deg", "agreement", "linearity"} <= set(table.not_known)
     assert not set(table.not_known) & set(table.figures)
 
 
-def test_the_darkest_light_is_foretold_from_the_primaries() -> None:
+def test_the_darkest_light_is_forecast_from_the_primaries() -> None:
     lab = hang(1)
     levels = {name: lab.world.white(colour, SETTINGS) for name, colour in {**PRIMARIES, "black": BLACK}.items()}
     lights = plan_illuminations(4, (2000, 8000))
     true = min(float(np.max(lab.world.white(light.colour, SETTINGS))) for light in lights)
-    assert foretell_lights(lights, levels)["darkest_counts"] == pytest.approx(true, rel=0.02)
-    assert foretell_lights(lights, levels, 0.5)["darkest_counts"] == pytest.approx(true / 2, rel=0.02)
-    assert foretell_lights((), levels) == {}
+    assert darkest_counts(lights, levels) == pytest.approx(true, rel=0.02)
+    assert darkest_counts(lights, levels, 0.5) == pytest.approx(true / 2, rel=0.02)
+    assert darkest_counts((), levels) is None

@@ -1,0 +1,87 @@
+"""Figures: each has its parts and stands once; limits at their borders; the blur that belongs to a bleed."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import fields, replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from acquisition.judge import limits as judge
+from calibration.figures import all_figures, light
+from calibration.figures.all_figures import FIGURES
+from calibration.figures.figure import QUESTIONS, CheckMeasurements, Figure
+from calibration.figures.truth import DARKEST_COUNTS
+from calibration.sampling import bleed, blur_of_bleed, largest_blur_px
+
+ROOT = Path(__file__).parents[2]
+PACKAGES = ("foundation", "drivers", "sim", "experiment", "calibration", "acquisition", "benchmarks")
+
+
+def test_a_figure_that_lacks_a_part_does_not_import() -> None:
+    parts: dict[str, Any] = {part.name: getattr(DARKEST_COUNTS, part.name) for part in fields(Figure) if part.init}
+    assert Figure(**parts) == DARKEST_COUNTS
+    for name in parts.keys() - {"foremost", "found"}:
+        with pytest.raises(TypeError, match=name):
+            Figure(**{key: value for key, value in parts.items() if key != name})
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"why": ""},
+        {"title": ""},
+        {"source": ""},
+        {"refuse": 301.0},
+        {"name": "bleed"},
+        {"cause": replace(light.ADDITIVITY.cause, follows=("nothing",)) if light.ADDITIVITY.cause else None},
+    ],
+)
+def test_figures_that_contradict_themselves_do_not_import(
+    wrong: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(light, "WRONG", replace(DARKEST_COUNTS, **{"name": "wrong", **wrong}), raising=False)
+    with pytest.raises(ValueError, match=r"wrong|names"):
+        all_figures.collected()
+
+
+def test_figures_are_listed_in_the_order_of_their_definitions() -> None:
+    assert all_figures.collected() == FIGURES
+    names = [figure.name for figure in FIGURES]
+    assert names[:3] == ["tags_found", "cell_px", "bleed"]
+    assert names[-1] == "darkest_counts"
+    assert {figure.group for figure in FIGURES} == QUESTIONS.keys()
+    places = [line.place for figure in FIGURES for line in figure.lines]
+    assert len(set(places)) == len(places)
+
+
+def test_a_name_stands_in_its_figure() -> None:
+    """A figure has one home: at most two other files hold its name, as a key or a word of their own."""
+    texts = {path: path.read_text() for package in PACKAGES for path in (ROOT / package).rglob("*.py")}
+    for figure in FIGURES:
+        found = [path for path, text in texts.items() if re.search(rf"[\"']{figure.name}[\"']", text)]
+        assert 1 <= len(found) <= 3, (figure.name, found)
+
+
+def test_a_check_that_saw_nothing_forecasts_nothing() -> None:
+    nothing = CheckMeasurements()
+    assert [figure.name for figure in FIGURES if figure.forecast is not None and figure.forecast(nothing)] == []
+
+
+@pytest.mark.parametrize("share", [0.005, 0.03])
+@pytest.mark.parametrize("cell_px", [8.6, 10.2, 12.4])
+def test_the_blur_of_a_bleed_is_its_inverse(share: float, cell_px: float) -> None:
+    assert bleed(cell_px, blur_of_bleed(cell_px, share)) == pytest.approx(share, rel=1e-9)
+
+
+def test_larger_cells_may_be_softer() -> None:
+    assert largest_blur_px(10.0) == 1.0
+    assert largest_blur_px(100.0) > 20
+
+
+def test_the_live_judge_follows_a_lasting_change_as_far_as_a_table_is_made() -> None:
+    assert judge.LAMP_TOTAL == 15.0
+    assert judge.LIGHT_FOLLOWED_DEG == 2.0
+    assert judge.ADDED_LEAST == 0.004
