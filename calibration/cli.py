@@ -5,155 +5,29 @@ Parse, call, print; nothing else.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Generator, Sequence
 from contextlib import contextmanager
-from pathlib import Path
-from typing import TYPE_CHECKING
-
-from foundation.console import shows_progress
-from foundation.errors import FormatError
-from foundation.trust.secret_texts import masked, printable
-
-if TYPE_CHECKING:
-    from calibration.table.lut import Lut
-    from foundation.json_output import JsonOutput
-from collections.abc import Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from calibration.citation import Licence, Note
 from foundation import console
-from foundation.console import EXIT_CODES, Quiet, Verbose, Version, new_app
-from foundation.errors import InputError, QualityError
+from foundation.console import EXIT_CODES, Quiet, Verbose, Version, new_app, shows_progress
+from foundation.errors import FormatError, InputError, QualityError
 from foundation.json_output import AsJson, JsonOutput, json_output
+from foundation.trust.secret_texts import masked, printable
 
 if TYPE_CHECKING:
     from calibration.pipeline.baseline import BuildOptions
     from calibration.pipeline.build import TableProgress
+    from calibration.table.lut import Lut
     from calibration.verdict import BuildResult
     from experiment.session.folder import Session
 
 app = new_app()
-
-
-def print_table(folder: Path, output: JsonOutput) -> None:
-    """Print what a table is and what it was made of, a line each."""
-    from calibration.table.lut import open_lut
-    from calibration.table.verification import describe
-
-    lut = open_lut(folder)
-    output.add(
-        table=folder,
-        sha256=lut.sha256,
-        lights=len(lut.white),
-        colours=8**lut.provenance.bits,
-        samples=int(lut.samples.shape[2]),
-        provenance=lut.provenance.model_dump(mode="json"),
-    )
-    for name, value in describe(lut):
-        print(f"{name + ':':17}{printable(value)}")
-
-
-def print_citation(folder: Path, output: JsonOutput) -> None:
-    """Print a BibTeX entry of a table."""
-    from calibration.table.lut import open_lut
-    from calibration.table.verification import citation_of
-
-    entry = printable(citation_of(open_lut(folder)))
-    output.add(table=folder, bibtex=entry)
-    print(entry, end="")
-
-
-def verify_table(folder: Path, session: Path | None, output: JsonOutput) -> None:
-    """Hash every byte of a table again, with a session its frames too; a FormatError where anything changed."""
-    from calibration.table.lut import open_lut
-    from calibration.table.verification import find_faults
-
-    lut = open_lut(folder, check=False)
-    with progress_bar("reading the samples") as progress:
-        faults = find_faults(lut, lambda done, total: progress(done, total, "reading the samples"))
-    if session is not None:
-        from calibration.pipeline.frames import frame_faults
-        from experiment.session.folder import Session
-
-        with Session.open(session) as opened, progress_bar("reading the frames") as progress:
-            faults += frame_faults(lut, opened, progress)
-    output.add(table=folder, sha256=lut.sha256, frames=None if session is None else len(lut.frames), faults=faults)
-    for fault in faults:
-        print(fault)
-    if faults:
-        raise FormatError(
-            f"{folder} is not as it was built: {len(faults)} faults; restore it from a copy, or build it again"
-        )
-    frames = "" if session is None else f", and so are its {len(lut.frames)} frames in {session}"
-    print(f"{folder}: every byte is as it was built{frames}")
-
-
-def match_tables(one: Path, other: Path, output: JsonOutput) -> None:
-    """Print that two tables correspond number by number; a FormatError says where they do not."""
-    from calibration.table.lut import open_lut
-    from calibration.table.verification import require_match
-
-    tables = open_lut(one), open_lut(other)
-    require_match(*tables)
-    output.add(tables=[one, other], cameras=[table.provenance.camera for table in tables], match=True)
-    cameras = " and ".join(table.provenance.camera for table in tables)
-    print(f"{one} and {other} ({cameras}): colours and lights correspond number by number")
-
-
-def publish_table(folder: Path, url: str, output: JsonOutput) -> None:
-    """Copy a table to a store, and print how others get it."""
-    from calibration.table.lut import open_lut
-    from calibration.table.zarr_store import publish
-
-    lut = open_lut(folder)
-    with progress_bar("writing lights") as progress:
-        publish(lut, url, lambda done, total: progress(done, total, "writing lights"))
-    output.add(table=folder, url=masked(url), lights=len(lut.samples), sha256=lut.sha256)
-    print(f"{masked(url)}: {len(lut.samples)} lights of {folder}; others get them by")
-    print(f"build-lut --fetch {masked(url)} LUT --expect {lut.sha256}")
-
-
-def fetch_table(url: str, folder: Path, expect: str | None, output: JsonOutput) -> None:
-    """Copy a published table from a store, and print what is known of it."""
-    from calibration.table.zarr_store import fetch
-
-    with progress_bar("reading lights") as progress:
-        lut = fetch(url, folder, lambda done, total: progress(done, total, "reading lights"), expect)
-    output.add(table=folder, url=masked(url), lights=len(lut.samples), sha256=lut.sha256, expected=expect is not None)
-    print(f"{folder}: {len(lut.samples)} lights, {printable(lut.provenance.camera)}; {_vouched(lut, expect)}")
-
-
-def _vouched(lut: Lut, expect: str | None) -> str:
-    """Return in words what is known of a table that was fetched."""
-    if not lut.provenance.lights_sha256:
-        return "it has no hashes, so that nobody can say whether it is as it was built"
-    covered = "every file is" if lut.provenance.has_sums else "ground truth and samples are (it is an older table)"
-    if expect is not None:
-        return f"it is the table expected, and {covered} as it was built"
-    return (
-        f"{covered} as its own hashes say; that it is the table you mean shows its hash, {lut.sha256}: compare it with "
-        "the one you were told, or give that with --expect"
-    )
-
-
-@contextmanager
-def progress_bar(beginning: str) -> Generator[Callable[[int, int, str], None]]:
-    """Show a bar of progress on stderr; yield what is to be called with done, total, and the present work."""
-    from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-
-    columns = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeRemainingColumn(),
-    )
-    with Progress(*columns, console=Console(stderr=True), transient=True, disable=not shows_progress()) as bar:
-        task = bar.add_task(beginning, total=None)
-        yield lambda done, total, what: bar.update(task, completed=done, total=total, description=what)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -401,17 +275,17 @@ def build_lut(
         raise InputError(f"{given[0]} does not expect {lut or session}; leave it out")
     with json_output("build-lut", as_json) as output:
         if info is not None:
-            print_table(info, output)
+            _print_table(info, output)
         elif cite is not None:
-            print_citation(cite, output)
+            _print_citation(cite, output)
         elif verify is not None:
-            verify_table(verify, session, output)
+            _verify_table(verify, session, output)
         elif match is not None:
-            match_tables(*match, output)
+            _match_tables(*match, output)
         elif publish is not None:
-            publish_table(*publish, output)
+            _publish_table(*publish, output)
         elif fetch is not None:
-            fetch_table(*fetch, expect, output)
+            _fetch_table(*fetch, expect, output)
         else:
             from calibration.pipeline.baseline import BuildOptions
             from calibration.sampling import WINDOW
@@ -431,6 +305,107 @@ def build_lut(
                 _compare(*compare, options, output, out, chart)
                 return
             _make(session, lut, check, append, options, linearity, picture, changes, output)
+
+
+def _print_table(folder: Path, output: JsonOutput) -> None:
+    """Print what a table is and what it was made of, a line each."""
+    from calibration.table.lut import open_lut
+    from calibration.table.verification import describe
+
+    lut = open_lut(folder)
+    output.add(
+        table=folder,
+        sha256=lut.sha256,
+        lights=len(lut.white),
+        colours=8**lut.provenance.bits,
+        samples=int(lut.samples.shape[2]),
+        provenance=lut.provenance.model_dump(mode="json"),
+    )
+    for name, value in describe(lut):
+        print(f"{name + ':':17}{printable(value)}")
+
+
+def _print_citation(folder: Path, output: JsonOutput) -> None:
+    """Print a BibTeX entry of a table."""
+    from calibration.table.lut import open_lut
+    from calibration.table.verification import citation_of
+
+    entry = printable(citation_of(open_lut(folder)))
+    output.add(table=folder, bibtex=entry)
+    print(entry, end="")
+
+
+def _verify_table(folder: Path, session: Path | None, output: JsonOutput) -> None:
+    """Hash every byte of a table again, with a session its frames too; a FormatError where anything changed."""
+    from calibration.table.lut import open_lut
+    from calibration.table.verification import find_faults
+
+    lut = open_lut(folder, check=False)
+    with _progress_bar("reading the samples") as progress:
+        faults = find_faults(lut, lambda done, total: progress(done, total, "reading the samples"))
+    if session is not None:
+        from calibration.pipeline.frames import frame_faults
+        from experiment.session.folder import Session
+
+        with Session.open(session) as opened, _progress_bar("reading the frames") as progress:
+            faults += frame_faults(lut, opened, progress)
+    output.add(table=folder, sha256=lut.sha256, frames=None if session is None else len(lut.frames), faults=faults)
+    for fault in faults:
+        print(fault)
+    if faults:
+        raise FormatError(
+            f"{folder} is not as it was built: {len(faults)} faults; restore it from a copy, or build it again"
+        )
+    frames = "" if session is None else f", and so are its {len(lut.frames)} frames in {session}"
+    print(f"{folder}: every byte is as it was built{frames}")
+
+
+def _match_tables(one: Path, other: Path, output: JsonOutput) -> None:
+    """Print that two tables correspond number by number; a FormatError says where they do not."""
+    from calibration.table.lut import open_lut
+    from calibration.table.verification import require_match
+
+    tables = open_lut(one), open_lut(other)
+    require_match(*tables)
+    output.add(tables=[one, other], cameras=[table.provenance.camera for table in tables], match=True)
+    cameras = " and ".join(table.provenance.camera for table in tables)
+    print(f"{one} and {other} ({cameras}): colours and lights correspond number by number")
+
+
+def _publish_table(folder: Path, url: str, output: JsonOutput) -> None:
+    """Copy a table to a store, and print how others get it."""
+    from calibration.table.lut import open_lut
+    from calibration.table.zarr_store import publish
+
+    lut = open_lut(folder)
+    with _progress_bar("writing lights") as progress:
+        publish(lut, url, lambda done, total: progress(done, total, "writing lights"))
+    output.add(table=folder, url=masked(url), lights=len(lut.samples), sha256=lut.sha256)
+    print(f"{masked(url)}: {len(lut.samples)} lights of {folder}; others get them by")
+    print(f"build-lut --fetch {masked(url)} LUT --expect {lut.sha256}")
+
+
+def _fetch_table(url: str, folder: Path, expect: str | None, output: JsonOutput) -> None:
+    """Copy a published table from a store, and print what is known of it."""
+    from calibration.table.zarr_store import fetch
+
+    with _progress_bar("reading lights") as progress:
+        lut = fetch(url, folder, lambda done, total: progress(done, total, "reading lights"), expect)
+    output.add(table=folder, url=masked(url), lights=len(lut.samples), sha256=lut.sha256, expected=expect is not None)
+    print(f"{folder}: {len(lut.samples)} lights, {printable(lut.provenance.camera)}; {_vouched(lut, expect)}")
+
+
+def _vouched(lut: Lut, expect: str | None) -> str:
+    """Return in words what is known of a table that was fetched."""
+    if not lut.provenance.lights_sha256:
+        return "it has no hashes, so that nobody can say whether it is as it was built"
+    covered = "every file is" if lut.provenance.has_sums else "ground truth and samples are (it is an older table)"
+    if expect is not None:
+        return f"it is the table expected, and {covered} as it was built"
+    return (
+        f"{covered} as its own hashes say; that it is the table you mean shows its hash, {lut.sha256}: compare it with "
+        "the one you were told, or give that with --expect"
+    )
 
 
 def _make(
@@ -511,7 +486,7 @@ def _build(
     from calibration.pipeline.build import append, build
     from calibration.report.report import write_report
 
-    with progress_bar("finding the chart") as progress:
+    with _progress_bar("finding the chart") as progress:
         return (append if so_far else build)(session, lut, progress, write_report, options, linearity)
 
 
@@ -526,7 +501,7 @@ def _compare(
     if out is not None:
         require_free(out, "the comparison")
     with (
-        progress_bar("reading") as progress,
+        _progress_bar("reading") as progress,
         table_of(one, options, progress) as a,
         table_of(other, options, progress) as b,
     ):
@@ -561,6 +536,23 @@ def _print_result(result: BuildResult, output: JsonOutput) -> None:
     for judged in result.verdict.remarks:
         print(f"remark: {remark(judged, result.figures)}")
     print(f"{'Verdict:':{width}}{result.verdict.outcome}")
+
+
+@contextmanager
+def _progress_bar(beginning: str) -> Generator[Callable[[int, int, str], None]]:
+    """Show a bar of progress on stderr; yield what is to be called with done, total, and the present work."""
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeRemainingColumn(),
+    )
+    with Progress(*columns, console=Console(stderr=True), transient=True, disable=not shows_progress()) as bar:
+        task = bar.add_task(beginning, total=None)
+        yield lambda done, total, what: bar.update(task, completed=done, total=total, description=what)
 
 
 if __name__ == "__main__":

@@ -36,6 +36,7 @@ from calibration.pipeline.baseline import BuildOptions
 from calibration.pipeline.build import build
 from calibration.report.report import report_json
 from calibration.table.lut import REFERENCES, REPORT_JSON, Lut, open_lut
+from calibration.table.verification import chart_difference
 from calibration.verdict import BuildResult
 from experiment.chart.model import Chart, load_chart
 from experiment.lights.illuminations import Illumination
@@ -297,12 +298,7 @@ def light_pairs(one: Sequence[Illumination], other: Sequence[Illumination]) -> L
 
 def require_one_chart(one: Lut, other: Lut) -> None:
     """Refuse two tables of different charts: a colour then means another place, and nothing can be compared."""
-    ours, theirs = one.provenance, other.provenance
-    differs = ""
-    if ours.bits != theirs.bits:
-        differs = f"{ours.bits} bits of each channel against {theirs.bits}"
-    elif ours.chart_sha256 != theirs.chart_sha256:
-        differs = f"chart {ours.chart_sha256[:12]}… against {theirs.chart_sha256[:12]}…"
+    differs = chart_difference(one, other)
     if differs:
         raise FormatError(
             f"{one.folder} and {other.folder} are of different charts ({differs}), so that their cells cannot be "

@@ -45,7 +45,6 @@ from calibration.pipeline.frames import (
     SelectedFrames,
     decode_frame,
     select_frames,
-    session_sha256,
     source_frames,
 )
 from calibration.pipeline.linearity import read_linearity
@@ -65,6 +64,7 @@ from calibration.table.lut import (
     REPORT_VERSION,
     SAMPLES,
     Provenance,
+    frames_sha256,
 )
 from calibration.table.writer import LutWriter
 from calibration.verdict import COMMAND, BuildResult, judge, judged_values, refusal, retake_json
@@ -339,7 +339,7 @@ def _write_table(done: Accumulator, figures: TableMeasurements, writer: LutWrite
         bits=session.chart.bits,
         white_level=figures.sensor.white_level,
         corrections=applied,
-        session_sha256=session_sha256(records),
+        session_sha256=frames_sha256(source_frames(records)),
         chart_sha256=session.chart.sha256,
         software=software(),
         unfit=list(figures.cells.unfit),

@@ -25,7 +25,7 @@ from pydantic import ValidationError
 
 from calibration.citation import Rig, StatedOrigin
 from calibration.radiometry.primaries import pure_lights
-from calibration.table.lut import Lut, SourceFrame, frames_sha256
+from calibration.table.lut import Lut, SourceFrame
 from drivers.raw.rawfile import Mosaic, decode_raw
 from experiment.config import CameraSettings, CitationSettings
 from experiment.framing.planes import Channel, frame_black, strongest_channel
@@ -201,11 +201,6 @@ def stated_origin(session: Session) -> StatedOrigin:
     except (CropError, ValidationError, ValueError, KeyError, RecursionError):
         return StatedOrigin(CitationSettings(), None, None, session.journal.records())
     return StatedOrigin(citation, rig, set_by, session.journal.records())
-
-
-def session_sha256(records: Sequence[FrameRecord]) -> str:
-    """Return the hash that names a session: SHA-256 over kind, light and hash of each frame used, a line each."""
-    return frames_sha256(source_frames(records))
 
 
 def source_frames(records: Sequence[FrameRecord]) -> list[SourceFrame]:

@@ -42,7 +42,7 @@ class MeasuredFrame:
     """A light or white frame as measured; C cells of S samples.
 
     - `figures`: for the report, the ground truth and the flat field.
-    - `registered`, `dark`: what it was measured with: the frame registered last, and the dark light subtracted.
+    - `registered`: the frame registered last, with which it was measured.
     - `saturation`: raw count of saturation, as far as it can be seen in this frame.
     - `values`: (C, S, 3) uint16, the table's samples.
     - `highest`: (C,) uint16, the highest raw count of each cell.
@@ -53,7 +53,6 @@ class MeasuredFrame:
 
     figures: FrameMeasurements
     registered: RegisteredFrame
-    dark: DarkLight | None
     saturation: int
     values: npt.NDArray[np.uint16]
     highest: npt.NDArray[np.uint16]
@@ -218,7 +217,7 @@ def _measured(
         exposure=decoded.mosaic.origin.exposure,
         origin=decoded.mosaic.origin,
     )
-    return MeasuredFrame(figures, registered, dark, decoded.saturation, values, highest, at.cells.inside, kept, noise)
+    return MeasuredFrame(figures, registered, decoded.saturation, values, highest, at.cells.inside, kept, noise)
 
 
 def _to_subtract(

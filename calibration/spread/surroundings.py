@@ -22,14 +22,11 @@ import numpy.typing as npt
 
 from calibration import kernels
 from calibration.kernels import PARTS, REACH
-from calibration.registration.register import Registration
-from calibration.sampling import Sites
-from calibration.spread.fitting import NEAR_PX, place_terms
+from calibration.spread.fitting import NEAR_PX
 from drivers.raw.rawfile import Mosaic
 from experiment.chart.model import Chart
 from experiment.chart.printing import drawing
 from experiment.framing.planes import CHANNELS, channel_offset_px, phases
-from experiment.measures.flat_field import FlatField
 
 PAD = 6
 """Slots around the outermost patches: margins and what lies behind the print, as far as wide kernels see them."""
@@ -189,7 +186,7 @@ class UsualLight:
 
 @dataclass(frozen=True, eq=False)
 class Surroundings:
-    """A frame's patches and what lies around them; made by `surroundings`.
+    """A frame's patches and what lies around them; made by `PrintView.around`.
 
     - `grid`, `window`: the print, and pixels along a patch's window.
     - `neighbours`: (P, 25) int32, as in `PrintedGrid`.
@@ -310,47 +307,7 @@ def far_taps(scale: float) -> _Float:
     return (taps / taps.sum()).astype(np.float32)
 
 
-def surroundings(
-    grid: PrintedGrid,
-    neighbours: npt.NDArray[np.int32],
-    mosaic_offsets_px: _Array,
-    frame_px: tuple[int, int],
-    registration: Registration,
-    cells: Sites,
-    references: Sites,
-    whites: slice,
-    light: UsualLight,
-) -> Surroundings:
-    """Return the surroundings of the patches of a frame.
-
-    `neighbours`: (P, 25) int32, as in `PrintedGrid`. `mosaic_offsets_px`: (3, 2) float64, where each channel's
-    photosites lie from a block's centre, `photosite_offsets_px`.
-    """
-    half = np.array(grid.pitch_mm) / 2
-    points = grid.points_mm
-    across, down = (
-        registration.to_pixels(points + half * axis) - registration.to_pixels(points - half * axis)
-        for axis in (np.array([1.0, 0.0]), np.array([0.0, 1.0]))
-    )
-    pitch = np.stack([np.linalg.norm(across, axis=1), np.linalg.norm(down, axis=1)], axis=1)
-    to_slots = np.linalg.inv(np.stack([across, down], axis=-1))
-    middle = np.stack(
-        [np.concatenate([cells.columns, references.columns]), np.concatenate([cells.rows, references.rows])], axis=1
-    )
-    seen = np.stack([registration.to_pixels(points, channel) for channel in CHANNELS], axis=1)
-    from_centre = middle[:, None] + mosaic_offsets_px - seen
-    offset = np.einsum("nij,ncj->nci", to_slots, from_centre) * pitch[:, None]
-    places = place_terms(middle.astype(np.float64), frame_px)
-    return Surroundings(grid, cells.window, neighbours, np.ascontiguousarray(offset), pitch, places, whites, light)
-
-
 def photosite_offsets_px(mosaic: Mosaic) -> _Array:
     """Return (3, 2) float64 half-size px: where photosites of red, green and blue lie from their block's centre."""
     found = phases(mosaic)
     return np.array([channel_offset_px(found[channel]) for channel in CHANNELS])
-
-
-def light_at(grid: PrintedGrid, field: FlatField) -> UsualLight:
-    """Return the light of a field."""
-    low, high = grid.points_mm.min(axis=0), grid.points_mm.max(axis=0)
-    return UsualLight.of(grid, field.at(grid.points_mm), field.at(np.clip(grid.slots_mm, low, high)))

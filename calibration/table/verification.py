@@ -131,18 +131,24 @@ def _frame_list_faults(lut: Lut) -> list[str]:
     return []
 
 
+def chart_difference(one: Lut, other: Lut) -> str:
+    """Return in what the charts of two tables differ, so that a colour means another place; "" of one chart."""
+    ours, theirs = one.provenance, other.provenance
+    if ours.bits != theirs.bits:
+        return f"{ours.bits} bits of each channel against {theirs.bits}"
+    if ours.chart_sha256 != theirs.chart_sha256:
+        return f"chart {ours.chart_sha256[:12]}… against {theirs.chart_sha256[:12]}…"
+    return ""
+
+
 def require_match(one: Lut, other: Lut) -> None:
     """Refuse two tables whose colours or lights do not correspond number by number.
 
     Tables of one chart under one list of lights, photographed by two bodies or on two days, pass: colour index and
     light index then mean the same in both.
     """
-    ours, theirs = one.provenance, other.provenance
-    found: list[str] = []
-    if ours.bits != theirs.bits:
-        found.append(f"{ours.bits} bits of each channel against {theirs.bits}")
-    elif ours.chart_sha256 != theirs.chart_sha256:
-        found.append(f"chart {ours.chart_sha256[:12]}… against {theirs.chart_sha256[:12]}…")
+    differs = chart_difference(one, other)
+    found = [differs] if differs else []
     if len(one.illuminations) != len(other.illuminations):
         found.append(f"{len(one.illuminations)} lights against {len(other.illuminations)}")
     else:
