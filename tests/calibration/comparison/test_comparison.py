@@ -239,6 +239,14 @@ def test_the_files_hold_every_light_and_every_cell(one: Lut, tmp_path: Path) -> 
     assert "-10.0" in page
     stored = json.loads((tmp_path / "report" / "comparison.json").read_text())
     assert (stored["format"], stored["same_within_noise"]) == ("crop.comparison", False)
+    assert list(stored["tables"][0].items()) == [
+        ("place", str(one.folder)),
+        ("camera", one.provenance.camera),
+        ("software", one.provenance.software),
+        ("lights", len(LIGHTS)),
+        ("samples", one.samples.shape[2]),
+        ("drift_corrected", False),
+    ]
     assert stored["gains"] == pytest.approx([0.9] * 3, abs=1e-3)
     assert (tmp_path / "report" / "lights.png").read_bytes()[:4] == b"\x89PNG"
 
