@@ -266,12 +266,12 @@ def places_text(finding: ProbableCause | None) -> str:
     if finding is None:
         return ""
     files = [frame.file for frame in finding.frames]
-    told = [f"in {first_of(files)}"] if files else []
+    described = [f"in {first_of(files)}"] if files else []
     if finding.places:
         place = finding.places[0]
-        told.append(f"about {place.x_mm:.0f}, {place.y_mm:.0f} mm from the sheet's top-left corner")
+        described.append(f"about {place.x_mm:.0f}, {place.y_mm:.0f} mm from the sheet's top-left corner")
         if place.size_mm > 0:
-            told.append(f"{place.size_mm:.0f} mm across")
+            described.append(f"{place.size_mm:.0f} mm across")
         if not files:
-            told[0] = f"seen in {place.file} {told[0]}"
-    return ", ".join(told)
+            described[0] = f"seen in {place.file} {described[0]}"
+    return ", ".join(described)

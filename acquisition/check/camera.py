@@ -15,8 +15,8 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from acquisition.check.findings import LIMITS, Finding, Grade, Range, amount, judged, not_checked, percent, worst
-from acquisition.check.light_and_print import AREAS, area_name
+from acquisition.check.findings import LIMITS, Finding, Grade, amount, judged, not_checked, percent, worst
+from acquisition.check.light_and_print import AREAS, area_name, areas_of
 from acquisition.check.places import ChartMap
 from acquisition.run.planning.sizes import bytes_text, free_bytes_at, needed_bytes
 from calibration.figures.light import LINEARITY
@@ -67,12 +67,10 @@ def judge_sharpness(blur: BlurMap, chart: Chart, module_px: float, cell_px: floa
         )  # fmt: skip
     if not len(blur.sigma_px):
         return not_checked("sharpness", "no printed edge lies whole in the picture", "bring the chart into the picture")
-    rows, columns = AREAS
-    at = np.clip(blur.points_mm / chart.page_mm, 0, 1 - 1e-9)
-    area = (at[:, 1] * rows).astype(int) * columns + (at[:, 0] * columns).astype(int)
+    area = areas_of(blur.points_mm, chart)
     found = {int(number): float(np.median(blur.sigma_px[area == number])) for number in np.unique(area)}
     softest, sharpest = max(found, key=lambda each: found[each]), min(found, key=lambda each: found[each])
-    names = {number: area_name(number // columns, number % columns) for number in found}
+    names = {number: area_name(number) for number in found}
     middle = float(np.median(blur.sigma_px))
     worst_bleed, usual_bleed = (bleed(cell_px, sigma) for sigma in (found[softest], middle))
     aside = found[softest] - found[sharpest] > 0.25
@@ -121,10 +119,8 @@ def judge_turn(framing: Framing) -> Finding:
     if quarters == 0:
         return found
     reason = "the table is the same either way; a landscape chart fills an upright picture badly"
-    return Finding(
-        found.name, worst((found.grade, "remark")), found.said, found.value, found.unit, found.good, found.tolerable,
-        found.reason or reason, found.remedy or "see that it hangs as it was meant to", found.details,
-    )  # fmt: skip
+    remedy = found.remedy or "see that it hangs as it was meant to"
+    return replace(found, grade=worst((found.grade, "remark")), reason=found.reason or reason, remedy=remedy)
 
 
 def judge_tilt(framing: Framing, chart: Chart, focal_px: float | None) -> Finding:
@@ -251,27 +247,23 @@ def judge_clipping(
     letters = [letter for letter in CHANNELS if any(blocks[p].any() for p in phases(mosaic)[letter])]
     if share > 0 and place is not None:
         where = f", most of them at {_densest(np.asarray(blocks.any(axis=(0, 1))), place)} of the chart"
-    told = f" in {', '.join(letters)}" if letters else ""
+    described = f" in {', '.join(letters)}" if letters else ""
     limit = LIMITS["clipping"]
     allowed = allowed_percent / 100
-    tolerable: Range = (None, allowed)
     found = judged(
         limit,
         share,
         f"{percent(share)} of a white frame's photosites at {shutter_s:.4g} s reach {percent(CLIPPING_SHARE)} "
-        f"of saturation{told}{where}",
+        f"of saturation{described}{where}",
         "expose less, and keep reflections off the chart",
         {"channels": letters},
     )
-    grade = "fault" if share > allowed else ("remark" if found.grade == "fault" else found.grade)
-    return Finding(
-        found.name, grade, found.said, found.value, found.unit, found.good, tolerable, found.reason, found.remedy,
-        found.details,
-    )  # fmt: skip
+    grade: Grade = "fault" if share > allowed else ("remark" if found.grade == "fault" else found.grade)
+    return replace(found, grade=grade, tolerable=(None, allowed))
 
 
 def _densest(full: npt.NDArray[np.bool_], place: ChartMap) -> str:
-    rows, columns = 3, 5
+    rows, columns = AREAS
     width, height = place.page_mm
     counts = np.zeros((rows, columns))
     for row in range(rows):
@@ -281,8 +273,7 @@ def _densest(full: npt.NDArray[np.bool_], place: ChartMap) -> str:
             mask = np.zeros(full.shape, dtype=np.uint8)
             cv2.fillConvexPoly(mask, outline.round().astype(np.int32), 1)
             counts[row, column] = np.count_nonzero(full[mask > 0])
-    row, column = np.unravel_index(int(np.argmax(counts)), counts.shape)
-    return area_name(int(row), int(column))
+    return area_name(int(np.argmax(counts)))
 
 
 def judge_hot(dark: Mosaic, share: float, white: Mosaic) -> Finding:
@@ -442,12 +433,12 @@ def judge_linearity(seen: _Array, times_s: Sequence[float], transfer: Transfer) 
             straight,
             not_checked("photon transfer", "noise does not rise with light"),
         ]
-    told = ", ".join(
+    described = ", ".join(
         f"{letter} {one:.2f} e⁻ a count and {two:.1f} counts ({one * two:.1f} e⁻) of read noise"
         for letter, one, two in zip(CHANNELS, gain, read, strict=True)
     )
     noise = Finding(
-        "photon transfer", "good", told, float(np.median(gain)), "e⁻ a count",
+        "photon transfer", "good", described, float(np.median(gain)), "e⁻ a count",
         details={"gain_e": gain.tolist(), "read_noise_counts": read.tolist()},
     )  # fmt: skip
     return [straight, noise]

@@ -12,7 +12,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 
 from acquisition.check.camera import (
     judge_chart,
@@ -27,10 +26,10 @@ from acquisition.check.camera import (
     judge_tilt,
     judge_turn,
 )
-from acquisition.check.findings import CheckReport, Finding, not_checked
+from acquisition.check.findings import CheckReport, Finding, not_checked, not_checked_all
 from acquisition.check.forecast import Forecast, darkest_counts, forecast_findings, measure_table, smallest_cell_px
 from acquisition.check.frames import (
-    ChartFigures,
+    ChartMeasurements,
     CheckFrames,
     Photographer,
     judge_exposure,
@@ -66,10 +65,14 @@ from experiment.lights.illuminations import Illumination, load_illuminations
 from foundation.errors import DeviceError, counted
 from foundation.files import write_whole
 
+LEAST_WHITE = 100.0
+"""Counts of paper under white in the weakest channel, from which on lights are compared with it."""
+
+_OF_PRIMARIES = ("brightest light", ADDITIVITY.name, "flicker", "brightness")
+"""What is judged by frames of the primaries, and of white again."""
+
 CLIPPED = "white is clipped at every shutter time that was tried"
 """Why nothing can be said of the light."""
-
-_Array = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -100,8 +103,8 @@ def check_lab(
     frames = len(planned_steps(settings, lights))
     lines = [f"lights      {len(lights)} in {settings.illuminations.name}, {counted(frames, 'frame')} of a session"]
     with open_rig(settings, chart) as devices, tempfile.TemporaryDirectory() as scratch:
-        told, screen = _make_devices_ready(devices, settings, announce)
-        lines += told
+        described, screen = _make_devices_ready(devices, settings, announce)
+        lines += described
         camera = Photographer(devices, settings, Path(scratch))
         seen = look(
             camera, settings, chart, devices.camera.shutter_speeds(), period_s(settings), options.corners,
@@ -151,24 +154,22 @@ def _exposure_findings(seen: CheckFrames, settings: LabSettings, recorded: bool)
 
 
 def _chart_findings(
-    seen: CheckFrames, figures: ChartFigures | None, chart: Chart, options: CheckOptions
+    seen: CheckFrames, figures: ChartMeasurements | None, chart: Chart, options: CheckOptions
 ) -> list[Finding]:
     if figures is None:
         look_at = "" if options.picture is None else f"see {options.picture}"
         names = ("evenness", "colour evenness", "sharpness", "turn", "tilt", "size", "stains")
         why = "the chart was not found"
-        return [Finding("chart", "fault", seen.trouble or why, remedy=look_at), *(not_checked(n, why) for n in names)]
+        return [Finding("chart", "fault", seen.trouble or why, remedy=look_at), *not_checked_all(names, why)]
     framing, place = figures.placed.framing, figures.placed.place
-    print_found, evenness, coloured = (
-        judge_print(figures.state, chart, place.matched),
-        *judge_evenness(figures.light, chart),
-    )
+    print_found = judge_print(figures.state, chart, place.matched)
+    evenness, coloured = judge_evenness(figures.light, chart)
     if evenness.grade != "good" and print_found.grade in ("fault", "remark"):
         said = f"{print_found.said}; the light is so uneven that it may be an edge of the light"
         print_found = replace(print_found, said=said)
     lit = [print_found, evenness, coloured]
     if not seen.usable:
-        lit = [not_checked(name, CLIPPED) for name in ("stains", "evenness", "colour evenness")]
+        lit = not_checked_all(("stains", "evenness", "colour evenness"), CLIPPED)
     return [
         judge_chart(framing, chart),
         *lit,
@@ -192,7 +193,7 @@ def _forecast(seen: CheckFrames, chart: Chart, lights: Sequence[Illumination]) -
     levels = seen.primaries
     if levels is not None:
         measured = replace(measured, darkest_counts=darkest_counts(lights, levels, ratio))
-        if float(levels["white"].min()) >= 100.0:
+        if float(levels["white"].min()) >= LEAST_WHITE:
             alone = np.sum([levels[name] for name in ("red", "green", "blue")], axis=0)
             off = float(np.abs((alone - 2 * levels["black"]) / levels["white"] - 1).max())
             measured = replace(measured, not_additive=off)
@@ -200,11 +201,10 @@ def _forecast(seen: CheckFrames, chart: Chart, lights: Sequence[Illumination]) -
 
 
 def _light_findings(
-    seen: CheckFrames, figures: ChartFigures | None, chart: Chart, plan_has: bool, dark_percent: float
+    seen: CheckFrames, figures: ChartMeasurements | None, chart: Chart, plan_has: bool, dark_percent: float
 ) -> list[Finding]:
     if not seen.usable:
-        names = ("room light", "brightest light", ADDITIVITY.name, "flicker", "brightness")
-        return [not_checked(name, CLIPPED) for name in names]
+        return not_checked_all(("room light", *_OF_PRIMARIES), CLIPPED)
     if figures is None:
         findings = [not_checked("room light", "the chart was not found")]
     else:
@@ -218,15 +218,11 @@ def _light_findings(
         assert dark is not None
         room = judge_room_light(chart, points, white, dark, muted, seen.why_not_muted)
         findings = [_as_the_run_refuses(room, dark_percent)]
-    recorded = "a recording cannot be exposed anew"
     if seen.primaries is None:
-        names = ("brightest light", ADDITIVITY.name, "flicker", "brightness")
-        return [*findings, *(not_checked(name, recorded) for name in names)]
-    if float(seen.primaries["white"].min()) < 100.0:
-        names = ("brightest light", ADDITIVITY.name, "flicker", "brightness")
-        return [*findings, *(not_checked(name, "white is too dim") for name in names)]
-    whites = [_paper_level(shot_levels) for shot_levels in _whites(seen, figures, chart)]
-    return [*findings, *judge_primaries(seen.primaries, plan_has), *judge_flicker(whites, seen.used_s)]
+        return [*findings, *not_checked_all(_OF_PRIMARIES, "a recording cannot be exposed anew")]
+    if float(seen.primaries["white"].min()) < LEAST_WHITE:
+        return [*findings, *not_checked_all(_OF_PRIMARIES, "white is too dim")]
+    return [*findings, *judge_primaries(seen.primaries, plan_has), *judge_flicker(seen.white_levels, seen.used_s)]
 
 
 def _as_the_run_refuses(found: Finding, dark_percent: float) -> Finding:
@@ -237,21 +233,10 @@ def _as_the_run_refuses(found: Finding, dark_percent: float) -> Finding:
     return replace(found, grade="fault" if beyond else "remark", tolerable=(None, dark_percent / 100))
 
 
-def _whites(seen: CheckFrames, figures: ChartFigures | None, chart: Chart) -> list[_Array]:
-    if figures is None:
-        return [shot.brightest(99.0)[None] for shot in seen.whites]
-    points = points_of(chart)
-    return [mean_levels((shot,), figures.placed, points, seen.saturation.counts).mean for shot in seen.whites]
-
-
-def _paper_level(levels: _Array) -> _Array:
-    return np.nanmean(levels, axis=0)
-
-
 def _sensor_findings(
     seen: CheckFrames,
     timings: list[tuple[float, float]],
-    figures: ChartFigures | None,
+    figures: ChartMeasurements | None,
     chart: Chart,
     options: CheckOptions,
 ) -> list[Finding]:
@@ -270,7 +255,7 @@ def _sensor_findings(
         return findings
     if seen.series is None:
         why = "the chart was not found" if seen.chart is None else "a recording cannot be exposed anew"
-        return [*findings, not_checked(LINEARITY.name, why), not_checked("photon transfer", why)]
+        return [*findings, *not_checked_all((LINEARITY.name, "photon transfer"), why)]
     series = seen.series
     return [*findings, *judge_linearity(series.seen, series.times_s, series.transfer)]
 

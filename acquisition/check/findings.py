@@ -19,7 +19,7 @@ from dataclasses import asdict, dataclass, field
 from types import MappingProxyType
 from typing import Any, Literal
 
-from calibration.figures.figure import Outcome
+from calibration.figures.figure import JUDGEMENT, SIMULATED, Outcome, Range
 from calibration.figures.geometry import BLEED, CELL_PX
 from calibration.figures.light import ADDITIVITY, GREY_TINT_DEG, LEAK_SHARE, LINEARITY, WHITE_DRIFT, WHITE_DRIFT_DEG
 from calibration.figures.radiometry import UNFIT_SHARE
@@ -31,12 +31,6 @@ CELL_PHOTOSITES = 100
 Grade = Literal["fault", "remark", "not checked", "good"]
 GRADES: tuple[Grade, ...] = ("fault", "remark", "not checked", "good")
 """In the order in which findings are told."""
-
-Range = tuple[float | None, float | None]
-"""Lowest and highest value, None where open."""
-
-JUDGEMENT = "judgement"
-"""The source of a limit that nothing but experience supports."""
 
 
 @dataclass(frozen=True)
@@ -134,12 +128,12 @@ class CheckReport:
 
     def lines(self) -> tuple[str, ...]:
         """Return the report as lines for a terminal: devices, then findings, faults first."""
-        told = [
+        described = [
             f"{finding.grade:<12}{finding.name:<18}{finding.sentence()}"
             for grade in GRADES
             for finding in self.of(grade)
         ]
-        return *self.devices, *told, *self._forecast_lines()
+        return *self.devices, *described, *self._forecast_lines()
 
     def _forecast_lines(self) -> list[str]:
         if self.forecast is None:
@@ -184,6 +178,11 @@ def judged(limit: Limit, value: float, said: str, remedy: str, details: Mapping[
 def not_checked(name: str, why: str, remedy: str = "") -> Finding:
     """Return the finding of what could not be looked at."""
     return Finding(name, "not checked", why, remedy=remedy)
+
+
+def not_checked_all(names: Iterable[str], why: str) -> list[Finding]:
+    """Return the findings of what could not be looked at for one reason."""
+    return [not_checked(name, why) for name in names]
 
 
 def worst(grades: Iterable[Grade]) -> Grade:
@@ -231,7 +230,6 @@ def _plain(value: Any) -> Any:
     return value
 
 
-_SIMULATED = "measured on simulated frames"
 _VERDICT = "the limits of a table's verdict"
 _EARLY = "a warning while it can be mended; no table is refused for it"
 
@@ -270,7 +268,7 @@ _LIMITS = (
         "evenness", "Light missing at the chart's darkest place, of its brightest", "share", (None, 0.55), (None, None),
         "dark corners have too little light for their colours, and the smooth field that divides it out is not known "
         "there well enough",
-        _SIMULATED + ": fields whose corners have 42 to 52 % of the centre are divided out to 0.2 %; " + _EARLY,
+        SIMULATED + ": fields whose corners have 42 to 52 % of the centre are divided out to 0.2 %; " + _EARLY,
     ),
     Limit(
         "colour evenness", "Change of white's R/G or B/G over the chart", "share", (None, 0.12), (None, None),

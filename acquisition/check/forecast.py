@@ -8,13 +8,13 @@ does not show is not known before the session (`not_known`), and the verdict can
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import numpy.typing as npt
 
 from acquisition.check.findings import LIMITS, Finding, judged, not_checked, percent
-from acquisition.check.frames import PlacedChart, Shot, mean_levels, points_of
+from acquisition.check.frames import PlacedChart, Shot, chart_levels, mean_levels
 from acquisition.check.light_and_print import no_light
 from acquisition.check.places import Levels
 from calibration.figures.all_figures import BY_NAME, FIGURES
@@ -89,13 +89,10 @@ def measure_table(
     sensor saturates.
     """
     framing = placed.framing
-    levels = mean_levels(whites, placed, points_of(chart), saturation)
-    count = len(chart.centres_mm)
+    cells, references = chart_levels(whites, placed, chart, saturation)
     white = np.array([reference.is_white for reference in chart.references], dtype=np.bool_)
-    references = Levels(levels.mean[count:], levels.clipped[count:])
     seen = np.where(references.clipped[:, None], np.nan, references.mean)
     paper = _paper(chart, seen[white])
-    cells = Levels(levels.mean[:count], levels.clipped[:count])
     stains = None if paper is None else _stains(chart, cells, paper)
     unfit = _unfit_cells(cells, stains, chart)
     usable = int(np.isfinite(seen[white]).all(axis=1).sum())
@@ -211,11 +208,8 @@ def _references(table: Forecast, chart: Chart, why_not: str) -> Finding:
         {"used": used},
     )
     if found.grade == "good" and REFERENCES_USED.outcome(used) != "accept":
-        return Finding(
-            found.name, "remark", found.said, found.value, found.unit, found.good, found.tolerable,
-            "flat field and ground truth rest on few places", "uncover the print, and bring all of it into the picture",
-            found.details,
-        )  # fmt: skip
+        remedy = "uncover the print, and bring all of it into the picture"
+        return replace(found, grade="remark", reason=REFERENCES_USED.why, remedy=remedy)
     return found
 
 
@@ -224,11 +218,11 @@ def _unfit(table: Forecast, why_not: str) -> Finding:
     if share is None:
         return not_checked("unfit cells", why_not or "stains cannot be judged, and no other cause is seen")
     causes = {cause: part for cause, part in table.unfit.items() if part > 0}
-    told = ", ".join(f"{percent(part)} {cause}" for cause, part in causes.items())
+    described = ", ".join(f"{percent(part)} {cause}" for cause, part in causes.items())
     return judged(
         LIMITS["unfit cells"],
         share,
-        f"{percent(share)} of the cells would be unfit for use{f': {told}' if told else ''}",
+        f"{percent(share)} of the cells would be unfit for use{f': {described}' if described else ''}",
         "; ".join(_HELPS[cause] for cause in causes),
         dict(table.unfit),
     )

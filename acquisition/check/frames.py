@@ -410,6 +410,7 @@ class CheckFrames:
     - `chart`: where the chart is; None where it was not found.
     - `trouble`: why not.
     - `whites`: frames of white at `used_s`; one of a recording.
+    - `white_levels`: levels of paper in each, (3,) counts above black; none of a recording.
     - `dark`: A frame of black there.
     - `muted`: the same with the projector muted; None where it could not be.
     - `why_not_muted`: why not.
@@ -426,6 +427,7 @@ class CheckFrames:
     chart: PlacedChart | None
     trouble: str
     whites: tuple[Shot, ...]
+    white_levels: tuple[_Array, ...]
     dark: Shot
     muted: Shot | None
     why_not_muted: str
@@ -531,8 +533,9 @@ def look(
     used_s = first.shutter_s if usable else best.shutter_s
     whites = tuple(camera.take(WHITE, used_s) for _ in range(REPEATS))
     dark = camera.take(BLACK, used_s)
+    white_levels = tuple(found.paper(shot, saturation) for shot in whites)
     primaries = {
-        "white": np.mean([found.paper(shot, saturation) for shot in whites], axis=0),
+        "white": np.mean(white_levels, axis=0),
         "black": found.paper(dark, saturation),
         **{name: found.paper(camera.take(colour, used_s), saturation) for name, colour in PRIMARIES.items()},
     }
@@ -545,8 +548,8 @@ def look(
     focal_px = camera.focal_px
     camera.restore()
     return CheckFrames(
-        first, trials, tuple(times), saturation, found.placed, found.trouble, whites, dark, muted, why_not, primaries,
-        series, focal_px,
+        first, trials, tuple(times), saturation, found.placed, found.trouble, whites, white_levels, dark, muted,
+        why_not, primaries, series, focal_px,
     )  # fmt: skip
 
 
@@ -559,7 +562,7 @@ def _recorded(camera: Photographer, first: Shot, found: _Look) -> CheckFrames:
     why = "a recording has no picture to mute"
     trials = (found.level(first, saturation),)
     return CheckFrames(
-        first, trials, (), saturation, found.placed, found.trouble, (first,), dark, None, why, None, None,
+        first, trials, (), saturation, found.placed, found.trouble, (first,), (), dark, None, why, None, None,
         camera.focal_px,
     )  # fmt: skip
 
@@ -613,8 +616,16 @@ def mean_levels(shots: tuple[Shot, ...], placed: PlacedChart, points_mm: _Array,
     return replace(first, mean=np.mean([one.mean for one in each], axis=0), clipped=clipped)
 
 
+def chart_levels(
+    shots: tuple[Shot, ...], placed: PlacedChart, chart: Chart, saturation: float
+) -> tuple[Levels, Levels]:
+    """Return what a chart's cells, and its references, show in the mean of frames."""
+    both, count = mean_levels(shots, placed, points_of(chart), saturation), len(chart.centres_mm)
+    return Levels(both.mean[:count], both.clipped[:count]), Levels(both.mean[count:], both.clipped[count:])
+
+
 @dataclass(frozen=True, eq=False)
-class ChartFigures:
+class ChartMeasurements:
     """What was measured of the chart, where it was found.
 
     - `placed`: where it is.
@@ -632,11 +643,9 @@ class ChartFigures:
     state: PrintState | None
 
 
-def measure_chart(seen: CheckFrames, placed: PlacedChart, chart: Chart) -> ChartFigures:
+def measure_chart(seen: CheckFrames, placed: PlacedChart, chart: Chart) -> ChartMeasurements:
     """Return what the white frames show of the chart."""
-    levels = mean_levels(seen.whites, placed, points_of(chart), seen.saturation.counts)
-    count = len(chart.centres_mm)
-    cells, references = (Levels(levels.mean[part], levels.clipped[part]) for part in (slice(count), slice(count, None)))
+    cells, references = chart_levels(seen.whites, placed, chart, seen.saturation.counts)
     light = measure_light(chart, references)
     state = None if light is None else measure_print(chart, cells, references, light)
-    return ChartFigures(placed, measure_blur(placed.framing), cells, references, light, state)
+    return ChartMeasurements(placed, measure_blur(placed.framing), cells, references, light, state)

@@ -150,13 +150,14 @@ def judge_evenness(light: SmoothLight | None, chart: Chart) -> list[Finding]:
     shares = corners / centre
     channel = int(np.argmax(falloff))
     names = ("top left", "top right", "bottom right", "bottom left")
-    told = ", ".join(f"{name} {percent(share)}" for name, share in zip(names, shares[:, channel], strict=True))
+    described = ", ".join(f"{name} {percent(share)}" for name, share in zip(names, shares[:, channel], strict=True))
     each = ", ".join(f"{letter} {percent(value)}" for letter, value in zip(CHANNELS, falloff, strict=True))
     darkest = chart.centres_mm[int(np.argmin(cells[:, channel]))]
     even = judged(
         LIMITS["evenness"],
         float(falloff[channel]),
-        f"lens and projector together lose {each} over the chart; of the centre's light ({CHANNELS[channel]}) {told}",
+        f"lens and projector together lose {each} over the chart; of the centre's light ({CHANNELS[channel]}) "
+        f"{described}",
         "centre the chart in the projector's picture and zoom it out, stop the lens down, or step back and take a "
         "longer lens; one frame cannot tell which of the two it is: turn the camera, what turns with it is the lens's",
         {
@@ -215,25 +216,31 @@ def judge_room_light(
 
 def _worst_share(chart: Chart, points_mm: _Array, white: _Array, dark: _Array) -> tuple[float | None, str]:
     """Return the largest ratio of areas of the chart and channels, and the area's name; None where white is too dim."""
-    rows, columns = AREAS
-    at = np.clip(points_mm / chart.page_mm, 0, 1 - 1e-9)
-    area = (at[:, 1] * rows).astype(int) * columns + (at[:, 0] * columns).astype(int)
+    area = areas_of(points_mm, chart)
     best: tuple[float | None, str] = (None, "")
     with np.errstate(invalid="ignore"):
         known = white >= MEASURABLE_COUNTS
-    for number in range(rows * columns):
+    for number in range(AREAS[0] * AREAS[1]):
         for channel in range(3):
             here = known[:, channel] & (area == number) & np.isfinite(dark[:, channel])
             if here.sum() < 3:
                 continue
             share = float(np.median(dark[here, channel] / white[here, channel]))
             if best[0] is None or share > best[0]:
-                best = share, area_name(number // columns, number % columns)
+                best = share, area_name(number)
     return best
 
 
-def area_name(row: int, column: int) -> str:
+def areas_of(points_mm: _Array, chart: Chart) -> npt.NDArray[np.int64]:
+    """Return the number (N,) of the area that each point (N, 2) lies in, row by row."""
+    rows, columns = AREAS
+    across, down = np.clip(points_mm / chart.page_mm, 0, 1 - 1e-9).T
+    return (down * rows).astype(np.int64) * columns + (across * columns).astype(np.int64)
+
+
+def area_name(number: int) -> str:
     """Return where one of the areas lies: "the top left", "the middle"."""
+    row, column = divmod(number, AREAS[1])
     down = ("top", "middle", "bottom")[row]
     across = ("far left", "left", "middle", "right", "far right")[column]
     if down == across:
@@ -283,20 +290,20 @@ def judge_flicker(whites: Sequence[_Array], shutter_s: float) -> list[Finding]:
     angle = float(angles_deg(seen, seen[0]).max())
     strongest = int(np.argmax(seen.mean(axis=0)))
     bright = float((np.ptp(seen, axis=0) / seen.mean(axis=0)).max())
-    told = f"over {len(seen)} frames of {shutter_s:.4g} s"
+    described = f"over {len(seen)} frames of {shutter_s:.4g} s"
     return [
         judged(
             LIMITS["flicker"],
             angle,
             f"white is up to {angle:.2f}° from the first one, its R/G has a standard deviation of "
-            f"{percent(float(ratio.std(ddof=1) / ratio.mean()))} {told}",
+            f"{percent(float(ratio.std(ddof=1) / ratio.mean()))} {described}",
             "expose for 0.5 s or more, and for whole turns of the colour wheel (set lab.projector.colour_wheel_hz)",
             {"red_over_green": ratio.tolist()},
         ),
         judged(
             LIMITS["brightness"],
             bright,
-            f"white changes by {percent(bright)} {told}",
+            f"white changes by {percent(bright)} {described}",
             "let the lamp warm up, switch off its eco mode and dynamic contrast, keep other light away",
             {"counts": seen[:, strongest].tolist()},
         ),
@@ -433,12 +440,12 @@ def judge_print(state: PrintState | None, chart: Chart, matched: float) -> Findi
     between = "; what lies between them is not seen on a chart of few colours" if state.by_references else ""
     if not state.spots:
         return judged(LIMITS["stains"], 0.0, f"none seen on {judged_patches} {what}{between}", "")
-    told = "; ".join(str(spot) for spot in state.spots[:4])
+    described = "; ".join(str(spot) for spot in state.spots[:4])
     more = f"; and {len(state.spots) - 4} more" if len(state.spots) > 4 else ""
     return judged(
         LIMITS["stains"],
         share,
-        f"{told}{more}, {percent(share)} of the {what}{between}",
+        f"{described}{more}, {percent(share)} of the {what}{between}",
         "clean or flatten the print there, look for a shadow on it, or print it anew",
         {
             "spots": [

@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from acquisition.check.findings import GRADES, CheckReport
-from acquisition.check.frames import ChartFigures, CheckFrames
+from acquisition.check.frames import ChartMeasurements, CheckFrames
 from acquisition.check.light_and_print import Spot, light_share
 from experiment.chart.model import Chart
 from experiment.framing.annotated import annotated_png
@@ -26,7 +26,7 @@ _LINE = 150
 """Letters to a line of verdicts."""
 
 
-def check_png(seen: CheckFrames, figures: ChartFigures | None, chart: Chart, report: CheckReport) -> bytes:
+def check_png(seen: CheckFrames, figures: ChartMeasurements | None, chart: Chart, report: CheckReport) -> bytes:
     """Return the picture of a check as PNG bytes; without a chart, the frame with what was looked for."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
@@ -69,7 +69,7 @@ def _verdict_lines(report: CheckReport) -> list[tuple[str, str]]:
     return lines
 
 
-def _draw_frame(axes: Any, seen: CheckFrames, figures: ChartFigures | None, chart: Chart) -> None:
+def _draw_frame(axes: Any, seen: CheckFrames, figures: ChartMeasurements | None, chart: Chart) -> None:
     import cv2
 
     shot = seen.whites[0]
@@ -114,7 +114,7 @@ def _page(axes: Any, chart: Chart, title: str) -> None:
     axes.set_title(title)
 
 
-def _draw_light(axes: Any, figures: ChartFigures, chart: Chart) -> None:
+def _draw_light(axes: Any, figures: ChartMeasurements, chart: Chart) -> None:
     width, height = chart.page_mm
     if figures.light is None:
         _page(axes, chart, "light: not measured, too few white references")
@@ -134,7 +134,7 @@ def _per_cent(share: float) -> str:
     return f"{100 * share:.0f} %"
 
 
-def _draw_sharpness(axes: Any, figures: ChartFigures, chart: Chart) -> None:
+def _draw_sharpness(axes: Any, figures: ChartMeasurements, chart: Chart) -> None:
     points, sigma = figures.blur.points_mm, figures.blur.sigma_px
     worst = MAX_BLUR_PX
     marks = axes.scatter(
@@ -147,7 +147,7 @@ def _draw_sharpness(axes: Any, figures: ChartFigures, chart: Chart) -> None:
     _page(axes, chart, "blur of printed edges")
 
 
-def _draw_print(axes: Any, figures: ChartFigures, chart: Chart) -> None:
+def _draw_print(axes: Any, figures: ChartMeasurements, chart: Chart) -> None:
     state = figures.state
     if state is None:
         _page(axes, chart, "print: not judged, its light is not known")

@@ -88,10 +88,9 @@ class Gathered:
     places: tuple[PrintPlace, ...]
 
 
-def block_evidence(table: TableMeasurements, limit: float) -> Gathered | None:
+def block_evidence(table: TableMeasurements, limit: float) -> Gathered:
     """Return what is known of the place that deviates most in any frame from the frame registered first."""
-    worst = max(table.frames, key=lambda frame: frame.consistency.block, default=None)
-    return None if worst is None else _block_of(table, worst, limit)
+    return _block_of(table, max(table.frames, key=lambda frame: frame.consistency.block), limit)
 
 
 def _block_of(table: TableMeasurements, worst: FrameMeasurements, limit: float) -> Gathered:
@@ -212,8 +211,7 @@ def unfit_evidence(table: TableMeasurements, limit: float) -> Gathered | None:
 
 def noisy_evidence(table: TableMeasurements, limit: float) -> Gathered | None:
     """Return what is known of cells that are noisier than their level explains."""
-    noisy, stains = np.asarray(table.sensor.transfer.noisy), table.cells.stains
-    concerned = np.flatnonzero(noisy.any(axis=-1) if noisy.ndim > 1 else noisy)
+    concerned, stains = np.flatnonzero(table.sensor.transfer.noisy), table.cells.stains
     spotted = stains.stained | stains.doubtful
     if len(concerned) and stains.known and float(spotted[concerned].mean()) >= _IN_SPOT:
         return spot_evidence(table, limit)
@@ -418,22 +416,16 @@ def _hot_share(table: TableMeasurements, at_mm: _Array, size_mm: float) -> float
     return float((hottest[near] > 0).mean()) if near.any() else np.nan
 
 
-def scatter_evidence(table: TableMeasurements, limit: float) -> Gathered | None:
+def scatter_evidence(table: TableMeasurements, limit: float) -> Gathered:
     """Return what is known of the frame whose cells scatter most."""
-    worst = max(table.frames, key=lambda frame: frame.consistency.scatter, default=None)
-    if worst is None:
-        return None
-    beyond = [frame for frame in table.frames if frame.consistency.scatter > limit]
-    return _of_frames(table, worst, beyond)
+    worst = max(table.frames, key=lambda frame: frame.consistency.scatter)
+    return _of_frames(table, worst, [frame for frame in table.frames if frame.consistency.scatter > limit])
 
 
-def blur_evidence(table: TableMeasurements, limit: float) -> Gathered | None:
+def blur_evidence(table: TableMeasurements, limit: float) -> Gathered:
     """Return what is known of the softest frame."""
-    worst = max(table.frames, key=lambda frame: frame.blur_px, default=None)
-    if worst is None:
-        return None
-    beyond = [frame for frame in table.frames if table.added_bleed(frame) > limit]
-    return _of_frames(table, worst, beyond)
+    worst = max(table.frames, key=lambda frame: frame.blur_px)
+    return _of_frames(table, worst, [frame for frame in table.frames if table.added_bleed(frame) > limit])
 
 
 def movement_evidence(table: TableMeasurements, limit: float) -> Gathered | None:
@@ -458,11 +450,11 @@ def _of_frames(table: TableMeasurements, worst: FrameMeasurements, beyond: list[
     frames, ordered = table.frames, sorted(beyond, key=lambda frame: frame is not worst)
     evidence = Evidence(
         frames=float(len(frames)),
-        showing=len(beyond) / max(len(frames), 1),
+        showing=len(beyond) / len(frames),
         scatter=worst.consistency.scatter,
         softer=table.added_bleed(worst),
         moved_px=worst.shift.length_px,
-        anew=float(np.mean([frame.reregistered for frame in frames])) if frames else np.nan,
+        anew=float(np.mean([frame.reregistered for frame in frames])),
         agreement=table.registration.agreement,
     )
     whole = len(beyond) == len(frames)
@@ -472,25 +464,17 @@ def _of_frames(table: TableMeasurements, worst: FrameMeasurements, beyond: list[
 def light_evidence(table: TableMeasurements, limit: float) -> Gathered:
     """Return what is known of whites that do not add up, drift, or are not what their codes give."""
     frames = table.frames
+    evidence = Evidence(frames=float(len(frames)))
     stated = np.array([frame.exposure for frame in frames])
-    known = stated > 0
-    exposure, worst = np.nan, -1
-    if known.all() and len(frames) > 1:
-        # What most light frames have is the session's; white frames are few.
-        usual = float(np.median([frame.exposure for frame in frames if frame.record.kind == "light"] or stated))
-        ratio = stated / usual
-        worst = int(np.argmax(np.abs(np.log(ratio))))
-        exposure = float(ratio[worst])
-        beyond = [
-            frame
-            for frame, one in zip(frames, ratio.tolist(), strict=True)
-            if abs(np.log(one)) > 0.5 * abs(np.log(exposure))
-        ]
-    else:
-        beyond = []
-    evidence = Evidence(frames=float(len(frames)), exposure=exposure)
-    differs = exposure == exposure and abs(np.log(exposure)) > _SAME
-    return Gathered(evidence, tuple(frame.record for frame in beyond) if differs else (), ())
+    if len(frames) < 2 or not (stated > 0).all():
+        return Gathered(evidence, (), ())
+    # What most light frames have is the session's; white frames are few.
+    ratio = stated / float(np.median([frame.exposure for frame in frames if frame.record.kind == "light"] or stated))
+    off = np.abs(np.log(ratio))
+    worst = int(np.argmax(off))
+    beyond = np.flatnonzero(off > 0.5 * off[worst]) if off[worst] > _SAME else ()
+    evidence = replace(evidence, exposure=float(ratio[worst]))
+    return Gathered(evidence, tuple(frames[number].record for number in beyond), ())
 
 
 def drift_evidence(table: TableMeasurements, limit: float) -> Gathered:

@@ -177,7 +177,6 @@ class Evidence:
     - `anew`: share of the frames in which the chart had to be registered again.
     - `agreement`: correlation of the cells with the chart where it was registered.
     - `exposure`: exposure of the frame by its file over the other frames'.
-    - `brightness`: light of the frame over what its code gives.
     - `off_codes_deg`: angle between a light's white and what its codes give, degrees.
     - `named_right`: 1 where a light's white is what its codes give, 0 where it is what another light's give.
     - `cameras`: cameras or lenses among the frames, by their files.
@@ -214,7 +213,6 @@ class Evidence:
     anew: float = NAN
     agreement: float = NAN
     exposure: float = NAN
-    brightness: float = NAN
     off_codes_deg: float = NAN
     named_right: float = NAN
     cameras: float = NAN

@@ -63,7 +63,7 @@ _LARGE = 1000.0
 
 
 @dataclass(frozen=True)
-class Cause:
+class Explanation:
     """How the cause of a figure beyond its limit is found (`calibration.causes`).
 
     - `about`: what the figure is about, which rules ask for.
@@ -161,6 +161,7 @@ NOT_DRAWN: Final = None
 NO_LINES: Final[tuple[Line, ...]] = ()
 OF_ITS_CAUSE: Final = None
 ONLY_OF_A_SESSION: Final = None
+"""What a figure has not, said by name: a part that is left out is an error."""
 
 
 @dataclass(frozen=True)
@@ -206,7 +207,7 @@ class Figure:
     worst: Callable[[TableMeasurements, Chart], Worst | None] | None
     where: Callable[[TableMeasurements, float], str] | None
     retake: Callable[[TableMeasurements, float], list[FrameRecord] | None] | None
-    cause: Cause | None
+    cause: Explanation | None
     drawing: Drawing | None
     lines: tuple[Line, ...]
     foremost: bool = False
@@ -243,7 +244,7 @@ class Figure:
 
 def worst_outcome(outcomes: Iterable[Outcome]) -> Outcome:
     """Return the worst of some outcomes; of none, that all is accepted."""
-    return max(outcomes, key=OUTCOMES.index, default="accept")
+    return max(outcomes, key=OUTCOMES.index, default=OUTCOMES[0])
 
 
 def format_value(value: float, unit: str) -> str:

@@ -17,8 +17,8 @@ from calibration.figures.figure import (
     OF_ITS_CAUSE,
     ONLY_OF_A_SESSION,
     SIMULATED,
-    Cause,
     CheckMeasurements,
+    Explanation,
     Figure,
     Line,
     SummaryRow,
@@ -70,8 +70,8 @@ def _tags_found(table: TableMeasurements) -> float | None:
 def _tags_row(table: TableMeasurements) -> SummaryRow:
     framing = table.registration.framing
     count = len(framing.tags)
-    told = f"{count} of {count + len(framing.missing)}" if framing.field is None else "the chart has none"
-    return SummaryRow("Tags found", told, "", brief=True)
+    described = f"{count} of {count + len(framing.missing)}" if framing.field is None else "the chart has none"
+    return SummaryRow("Tags found", described, "", brief=True)
 
 
 TAGS_FOUND = Figure(
@@ -79,7 +79,7 @@ TAGS_FOUND = Figure(
     why="where a tag is missing, the place of the cells around it rests on the cells alone", source=JUDGEMENT,
     remedy="bring all of the chart into the picture, and uncover it",
     measure=_tags_found, forecast=lambda check: check.tags_found,
-    worst=NO_PLACE, where=OF_ITS_CAUSE, retake=NO_FRAMES, cause=Cause("chart", chart_evidence),
+    worst=NO_PLACE, where=OF_ITS_CAUSE, retake=NO_FRAMES, cause=Explanation("chart", chart_evidence),
     drawing="chart", lines=(Line(30, _tags_row),),
 )  # fmt: skip
 
@@ -148,8 +148,8 @@ BLEED = Figure(
 def _left_by_lens(table: TableMeasurements) -> float | None:
     # Smooth light that is no lens's, as a reflection, has figures of its own; few cells cannot tell it from a veil.
     spread, cells = table.point_spread, len(table.registration.mismatched_cells)
-    told = spread is None or spread.misfit <= MOST_MISFIT or cells >= _LEAST_CELLS
-    return table.lens.left if table.lens.measured and told else None
+    separable = spread is None or spread.misfit <= MOST_MISFIT or cells >= _LEAST_CELLS
+    return table.lens.left if table.lens.measured and separable else None
 
 
 def _left_in_worst_cell(table: TableMeasurements) -> float | None:
@@ -276,7 +276,7 @@ BLOCKS_GOOD = Figure(
     why="part of the print is covered, damaged, or another print", source=JUDGEMENT,
     remedy="uncover the print, or print it anew",
     measure=lambda table: float(table.registration.blocks.good.mean()), forecast=ONLY_OF_A_SESSION,
-    worst=NO_PLACE, where=OF_ITS_CAUSE, retake=NO_FRAMES, cause=Cause("chart", chart_evidence),
+    worst=NO_PLACE, where=OF_ITS_CAUSE, retake=NO_FRAMES, cause=Explanation("chart", chart_evidence),
     drawing="residuals", lines=NO_LINES,
 )  # fmt: skip
 
@@ -292,6 +292,6 @@ AGREEMENT = Figure(
     source=SIMULATED + ": 0.99 and more; another order of the cells has about 0",
     remedy="name the chart.json of this print, and print without colour management",
     measure=lambda table: table.registration.agreement, forecast=ONLY_OF_A_SESSION,
-    worst=NO_PLACE, where=OF_ITS_CAUSE, retake=NO_FRAMES, cause=Cause("chart", chart_evidence),
+    worst=NO_PLACE, where=OF_ITS_CAUSE, retake=NO_FRAMES, cause=Explanation("chart", chart_evidence),
     drawing="chart", lines=(Line(110, _agreement_row),),
 )  # fmt: skip

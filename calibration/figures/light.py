@@ -28,7 +28,7 @@ from calibration.figures.figure import (
     OF_ITS_CAUSE,
     ONLY_OF_A_SESSION,
     SIMULATED,
-    Cause,
+    Explanation,
     Figure,
     Line,
     SummaryRow,
@@ -95,7 +95,7 @@ WHITE_DRIFT = Figure(
     why="lights taken at other times differ in brightness; each has its own ground truth, so its colour is right",
     source=JUDGEMENT + "; 1 % between whites is usual for a warm lamp", remedy=_WARM_UP,
     measure=_white_drift, forecast=ONLY_OF_A_SESSION,
-    worst=NO_PLACE, where=OF_ITS_CAUSE, retake=NO_FRAMES, cause=Cause("drift", drift_evidence),
+    worst=NO_PLACE, where=OF_ITS_CAUSE, retake=NO_FRAMES, cause=Explanation("drift", drift_evidence),
     drawing="course", lines=(Line(130, _drift_row),),
 )  # fmt: skip
 
@@ -129,7 +129,7 @@ WHITE_DRIFT_DEG = Figure(
     why="the lamp's spectrum changes, not its brightness alone",
     source=JUDGEMENT + ": a tenth of a good method's error", remedy=_WARM_UP,
     measure=_white_drift_deg, forecast=ONLY_OF_A_SESSION,
-    worst=NO_PLACE, where=OF_ITS_CAUSE, retake=NO_FRAMES, cause=Cause("drift", drift_evidence),
+    worst=NO_PLACE, where=OF_ITS_CAUSE, retake=NO_FRAMES, cause=Explanation("drift", drift_evidence),
     drawing="course", lines=NO_LINES,
 )  # fmt: skip
 
@@ -156,7 +156,7 @@ LEAK_SHARE = Figure(
     source=JUDGEMENT + "; a contrast of 1 : 1500 leaks 0.07 %",
     remedy="darken the room, cover lamps and displays, or have it subtracted (build-lut --subtract-dark)",
     measure=_leak, forecast=lambda check: None if check.leak is None else float(np.abs(check.leak).max()),
-    worst=NO_PLACE, where=OF_ITS_CAUSE, retake=NO_FRAMES, cause=Cause("dark", dark_evidence),
+    worst=NO_PLACE, where=OF_ITS_CAUSE, retake=NO_FRAMES, cause=Explanation("dark", dark_evidence),
     drawing=NOT_DRAWN, lines=(Line(210, _dark_row),),
 )  # fmt: skip
 
@@ -168,7 +168,7 @@ DARK_DRIFT = Figure(
     remedy="darken the room, and keep daylight out",
     measure=lambda table: table.dark_change if len(table.dark_frames.lights) > 1 else None,
     forecast=ONLY_OF_A_SESSION,
-    worst=NO_PLACE, where=OF_ITS_CAUSE, retake=NO_FRAMES, cause=Cause("dark", dark_evidence),
+    worst=NO_PLACE, where=OF_ITS_CAUSE, retake=NO_FRAMES, cause=Explanation("dark", dark_evidence),
     drawing=NOT_DRAWN, lines=NO_LINES,
 )  # fmt: skip
 
@@ -200,7 +200,7 @@ STRAY_SHARE = Figure(
     remedy="darken the room, see that no door, lamp or display changes during the session, switch power saving and "
     "dynamic contrast off, and take the frames again",
     measure=_stray, forecast=ONLY_OF_A_SESSION,
-    worst=NO_PLACE, where=OF_ITS_CAUSE, retake=NO_FRAMES, cause=Cause("stray", stray_evidence),
+    worst=NO_PLACE, where=OF_ITS_CAUSE, retake=NO_FRAMES, cause=Explanation("stray", stray_evidence),
     drawing=NOT_DRAWN, lines=(Line(250, _stray_row),),
 )  # fmt: skip
 
@@ -257,7 +257,7 @@ ADDITIVITY = Figure(
     source=JUDGEMENT + "; the drift of the lamp is taken out first",
     remedy="switch off brilliant colour, white boost and dynamic contrast in the projector's menu",
     measure=_beyond_sum(-1), forecast=lambda check: check.not_additive,
-    worst=NO_PLACE, where=OF_ITS_CAUSE, retake=NO_FRAMES, cause=Cause("sum", _sum_evidence),
+    worst=NO_PLACE, where=OF_ITS_CAUSE, retake=NO_FRAMES, cause=Explanation("sum", _sum_evidence),
     drawing=NOT_DRAWN, lines=(Line(260, _sum_row),),
 )  # fmt: skip
 
@@ -268,7 +268,7 @@ WHITE_DEFICIT = Figure(
     source=JUDGEMENT + "; a lamp that flickers by 1 % gives 2 %",
     remedy="look at the exposures of these frames, and switch dynamic contrast and power saving off",
     measure=_beyond_sum(1), forecast=ONLY_OF_A_SESSION,
-    worst=NO_PLACE, where=OF_ITS_CAUSE, retake=NO_FRAMES, cause=Cause("brightness", light_evidence),
+    worst=NO_PLACE, where=OF_ITS_CAUSE, retake=NO_FRAMES, cause=Explanation("brightness", light_evidence),
     drawing=NOT_DRAWN, lines=NO_LINES,
 )  # fmt: skip
 
@@ -334,7 +334,7 @@ OFF_CODES_DEG = Figure(
     remedy="correct the list of frames that was imported, let the picture settle for longer (sequence.settle_s), or "
     "expose whole turns of the colour wheel",
     measure=_off_codes, forecast=ONLY_OF_A_SESSION,
-    worst=_furthest_off, where=_off_lights, retake=_frames_off_codes, cause=Cause("names", name_evidence),
+    worst=_furthest_off, where=_off_lights, retake=_frames_off_codes, cause=Explanation("names", name_evidence),
     drawing="lights", lines=(Line(220, _codes_row),),
 )  # fmt: skip
 
@@ -376,7 +376,7 @@ OFF_BRIGHTNESS = Figure(
     remedy="keep one exposure for the session, and take the frames again",
     measure=_of_codes(lambda codes: float(codes.off_brightness.max())), forecast=ONLY_OF_A_SESSION,
     worst=_brightest_off, where=_brightness_text, retake=_frames_off_brightness,
-    cause=Cause("brightness", brightness_evidence, follows=("off_codes_deg", "exchanged_lights")),
+    cause=Explanation("brightness", brightness_evidence, follows=("off_codes_deg", "exchanged_lights")),
     drawing=NOT_DRAWN, lines=NO_LINES,
 )  # fmt: skip
 
@@ -387,7 +387,7 @@ EXCHANGED_LIGHTS = Figure(
     source=SIMULATED + ": none in random healthy rooms, all pairs further apart than the figure below in the others",
     remedy="correct the list of frames that was imported, or take both again",
     measure=_of_codes(lambda codes: float(len(codes.exchanges))), forecast=ONLY_OF_A_SESSION,
-    worst=NO_PLACE, where=_exchanges, retake=NO_FRAMES, cause=Cause("names", name_evidence),
+    worst=NO_PLACE, where=_exchanges, retake=NO_FRAMES, cause=Explanation("names", name_evidence),
     drawing="lights", lines=NO_LINES,
 )  # fmt: skip
 
@@ -436,10 +436,10 @@ CHECKED_SHARE = Figure(
     drawing=NOT_DRAWN, lines=(Line(230, _checked_row),),
 )  # fmt: skip
 
-_OF_WHITES = Callable[["CodeAgreement"], "npt.NDArray[np.float64]"]
+_WhiteValues = Callable[["CodeAgreement"], "npt.NDArray[np.float64]"]
 
 
-def _white_frames(of: _OF_WHITES) -> Callable[[TableMeasurements], float | None]:
+def _white_frames(of: _WhiteValues) -> Callable[[TableMeasurements], float | None]:
     """Return what measures how far white frames are from what the lights predict; None without them."""
 
     def measure(table: TableMeasurements) -> float | None:
@@ -448,12 +448,12 @@ def _white_frames(of: _OF_WHITES) -> Callable[[TableMeasurements], float | None]
     return measure
 
 
-def _white_frames_beyond(of: _OF_WHITES) -> Callable[[TableMeasurements, float], list[FrameRecord]]:
+def _white_frames_beyond(of: _WhiteValues) -> Callable[[TableMeasurements, float], list[FrameRecord]]:
     """Return what tells the white frames that are further than a limit from what the lights predict."""
 
     def beyond(table: TableMeasurements, limit: float) -> list[FrameRecord]:
         white = table.lights.white_frames
-        off = [] if white is None else of(white).tolist()
+        off: list[float] = [] if white is None else of(white).tolist()
         return [frame.record for frame, value in zip(table.white_frames, off, strict=False) if value > limit]
 
     return beyond
@@ -469,7 +469,7 @@ WHITE_FRAME_DEG = Figure(
     remedy="correct the list of frames that was imported, or take the white frame again",
     measure=_white_frames(lambda white: white.off_deg), forecast=ONLY_OF_A_SESSION,
     worst=NO_PLACE, where=lambda table, accepted: first_of([one.file for one in _beyond_deg(table, accepted)]),
-    retake=_beyond_deg, cause=Cause("names", name_evidence),
+    retake=_beyond_deg, cause=Explanation("names", name_evidence),
     drawing="course", lines=NO_LINES,
 )  # fmt: skip
 
@@ -481,7 +481,7 @@ WHITE_FRAME_BRIGHTNESS = Figure(
     remedy="keep one exposure for the session, and take the white frame again",
     measure=_white_frames(lambda white: white.off_brightness), forecast=ONLY_OF_A_SESSION,
     worst=NO_PLACE, where=lambda table, accepted: first_of([one.file for one in _beyond_brightness(table, accepted)]),
-    retake=_beyond_brightness, cause=Cause("brightness", light_evidence),
+    retake=_beyond_brightness, cause=Explanation("brightness", light_evidence),
     drawing="course", lines=NO_LINES,
 )  # fmt: skip
 

@@ -32,8 +32,8 @@ from calibration.figures.figure import (
     OF_ITS_CAUSE,
     ONLY_OF_A_SESSION,
     SIMULATED,
-    Cause,
     CheckMeasurements,
+    Explanation,
     Figure,
     Line,
     SummaryRow,
@@ -49,7 +49,7 @@ if TYPE_CHECKING:
     from experiment.chart.model import Chart
     from experiment.session.records import FrameRecord
 
-_OF_FRAME = Callable[["TableMeasurements", "FrameMeasurements"], float]
+_FrameValue = Callable[["TableMeasurements", "FrameMeasurements"], float]
 
 _UNFIT_REMEDIES = {
     "outside": "bring all of the chart into the picture",
@@ -98,7 +98,7 @@ UNFIT_SHARE = Figure(
     why="colours without samples are missing from every picture", source=JUDGEMENT, remedy="", found=_most_unfit,
     measure=lambda table: len(table.cells.unfit) / max(_cell_count(table), 1), forecast=_unfit_in_check,
     worst=NO_PLACE, where=OF_ITS_CAUSE, retake=NO_FRAMES,
-    cause=Cause("unfit cells", unfit_evidence, follows=("unlike_block",)),
+    cause=Explanation("unfit cells", unfit_evidence, follows=("unlike_block",)),
     drawing="print", lines=(Line(290, _unfit_row),),
 )  # fmt: skip
 
@@ -125,7 +125,7 @@ DOUBTFUL_SHARE = Figure(
     remedy="clean the print, hang it flatter, and look for shadows on it",
     measure=lambda table: float(table.cells.stains.doubtful.mean()) if table.cells.stains.known else None,
     forecast=_doubtful_in_check,
-    worst=_most_deviating, where=OF_ITS_CAUSE, retake=NO_FRAMES, cause=Cause("spot", spot_evidence),
+    worst=_most_deviating, where=OF_ITS_CAUSE, retake=NO_FRAMES, cause=Explanation("spot", spot_evidence),
     drawing="print", lines=NO_LINES,
 )  # fmt: skip
 
@@ -143,12 +143,12 @@ ADDED_LIGHT = Figure(
     remedy="turn print or projector until nothing is mirrored on it, or print on matt paper",
     measure=lambda table: added_light(table.cells.stains) if table.cells.stains.known else None,
     forecast=_added_in_check,
-    worst=NO_PLACE, where=OF_ITS_CAUSE, retake=NO_FRAMES, cause=Cause("spot", spot_evidence),
+    worst=NO_PLACE, where=OF_ITS_CAUSE, retake=NO_FRAMES, cause=Explanation("spot", spot_evidence),
     drawing="print", lines=NO_LINES,
 )  # fmt: skip
 
 
-def _frames_beyond(value: _OF_FRAME) -> Callable[[TableMeasurements, float], list[FrameRecord] | None]:
+def _frames_beyond(value: _FrameValue) -> Callable[[TableMeasurements, float], list[FrameRecord] | None]:
     """Return what tells the frames beyond a limit by themselves; of all of them none is told."""
 
     def retake(table: TableMeasurements, limit: float) -> list[FrameRecord] | None:
@@ -177,7 +177,7 @@ SOFTER_BLEED = Figure(
     measure=lambda table: max(map(table.added_bleed, table.frames), default=0.0), forecast=ONLY_OF_A_SESSION,
     worst=lambda table, chart: Worst(f"blur σ {_softest(table).blur_px:.2f} px", _softest(table).record.file),
     where=_softest_text, retake=_frames_beyond(lambda table, frame: table.added_bleed(frame)),
-    cause=Cause("frame", blur_evidence),
+    cause=Explanation("frame", blur_evidence),
     drawing="course", lines=NO_LINES,
 )  # fmt: skip
 
@@ -188,7 +188,7 @@ def _most_scattered(table: TableMeasurements, chart: Chart) -> Worst | None:
     return Worst(f"{100 * scatter:.2g} %", worst.record.file) if scatter > 0 else None
 
 
-def _of_alike_frames(value: _OF_FRAME) -> Callable[[TableMeasurements], float | None]:
+def _of_alike_frames(value: _FrameValue) -> Callable[[TableMeasurements], float | None]:
     """Return what measures the largest value of a frame, on charts of enough cells to compare frames by."""
 
     def measure(table: TableMeasurements) -> float | None:
@@ -208,7 +208,7 @@ FRAME_SCATTER = Figure(
     worst=_most_scattered,
     where=lambda table, accepted: f"in {max(table.frames, key=lambda one: one.consistency.scatter).record.file}",
     retake=_frames_beyond(lambda table, frame: frame.consistency.scatter),
-    cause=Cause("frame", scatter_evidence, follows=("unlike_block", "disturbed_cells")),
+    cause=Explanation("frame", scatter_evidence, follows=("unlike_block", "disturbed_cells")),
     drawing="course", lines=NO_LINES,
 )  # fmt: skip
 
@@ -226,7 +226,7 @@ UNLIKE_BLOCK = Figure(
     source=SIMULATED + ": to 0.4 % beyond noise", remedy="see that nobody comes between lamp, print and camera",
     measure=_of_alike_frames(lambda table, frame: frame.consistency.block), forecast=ONLY_OF_A_SESSION,
     worst=_worst_block, where=OF_ITS_CAUSE, retake=_frames_beyond(lambda table, frame: frame.consistency.block),
-    cause=Cause("block", block_evidence),
+    cause=Explanation("block", block_evidence),
     drawing="course", lines=NO_LINES,
 )  # fmt: skip
 
@@ -247,7 +247,7 @@ DISTURBED_CELLS = Figure(
     remedy="see that nothing comes between lamp, print and camera",
     measure=_disturbed, forecast=ONLY_OF_A_SESSION,
     worst=NO_PLACE, where=OF_ITS_CAUSE, retake=NO_FRAMES,
-    cause=Cause("few cells", disturbed_evidence, follows=("unlike_block",)),
+    cause=Explanation("few cells", disturbed_evidence, follows=("unlike_block",)),
     drawing="worst", lines=NO_LINES,
 )  # fmt: skip
 
@@ -269,7 +269,7 @@ REGISTERED_ANEW = Figure(
     remedy="fix camera and print, and let nobody walk about",
     measure=lambda table: float(_registered_anew(table)) if len(table.frames) > 1 else None,
     forecast=ONLY_OF_A_SESSION,
-    worst=NO_PLACE, where=OF_ITS_CAUSE, retake=NO_FRAMES, cause=Cause("movement", movement_evidence),
+    worst=NO_PLACE, where=OF_ITS_CAUSE, retake=NO_FRAMES, cause=Explanation("movement", movement_evidence),
     drawing="course", lines=(Line(120, _movement_row),),
 )  # fmt: skip
 
@@ -289,7 +289,7 @@ OTHER_CAMERA = Figure(
     measure=lambda table: float(len(table.origins.other_camera)), forecast=ONLY_OF_A_SESSION,
     worst=NO_PLACE, where=lambda table, accepted: _foreign(table.origins.other_camera),
     retake=lambda table, limit: [frame.record for frame in table.origins.other_camera],
-    cause=Cause("camera", camera_evidence),
+    cause=Explanation("camera", camera_evidence),
     drawing=NOT_DRAWN, lines=NO_LINES,
 )  # fmt: skip
 
@@ -299,7 +299,7 @@ OTHER_LENS = Figure(
     remedy="take these frames again through the session's lens",
     measure=lambda table: float(len(table.origins.other_lens)), forecast=ONLY_OF_A_SESSION,
     worst=NO_PLACE, where=lambda table, accepted: _foreign(table.origins.other_lens), retake=NO_FRAMES,
-    cause=Cause("camera", camera_evidence),
+    cause=Explanation("camera", camera_evidence),
     drawing=NOT_DRAWN, lines=NO_LINES,
 )  # fmt: skip
 
@@ -316,7 +316,7 @@ OTHER_EXPOSURE = Figure(
     source="shutter times are steps of 26 % apart, and are written rounded", remedy=_SAME_EXPOSURE,
     measure=lambda table: table.origins.exposure_difference, forecast=ONLY_OF_A_SESSION,
     worst=NO_PLACE, where=lambda table, accepted: _foreign(table.origins.other_exposure), retake=_otherwise_exposed,
-    cause=Cause("brightness", light_evidence),
+    cause=Explanation("brightness", light_evidence),
     drawing=NOT_DRAWN, lines=NO_LINES,
 )  # fmt: skip
 
@@ -326,7 +326,7 @@ OTHER_ISO = Figure(
     source="by definition", remedy=_SAME_EXPOSURE,
     measure=lambda table: float(len(table.origins.other_iso)), forecast=ONLY_OF_A_SESSION,
     worst=NO_PLACE, where=lambda table, accepted: _foreign(table.origins.other_iso), retake=NO_FRAMES,
-    cause=Cause("iso", iso_evidence),
+    cause=Explanation("iso", iso_evidence),
     drawing=NOT_DRAWN, lines=NO_LINES,
 )  # fmt: skip
 

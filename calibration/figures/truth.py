@@ -16,7 +16,7 @@ from calibration.figures.figure import (
     OF_ITS_CAUSE,
     ONLY_OF_A_SESSION,
     SIMULATED,
-    Cause,
+    Explanation,
     Figure,
     Line,
     SummaryRow,
@@ -79,7 +79,7 @@ NOISY_SHARE = Figure(
     why="they are not of one colour: dirt, a fold, a neighbour's edge", source="a variance 3.5 times the model's",
     remedy="clean the print, focus, and hang it flatter",
     measure=lambda table: float(table.sensor.transfer.noisy.mean()), forecast=ONLY_OF_A_SESSION,
-    worst=_noisiest, where=OF_ITS_CAUSE, retake=NO_FRAMES, cause=Cause("noisy cells", noisy_evidence),
+    worst=_noisiest, where=OF_ITS_CAUSE, retake=NO_FRAMES, cause=Explanation("noisy cells", noisy_evidence),
     drawing="cells", lines=(Line(180, _transfer_row),),
 )  # fmt: skip
 
@@ -124,7 +124,7 @@ REFERENCE_SPREAD = Figure(
     remedy="clean or flatten the print, and look for shadows on it",
     measure=lambda table: max(map(_spread_of, table.white_frames), default=None),
     forecast=lambda check: None if check.paper is None else _spread(check.paper),
-    worst=_most_spread, where=OF_ITS_CAUSE, retake=NO_FRAMES, cause=Cause("references", reference_evidence),
+    worst=_most_spread, where=OF_ITS_CAUSE, retake=NO_FRAMES, cause=Explanation("references", reference_evidence),
     drawing="rest", lines=NO_LINES,
 )  # fmt: skip
 

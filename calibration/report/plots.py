@@ -268,21 +268,21 @@ def _ring(axes: Any, x: float, y: float, text: str) -> None:
     axes.annotate(text, (x, y), xytext=(8, 8), textcoords="offset points", color=MARK, fontsize=8)
 
 
-def _ring_largest(axes: Any, values: Any, figures: TableMeasurements, least: bool = False) -> None:
+def _ring_largest(axes: Any, values: Any, table: TableMeasurements, least: bool = False) -> None:
     """Ring the frame of the largest value, or the least, unless all are alike; its name is that of its file."""
     seen = np.asarray(values, dtype=np.float64)
     if not len(seen) or np.ptp(seen) == 0:
         return
     at = int(np.argmin(seen) if least else np.argmax(seen))
-    _ring(axes, at, float(seen[at]), Path(figures.frames[at].record.file).stem)
+    _ring(axes, at, float(seen[at]), Path(table.frames[at].record.file).stem)
 
 
-def draw_course(figure: Any, figures: TableMeasurements) -> None:
+def draw_course(figure: Any, table: TableMeasurements) -> None:
     """Draw black, movement, blur, white, the cells' deviations and the references used, frame by frame.
 
     The worst frame of each is ringed and named.
     """
-    frames = figures.frames
+    frames = table.frames
     figure.set_size_inches(10, 5.4)
     (black, shift, blur), (white, consistency, used) = figure.subplots(2, 3)
     count = np.arange(len(frames))
@@ -294,18 +294,18 @@ def draw_course(figure: Any, figures: TableMeasurements) -> None:
     blurs = [frame.blur_px for frame in frames]
     blur.plot(count, blurs, ".", color=INK, markersize=3)
     blur.set(title="blur σ", ylabel="px", xlabel="frame")
-    _ring_largest(blur, blurs, figures)
+    _ring_largest(blur, blurs, table)
     counts = [frame.paper.references for frame in frames]
     used.plot(count, counts, ".", color=INK, markersize=3)
     used.set(title="white references used", xlabel="frame", ylim=(0, 1.15 * max(counts, default=1)))
-    _ring_largest(used, counts, figures, least=True)
+    _ring_largest(used, counts, table, least=True)
     moved = [frame.shift.length_px for frame in frames]
     shift.plot(count, moved, ".", color=INK, markersize=3)
     shift.axhline(STILL_PX, color=MARK, linewidth=0.8, linestyle=(0, (4, 3)))
     shift.set(
         title="movement of the chart", ylabel="px", xlabel="frame", ylim=(0, max(0.12, 1.1 * max(moved, default=0)))
     )
-    _ring_largest(shift, moved, figures)
+    _ring_largest(shift, moved, table)
     at = [number for number, frame in enumerate(frames) if frame.record.kind == "white"]
     whites = np.array([frames[number].paper.white for number in at]).reshape(-1, 3)
     if len(whites):
@@ -321,17 +321,17 @@ def draw_course(figure: Any, figures: TableMeasurements) -> None:
         white.legend(frameon=False, fontsize=8)
     white.axhline(0, color="0.8", linewidth=0.8, zorder=0)
     white.set(title="bare paper under white", ylabel="change since the first, %", xlabel="frame")
-    _draw_consistency(consistency, count, figures)
+    _draw_consistency(consistency, count, table)
 
 
-def _draw_consistency(axes: Any, count: npt.NDArray[np.integer], figures: TableMeasurements) -> None:
+def _draw_consistency(axes: Any, count: npt.NDArray[np.integer], table: TableMeasurements) -> None:
     axes.set(title="cells off their codes' colours", ylabel="%", xlabel="frame")
-    if not has_enough_cells(len(figures.registration.mismatched_cells)):
+    if not has_enough_cells(len(table.registration.mismatched_cells)):
         axes.text(0.5, 0.5, "too few colours to compare", ha="center", va="center", transform=axes.transAxes)
         return
     axes.plot(
         count,
-        [100 * frame.consistency.scatter for frame in figures.frames],
+        [100 * frame.consistency.scatter for frame in table.frames],
         ".",
         color=INK,
         markersize=3,
@@ -339,7 +339,7 @@ def _draw_consistency(axes: Any, count: npt.NDArray[np.integer], figures: TableM
     )
     axes.plot(
         count,
-        [100 * frame.consistency.block for frame in figures.frames],
+        [100 * frame.consistency.block for frame in table.frames],
         "x",
         color=MARK,
         markersize=3,
@@ -347,9 +347,9 @@ def _draw_consistency(axes: Any, count: npt.NDArray[np.integer], figures: TableM
     )
     axes.legend(frameon=False, fontsize=7, loc="upper right")
     axes.set_ylim(bottom=0, top=max(1.5, 1.3 * axes.get_ylim()[1]))
-    _ring_largest(axes, [100 * frame.consistency.scatter for frame in figures.frames], figures)
-    if any(frame.consistency.block for frame in figures.frames):
-        _ring_largest(axes, [100 * frame.consistency.block for frame in figures.frames], figures)
+    _ring_largest(axes, [100 * frame.consistency.scatter for frame in table.frames], table)
+    if any(frame.consistency.block for frame in table.frames):
+        _ring_largest(axes, [100 * frame.consistency.block for frame in table.frames], table)
 
 
 def draw_worst_cells(figure: Any, picture: _Image, chart: Chart, registration: Registration, window: int) -> None:
@@ -358,13 +358,8 @@ def draw_worst_cells(figure: Any, picture: _Image, chart: Chart, registration: R
     `picture` is (H, W, 3) float32 counts; all parameters are those of `draw_registration`.
     """
     figure.set_size_inches(10, 3.1)
-    height, width = picture.shape[:2]
     places = registration.to_pixels(chart.centres_mm)
-    sites = sites_at(places, (height, width), window)
-    offsets = np.arange(window) - window // 2
-    at = np.flatnonzero(sites.inside)
-    samples = picture[sites.rows[at, None, None] + offsets[:, None], sites.columns[at, None, None] + offsets]
-    samples = samples.reshape(len(at), window**2, 3)
+    at, samples = _samples(picture, places, window)
     difference, sigma = rim_difference(samples, sample_noise(samples))
     score = (difference / np.maximum(sigma, 1e-6)).max(axis=1)
     shown = viewable(picture)
@@ -386,7 +381,7 @@ _Image = npt.NDArray[np.float32]
 _Array = npt.NDArray[np.float64]
 
 
-def draw_errors(figure: Any, figures: TableMeasurements, chart: Chart) -> None:
+def draw_errors(figure: Any, table: TableMeasurements, chart: Chart) -> None:
     """Draw how far cells are off their codes' colours, and how well their places are known, over the print.
 
     The worst cell of each is ringed. Where the first is not known, on small charts, it is left empty and says so.
@@ -395,7 +390,7 @@ def draw_errors(figure: Any, figures: TableMeasurements, chart: Chart) -> None:
     figure.set_size_inches(10, 0.2 + 4.6 * page_h / page_w)
     left, right = figure.subplots(1, 2)
     side = 72 * 4.1 / page_w * float(np.mean(chart.cell_mm))
-    stains = figures.cells.stains
+    stains = table.cells.stains
     if stains.known:
         off = 100 * stains.largest_deviation()
         places = chart.centres_mm[chart.cell_of_colour]
@@ -407,7 +402,7 @@ def draw_errors(figure: Any, figures: TableMeasurements, chart: Chart) -> None:
         _mark(left, places[int(np.argmax(np.abs(off)))])
     else:
         left.text(0.5, 0.5, "too few colours to compare", ha="center", va="center", transform=left.transAxes)
-    error = figures.registration.uncertainty_px(chart.centres_mm)
+    error = table.registration.uncertainty_px(chart.centres_mm)
     image = right.scatter(
         *chart.centres_mm.T, c=error, s=max(side, 1.2) ** 2, marker="s", linewidths=0, cmap="cividis", vmin=0,
         vmax=max(float(np.percentile(error, _SHOWN_PERCENTILE)), 1e-3),
@@ -431,13 +426,18 @@ def cell_noise(picture: _Image, chart: Chart, registration: Registration, window
 
     `picture`: (H, W, 3) float32 counts above black, the frame at half size.
     """
+    samples = _samples(picture, registration.to_pixels(chart.centres_mm), window)[1].astype(np.float64)
+    return samples.mean(axis=1), samples.var(axis=1, ddof=1)
+
+
+def _samples(picture: _Image, places: _Array, window: int) -> tuple[npt.NDArray[np.intp], _Image]:
+    """Return which cells at places (N, 2) lie in the frame, (M,), and their samples (M, window², 3)."""
     height, width = picture.shape[:2]
-    sites = sites_at(registration.to_pixels(chart.centres_mm), (height, width), window)
+    sites = sites_at(places, (height, width), window)
     offsets = np.arange(window) - window // 2
     at = np.flatnonzero(sites.inside)
     samples = picture[sites.rows[at, None, None] + offsets[:, None], sites.columns[at, None, None] + offsets]
-    flat = samples.reshape(len(at), window**2, 3).astype(np.float64)
-    return flat.mean(axis=1), flat.var(axis=1, ddof=1)
+    return at, samples.reshape(len(at), window**2, 3)
 
 
 def draw_noise(figure: Any, noise: tuple[_Array, _Array], transfer: PhotonTransfer, samples: int) -> None:

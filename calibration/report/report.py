@@ -60,29 +60,27 @@ _Array = npt.NDArray[np.float64]
 
 def report_json(result: BuildResult) -> dict[str, Any]:
     """Return the content of `report.json`: verdict, figures, and every limit with its reason."""
-    figures, verdict = result.figures, result.verdict
-    off_codes_deg, primaries = figures.lights.off_codes_deg, figures.primaries
+    table, verdict = result.figures, result.verdict
+    off_codes_deg, primaries = table.lights.off_codes_deg, table.primaries
     return {
         "format": REPORT_FORMAT,
         "version": REPORT_VERSION,
         "verdict": verdict.outcome,
-        "session": figures.session.folder.name,
-        "camera": figures.session.camera,
-        "lights": figures.session.lights,
-        "channels": _channels(figures),
-        "chart_places": _chart_places(figures),
-        "geometry": _geometry(figures),
-        "lens": figures.lens.to_json() | ({} if figures.point_spread is None else figures.point_spread.to_json()),
+        "session": table.session.folder.name,
+        "camera": table.session.camera,
+        "lights": table.session.lights,
+        "channels": _channels(table),
+        "chart_places": _chart_places(table),
+        "geometry": _geometry(table),
+        "lens": table.lens.to_json() | ({} if table.point_spread is None else table.point_spread.to_json()),
         "off_codes_deg": None if off_codes_deg is None else _short(off_codes_deg),
-        "codes": None if figures.lights.codes is None else _codes(figures.lights.codes),
-        "origin": figures.origin.model_dump(mode="json"),
-        "origins": _origins(figures),
+        "codes": None if table.lights.codes is None else _codes(table.lights.codes),
+        "origin": table.origin.model_dump(mode="json"),
+        "origins": _origins(table),
         "primaries_differ": None if primaries is None else float(f"{primaries.difference:.3g}"),
-        "figures": {name: _rounded(value) for name, value in judged_values(figures).items()},
+        "figures": {name: _rounded(value) for name, value in judged_values(table).items()},
         "causes": _causes(result),
-        **retake_json(
-            retaken_frames(verdict, figures), figures.registered_frame.record.sha256, _newest_sha256(figures)
-        ),
+        **retake_json(retaken_frames(verdict, table), table.registered_frame.record.sha256, _newest_sha256(table)),
         "limits": [row.figure.limit_json() | {"outcome": row.outcome} for row in verdict.rows],
     }
 
@@ -114,30 +112,30 @@ def _causes(result: BuildResult) -> list[dict[str, Any]]:
     ]
 
 
-def _newest_sha256(figures: TableMeasurements) -> str:
+def _newest_sha256(table: TableMeasurements) -> str:
     """Return the hash of the measured frame that was taken last."""
-    return max((frame.record for frame in figures.frames), key=lambda record: record.attempt).sha256
+    return max((frame.record for frame in table.frames), key=lambda record: record.attempt).sha256
 
 
-def _chart_places(figures: TableMeasurements) -> dict[str, Any]:
+def _chart_places(table: TableMeasurements) -> dict[str, Any]:
     """Return where points of the page lie in the frame that was registered first, half-size px.
 
     Of two tables of one chart these tell how it hung elsewhere.
     """
-    registration = figures.registration
+    registration = table.registration
     width, height = registration.colours.page_mm
     across, down = PLACES
     points = [(x, y) for y in np.linspace(0.05, 0.95, down) * height for x in np.linspace(0.05, 0.95, across) * width]
     return {
-        "frame": figures.session.registered_file,
+        "frame": table.session.registered_file,
         "mm": np.round(points, 3).tolist(),
         "px": np.round(registration.to_pixels(points), 3).tolist(),
     }
 
 
-def _geometry(figures: TableMeasurements) -> dict[str, Any]:
+def _geometry(table: TableMeasurements) -> dict[str, Any]:
     """Return how well cells' places are known, and where red and blue lie against green, half-size px."""
-    registration = figures.registration
+    registration = table.registration
     inner, outer = registration.places_known_px
     lateral = registration.lateral
     return {
@@ -163,9 +161,9 @@ def _codes(codes: CodeAgreement) -> dict[str, Any]:
     }
 
 
-def _origins(figures: TableMeasurements) -> dict[str, Any]:
+def _origins(table: TableMeasurements) -> dict[str, Any]:
     """Return which frames' files state another camera, lens or exposure than most."""
-    origins = figures.origins
+    origins = table.origins
     named = {
         "other_camera": origins.other_camera,
         "other_lens": origins.other_lens,
@@ -181,12 +179,12 @@ def _short(values: _Array) -> list[float]:
     return [float(f"{value:.3g}") for value in values.tolist()]
 
 
-def _channels(figures: TableMeasurements) -> dict[str, Any]:
+def _channels(table: TableMeasurements) -> dict[str, Any]:
     """Return what is known for each channel; what could not be measured is null."""
-    transfer, dark, lights = figures.sensor.transfer, figures.dark_frames, figures.lights
-    linearity, registration = figures.sensor.linearity, figures.registration
+    transfer, dark, lights = table.sensor.transfer, table.dark_frames, table.lights
+    linearity, registration = table.sensor.linearity, table.registration
     return {
-        "window": figures.cells.window,
+        "window": table.cells.window,
         "largest_window": largest_window(registration.cell_px, registration.blur_px),
         LINEARITY.name: None if linearity is None else linearity.to_json(),
         "dark_frames": len(dark.files),
@@ -200,7 +198,7 @@ def _channels(figures: TableMeasurements) -> dict[str, Any]:
         "read_noise_counts": _numbers(transfer.read_noise),
         "response_spread": _numbers(transfer.response),
         "noisy_colours": np.flatnonzero(transfer.noisy).tolist(),
-        "grey_tint_deg": dict(zip(figures.greys.names, _numbers(figures.greys.tints_deg(lights.white)), strict=True)),
+        "grey_tint_deg": dict(zip(table.greys.names, _numbers(table.greys.tints_deg(lights.white)), strict=True)),
     }
 
 
@@ -237,9 +235,9 @@ def worst_of_figures(table: TableMeasurements, chart: Chart) -> dict[str, Worst]
 
 def _pictures(result: BuildResult, session: Session, worsts: Mapping[str, Worst]) -> list[Picture]:
     """Return the pictures: first chart, lights, errors and noise, then those of the groups."""
-    figures = result.figures
-    chart, registration = session.chart, figures.registration
-    frame = half_size(read_raw(session.folder / figures.session.registered_file))
+    table = result.figures
+    chart, registration = session.chart, table.registration
+    frame = half_size(read_raw(session.folder / table.session.registered_file))
     return [
         *_first_pictures(result, session, frame, worsts),
         Picture(
@@ -250,22 +248,22 @@ def _pictures(result: BuildResult, session: Session, worsts: Mapping[str, Worst]
             "geometry",
             "residuals",
         ),
-        *_worst_pictures(chart, figures, frame, worsts),
+        *_worst_pictures(chart, table, frame, worsts),
         Picture(
             "The light on the print",
             "Shape of the light under the frame that was registered, from its white references; it is divided out of "
-            f"samples and ground truth. Contours are 2 % apart. {_primaries_caption(figures)}",
-            png_of(draw_field, chart, figures.registered_frame.paper.field),
+            f"samples and ground truth. Contours are 2 % apart. {_primaries_caption(table)}",
+            png_of(draw_field, chart, table.registered_frame.paper.field),
             "light",
             "field",
         ),
-        *_print_picture(chart, figures.cells.stains),
+        *_print_picture(chart, table.cells.stains),
         Picture(
             "The course of the session",
             "Black level, movement and blur of the chart, bare paper under white, how far cells are off their codes' "
             "colours, and the white references used, frame by frame; the worst frame of each is ringed. All cells are "
             "off where the focus is lost, a block of them where a hand or a shadow lies on the print.",
-            png_of(draw_course, figures),
+            png_of(draw_course, table),
             "radiometry",
             "course",
         ),
@@ -273,11 +271,11 @@ def _pictures(result: BuildResult, session: Session, worsts: Mapping[str, Worst]
             "The worst cells",
             f"The {WORST_CELLS} cells whose rim and middle differ most under white, in standard deviations, each "
             "between its neighbours; the frame is the samples.",
-            png_of(draw_worst_cells, frame, chart, registration, figures.cells.window),
+            png_of(draw_worst_cells, frame, chart, registration, table.cells.window),
             "noise",
             "cells",
         ),
-        *_residual_picture(chart, figures, frame),
+        *_residual_picture(chart, table, frame),
     ]
 
 
@@ -285,17 +283,17 @@ def _first_pictures(
     result: BuildResult, session: Session, frame: npt.NDArray[np.float32], worsts: Mapping[str, Worst]
 ) -> list[Picture]:
     """Return what a scientist looks at first: chart, lights, errors, noise."""
-    figures, chart = result.figures, session.chart
-    registration, window = figures.registration, figures.cells.window
+    table, chart = result.figures, session.chart
+    registration, window = table.registration, table.cells.window
     codes = np.array([light.codes for light in session.illuminations])
     black_body = np.array([light.kind == "blackbody" for light in session.illuminations], dtype=np.bool_)
-    seen = f"seen by the {figures.session.camera}"
+    seen = f"seen by the {table.session.camera}"
     truth = worsts[TRUTH_WORST_DEG.name].light if TRUTH_WORST_DEG.name in worsts else None
     ringed = "" if truth is None else f" Ringed is light {truth}, whose ground truth is known worst."
     return [
         Picture(
             "The chart as registered",
-            f"{figures.session.registered_file}, contrast stretched, with the tags as found; below, magnified: the "
+            f"{table.session.registered_file}, contrast stretched, with the tags as found; below, magnified: the "
             f"outline of every cell and the pixels of its {window**2} samples, in the corners and in the middle.",
             png_of(draw_registration, frame, chart, registration, window),
             name="chart",
@@ -304,28 +302,28 @@ def _first_pictures(
             "The lights",
             "rb-chromaticities of the lights as projected, as the camera sees them on bare paper (the ground truth), "
             f"and the latter in their colours. Rings are black bodies.{ringed}",
-            png_of(draw_chromaticities, codes, black_body, figures.lights.white, seen, truth),
+            png_of(draw_chromaticities, codes, black_body, table.lights.white, seen, truth),
             name="lights",
         ),
         Picture(
             "Where cells err",
             "Left: how far cells and their neighbours are off their codes' colours elsewhere on the sheet. Right: how "
             "well the place of each cell is known. The worst cell of each is ringed.",
-            png_of(draw_errors, figures, chart),
+            png_of(draw_errors, table, chart),
             name="errors",
         ),
         Picture(
             "The noise",
             "Left: variance of one sample over its level, medians of cells of like levels and the fitted curve (read "
             "noise, photons, unequal photosites). Right: what that makes of signal over noise.",
-            png_of(draw_noise, cell_noise(frame, chart, registration, window), figures.sensor.transfer, window**2),
+            png_of(draw_noise, cell_noise(frame, chart, registration, window), table.sensor.transfer, window**2),
             name="noise",
         ),
     ]
 
 
 def _worst_pictures(
-    chart: Chart, figures: TableMeasurements, frame: npt.NDArray[np.float32], worsts: Mapping[str, Worst]
+    chart: Chart, table: TableMeasurements, frame: npt.NDArray[np.float32], worsts: Mapping[str, Worst]
 ) -> list[Picture]:
     """Return the picture of the places where figures are worst."""
     places = [
@@ -339,7 +337,7 @@ def _worst_pictures(
         "The place of the worst of each figure that has one, on the frame that was registered, whether or not it is "
         "beyond a limit. Worst frames are ringed in the course of the session, the worst light among the lights."
     )
-    drawn = png_of(draw_places, frame, chart, figures.registration, places)
+    drawn = png_of(draw_places, frame, chart, table.registration, places)
     return [Picture("Where the worst is", caption, drawn, "geometry", "worst")]
 
 
@@ -362,10 +360,10 @@ def _place_pictures(result: BuildResult, session: Session) -> list[Picture]:
     return pictures
 
 
-def _residual_picture(chart: Chart, figures: TableMeasurements, picture: npt.NDArray[np.float32]) -> list[Picture]:
+def _residual_picture(chart: Chart, table: TableMeasurements, picture: npt.NDArray[np.float32]) -> list[Picture]:
     """Return the picture of what the field leaves of the references, none where there are none."""
     places_mm = np.array([reference.centre_mm for reference in chart.white_references], dtype=np.float64).reshape(-1, 2)
-    residual = reference_residuals(picture, places_mm, figures.registration, figures.registered_frame)
+    residual = reference_residuals(picture, places_mm, table.registration, table.registered_frame)
     if not np.isfinite(residual).any():
         return []
     caption = (
@@ -384,11 +382,11 @@ def _residual_picture(chart: Chart, figures: TableMeasurements, picture: npt.NDA
     ]
 
 
-def _primaries_caption(figures: TableMeasurements) -> str:
-    if figures.primaries is None:
+def _primaries_caption(table: TableMeasurements) -> str:
+    if table.primaries is None:
         return "No frames of red, green and blue alone show whether these light the print alike."
     return (
-        f"Red, green and blue differ by up to {100 * figures.primaries.difference:.1f} % in how they light it; what "
+        f"Red, green and blue differ by up to {100 * table.primaries.difference:.1f} % in how they light it; what "
         "that makes of each cell by its colour is divided out too."
     )
 

@@ -86,7 +86,10 @@ def measured(scatters: Sequence[float], exposures: Sequence[Any] = ()) -> Any:
 
 @pytest.fixture
 def nothing_explained(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(module, "findings", lambda *_: {})
+    def findings(*_: object) -> dict[str, Any]:
+        return {}
+
+    monkeypatch.setattr(module, "findings", findings)
 
 
 @pytest.mark.usefixtures("nothing_explained")

@@ -21,6 +21,7 @@ COPIED = (
     "foundation",
     "drivers",
     "sim",
+    "experiment",
     "acquisition",
     "calibration",
     "synthesis",
