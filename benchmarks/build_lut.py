@@ -35,13 +35,11 @@ import numpy as np
 import rawpy
 
 from calibration.checks.frame_consistency import ConsistencyCheck
-from calibration.pipeline.baseline import baseline_of, with_lens
-from calibration.pipeline.build import build
+from calibration.pipeline.baseline import PAPER_OPTIONS, BuildOptions, baseline_of, with_lens
+from calibration.pipeline.build import build, thread_count
 from calibration.pipeline.frames import decode_frame, select_frames
-from calibration.pipeline.options import PAPER_OPTIONS, BuildOptions
-from calibration.pipeline.prefetching import thread_count
 from calibration.registration.register import register
-from calibration.sampling.samples import gather_values, sites_at
+from calibration.sampling import gather_values, sites_at
 from drivers.camera import CapturedFrame
 from drivers.raw.rawfile import read_raw
 from experiment.chart.layout import design_chart

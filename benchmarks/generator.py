@@ -37,8 +37,7 @@ import numpy as np
 import numpy.typing as npt
 import skimage.data
 
-from calibration.table.lut import Lut, open_lut
-from calibration.table.provenance import Provenance
+from calibration.table.lut import Lut, Provenance, open_lut
 from calibration.table.writer import LutWriter
 from drivers.presenter import Colour
 from foundation.compiled import compiled

@@ -28,8 +28,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from benchmarks.rooms import Case, PhotographedChart, photographed
-from calibration.registration.register import register
-from calibration.registration.registration import Registration
+from calibration.registration.register import Registration, register
 from experiment.chart.layout import design_chart, paper_chart
 from experiment.framing.planes import CHANNELS
 from foundation.errors import CropError

@@ -34,8 +34,7 @@ import numpy.typing as npt
 
 from benchmarks.cases import BY_NAME, CASES, FAILURES, LENS_LEFT, WRONG_SHARE, Outcome, chart_of, outcome_of, try_case
 from benchmarks.sessions import short_session, world_of
-from calibration.registration.register import register
-from calibration.registration.registration import Registration
+from calibration.registration.register import Registration, register
 from drivers.camera import ExposureSettings
 from drivers.presenter import WHITE, Colour
 from drivers.raw.rawfile import Mosaic, read_raw

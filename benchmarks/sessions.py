@@ -24,8 +24,8 @@ import numpy as np
 import numpy.typing as npt
 
 from calibration.measurements import FrameMeasurements
-from calibration.registration.registration import Registration
-from calibration.sampling.samples import sites_at
+from calibration.registration.register import Registration
+from calibration.sampling import sites_at
 from calibration.table.lut import Lut
 from calibration.verdict import BuildResult
 from drivers.camera import CapturedFrame, ExposureSettings

@@ -1,31 +1,38 @@
-"""`build-lut`: makes the table of a session, judges it, describes it, verifies it. Parse, call, print; nothing else."""
+"""`build-lut`: makes the table of a session, judges it; describes, verifies, matches, publishes, compares tables.
+
+Parse, call, print; nothing else.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Generator, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from calibration.citation.options import Licence, Note
-from calibration.table_jobs import (
-    fetch_table,
-    match_tables,
-    print_citation,
-    print_table,
-    progress_bar,
-    publish_table,
-    verify_table,
-)
+from calibration.citation import Licence, Note
 from foundation import console
-from foundation.console import EXIT_CODES, AsJson, JsonOutput, Quiet, Verbose, Version, json_output, new_app
+from foundation.console import (
+    EXIT_CODES,
+    AsJson,
+    JsonOutput,
+    Quiet,
+    Verbose,
+    Version,
+    json_output,
+    new_app,
+    shows_progress,
+)
 from foundation.errors import FormatError, InputError, QualityError
+from foundation.secret_texts import masked, printable
 
 if TYPE_CHECKING:
+    from calibration.pipeline.baseline import BuildOptions
     from calibration.pipeline.build import TableProgress
-    from calibration.pipeline.options import BuildOptions
+    from calibration.table.lut import Lut
     from calibration.verdict import BuildResult
     from experiment.session.folder import Session
 
@@ -275,22 +282,22 @@ def build_lut(
         raise InputError(f"{next(name for name, value in beside.items() if value)} goes with --compare; leave it out")
     if (lut if verify else session if compare or any(reading.values()) else None) is not None:
         raise InputError(f"{given[0]} does not expect {lut or session}; leave it out")
-    with json_output("build-lut", as_json) as told:
+    with json_output("build-lut", as_json) as output:
         if info is not None:
-            print_table(info, told)
+            _print_table(info, output)
         elif cite is not None:
-            print_citation(cite, told)
+            _print_citation(cite, output)
         elif verify is not None:
-            verify_table(verify, session, told)
+            _verify_table(verify, session, output)
         elif match is not None:
-            match_tables(*match, told)
+            _match_tables(*match, output)
         elif publish is not None:
-            publish_table(*publish, told)
+            _publish_table(*publish, output)
         elif fetch is not None:
-            fetch_table(*fetch, expect, told)
+            _fetch_table(*fetch, expect, output)
         else:
-            from calibration.pipeline.options import BuildOptions
-            from calibration.sampling.samples import WINDOW
+            from calibration.pipeline.baseline import BuildOptions
+            from calibration.sampling import WINDOW
             from experiment.framing.field import parse_corners
 
             if picture is not None and not check:
@@ -304,9 +311,110 @@ def build_lut(
                 unfit = [name for name in ("--linearity", "--note", "--licence", "--author", "--serial") if made[name]]
                 if unfit:
                     raise InputError(f"{unfit[0]} is for the report of one table; leave it out of --compare")
-                _compare(*compare, options, told, out, chart)
+                _compare(*compare, options, output, out, chart)
                 return
-            _make(session, lut, check, append, options, linearity, picture, changes, told)
+            _make(session, lut, check, append, options, linearity, picture, changes, output)
+
+
+def _print_table(folder: Path, output: JsonOutput) -> None:
+    """Print what a table is and what it was made of, a line each."""
+    from calibration.table.lut import open_lut
+    from calibration.table.verification import describe
+
+    lut = open_lut(folder)
+    output.add(
+        table=folder,
+        sha256=lut.sha256,
+        lights=len(lut.white),
+        colours=8**lut.provenance.bits,
+        samples=int(lut.samples.shape[2]),
+        provenance=lut.provenance.model_dump(mode="json"),
+    )
+    for name, value in describe(lut):
+        print(f"{name + ':':17}{printable(value)}")
+
+
+def _print_citation(folder: Path, output: JsonOutput) -> None:
+    """Print a BibTeX entry of a table."""
+    from calibration.table.lut import open_lut
+    from calibration.table.verification import citation_of
+
+    entry = printable(citation_of(open_lut(folder)))
+    output.add(table=folder, bibtex=entry)
+    print(entry, end="")
+
+
+def _verify_table(folder: Path, session: Path | None, output: JsonOutput) -> None:
+    """Hash every byte of a table again, with a session its frames too; a FormatError where anything changed."""
+    from calibration.table.lut import open_lut
+    from calibration.table.verification import find_faults
+
+    lut = open_lut(folder, check=False)
+    with _progress_bar("reading the samples") as progress:
+        faults = find_faults(lut, lambda done, total: progress(done, total, "reading the samples"))
+    if session is not None:
+        from calibration.pipeline.frames import frame_faults
+        from experiment.session.folder import Session
+
+        with Session.open(session) as opened, _progress_bar("reading the frames") as progress:
+            faults += frame_faults(lut, opened, progress)
+    output.add(table=folder, sha256=lut.sha256, frames=None if session is None else len(lut.frames), faults=faults)
+    for fault in faults:
+        print(fault)
+    if faults:
+        raise FormatError(
+            f"{folder} is not as it was built: {len(faults)} faults; restore it from a copy, or build it again"
+        )
+    frames = "" if session is None else f", and so are its {len(lut.frames)} frames in {session}"
+    print(f"{folder}: every byte is as it was built{frames}")
+
+
+def _match_tables(one: Path, other: Path, output: JsonOutput) -> None:
+    """Print that two tables correspond number by number; a FormatError says where they do not."""
+    from calibration.table.lut import open_lut
+    from calibration.table.verification import require_match
+
+    tables = open_lut(one), open_lut(other)
+    require_match(*tables)
+    output.add(tables=[one, other], cameras=[table.provenance.camera for table in tables], match=True)
+    cameras = " and ".join(table.provenance.camera for table in tables)
+    print(f"{one} and {other} ({cameras}): colours and lights correspond number by number")
+
+
+def _publish_table(folder: Path, url: str, output: JsonOutput) -> None:
+    """Copy a table to a store, and print how others get it."""
+    from calibration.table.lut import open_lut
+    from calibration.table.zarr_store import publish
+
+    lut = open_lut(folder)
+    with _progress_bar("writing lights") as progress:
+        publish(lut, url, lambda done, total: progress(done, total, "writing lights"))
+    output.add(table=folder, url=masked(url), lights=len(lut.samples), sha256=lut.sha256)
+    print(f"{masked(url)}: {len(lut.samples)} lights of {folder}; others get them by")
+    print(f"build-lut --fetch {masked(url)} LUT --expect {lut.sha256}")
+
+
+def _fetch_table(url: str, folder: Path, expect: str | None, output: JsonOutput) -> None:
+    """Copy a published table from a store, and print what is known of it."""
+    from calibration.table.zarr_store import fetch
+
+    with _progress_bar("reading lights") as progress:
+        lut = fetch(url, folder, lambda done, total: progress(done, total, "reading lights"), expect)
+    output.add(table=folder, url=masked(url), lights=len(lut.samples), sha256=lut.sha256, expected=expect is not None)
+    print(f"{folder}: {len(lut.samples)} lights, {printable(lut.provenance.camera)}; {_vouched(lut, expect)}")
+
+
+def _vouched(lut: Lut, expect: str | None) -> str:
+    """Return in words what is known of a table that was fetched."""
+    if not lut.provenance.lights_sha256:
+        return "it has no hashes, so that nobody can say whether it is as it was built"
+    covered = "every file is" if lut.provenance.has_sums else "ground truth and samples are (it is an older table)"
+    if expect is not None:
+        return f"it is the table expected, and {covered} as it was built"
+    return (
+        f"{covered} as its own hashes say; that it is the table you mean shows its hash, {lut.sha256}: compare it with "
+        "the one you were told, or give that with --expect"
+    )
 
 
 def _make(
@@ -318,7 +426,7 @@ def _make(
     linearity: Path | None,
     picture: Path | None,
     changes: dict[str, Any],
-    told: JsonOutput,
+    output: JsonOutput,
 ) -> None:
     if check and lut is not None:
         raise InputError(f"--check writes nothing, so a table's folder ({lut}) is not expected; leave one of them out")
@@ -328,14 +436,14 @@ def _make(
 
     if check:
         with Session.open(session) as opened:
-            _check(opened, _with_citation(options, opened, changes), linearity, picture, told)
+            _check(opened, _with_citation(options, opened, changes), linearity, picture, output)
         return
     if lut is None:
         raise InputError("a folder for the table is expected: build-lut SESSION LUT, or --check to judge only")
     import json
 
     from calibration.pipeline.build import TableProgress, refused_folder
-    from calibration.table.file_names import REPORT_JSON, REPORT_PAGE
+    from calibration.table.lut import REPORT_JSON, REPORT_PAGE
 
     kept = refused_folder(lut) / REPORT_JSON
     before = kept.stat().st_mtime_ns if kept.is_file() else None
@@ -344,35 +452,36 @@ def _make(
             result = _build(opened, lut, append, _with_citation(options, opened, changes), linearity)
         except QualityError:
             # A report of an earlier build says nothing of this one.
-            if told.asked and kept.is_file() and kept.stat().st_mtime_ns != before:
-                told.add(**json.loads(kept.read_text(encoding="utf-8")))
+            if output.asked and kept.is_file() and kept.stat().st_mtime_ns != before:
+                output.add(**json.loads(kept.read_text(encoding="utf-8")))
             raise
     if isinstance(result, TableProgress):
-        told.add(table=lut, progress=result)
+        output.add(table=lut, progress=result)
         print(
             f"{lut}: {result.lights} of {result.lights_planned} lights, {result.new_frames} frames taken in now, "
             f"{result.frames} in all; run the same command again when more have come"
         )
         return
-    told.add(table=lut)
-    _print_result(result, told)
+    output.add(table=lut)
+    _print_result(result, output)
     print(f"{lut}: {result.figures.session.lights} lights, {result.figures.session.camera}; see {lut / REPORT_PAGE}")
 
 
 def _with_citation(options: BuildOptions, session: Session, changes: dict[str, Any]) -> BuildOptions:
     """Return the options with what was given of the table's origin in place of what the session's settings state."""
-    from calibration.citation.stated import stated_origin, with_changes
+    from calibration.citation import with_changes
+    from calibration.pipeline.frames import stated_origin
 
     return replace(options, citation=with_changes(stated_origin(session).citation, changes)) if changes else options
 
 
 def _check(
-    session: Session, options: BuildOptions, linearity: Path | None, picture: Path | None, told: JsonOutput
+    session: Session, options: BuildOptions, linearity: Path | None, picture: Path | None, output: JsonOutput
 ) -> None:
     from calibration.pipeline.build import check
 
     result = check(session, options, linearity, picture)
-    _print_result(result, told)
+    _print_result(result, output)
     if result.verdict.refused:
         from calibration.verdict import refusal
 
@@ -386,23 +495,22 @@ def _build(
     from calibration.pipeline.build import append, build
     from calibration.report.report import write_report
 
-    with progress_bar("finding the chart") as progress:
+    with _progress_bar("finding the chart") as progress:
         return (append if so_far else build)(session, lut, progress, write_report, options, linearity)
 
 
 def _compare(
-    one: Path, other: Path, options: BuildOptions, told: JsonOutput, out: Path | None, chart: Path | None
+    one: Path, other: Path, options: BuildOptions, output: JsonOutput, out: Path | None, chart: Path | None
 ) -> None:
-    from calibration.comparison.comparing import compare
-    from calibration.comparison.sources import chart_of, table_of
-    from calibration.comparison.wording import comparison_json, lines
+    from calibration.comparison.comparing import chart_of, compare, table_of
+    from calibration.comparison.report import comparison_json, lines
     from experiment.chart.model import load_chart
     from foundation.files import require_free
 
     if out is not None:
         require_free(out, "the comparison")
     with (
-        progress_bar("reading") as progress,
+        _progress_bar("reading") as progress,
         table_of(one, options, progress) as a,
         table_of(other, options, progress) as b,
     ):
@@ -410,8 +518,8 @@ def _compare(
         drawn = chart_of((one, other)) if chart is None else load_chart(chart)
         if drawn is not None and drawn.sha256 != a.provenance.chart_sha256:
             raise FormatError(f"{chart} is not the chart of {one}; name the chart.json that was printed")
-    if told.asked:
-        told.add(**comparison_json(found))
+    if output.asked:
+        output.add(**comparison_json(found))
     else:
         print("\n".join(lines(found)))
     if out is not None:
@@ -420,12 +528,12 @@ def _compare(
         write_comparison(found, out, drawn)
 
 
-def _print_result(result: BuildResult, told: JsonOutput) -> None:
+def _print_result(result: BuildResult, output: JsonOutput) -> None:
     """Print the figures that matter most, the remarks, and the verdict; or add all that `report.json` holds."""
-    if told.asked:
+    if output.asked:
         from calibration.report.report import report_json
 
-        told.add(**report_json(result))
+        output.add(**report_json(result))
         return
     from calibration.report.page import summary
     from calibration.verdict import remark
@@ -437,6 +545,23 @@ def _print_result(result: BuildResult, told: JsonOutput) -> None:
     for judged in result.verdict.remarks:
         print(f"remark: {remark(judged, result.figures)}")
     print(f"{'Verdict:':{width}}{result.verdict.outcome}")
+
+
+@contextmanager
+def _progress_bar(beginning: str) -> Generator[Callable[[int, int, str], None]]:
+    """Show a bar of progress on stderr; yield what is to be called with done, total, and the present work."""
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeRemainingColumn(),
+    )
+    with Progress(*columns, console=Console(stderr=True), transient=True, disable=not shows_progress()) as bar:
+        task = bar.add_task(beginning, total=None)
+        yield lambda done, total, what: bar.update(task, completed=done, total=total, description=what)
 
 
 if __name__ == "__main__":

@@ -22,11 +22,8 @@ import numpy as np
 import typer
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
-from calibration.citation.options import Licence, Note
-from calibration.citation.record import OriginRecord
-from calibration.citation.stated import with_changes
-from calibration.sampling.samples import WINDOW
-from calibration.sampling.windows import WINDOWS
+from calibration.citation import Licence, Note, OriginRecord, with_changes
+from calibration.sampling import WINDOW, WINDOWS
 from drivers.camera import ExposureSettings
 from experiment.chart.layout import design_chart
 from experiment.config import CitationSettings, unknown_key

@@ -41,7 +41,7 @@ import numpy as np
 import numpy.typing as npt
 
 from calibration.radiometry.primaries import pure_lights
-from calibration.sampling.samples import Sites
+from calibration.sampling import Sites
 from drivers.camera import ExposureSettings
 from drivers.presenter import WHITE
 from drivers.raw.rawfile import Area, Mosaic

@@ -24,17 +24,13 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
-from calibration.citation.record import OriginRecord
-from calibration.pipeline.baseline import usable_means
-from calibration.pipeline.registered_frame import ChartPoints
-from calibration.radiometry.corrections import corrections
+from calibration.citation import OriginRecord
+from calibration.pipeline.baseline import ChartPoints, usable_means
+from calibration.radiometry.drift import corrections
 from calibration.radiometry.greys import references_csv
 from calibration.radiometry.primaries import Primaries
-from calibration.sampling.patch_statistics import patch_means
-from calibration.sampling.samples import Sites, gather, gather_values
-from calibration.table.file_names import REFERENCES
-from calibration.table.provenance import Provenance, Unfit
-from calibration.table.source_frames import frames_sha256
+from calibration.sampling import Sites, gather, gather_values, patch_means
+from calibration.table.lut import REFERENCES, Provenance, Unfit, frames_sha256
 from calibration.table.writer import LutWriter
 from drivers.camera import ExposureSettings
 from experiment.chart.model import Chart

@@ -20,7 +20,7 @@ from acquisition.check.light_and_print import AREAS, area_name, areas_of
 from acquisition.check.places import ChartMap
 from acquisition.run.plan import bytes_text, free_bytes_at, needed_bytes
 from calibration.figures.light import LINEARITY
-from calibration.sampling.windows import bleed, largest_blur_px
+from calibration.sampling import bleed, largest_blur_px
 from drivers.camera import Camera, ReportsSupplies, Supplies
 from drivers.raw.rawfile import Mosaic
 from experiment.chart.model import Chart

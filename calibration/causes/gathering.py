@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from calibration.causes.rules import Evidence
 from calibration.measurements import FrameMeasurements, TableMeasurements
-from calibration.sampling.windows import WINDOW_PX, bleed
+from calibration.sampling import WINDOW_PX, bleed
 from experiment.measures.stains import Stains, cell_mm, joined_cells, light_of_spot, spot_colour, spots_of
 from experiment.session.records import FrameRecord
 

@@ -80,11 +80,11 @@ class StrayLight:
         worst = [int(light) for light in np.argsort(-self.certain, kind="stable") if self.certain[light] > accepted]
         own = [light for light in worst if self.at_zero[light] > 0]
         lacking = [light for light in worst if self.at_zero[light] < 0]
-        told = self.of_primaries > accepted
+        together = self.of_primaries > accepted
         of = [
             light
             for primary, light in enumerate(self.primaries)
-            if told or any(self.lights_of[one, primary] for one in lacking)
+            if together or any(self.lights_of[one, primary] for one in lacking)
         ]
         return own + [light for light in of if light not in own]
 

@@ -1,8 +1,19 @@
-"""Compare two tables light by light, in bounded memory: a light of either is held at a time for each thread.
+"""Two tables compared light by light, in bounded memory; whether they are the same within noise; B over A, always.
 
-What noise alone predicts is taken from the tables themselves: a cell's standard error from the scatter of its own
-samples, a white's from `references.csv`. Where photosites differ in response, samples scatter by that too; it is the
-same in both tables where the chart did not move between them, so that noise then predicts a little more than there is.
+Rules that hold inside:
+
+- A light of either table is held at a time for each thread. A session is compared by its table, built for the
+  comparison and thrown away (`table_of`).
+- What noise alone predicts is taken from the tables themselves: a cell's standard error from the scatter of its own
+  samples, a white's from `references.csv`. Where photosites differ in response, samples scatter by that too; it is the
+  same in both tables where the chart did not move between them, so that noise then predicts a little more than there
+  is.
+- With 700 lights and 32 768 cells any difference is significant, however small. So what is asked is not whether noise
+  is the only cause, but whether what is beyond it matters: limits are those of noise at a chance of one in a hundred
+  for the whole table, widened by what standard errors that are themselves estimated may be off, and a floor of what no
+  use of a table would notice.
+
+L common lights, C colours.
 """
 
 from __future__ import annotations
@@ -10,7 +21,9 @@ from __future__ import annotations
 import csv
 import io
 import json
-from collections.abc import Callable
+import tempfile
+from collections.abc import Callable, Generator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,22 +31,58 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from calibration.comparison.answers import answers_of
-from calibration.comparison.geometry import geometry_difference
-from calibration.comparison.pairs import LightPairs, light_pairs, require_common_lights, require_one_chart, warnings_of
-from calibration.comparison.values import (
-    CellDifferences,
-    ColourGroup,
-    ComparedTable,
-    GeometryDifference,
-    LightDifferences,
-    TableComparison,
-)
-from calibration.table.file_names import REFERENCES, REPORT_JSON
-from calibration.table.lut import Lut
+from calibration.kernels import moments
+from calibration.pipeline.baseline import BuildOptions
+from calibration.pipeline.build import build
+from calibration.report.report import report_json
+from calibration.table.lut import REFERENCES, REPORT_JSON, Lut, open_lut
+from calibration.table.verification import chart_difference
+from calibration.verdict import BuildResult
+from experiment.chart.model import Chart, load_chart
+from experiment.lights import Illumination
+from experiment.measures.stains import STAINED
+from experiment.session.folder import Session
+from experiment.session.journal import JOURNAL_FILE
 from foundation.colorimetry import angles_deg
-from foundation.errors import FormatError
+from foundation.errors import FormatError, counted, first_of
+from foundation.files import storage_error, write_whole
 from foundation.processors import ordered_map, processor_count
+
+_Array = npt.NDArray[np.float64]
+
+CHANCE = 0.01
+"""With which noise alone makes any light of a whole table differ."""
+
+ERROR_OF_ERRORS = 1.3
+"""By how much the whites' standard errors may be too small: they are the scatter about a polynomial that was fitted to
+the same references, with up to a third as many terms (a factor of 1.22), from references few in number."""
+
+ANGLE_FLOOR_DEG = 0.005
+"""Angle that is called none (judgement): a two-hundredth of a good method's error of one degree."""
+
+BRIGHTNESS_FLOOR = 0.002
+"""Difference of brightness that is called none: fields that were fitted anew on another sheet leave up to 0.17 % in
+the whites of a small simulated chart; a fifth of the drift that is usual in a session."""
+
+CELL_SCORE = 1.1
+"""Root mean square of cells in units of their noise up to which noise is the cause: what is beyond is then less than
+half of the noise of a single cell of 25 samples. Sessions of one simulated room with other noise give 1.00 to 1.05."""
+
+LIGHT_SCORE = 1.3
+"""The same of one light's cells."""
+
+CELL_SIGMAS = 6.0
+"""Standard errors by which a cell's mean over all lights must differ to be named; by chance one of 5·10⁸."""
+
+CELL_FLOOR = STAINED
+"""Relative difference that it must have, too: that from which on `build-lut` calls a cell stained. Pixels are taken
+whole, so a cell of 9 px that lies a fraction of one elsewhere takes in 1.5 % more or less of a bright neighbour."""
+
+CHART_FILE = "chart.json"
+"""What was photographed, in a session's folder (docs/formats.md)."""
+
+ReportBuild = Callable[[int, int, str], None]
+"""Called with frames taken in, frames in all, and what is being done."""
 
 LEAST_COUNTS = 300.0
 """Counts above which a cell is compared: 25 samples of 300 counts have a mean good to 1 %, and README's figures of a
@@ -51,7 +100,373 @@ _LEAST_SHARE = 0.05
 ReportLights = Callable[[int, int], None]
 """Called with the number of lights compared, and the number of all."""
 
-_Array = npt.NDArray[np.float64]
+
+@dataclass(frozen=True)
+class ComparedTable:
+    """One of the two tables.
+
+    - `place`: its folder, or that of the session that it was made of for the comparison.
+    - `camera`, `software`: as `lut.json` has them.
+    - `lights`, `samples`: lights, and samples of each cell.
+    - `drift_corrected`: whether the lamp's drift was taken out of it.
+    """
+
+    place: Path
+    camera: str
+    software: str
+    lights: int
+    samples: int
+    drift_corrected: bool
+
+
+@dataclass(frozen=True, eq=False)
+class LightDifferences:
+    """What differs light by light.
+
+    - `one`, `other`: (L,) int64, the light's number in A and in B.
+    - `angle_deg`: (L,) float64 degrees between the two whites.
+    - `angle_noise_deg`: (L,) float64 degrees, root mean square of that angle by the whites' standard errors alone; NaN
+      where a table does not have them.
+    - `angle_score`: (L,) float64, the angle in units of its errors: χ² of two freedoms over 2 has this squared; NaN
+      likewise.
+    - `brightness`: (L,) float64, length of B's white over A's, less 1.
+    - `brightness_left`: (L,) float64, the same after the drift that both tables record, and the median of the lights,
+      are divided out.
+    - `brightness_noise`: (L,) float64, standard error of either by the whites' errors alone; NaN where it is not known.
+    - `gains`: (3,) float64, B's white over A's channel by channel, median of the lights with enough of it.
+    - `cell_rms`, `cell_noise`: (L,) float64, root mean square over the cells of B over A less 1, each over its own
+      light's white, and what noise alone predicts of it; NaN where no cell is bright enough.
+    - `cell_score`: (L,) float64, root mean square of the cells' differences in units of their standard errors: 1 by
+      noise alone.
+    """
+
+    one: npt.NDArray[np.int64]
+    other: npt.NDArray[np.int64]
+    angle_deg: _Array
+    angle_noise_deg: _Array
+    angle_score: _Array
+    brightness: _Array
+    brightness_left: _Array
+    brightness_noise: _Array
+    gains: _Array
+    cell_rms: _Array
+    cell_noise: _Array
+    cell_score: _Array
+
+
+@dataclass(frozen=True, eq=False)
+class CellDifferences:
+    """What differs cell by cell, over all lights: B over A less 1, each over its own light's white.
+
+    Only where both means are above `LEAST_COUNTS`; NaN where none is, and for cells that a table lists as unfit.
+
+    - `lights`: (C, 3) int64, lights that count.
+    - `mean`, `spread`: (C, 3) float64, over the lights.
+    - `noise`: (C, 3) float64, standard error of `mean` by noise alone.
+    - `worst`, `worst_light`: (C, 3) float64, the largest difference in units of its standard error, with its sign; (C,
+      3) int64 the light of A under which it is, −1 for none.
+    - `worst_share`: (C, 3) float64, that difference, relative.
+    - `unfit_one`, `unfit_other`: cells that only A, and only B, lists as unfit.
+    - `score`: root mean square over cells, channels and lights of differences in units of their standard errors.
+    - `rms`, `predicted_rms`: root mean square of the differences, and by noise alone.
+    - `offset`: (3,) float64, mean of all differences.
+    """
+
+    lights: npt.NDArray[np.int64]
+    mean: _Array
+    spread: _Array
+    noise: _Array
+    worst: _Array
+    worst_light: npt.NDArray[np.int64]
+    worst_share: _Array
+    unfit_one: tuple[int, ...]
+    unfit_other: tuple[int, ...]
+    score: float
+    rms: float
+    predicted_rms: float
+    offset: _Array
+
+    @property
+    def beyond_noise(self) -> float:
+        """What of `rms` noise does not explain: the root of the difference of the squares, 0 where it explains all."""
+        return float(np.sqrt(max(self.rms**2 - self.predicted_rms**2, 0.0)))
+
+
+@dataclass(frozen=True)
+class ColourGroup:
+    """Cells of one part of the colour cube.
+
+    - `name`: which channels of the code are in the upper half: ``black``, ``blue`` … ``white``.
+    - `cells`: how many of them count.
+    - `mean`, `spread`: mean and standard deviation over the cells of their mean difference, in the channel that
+      deviates most.
+    - `worst`: the largest mean difference, with its sign.
+    """
+
+    name: str
+    cells: int
+    mean: float
+    spread: float
+    worst: float
+    worst_colour: int
+
+
+@dataclass(frozen=True)
+class GeometryDifference:
+    """How the chart lay elsewhere in the frame that was registered first; half-size px of A's frame.
+
+    - `shift_px`: (dx, dy) of the page's middle.
+    - `turned_deg`: clockwise in the picture.
+    - `scale`: B's size over A's, less 1.
+    - `bent_px`: root mean square of what shift, turn and scale leave: perspective, another lens, another shape of the
+      sheet.
+    """
+
+    shift_px: tuple[float, float]
+    turned_deg: float
+    scale: float
+    bent_px: float
+
+
+@dataclass(frozen=True)
+class NoiseAnswer:
+    """Whether one thing is the same within noise.
+
+    - `name`: ``colour of lights``, ``brightness of lights``, ``cells``.
+    - `same`: yes, no, or None where it cannot be said.
+    - `said`: the numbers, in words.
+    """
+
+    name: str
+    same: bool | None
+    said: str
+
+
+@dataclass(frozen=True, eq=False)
+class TableComparison:
+    """All of it."""
+
+    one: ComparedTable
+    other: ComparedTable
+    warnings: tuple[str, ...]
+    lights: LightDifferences
+    cells: CellDifferences
+    groups: tuple[ColourGroup, ...]
+    geometry: GeometryDifference | None
+    answers: tuple[NoiseAnswer, ...]
+
+    @property
+    def same(self) -> bool | None:
+        """Whether everything is the same within noise; None where something cannot be said and nothing differs."""
+        said = [answer.same for answer in self.answers]
+        return False if False in said else None if None in said else True
+
+
+@dataclass(frozen=True)
+class LightPairs:
+    """The lights that two tables have in common, in the order of the first.
+
+    - `one`, `other`: their numbers in either table.
+    - `only_one`, `only_other`: lights that only one of the tables has.
+    """
+
+    one: tuple[int, ...]
+    other: tuple[int, ...]
+    only_one: tuple[int, ...]
+    only_other: tuple[int, ...]
+
+
+def light_pairs(one: Sequence[Illumination], other: Sequence[Illumination]) -> LightPairs:
+    """Return which lights are the same: kind, temperature, codes and name, whatever their numbers.
+
+    Where a table has a light more than once, the first of it is that of the other's first, and so on.
+    """
+    there: dict[object, list[int]] = {}
+    for light in reversed(other):
+        there.setdefault(_key(light), []).append(light.index)
+    pairs: list[tuple[int, int]] = []
+    alone: list[int] = []
+    for light in one:
+        found = there.get(_key(light))
+        if found:
+            pairs.append((light.index, found.pop()))
+        else:
+            alone.append(light.index)
+    left = sorted(index for found in there.values() for index in found)
+    return LightPairs(tuple(i for i, _ in pairs), tuple(j for _, j in pairs), tuple(alone), tuple(left))
+
+
+def require_one_chart(one: Lut, other: Lut) -> None:
+    """Refuse two tables of different charts: a colour then means another place, and nothing can be compared."""
+    differs = chart_difference(one, other)
+    if differs:
+        raise FormatError(
+            f"{one.folder} and {other.folder} are of different charts ({differs}), so that their cells cannot be "
+            "compared; name two tables or sessions of one chart.json"
+        )
+
+
+def require_common_lights(pairs: LightPairs, one: Lut, other: Lut) -> None:
+    """Refuse two tables without a light in common."""
+    if not pairs.one:
+        raise FormatError(
+            f"{one.folder} has {counted(len(one.illuminations), 'light')} and {other.folder} "
+            f"{len(other.illuminations)}, none of them the same: expected at least one of the same kind and codes"
+        )
+
+
+def warnings_of(one: Lut, other: Lut, pairs: LightPairs) -> tuple[str, ...]:
+    """Return what a reader of the comparison must know of the two tables, a sentence each."""
+    ours, theirs = one.provenance, other.provenance
+    found: list[str] = []
+    if ours.camera != theirs.camera:
+        found.append(
+            f"two cameras, {ours.camera} and {theirs.camera}: what differs is first of all the cameras, not the lab"
+        )
+    if pairs.only_one or pairs.only_other:
+        found.append(
+            f"{len(pairs.one)} lights are compared, which both have; {len(pairs.only_one)} of the first and "
+            f"{len(pairs.only_other)} of the second are not in the other"
+        )
+    if (ours.computed is None) != (theirs.computed is None):
+        found.append("one of the tables was computed, and nothing was photographed for it")
+    if ours.session_sha256 == theirs.session_sha256 and ours.computed is None:
+        found.append("both tables are of the same frames: their noise is the same, and agreement shows nothing")
+    if one.samples.shape[2] != other.samples.shape[2]:
+        found.append(
+            f"{one.samples.shape[2]} samples a cell against {other.samples.shape[2]}: the larger window takes in more "
+            "of a cell's rim"
+        )
+    return tuple(found)
+
+
+def _key(light: Illumination) -> object:
+    return light.kind, light.cct_k, light.codes, light.name
+
+
+def answers_of(lights: LightDifferences, cells: CellDifferences) -> tuple[NoiseAnswer, ...]:
+    """Return whether the lights' colour, their brightness, and the cells are the same within noise."""
+    return _colour(lights), _brightness(lights), _cells(lights, cells)
+
+
+def differing_lights(lights: LightDifferences) -> npt.NDArray[np.int64]:
+    """Return (K,) int64 the places, among the compared lights, of those whose colour differs; the worst first."""
+    beyond = np.flatnonzero((lights.angle_score > _most_score(len(lights.one))) & (lights.angle_deg > ANGLE_FLOOR_DEG))
+    return beyond[np.argsort(-lights.angle_deg[beyond])]
+
+
+def differing_cells(cells: CellDifferences) -> npt.NDArray[np.int64]:
+    """Return (K,) int64 the colours whose mean over the lights differs from that of the others; the worst first."""
+    with np.errstate(invalid="ignore"):
+        off = np.abs(cells.mean - cells.offset)
+        beyond = np.flatnonzero(((off > CELL_SIGMAS * cells.noise) & (off > CELL_FLOOR)).any(axis=1))
+    return beyond[np.argsort(-np.nanmax(off[beyond], axis=1))] if len(beyond) else beyond
+
+
+def _most_score(count: int) -> float:
+    """Return the score that noise alone exceeds in any of `count` lights with `CHANCE`: χ² of two freedoms."""
+    return ERROR_OF_ERRORS * float(np.sqrt(np.log(count / CHANCE)))
+
+
+def _colour(lights: LightDifferences) -> NoiseAnswer:
+    angle, noise = lights.angle_deg, lights.angle_noise_deg
+    worst = int(angle.argmax())
+    said = f"median {np.median(angle):.4f}°, worst {angle[worst]:.4f}° (light {lights.one[worst]})"
+    if not np.isfinite(lights.angle_score).any():
+        return NoiseAnswer("colour of lights", None, f"{said}; what noise alone gives is not known of these tables")
+    beyond = differing_lights(lights)
+    said += f"; noise alone gives {np.nanmedian(noise):.4f}° RMS under the median light"
+    if len(beyond):
+        said += f"; {len(beyond)} of {len(angle)} lights are beyond it: {first_of(lights.one[beyond].tolist())}"
+    return NoiseAnswer("colour of lights", not len(beyond), said)
+
+
+def _brightness(lights: LightDifferences) -> NoiseAnswer:
+    off, left, noise = lights.brightness, lights.brightness_left, lights.brightness_noise
+    said = (
+        f"{100 * float(np.median(off)):+.3f} % on the median, {100 * off.min():+.3f} to {100 * off.max():+.3f} %; "
+        f"without the recorded drift and that median {100 * float(np.sqrt((left**2).mean())):.3f} % RMS, "
+        f"{100 * np.abs(left).max():.3f} % at most"
+    )
+    if not np.isfinite(noise).any():
+        return NoiseAnswer("brightness of lights", None, f"{said}; what noise alone gives is not known of these tables")
+    # Two-sided and of one freedom, so bounded by the same tail as two.
+    limit = np.maximum(_most_score(len(off)) * np.sqrt(2) * noise, BRIGHTNESS_FLOOR)
+    beyond = int((np.abs(off) > limit).sum())
+    said += f"; noise alone gives {100 * float(np.nanmedian(noise)):.3f} %"
+    if beyond:
+        still = int((np.abs(left) > limit).sum())
+        said += f"; {beyond} of {len(off)} lights are beyond it, {still} without drift and median"
+    return NoiseAnswer("brightness of lights", not beyond, said)
+
+
+def _cells(lights: LightDifferences, cells: CellDifferences) -> NoiseAnswer:
+    if not np.isfinite(cells.score):
+        return NoiseAnswer("cells", None, "no cell is bright enough in both tables")
+    named = differing_cells(cells)
+    uneven = np.flatnonzero(lights.cell_score > LIGHT_SCORE)
+    said = (
+        f"{100 * cells.rms:.3f} % RMS of cells above 300 counts, of which noise explains "
+        f"{100 * cells.predicted_rms:.3f} % and leaves {100 * cells.beyond_noise:.3f} %; "
+        f"{cells.score:.3f} in units of noise"
+    )
+    if len(uneven):
+        order = uneven[np.argsort(-lights.cell_score[uneven])]
+        said += f"; {len(uneven)} lights are beyond {LIGHT_SCORE:g}: {first_of(lights.one[order].tolist())}"
+    if len(named):
+        said += f"; {len(named)} cells differ under all lights: {first_of(named.tolist())}"
+    return NoiseAnswer("cells", cells.score <= CELL_SCORE and not len(uneven) and not len(named), said)
+
+
+def geometry_difference(one: _Array, other: _Array) -> GeometryDifference:
+    """Return the similarity that takes places to others best, in least squares.
+
+    The closed solution with complex numbers, of which scale and turn are one; places are x + iy, y down.
+
+    `one`, `other`: (N, 2) float64 half-size px, N at least 2: the same points of the print in two frames.
+    """
+    first, second = (places[:, 0] + 1j * places[:, 1] for places in (one, other))
+    middle, after = first.mean(), second.mean()
+    about = first - middle
+    factor = (np.conj(about) @ (second - after)) / (np.conj(about) @ about)
+    left = second - after - factor * about
+    shift = after - middle
+    return GeometryDifference(
+        shift_px=(float(shift.real), float(shift.imag)),
+        turned_deg=float(np.degrees(np.angle(factor))),
+        scale=float(np.abs(factor)) - 1,
+        bent_px=float(np.sqrt((np.abs(left) ** 2).mean())),
+    )
+
+
+@contextmanager
+def table_of(place: Path, options: BuildOptions, progress: ReportBuild | None = None) -> Generator[Lut]:
+    """Yield the table of a table's folder as it is, or of a session's, which is built as `build-lut` builds it.
+
+    The table of a session lies in a hidden folder beside the session until the end: it needs 3.5 GB of 707 lights.
+    """
+    if not (place / JOURNAL_FILE).is_file():
+        yield open_lut(place)
+        return
+    try:
+        scratch = tempfile.TemporaryDirectory(prefix=f".{place.name}.compared.", dir=place.resolve().parent)
+    except OSError as error:
+        raise storage_error(place.parent, error) from error
+    with scratch as folder, Session.open(place) as session:
+        table = Path(folder) / "table"
+        build(session, table, progress, _write_figures, options)
+        yield open_lut(table)
+
+
+def chart_of(places: Sequence[Path]) -> Chart | None:
+    """Return the chart of the first session among the places; None where all are tables, which do not hold it."""
+    found = (place / CHART_FILE for place in places if (place / JOURNAL_FILE).is_file())
+    return next((load_chart(path) for path in found if path.is_file()), None)
+
+
+def _write_figures(result: BuildResult, session: Session, folder: Path) -> None:
+    """Write the figures of a table without its pictures, which nobody sees."""
+    write_whole(folder / REPORT_JSON, json.dumps(report_json(result)) + "\n")
 
 
 def compare(
@@ -125,8 +540,6 @@ def _compare_light(
     one: Lut, other: Lut, light: int, counterpart: int, usable: npt.NDArray[np.bool_], widening: float
 ) -> _CellsOfALight:
     """Return what differs of the cells of one light, each mean over its own table's white."""
-    from calibration.comparison.kernels import moments
-
     relative: list[_Array] = []
     variance: list[_Array] = []
     bright = np.broadcast_to(usable[:, None], (len(usable), 3)).copy()

@@ -30,7 +30,7 @@ from calibration.registration.register import (
     MIN_AGREEMENT,
     MIN_GOOD_BLOCKS,
 )
-from calibration.sampling.windows import SAFE_BLEED, bleed, largest_window
+from calibration.sampling import SAFE_BLEED, bleed, largest_window
 from calibration.spread.fitting import MOST_MISFIT
 from experiment.framing.finding import MIN_TAG_SHARE
 from experiment.framing.sharpness import MIN_CELL_PX

@@ -63,7 +63,7 @@ _UNFIT_REMEDIES = {
     "misplaced": "hang the print flatter",
     "uneven": "focus on the print and keep the camera still",
 }
-"""What helps against each cause of unfit cells (`calibration.pipeline.cell_statistics`)."""
+"""What helps against each cause of unfit cells (`calibration.pipeline.accumulator`)."""
 
 _SAME_EXPOSURE = "keep one exposure and ISO speed for the session, and take these frames again"
 

@@ -2,7 +2,15 @@
 
 The shape of its light is the base of all others', and its cells are what those of every frame are compared with; the
 frames of the primaries show how the field of a coloured cell differs from that of paper. A baseline does not change, so
-threads share it.
+threads share it. Here, too, is what a user may choose about how a table is built (`BuildOptions`), and where the chart
+lies from a frame in which it was registered until it moves too far from there (`RegisteredFrame`).
+
+Rules that hold inside:
+
+- Cells are in the order of colour indices, as in the table, and not in the chart's own order.
+- References follow the cells, the white ones before the grey ones.
+
+C cells, W white references, N grey references; places on the print in millimetres, in frames in half-size pixels.
 """
 
 from __future__ import annotations
@@ -15,14 +23,12 @@ import numpy.typing as npt
 
 from calibration.checks.frame_consistency import ConsistencyCheck
 from calibration.pipeline.frames import DecodedFrame
-from calibration.pipeline.options import PAPER_OPTIONS, BuildOptions
-from calibration.pipeline.registered_frame import ChartPoints, RegisteredFrame, register_frame
-from calibration.radiometry.cell_field import field_of_cells
-from calibration.radiometry.dark_subtraction import DarkLightEstimator, reflectances
+from calibration.radiometry.dark_frames import DarkLightEstimate, reflectances
+from calibration.radiometry.greys import GreyLevels
 from calibration.radiometry.photon_transfer import PhotonTransfer, photon_transfer
 from calibration.radiometry.primaries import Primaries
-from calibration.registration.registration import Registration
-from calibration.sampling.samples import Sites, gather, gather_means
+from calibration.registration.register import Registration, register
+from calibration.sampling import WINDOW, WINDOWS, Sites, gather, gather_means, sites_at
 from calibration.spread.correction import (
     FrameCorrection,
     LensCorrection,
@@ -32,16 +38,208 @@ from calibration.spread.correction import (
     measure_spread,
 )
 from calibration.spread.fitting import LEAST_COUNTS, LOOSE_UNEVENNESS, USUAL_UNEVENNESS
-from calibration.spread.printed_grid import printed_grid, unsuitable
-from calibration.spread.surroundings import FrameLevels, photosite_offsets_px
+from calibration.spread.surroundings import FrameLevels, photosite_offsets_px, printed_grid, unsuitable
 from drivers.raw.rawfile import Area, Mosaic
 from experiment.chart.model import Chart
+from experiment.config import CitationSettings
+from experiment.framing.field import Corners
 from experiment.framing.movement import STILL_PX, Shift, gauges_of, shift_between
-from experiment.framing.planes import CLIPPING_SHARE, Channel
-from experiment.measures.paper import MAX_ORDER, MAX_ORDER_AROUND, PaperReader
-from foundation.errors import FormatError
+from experiment.framing.planes import CHANNELS, CLIPPING_SHARE, Channel, Plane
+from experiment.measures.least_squares import code_polynomial, code_powers, least_squares, page_polynomial
+from experiment.measures.paper import MAX_ORDER, MAX_ORDER_AROUND, FlatField, PaperReader
+from foundation.errors import FormatError, InputError
+from foundation.robust import huber_weights, sigma_of
 
 _Array = npt.NDArray[np.float64]
+
+CODE_DEGREE = 8
+"""Of the polynomial in the codes, where there are cells enough: describes inks to a fraction of a per cent."""
+
+LIGHT_ORDER = 4
+"""Of the polynomial over the page, where there are cells enough."""
+
+_LEAST_CELLS_A_TERM = 5
+"""Cells for each term of the polynomial in the codes; with fewer its degree is lowered."""
+
+_LEAST_COUNTS = 10.0
+"""Counts above black below which a cell's logarithm is mostly noise."""
+
+_EVEN_COUNTS = 300.0
+"""Counts from which on a cell weighs no more by being brighter: the polynomial's own error exceeds the noise."""
+
+_PAPER_WORTH = 10.0
+"""Cells that a white reference counts for: its colour needs no polynomial."""
+
+_ROUNDS = 5
+"""Reweighted solutions in a row; Huber's weights, squared, have settled by then."""
+
+
+@dataclass(frozen=True)
+class BuildOptions:
+    """How a table is built; by default 25 samples, the paper's, from which black and the lens's spread are subtracted.
+
+    - `window`: pixels along the side of a cell's window: one of `calibration.sampling.WINDOWS`.
+    - `subtract_dark`: whether the light of the dark frames is subtracted from samples and ground truth.
+    - `corners`: four corners (x, y) of the field of cells in the frame that is registered first, half-size px,
+      clockwise from the printed top-left, for a chart without tags; None to have it found.
+    - `correct_drift`: whether the lamp's drift between white frames is taken out of samples and ground truth at the
+      end.
+    - `lens_correction`: whether what the lens spreads beside its sharp core is subtracted from samples and ground
+      truth, where the print proves that it does.
+    - `citation`: what the lab states of the table's origin; None for what the session's settings state. No sample
+      depends on it.
+    """
+
+    window: int = WINDOW
+    subtract_dark: bool = False
+    corners: Corners | None = None
+    correct_drift: bool = False
+    lens_correction: bool = True
+    citation: CitationSettings | None = None
+
+    def __post_init__(self) -> None:
+        if self.window not in WINDOWS:
+            raise InputError(
+                f"a window of {self.window} pixels was asked for; {', '.join(map(str, WINDOWS[:-1]))} or {WINDOWS[-1]} "
+                "expected: a window has a middle pixel, and cells are about 10 pixels wide"
+            )
+
+    @property
+    def samples(self) -> int:
+        """Samples of each cell."""
+        return self.window**2
+
+
+PAPER_OPTIONS = BuildOptions()
+"""The paper's options, which hold where none are given."""
+
+
+@dataclass(frozen=True, eq=False)
+class ChartPoints:
+    """The points of a chart that are sampled.
+
+    - `cells_mm`: (C, 2) float64 mm, centres of the cells in the order of colour indices.
+    - `whites_mm`, `greys_mm`: (W, 2) and (N, 2) float64 mm, centres of the white and of the grey references.
+    - `levels`: the level of each grey reference.
+    """
+
+    cells_mm: _Array
+    whites_mm: _Array
+    greys_mm: _Array
+    levels: GreyLevels
+
+    @staticmethod
+    def of(chart: Chart) -> ChartPoints:
+        """Return the points of a chart."""
+        whites = [reference for reference in chart.references if reference.is_white]
+        greys = [reference for reference in chart.references if not reference.is_white]
+        whites_mm, greys_mm = (
+            np.array([reference.centre_mm for reference in references]).reshape(-1, 2) for references in (whites, greys)
+        )
+        return ChartPoints(chart.centres_mm[chart.cell_of_colour], whites_mm, greys_mm, GreyLevels.of(greys))
+
+    @property
+    def references_mm(self) -> _Array:
+        """(W + N, 2) float64 mm, centres of the references."""
+        return np.concatenate([self.whites_mm, self.greys_mm])
+
+
+@dataclass(frozen=True, eq=False)
+class RegisteredFrame:
+    """A frame in which the chart was registered; it holds for those after it until the chart moves too far.
+
+    - `registration`: the chart's place in it.
+    - `cells`: where the C cells are sampled.
+    - `references`: where the W + N references are sampled.
+    - `gauges`: the frame around its tags, or the outline of its field, to measure movements against.
+    - `lens`: corrects frames sampled at these places for what the lens spreads; None where nothing is corrected.
+    """
+
+    file: str
+    registration: Registration
+    cells: Sites
+    references: Sites
+    gauges: dict[Channel, Plane]
+    lens: FrameCorrection | None = None
+
+
+def register_frame(
+    decoded: DecodedFrame, chart: Chart, points: ChartPoints, options: BuildOptions, near: Registration | None = None
+) -> RegisteredFrame:
+    """Return a frame with the chart registered in it."""
+    registration = register(decoded.mosaic, chart, decoded.record.file, options.corners, near)
+    cells, references = sites_of(registration, points, decoded.mosaic.block_planes().shape[2:], options.window)
+    gauges: dict[Channel, Plane] = {
+        channel: gauges_of(decoded.mosaic, channel, decoded.black, registration.framing) for channel in CHANNELS
+    }
+    return RegisteredFrame(decoded.record.file, registration, cells, references, gauges)
+
+
+def sites_of(
+    registration: Registration, points: ChartPoints, shape: tuple[int, ...], window: int
+) -> tuple[Sites, Sites]:
+    """Return the sites of the cells and of the references.
+
+    `shape` is rows and columns of the half-size frame, `window` the pixels along a window's side.
+    """
+    height, width = shape
+    cells, references = (
+        sites_at(registration.to_pixels(places), (height, width), window)
+        for places in (points.cells_mm, points.references_mm)
+    )
+    return cells, references
+
+
+def field_of_cells(
+    rgb: npt.ArrayLike,
+    cells_mm: _Array,
+    level: _Array,
+    usable: npt.NDArray[np.bool_],
+    paper_mm: _Array,
+    paper: _Array,
+    page_mm: tuple[float, float],
+) -> FlatField:
+    """Return the field of a frame from its cells.
+
+    `rgb`: (C, 3) int printed codes, 0 … 255. `cells_mm`: (C, 2) float64 mm, the cells' centres. `level`: (C, 3) float64
+    mean counts above black. `usable`: (C,) bool, cells that lie in the frame and are not covered. `paper_mm`, `paper`:
+    (N, 2) mm, white references, and (N, 3) their mean counts above black; NaN where one cannot be used.
+    """
+    degree = CODE_DEGREE
+    while degree > 1 and len(cells_mm) < _LEAST_CELLS_A_TERM * len(code_powers(degree)):
+        degree -= 1
+    # In few blocks of few cells a light of higher order cannot be separated from the inks' interaction.
+    order = LIGHT_ORDER if degree == CODE_DEGREE else min(2, degree)
+    codes = code_polynomial(rgb, degree)
+    light, at_paper = page_polynomial(cells_mm, page_mm, order), page_polynomial(paper_mm, page_mm, order)
+    # Light's constant is the colours' too; bare paper need not be what ink of code 255 is.
+    design = np.block(
+        [
+            [codes, light[:, 1:], np.zeros((len(codes), 1))],
+            [np.zeros((len(paper), codes.shape[1])), at_paper[:, 1:], np.ones((len(paper), 1))],
+        ]
+    )
+    factors: list[tuple[_Array, ...]] = []
+    for channel in range(3):
+        seen = np.concatenate([level[:, channel], paper[:, channel]])
+        there = np.concatenate([usable, np.ones(len(paper), dtype=np.bool_)]) & (np.nan_to_num(seen) > _LEAST_COUNTS)
+        if there.sum() < 2 * design.shape[1]:
+            factors.append(())
+            continue
+        value, rows = np.log(seen[there]), np.ascontiguousarray(design[there])
+        trust = seen[there] / (seen[there] + _EVEN_COUNTS)
+        trust *= np.where(np.arange(len(seen))[there] < len(codes), 1.0, _PAPER_WORTH)
+        weights, solution = trust, np.zeros(design.shape[1])
+        for _ in range(_ROUNDS):
+            solution = least_squares(rows, value, weights)
+            off = np.abs(value - rows @ solution)
+            spread = max(sigma_of(off), 1e-6)
+            weights = trust * huber_weights(off, spread) ** 2
+        shape = np.exp(light[:, 1:] @ solution[codes.shape[1] : -1])
+        smooth = least_squares(np.ascontiguousarray(light), shape, np.ones(len(shape)))
+        factors.append((smooth / float((light @ smooth).mean()),))
+    red, green, blue = factors
+    return FlatField(page_mm, (red, green, blue))
 
 
 @dataclass(frozen=True)
@@ -67,7 +265,7 @@ class Baseline:
 
     - `chart`, `points`: the chart, and its points: C cells, W white and N grey references.
     - `options`: how the table is built.
-    - `layout`: the sensor's, the same in all frames.
+    - `camera`, `layout`: maker and model, and the sensor's layout, the same in all frames.
     - `first`: the frame that is registered first.
     - `whites`: (W, 3) float64 counts above black of its white references; NaN where one cannot be used.
     - `means`: (C + W + N, 3) float64 counts above black of its cells and references.
@@ -81,6 +279,7 @@ class Baseline:
     chart: Chart
     points: ChartPoints
     options: BuildOptions
+    camera: str
     layout: SensorLayout
     first: RegisteredFrame
     whites: _Array
@@ -141,12 +340,12 @@ class Baseline:
             peaks.append(highest)
         return np.concatenate(means), np.concatenate(peaks)
 
-    def dark_light_estimator(self) -> DarkLightEstimator:
+    def dark_light_estimate(self) -> DarkLightEstimate:
         """Return the estimate of the dark light before any dark frame, with the reflectances of the first frame."""
         paper, shape = self.paper.read(self.whites, self.first.file)
         field = np.concatenate([shape, paper.field.at(self.points.references_mm)])
         inside = np.concatenate([self.first.cells.inside, self.first.references.inside])
-        return DarkLightEstimator(reflectances(self.means, field, paper.white), inside, self.options.samples)
+        return DarkLightEstimate.none(reflectances(self.means, field, paper.white), inside, self.options.samples)
 
 
 def baseline_of(chart: Chart, first: DecodedFrame, options: BuildOptions = PAPER_OPTIONS) -> Baseline:
@@ -274,6 +473,7 @@ def _baseline(
         chart=chart,
         points=points,
         options=options,
+        camera=first.mosaic.camera,
         layout=SensorLayout.of(first.mosaic),
         first=registered,
         whites=whites,

@@ -3,9 +3,12 @@
 Rules that hold inside:
 
 - A session that lacks a light makes no table.
-- The table appears whole or not at all. Until then it is made under a hidden name (`calibration.pipeline.checkpoint`),
-  and a build that was stopped, anywhere, goes on from its last checkpoint and ends in the bytes of one that was not:
-  frames enter in the order taken, and what one adds depends on those before it alone.
+- The table appears whole or not at all. Until then it stands beside its place under a hidden name, and a build that was
+  stopped, anywhere, goes on from its last checkpoint and ends in the bytes of one that was not: frames enter in the
+  order taken, and what one adds depends on those before it alone.
+- A checkpoint is one file, replaced whole: the accumulator, and the hashes of the samples on the disk. It is used only
+  if it was made of what is asked for now, and if the samples have these hashes; otherwise the work begins anew.
+- One program makes a table at a time.
 
 Threads read, decode and measure frames before their turn, each with what holds at that moment; where that has changed
 by the time a frame is taken in, it is measured again. The memory is that of a few frames whatever the session.
@@ -13,20 +16,28 @@ by the time a frame is taken in, it is measured again. The memory is that of a f
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
+import io
 import json
-from collections.abc import Callable, Sequence
+import shutil
+import zipfile
+from collections import deque
+from collections.abc import Callable, Generator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
+import numpy.typing as npt
 
 from calibration.figures.all_figures import FIGURES
 from calibration.figures.figure import Figure
 from calibration.measurements import LinearityMeasurements, TableMeasurements
-from calibration.pipeline.baseline import baseline_of, with_lens, with_primaries
-from calibration.pipeline.checkpoint import Checkpoint, UnfinishedTable, unfinished_table
+from calibration.pipeline.accumulator import Accumulator, EarlyMeasurement
+from calibration.pipeline.baseline import PAPER_OPTIONS, BuildOptions, baseline_of, with_lens, with_primaries
 from calibration.pipeline.collecting import check_figures, table_figures
 from calibration.pipeline.frames import (
     ChangedFrame,
@@ -34,10 +45,8 @@ from calibration.pipeline.frames import (
     SelectedFrames,
     decode_frame,
     select_frames,
-    session_sha256,
     source_frames,
 )
-from calibration.pipeline.intake import EarlyMeasurement, Intake, IntakeState
 from calibration.pipeline.linearity import read_linearity
 from calibration.pipeline.measuring import (
     MeasuredFrame,
@@ -45,13 +54,18 @@ from calibration.pipeline.measuring import (
     measure_registered_frame,
     sample_dark_frame,
 )
-from calibration.pipeline.options import PAPER_OPTIONS, BuildOptions
-from calibration.pipeline.prefetching import prefetched
-from calibration.radiometry.corrections import applied_drift, corrections
-from calibration.radiometry.drift import LEAST_WHITES, DriftCorrection, corrected
+from calibration.radiometry.drift import LEAST_WHITES, applied_drift, corrected, corrections
 from calibration.radiometry.greys import references_csv
-from calibration.table.file_names import REFERENCES, REPORT_FORMAT, REPORT_JSON, REPORT_PAGE, REPORT_VERSION, SAMPLES
-from calibration.table.provenance import Provenance
+from calibration.table.lut import (
+    REFERENCES,
+    REPORT_FORMAT,
+    REPORT_JSON,
+    REPORT_PAGE,
+    REPORT_VERSION,
+    SAMPLES,
+    Provenance,
+    frames_sha256,
+)
 from calibration.table.writer import LutWriter
 from calibration.verdict import COMMAND, BuildResult, judge, judged_values, refusal, retake_json
 from experiment.framing.movement import Shift
@@ -59,7 +73,10 @@ from experiment.framing.pictures import annotated_png
 from experiment.session.folder import Session
 from experiment.session.records import FrameRecord
 from foundation.errors import FormatError, QualityError, RegistrationError, counted, first_of
-from foundation.files import write_whole
+from foundation.files import partial_path, publish_folder, require_free, storage_error, sync_folder, write_whole
+from foundation.held_folders import LOCK_FILE, held_folder
+from foundation.processors import processor_count
+from foundation.records import to_plain
 from foundation.version import software
 
 REPORT_FILES = (REPORT_PAGE, REPORT_JSON)
@@ -71,8 +88,19 @@ CHECKPOINT_EVERY = 16
 METHOD = 12
 """Raised when samples, ground truth or unfit cells come out otherwise, so that no table is made by two methods."""
 
-_IN_PLACE = Shift(0.0, 0.0, 0.0, 0)
-"""The movement of the frame in which the chart is registered first."""
+CHECKPOINT_FORM = 2
+"""Raised when a checkpoint stores other names, so that one of older software is not gone on from."""
+
+CHECKPOINT = "checkpoint.npz"
+"""Name of the checkpoint in the hidden folder."""
+
+_TEXT = "text"
+"""Name of the array that holds all that is no array, as JSON."""
+
+MOST_THREADS = 8
+"""Each thread holds a raw file and its counts, 110 MB for a 6D Mark II: more would not stay below 2 GB."""
+
+_Result = TypeVar("_Result")
 
 WriteReport = Callable[[BuildResult, Session, Path], None]
 """Writes the report of a result and its session into a folder; `calibration.report.report.write_report`."""
@@ -111,9 +139,25 @@ def build(
         )
     _require_dark_frames(session, options)
     _require_white_frames(selected, session, options)
+    show = progress or _no_progress
     with unfinished_table(out) as unfinished:
-        job = _Job(session, selected, options, linearity, out, unfinished, progress or _no_progress)
-        return _finish(job, _take_in_all(job, job.checkpoint()), out, report, judged_by)
+        done, writer, series = _take_in_all(session, selected, options, linearity, unfinished, show)
+        show(len(done.figures), len(done.figures), "writing the report")
+        figures = table_figures(done, series)
+        result = BuildResult(figures, judge(judged_values(figures), judged_by), out)
+        if figures.lights.drift is not None and not result.verdict.refused:
+            # A build that is killed meanwhile finds other samples than its checkpoint names, and begins anew.
+            for light, gain in enumerate(figures.lights.drift.gains):
+                writer.put(light, corrected(writer.get(light), gain))
+        # The table lists the hashes of its report.
+        if report is not None:
+            report(result, session, unfinished.folder)
+        _write_table(done, figures, writer)
+        if result.verdict.refused:
+            unfinished.discard()
+            raise _refused(result, out, unfinished.folder)
+        unfinished.publish()
+        return result
 
 
 def append(
@@ -132,17 +176,16 @@ def append(
     """
     selected = select_frames(session)
     # The plan of a session that was put together otherwise may be empty; its lights are the plan then.
-    complete = not selected.lights_without and {step.number for step in session.steps} <= session.done_steps()
+    if not selected.lights_without and {step.number for step in session.steps} <= session.done_steps():
+        return build(session, out, progress, report, options, linearity, judged_by)
     _require_dark_frames(session, options)
     with unfinished_table(out) as unfinished:
-        job = _Job(session, selected, options, linearity, out, unfinished, progress or _no_progress)
-        checkpoint = job.checkpoint()
-        if complete:
-            _require_white_frames(selected, session, options)
-            return _finish(job, _take_in_all(job, checkpoint), out, report, judged_by)
-        frames, before = len(selected.records), 0 if checkpoint is None else len(checkpoint.frames)
+        stored = unfinished.load(_identity(session, selected, options), _frame_keys(selected))
+        frames, before = len(selected.records), 0 if stored is None else len(stored.frames)
         if before < frames:
-            job.save(_take_in_all(job, checkpoint))
+            show = progress or _no_progress
+            done, writer, _ = _take_in_all(session, selected, options, linearity, unfinished, show)
+            unfinished.save(_checkpoint(done, writer))
         lights = len(session.illuminations)
         return TableProgress(lights - len(selected.lights_without), lights, frames - before, frames)
 
@@ -170,173 +213,109 @@ def check(
         raise RegistrationError(f"{error}; see {picture}") from error
     if picture is not None:
         write_whole(picture, annotated_png(first.mosaic, session.chart, baseline.first.registration.framing))
-    intake = Intake(session, selected, baseline)
-    measured = measure_registered_frame(baseline, first, baseline.first, _IN_PLACE, keep_samples=True)
-    taken = intake.with_frame(measured, intake.before_all_frames(first.saturation))
+    in_place = Shift(0.0, 0.0, 0.0, 0)
+    measured = measure_registered_frame(baseline, first, baseline.first, in_place, keep_samples=True)
+    done = Accumulator.empty(session, selected, baseline, first.saturation).with_frame(measured)
     dark = next((record for record in selected.records if record.kind == "dark"), None)
     if dark is not None:
-        taken = intake.with_dark_frame(sample_dark_frame(baseline, decode_frame(session, dark), baseline.first), taken)
+        done = done.with_dark_frame(sample_dark_frame(baseline, decode_frame(session, dark), baseline.first))
     series = None if linearity is None else read_linearity(linearity, baseline)
-    figures = check_figures(intake, taken, first.mosaic.camera, series)
+    figures = check_figures(done, series)
     return BuildResult(figures, judge(judged_values(figures), judged_by), None)
 
 
-@dataclass(frozen=True, eq=False)
-class _Job:
-    """A build as it was asked for: which frames, how, and where the table is made."""
+def _take_in_all(
+    session: Session,
+    selected: SelectedFrames,
+    options: BuildOptions,
+    linearity: Path | None,
+    unfinished: UnfinishedTable,
+    progress: ReportProgress,
+) -> tuple[Accumulator, LutWriter, LinearityMeasurements | None]:
+    """Return what all frames give, after taking in those that an earlier program has not, with their samples written.
 
-    session: Session
-    selected: SelectedFrames
-    options: BuildOptions
-    linearity: Path | None
-    out: Path
-    unfinished: UnfinishedTable
-    progress: ReportProgress
-
-    @property
-    def identity(self) -> dict[str, Any]:
-        """What the samples depend on besides the frames taken in."""
-        return {
-            "software": software(),
-            "method": METHOD,
-            # The drift is taken out of the finished samples.
-            "options": {name: value for name, value in self.options.to_json().items() if name != "correct_drift"},
-            "chart": self.session.chart.sha256,
-            "lights": hashlib.sha256(repr(self.session.illuminations).encode()).hexdigest(),
-            "registered": self.selected.registered.sha256,
-            "primaries": [record.sha256 for record in self.selected.primaries],
-        }
-
-    @property
-    def keys(self) -> list[str]:
-        """What names each frame in a checkpoint."""
-        return [f"{record.kind},{record.illumination},{record.sha256}" for record in self.selected.records]
-
-    def checkpoint(self) -> Checkpoint | None:
-        """Return how far an earlier program came with the same job."""
-        found = self.unfinished.load()
-        if found is None or not found.fits(self.identity, self.keys):
-            return None
-        return found if (self.unfinished.folder / SAMPLES).is_file() else None
-
-    def writer(self, checkpoint: Checkpoint | None) -> tuple[LutWriter, Checkpoint | None]:
-        """Return the writer of the samples, and the checkpoint if the samples on the disk are those that it names."""
-        folder, lights = self.unfinished.folder, len(self.session.illuminations)
-        shape = lights, self.session.chart.colour_count, self.options.samples
-        if checkpoint is not None:
-            written = {int(light): sha256 for light, sha256 in checkpoint.values["sha256"].items()}
-            writer = LutWriter(folder, *shape, written=written)
-            if not writer.damaged():
-                return writer, checkpoint
-        self.unfinished.begin_anew()
-        return LutWriter(folder, *shape), None
-
-    def save(self, work: _BuildState) -> None:
-        """Write a checkpoint: a later program goes on from here."""
-        taken = work.taken
-        values = taken.to_json() | {"sha256": work.writer.sha256}
-        self.unfinished.save(Checkpoint(self.identity, self.keys[: len(taken.figures)], values, taken.to_arrays()))
-
-
-@dataclass(frozen=True, eq=False)
-class _BuildState:
-    """How far a build has come: the frames taken in, and their samples on the disk."""
-
-    intake: Intake
-    taken: IntakeState
-    writer: LutWriter
-    camera: str
-    linearity: LinearityMeasurements | None
-
-
-def _take_in_all(job: _Job, checkpoint: Checkpoint | None) -> _BuildState:
-    """Return the state with every frame taken in, after measuring those that were not yet."""
-    records = job.selected.records
-    writer, checkpoint = job.writer(checkpoint)
-    job.progress(0, len(records), "finding the chart")
-    work = _begin(job, checkpoint, writer)
-    intake, taken = work.intake, work.taken
-    before = len(taken.figures)
+    With them what a series of exposures shows, which is read first: it may be none.
+    """
+    records = selected.records
+    stored = unfinished.load(_identity(session, selected, options), _frame_keys(selected))
+    writer, stored = _writer(session, options, unfinished, stored)
+    progress(0, len(records), "finding the chart")
+    done = _begin(session, selected, options)
+    series = None if linearity is None else read_linearity(linearity, done.baseline)
+    if stored is not None:
+        done = done.restored(stored.values, stored.arrays)
+    before = len(done.figures)
 
     def measure_early(record: FrameRecord) -> EarlyMeasurement:
-        # In a thread, with the state as it is at that moment.
-        return intake.measure(record, taken)
+        # In a thread, with what holds at that moment.
+        return done.measure(record)
 
     try:
-        for record, early in prefetched(measure_early, records[before:], intake.others_wait_for):
-            taken, measured = intake.take_in(record, early, taken)
+        for record, early in prefetched(measure_early, records[before:], done.others_wait_for):
+            done, measured = done.with_next(record, early)
             if isinstance(measured, MeasuredFrame) and record.kind == "light" and record.illumination is not None:
                 writer.put(record.illumination, measured.values)
-            if (len(taken.figures) - before) % CHECKPOINT_EVERY == 0:
-                job.save(replace(work, taken=taken))
-            job.progress(len(taken.figures), len(records), record.file)
+            if (len(done.figures) - before) % CHECKPOINT_EVERY == 0:
+                unfinished.save(_checkpoint(done, writer))
+            progress(len(done.figures), len(records), record.file)
     except ChangedFrame:
         raise
     except (FormatError, QualityError) as error:
-        raise _stopped_by(error, records[len(taken.figures)], job) from error
-    return replace(work, taken=taken)
+        raise _stopped_by(error, records[len(done.figures)], done, unfinished.out) from error
+    return done, writer, series
 
 
-def _stopped_by(error: FormatError | QualityError, record: FrameRecord, job: _Job) -> FormatError | QualityError:
+def _begin(session: Session, selected: SelectedFrames, options: BuildOptions) -> Accumulator:
+    """Register the chart, measure lens and primaries, and return what there is before any frame."""
+    first = decode_frame(session, selected.registered)
+    pure = [decode_frame(session, record) for record in selected.primaries]
+    baseline = with_lens(baseline_of(session.chart, first, options), first, pure)
+    # The first frame's counts are not held any longer: it is read again in its turn.
+    return Accumulator.empty(
+        session, selected, with_primaries(baseline, measure_primaries(baseline, pure)), first.saturation
+    )
+
+
+def _stopped_by(
+    error: FormatError | QualityError, record: FrameRecord, done: Accumulator, out: Path
+) -> FormatError | QualityError:
     """Return why the build ends at a frame, after naming it in a report that `acquire run --retake bad` reads."""
     says = {"format": REPORT_FORMAT, "version": REPORT_VERSION, "verdict": "refuse", "reason": str(error)}
-    says |= {"session": job.session.folder.name, **retake_json((record,), record.sha256, job.selected.newest.sha256)}
-    write_whole(refused_folder(job.out) / REPORT_JSON, json.dumps(says, indent=2) + "\n")
+    says |= {"session": done.session.folder.name, **retake_json((record,), record.sha256, done.selected.newest.sha256)}
+    write_whole(refused_folder(out) / REPORT_JSON, json.dumps(says, indent=2) + "\n")
     return type(error)(f"{error}; or take {record.file} again: {COMMAND}")
 
 
-def _begin(job: _Job, checkpoint: Checkpoint | None, writer: LutWriter) -> _BuildState:
-    """Register the chart, and return the state that an earlier program left, or the one before any frame."""
-    session, selected = job.session, job.selected
-    first = decode_frame(session, selected.registered)
-    pure = [decode_frame(session, record) for record in selected.primaries]
-    baseline = with_lens(baseline_of(session.chart, first, job.options), first, pure)
-    primaries = measure_primaries(baseline, pure)
-    intake = Intake(session, selected, with_primaries(baseline, primaries))
-    linearity = None if job.linearity is None else read_linearity(job.linearity, baseline)
-    taken = intake.before_all_frames(first.saturation)
-    if checkpoint is not None:
-        taken = intake.restored(checkpoint.values, checkpoint.arrays, taken)
-    # The first frame's counts are not held any longer: it is read again in its turn.
-    return _BuildState(intake, intake.with_dark_light(taken), writer, first.mosaic.camera, linearity)
+def prefetched(
+    work: Callable[[FrameRecord], _Result],
+    records: Sequence[FrameRecord],
+    others_wait_for: Callable[[FrameRecord], bool],
+) -> Generator[tuple[FrameRecord, _Result]]:
+    """Yield each frame with what `work` returned for it, in order, while threads work on those that follow."""
+    count = thread_count()
+    with ThreadPoolExecutor(count) as pool:
+        begun: deque[tuple[FrameRecord, Future[_Result]]] = deque()
+        todo = deque(records)
+        try:
+            while todo or begun:
+                while todo and len(begun) <= count and not any(others_wait_for(record) for record, _ in begun):
+                    record = todo.popleft()
+                    begun.append((record, pool.submit(work, record)))
+                record, future = begun[0]
+                result = future.result()
+                yield record, result
+                begun.popleft()
+        finally:
+            for _, future in begun:
+                future.cancel()
 
 
-def _finish(
-    job: _Job, work: _BuildState, out: Path, report: WriteReport | None, judged_by: Sequence[Figure]
-) -> BuildResult:
-    """Judge the table, give it its name, and return the result."""
-    unfinished, frames = job.unfinished, len(work.taken.figures)
-    job.progress(frames, frames, "writing the report")
-    figures = table_figures(work.intake, work.taken, work.camera, work.linearity)
-    result = BuildResult(figures, judge(judged_values(figures), judged_by), out)
-    if figures.lights.drift is not None and not result.verdict.refused:
-        _correct_drift(work.writer, figures.lights.drift)
-    # The table lists the hashes of its report.
-    if report is not None:
-        report(result, job.session, unfinished.folder)
-    _write_table(work, figures)
-    if result.verdict.refused:
-        unfinished.discard()
-        raise _refused(result, out, unfinished.folder)
-    unfinished.publish()
-    return result
-
-
-def _correct_drift(writer: LutWriter, drift: DriftCorrection) -> None:
-    """Divide every light's samples by its gains.
-
-    A build that is killed meanwhile finds other samples than its checkpoint names, and begins anew.
-    """
-    for light, gain in enumerate(drift.gains):
-        writer.put(light, corrected(writer.get(light), gain))
-
-
-def _write_table(work: _BuildState, figures: TableMeasurements) -> None:
+def _write_table(done: Accumulator, figures: TableMeasurements, writer: LutWriter) -> None:
     """Write all of the table but its samples, which are there, and its report."""
-    session, records, lights, greys = work.intake.session, work.taken.records, figures.lights, figures.greys
+    session, records, lights, greys = done.session, done.records, figures.lights, figures.greys
     by_light = {frame.record.illumination: frame for frame in figures.frames if frame.record.kind == "light"}
     frames = [by_light[light.index] for light in session.illuminations]
-    done = corrections(
+    applied = corrections(
         session.chart.page_mm,
         np.array([frame.black for frame in frames]),
         figures.sensor.saturation_counts,
@@ -347,20 +326,20 @@ def _write_table(work: _BuildState, figures: TableMeasurements) -> None:
         at_zero=lights.share_at_zero,
     )
     if figures.primaries is not None:
-        done.append(figures.primaries.correction(lights.white))
-    lens = work.intake.baseline.lens
+        applied.append(figures.primaries.correction(lights.white))
+    lens = done.baseline.lens
     if lens is not None and figures.lens.corrected:
-        done.append(lens.correction())
+        applied.append(lens.correction())
     gain = np.ones(lights.white.shape)
     if lights.drift is not None:
         gain = lights.drift.gains
-        done.append(applied_drift(gain))
+        applied.append(applied_drift(gain))
     provenance = Provenance(
-        camera=work.camera,
+        camera=done.baseline.camera,
         bits=session.chart.bits,
         white_level=figures.sensor.white_level,
-        corrections=done,
-        session_sha256=session_sha256(records),
+        corrections=applied,
+        session_sha256=frames_sha256(source_frames(records)),
         chart_sha256=session.chart.sha256,
         software=software(),
         unfit=list(figures.cells.unfit),
@@ -371,7 +350,25 @@ def _write_table(work: _BuildState, figures: TableMeasurements) -> None:
         greys.names, lights.white / gain, lights.white_error / gain, greys.values / per_light, greys.errors / per_light
     )
     files = {REFERENCES: references} if greys.names else {}
-    work.writer.finish(session.illuminations, lights.white / gain, provenance, source_frames(records), files)
+    writer.finish(session.illuminations, lights.white / gain, provenance, source_frames(records), files)
+
+
+def _refused(result: BuildResult, out: Path, folder: Path) -> QualityError:
+    """Return why there is no table; its report is kept beside the place where the table would be."""
+    refused = refused_folder(out)
+    kept = [name for name in REPORT_FILES if (folder / name).exists()]
+    for name in kept:
+        write_whole(refused / name, (folder / name).read_bytes())
+    where = f"; see {refused / kept[0]}" if kept else ""
+    figures = result.figures
+    return QualityError(
+        f"{figures.session.folder}: no table is made. {refusal(result.verdict, figures, reported=bool(kept))}{where}"
+    )
+
+
+def refused_folder(out: Path) -> Path:
+    """Return where the report of a refused table goes: `LUT.refused` beside `LUT`."""
+    return out.with_name(f"{out.name}.refused")
 
 
 def _require_dark_frames(session: Session, options: BuildOptions) -> None:
@@ -398,19 +395,142 @@ def _no_progress(done: int, total: int, what: str) -> None:
     """Show nothing."""
 
 
-def _refused(result: BuildResult, out: Path, folder: Path) -> QualityError:
-    """Return why there is no table; its report is kept beside the place where the table would be."""
-    refused = refused_folder(out)
-    kept = [name for name in REPORT_FILES if (folder / name).exists()]
-    for name in kept:
-        write_whole(refused / name, (folder / name).read_bytes())
-    where = f"; see {refused / kept[0]}" if kept else ""
-    figures = result.figures
-    return QualityError(
-        f"{figures.session.folder}: no table is made. {refusal(result.verdict, figures, reported=bool(kept))}{where}"
-    )
+def thread_count() -> int:
+    """Return how many frames are read and measured at a time: one a processor, as far as memory allows."""
+    return min(processor_count(), MOST_THREADS)
 
 
-def refused_folder(out: Path) -> Path:
-    """Return where the report of a refused table goes: `LUT.refused` beside `LUT`."""
-    return out.with_name(f"{out.name}.refused")
+def _identity(session: Session, selected: SelectedFrames, options: BuildOptions) -> dict[str, Any]:
+    """Return what the samples depend on besides the frames taken in."""
+    return {
+        "software": software(),
+        "method": METHOD,
+        "form": CHECKPOINT_FORM,
+        # The drift is taken out of the finished samples, and no sample depends on the citation.
+        "options": to_plain(replace(options, correct_drift=False, citation=None)),
+        "chart": session.chart.sha256,
+        "lights": hashlib.sha256(repr(session.illuminations).encode()).hexdigest(),
+        "registered": selected.registered.sha256,
+        "primaries": [record.sha256 for record in selected.primaries],
+    }
+
+
+def _frame_keys(selected: SelectedFrames) -> list[str]:
+    """Return what names each frame in a checkpoint."""
+    return [f"{record.kind},{record.illumination},{record.sha256}" for record in selected.records]
+
+
+def _checkpoint(done: Accumulator, writer: LutWriter) -> Checkpoint:
+    """Return what a later program goes on from."""
+    identity = _identity(done.session, done.selected, done.baseline.options)
+    frames = _frame_keys(done.selected)[: len(done.figures)]
+    return Checkpoint(identity, frames, done.to_json() | {"sha256": writer.sha256}, done.to_arrays())
+
+
+def _writer(
+    session: Session, options: BuildOptions, unfinished: UnfinishedTable, stored: Checkpoint | None
+) -> tuple[LutWriter, Checkpoint | None]:
+    """Return the writer of the samples, and the checkpoint if the samples on the disk are those that it names."""
+    shape = len(session.illuminations), session.chart.colour_count, options.samples
+    if stored is not None:
+        written = {int(light): sha256 for light, sha256 in stored.values["sha256"].items()}
+        writer = LutWriter(unfinished.folder, *shape, written=written)
+        if not writer.damaged():
+            return writer, stored
+    unfinished.begin_anew()
+    return LutWriter(unfinished.folder, *shape), None
+
+
+@dataclass(frozen=True, eq=False)
+class Checkpoint:
+    """How far a table has come.
+
+    - `identity`: what it is made of and by what; a build goes on from a checkpoint of the same identity only.
+    - `frames`: what names each frame taken in, in their order.
+    - `values`: anything JSON can hold; numbers are restored to the last bit.
+    - `arrays`: arrays of plain numbers, by name.
+    """
+
+    identity: dict[str, Any]
+    frames: list[str]
+    values: dict[str, Any]
+    arrays: dict[str, npt.NDArray[Any]]
+
+
+class UnfinishedTable:
+    """The hidden folder of a table that is being made; made by `unfinished_table`."""
+
+    def __init__(self, folder: Path, out: Path) -> None:
+        self.folder = folder
+        self.out = out
+        self._keep = True
+
+    def load(self, identity: dict[str, Any], frames: list[str]) -> Checkpoint | None:
+        """Return how far an earlier program came; None where there is no checkpoint, or it was made of something else.
+
+        A build goes on from a checkpoint of the same identity that took in the first of its `frames`.
+        """
+        if not (self.folder / SAMPLES).is_file():
+            return None
+        try:
+            with np.load(self.folder / CHECKPOINT, allow_pickle=False) as stored:
+                arrays: dict[str, npt.NDArray[Any]] = {name: stored[name] for name in stored.files}
+            text = json.loads(arrays.pop(_TEXT).tobytes())
+            found = Checkpoint(text["identity"], text["frames"], text["values"], arrays)
+        except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile):
+            return None
+        began = bool(found.frames) and found.frames == frames[: len(found.frames)]
+        return found if began and found.identity == identity else None
+
+    def save(self, checkpoint: Checkpoint) -> None:
+        """Replace the checkpoint."""
+        content = {"identity": checkpoint.identity, "frames": checkpoint.frames, "values": checkpoint.values}
+        text = np.frombuffer(json.dumps(content).encode(), dtype=np.uint8)
+        stream = io.BytesIO()
+        np.savez(stream, allow_pickle=False, **{**checkpoint.arrays, _TEXT: text})
+        write_whole(self.folder / CHECKPOINT, stream.getvalue())
+
+    def begin_anew(self) -> None:
+        """Empty the folder."""
+        for path in self.folder.iterdir():
+            if path.name == LOCK_FILE:
+                continue
+            if path.is_dir() and not path.is_symlink():
+                shutil.rmtree(path)
+            else:
+                path.unlink()
+
+    def discard(self) -> None:
+        """Leave nothing behind when the block ends, since going on would lead to the same end."""
+        self._keep = False
+
+    def publish(self) -> None:
+        """Give the table its final name."""
+        require_free(self.out, "the table")
+        try:
+            (self.folder / CHECKPOINT).unlink(missing_ok=True)
+            sync_folder(self.folder)
+        except OSError as error:
+            raise storage_error(self.out, error) from error
+        publish_folder(self.folder, self.out, "the table")
+
+    @property
+    def worth_keeping(self) -> bool:
+        """Whether a later program could go on from here."""
+        return self._keep and (self.folder / CHECKPOINT).is_file()
+
+
+@contextmanager
+def unfinished_table(out: Path) -> Generator[UnfinishedTable]:
+    """Open, or make, the hidden folder of the table `out`; what is not published stays if it holds a checkpoint."""
+    require_free(out, "the table")
+    folder = partial_path(out)
+    busy = f"{out} is being made by another program; wait for it, or name another place"
+    with held_folder(folder, busy, of=out):
+        unfinished = UnfinishedTable(folder, out)
+        try:
+            yield unfinished
+        finally:
+            if folder.is_dir() and not unfinished.worth_keeping:
+                with contextlib.suppress(OSError):
+                    shutil.rmtree(folder)

@@ -11,8 +11,7 @@ import numpy.typing as npt
 from calibration.checks.frame_origins import origin_figures
 from calibration.checks.light_codes import CodeAgreement, code_agreement
 from calibration.checks.stray_light import StrayLight, stray_light
-from calibration.citation.serial_numbers import with_told_serials
-from calibration.citation.stated import StatedOrigin, origin_record, stated_origin
+from calibration.citation import origin_record, with_published_serials
 from calibration.measurements import (
     CellMeasurements,
     FrameMeasurements,
@@ -23,13 +22,12 @@ from calibration.measurements import (
     SessionMeasurements,
     TableMeasurements,
 )
+from calibration.pipeline.accumulator import Accumulator
 from calibration.pipeline.baseline import Baseline, lens_figures
-from calibration.pipeline.intake import Intake, IntakeState
+from calibration.pipeline.frames import stated_origin
 from calibration.radiometry.drift import drift_correction
-from calibration.radiometry.primaries import pure_lights
-from calibration.radiometry.projector import additivity, drift_gains
+from calibration.radiometry.primaries import additivity, drift_gains, pure_lights
 from experiment.lights import Illumination
-from experiment.session.folder import Session
 from foundation.colorimetry import angles_deg
 
 _LEAST_WHITE = 1e-3
@@ -44,35 +42,21 @@ _FULL_CODE = 255
 _Array = npt.NDArray[np.float64]
 
 
-def table_figures(
-    intake: Intake, taken: IntakeState, camera: str, linearity: LinearityMeasurements | None
-) -> TableMeasurements:
+def table_figures(done: Accumulator, linearity: LinearityMeasurements | None) -> TableMeasurements:
     """Return the figures of a table, all of whose frames have been taken in.
 
     `linearity`: what a series of exposures shows; None where none was given.
     """
-    baseline, session = intake.baseline, intake.session
-    even = next((frame for frame in taken.frames if intake.selected.is_even(frame.record)), taken.frames[0])
-    lit = {frame.record.illumination: frame for frame in taken.frames if frame.record.kind == "light"}
-    by_light = [lit[light.index] for light in session.illuminations]
-    return _figures(
-        session=_session_figures(session, intake, camera, len(by_light)),
-        baseline=baseline,
-        taken=taken,
-        even=even,
-        lights=_light_figures(intake, taken, by_light),
-        greys=(np.array([frame.greys for frame in by_light]), np.array([frame.grey_errors for frame in by_light])),
-        linearity=linearity,
-        stated=_stated(intake),
-    )
+    even = next((frame for frame in done.frames if done.selected.is_even(frame.record)), done.frames[0])
+    lit = {frame.record.illumination: frame for frame in done.frames if frame.record.kind == "light"}
+    by_light = [lit[light.index] for light in done.session.illuminations]
+    greys = np.array([frame.greys for frame in by_light]), np.array([frame.grey_errors for frame in by_light])
+    return _figures(done, even, len(by_light), _light_figures(done, by_light), greys, linearity)
 
 
-def check_figures(
-    intake: Intake, taken: IntakeState, camera: str, linearity: LinearityMeasurements | None
-) -> TableMeasurements:
+def check_figures(done: Accumulator, linearity: LinearityMeasurements | None) -> TableMeasurements:
     """Return the figures of a check, which has taken in the frame that is registered, and a dark one where there is."""
-    (frame,) = taken.frames
-    with_frame = len(intake.session.illuminations) - len(intake.selected.lights_without)
+    (frame,) = done.frames
     lights = LightMeasurements(
         white=frame.paper.white[None],
         white_error=frame.paper.error[None],
@@ -83,67 +67,53 @@ def check_figures(
         codes=None,
         white_frames=None,
     )
-    return _figures(
-        session=_session_figures(intake.session, intake, camera, with_frame),
-        baseline=intake.baseline,
-        taken=taken,
-        even=frame,
-        lights=lights,
-        greys=(frame.greys[None], frame.grey_errors[None]),
-        linearity=linearity,
-        stated=_stated(intake),
-    )
-
-
-def _stated(intake: Intake) -> StatedOrigin:
-    """Return what session and lab state; what was given for the build stands in place of the session's settings."""
-    stated, given = stated_origin(intake.session), intake.baseline.options.citation
-    return stated if given is None else replace(stated, citation=given)
-
-
-def _session_figures(session: Session, intake: Intake, camera: str, lights: int) -> SessionMeasurements:
-    return SessionMeasurements(
-        folder=session.folder,
-        camera=camera,
-        lights=lights,
-        registered_file=intake.selected.registered.file,
-        white_references=len(session.chart.white_references),
-        codes=tuple(light.codes for light in session.illuminations),
-    )
+    with_frame = len(done.session.illuminations) - len(done.selected.lights_without)
+    return _figures(done, frame, with_frame, lights, (frame.greys[None], frame.grey_errors[None]), linearity)
 
 
 def _figures(
-    session: SessionMeasurements,
-    baseline: Baseline,
-    taken: IntakeState,
+    done: Accumulator,
     even: FrameMeasurements,
+    lights_taken: int,
     lights: LightMeasurements,
     greys: tuple[_Array, _Array],
     linearity: LinearityMeasurements | None,
-    stated: StatedOrigin,
 ) -> TableMeasurements:
-    statistics, saturation = taken.statistics, taken.saturation
-    told = with_told_serials([one.origin for one in taken.figures], stated.citation.camera_serial)
-    stains, dark = statistics.stains(_field_at_cells(baseline, even)), statistics.dark_summary()
-    frames = _without_hot(taken.frames, dark.hottest, stains.places_mm)
+    """Return all figures; `even` is the frame that shows how even cells are."""
+    session, baseline, saturation = done.session, done.baseline, done.saturation
+    stated = stated_origin(session)
+    if baseline.options.citation is not None:
+        # What was given for the build stands in place of the session's settings.
+        stated = replace(stated, citation=baseline.options.citation)
+    origins = [one.origin for one in done.figures]
+    published = with_published_serials(origins, stated.citation.camera_serial)
+    stains, dark = done.stains(_field_at_cells(baseline, even)), done.dark_summary()
+    frames = _without_hot(done.frames, dark.hottest, stains.places_mm)
     return TableMeasurements(
-        session=session,
+        session=SessionMeasurements(
+            folder=session.folder,
+            camera=baseline.camera,
+            lights=lights_taken,
+            registered_file=done.selected.registered.file,
+            white_references=len(session.chart.white_references),
+            codes=tuple(light.codes for light in session.illuminations),
+        ),
         registration=baseline.first.registration,
         frames=frames,
         lights=lights,
         greys=GreyMeasurements(baseline.points.levels.names, *greys),
         sensor=SensorMeasurements(
             saturation_counts=saturation,
-            saturation_measured=statistics.saturated(saturation),
-            white_level=round(saturation - float(np.mean([frame.black.mean() for frame in taken.frames]))),
-            noise=statistics.noise(),
+            saturation_measured=bool((done.highest >= saturation).any()),
+            white_level=round(saturation - float(np.mean([frame.black.mean() for frame in done.frames]))),
+            noise=done.noise(),
             transfer=baseline.transfer,
             linearity=linearity,
         ),
         dark_frames=dark,
-        cells=CellMeasurements(baseline.options.window, statistics.unfit(saturation, stains, frames), stains),
-        origins=origin_figures([(one.record, origin) for one, origin in zip(taken.figures, told, strict=True)]),
-        origin=origin_record(stated, taken.records, [one.origin for one in taken.figures]),
+        cells=CellMeasurements(baseline.options.window, done.unfit(stains, frames), stains),
+        origins=origin_figures(list(zip(done.records, published, strict=True))),
+        origin=origin_record(stated, done.records, origins),
         primaries=baseline.primaries,
         lens=lens_figures(baseline),
         point_spread=None if baseline.lens is None else baseline.lens.spread,
@@ -169,30 +139,32 @@ def _without_hot(
     return tuple(replace(one, consistency=one.consistency.without_hot(hot, cells_mm)) for one in frames)
 
 
-def _light_figures(intake: Intake, taken: IntakeState, by_light: Sequence[FrameMeasurements]) -> LightMeasurements:
+def _light_figures(done: Accumulator, by_light: Sequence[FrameMeasurements]) -> LightMeasurements:
     """Return what was measured of the lights, whose frames are `by_light`."""
-    illuminations, subtract_dark = intake.session.illuminations, intake.subtracts_dark
+    illuminations, options = done.session.illuminations, done.baseline.options
     error = np.array([frame.paper.error for frame in by_light])
     # A channel without light may be measured at or below 0; its standard error is what is known of it.
     white = np.maximum([frame.paper.white for frame in by_light], np.maximum(error, _LEAST_WHITE))
-    whites = [frame for frame in taken.frames if frame.record.kind == "white"]
+    whites = [frame for frame in done.frames if frame.record.kind == "white"]
     gains = _gains(by_light, whites)
-    dark = np.zeros(3) if subtract_dark else taken.statistics.dark_summary().light
+    dark = np.zeros(3) if options.subtract_dark else done.dark_summary().light
     full_white = whites[0].paper.white if whites else None
-    told = whites[:1] if _drift_is_one(whites) else whites
-    agreement = _code_agreement(illuminations, by_light, told, dark, gains if len(told) < 2 else np.ones_like(gains))
+    compared = whites[:1] if _drift_is_one(whites) else whites
+    agreement = _code_agreement(
+        illuminations, by_light, compared, dark, gains if len(compared) < 2 else np.ones_like(gains)
+    )
     return LightMeasurements(
         white=white,
         white_error=error,
         gains=gains,
-        subtracted=np.array([frame.dark for frame in by_light]) if subtract_dark else None,
+        subtracted=np.array([frame.dark for frame in by_light]) if options.subtract_dark else None,
         share_at_zero=np.array([frame.share_at_zero for frame in by_light]),
         additivity=additivity(illuminations, white, full_white, dark, gains),
         codes=agreement.rows(slice(len(by_light))),
         white_frames=agreement.rows(slice(len(by_light), None)) if whites else None,
         stray=_stray_light(illuminations, by_light, whites, dark, gains),
         drift=drift_correction(*_times_s(by_light, whites), np.array([frame.paper.white for frame in whites]))
-        if intake.baseline.options.correct_drift
+        if options.correct_drift
         else None,
     )
 

@@ -10,25 +10,29 @@ Rules that hold inside:
 from __future__ import annotations
 
 import hashlib
+import tomllib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from datetime import timedelta
 from functools import cached_property
 from itertools import pairwise
 from statistics import median
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from pydantic import ValidationError
 
+from calibration.citation import Rig, StatedOrigin
 from calibration.radiometry.primaries import pure_lights
-from calibration.table.lut import Lut
-from calibration.table.source_frames import SourceFrame, frames_sha256
+from calibration.table.lut import Lut, SourceFrame
 from drivers.raw.rawfile import Mosaic, decode_raw
+from experiment.config import CameraSettings, CitationSettings
 from experiment.framing.planes import Channel, frame_black, strongest_channel
 from experiment.measures.sensor import saturation
 from experiment.session.folder import Session
 from experiment.session.records import FrameRecord
-from foundation.errors import FormatError
+from foundation.errors import CropError, FormatError
 from foundation.files import read_whole
 from foundation.hashing import file_sha256
 
@@ -41,6 +45,12 @@ ReportProgress = Callable[[int, int, str], None]
 
 class ChangedFrame(FormatError):
     """A frame's file is gone, or is not what was taken; the next run of the session takes it again by itself."""
+
+
+_RIGS: tuple[Rig, ...] = ("lab", "simulated", "replay", "imported")
+
+_SETTING_RIGS = ("lab", "simulated")
+"""Rigs whose settings set the camera; of others they say nothing of the exposure."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -181,9 +191,16 @@ def decode_frame(session: Session, record: FrameRecord) -> DecodedFrame:
     return DecodedFrame(record, mosaic, black, strongest_channel(mosaic, black), saturation(mosaic))
 
 
-def session_sha256(records: Sequence[FrameRecord]) -> str:
-    """Return the hash that names a session: SHA-256 over kind, light and hash of each frame used, a line each."""
-    return frames_sha256(source_frames(records))
+def stated_origin(session: Session) -> StatedOrigin:
+    """Return what a session states; what older software did not write, or is damaged, is not known."""
+    try:
+        document: dict[str, Any] = tomllib.loads(session.settings_text())
+        rig: Rig | None = next((known for known in _RIGS if known == document.get("rig")), None)
+        citation = CitationSettings.model_validate(document.get("citation", {}))
+        set_by = CameraSettings.model_validate(document["camera"]) if rig in _SETTING_RIGS else None
+    except (CropError, ValidationError, ValueError, KeyError, RecursionError):
+        return StatedOrigin(CitationSettings(), None, None, session.journal.records())
+    return StatedOrigin(citation, rig, set_by, session.journal.records())
 
 
 def source_frames(records: Sequence[FrameRecord]) -> list[SourceFrame]:

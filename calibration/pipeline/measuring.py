@@ -17,15 +17,18 @@ import numpy as np
 import numpy.typing as npt
 
 from calibration.measurements import FrameMeasurements
-from calibration.pipeline.baseline import Baseline, beyond_print, usable_means
+from calibration.pipeline.baseline import Baseline, RegisteredFrame, beyond_print, sites_of, usable_means
 from calibration.pipeline.frames import DecodedFrame
-from calibration.pipeline.registered_frame import RegisteredFrame, sites_of
-from calibration.radiometry.dark_frames import DarkFrameFigures, measure_dark_frame
-from calibration.radiometry.dark_subtraction import DarkLight, winsorised_means
+from calibration.radiometry.dark_frames import DarkFrameFigures, DarkLight, measure_dark_frame, winsorised_means
 from calibration.radiometry.primaries import Primaries
-from calibration.sampling.patch_statistics import patch_means, sample_noise
-from calibration.sampling.samples import Sites, gather, gather_means, gather_values, table_values
-from calibration.spread.correction import FrameCorrection
+from calibration.sampling import (
+    gather,
+    gather_means,
+    gather_values,
+    patch_means,
+    sample_noise,
+    table_values,
+)
 from calibration.spread.surroundings import FrameLevels
 from experiment.framing.movement import REREGISTER_PX, STILL_PX, Shift, gauges_of, shift_between
 from experiment.measures.paper import Paper
@@ -35,22 +38,11 @@ _Array = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
-class _Grid:
-    """Where a frame is sampled, its movement, and whether the chart was registered again in this very frame."""
-
-    cells: Sites
-    references: Sites
-    lens: FrameCorrection | None
-    shift: Shift
-    reregistered: bool
-
-
-@dataclass(frozen=True, eq=False)
 class MeasuredFrame:
     """A light or white frame as measured; C cells of S samples.
 
     - `figures`: for the report, the ground truth and the flat field.
-    - `registered`, `dark`: what it was measured with: the frame registered last, and the dark light subtracted.
+    - `registered`: the frame registered last, with which it was measured.
     - `saturation`: raw count of saturation, as far as it can be seen in this frame.
     - `values`: (C, S, 3) uint16, the table's samples.
     - `highest`: (C,) uint16, the highest raw count of each cell.
@@ -61,7 +53,6 @@ class MeasuredFrame:
 
     figures: FrameMeasurements
     registered: RegisteredFrame
-    dark: DarkLight | None
     saturation: int
     values: npt.NDArray[np.uint16]
     highest: npt.NDArray[np.uint16]
@@ -97,18 +88,18 @@ def measure_frame(
     channel, framing = decoded.strongest, registered.registration.framing
     gauges = gauges_of(decoded.mosaic, channel, decoded.black, framing)
     shift = shift_between(registered.gauges[channel], framing, gauges)
-    # A turn or a change of distance moves the tags differently; moving the grid along would not mend it.
+    # A turn or a change of distance moves the tags differently; moving the grid along would not help.
     turned = shift.largest_px > shift.length_px + STILL_PX
     if shift.gauges == 0 or shift.length_px > REREGISTER_PX or turned:
         return shift
-    cells, references, lens = registered.cells, registered.references, registered.lens
+    at = registered
     if shift.length_px > STILL_PX:
         moved = registered.registration.shifted(shift.dx, shift.dy)
         shape = decoded.mosaic.block_planes().shape[2:]
         cells, references = sites_of(moved, baseline.points, shape, baseline.options.window)
         lens = baseline.correction(moved, cells, references)
-    grid = _Grid(cells, references, lens, shift, reregistered=False)
-    return _measured(baseline, decoded, registered, grid, keep_samples, dark)
+        at = replace(registered, cells=cells, references=references, lens=lens)
+    return _measured(baseline, decoded, at, shift, False, keep_samples, dark, registered)
 
 
 def measure_registered_frame(
@@ -123,9 +114,8 @@ def measure_registered_frame(
 
     Parameters and errors are otherwise those of `measure_frame`.
     """
-    reregistered = registered is not baseline.first
-    grid = _Grid(registered.cells, registered.references, registered.lens, shift, reregistered)
-    return _measured(baseline, decoded, registered, grid, keep_samples, dark)
+    again = registered is not baseline.first
+    return _measured(baseline, decoded, registered, shift, again, keep_samples, dark, registered)
 
 
 def sample_dark_frame(baseline: Baseline, decoded: DecodedFrame, registered: RegisteredFrame) -> MeasuredDarkFrame:
@@ -176,15 +166,18 @@ def movement_of(baseline: Baseline, before: RegisteredFrame, after: RegisteredFr
 def _measured(
     baseline: Baseline,
     decoded: DecodedFrame,
-    registered: RegisteredFrame,
-    grid: _Grid,
+    at: RegisteredFrame,
+    shift: Shift,
+    reregistered: bool,
     keep_samples: bool,
     dark: DarkLight | None,
+    registered: RegisteredFrame,
 ) -> MeasuredFrame:
+    """Return what a frame shows that is sampled `at` these places."""
     points = baseline.points
-    samples, highest = gather(decoded.mosaic, decoded.black, grid.references)
-    seen = usable_means(samples, highest, grid.references, decoded.saturation)
-    to_subtract = _to_subtract(decoded, grid, samples, dark)
+    samples, highest = gather(decoded.mosaic, decoded.black, at.references)
+    seen = usable_means(samples, highest, at.references, decoded.saturation)
+    to_subtract = _to_subtract(decoded, at, samples, dark)
     of_cells = None
     if to_subtract is not None:
         of_cells, of_references = np.split(to_subtract, [len(points.cells_mm)])
@@ -195,54 +188,50 @@ def _measured(
         shape = shape * baseline.primaries.field_ratio(paper.white)
     grey_values, grey_errors = points.levels.read(greys, paper.field.at(points.greys_mm))
     if keep_samples:
-        kept, highest = gather(decoded.mosaic, decoded.black, grid.cells)
+        kept, highest = gather(decoded.mosaic, decoded.black, at.cells)
         values, noise = table_values(kept, shape, of_cells), sample_noise(kept)
         if of_cells is not None and dark is None:
             kept -= of_cells[:, None]
         elif of_cells is not None and dark is not None:
             kept -= (of_cells - dark.patches[: len(of_cells)])[:, None]
     else:
-        values, highest = gather_values(decoded.mosaic, decoded.black, grid.cells, shape, of_cells)
+        values, highest = gather_values(decoded.mosaic, decoded.black, at.cells, shape, of_cells)
         kept = noise = None
+    # σ of the registered frame's blur, and what the gauges are softer than in it.
+    blur_growth_px2 = 0.0 if reregistered else shift.blur_growth_px2
     mean = patch_means(values)
     variance = baseline.transfer.variance(mean) / baseline.options.samples
     figures = FrameMeasurements(
         record=decoded.record,
         black=decoded.black,
         channel=decoded.strongest,
-        shift=grid.shift,
-        reregistered=grid.reregistered,
+        shift=shift,
+        reregistered=reregistered,
         paper=paper,
         consistency=baseline.consistency_check.compare(mean, variance),
         greys=grey_values,
         grey_errors=grey_errors,
         dark=np.zeros(3) if dark is None else dark.paper,
         share_at_zero=1 - int(np.count_nonzero(values)) / values.size,
-        blur_px=_blur_px(registered, grid),
+        blur_px=float(np.sqrt(max(at.registration.blur_px**2 + blur_growth_px2, 0.0))),
         exposure=decoded.mosaic.origin.exposure,
         origin=decoded.mosaic.origin,
     )
-    return MeasuredFrame(figures, registered, dark, decoded.saturation, values, highest, grid.cells.inside, kept, noise)
+    return MeasuredFrame(figures, registered, decoded.saturation, values, highest, at.cells.inside, kept, noise)
 
 
 def _to_subtract(
-    decoded: DecodedFrame, grid: _Grid, references: npt.NDArray[np.float32], dark: DarkLight | None
+    decoded: DecodedFrame, at: RegisteredFrame, references: npt.NDArray[np.float32], dark: DarkLight | None
 ) -> npt.NDArray[np.float32] | None:
     """Return what is subtracted from each patch, (P, 3) float32 counts: dark light, and what the lens added.
 
     `references` are the references' samples. None where nothing is subtracted.
     """
-    if grid.lens is None:
+    if at.lens is None:
         return None if dark is None else dark.patches
-    cells = gather_means(decoded.mosaic, decoded.black, grid.cells)
+    cells = gather_means(decoded.mosaic, decoded.black, at.cells)
     means = np.concatenate([cells, references.mean(axis=1, dtype=np.float64)])
     if dark is not None:
         means -= dark.patches
-    added = grid.lens.added(FrameLevels(means, beyond_print(decoded, grid.lens.beyond))).astype(np.float32)
+    added = at.lens.added(FrameLevels(means, beyond_print(decoded, at.lens.beyond))).astype(np.float32)
     return added if dark is None else added + dark.patches
-
-
-def _blur_px(registered: RegisteredFrame, grid: _Grid) -> float:
-    """Return σ of the blur, half-size px: that of the registered frame, and what the gauges are softer than in it."""
-    softer = 0.0 if grid.reregistered else grid.shift.blur_growth_px2
-    return float(np.sqrt(max(registered.registration.blur_px**2 + softer, 0.0)))

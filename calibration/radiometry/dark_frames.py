@@ -4,22 +4,42 @@ Rules that hold inside:
 
 - The projector's leak and ambient light cannot be separated and are one figure, read on bare paper.
 - They are part of every light: samples and ground truth contain them alike, so nothing is subtracted unless the user
-  asks for it (`calibration.radiometry.dark_subtraction`).
+  asks for it.
 - A photosite is hot when it is an outlier in every dark frame; an outlier in a single one is a cosmic ray.
+- What a dark frame adds depends on those before it alone, so that a build that was stopped goes on to the same bits.
+
+What is subtracted is predicted (docs/decisions/0009-dark-light-is-predicted.md). A dark frame shows the light at each
+cell, but with the noise of a few samples: 1.2 counts in a single frame, as much as the light itself often is. So it is
+dark paper × field × the cell's reflectance, and what cells show beyond the prediction is added as far as it is more
+than noise: the share w = 1 − noise² / variance of what is left over, one for each channel (empirical Bayes; B. Efron
+and C. Morris, Journal of the American Statistical Association 68, 1973).
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field
-from typing import Any
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import numpy.typing as npt
 
 from drivers.raw.rawfile import FrameOrigin
+from experiment.measures.paper import Paper
 from experiment.session.records import FrameRecord
+from foundation.records import FloatArray
 from foundation.robust import MAD_TO_SIGMA, MEDIAN_ERROR
+
+_LEAST_WHITE = 50.0
+"""Counts that paper must have in a channel for a cell's reflectance to be read there."""
+
+_MOST_REFLECTANCE = 1.5
+"""Of bare paper's: no print reflects more, but noise in a dim channel may seem to."""
+
+_FAR_SIGMA = 6.0
+"""Standard deviations from its patch's median up to which a sample is light: read noise alone passes 6 σ once in 2.5
+million samples, a chart's."""
+
+_Array = npt.NDArray[np.float64]
 
 HOT_COUNTS = 32.0
 """Counts above its patch from which a sample is hot: the signal of the darkest cells that are of use, about 30."""
@@ -27,7 +47,93 @@ HOT_COUNTS = 32.0
 HOT_SIGMA = 10.0
 """Read noise alone passes 6 σ once in 2.5 million samples, a chart's."""
 
-_Array = npt.NDArray[np.float64]
+_NEVER = 32767
+"""The excess of a sample that no dark frame has shown yet."""
+
+
+@dataclass(frozen=True, eq=False)
+class DarkLight:
+    """What is to be subtracted from frames.
+
+    - `paper`: (3,) float64 counts, of bare paper with the field divided out: for the record.
+    - `patches`: (P, 3) float32 counts, of each patch as the camera sees it, field and all.
+    - `share`: (3,) float64, 0 … 1, how much of what cells show beyond the prediction was added.
+    """
+
+    paper: _Array
+    patches: npt.NDArray[np.float32]
+    share: _Array
+
+
+def winsorised_means(samples: npt.NDArray[np.float32], noise: _Array) -> _Array:
+    """Return the winsorised means of dark samples, since a hot photosite or a cosmic ray is no light.
+
+    `samples`: (P, S, 3) float32 counts above black; those beyond 6 σ of their patch's median count as if they were
+    there. `noise`: (3,) float64 counts, σ of one sample. Returns (P, 3) float64 counts.
+    """
+    middle = np.median(samples, axis=1, keepdims=True)
+    far = (_FAR_SIGMA * noise).astype(np.float32)
+    return np.clip(samples, middle - far, middle + far).mean(axis=1, dtype=np.float64)
+
+
+def reflectances(seen: _Array, field: _Array, white: _Array) -> _Array:
+    """Return the reflectance (P, 3) float64 of patches, 1 = bare paper.
+
+    `seen`: (P, 3) mean counts above black in a frame of even light. `field`: (P, 3) its flat field at the patches.
+    `white`: (3,) counts of bare paper in it. A channel without light has the reflectances of the brightest one.
+    """
+    found = np.clip(seen / (field * np.maximum(white, _LEAST_WHITE)), 0, _MOST_REFLECTANCE)
+    found[:, white < _LEAST_WHITE] = found[:, [int(np.argmax(white))]]
+    return found
+
+
+@dataclass(frozen=True, eq=False)
+class DarkLightEstimate:
+    """What dark frames, one after another, have shown of the dark light; each makes a new one.
+
+    - `reflectance`: (P, 3) float64 of each patch. `inside`: (P,) bool, whether a patch lies in the frame.
+    - `samples`: of each patch.
+    - `left`: (P, 3) float64 counts, sum of what patches showed beyond the prediction.
+    - `noise`: (3,) float64 counts², sum of the variances of a patch's mean.
+    - `frames`: how many they are.
+    """
+
+    reflectance: _Array
+    inside: npt.NDArray[np.bool_]
+    samples: int
+    left: _Array
+    noise: _Array
+    frames: int
+
+    @staticmethod
+    def none(reflectance: _Array, inside: npt.NDArray[np.bool_], samples: int) -> DarkLightEstimate:
+        """Return the estimate before any dark frame, of patches with reflectances (P, 3) that are inside (P,)."""
+        return DarkLightEstimate(reflectance, inside, samples, np.zeros_like(reflectance), np.zeros(3), 0)
+
+    def restarted(self) -> DarkLightEstimate:
+        """Return it without what cells showed beyond the prediction: they lie on other photosites from now on."""
+        return DarkLightEstimate.none(self.reflectance, self.inside, self.samples)
+
+    def with_frame(
+        self, means: _Array, noise: _Array, paper: Paper, field: _Array
+    ) -> tuple[DarkLightEstimate, DarkLight]:
+        """Return the estimate after a dark frame, and what is to be subtracted from the frames after it.
+
+        `means`: (P, 3) mean counts above black of each patch. `noise`: (3,) standard deviation of one sample. `field`:
+        (P, 3) its field at the patches.
+        """
+        predicted = paper.white * field * self.reflectance
+        after = replace(
+            self,
+            left=self.left + (means - predicted),
+            noise=self.noise + noise**2 / self.samples,
+            frames=self.frames + 1,
+        )
+        left = after.left / after.frames
+        spread = MAD_TO_SIGMA * np.median(np.abs(left[self.inside] - np.median(left[self.inside], axis=0)), axis=0)
+        chance = after.noise / after.frames**2
+        share = np.clip(1 - chance / np.maximum(spread**2, 1e-12), 0, 1)
+        return after, DarkLight(paper.white, (predicted + share * left).astype(np.float32), share)
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,22 +172,11 @@ class DarkFrameFigures:
     """
 
     record: FrameRecord
-    black: _Array
-    light: _Array
-    error: _Array
-    noise: _Array
+    black: FloatArray
+    light: FloatArray
+    error: FloatArray
+    noise: FloatArray
     origin: FrameOrigin = field(default_factory=FrameOrigin)
-
-    def to_json(self) -> dict[str, Any]:
-        """Return the figures as JSON can hold them; `from_json` restores them to the last bit."""
-        figures = {name: getattr(self, name).tolist() for name in ("black", "light", "error", "noise")}
-        return figures | {"origin": asdict(self.origin)}
-
-    @staticmethod
-    def from_json(record: FrameRecord, data: dict[str, Any]) -> DarkFrameFigures:
-        """Return the figures of a frame from what `to_json` returned."""
-        figures = (np.array(data[name]) for name in ("black", "light", "error", "noise"))
-        return DarkFrameFigures(record, *figures, origin=FrameOrigin(**data["origin"]))
 
 
 def measure_dark_frame(
@@ -109,25 +204,32 @@ def measure_dark_frame(
     return figures, np.clip(np.rint(excess), -32768, 32767).astype(np.int16)
 
 
+@dataclass(frozen=True, eq=False)
 class HotPixels:
-    """Accumulates, over dark frames, which samples exceed their cells' medians in every one of them."""
+    """Which samples exceed their cells' medians in every dark frame so far; each frame makes a new one.
 
-    def __init__(self, cells: int, samples: int) -> None:
-        self._shape = cells, samples, 3
-        self._least: npt.NDArray[np.int16] = np.full(self._shape, 32767, dtype=np.int16)
-        self._past = np.zeros(cells)
+    - `least`: (C, S, 3) int16 counts, the least excess of each sample since the chart was registered last.
+    - `past`: (C,) float64 counts, by how much a cell was hot before that.
+    """
 
-    def add(self, excess: npt.NDArray[np.int16]) -> None:
-        """Take in a frame; `excess` (C, S, 3) counts, as `measure_dark_frame` returned it."""
-        np.minimum(self._least, excess, out=self._least)
+    least: npt.NDArray[np.int16]
+    past: _Array
 
-    def restart(self, noise: _Array) -> None:
-        """Begin again, since cells lie on other photosites from now on; cells that were hot so far stay so.
+    @staticmethod
+    def none(cells: int, samples: int) -> HotPixels:
+        """Return what is known before any dark frame."""
+        return HotPixels(np.full((cells, samples, 3), _NEVER, dtype=np.int16), np.zeros(cells))
+
+    def with_frame(self, excess: npt.NDArray[np.int16]) -> HotPixels:
+        """Return it after a frame; `excess` (C, S, 3) counts, as `measure_dark_frame` returned it."""
+        return replace(self, least=np.minimum(self.least, excess))
+
+    def restarted(self, noise: _Array) -> HotPixels:
+        """Return it begun again, since cells lie on other photosites from now on; cells that were hot so far stay so.
 
         `noise` (3,) counts is the standard deviation of a sample.
         """
-        self._past = self.hottest(noise)
-        self._least = np.full(self._shape, 32767, dtype=np.int16)
+        return HotPixels(np.full_like(self.least, _NEVER), self.hottest(noise))
 
     def hottest(self, noise: _Array) -> _Array:
         """Return how far the hottest sample of each cell (C,) float64 exceeds its median in every frame, counts.
@@ -135,16 +237,8 @@ class HotPixels:
         0 where none does. `noise` (3,) counts is the standard deviation of a sample.
         """
         hot = np.maximum(HOT_COUNTS, HOT_SIGMA * noise)
-        seen = (self._least > hot) & (self._least < 32767)
-        return np.maximum(np.where(seen, self._least, 0).max(axis=(1, 2)).astype(np.float64), self._past)
-
-    def to_arrays(self) -> dict[str, npt.NDArray[Any]]:
-        """Return all that is needed to go on: int16 (C, S, 3) and float64 (C,) arrays by name."""
-        return {"dark_least": self._least, "dark_past": self._past}
-
-    def restore(self, arrays: dict[str, npt.NDArray[Any]]) -> None:
-        """Go on from what `to_arrays` returned: int16 (C, S, 3) and float64 (C,) arrays by name."""
-        self._least, self._past = arrays["dark_least"].copy(), arrays["dark_past"]
+        seen = (self.least > hot) & (self.least < _NEVER)
+        return np.maximum(np.where(seen, self.least, 0).max(axis=(1, 2)).astype(np.float64), self.past)
 
 
 def median_noise(frames: Sequence[DarkFrameFigures]) -> _Array:

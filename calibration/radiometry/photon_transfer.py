@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from calibration.sampling.patch_statistics import median_of_variance
+from calibration.sampling import median_of_variance
 
 NOISY = 1e-8
 """Chance that noise alone lists a cell: a variance 3.5 times the model's for 25 samples."""

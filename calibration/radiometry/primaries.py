@@ -1,11 +1,12 @@
-"""The flat field of coloured cells, where the projector's primaries light the print unevenly in different ways.
+"""Red, green and blue alone: the flat field of coloured cells, whether the primaries add up, and how the lamp drifts.
 
 A projector's red, green and blue do not fade alike towards the corners. The field of a light that mixes them, as bare
 paper shows it in a channel, is the mean of their fields, weighted by what paper reflects of each into that channel; a
 coloured cell reflects other shares, and its mean is another. The frames of the primaries alone show both: the field of
-each, on paper, and what each cell reflects of it. What a light is mixed of follows from its paper.
+each, on paper, and what each cell reflects of it. What a light is mixed of follows from its paper
+(`docs/decisions/0014-fields-of-the-primaries.md`).
 
-Why so: `docs/decisions/0014-fields-of-the-primaries.md`.
+Additivity and drift alter no table: each light's ground truth is measured in the frame of its samples.
 """
 
 from __future__ import annotations
@@ -21,13 +22,52 @@ from experiment.lights import Illumination
 from experiment.measures.least_squares import product
 from experiment.measures.paper import FlatField, Paper
 
+_Array = npt.NDArray[np.float64]
+
 LEAST_PAPER = 300.0
 """Counts above black that paper must show under a primary for its field to be known well enough (judgement)."""
 
 _LARGEST = 0.2
 """Share by which a cell's field may differ from paper's; beyond, the difference is noise and left out."""
 
-_Array = npt.NDArray[np.float64]
+
+def additivity(
+    lights: Sequence[Illumination], white: _Array, full_white: _Array | None, dark: _Array, gains: _Array
+) -> _Array | None:
+    """Return by how much the primaries together differ from white, per channel, relative to white.
+
+    red + green + blue − 2 black = white where light adds: each of the three brings the projector's black along. A
+    projector with a white segment on its wheel, or one that processes colours, gives more or less. It harms no table,
+    since each light's ground truth is measured; it means that a light cannot be predicted from its codes.
+
+    `lights`: L lights; used are the three with one full primary, and full white if `full_white` is None. `white`: (L,
+    3) their ground truths. `full_white`: (3,) paper under full white from the white frames, None without. `dark`: (3,)
+    paper in the dark frames; zeros where already subtracted. `gains`: (L, 3) the lamp's drift at each light, of which
+    white frames are free; `drift_gains`. Returns (3,) float64; None when a primary or white is missing.
+    """
+    found: dict[tuple[int, int, int], _Array] = {}
+    for light in lights:
+        found[light.codes] = white[light.index] / gains[light.index]
+    total = full_white if full_white is not None else found.get((255, 255, 255))
+    primaries = [found.get(code) for code in ((255, 0, 0), (0, 255, 0), (0, 0, 255))]
+    red, green, blue = primaries
+    if total is None or red is None or green is None or blue is None or not np.isfinite(dark).all():
+        return None
+    return (red + green + blue - 2 * dark) / total - 1
+
+
+def drift_gains(at_s: _Array, white_at_s: _Array, white: _Array) -> _Array:
+    """Return the lamp's light at times over that of the first white frame, linear between white frames.
+
+    `at_s`: (L,) when each light was taken. `white_at_s`, `white`: (W,) and (W, 3) when the white frames were taken,
+    rising, and paper in them. Returns (L, 3) float64; ones where there are fewer than two white frames.
+    """
+    if len(white) < 2:
+        return np.ones((len(at_s), 3))
+    gains = np.ones((len(at_s), 3))
+    for channel in range(3):
+        gains[:, channel] = np.interp(at_s, white_at_s, white[:, channel] / white[0, channel])
+    return gains
 
 
 def pure_lights(illuminations: Sequence[Illumination]) -> tuple[int, int, int] | None:

@@ -3,11 +3,9 @@
 Rules that hold inside:
 
 - Tags give a homography and Brown's distortion and nothing finer: 35 of them cannot sample a wavy sheet. The local
-  part is measured on the cells: the frame is rectified to the print, compared with the print's colours as the camera
-  sees them (a colour model fitted on the frame itself), and a smooth displacement is fitted to what does not coincide.
+  part is measured on the cells (`calibration.registration.matching`).
 - A chart without tags has the outline of its field for that, and is then followed from coarse to fine: a map that has
   slipped by a cell is looked for, and refused.
-- All colours are used, each in its own place: red and blue photosites lie a quarter pixel beside the blocks' centres.
 - A registration that cannot be trusted is a `RegistrationError`, never a value.
 
 Places are half-size pixels, pixel centres at integers; millimetres on the print.
@@ -15,28 +13,35 @@ Places are half-size pixels, pixel centres at integers; millimetres on the print
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
 from scipy.spatial import cKDTree
 
-from calibration.registration.blocks import Blocks
-from calibration.registration.colour_checks import agreement, mismatched
-from calibration.registration.lateral_colour import LateralColour
-from calibration.registration.lens import Lens, fit_lens
-from calibration.registration.matching import Anchors, Matcher, not_this_chart
-from calibration.registration.registration import Registration
-from calibration.sampling.windows import largest_blur_px
+from calibration.registration.colours import ColourModel, agreement, mismatched
+from calibration.registration.geometry import Displacement, LateralColour, Lens, fit_lens
+from calibration.registration.matching import Anchors, Blocks, Matcher, PlaceErrors, not_this_chart
+from calibration.sampling import SAMPLE_REACH_PX, largest_blur_px
 from drivers.raw.rawfile import Mosaic
 from experiment.chart.model import Chart
 from experiment.framing.field import SIDE_POINTS, FoundField, field_mm, refine_edges
 from experiment.framing.finding import Framing, find_chart
 from experiment.framing.homography import rms
-from experiment.framing.planes import CHANNELS, Plane, frame_black, plane_of
+from experiment.framing.planes import CHANNELS, Channel, Plane, frame_black, plane_of
 from experiment.framing.sharpness import MIN_CELL_PX, blur_px
 from foundation.errors import RegistrationError
 from foundation.robust import sigma_of
+
+MAX_PLACE_ERROR_PX = 0.5
+"""Three standard errors of the place of a cell of 10 px, at most: at 0.5 px the outermost of its 25 pixels, rounding
+included, has 0.1 % of its light from the next cell at a blur of 0.7 px (`calibration.sampling`)."""
+
+CLEARANCE_PX = 1.75
+"""From there to the edge of a cell of 10 px, for which the limits of places were found."""
+
+_Array = npt.NDArray[np.float64]
+_Mask = npt.NDArray[np.bool_]
 
 MAX_TAG_RESIDUAL_PX = 8.0
 """RMS of the tags against homography and distortion; 2.3 is a sheet that waves by 6 mm and curls by 10."""
@@ -77,8 +82,87 @@ _FEW_SLIPPED, _SLIPPED_SHARE = 2, 0.015
 """Number and share of a field's parts from which on it is refused: none looks slipped in any simulated room that is
 registered well."""
 
-_Array = npt.NDArray[np.float64]
-_Mask = npt.NDArray[np.bool_]
+
+@dataclass(frozen=True, eq=False)
+class Registration:
+    """The chart's place in a frame.
+
+    - `framing`: the tags, or the field's outline, as found.
+    - `lens`, `displacement`: the two parts of the map of green.
+    - `lateral`: where red and blue lie against it.
+    - `marks_residual_px`: (N, 2) float64, the tags' corners against the final map; of a chart without tags the field's
+      outline, across.
+    - `lens_residual_px`: RMS of the same against the lens alone: what the paper's waviness leaves.
+    - `blocks`: fit of the cells.
+    - `place_errors`: how well places are known.
+    - `colours`: the colour model of the frame.
+    - `mismatched_cells`: (N,) bool, cells in the chart's order whose colour is not nearly the model's: covered,
+      damaged, misprinted.
+    - `agreement`: correlation of the cells' colours with the model's, the mean of the channels that carry light.
+    - `blur_px`: σ of the tags' edges, or of the field's.
+    - `cell_px`: half-size pixels per cell, the shorter side of the smallest.
+    - `shift_px`: movement since the frame that was registered, (dx, dy).
+    """
+
+    framing: Framing
+    lens: Lens
+    displacement: Displacement
+    lateral: LateralColour
+    marks_residual_px: _Array
+    lens_residual_px: float
+    blocks: Blocks
+    place_errors: PlaceErrors
+    colours: ColourModel
+    mismatched_cells: _Mask
+    agreement: float
+    blur_px: float
+    cell_px: float
+    shift_px: tuple[float, float] = (0.0, 0.0)
+
+    def to_pixels(self, points_mm: npt.ArrayLike, channel: Channel = "G") -> _Array:
+        """Return the half-size pixels (N, 2) float64, x then y, where a channel sees points (N, 2) on the print.
+
+        The lens shifts red and blue against green. Samples are taken where green is.
+        """
+        places = self.lens.to_pixels(points_mm) + self.displacement.at(points_mm) + self.shift_px
+        return places + self.lateral.shift_px(places, channel)
+
+    def uncertainty_px(self, points_mm: npt.ArrayLike) -> _Array:
+        """Return the standard error (N,) float64 px of the places of points (N, 2) on the print, in green."""
+        return self.place_errors.at(points_mm)
+
+    def uncertain(self, points_mm: npt.ArrayLike) -> _Mask:
+        """Return which points (N,) bool are known too badly to be sampled: three standard errors exceed the limit."""
+        return np.asarray(3 * self.uncertainty_px(points_mm) > MAX_PLACE_ERROR_PX * self.clearance)
+
+    @property
+    def places_known_px(self) -> tuple[float, float]:
+        """Standard error of places, px: the median over the field, and the largest of the outermost cells but 1 %."""
+        error = self.place_errors.error_px
+        rim = np.concatenate([error[1], error[-2], error[:, 1], error[:, -2]])
+        return float(np.median(error)), float(np.percentile(rim, 99))
+
+    def shifted(self, dx: float, dy: float) -> Registration:
+        """Return this registration for a frame in which the chart lies (dx, dy) px further."""
+        return replace(self, shift_px=(self.shift_px[0] + dx, self.shift_px[1] + dy))
+
+    @property
+    def marks_rms_px(self) -> float:
+        """RMS distance of the tags' corners, or the field's outline, from the final map."""
+        return rms(self.marks_residual_px)
+
+    @property
+    def block_rms_px(self) -> float:
+        """RMS displacement that the good blocks would still need: the registration's own estimate of its error."""
+        return rms(self.blocks.residual_px[self.blocks.good])
+
+    @property
+    def clearance(self) -> float:
+        """How much further samples are from their cells' edges than in cells of 10 px, ≥ 1: places matter less by it.
+
+        Cells of a hundred pixels are found to a pixel, which is nothing to them.
+        """
+        return max(1.0, (self.cell_px / 2 - SAMPLE_REACH_PX) / CLEARANCE_PX)
 
 
 def register(

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from importlib import resources
 from typing import Any
 
-from calibration.citation.record import origin_lines
+from calibration.citation import origin_lines
 from calibration.figures.all_figures import BY_NAME, FIGURES
 from calibration.figures.figure import QUESTIONS, Drawing, Group, Outcome, SummaryRow, Worst
 from calibration.measurements import TableMeasurements
@@ -26,7 +26,7 @@ from calibration.verdict import (
     retaken_frames,
 )
 from foundation.errors import counted, first_of
-from foundation.pages import figure, render
+from foundation.pages import render
 
 MOST_UNFIT = 200
 """Unfit cells that are listed; all of them are in lut.json, and a page of thousands is read by nobody."""
@@ -172,8 +172,3 @@ STYLE = "".join(
     (resources.files("foundation") / "templates" / name).read_text() for name in ("colours.css", "style.css")
 )
 """The style sheet of a page that is not made from a template."""
-
-
-def picture_html(picture: Picture) -> str:
-    """Return a picture with its heading and caption as HTML; the file is part of the text."""
-    return f"<h2>{picture.heading}</h2>{figure(picture.png, picture.caption, picture.heading)}"

@@ -21,9 +21,8 @@ from calibration.causes.gathering import PrintPlace
 from calibration.checks.frame_consistency import has_enough_cells
 from calibration.measurements import FrameMeasurements, TableMeasurements
 from calibration.radiometry.photon_transfer import PhotonTransfer, noise_levels
-from calibration.registration.registration import Registration
-from calibration.sampling.patch_statistics import rim_difference, sample_noise
-from calibration.sampling.samples import sites_at
+from calibration.registration.register import Registration
+from calibration.sampling import rim_difference, sample_noise, sites_at
 from drivers.raw.rawfile import Mosaic
 from experiment.chart.model import Chart
 from experiment.framing.movement import STILL_PX

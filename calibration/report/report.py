@@ -42,8 +42,8 @@ from calibration.report.plots import (
     half_size,
     reference_residuals,
 )
-from calibration.sampling.windows import largest_window
-from calibration.table.file_names import REPORT_FORMAT, REPORT_JSON, REPORT_PAGE, REPORT_VERSION
+from calibration.sampling import largest_window
+from calibration.table.lut import REPORT_FORMAT, REPORT_JSON, REPORT_PAGE, REPORT_VERSION
 from calibration.verdict import BuildResult, findings, judged_values, retake_command, retake_json, retaken_frames
 from drivers.raw.rawfile import read_raw
 from experiment.chart.model import Chart

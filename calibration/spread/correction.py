@@ -16,12 +16,30 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from calibration.registration.registration import Registration
-from calibration.sampling.samples import Sites, sites_at
-from calibration.spread.fitting import VARYING_BITS, ReferenceData, SpreadData, fit_spread, predicted_levels
-from calibration.spread.point_spread import FAR_PX, NEAR_PX, PLACES, PointSpread, kernel_of_terms, terms_of
-from calibration.spread.printed_grid import PrintedGrid
-from calibration.spread.surroundings import FrameLevels, NearLight, Surroundings, UsualLight, light_at, surroundings
+from calibration.registration.register import Registration
+from calibration.sampling import Sites, sites_at
+from calibration.spread.fitting import (
+    FAR_PX,
+    NEAR_PX,
+    PLACES,
+    VARYING_BITS,
+    PointSpread,
+    ReferenceData,
+    SpreadData,
+    fit_spread,
+    kernel_of_terms,
+    place_terms,
+    predicted_levels,
+    terms_of,
+)
+from calibration.spread.surroundings import (
+    FrameLevels,
+    NearLight,
+    PrintedGrid,
+    Surroundings,
+    UsualLight,
+)
+from experiment.framing.planes import CHANNELS
 from experiment.measures.least_squares import page_polynomial, page_powers
 from experiment.measures.paper import FlatField
 
@@ -72,15 +90,35 @@ class PrintView:
 
         `photosites_px`: (3, 2) float64, where each channel's photosites lie from a block's centre.
         """
+        low, high = grid.points_mm.min(axis=0), grid.points_mm.max(axis=0)
+        light = UsualLight.of(grid, field.at(grid.points_mm), field.at(np.clip(grid.slots_mm, low, high)))
         beyond = _places_beyond(grid, registration, shape, window)
-        return PrintView(grid, grid.neighbours, whites, photosites_px, shape, light_at(grid, field), beyond)
+        return PrintView(grid, grid.neighbours, whites, photosites_px, shape, light, beyond)
 
     def around(self, registration: Registration, cells: Sites, references: Sites) -> Surroundings:
         """Return the surroundings of the patches of a frame, given where they are sampled."""
-        return surroundings(
-            self.grid, self.neighbours, self.photosites_px, self.frame_px, registration, cells, references, self.whites,
-            self.light,
-        )  # fmt: skip
+        half, points = np.array(self.grid.pitch_mm) / 2, self.grid.points_mm
+        across, down = (
+            registration.to_pixels(points + half * axis) - registration.to_pixels(points - half * axis)
+            for axis in (np.array([1.0, 0.0]), np.array([0.0, 1.0]))
+        )
+        pitch = np.stack([np.linalg.norm(across, axis=1), np.linalg.norm(down, axis=1)], axis=1)
+        to_slots = np.linalg.inv(np.stack([across, down], axis=-1))
+        columns = np.concatenate([cells.columns, references.columns])
+        middle = np.stack([columns, np.concatenate([cells.rows, references.rows])], axis=1)
+        seen = np.stack([registration.to_pixels(points, channel) for channel in CHANNELS], axis=1)
+        from_centre = middle[:, None] + self.photosites_px - seen
+        offset = np.einsum("nij,ncj->nci", to_slots, from_centre) * pitch[:, None]
+        return Surroundings(
+            grid=self.grid,
+            window=cells.window,
+            neighbours=self.neighbours,
+            offset_px=np.ascontiguousarray(offset),
+            pitch_px=pitch,
+            places=place_terms(middle.astype(np.float64), self.frame_px),
+            whites=self.whites,
+            light=self.light,
+        )
 
 
 @dataclass(frozen=True, eq=False)

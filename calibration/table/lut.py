@@ -1,10 +1,17 @@
 """The look-up table on disk, opened for reading; nothing about how its numbers were measured.
 
 A LUT folder holds `samples.npy` (uint16 little-endian, C order, [light, colour, sample, RGB]), `illuminations.csv`
-(the lights and their ground truth), `lut.json` (provenance), and `frames.csv` (the frames it was made from). The
-generator reads tables through this file, and nothing behind it.
+(the lights and their ground truth), `lut.json` (provenance), `frames.csv` (the frames it was made from), and
+`SHA256SUMS`. The generator reads tables through this file, and nothing behind it (docs/formats.md).
 
-Every released version of the format stays readable. Keys added since are optional.
+Rules that hold inside:
+
+- Every released version of the format stays readable. Keys added since are optional.
+- `SHA256SUMS` has the form of `sha256sum`, so that ``sha256sum -c SHA256SUMS`` checks a table without this software,
+  and ``sha256sum SHA256SUMS`` gives the table's hash: whoever was told it from elsewhere has every byte of the table by
+  it. Tables made before it was written have hashes of ground truth and samples in `lut.json`, or none at all; what they
+  have is held against them.
+- Small files are held against their hashes whenever a table is opened, samples when a light is first used.
 """
 
 from __future__ import annotations
@@ -12,23 +19,88 @@ from __future__ import annotations
 import csv
 import hashlib
 import io
+import math
+import re
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Final
+from typing import Annotated, Any, Final, Literal, Self
 
 import numpy as np
 import numpy.typing as npt
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from calibration.table.file_names import FRAMES, ILLUMINATIONS, PROVENANCE, SAMPLES, SUMS
-from calibration.table.provenance import Provenance, parse_provenance
-from calibration.table.sample_hashes import light_sha256, map_samples
-from calibration.table.source_frames import SourceFrame, load_frames
-from calibration.table.sums import require_listed, require_plain_table
+from calibration.citation import OriginRecord
 from experiment.lights import Illumination, load_illuminations
 from foundation.errors import FormatError
-from foundation.files import partial_path
-from foundation.hashing import file_sha256
+from foundation.files import partial_path, reading_error
+from foundation.foreign_folders import require_plain_folder
+from foundation.hashing import file_sha256, sha256_of
+
+FORMAT: Final = "crop.lut"
+
+VERSION: Final = 1
+"""The only version so far: keys that were added since are optional."""
+
+Sha256 = Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
+"""A SHA-256 as 64 lowercase hexadecimal digits."""
+
+FileName = Annotated[str, Field(pattern=r"^[A-Za-z0-9_][A-Za-z0-9_.-]{0,99}$")]
+"""Name of a file that lies in the table's own folder."""
+
+COLUMNS: Final = ("kind", "illumination", "file", "sha256")
+"""Columns of a table's `frames.csv` (docs/formats.md)."""
+
+MOST_SAMPLES: Final = 1024
+"""Samples of a cell at most: the largest window has 9×9."""
+
+PROVENANCE: Final = "lut.json"
+"""What the table was made from and how; written last, so that a folder without it is no table."""
+
+SAMPLES: Final = "samples.npy"
+"""The samples, uint16 little-endian, C order, [light, colour, sample, RGB]."""
+
+ILLUMINATIONS: Final = "illuminations.csv"
+"""The lights and their ground truth."""
+
+FRAMES: Final = "frames.csv"
+"""The raw files that the table was made from; absent in tables made before they were recorded."""
+
+REFERENCES: Final = "references.csv"
+"""The grey references under each light, where the chart has some."""
+
+REPORT_PAGE: Final = "report.html"
+"""The report for people."""
+
+REPORT_JSON: Final = "report.json"
+"""The report for programs."""
+
+SUMS: Final = "SHA256SUMS"
+"""Hashes of all other files of the table, as `sha256sum -c` reads them; absent in tables made before it was written."""
+
+REPORT_FORMAT: Final = "crop.report"
+
+REPORT_VERSION: Final = 1
+"""`format` and `version` of `report.json` (docs/formats.md)."""
+
+MOST_BYTES: Final = {
+    PROVENANCE: 64 << 20,
+    ILLUMINATIONS: 16 << 20,
+    FRAMES: 16 << 20,
+    REFERENCES: 64 << 20,
+    REPORT_JSON: 64 << 20,
+    REPORT_PAGE: 256 << 20,
+    SUMS: 64 << 10,
+}
+"""Largest sizes of a table's files but its samples: forty times those of 707 lights and 32 768 colours."""
+
+OPTIONAL: Final = frozenset({REPORT_PAGE})
+"""Files that a table may do without: no number is read from them, and a table that was fetched has none."""
+
+_LINE = re.compile(r"([0-9a-f]{64})  ([A-Za-z0-9_][A-Za-z0-9_.-]{0,99})")
+_TEXTS: Final = (ILLUMINATIONS, FRAMES, REFERENCES, REPORT_JSON, REPORT_PAGE)
+RESTORE: Final = "restore it from a copy, fetch the table again, or build it anew"
 
 WHITE_COLUMNS: Final = ("white_r", "white_g", "white_b")
 """Columns of `illuminations.csv` with the ground truth, after those of the lights."""
@@ -36,6 +108,278 @@ WHITE_COLUMNS: Final = ("white_r", "white_g", "white_b")
 MOST_WHITE: Final = 1_000_000
 """A ground truth is below this, in units of samples of 16 bits: what is larger was not measured, and its chromaticity
 might not be a number."""
+
+
+class Unfit(BaseModel):
+    """A cell whose samples must not be used, and why."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    colour: int = Field(ge=0)
+    cause: str
+
+    @property
+    def kind(self) -> str:
+        """The cause in a word, without its numbers."""
+        return self.cause.split(":")[0]
+
+
+class Provenance(BaseModel):
+    """The content of `lut.json`.
+
+    - `camera`: maker and model as the raw files name it.
+    - `bits`: bits kept of each channel; the table has 8**bits colours.
+    - `white_level`: sample value of sensor saturation: linear camera RGB after black subtraction.
+    - `corrections`: what was applied to the counts, with its parameters, in order.
+    - `session_sha256`: hash over the frames' hashes (`calibration.table.lut.frames_sha256`).
+    - `chart_sha256`: hash of the chart.
+    - `software`: name and version of the program that built the table.
+    - `unfit`: cells unfit for use.
+    - `samples_sha256`, `illuminations_sha256`: of the files; None in tables made before they were recorded.
+    - `lights_sha256`: of each light's samples as they lie in the file, in the order of lights, so that damage can be
+      traced to a light; empty in tables made before they were recorded.
+    - `files_sha256`: of further files of the table, `references.csv`; empty in tables made before they were recorded.
+    - `has_sums`: whether `SHA256SUMS` lists every file of the table; false in tables made before it was written.
+    - `computed`: where the table was computed from spectra and a model of the sensor and nothing was photographed: by
+      what, and with which settings. None where it was made from frames.
+    - `origin`: with what, when and by whom the frames were taken, and under which licence the table may be used; None
+      in tables made before it was kept, and in computed ones of which nothing is stated.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="ignore")
+
+    format: Literal["crop.lut"] = FORMAT
+    version: Literal[1] = VERSION
+    camera: str
+    bits: int = Field(ge=1, le=5)
+    white_level: int = Field(ge=1, le=65535)
+    corrections: list[dict[str, Any]] = []
+    session_sha256: str
+    chart_sha256: str
+    software: str
+    unfit: list[Unfit] = []
+    samples_sha256: Sha256 | None = None
+    illuminations_sha256: Sha256 | None = None
+    lights_sha256: list[Sha256] = []
+    files_sha256: dict[FileName, Sha256] = {}
+    has_sums: bool = False
+    computed: dict[str, Any] | None = None
+    origin: OriginRecord | None = None
+
+    @model_validator(mode="after")
+    def _require_colours(self) -> Self:
+        """Require that unfit cells are cells of the chart."""
+        beyond = [cell.colour for cell in self.unfit if cell.colour >= 8**self.bits]
+        if beyond:
+            raise ValueError(f"unfit: colour {beyond[0]} is none of the {8**self.bits} of {self.bits} bits a channel")
+        return self
+
+    def to_json(self) -> str:
+        """Return the text of `lut.json`; `computed` and `origin` stand in it where they are known."""
+        left_out = {name for name in ("computed", "origin") if getattr(self, name) is None}
+        return self.model_dump_json(indent=2, exclude=left_out) + "\n"
+
+
+class _Head(BaseModel):
+    format: Any = None
+    version: Any = None
+
+
+def parse_provenance(text: bytes, path: Path) -> Provenance:
+    """Return the content of `lut.json` from its bytes."""
+    try:
+        head = _Head.model_validate_json(text)
+    except ValidationError as error:
+        raise FormatError(f"{path} is no table's description: it is damaged; build the table again") from error
+    if head.format != FORMAT:
+        raise FormatError(f"{path} is no table of CroP: its format is not {FORMAT!r}; name a folder made by build-lut")
+    if head.version != VERSION:
+        raise FormatError(
+            f"{path.parent} is a table of version {head.version!r}, this software reads version {VERSION}; "
+            "build it again from its session with build-lut, or install the software that wrote it"
+        )
+    try:
+        return Provenance.model_validate_json(text)
+    except ValidationError as error:
+        first = error.errors()[0]
+        where = "".join(f"{part}: " for part in (".".join(map(str, first["loc"])),) if part)
+        raise FormatError(f"{path} is damaged: {where}{first['msg']}; restore it from a copy") from error
+
+
+@dataclass(frozen=True)
+class SourceFrame:
+    """A raw file that a table was made from.
+
+    - `kind`: ``light``, ``white`` or ``dark``.
+    - `illumination`: number of the light; None for white and dark frames.
+    - `file`: path relative to the session's folder.
+    - `sha256`: of the file.
+    """
+
+    kind: str
+    illumination: int | None
+    file: str
+    sha256: str
+
+
+def frames_sha256(frames: Sequence[SourceFrame]) -> str:
+    """Return the hash that names a session: SHA-256 over kind, light and hash of each frame used, a line each."""
+    lines = [f"{frame.kind},{frame.illumination},{frame.sha256}\n" for frame in frames]
+    return hashlib.sha256("".join(lines).encode()).hexdigest()
+
+
+def frames_csv(frames: Sequence[SourceFrame]) -> str:
+    """Return the text of `frames.csv`."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(COLUMNS)
+    for frame in frames:
+        illumination = "" if frame.illumination is None else frame.illumination
+        writer.writerow([frame.kind, illumination, frame.file, frame.sha256])
+    return text.getvalue()
+
+
+def load_frames(path: Path) -> tuple[SourceFrame, ...]:
+    """Return the frames that a `frames.csv` lists, in the order taken; none where the file does not exist."""
+    if not path.is_file():
+        return ()
+    try:
+        rows = list(csv.DictReader(io.StringIO(path.read_text(encoding="utf-8"))))
+        return tuple(
+            SourceFrame(
+                row["kind"], int(row["illumination"]) if row["illumination"] else None, row["file"], row["sha256"]
+            )
+            for row in rows
+        )
+    except (OSError, KeyError, TypeError, ValueError) as error:
+        raise FormatError(f"{path} is damaged: columns {','.join(COLUMNS)} expected; build the table again") from error
+
+
+def light_sha256(samples: npt.NDArray[np.uint16]) -> str:
+    """Return the SHA-256 of one light's samples (8**bits, S, 3) uint16, as their bytes lie in the file."""
+    return sha256_of(np.ascontiguousarray(samples, dtype="<u2").data)
+
+
+def map_samples(path: Path, lights: int, bits: int) -> npt.NDArray[np.uint16]:
+    """Return `samples.npy` (lights, 8**bits, samples, 3) uint16, mapped from the disk."""
+    try:
+        with path.open("rb") as stream:
+            version = np.lib.format.read_magic(stream)
+            if version != (1, 0):
+                raise ValueError(f"it is of version {version[0]}.{version[1]}, 1.0 expected")
+            shape, columns_first, dtype = np.lib.format.read_array_header_1_0(stream)
+            offset, size = stream.tell(), stream.seek(0, 2)
+    except OSError as error:
+        raise reading_error(path, error, "build the table again") from error
+    except Exception as error:
+        # The head is a Python literal, which fails in many ways.
+        raise FormatError(f"cannot read {path}: {error}; restore it from a copy, or build the table again") from error
+    if dtype != np.dtype("<u2") or columns_first or shape[:2] != (lights, 8**bits) or shape[3:] != (3,):
+        raise FormatError(
+            f"{path} holds {dtype} {shape}, expected uint16 ({lights}, {8**bits}, samples, 3); build the table again"
+        )
+    expected = offset + math.prod(shape) * 2
+    if size != expected or not 0 < shape[2] <= MOST_SAMPLES:
+        raise FormatError(f"{path} has {size} bytes, {expected} expected; restore it from a copy, or build it again")
+    return np.memmap(path, dtype, "r", offset, shape)
+
+
+def samples_sha256(
+    path: Path, samples: npt.NDArray[np.uint16], progress: Callable[[int, int], None] | None = None
+) -> tuple[str, list[str]]:
+    """Return the hash of the file, and of each light's part of it, read once and in order.
+
+    `samples`: (L, 8**bits, S, 3) uint16, the same file mapped: its shape is used.
+    """
+    whole, lights = hashlib.sha256(), list[str]()
+    size = samples[0].nbytes
+    try:
+        with path.open("rb") as stream:
+            whole.update(stream.read(path.stat().st_size - len(samples) * size))
+            for light in range(len(samples)):
+                slab = stream.read(size)
+                whole.update(slab)
+                lights.append(sha256_of(slab))
+                if progress is not None:
+                    progress(light + 1, len(samples))
+    except OSError as error:
+        raise FormatError(f"cannot read {path}: {error.strerror}; check the disk, or build the table again") from error
+    return whole.hexdigest(), lights
+
+
+def sums_of(folder: Path, samples_sha256: str, provenance: str) -> str:
+    """Return the text of `SHA256SUMS` of a table that is complete but for `lut.json`."""
+    hashes = {name: file_sha256(folder / name) for name in _TEXTS if (folder / name).is_file()}
+    hashes |= {SAMPLES: samples_sha256, PROVENANCE: provenance}
+    return "".join(f"{hashes[name]}  {name}\n" for name in sorted(hashes))
+
+
+def parse_sums(text: str, path: Path) -> dict[str, str]:
+    """Return the hashes of a table's files by name."""
+    hashes: dict[str, str] = {}
+    for number, line in enumerate(text.splitlines(), 1):
+        found = _LINE.fullmatch(line)
+        if found is None or found[2] in hashes:
+            raise FormatError(f"{path}, line {number}: expected a hash, two blanks and a name of its own; {RESTORE}")
+        hashes[found[2]] = found[1]
+    lacking = {PROVENANCE, ILLUMINATIONS, SAMPLES} - hashes.keys()
+    if lacking:
+        raise FormatError(f"{path} does not list {' and '.join(sorted(lacking))}; {RESTORE}")
+    return hashes
+
+
+def require_plain_table(folder: Path) -> None:
+    """Refuse a table's folder with files that are no files, or larger than they may be; a FormatError says which."""
+    require_plain_folder(folder, MOST_BYTES)
+
+
+def known_sums(folder: Path, provenance: Provenance) -> dict[str, str]:
+    """Return the recorded hashes of a table's files by name, `samples.npy` included; of older tables what they have."""
+    if provenance.has_sums:
+        path = folder / SUMS
+        try:
+            return parse_sums(path.read_text("utf-8"), path)
+        except (OSError, UnicodeDecodeError) as error:
+            reason = error.strerror if isinstance(error, OSError) else "it is no text"
+            raise FormatError(f"cannot read {path}: {reason}; {RESTORE}") from error
+    if (folder / SUMS).exists():
+        raise FormatError(
+            f"{folder / PROVENANCE} does not know of {SUMS} beside it: one of them has changed; {RESTORE}"
+        )
+    recorded = {ILLUMINATIONS: provenance.illuminations_sha256, SAMPLES: provenance.samples_sha256}
+    return dict(provenance.files_sha256) | {name: known for name, known in recorded.items() if known is not None}
+
+
+def changed_files(folder: Path, known: Mapping[str, str]) -> Iterator[str]:
+    """Yield, in words, each file of a table but its samples that is not as it was built, is gone, or is not listed."""
+    for name, then in known.items():
+        path = folder / name
+        if name == SAMPLES or (name in OPTIONAL and not path.exists()):
+            continue
+        if not path.is_file():
+            yield f"{name} is gone"
+        elif file_sha256(path) != then:
+            yield f"{name} is not as it was built" + ": lights or ground truth have changed" * (name == ILLUMINATIONS)
+    if PROVENANCE in known:
+        # Nothing but what is listed is read, so that only files of a table's own names matter.
+        yield from (
+            f"{name} is no part of the table as it was built"
+            for name in _TEXTS
+            if name not in known and (folder / name).exists()
+        )
+
+
+def require_listed(folder: Path, provenance: Provenance, lights: int) -> dict[str, str]:
+    """Return the recorded hashes of a table's files after holding all but the samples against them."""
+    hashes = len(provenance.lights_sha256)
+    if hashes not in (lights, 0) or (provenance.has_sums and not hashes):
+        raise FormatError(
+            f"{folder / PROVENANCE} has hashes of {hashes} lights, the table has {lights} lights; {RESTORE}"
+        )
+    known = known_sums(folder, provenance)
+    for fault in changed_files(folder, known):
+        raise FormatError(f"{folder}: {fault}; {RESTORE}")
+    return known
 
 
 @dataclass(frozen=True, eq=False)

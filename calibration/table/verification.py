@@ -1,15 +1,101 @@
-"""Whether a table is as it was built, byte by byte, and whether two tables correspond number by number."""
+"""What a table is, in lines for people; whether it is as it was built, byte by byte; whether two tables correspond."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from typing import Any
 
-from calibration.table.file_names import FRAMES, PROVENANCE, SAMPLES
-from calibration.table.lut import Lut
-from calibration.table.sample_hashes import samples_sha256
-from calibration.table.source_frames import frames_sha256
-from calibration.table.sums import changed_files, known_sums
+from calibration.citation import bibtex, origin_lines
+from calibration.table.lut import (
+    FRAMES,
+    PROVENANCE,
+    SAMPLES,
+    SUMS,
+    Lut,
+    Provenance,
+    changed_files,
+    frames_sha256,
+    known_sums,
+    samples_sha256,
+)
 from foundation.errors import FormatError, InputError, first_of
+
+
+def _hashes(known: Provenance) -> str:
+    """Return in words what of a table its recorded hashes cover."""
+    if known.has_sums:
+        return f"every file, in {SUMS}, whose own names the table"
+    if known.lights_sha256:
+        return "ground truth and samples; the table is older than the list of every file"
+    return "none: the table was made before they were recorded, so that changes are not noticed"
+
+
+def describe(lut: Lut) -> list[tuple[str, str]]:
+    """Return what a table is and what it was made from: names and values, for people to read."""
+    known, lights = lut.provenance, lut.illuminations
+    black_bodies = [light.cct_k for light in lights if light.cct_k is not None]
+    spectra = sum(light.kind == "spectrum" for light in lights)
+    kinds = f"{len(lights) - len(black_bodies) - spectra} uniform, {len(black_bodies)} black bodies"
+    if black_bodies:
+        kinds += f" {min(black_bodies):g} to {max(black_bodies):g} K"
+    if spectra:
+        kinds += f", {spectra} spectra"
+    causes: dict[str, int] = {}
+    for cell in known.unfit:
+        cause = cell.cause.split(":")[0]
+        causes[cause] = causes.get(cause, 0) + 1
+    brightest = lut.white.max(axis=1)
+    low, high = lut.ground_truth.min(axis=0), lut.ground_truth.max(axis=0)
+    chromaticities = ", ".join(
+        f"{channel} {least:.3f} to {most:.3f}"
+        for channel, least, most in zip("rgb", low.tolist(), high.tolist(), strict=True)
+    )
+    frames = f"{len(lut.frames)}, listed in {FRAMES}" if lut.frames else "not listed"
+    origin: list[tuple[str, str]] = []
+    session = known.session_sha256
+    if known.computed is not None:
+        by = known.computed.get("by", "a program")
+        origin = [("Origin", f"computed by {by} from spectra and a model of the sensor; nothing was photographed")]
+        frames = session = "none: computed"
+    return [
+        *origin,
+        ("Camera", known.camera),
+        ("Lights", f"{len(lights)}: {kinds}"),
+        ("Colours", f"{8**known.bits} ({known.bits} bits a channel), {lut.samples.shape[2]} samples each"),
+        ("Size", f"{lut.samples.nbytes / 1e9:.2f} GB of samples"),
+        (
+            "White",
+            f"{brightest.min():.0f} to {brightest.max():.0f} in the brightest channel, saturation {known.white_level}",
+        ),
+        ("Chromaticities", chromaticities),
+        (
+            "Cells unfit",
+            f"{len(known.unfit)} of {8**known.bits}"
+            + "".join(f", {count} {cause}" for cause, count in sorted(causes.items())),
+        ),
+        ("Corrections", ", ".join(_name(correction) for correction in known.corrections)),
+        *origin_lines(known.origin),
+        ("Built by", known.software),
+        ("Frames", frames),
+        ("Session", session),
+        ("Chart", known.chart_sha256),
+        ("Samples", known.samples_sha256 or "no hash recorded"),
+        ("Hashes", _hashes(known)),
+        ("Table", lut.sha256),
+    ]
+
+
+def citation_of(lut: Lut) -> str:
+    """Return a BibTeX entry of a table, with its hash."""
+    known = lut.provenance
+    computed = known.computed is not None
+    return bibtex(known.camera, len(lut.illuminations), known.software, lut.sha256, known.origin, computed)
+
+
+def _name(correction: Mapping[str, Any]) -> str:
+    """Return what a correction is called, and whether it was only recorded."""
+    name = str(correction.get("name", "?"))
+    return f"{name} (recorded, not applied)" if correction.get("applied") is False else name
 
 
 def find_faults(lut: Lut, progress: Callable[[int, int], None] | None = None) -> list[str]:
@@ -45,18 +131,24 @@ def _frame_list_faults(lut: Lut) -> list[str]:
     return []
 
 
+def chart_difference(one: Lut, other: Lut) -> str:
+    """Return in what the charts of two tables differ, so that a colour means another place; "" of one chart."""
+    ours, theirs = one.provenance, other.provenance
+    if ours.bits != theirs.bits:
+        return f"{ours.bits} bits of each channel against {theirs.bits}"
+    if ours.chart_sha256 != theirs.chart_sha256:
+        return f"chart {ours.chart_sha256[:12]}… against {theirs.chart_sha256[:12]}…"
+    return ""
+
+
 def require_match(one: Lut, other: Lut) -> None:
     """Refuse two tables whose colours or lights do not correspond number by number.
 
     Tables of one chart under one list of lights, photographed by two bodies or on two days, pass: colour index and
     light index then mean the same in both.
     """
-    ours, theirs = one.provenance, other.provenance
-    found: list[str] = []
-    if ours.bits != theirs.bits:
-        found.append(f"{ours.bits} bits of each channel against {theirs.bits}")
-    elif ours.chart_sha256 != theirs.chart_sha256:
-        found.append(f"chart {ours.chart_sha256[:12]}… against {theirs.chart_sha256[:12]}…")
+    differs = chart_difference(one, other)
+    found = [differs] if differs else []
     if len(one.illuminations) != len(other.illuminations):
         found.append(f"{len(one.illuminations)} lights against {len(other.illuminations)}")
     else:

@@ -12,12 +12,20 @@ from types import MappingProxyType
 import numpy as np
 import numpy.typing as npt
 
-from calibration.table.file_names import FRAMES, ILLUMINATIONS, PROVENANCE, SAMPLES, SUMS
-from calibration.table.lut import WHITE_COLUMNS
-from calibration.table.provenance import Provenance
-from calibration.table.sample_hashes import light_sha256, samples_sha256
-from calibration.table.source_frames import SourceFrame, frames_csv
-from calibration.table.sums import sums_of
+from calibration.table.lut import (
+    FRAMES,
+    ILLUMINATIONS,
+    PROVENANCE,
+    SAMPLES,
+    SUMS,
+    WHITE_COLUMNS,
+    Provenance,
+    SourceFrame,
+    frames_csv,
+    light_sha256,
+    samples_sha256,
+    sums_of,
+)
 from experiment.lights import COLUMNS, NAME, Illumination
 from foundation.errors import StorageError
 from foundation.files import storage_error, write_whole

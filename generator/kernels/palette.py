@@ -19,7 +19,7 @@ from generator.kernels.choice import EDGE_BYTES, OFFSETS_BYTES, group_address
 from generator.kernels.vector import GROUP, copy1, offset_at, write_colours
 
 if TYPE_CHECKING:
-    from calibration.table.provenance import Provenance
+    from calibration.table.lut import Provenance
 
 
 def bits_of(colours: int) -> int:

@@ -10,7 +10,7 @@ White stays W to the last bit, so the ground truth is the same; a share of 1 mak
 inside:
 
 - Signal and noise are stretched alike, by 1 / (1 - v b / W), some hundredths: the noise is else left as it was.
-- Counts have no sign (calibration.sampling.samples clips them at 0), and noise around a black that was taken out would
+- Counts have no sign (calibration.sampling clips them at 0), and noise around a black that was taken out would
   have one. Cut off at 0, black would be too bright by .4 σ. So of a cell with samples below 0 these become 0, and all
   above are lowered by one number that keeps the cell's mean. Where a cell is darker than what is taken out, it is 0.
 - Rounding keeps the mean of a cell: each sample takes over what rounding the one before has left.

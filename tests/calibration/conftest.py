@@ -1,4 +1,4 @@
-"""The small lab of these tests, rendered once: the Test body before 512 colours, and a session taken in it."""
+"""The small lab of these tests, rendered once: the Test body before 512 colours, a session taken in it, its table."""
 
 from __future__ import annotations
 
@@ -6,6 +6,9 @@ from collections.abc import Generator
 
 import pytest
 
+from calibration.pipeline.build import build
+from calibration.report.report import write_report
+from calibration.verdict import BuildResult
 from experiment.session.folder import Session
 from tests.calibration.lab import LIGHTS, Lab, hang, take
 
@@ -19,3 +22,9 @@ def lab() -> Lab:
 def session(lab: Lab, tmp_path_factory: pytest.TempPathFactory) -> Generator[Session]:
     with take(lab, tmp_path_factory.mktemp("lab") / "session", LIGHTS, every=6) as taken:
         yield taken
+
+
+@pytest.fixture(scope="session")
+def built(session: Session, tmp_path_factory: pytest.TempPathFactory) -> BuildResult:
+    """Return the table of the session with its report; to be read, not changed."""
+    return build(session, tmp_path_factory.mktemp("table") / "lut", report=write_report)

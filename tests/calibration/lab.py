@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
@@ -13,6 +14,9 @@ import numpy as np
 import numpy.typing as npt
 
 from benchmarks.sessions import record_session
+from calibration.report.report import report_json
+from calibration.table.lut import REPORT_JSON
+from calibration.verdict import BuildResult
 from drivers.camera import ExposureSettings
 from drivers.presenter import WHITE, Colour
 from drivers.raw.rawfile import Mosaic, read_raw
@@ -113,6 +117,11 @@ def take(
         return "as the test asks" if verdict is not None and verdict(step) != ACCEPTED else None
 
     return record_session(folder, lab.chart, lights, frame or planned, every=every, reason=reason)
+
+
+def figures_alone(result: BuildResult, session: Session, folder: Path) -> None:
+    """Write a report without its page, whose pictures take seconds."""
+    (folder / REPORT_JSON).write_text(json.dumps(report_json(result)))
 
 
 def renumbered(lights: Sequence[Illumination]) -> tuple[Illumination, ...]:

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from calibration.cli import main
-from calibration.pipeline.build import build
+from calibration.verdict import BuildResult
 from experiment.session.folder import Session
 from tests.calibration.lab import LIGHTS
 
@@ -28,11 +28,10 @@ def command(capsys: pytest.CaptureFixture[str]) -> Command:
     return run
 
 
-@pytest.fixture(scope="module")
-def lut(session: Session, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("table") / "lut"
-    build(session, folder)
-    return folder
+@pytest.fixture
+def lut(built: BuildResult) -> Path:
+    assert built.lut is not None
+    return built.lut
 
 
 def test_info_tells_what_the_table_is(lut: Path, command: Command) -> None:

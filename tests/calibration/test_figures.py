@@ -14,7 +14,7 @@ from calibration.figures import all_figures, light
 from calibration.figures.all_figures import FIGURES
 from calibration.figures.figure import QUESTIONS, CheckMeasurements, Figure
 from calibration.figures.truth import DARKEST_COUNTS
-from calibration.sampling.windows import bleed, blur_of_bleed, largest_blur_px
+from calibration.sampling import bleed, blur_of_bleed, largest_blur_px
 
 ROOT = Path(__file__).parents[2]
 PACKAGES = ("foundation", "drivers", "sim", "experiment", "calibration", "acquisition", "benchmarks")

@@ -8,8 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from calibration.table.lut import open_lut
-from calibration.table.provenance import Provenance
+from calibration.table.lut import Provenance, open_lut
 from calibration.table.writer import LutWriter
 from drivers.presenter import Colour
 from experiment.lights import Illumination

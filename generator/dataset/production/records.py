@@ -11,7 +11,7 @@ from typing import Any, Final, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, SerializerFunctionWrapHandler, model_serializer
 
-from calibration.citation.record import OriginRecord
+from calibration.citation import OriginRecord
 from generator.files.formats import Format
 
 FORMAT: Final = "crop.dataset"
@@ -68,7 +68,7 @@ class TableRecord(_RecordWithOptional):
     """The table a dataset was made from; `sha256` as `calibration.table.lut.Lut.sha256`.
 
     `computed` is what the table says of itself where nothing was photographed for it
-    (`calibration.table.provenance.Provenance.computed`), `lights` how many
+    (`calibration.table.lut.Provenance.computed`), `lights` how many
     it has, `origin` with what, when and by whom its frames were taken; None where that was not kept.
     """
 

@@ -12,7 +12,7 @@ import numpy.typing as npt
 import pytest
 
 from calibration.registration.register import register
-from calibration.sampling.samples import gather, sites_at
+from calibration.sampling import gather, sites_at
 from experiment.framing.planes import frame_black
 from experiment.measures.paper import PaperReader
 from experiment.measures.stains import Stains, find_stains

@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 import json
-import shutil
 from pathlib import Path
 
 import pytest
 
 from calibration.cli import main
-from calibration.comparison.comparing import compare
-from calibration.comparison.sources import table_of
-from calibration.pipeline.build import build
-from calibration.pipeline.options import BuildOptions
-from experiment.session.folder import Session
+from calibration.comparison.comparing import compare, table_of
+from calibration.pipeline.baseline import BuildOptions
+from calibration.verdict import BuildResult
 from sim.world.room import Room
 from tests.calibration.lab import LIGHTS, Lab, hang, take
 
@@ -56,9 +53,7 @@ def test_one_room_and_other_noise_are_the_same(folders: tuple[Path, Path], lab: 
 
 
 def test_a_table_is_compared_with_a_session(
-    folders: tuple[Path, Path], session: Session, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    folders: tuple[Path, Path], built: BuildResult, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    build(session, tmp_path / "lut")
-    shutil.copytree(tmp_path / "lut", tmp_path / "copy")
-    assert main(["--compare", str(tmp_path / "lut"), str(folders[0])]) == 0
+    assert main(["--compare", str(built.lut), str(folders[0])]) == 0
     assert "warning: both tables are of the same frames" in capsys.readouterr().out

@@ -13,15 +13,17 @@ import numpy.typing as npt
 import pytest
 
 from calibration.cli import main
-from calibration.comparison.comparing import compare, recorded_drift
-from calibration.comparison.geometry import geometry_difference
-from calibration.comparison.pairs import light_pairs
-from calibration.comparison.report import write_comparison
-from calibration.comparison.values import NoiseAnswer, TableComparison
-from calibration.comparison.wording import cells_csv, comparison_json, lights_csv, lines
+from calibration.comparison.comparing import (
+    NoiseAnswer,
+    TableComparison,
+    compare,
+    geometry_difference,
+    light_pairs,
+    recorded_drift,
+)
+from calibration.comparison.report import cells_csv, comparison_json, lights_csv, lines, write_comparison
 from calibration.radiometry.greys import references_csv
-from calibration.table.lut import Lut, open_lut
-from calibration.table.provenance import Provenance
+from calibration.table.lut import Lut, Provenance, open_lut
 from calibration.table.writer import LutWriter
 from drivers.presenter import Colour
 from experiment.lights import Illumination
@@ -237,6 +239,14 @@ def test_the_files_hold_every_light_and_every_cell(one: Lut, tmp_path: Path) -> 
     assert "-10.0" in page
     stored = json.loads((tmp_path / "report" / "comparison.json").read_text())
     assert (stored["format"], stored["same_within_noise"]) == ("crop.comparison", False)
+    assert list(stored["tables"][0].items()) == [
+        ("place", str(one.folder)),
+        ("camera", one.provenance.camera),
+        ("software", one.provenance.software),
+        ("lights", len(LIGHTS)),
+        ("samples", one.samples.shape[2]),
+        ("drift_corrected", False),
+    ]
     assert stored["gains"] == pytest.approx([0.9] * 3, abs=1e-3)
     assert (tmp_path / "report" / "lights.png").read_bytes()[:4] == b"\x89PNG"
 

@@ -17,8 +17,7 @@ import numpy as np
 import pytest
 
 import calibration.pipeline.build as building
-from calibration.pipeline.build import TableProgress, append, build
-from calibration.pipeline.checkpoint import CHECKPOINT, Checkpoint, unfinished_table
+from calibration.pipeline.build import CHECKPOINT, Checkpoint, TableProgress, append, build, unfinished_table
 from calibration.pipeline.frames import frame_faults
 from calibration.table.lut import open_lut
 from calibration.table.verification import find_faults
@@ -33,7 +32,7 @@ pytestmark = pytest.mark.slow
 
 KILLER = """
 import os, signal, sys
-import calibration.pipeline.build, calibration.pipeline.checkpoint, calibration.table.writer, calibration.report.report
+import calibration.pipeline.build, calibration.table.writer, calibration.report.report
 from calibration.cli import main
 
 place, count = sys.argv[1], int(sys.argv[2])
@@ -41,9 +40,9 @@ calibration.pipeline.build.CHECKPOINT_EVERY = 3
 calibration.report.report.write_report = lambda *_: None
 owner, name = {
     "putting": (calibration.table.writer.LutWriter, "put"),
-    "saving": (calibration.pipeline.checkpoint.UnfinishedTable, "save"),
+    "saving": (calibration.pipeline.build.UnfinishedTable, "save"),
     "finishing": (calibration.table.writer, "write_whole"),
-    "publishing": (calibration.pipeline.checkpoint.Path, "replace"),
+    "publishing": (calibration.pipeline.build.Path, "replace"),
 }[place]
 real = getattr(owner, name)
 
@@ -217,10 +216,13 @@ def test_two_programs_do_not_make_one_table(session: Session, tmp_path: Path) ->
 def test_a_checkpoint_comes_back_to_the_last_bit(tmp_path: Path) -> None:
     values = {"value": 0.1 + 0.2, "tiny": 5e-324, "nothing": None}
     with unfinished_table(tmp_path / "lut") as unfinished:
+        (unfinished.folder / "samples.npy").touch()
         unfinished.save(Checkpoint({"a": "b"}, ["x"], values, {"sum": np.array([0.1, np.inf], np.float32)}))
     assert (tmp_path / ".lut.partial").is_dir()
     with unfinished_table(tmp_path / "lut") as unfinished:
-        back = unfinished.load()
+        assert unfinished.load({"a": "c"}, ["x"]) is None
+        assert unfinished.load({"a": "b"}, ["y", "x"]) is None
+        back = unfinished.load({"a": "b"}, ["x", "y"])
         unfinished.discard()
     assert back is not None
     assert (back.identity, back.frames, back.values) == ({"a": "b"}, ["x"], values)
@@ -232,8 +234,9 @@ def test_a_checkpoint_of_another_form_is_not_gone_on_from(tmp_path: Path) -> Non
     """Versions before this one stored other keys."""
     text = np.frombuffer(b'{"identity": {"a": "b"}, "frames": ["x"], "told": {}}', dtype=np.uint8)
     with unfinished_table(tmp_path / "lut") as unfinished:
+        (unfinished.folder / "samples.npy").touch()
         np.savez(unfinished.folder / CHECKPOINT, text=text)
-        assert unfinished.load() is None
+        assert unfinished.load({"a": "b"}, ["x"]) is None
 
 
 def test_the_frames_of_a_table_are_found_again(session: Session, session_under_way: Session, tmp_path: Path) -> None:

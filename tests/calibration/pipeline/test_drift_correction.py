@@ -12,8 +12,8 @@ import pytest
 
 from calibration.cli import main
 from calibration.comparison.comparing import compare
+from calibration.pipeline.baseline import BuildOptions
 from calibration.pipeline.build import BuildResult, build
-from calibration.pipeline.options import BuildOptions
 from calibration.radiometry.drift import as_measured
 from calibration.table.lut import Lut, open_lut
 from calibration.table.verification import find_faults
@@ -21,7 +21,7 @@ from experiment.session.folder import Session
 from experiment.session.plan import SessionStep
 from foundation.errors import FormatError, QualityError
 from sim.camera.film import write_dng
-from tests.calibration.lab import LIGHTS, SETTINGS, TAKEN_AT, Lab, take
+from tests.calibration.lab import LIGHTS, SETTINGS, TAKEN_AT, Lab, figures_alone, take
 
 pytestmark = pytest.mark.slow
 
@@ -133,7 +133,10 @@ def test_one_white_frame_is_refused_before_anything_is_read(lab: Lab, tmp_path: 
         build(session, tmp_path / "lut", options=CORRECTED)
 
 
-def test_the_command_says_what_it_did(drifting: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_command_says_what_it_did(
+    drifting: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("calibration.report.report.write_report", figures_alone)
     assert main([str(drifting), str(tmp_path / "lut"), "--correct-drift"]) == 0
     capsys.readouterr()
     assert main(["--info", str(tmp_path / "lut")]) == 0

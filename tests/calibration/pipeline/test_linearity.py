@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 
@@ -13,7 +14,6 @@ import pytest
 from calibration.cli import main
 from calibration.pipeline.build import build, check
 from calibration.report.page import summary
-from calibration.report.report import write_report
 from calibration.table.lut import open_lut
 from calibration.table.verification import find_faults
 from calibration.verdict import BuildResult
@@ -23,7 +23,7 @@ from experiment.measures.sensor import deviations
 from experiment.session.folder import Session
 from foundation.errors import FormatError, InputError
 from sim.world.room import Room
-from tests.calibration.lab import Lab, hang
+from tests.calibration.lab import Lab, figures_alone, hang
 
 pytestmark = pytest.mark.slow
 
@@ -125,19 +125,21 @@ def shown(result: BuildResult) -> tuple[str, str]:
     return next((row.value, row.note) for row in summary(result.figures) if row.name == "Linearity")
 
 
-def test_the_table_says_how_linear_its_camera_is(session: Session, lab: Lab, tmp_path: Path) -> None:
+def test_the_table_says_how_linear_its_camera_is(
+    session: Session, built: BuildResult, lab: Lab, tmp_path: Path
+) -> None:
     folder = write_series(lab, tmp_path / "series")
-    result = build(session, tmp_path / "lut", report=write_report, linearity=folder)
+    result = build(session, tmp_path / "lut", report=figures_alone, linearity=folder)
     written = json.loads((tmp_path / "lut" / "report.json").read_text())
     assert written["figures"]["linearity"] < 0.005
     assert len(written["channels"]["linearity"]) == 10
     assert shown(result)[0].endswith("from a straight line at most")
     assert "8 exposures" in shown(result)[1]
     # The series says nothing of the samples, so it changes none of the table's bytes.
-    plain = build(session, tmp_path / "plain")
-    assert shown(plain) == ("not measured", "give a series of exposures of the chart with --linearity")
+    assert built.lut is not None
+    assert shown(built) == ("not measured", "give a series of exposures of the chart with --linearity")
     for name in ("samples.npy", "illuminations.csv", "lut.json"):
-        assert (tmp_path / "lut" / name).read_bytes() == (tmp_path / "plain" / name).read_bytes()
+        assert (tmp_path / "lut" / name).read_bytes() == (built.lut / name).read_bytes()
 
 
 def test_a_sensor_that_bends_is_remarked_on(session: Session, lab: Lab, tmp_path: Path) -> None:
@@ -172,21 +174,26 @@ def test_a_chart_that_stands_elsewhere_is_refused(session: Session, tmp_path: Pa
         check(session, linearity=write_series(moved, tmp_path / "series"))
 
 
-def test_references_are_under_the_table_s_hashes(session: Session, tmp_path: Path) -> None:
-    build(session, tmp_path / "lut")
-    path = tmp_path / "lut" / "references.csv"
-    assert find_faults(open_lut(tmp_path / "lut")) == []
+@pytest.fixture
+def copied(built: BuildResult, tmp_path: Path) -> Path:
+    """Return a copy of the table, to be changed."""
+    assert built.lut is not None
+    shutil.copytree(built.lut, tmp_path / "lut")
+    return tmp_path / "lut"
+
+
+def test_references_are_under_the_table_s_hashes(copied: Path) -> None:
+    path = copied / "references.csv"
+    assert find_faults(open_lut(copied)) == []
     path.write_text(path.read_text().replace("white", "wight", 1))
-    assert find_faults(open_lut(tmp_path / "lut", check=False)) == ["references.csv is not as it was built"]
+    assert find_faults(open_lut(copied, check=False)) == ["references.csv is not as it was built"]
     path.unlink()
-    assert find_faults(open_lut(tmp_path / "lut", check=False)) == ["references.csv is gone"]
+    assert find_faults(open_lut(copied, check=False)) == ["references.csv is gone"]
 
 
-def test_a_dark_frame_is_under_the_table_s_hashes(session: Session, tmp_path: Path) -> None:
-    build(session, tmp_path / "lut")
-    lut = open_lut(tmp_path / "lut")
-    assert any(frame.kind == "dark" for frame in lut.frames)
-    frames = tmp_path / "lut" / "frames.csv"
+def test_a_dark_frame_is_under_the_table_s_hashes(copied: Path) -> None:
+    assert any(frame.kind == "dark" for frame in open_lut(copied).frames)
+    frames = copied / "frames.csv"
     lines = frames.read_text().splitlines(keepends=True)
     frames.write_text("".join(line for line in lines if not line.startswith("dark")))
-    assert find_faults(open_lut(tmp_path / "lut", check=False)) == ["frames.csv is not as it was built"]
+    assert find_faults(open_lut(copied, check=False)) == ["frames.csv is not as it was built"]

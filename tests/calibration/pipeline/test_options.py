@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,14 +9,12 @@ import numpy as np
 import pytest
 
 from calibration.cli import main
+from calibration.pipeline.baseline import BuildOptions
 from calibration.pipeline.build import build, check
-from calibration.pipeline.options import BuildOptions
 from calibration.report.page import summary as report_summary
-from calibration.report.report import write_report
-from calibration.table.description import describe
 from calibration.table.lut import open_lut
-from calibration.table.verification import find_faults
-from calibration.verdict import judge, judged_values, remark
+from calibration.table.verification import describe, find_faults
+from calibration.verdict import BuildResult, judge, judged_values, remark
 from experiment.session.folder import Session
 from foundation.errors import InputError
 
@@ -30,10 +27,12 @@ def test_a_window_that_has_no_middle_or_no_place_is_refused(window: int) -> None
         BuildOptions(window)
 
 
-def test_three_by_three_are_the_inner_samples_of_five_by_five(session: Session, tmp_path: Path) -> None:
-    large = build(session, tmp_path / "5")
-    small = build(session, tmp_path / "3", report=write_report, options=BuildOptions(3))
-    five, three = open_lut(tmp_path / "5"), open_lut(tmp_path / "3")
+def test_three_by_three_are_the_inner_samples_of_five_by_five(
+    session: Session, built: BuildResult, tmp_path: Path
+) -> None:
+    small = build(session, tmp_path / "3", options=BuildOptions(3))
+    assert built.lut is not None
+    five, three = open_lut(built.lut), open_lut(tmp_path / "3")
     assert three.samples.shape == (*five.samples.shape[:2], 9, 3)
     assert "9 samples each" in dict(describe(three))["Colours"]
     assert find_faults(three) == []
@@ -43,7 +42,7 @@ def test_three_by_three_are_the_inner_samples_of_five_by_five(session: Session, 
     assert np.abs(off).max() <= 1 + 0.02 * three.samples.max()
     assert np.abs(off / np.maximum(inner, 100)).mean() < 0.004
     assert three.ground_truth == pytest.approx(five.ground_truth, abs=0.003)
-    assert judged_values(small.figures)["bleed"] < judged_values(large.figures)["bleed"]
+    assert judged_values(small.figures)["bleed"] < judged_values(built.figures)["bleed"]
     assert len(small.figures.cells.unfit) <= 2
     assert small.figures.sensor.transfer.noisy.sum() <= 1
 
@@ -67,14 +66,10 @@ def test_the_command_takes_a_window(session: Session, tmp_path: Path, capsys: py
     code, said = run("--window", 3, "--info", tmp_path / "lut")
     assert code == 2
     assert "--window is about how a table is made, and --info reads one" in said
-    code, said = run("--window", 9, session.folder, tmp_path / "lut")
-    assert code == 4
-    assert "a smaller window (build-lut --window)" in said
-    assert json.loads((tmp_path / "lut.refused" / "report.json").read_text())["channels"]["window"] == 9
 
 
-def test_dark_cells_that_the_lens_may_have_left_wrong_are_named_with_its_veil(session: Session, tmp_path: Path) -> None:
-    figures = build(session, tmp_path / "lut").figures
+def test_dark_cells_that_the_lens_may_have_left_wrong_are_named_with_its_veil(built: BuildResult) -> None:
+    figures = built.figures
     lens = replace(figures.lens, measured=True, corrected=True, residual=0.008, residual_worst=0.034, worst_level=0.045)
     few = replace(figures, lens=replace(lens, veil=0.003, veil_error=0.0035), point_spread=None)
     (row,) = (row for row in judge(judged_values(few)).remarks if row.figure.name.startswith("correction"))

@@ -8,9 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from calibration.pipeline import prefetching
-from calibration.pipeline.build import build
-from calibration.pipeline.prefetching import prefetched
+from calibration.pipeline import build as prefetching
+from calibration.pipeline.build import build, prefetched
 from experiment.session.folder import Session
 from experiment.session.records import FrameRecord
 

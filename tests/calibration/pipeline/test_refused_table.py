@@ -14,7 +14,7 @@ from calibration.cli import main
 from calibration.figures.all_figures import FIGURES
 from calibration.pipeline.build import build, check, refused_folder
 from calibration.report.report import write_report
-from calibration.verdict import judged_values
+from calibration.verdict import BuildResult, judged_values
 from experiment.session.folder import Session
 from foundation.errors import QualityError
 from tests.calibration.lab import LIGHTS, Lab, take
@@ -31,18 +31,18 @@ def short(lab: Lab, tmp_path_factory: pytest.TempPathFactory) -> Generator[Sessi
         yield session
 
 
-def test_a_table_carries_its_verdict(session: Session, tmp_path: Path) -> None:
-    result = build(session, tmp_path / "lut", report=write_report)
-    report = json.loads((tmp_path / "lut" / "report.json").read_text())
+def test_a_table_carries_its_verdict(built: BuildResult) -> None:
+    assert built.lut is not None
+    report = json.loads((built.lut / "report.json").read_text())
     assert report["format"] == "crop.report"
-    assert report["verdict"] == result.verdict.outcome != "refuse"
-    assert report["figures"].keys() == judged_values(result.figures).keys()
+    assert report["verdict"] == built.verdict.outcome != "refuse"
+    assert report["figures"].keys() == judged_values(built.figures).keys()
     assert {limit["name"] for limit in report["limits"]} == report["figures"].keys()
     # No series of exposures was given, no drift was to be taken out, and the chart is so small that the mean of what
     # the lens may leave is remarked on, which names the worst cells.
     unknown = {"linearity", "drift_left", "correction_worst"}
     assert report["figures"].keys() == {limit.name for limit in FIGURES} - unknown
-    page = (tmp_path / "lut" / "report.html").read_text()
+    page = (built.lut / "report.html").read_text()
     assert "class='verdict " in page
     for limit in report["limits"]:
         assert limit["title"] in html.unescape(page)
@@ -71,4 +71,5 @@ def test_the_command_ends_with_the_exit_code_of_a_refusal(
     found = json_of(main, ["--window", "9", short.folder, tmp_path / "lut"], capsys, code=4)
     assert (found["command"], found["verdict"]) == ("build-lut", "refuse")
     assert found["figures"]
+    assert found["channels"]["window"] == 9
     assert not (tmp_path / "lut").exists()

@@ -26,14 +26,16 @@ def test_a_small_chart_becomes_a_table(bits: int, seed: int, tmp_path: Path) -> 
     lab = hang_chart(design_chart(bits, seed=seed), "Test", Room(projector_falloff=0.3))
     with take(lab, tmp_path / "session", LIGHT) as session:
         result = build(session, tmp_path / "lut")
-        write_report(result, session, tmp_path)
+        if seed == 1:
+            write_report(result, session, tmp_path)
     assert result.verdict.outcome == "accept"
     assert not result.figures.cells.unfit
     assert judged_values(result.figures).keys().isdisjoint({"unlike_scatter", "unlike_block", "doubtful_share"})
     # What is not judged is not shown as clean.
-    report = (tmp_path / "report.html").read_text()
-    assert "The course of the session" in report
-    assert "<h2>The print</h2>" not in report
+    if seed == 1:
+        report = (tmp_path / "report.html").read_text()
+        assert "The course of the session" in report
+        assert "<h2>The print</h2>" not in report
     table = open_lut(tmp_path / "lut")
     codes = lab.chart.rgb[lab.chart.cell_of_colour]
     true = lab.world.reflected(codes, LIGHT[0].colour, SETTINGS) / lab.world.white(LIGHT[0].colour, SETTINGS)

@@ -10,8 +10,8 @@ import pytest
 from benchmarks.cases import chart_of
 from benchmarks.sessions import AS_PLANNED, FrameChange, light_named, short_plan, short_session, world_of
 from calibration.figures.all_figures import FIGURES
+from calibration.pipeline.baseline import BuildOptions
 from calibration.pipeline.build import build
-from calibration.pipeline.options import BuildOptions
 from calibration.report.page import summary
 from calibration.verdict import BuildResult, judge, judged_values, remark
 from drivers.presenter import Colour

@@ -6,7 +6,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from calibration.radiometry.cell_field import field_of_cells
+from calibration.pipeline.baseline import field_of_cells
 from drivers.presenter import WHITE, Colour
 from experiment.chart.layout import paper_chart
 from experiment.chart.printing import drawing

@@ -15,6 +15,7 @@ from calibration.radiometry.dark_frames import (
     measure_dark_frame,
 )
 from experiment.session.records import FrameRecord
+from foundation.records import from_plain, to_plain
 
 
 def samples(count: int, level: tuple[float, float, float], seed: int) -> npt.NDArray[np.float32]:
@@ -31,15 +32,15 @@ def dark_frame(
 
 def test_leak_and_hot_photosites_are_read() -> None:
     shape = np.random.default_rng(1).uniform(0.8, 1.2, (400, 1)) * np.ones(3)
-    hot, frames = HotPixels(2000, 25), list[DarkFrameFigures]()
+    hot, frames = HotPixels.none(2000, 25), list[DarkFrameFigures]()
     for number in range(3):
         cells, paper = samples(2000, (1, 2, 1), 10 + number), samples(400, (0, 0, 0), 20 + number)
         paper += (shape[:, None] * (4, 7, 5)).astype(np.float32)
         cells[17, 3, 1] += 200
         cells[99 + number, 5, 0] += 900
         figures, excess = dark_frame(number, cells, paper, shape)
-        frames.append(DarkFrameFigures.from_json(figures.record, figures.to_json()))
-        hot.add(excess)
+        frames.append(from_plain(DarkFrameFigures, to_plain(figures), "a checkpoint", "begin anew"))
+        hot = hot.with_frame(excess)
     dark = dark_summary(frames, hot)
     assert dark.light == pytest.approx([4, 7, 5], abs=4 * 6 / np.sqrt(400 * 25))
     assert (dark.error < 0.1).all()
@@ -51,27 +52,23 @@ def test_leak_and_hot_photosites_are_read() -> None:
 
 def test_a_hot_photosite_is_remembered_over_a_bump() -> None:
     """Before it, cell 3 lies on the photosite; after it, cell 4; a cosmic ray in one frame of a stretch is none."""
-    hot, noise = HotPixels(10, 25), np.full(3, 6.0)
+    hot, noise = HotPixels.none(10, 25), np.full(3, 6.0)
     none = np.zeros((10, 25, 3), dtype=np.int16)
     for number in range(4):
         if number == 2:
-            hot.restart(noise)
+            hot = hot.restarted(noise)
         excess = none.copy()
         excess[3 if number < 2 else 4, 12, 0] = 150
         excess[number, 1, 1] += 800
-        hot.add(excess)
-    copy = HotPixels(10, 25)
-    copy.restore(hot.to_arrays())
-    for one in (hot, copy):
-        assert np.flatnonzero(one.hottest(noise)).tolist() == [3, 4]
+        hot = hot.with_frame(excess)
+    assert np.flatnonzero(hot.hottest(noise)).tolist() == [3, 4]
 
 
 def test_a_stretch_without_dark_frames_has_nothing_hot() -> None:
-    hot = HotPixels(4, 25)
+    hot = HotPixels.none(4, 25)
     assert not hot.hottest(np.full(3, np.nan)).any()
-    hot.restart(np.full(3, np.nan))
-    assert not hot.hottest(np.full(3, 6.0)).any()
+    assert not hot.restarted(np.full(3, np.nan)).hottest(np.full(3, 6.0)).any()
 
 
 def test_without_dark_frames_nothing_is_known() -> None:
-    assert np.isnan(dark_summary([], HotPixels(2, 25)).light).all()
+    assert np.isnan(dark_summary([], HotPixels.none(2, 25)).light).all()

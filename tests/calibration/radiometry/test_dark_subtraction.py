@@ -11,9 +11,9 @@ import numpy.typing as npt
 import pytest
 
 from calibration.cli import main
+from calibration.pipeline.baseline import BuildOptions
 from calibration.pipeline.build import TableProgress, append, build, check
-from calibration.pipeline.options import BuildOptions
-from calibration.radiometry.dark_subtraction import DarkLightEstimator, reflectances, winsorised_means
+from calibration.radiometry.dark_frames import DarkLight, DarkLightEstimate, reflectances, winsorised_means
 from calibration.report.page import summary
 from calibration.table.lut import open_lut
 from calibration.verdict import BuildResult
@@ -36,16 +36,17 @@ _Array = npt.NDArray[np.float64]
 
 def learnt(
     light: _Array, reflectance: _Array, frames: int, seed: int, beyond: _Array | float = 0.0
-) -> tuple[DarkLightEstimator, _Array]:
-    """Return a subtraction after dark frames of 25 samples, and the true dark light of the patches."""
+) -> tuple[DarkLightEstimate, DarkLight, _Array]:
+    """Return estimate and dark light after dark frames of 25 samples, and the true dark light of the patches."""
     random = np.random.default_rng(seed)
-    subtraction = DarkLightEstimator(reflectance, np.ones(len(reflectance), dtype=bool), 25)
+    estimate = DarkLightEstimate.none(reflectance, np.ones(len(reflectance), dtype=bool), 25)
     truth = light * reflectance + beyond
+    dark = DarkLight(light, truth.astype(np.float32), np.zeros(3))
     for _ in range(frames):
         means = truth + random.normal(0, 1, truth.shape) * NOISE / 5
         paper = Paper(FlatField.uniform((1.0, 1.0)), light, np.full(3, 0.05), 400, np.zeros(3))
-        subtraction.add(means, NOISE, paper, np.ones_like(reflectance))
-    return subtraction, truth
+        estimate, dark = estimate.with_frame(means, NOISE, paper, np.ones_like(reflectance))
+    return estimate, dark, truth
 
 
 @pytest.fixture
@@ -56,38 +57,21 @@ def reflectance() -> _Array:
 @pytest.mark.parametrize("frames", [1, 4])
 def test_where_the_prediction_is_right_no_noise_is_added(reflectance: _Array, frames: int) -> None:
     """The share that is believed by chance: the robust variance of 4000 values is good to 3.7 %, 5 σ."""
-    subtraction, truth = learnt(np.array([3.0, 8.0, 5.0]), reflectance, frames, 2)
-    assert subtraction.current is not None
-    assert (subtraction.current.share < 0.19).all()
-    error = (subtraction.current.patches - truth).std(axis=0)
-    assert (error < 0.2 * NOISE / 5 / np.sqrt(frames)).all()
+    _, dark, truth = learnt(np.array([3.0, 8.0, 5.0]), reflectance, frames, 2)
+    assert (dark.share < 0.19).all()
+    assert ((dark.patches - truth).std(axis=0) < 0.2 * NOISE / 5 / np.sqrt(frames)).all()
 
 
 def test_where_it_is_wrong_what_cells_show_is_believed(reflectance: _Array) -> None:
     """A lamp of another colour in the room: patches reflect it otherwise than the projector's light, by 10 %."""
     beyond = 30 * reflectance * np.random.default_rng(5).normal(0, 0.1, (PATCHES, 1))
-    subtraction, truth = learnt(np.array([30.0, 30.0, 30.0]), reflectance, 8, 6, beyond)
-    assert subtraction.current is not None
+    estimate, dark, truth = learnt(np.array([30.0, 30.0, 30.0]), reflectance, 8, 6, beyond)
     predicted = 30 * reflectance
-    assert (subtraction.current.share > 0.7).all()
-    assert ((subtraction.current.patches - truth).std(axis=0) < 0.5 * (predicted - truth).std(axis=0)).all()
-    subtraction.restart()
-    subtraction.add(
-        predicted, NOISE, Paper(FlatField.uniform((1, 1)), np.full(3, 30.0), NOISE, 9, NOISE), np.ones((1, 3))
-    )
-    assert subtraction.current.patches == pytest.approx(predicted, abs=0.01)
-
-
-def test_what_was_learnt_comes_back_to_the_last_bit(reflectance: _Array) -> None:
-    light = np.array([3.0, 8.0, 5.0])
-    whole, _ = learnt(light, reflectance, 2, 7)
-    copy = DarkLightEstimator(reflectance, np.ones(PATCHES, dtype=bool), 25)
-    copy.restore(whole.to_arrays())
-    paper = Paper(FlatField.uniform((1.0, 1.0)), light, np.full(3, 0.05), 400, np.zeros(3))
-    means = light * reflectance + 0.3
-    one, other = (each.add(means, NOISE, paper, np.ones_like(reflectance)) for each in (whole, copy))
-    assert one.patches.tobytes() == other.patches.tobytes()
-    assert DarkLightEstimator(reflectance, np.ones(PATCHES, dtype=bool), 25).to_arrays() == {}
+    assert (dark.share > 0.7).all()
+    assert ((dark.patches - truth).std(axis=0) < 0.5 * (predicted - truth).std(axis=0)).all()
+    paper = Paper(FlatField.uniform((1, 1)), np.full(3, 30.0), NOISE, 9, NOISE)
+    _, dark = estimate.restarted().with_frame(predicted, NOISE, paper, np.ones((1, 3)))
+    assert dark.patches == pytest.approx(predicted, abs=0.01)
 
 
 def test_a_hot_photosite_is_no_light() -> None:

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from calibration.radiometry.corrections import corrections
+from calibration.radiometry.drift import corrections
 from experiment.measures.paper import MAX_ORDER_AROUND, FlatField, Paper, PaperReader
 from foundation.errors import QualityError
 

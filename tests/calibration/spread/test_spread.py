@@ -10,9 +10,10 @@ import numpy.typing as npt
 import pytest
 from scipy import ndimage
 
+from calibration.kernels import PARTS
 from calibration.radiometry.greys import GreyLevels
-from calibration.registration.registration import Registration
-from calibration.sampling.samples import sites_at
+from calibration.registration.register import Registration
+from calibration.sampling import sites_at
 from calibration.spread.correction import (
     FrameCorrection,
     LensFigures,
@@ -20,10 +21,16 @@ from calibration.spread.correction import (
     SpreadFrame,
     measure_spread,
 )
-from calibration.spread.fitting import LEAST_COUNTS, MOST_VEIL, USUAL_UNEVENNESS, colour_residual
-from calibration.spread.point_spread import PointSpread
-from calibration.spread.printed_grid import PAD, PARTS, printed_grid, unsuitable
-from calibration.spread.surroundings import FrameLevels, Surroundings, UsualLight, far_taps
+from calibration.spread.fitting import LEAST_COUNTS, MOST_VEIL, USUAL_UNEVENNESS, PointSpread, colour_residual
+from calibration.spread.surroundings import (
+    PAD,
+    FrameLevels,
+    Surroundings,
+    UsualLight,
+    far_taps,
+    printed_grid,
+    unsuitable,
+)
 from experiment.chart.layout import A_SERIES_MM, design_chart, paper_chart
 from experiment.chart.model import Chart
 from experiment.measures.paper import FlatField

@@ -7,9 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from calibration.table.lut import Lut, open_lut
-from calibration.table.provenance import Provenance
-from calibration.table.source_frames import SourceFrame, frames_sha256
+from calibration.table.lut import Lut, Provenance, SourceFrame, frames_sha256, open_lut
 from calibration.table.writer import LutWriter
 from experiment.lights import plan_illuminations
 

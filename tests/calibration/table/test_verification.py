@@ -11,9 +11,8 @@ from pathlib import Path
 
 import pytest
 
-from calibration.table.description import describe
 from calibration.table.lut import Lut, open_lut
-from calibration.table.verification import find_faults, require_match
+from calibration.table.verification import describe, find_faults, require_match
 from foundation.errors import FormatError
 from tests.calibration.table.tables import LIGHTS, flip, write
 

@@ -17,9 +17,7 @@ import pytest
 from fsspec.implementations.memory import MemoryFileSystem
 
 from calibration.cli import main
-from calibration.table.lut import Lut, open_lut
-from calibration.table.provenance import Provenance
-from calibration.table.source_frames import SourceFrame
+from calibration.table.lut import Lut, Provenance, SourceFrame, open_lut
 from calibration.table.writer import LutWriter
 from calibration.table.zarr_store import SHARD_LIGHTS, fetch, publish
 from drivers.presenter import Colour
@@ -257,7 +255,7 @@ def test_claimed_lights_do_not_fill_the_disk(lut: Lut, tmp_path: Path, monkeypat
     def nearly_full(place: Path) -> SimpleNamespace:
         return SimpleNamespace(free=lut.samples.nbytes)
 
-    monkeypatch.setattr("calibration.table.published_claims.shutil.disk_usage", nearly_full)
+    monkeypatch.setattr("calibration.table.zarr_store.shutil.disk_usage", nearly_full)
     with pytest.raises(StorageError, match=r"0\.0 GB are free at .*; free space or choose another disk"):
         fetch(str(tmp_path / "published"), tmp_path / "back")
 

@@ -9,9 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from calibration.table.lut import Lut, open_lut
-from calibration.table.provenance import Provenance, Unfit
-from calibration.table.source_frames import SourceFrame, frames_sha256
+from calibration.table.lut import Lut, Provenance, SourceFrame, Unfit, frames_sha256, open_lut
 from calibration.table.writer import LutWriter
 from calibration.table.zarr_store import publish
 from drivers.camera import CapturedFrame

@@ -20,9 +20,8 @@ from typing import Any
 
 from acquisition.monitor.view import read_session
 from acquisition.status import status_json, status_lines
-from calibration.table.description import describe
 from calibration.table.lut import open_lut
-from calibration.table.verification import find_faults
+from calibration.table.verification import describe, find_faults
 from calibration.table.zarr_store import fetch
 from experiment.session.folder import Session
 from experiment.session.repair import held_secrets, unsound_files

@@ -8,7 +8,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from calibration.table.provenance import Provenance, Unfit
+from calibration.table.lut import Provenance, Unfit
 from generator.kernels.palette import channels_of, colours_in, nearest_fit_colours, replace_unfit_colours
 
 if TYPE_CHECKING:

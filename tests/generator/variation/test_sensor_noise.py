@@ -10,7 +10,7 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
-from calibration.citation.record import OriginRecord
+from calibration.citation import OriginRecord
 from calibration.table.lut import Lut
 from foundation.errors import InputError
 from generator.variation.iso_speed import known_of_table, parse_iso

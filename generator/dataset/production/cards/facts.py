@@ -7,8 +7,7 @@ from __future__ import annotations
 
 from typing import Any, Final
 
-from calibration.citation.citing import bibtex, table_title
-from calibration.citation.record import origin_lines
+from calibration.citation import bibtex, origin_lines, table_title
 from generator.dataset.production.records import Description
 from generator.files.formats import FULL
 

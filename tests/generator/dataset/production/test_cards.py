@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, get_args
 
 import pytest
 
-from calibration.citation.record import NOT_RECORDED, OriginRecord
+from calibration.citation import NOT_RECORDED, OriginRecord
 from generator.dataset.making import DatasetOptions, generate_dataset
 from generator.dataset.production.cards.croissant import CONFORMS_TO
 from generator.dataset.production.cards.datasheet import OPEN, datasheet

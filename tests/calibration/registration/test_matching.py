@@ -6,7 +6,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from calibration.registration.blocks import unfollowed_px
+from calibration.registration.matching import unfollowed_px
 
 WIDTH, HEIGHT, REACH = 200.0, 100.0, 20.0
 

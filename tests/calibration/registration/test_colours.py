@@ -6,7 +6,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from calibration.registration.colour_checks import agreement, mismatched, slipped_parts
+from calibration.registration.colours import agreement, mismatched, slipped_parts
 from experiment.chart.layout import A_SERIES_MM, design_chart
 
 PAPER = np.array([8000.0, 9000.0, 7000.0])

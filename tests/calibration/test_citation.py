@@ -10,13 +10,20 @@ from pathlib import Path
 
 import pytest
 
-from calibration.citation.citing import bibtex, tex_text
-from calibration.citation.record import NOT_RECORDED, OriginRecord, origin_lines
-from calibration.citation.serial_numbers import serial_hash, with_told_serials
-from calibration.citation.stated import StatedOrigin, origin_record, with_changes
+from calibration.citation import (
+    NOT_RECORDED,
+    OriginRecord,
+    StatedOrigin,
+    bibtex,
+    origin_lines,
+    origin_record,
+    serial_hash,
+    tex_text,
+    with_changes,
+    with_published_serials,
+)
 from calibration.cli import main
-from calibration.table.lut import open_lut
-from calibration.table.provenance import parse_provenance
+from calibration.table.lut import open_lut, parse_provenance
 from drivers.raw.rawfile import FrameOrigin
 from experiment.config import CameraSettings, CitationSettings, parse_lab
 from experiment.session.records import FrameRecord
@@ -76,7 +83,7 @@ def test_a_serial_number_that_is_not_told_stands_nowhere(form: str) -> None:
     citation = CitationSettings.model_validate({"camera_serial": form})
     found = origin_record(stated(citation), RECORDS, [BODY])
     text = found.model_dump_json() + json.dumps(origin_lines(found))
-    told = with_told_serials([BODY, replace(BODY, serial="99")], citation.camera_serial)
+    told = with_published_serials([BODY, replace(BODY, serial="99")], citation.camera_serial)
     assert BODY.serial not in text + repr(told)
     assert found.camera_serial_is == form
     assert ("(hash)" in text) is (form == "hash")
@@ -176,5 +183,5 @@ def test_an_address_ends_no_entry() -> None:
 
 def test_bodies_without_their_numbers_are_counted_as_they_come() -> None:
     origins = [FrameOrigin("Test", serial) for serial in ("7", "8", "7")]
-    told = [one.serial for one in with_told_serials(origins, "withheld")]
+    told = [one.serial for one in with_published_serials(origins, "withheld")]
     assert told == ["withheld (1)", "withheld (2)", "withheld (1)"]

@@ -1,1 +1,0 @@
-"""From photosites to the samples of a cell."""

@@ -1,0 +1,282 @@
+"""Lens, displacement and lateral colour come back from places made with known ones, and with errors they state."""
+
+from __future__ import annotations
+
+import itertools
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from calibration.registration.geometry import (
+    MOST_ROUGHNESS_PX,
+    ROUGHNESS_PX,
+    Displacement,
+    LateralColour,
+    Lens,
+    fit_lens,
+)
+from calibration.registration.register import Registration, register
+from drivers.raw.rawfile import Mosaic
+from experiment.framing.planes import CHANNELS
+from foundation.errors import RegistrationError
+from sim.world.room import Room
+from tests.calibration.lab import Lab, hang
+
+
+def test_the_lens_is_found_exactly_without_noise() -> None:
+    points = np.stack(np.meshgrid(np.linspace(0, 1189, 8), np.linspace(0, 841, 6)), axis=-1).reshape(-1, 2)
+    x, y = ((points - (594, 420)) / 1500 * 2).T
+    r2 = x * x + y * y
+    radial = 1 - 0.04 * r2 + 0.02 * r2**2
+    bent = np.stack([x * radial + 3e-4 * x * y, y * radial + 1.5e-4 * (r2 + 2 * y * y)], axis=-1)
+    places = bent * 1500 + (1300, 866)
+    lens, residual = fit_lens(points, places, (2601, 1733))
+    assert np.abs(residual).max() < 0.02
+    assert lens.to_pixels(points) == pytest.approx(places, abs=0.02)
+
+
+LINES = {
+    "level": (np.linspace(0, 1000, 12), np.full(12, 300.0)),
+    "upright": (np.full(12, 300.0), np.linspace(0, 700, 12)),
+    "slanted": (np.linspace(0, 1000, 12), 100 + 0.37 * np.linspace(0, 1000, 12)),
+    "one point": (np.full(12, 300.0), np.full(12, 200.0)),
+}
+
+
+@pytest.mark.parametrize("line", LINES.values(), ids=LINES)
+def test_marks_on_one_line_are_refused(line: tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]) -> None:
+    points = np.stack(line, axis=-1)
+    # Seen by a camera, the line's places are off it by the error of a measured corner.
+    places = 2 * points + (50, 80) + np.random.default_rng(1).normal(0, 0.1, points.shape)
+    with pytest.raises(RegistrationError, match="lie on one line"):
+        fit_lens(points, places, (2601, 1733))
+    with pytest.raises(RegistrationError, match="lie on one line"):
+        fit_lens(places, points, (2601, 1733))
+
+
+def test_two_small_tags_at_the_ends_of_a_sheet_are_not_on_one_line() -> None:
+    square = np.array([(0, 0), (6, 0), (6, 6), (0, 6)], dtype=np.float64)
+    points = np.concatenate([square + np.array([10, 10]), square + np.array([1170, 825])])
+    places = 2 * points + (50, 80)
+    lens, residual = fit_lens(points, places, (2601, 1733))
+    assert np.abs(residual).max() < 0.02
+    assert lens.to_pixels(points) == pytest.approx(places, abs=0.02)
+
+
+@pytest.mark.parametrize(("tilt_deg", "pan_deg"), [(0.0, 0.0), (8.0, -5.0)])
+def test_parallax_is_the_way_in_which_heights_are_seen(tilt_deg: float, pan_deg: float) -> None:
+    size = np.array([2601, 1733])
+    centre, radius = (size - 1) / 2, float(np.hypot(*size)) / 2
+    focal, distance = 2.2 * radius, 1500.0
+    tilt, pan = np.deg2rad([tilt_deg, pan_deg])
+    upright = np.array([[1, 0, 0], [0, np.cos(tilt), -np.sin(tilt)], [0, np.sin(tilt), np.cos(tilt)]])
+    turned = upright @ np.array([[np.cos(pan), 0, np.sin(pan)], [0, 1, 0], [-np.sin(pan), 0, np.cos(pan)]])
+    camera = np.array([[focal, 0, centre[0]], [0, focal, centre[1]], [0, 0, 1.0]])
+    start = np.array([-600.0, -420.0, distance])
+    homography = camera @ np.column_stack([turned[:, 0], turned[:, 1], start])
+    distortion = np.array([-0.05, 0.02, 1e-3, -5e-4])
+    lens = Lens(homography / homography[2, 2], centre, radius, distortion)
+    undistorted = Lens(np.eye(3), centre, radius, distortion)
+    points = np.stack(np.meshgrid(np.linspace(0, 1189, 5), np.linspace(0, 841, 4)), axis=-1).reshape(-1, 2)
+
+    def seen(height_mm: float) -> npt.NDArray[np.float64]:
+        raised = np.column_stack([points, np.full(len(points), -height_mm)])
+        places = (camera @ (turned @ raised.T + start[:, None])).T
+        return undistorted.to_pixels(places[:, :2] / places[:, 2:])
+
+    foot_mm = abs(float(turned[:, 2] @ start))
+    moved = (seen(1.0) - seen(-1.0)) / 2
+    assert lens.parallax(points) == pytest.approx(moved * foot_mm / radius, rel=2e-3, abs=1e-4)
+    assert lens.parallax(points[7]) == pytest.approx(lens.parallax(points)[7:8])
+
+
+@settings(max_examples=20, deadline=None)
+@given(st.floats(-3, 3), st.floats(-0.05, 0.05), st.floats(-0.05, 0.05))
+def test_a_displacement_without_bend_is_followed_exactly(level: float, slope_x: float, slope_y: float) -> None:
+    low, high = np.array([10.0, 20.0]), np.array([110.0, 90.0])
+    points = low + np.random.default_rng(1).random((300, 2)) * (high - low)
+    moved = np.stack([level + slope_x * points[:, 0], level + slope_y * points[:, 1]], axis=-1)
+    information = np.broadcast_to(np.eye(2) * 1e4, (300, 2, 2))
+    found = Displacement.over(low, high, 12.0).fitted(points, information, 1e4 * moved)
+    assert found.at(points) == pytest.approx(moved, abs=1e-3)
+
+
+def test_its_error_is_what_it_scatters_by_and_grows_where_nothing_is_measured() -> None:
+    random = np.random.default_rng(4)
+    low, high = np.array([0.0, 0.0]), np.array([200.0, 150.0])
+    points = low + random.random((4000, 2)) * (high - low)
+    points = points[(points[:, 0] < 80) | (points[:, 0] > 130)]
+    sigma = 0.2
+    information = np.broadcast_to(np.eye(2) / sigma**2, (len(points), 2, 2))
+    flat = Displacement.over(low, high, 15.0)
+    at = np.array([[40.0, 75.0], [105.0, 75.0]])
+    found = [
+        flat.fitted(points, information, information[0, 0, 0] * sigma * random.standard_normal(points.shape)).at(at)
+        for _ in range(60)
+    ]
+    scattered = np.sqrt((np.array(found) ** 2).sum(axis=2).mean(axis=0))
+    said = flat.errors_px(points, information, at)
+    assert said[0] == pytest.approx(scattered[0], rel=0.4)
+    assert said[1] > 2 * said[0]
+    assert (said >= 0.6 * scattered).all()
+
+
+@pytest.mark.parametrize("heights", [True, False])
+def test_an_edge_known_across_alone_tells_a_height_along_it_as_well(heights: bool) -> None:
+    """A sheet whose left edge stands off: its top edge moves left and up, and only the latter is seen."""
+    low, high = np.array([0.0, 0.0]), np.array([300.0, 200.0])
+    lens = Lens(np.eye(3), np.array([150.0, 100.0]), float(np.hypot(150, 100)), np.zeros(4))
+    along = np.linspace(0, 1, 160)
+    level, upright = along * 300, along * 200
+    points = np.concatenate(
+        [np.stack(side, axis=-1) for side in ((level, 0 * level), (level, 0 * level + 200))]
+        + [np.stack(side, axis=-1) for side in ((0 * upright, upright), (0 * upright + 300, upright))]
+    )
+    normals = np.repeat([(0, 1), (0, 1), (1, 0), (1, 0)], len(along), axis=0).astype(np.float64)
+
+    def sheet(at_mm: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+        height = 4.0 * np.sin(at_mm[:, :1] / 300 * 4 * np.pi)
+        return height * lens.parallax(at_mm)
+
+    information = 1e4 * np.einsum("ni,nj->nij", normals, normals)
+    pull = np.einsum("nij,nj->ni", information, sheet(points))
+    found = Displacement.over(low, high, 10.0, lens if heights else None).fitted(points, information, pull)
+    beside = np.stack([np.linspace(20, 280, 40), np.full(40, 2.0)], axis=-1)
+    off = np.linalg.norm(found.at(beside) - sheet(beside), axis=1)
+    if heights:
+        assert off.max() < 0.5
+        assert (off < 3 * found.errors_px(points, information, beside)).all()
+    else:
+        assert off.max() > 1.5
+
+
+def test_a_sheet_that_bends_more_than_usual_is_found_to() -> None:
+    """The outline is measured, and inside nothing is: the bends there are those that the outline has."""
+    low, high = np.array([0.0, 0.0]), np.array([160.0, 100.0])
+    along = np.linspace(0, 1, 120)[:, None]
+    corners = [low, (high[0], 0.0), high, (0.0, high[1]), low]
+    points = np.concatenate([np.array(a) + along * (np.array(b) - a) for a, b in itertools.pairwise(corners)])
+    information = np.broadcast_to(np.eye(2) * 1e4, (len(points), 2, 2))
+    blank = Displacement.over(low, high, 10.0)
+
+    def found(wave_px: float) -> float:
+        moved = wave_px * np.sin(2 * np.pi * points / 60.0)
+        roughness = ROUGHNESS_PX
+        for _ in range(6):
+            fit = blank.fitted(points, information, 1e4 * moved, roughness)
+            roughness = fit.likely_roughness_px(points, information, roughness)
+        return roughness
+
+    # Second differences of a sine of 6 knots: (2 sin(π/6))² = 1 times its height, 1/√2 of that usually.
+    assert found(2.0) == pytest.approx(np.sqrt(2), rel=0.6)
+    assert found(0.02) == ROUGHNESS_PX
+    assert found(50.0) == MOST_ROUGHNESS_PX
+
+
+SIZE = (400, 300)
+
+
+def compared(
+    true: npt.NDArray[np.float64], noise_px: float = 0.0
+) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+    """Return places, information and pull of blocks that channels with terms `true` (2, 2) and the map move."""
+    random = np.random.default_rng(3)
+    places = random.uniform((0, 0), SIZE, (600, 2))
+    information = np.stack([np.broadcast_to(np.eye(2) * level, (600, 2, 2)) for level in (300.0, 900.0, 200.0)])
+    blank = LateralColour.unmeasured(SIZE)
+    shifted = LateralColour(blank.centre_px, blank.radius_px, true, blank.covariance_px2)
+    moved = np.stack([0.3 + shifted.shift_px(places, channel) for channel in CHANNELS])
+    moved = moved + noise_px * random.standard_normal(moved.shape)
+    return places, information, np.einsum("cnij,cnj->cni", information, moved)
+
+
+def test_what_channels_share_is_the_map_and_the_rest_the_lens() -> None:
+    true = np.array([[0.4, 0.7], [-0.2, -0.3]])
+    found = LateralColour.unmeasured(SIZE).remeasured(*compared(true))
+    assert found.terms_px == pytest.approx(true, abs=0.01)
+    assert found.corner_px("R") == pytest.approx(1.1, abs=0.01)
+    assert found.corner_px("B") == pytest.approx(-0.5, abs=0.01)
+    assert found.corner_px("G") == 0 == found.corner_error_px("G")
+
+
+def test_its_error_is_that_of_its_noise() -> None:
+    true = np.array([[0.4, 0.7], [-0.2, -0.3]])
+    found = LateralColour.unmeasured(SIZE).remeasured(*compared(true, noise_px=0.4))
+    off = (found.terms_px - true).ravel()
+    assert off @ np.linalg.solve(found.covariance_px2, off) < 18.5, "χ² of 4 degrees of freedom, once in a thousand"
+    assert 0.02 < found.corner_error_px("R") < 0.3
+
+
+def test_an_outline_known_across_alone_tells_it() -> None:
+    true = np.array([[0.4, 0.7], [-0.2, -0.3]])
+    blank = LateralColour.unmeasured(SIZE)
+    along = np.linspace(20, np.array(SIZE) - 20, 100)
+    level = np.full(100, 1.0)
+    sides = [(along[:, 0], level * 30, (0, 1)), (along[:, 0], level * 270, (0, 1))]
+    sides += [(level * 40, along[:, 1], (1, 0)), (level * 360, along[:, 1], (1, 0))]
+    places = np.concatenate([np.stack([x, y], axis=-1) for x, y, _ in sides])
+    normals = np.repeat(np.array([normal for _, _, normal in sides], dtype=np.float64), 100, axis=0)
+    across = np.einsum("ni,nj->nij", normals, normals)
+    information = np.array([100.0, 300.0, 50.0])[:, None, None, None] * across
+    # Where blue is not clear nothing was measured, and where only green is clear nothing is told of the others.
+    information[2, ::3] = 0
+    information[0, ::6] = 0
+    shifted = LateralColour(blank.centre_px, blank.radius_px, true, blank.covariance_px2)
+    moved = np.stack([0.2 + shifted.shift_px(places, channel) for channel in CHANNELS])
+    found = blank.remeasured(places, information, np.einsum("cnij,cnj->cni", information, moved))
+    assert found.terms_px == pytest.approx(true, abs=0.02)
+    assert found.corner_error_px("R") < 0.1
+    green = information * np.array([0, 1, 0])[:, None, None, None]
+    alone = blank.remeasured(places, green, np.einsum("cnij,cnj->cni", green, moved))
+    assert not alone.terms_px.any()
+    assert alone.corner_error_px("R") == blank.corner_error_px("R")
+
+
+def test_blocks_of_another_picture_do_not_count_much() -> None:
+    true = np.array([[0.4, 0.7], [-0.2, -0.3]])
+    places, information, pull = compared(true, noise_px=0.05)
+    pull[0, ::10] += information[0, ::10, 0, 0, None] * 4.0
+    found = LateralColour.unmeasured(SIZE).remeasured(places, information, pull)
+    assert found.corner_px("R") == pytest.approx(1.1, abs=0.06)
+
+
+def test_a_dark_channel_is_as_uncertain_as_before() -> None:
+    places, information, pull = compared(np.zeros((2, 2)))
+    information[0], pull[0] = 0, 0
+    found = LateralColour.unmeasured(SIZE).remeasured(places, information, pull)
+    assert found.corner_px("R") == 0
+    assert found.corner_error_px("R") > 1
+
+
+def misses(registration: Registration, lab: Lab, mosaic: Mosaic) -> dict[str, float]:
+    """Return the RMS distance of each channel's cells from the truth, px."""
+    visible = lab.world.body.visible
+    aside = np.array([mosaic.visible.left - visible.left, mosaic.visible.top - visible.top]) / 2
+    found: dict[str, float] = {}
+    for channel in CHANNELS:
+        true = lab.world.project(lab.chart.centres_mm, channel) - aside
+        off = registration.to_pixels(lab.chart.centres_mm, channel) - true
+        found[channel] = float(np.sqrt((off**2).sum(axis=1).mean()))
+    return found
+
+
+def test_every_channel_has_its_own_place(tmp_path: Path) -> None:
+    room = Room(waviness_mm=1.0, lateral_red_px=1.0, lateral_blue_px=-0.6)
+    lab = hang(room=room)
+    mosaic = lab.mosaic(tmp_path)
+    registration = register(mosaic, lab.chart)
+    assert max(misses(registration, lab, mosaic).values()) < 0.04
+    lateral = registration.lateral
+    assert lateral.corner_px("R") == pytest.approx(1.0, abs=4 * lateral.corner_error_px("R"))
+    assert lateral.corner_px("B") == pytest.approx(-0.6, abs=4 * lateral.corner_error_px("B"))
+    assert lateral.corner_error_px("R") < 0.1
+
+
+def test_none_is_found_where_there_is_none(lab: Lab, tmp_path: Path) -> None:
+    lateral = register(lab.mosaic(tmp_path), lab.chart).lateral
+    for channel in ("R", "B"):
+        assert abs(lateral.corner_px(channel)) < 4 * lateral.corner_error_px(channel) < 0.5
