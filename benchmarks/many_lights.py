@@ -19,7 +19,7 @@ import numpy.typing as npt
 from benchmarks.encode import METADATA, photograph
 from benchmarks.generator import SAMPLES, WHITE, in_turns, mask_weights, noisy_table, report
 from calibration.table.lut import Lut
-from generator.files.formats import encode_pieces
+from generator.files import encode_pieces
 from generator.kernels.mixing import mix_samples
 from generator.lights.lighting import Lighting, plain
 from generator.masks.maps import encode_maps

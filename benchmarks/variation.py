@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.generator import in_turns, noisy_table, photograph, report
-from generator.files.formats import ImageMetadata, encode_image
+from generator.files import ImageMetadata, encode_image
 from generator.kernels.rendering import draw_samples
 from generator.variation.exposures import parse_exposure
 from generator.variation.gradients import parse_gradient

@@ -1,8 +1,8 @@
-"""Python functions compiled by numba: at their first call, for the processor at hand, and kept on disk for the next start.
+"""Python functions compiled by numba: at their first call, for the processor at hand, and kept on disk.
 
 A fresh machine needs no compiler: numba brings LLVM with it (`docs/decisions/0010-compiled-kernel.md`). numba itself is
 imported when a compiled function is first called, since that takes half a second
-(`docs/decisions/0038-numba-loads-its-own-code.md`). Compiled functions hold no state and no lock and release the
+(`docs/decisions/0039-numba-loads-its-own-code.md`). Compiled functions hold no state and no lock and release the
 interpreter's. What lies on disk is used for the very sources, settings, processor and libraries that it was made with,
 and where its bytes are those that were written; it lies where numba keeps code: in `NUMBA_CACHE_DIR`, else beside the
 source in `__pycache__`, else in the user's cache folder.
@@ -125,11 +125,15 @@ def _names(code: CodeType) -> set[str]:
 
 @cache
 def _settings() -> tuple[str, ...]:
-    """Return what code depends on beside its sources and the processor: numba's version, LLVM's, and numba's settings."""
+    """Return what code depends on beside sources and processor: numba's version, LLVM's, and numba's settings."""
     import llvmlite
 
     given = (f"{name}={value}" for name, value in sorted(os.environ.items()) if name.startswith("NUMBA_"))
-    return (_numba().__version__, llvmlite.__version__, *(one for one in given if not one.startswith("NUMBA_CACHE_DIR=")))
+    return (
+        _numba().__version__,
+        llvmlite.__version__,
+        *(one for one in given if not one.startswith("NUMBA_CACHE_DIR=")),
+    )
 
 
 @cache

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from foundation.errors import FormatError
-from generator.files.formats import require_plausible
+from generator.files import require_plausible
 
 
 def decode_values(file: bytes, what: Path | str) -> npt.NDArray[Any]:

@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from foundation.errors import FormatError
-from generator.files.formats import encode_map
+from generator.files import encode_map
 from generator.masks.decoding import decode_values
 from generator.masks.weights import FULL, Weights
 from generator.masks.whites import quantised_chromaticities, quantised_weights

@@ -199,7 +199,7 @@ def _wanted(job: ShardJob, position: int) -> list[tuple[int, int, Lighting]]:
 
 
 def _read(job: ShardJob, lut: Lut, place: int) -> _ReadSource:
-    from generator.files.formats import smallest_side
+    from generator.files import smallest_side
     from generator.kernels.palette import replace_unfit_colours
 
     source: Source = job.sources[place]
@@ -241,7 +241,7 @@ def _read(job: ShardJob, lut: Lut, place: int) -> _ReadSource:
 def _make(
     job: ShardJob, lut: Lut, writer: ShardWriter, number: int, source: _ReadSource, crop: int, lighting: Lighting
 ) -> Sample:
-    from generator.files.formats import (
+    from generator.files import (
         FULL,
         ImageMetadata,
         encode_pieces,

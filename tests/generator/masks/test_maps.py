@@ -18,7 +18,7 @@ from hypothesis.extra import numpy as hnp
 
 from foundation.angles import angles_deg
 from foundation.errors import FormatError
-from generator.files.formats import encode_map
+from generator.files import encode_map
 from generator.lights.lighting import Lighting, plain
 from generator.masks.given import find_masks
 from generator.masks.maps import decode_ground_truth, decode_weights, encode_maps

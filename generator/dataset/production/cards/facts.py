@@ -10,7 +10,7 @@ from typing import Any, Final
 from calibration.citation.citing import bibtex, table_title
 from calibration.citation.record import origin_lines
 from generator.dataset.production.records import Description
-from generator.files.formats import FULL
+from generator.files import FULL
 
 DATASHEET: Final = "DATASHEET.md"
 CROISSANT: Final = "croissant.json"
