@@ -22,8 +22,8 @@ from calibration.table.lut import Lut
 from generator.files import encode_pieces
 from generator.kernels.mixing import mix_samples
 from generator.lights.lighting import Lighting, plain
+from generator.masks.making import parse_masks
 from generator.masks.maps import encode_maps
-from generator.masks.request import parse_masks
 
 KINDS = ("half-plane", "soft-edge", "spots", "smooth", "window")
 FULL = 65535

@@ -128,12 +128,9 @@ def _settings() -> tuple[str, ...]:
     """Return what code depends on beside sources and processor: numba's version, LLVM's, and numba's settings."""
     import llvmlite
 
-    given = (f"{name}={value}" for name, value in sorted(os.environ.items()) if name.startswith("NUMBA_"))
-    return (
-        _numba().__version__,
-        llvmlite.__version__,
-        *(one for one in given if not one.startswith("NUMBA_CACHE_DIR=")),
-    )
+    given = {name: value for name, value in sorted(os.environ.items()) if name.startswith("NUMBA_")}
+    given.pop("NUMBA_CACHE_DIR", None)
+    return (_numba().__version__, llvmlite.__version__, *(f"{name}={value}" for name, value in given.items()))
 
 
 @cache
@@ -195,11 +192,12 @@ def _checked_cache() -> Any:
     class CheckedCache(caching.FunctionCache):
         def load_overload(self, sig: Any, target_context: Any) -> Any:
             target_context.refresh()
+            codegen = target_context.codegen()
             try:
-                data = self._path(sig).read_bytes()
+                data = self._path(sig, codegen).read_bytes()
             except OSError:
                 return None
-            if self._hash(sig, target_context.codegen(), data[_HASH_BYTES:]) != data[:_HASH_BYTES]:
+            if self._hash(sig, codegen, data[_HASH_BYTES:]) != data[:_HASH_BYTES]:
                 return None
             return self._impl.rebuild(target_context, pickle.loads(data[_HASH_BYTES:]))
 
@@ -207,13 +205,15 @@ def _checked_cache() -> Any:
             if not self._impl.check_cachable(data):
                 return
             code = serialize.dumps(self._impl.reduce(data))
-            with suppress(CropError, OSError), whole_file(self._path(sig)) as file:
+            with suppress(CropError, OSError), whole_file(self._path(sig, data.codegen)) as file:
                 file.write(self._hash(sig, data.codegen, code) + code)
 
-        def _path(self, sig: Any) -> Path:
-            """Return the file of a signature; new code of the function replaces the old one's."""
-            name = hashlib.sha256(str(sig).encode()).hexdigest()[:12]
-            return Path(self._cache_path) / f"{self._impl.filename_base}-{name}.code"
+        def _path(self, sig: Any, codegen: Any) -> Path:
+            """Return the file of a signature on this kind of processor; new code of the function replaces the old."""
+            function, (_, processor, _) = self._py_func, codegen.magic_tuple()
+            told = "|".join((function.__module__, str(sig), processor, sys.implementation.cache_tag))
+            name = hashlib.sha256(told.encode()).hexdigest()[:12]
+            return Path(self._cache_path) / f"{function.__qualname__}-{name}.code"
 
         def _hash(self, sig: Any, codegen: Any, code: bytes) -> bytes:
             """Return the SHA-256 of code and of all that it was made from."""

@@ -81,10 +81,11 @@ def test_code_that_is_damaged_or_of_another_setting_is_made_anew(tmp_path: Path)
         kept.write_bytes(damaged)
         assert _run(tmp_path, SQUARED) == ("False\n25 True\n", "")
         assert _run(tmp_path, SQUARED) == ("False\n25 False\n", "")
-    for setting in ("NUMBA_OPT", "NUMBA_CPU_NAME"):
-        told = _run(tmp_path, SQUARED, **{setting: {"NUMBA_OPT": "1", "NUMBA_CPU_NAME": "generic"}[setting]})
-        assert told == ("False\n25 True\n", "")
+    assert _run(tmp_path, SQUARED, NUMBA_OPT="1") == ("False\n25 True\n", "")
     assert len(list((tmp_path / "cache").rglob("*.code"))) == 1, "made anew, and kept in its place"
+    for compiles in (True, False):
+        assert _run(tmp_path, SQUARED, NUMBA_CPU_NAME="generic") == (f"False\n25 {compiles}\n", "")
+    assert len(list((tmp_path / "cache").rglob("*.code"))) == 2, "another processor's is kept beside it"
 
 
 PICKLED = """

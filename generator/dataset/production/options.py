@@ -112,7 +112,7 @@ class DatasetOptions:
 
     def describe_rendering(self, lut: Lut) -> dict[str, Any]:
         """Return how images are rendered as plain values; nothing for codes with the print's black kept."""
-        from generator.rendering.table_matrix import matrix_for
+        from generator.rendering.matrices import matrix_for
 
         described: dict[str, Any] = {}
         if self.rendering == "colorimetric":

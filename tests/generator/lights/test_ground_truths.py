@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from foundation.errors import FormatError
-from generator.lights.ground_truths import load_ground_truths
+from generator.lights.distributions import load_ground_truths
 from tests.data_files import available
 
 CUBEPLUS = [0.16238344, 0.45326359, 0.38435297]

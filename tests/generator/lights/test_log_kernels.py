@@ -10,9 +10,8 @@ import pytest
 
 from foundation.errors import FormatError
 from generator import philox
-from generator.lights.distributions import parse_distribution
+from generator.lights.distributions import LogKernels, parse_distribution
 from generator.lights.gamut import rgb_of
-from generator.lights.log_kernels import LogKernels
 from generator.statistics.image_numbers import log_chroma
 from tests.generator.statistics.stats_files import write_stats
 

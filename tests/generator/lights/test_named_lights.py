@@ -12,8 +12,7 @@ import pytest
 
 from foundation.errors import CropError, FormatError, InputError
 from generator.lights.gamut import Gamut
-from generator.lights.named_lights import load_named_truths, named_lights
-from generator.lights.request import LightRequest
+from generator.lights.request import LightRequest, load_named_truths, named_lights
 
 if TYPE_CHECKING:
     from calibration.table.lut import Lut

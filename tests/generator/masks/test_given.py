@@ -11,8 +11,7 @@ import numpy.typing as npt
 import pytest
 
 from foundation.errors import FormatError
-from generator.masks.given import find_masks
-from generator.masks.weights import FULL
+from generator.masks.making import FULL, find_masks
 
 if TYPE_CHECKING:
     pass

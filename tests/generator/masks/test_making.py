@@ -14,10 +14,17 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from foundation.errors import InputError
-from generator.masks.making import MadeMaskPlan
-from generator.masks.request import parse_masks
-from generator.masks.shapes import HalfPlanes, SmoothFields, Spots, Windows
-from generator.masks.weights import FULL, MaskMaker, quantise_shares
+from generator.masks.making import (
+    FULL,
+    HalfPlanes,
+    MadeMaskPlan,
+    MaskMaker,
+    SmoothFields,
+    Spots,
+    Windows,
+    parse_masks,
+    quantise_shares,
+)
 
 KINDS = ("half-plane", "soft-edge", "spots", "smooth", "window")
 Map = npt.NDArray[np.float32]

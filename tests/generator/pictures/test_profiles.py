@@ -14,8 +14,7 @@ from hypothesis import strategies as st
 from PIL import Image, ImageCms
 
 from foundation.errors import FormatError, InputError
-from generator.pictures.picture import Preparation, open_picture
-from generator.pictures.profiles import to_srgb
+from generator.pictures.picture import Preparation, open_picture, to_srgb
 from tests.generator.pictures.icc import gamma_profile
 
 Codes = npt.NDArray[np.uint8]

@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from generator.kernels.dithering import nearest_nodes
-from generator.rendering.cell_mixtures import CellMixtures
-from generator.rendering.gamut_summaries import summarise
-from generator.rendering.source_colours import NODES, node_codes
+from generator.rendering.cell_mixtures import CellMixtures, summarise
+from generator.rendering.colorimetric import NODES, node_codes
 
 
 def test_every_pixel_counts_as_the_node_nearest_to_it() -> None:

@@ -8,8 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from generator.rendering.cell_mixtures import CellMixtures
-from generator.rendering.kept_mixtures import cache_folder, keep_mixtures, load_mixtures
+from generator.rendering.cell_mixtures import CellMixtures, cache_folder, keep_mixtures, load_mixtures
 
 
 @pytest.fixture
@@ -83,6 +82,6 @@ def test_what_was_kept_first_makes_room(
         keep_mixtures(f"{number}", mixtures, tmp_path)
         os.utime(tmp_path / f"{number}.mixtures", ns=(number, number))
     size = (tmp_path / "0.mixtures").stat().st_size
-    monkeypatch.setattr("generator.rendering.kept_mixtures.MOST_BYTES", 3 * size)
+    monkeypatch.setattr("generator.rendering.cell_mixtures.MOST_BYTES", 3 * size)
     keep_mixtures("3", mixtures, tmp_path)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["1.mixtures", "2.mixtures", "3.mixtures", "notes.txt"]

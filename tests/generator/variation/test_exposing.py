@@ -12,9 +12,8 @@ import pytest
 
 from foundation.errors import InputError
 from generator import philox
-from generator.variation.deviates import normal_deviates
 from generator.variation.exposing import brightness_reached, expose
-from generator.variation.sensor_noise import SensorNoise
+from generator.variation.sensor_noise import SensorNoise, normal_deviates
 
 NOISE = SensorNoise(read=(6.0, 4.2, 5.0), shot=(0.56, 0.28, 0.4))
 QUIET = SensorNoise((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))

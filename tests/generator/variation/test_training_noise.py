@@ -13,9 +13,9 @@ from foundation.errors import InputError
 from generator.rendering.black_points import BlackPoint
 from generator.training.crops import Crops
 from generator.training.gallery import gallery_of
+from generator.variation.exposing import add_noise
 from generator.variation.iso_speed import IsoSpeed
 from generator.variation.sensor_noise import SensorNoise, measured_noise
-from generator.variation.training_noise import add_noise
 
 NOISE = SensorNoise((6.0, 4.2, 5.0), (0.56, 0.28, 0.4))
 WHITE = 10000
