@@ -6,20 +6,17 @@
     jxl     JPEG XL, lossless, 16 bits: the smallest of smooth pictures
     dng     a raw file: the Bayer mosaic of the image, two thirds of the values left out, as by a sensor
 
-Every encoder releases the interpreter's lock while it computes (not while it copies uncompressed pixels into the file).
-Beside image and file a PNG takes some megabytes, however large. `docs/decisions/0011-image-files.md` says what else was
-weighed.
+Every encoder releases the interpreter's lock while it computes (not while it copies uncompressed pixels into the
+file). Beside image and file a PNG takes some megabytes, however large. `docs/decisions/0011-image-files.md` says what
+else was weighed.
 
-**PNG** (ISO/IEC 15948). Chunks are written here around ISA-L's deflate. Values are the image's own: no gAMA, cICP or
-iCCP chunk, since camera RGB is no display's and some readers would convert, and no sBIT, since values lie at the lower
-end of the 16 bits. Photographs drawn from a table are packed without a filter: a table has only so many samples of a
-colour, so that half the pixels came before, as they are, within the 32 KiB that deflate looks back, and every filter
-hides it. Where colours change so smoothly that few repeat, the filter Sub packs better; a few rows are tried. Level 2
-finds repeats in hardly more time than level 1 (`docs/decisions/0040-png-by-isa-l.md`). Of maps, which are smooth and
-without noise, differences to the row above are small, and level 1 packs them into as few bytes as OpenCV's writer does.
+**PNG** (ISO/IEC 15948). Chunks are written here around `generator.deflate`; one of data holds a band of rows. Values
+are the image's own: no gAMA, cICP or iCCP chunk, since camera RGB is no display's and some readers would convert, and
+no sBIT, since values lie at the lower end of the 16 bits. Maps are smooth: of differences to the row above ISA-L makes
+as few bytes as OpenCV's writer does, in a fifth of its time; its bytes depend on its version and may on the processor.
 
-**TIFF** 6.0 as every reader can read it: one uncompressed strip. The zstd codec is missing from widespread readers, and
-deflate, at the speed of their TIFF writers, costs more time than it saves room.
+**TIFF** 6.0 as every reader can read it: one uncompressed strip. The zstd codec is missing from widespread readers,
+and deflate, at the speed of their TIFF writers, costs more time than it saves room.
 
 **OpenEXR**, scan lines under zip, saturation at the white level. Written here, since the libraries at hand write to
 named files only. Source: "OpenEXR File Layout" and "Technical Introduction to OpenEXR", version 2 of the file, one
@@ -28,10 +25,10 @@ part; the reordering and prediction before zip are those of the reference implem
 **JPEG XL** (ISO/IEC 18181) at its lowest effort; it has no place for the image's metadata.
 
 **DNG** 1.7.1, chapters 2 and 4. Each photosite of the RGGB pattern takes its own channel of its pixel. Black is 0,
-white the table's saturation, AsShotNeutral the ground truth, so that a raw program shows neutral things as neutral. The
-colour matrix is the one that LibRaw holds for the table's camera or, for a camera unknown to it, that of linear sRGB:
-neutral things stay neutral with both, other colours are right with the first only. The file names CroP as its maker, so
-that no program applies facts of the camera's own files to it, such as their black level.
+white the table's saturation, AsShotNeutral the ground truth, so that a raw program shows neutral things as neutral.
+The colour matrix is the one that LibRaw holds for the table's camera or, for a camera unknown to it, that of linear
+sRGB: neutral things stay neutral with both, other colours are right with the first only. The file names CroP as its
+maker, so that no program applies facts of the camera's own files to it, such as their black level.
 """
 
 from __future__ import annotations
@@ -41,6 +38,7 @@ import json
 import math
 import struct
 import tempfile
+import threading
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -54,10 +52,14 @@ from drivers.raw.camera_matrix import Matrix, camera_matrix
 from drivers.tiff.tags import CFA, D65, RGB, TiffTag
 from drivers.tiff.writing import Tags, ValueType, head, rationals, text
 from foundation.errors import FormatError, InputError
+from generator.deflate import WIDEST, Packer
 
 Image = npt.NDArray[np.uint16]
 Format = Literal["png", "tiff", "exr", "jxl", "dng"]
 FORMATS: Final[tuple[Format, ...]] = get_args(Format)
+
+_threads = threading.local()
+"""Each thread's packer of PNG, with its working memory."""
 
 
 @dataclass(frozen=True)
@@ -108,22 +110,16 @@ def from_full_scale(image: Image, white_level: int) -> Image:
 
 SIGNATURE: Final = b"\x89PNG\r\n\x1a\n"
 """The first bytes of every PNG file (clause 5.2)."""
-WIDEST: Final = 1 << 28
-"""Most pixels of a row: the bytes of one fit into 31 bits."""
 TALLEST: Final = (1 << 31) - 1
 """Largest size in the format (clause 11.2.2)."""
 BAND: Final = 1 << 18
 """Most pixels of a band, unless a row has more: 1.5 MiB, so that an image of any size needs little memory."""
-_LEVEL: Final = 2
-"""ISA-L's level for images, of 0 to 3; see above."""
-_LEVEL_OF_SMOOTH: Final = 1
-"""The same for maps, and for what OpenEXR's prediction leaves."""
-_NONE: Final = 0
-_SUB: Final = 1
+_ZLIB: Final = bytes([0x78, 0x01])
+"""Deflate, a window of 32 KiB, packed fast (RFC 1950, 2.2)."""
+_LEVEL: Final = 1
+"""Level of ISA-L's compression, of 0 to 3, for maps and for what OpenEXR's prediction leaves: both are smooth."""
 _UP: Final = 2
-"""Filter types (clause 9.2)."""
-_TRIED: Final = 1 << 13
-"""Pixels on which the filter is tried: 48 KiB, more than deflate looks back."""
+"""The filter type Up (clause 9.2)."""
 _GREY: Final = 0
 _RGB: Final = 2
 """Colour types (clause 11.2.2)."""
@@ -131,11 +127,11 @@ _RGB: Final = 2
 
 def encode_png(image: Image, metadata: ImageMetadata) -> bytes:
     """Return the file of `image` (H, W, 3) uint16."""
-    return b"".join(png_pieces(image, metadata))
+    return b"".join(map(bytes, png_pieces(image, metadata)))
 
 
-def png_pieces(image: Image, metadata: ImageMetadata) -> Iterator[bytes]:
-    """Yield the file of `image` (H, W, 3) uint16 piece by piece."""
+def png_pieces(image: Image, metadata: ImageMetadata) -> Iterator[bytes | memoryview]:
+    """Yield the file of `image` (H, W, 3) uint16 piece by piece; the memory of each is used again for the next."""
     height, width, _ = image.shape
     if width > WIDEST or height > TALLEST:
         raise InputError(
@@ -143,26 +139,22 @@ def png_pieces(image: Image, metadata: ImageMetadata) -> Iterator[bytes]:
             "make it smaller"
         )
     yield _head(width, height, _RGB)
-    yield _chunk(b"tEXt", b"Description\0" + metadata.to_json().encode("ascii"))
-    packer: Any = isal_zlib.compressobj(_LEVEL)
-    band = max(1, BAND // width)
-    tried = image[(height - 1) // 2 :][: -(-_TRIED // width)]
-    kind = min((_NONE, _SUB), key=lambda one: len(isal_zlib.compress(_rows(tried, one), _LEVEL)))
-    for top in range(0, height, band):
-        yield _chunk(b"IDAT", packer.compress(_rows(image[top : top + band], kind)))
-    yield _chunk(b"IDAT", packer.flush())
-    yield _chunk(b"IEND", b"")
+    yield from _chunk(b"tEXt", b"Description\0" + metadata.to_json().encode("ascii"))
+    rows = max(1, BAND // width)
+    checksum = 1
+    for top in range(0, height, rows):
+        last = top + rows >= height
+        data, plain = _packer().pack(np.ascontiguousarray(image[top : top + rows]), last=last)
+        checksum = int(isal_zlib.adler32(plain.data, checksum))  # pyright: ignore  # its stub leaves the function out
+        yield from _chunk(b"IDAT", b"" if top else _ZLIB, data.data, struct.pack(">I", checksum) if last else b"")
+    yield from _chunk(b"IEND")
 
 
-def _rows(image: Image, kind: int) -> memoryview:
-    """Return the bytes of the rows of `image` (h, w, 3), each behind a filter, which is none or Sub."""
-    plain = image.astype(">u2").view(np.uint8).reshape(len(image), -1)
-    rows = np.empty((len(plain), 1 + plain.shape[1]), np.uint8)
-    rows[:, 0] = kind
-    rows[:, 1:] = plain
-    if kind == _SUB:
-        rows[:, 7:] -= plain[:, :-6]
-    return rows.data
+def _packer() -> Packer:
+    """Return the calling thread's own packer."""
+    if not hasattr(_threads, "packer"):
+        _threads.packer = Packer()
+    return _threads.packer
 
 
 def encode_map(values: Image) -> bytes:
@@ -174,16 +166,23 @@ def encode_map(values: Image) -> bytes:
     rows[0, 1:] = plain[0]
     np.subtract(plain[1:], plain[:-1], out=rows[1:, 1:])
     head = _head(width, height, _GREY if values.ndim == 2 else _RGB)
-    return head + _chunk(b"IDAT", isal_zlib.compress(rows.data, _LEVEL_OF_SMOOTH)) + _chunk(b"IEND", b"")
+    packed = isal_zlib.compress(rows.data, _LEVEL)
+    return b"".join([head, *_chunk(b"IDAT", packed), *_chunk(b"IEND")])
 
 
 def _head(width: int, height: int, colour: int) -> bytes:
-    return SIGNATURE + _chunk(b"IHDR", struct.pack(">IIBBBBB", width, height, 16, colour, 0, 0, 0))
+    size = struct.pack(">IIBBBBB", width, height, 16, colour, 0, 0, 0)
+    return SIGNATURE + b"".join(_chunk(b"IHDR", size))
 
 
-def _chunk(kind: bytes, data: bytes) -> bytes:
-    """Return a chunk (clause 5.3)."""
-    return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", isal_zlib.crc32(data, isal_zlib.crc32(kind)))
+def _chunk(kind: bytes, *parts: bytes | memoryview) -> Iterator[bytes | memoryview]:
+    """Yield the pieces of a chunk (clause 5.3)."""
+    checksum = isal_zlib.crc32(kind)
+    for part in parts:
+        checksum = isal_zlib.crc32(part, checksum)
+    yield struct.pack(">I", sum(len(part) for part in parts)) + kind
+    yield from filter(None, parts)
+    yield struct.pack(">I", checksum)
 
 
 def decode_png(data: bytes) -> npt.NDArray[np.generic]:
@@ -278,7 +277,7 @@ def _scan_lines(image: Image, y: int) -> bytes:
     # Bytes of even and of odd places are parted, then differences taken: so noise and exponents stand apart.
     apart = np.concatenate([raw[0::2], raw[1::2]])
     apart[1:] = apart[1:] - apart[:-1] + np.uint8(128)
-    data = isal_zlib.compress(apart.data, _LEVEL_OF_SMOOTH)
+    data = isal_zlib.compress(apart.data, _LEVEL)
     # Data that do not become smaller are stored without reordering.
     body = data if len(data) < raw.nbytes else raw.tobytes()
     return struct.pack("<ii", y, len(body)) + body
@@ -455,7 +454,7 @@ def _neutral(metadata: ImageMetadata) -> tuple[float, float, float]:
 
 
 _LIBRARIES: Final[dict[Format, tuple[str, ...]]] = {
-    "png": ("isal",),
+    "png": (),
     "tiff": (),
     "exr": ("isal",),
     "jxl": ("imagecodecs",),
@@ -512,8 +511,11 @@ def encode_image(image: Image, form: Format, metadata: ImageMetadata) -> bytes:
     return encode(image, metadata)
 
 
-def encode_pieces(image: Image, form: Format, metadata: ImageMetadata) -> Iterable[bytes]:
-    """Return the file of `image` (H, W, 3) uint16 in pieces; of a PNG they are encoded one after the other."""
+def encode_pieces(image: Image, form: Format, metadata: ImageMetadata) -> Iterable[bytes | memoryview]:
+    """Return the file of `image` (H, W, 3) uint16 in pieces, whose memory may be used again for the next one.
+
+    Pieces of a PNG are encoded one after the other, so that a file of any size needs little memory.
+    """
     _check(image)
     if form == "png":
         return png_pieces(image, metadata)

@@ -1,0 +1,232 @@
+"""Packed rows are deflate that zlib, libdeflate and ISA-L unpack, in good codes; files are no larger than usual."""
+
+from __future__ import annotations
+
+import hashlib
+import heapq
+import zlib
+from itertools import pairwise
+
+import cv2
+import imagecodecs
+import numpy as np
+import numpy.typing as npt
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+from isal import isal_zlib
+
+from foundation.errors import InputError
+from generator import files
+from generator.deflate import LONGEST, Packer, code_lengths, codes_of, find_repeats
+from generator.files import ImageMetadata, encode_png
+
+METADATA = ImageMetadata(12000, (1.0, 1.0, 1.0), "Benchmark")
+
+Image16 = npt.NDArray[np.uint16]
+
+
+def drawn(height: int, width: int, colours: int, seed: int = 0) -> Image16:
+    """Return an image drawn from a table of 25 samples of each colour; few colours make it smooth."""
+    rng = np.random.default_rng(seed)
+    table = rng.poisson(rng.uniform(30, 9000, (colours, 1, 3)), (colours, 25, 3)).astype(np.uint16)
+    picture = np.sort(rng.integers(0, colours, (height, width)), axis=1)
+    return table[picture, rng.integers(0, 25, (height, width))]
+
+
+def smooth(height: int, width: int) -> Image16:
+    """Return a gradient with noise, in which hardly any pixel comes twice."""
+    rng = np.random.default_rng(1)
+    means = 3000 + 1000 * np.sin(np.arange(height)[:, None, None] / 50 + np.arange(width)[None, :, None] / 70)
+    return rng.poisson(means * [0.6, 1.0, 0.8]).astype(np.uint16)
+
+
+def rows_of(image: Image16, filters: npt.NDArray[np.uint8]) -> bytes:
+    """Return the rows of a PNG with filters 0 (None) or 1 (Sub), as ISO/IEC 15948, clause 9.2 has them."""
+    height, width, _ = image.shape
+    plain = image.astype(">u2").view(np.uint8).reshape(height, 6 * width).astype(np.int64)
+    left = np.pad(plain, ((0, 0), (6, 0)))[:, :-6]
+    filtered = (plain - np.where(filters[:, None] == 1, left, 0)) % 256
+    return np.hstack([filters[:, None], filtered]).astype(np.uint8).tobytes()
+
+
+@settings(max_examples=150, deadline=None)
+@given(
+    image=hnp.arrays(
+        np.uint16,
+        st.tuples(st.integers(1, 12), st.integers(1, 200), st.just(3)),
+        elements=st.integers(0, 65535) | st.integers(0, 2),
+        fill=st.integers(0, 65535),
+    ),
+    last=st.booleans(),
+)
+def test_bands_unpack_to_their_rows(image: Image16, last: bool) -> None:
+    data, rows = Packer().pack(image, last=last)
+    assert rows.tobytes() == rows_of(image, rows[:, 0])
+    stream = zlib.decompressobj(wbits=-15)
+    assert stream.decompress(data.data) == rows.tobytes()
+    assert stream.eof == last
+    assert not stream.unused_data
+
+
+@pytest.mark.parametrize("image", [drawn(300, 400, 500), smooth(300, 400), np.full((300, 400, 3), 7, np.uint16)])
+def test_other_libraries_unpack_the_same(image: Image16) -> None:
+    data, rows = Packer().pack(image, last=True)
+    assert isal_zlib.decompress(data.data, wbits=-15) == rows.tobytes()
+    assert imagecodecs.deflate_decode(data.tobytes(), raw=True, out=rows.nbytes) == rows.tobytes()
+
+
+def test_the_way_of_packing_is_the_smaller_one() -> None:
+    _, rows = Packer().pack(drawn(200, 300, 100), last=True)
+    assert set(rows[:, 0]) == {0}
+    _, rows = Packer().pack(smooth(200, 300), last=True)
+    assert set(rows[:, 0]) == {1}
+
+
+def test_a_packer_remembers_nothing_of_the_band_before() -> None:
+    packer = Packer()
+    first = packer.pack(drawn(90, 200, 50), last=False)[0].tobytes()
+    packer.pack(smooth(200, 300), last=True)
+    assert packer.pack(drawn(90, 200, 50), last=False)[0].tobytes() == first
+
+
+def test_a_packer_takes_bands_of_any_shape() -> None:
+    packer = Packer()
+    for height, width in ((700, 1), (8, 100), (1, 900), (30, 29)):
+        data, rows = packer.pack(drawn(height, width, 50), last=True)
+        assert zlib.decompress(data.data, wbits=-15) == rows.tobytes()
+
+
+def test_rows_that_are_not_counted_may_hold_anything() -> None:
+    """Codes come from every eighth row: here those hold few values, and others all values, runs and distances."""
+    image = drawn(400, 500, 300)
+    odd = np.random.default_rng(5).integers(0, 65536, (100, 500, 3)).astype(np.uint16)
+    for run in range(1, 50):
+        odd[run, 100 : 100 + run] = odd[run, 99]
+        odd[run + 50, 9 * run :] = odd[run + 50, : 500 - 9 * run]
+    image[:100][np.arange(100) % 8 != 4] = odd[np.arange(100) % 8 != 4]
+    data, rows = Packer().pack(image, last=True)
+    assert not rows[:, 0].any()
+    assert zlib.decompress(data.data, wbits=-15) == rows.tobytes() == rows_of(image, rows[:, 0])
+
+
+def distances_of(image: Image16) -> npt.NDArray[np.uint16]:
+    distances = np.empty(image.shape[:2], np.uint16)
+    find_repeats(image, np.empty(1 << 15, np.uint64), distances)
+    return distances
+
+
+def test_repeats_are_found_as_far_as_deflate_looks_back() -> None:
+    """Pixel 5461 of a row lies 32766 bytes after the first, within the 32768 allowed; the next one does not."""
+    # Every pixel another, but the two compared.
+    row = np.arange(1, 5464).astype(np.uint16)[None, :, None] * np.array([1, 3, 7], np.uint16)
+    for place, distance in ((5461, 32766), (5462, 0)):
+        image = row.copy()
+        image[0, place] = image[0, 0]
+        expected = np.zeros((1, 5463))
+        expected[0, place] = distance
+        np.testing.assert_array_equal(distances_of(image), expected)
+
+
+def test_distances_count_the_filters_between_rows() -> None:
+    image = np.arange(60).astype(np.uint16).reshape(4, 5, 3)
+    image[3, 4] = image[1, 0]
+    image[2, 2] = image[2, 1]
+    expected = np.zeros((4, 5))
+    expected[3, 4] = 2 * (1 + 6 * 5) + 6 * 4
+    expected[2, 2] = 6
+    np.testing.assert_array_equal(distances_of(image), expected)
+
+
+@settings(max_examples=50, deadline=None)
+@given(st.integers(0, 1 << 32), st.integers(1, 40), st.integers(1, 40), st.integers(2, 40))
+def test_what_is_found_is_equal(seed: int, height: int, width: int, colours: int) -> None:
+    image = drawn(height, width, colours, seed)
+    data = rows_of(image, np.zeros(height, np.uint8))
+    for (y, x), distance in np.ndenumerate(distances_of(image)):
+        at = y * (1 + 6 * width) + 1 + 6 * x
+        if distance:
+            assert data[at - distance : at - distance + 6] == data[at : at + 6]
+
+
+@pytest.mark.parametrize("band", [1, 400, 5000])
+def test_bands_make_one_stream(monkeypatch: pytest.MonkeyPatch, band: int) -> None:
+    monkeypatch.setattr(files, "BAND", band)
+    image = drawn(37, 400, 60)
+    data = encode_png(image, METADATA)
+    assert data.count(b"IDAT") == -(-37 // max(1, band // 400))
+    np.testing.assert_array_equal(imagecodecs.png_decode(data), image)
+
+
+@pytest.mark.parametrize("image", [drawn(512, 512, 2000), smooth(512, 512), np.full((512, 512, 3), 300, np.uint16)])
+def test_files_are_no_larger_than_those_of_opencv(image: Image16) -> None:
+    usual = cv2.imencode(".png", image[..., ::-1])[1]
+    assert len(encode_png(image, METADATA)) <= len(usual)
+
+
+def test_images_that_no_png_holds_are_refused() -> None:
+    wide = np.broadcast_to(np.zeros(1, np.uint16), (1, (1 << 28) + 1, 3))
+    with pytest.raises(InputError, match="268435457x1 px is too large for PNG"):
+        encode_png(wide, METADATA)
+    tall = np.broadcast_to(np.zeros(1, np.uint16), (1 << 31, 1, 3))
+    with pytest.raises(InputError, match="1x2147483648 px is too large for PNG"):
+        encode_png(tall, METADATA)
+
+
+frequencies = st.lists(st.integers(0, 1 << 40) | st.just(0), min_size=1, max_size=286)
+
+
+@settings(max_examples=200, deadline=None)
+@given(frequencies)
+def test_codes_are_complete_and_begin_no_other(counts: list[int]) -> None:
+    lengths = code_lengths(np.array(counts), LONGEST)
+    used = lengths[lengths > 0]
+    assert ((lengths > 0) == (np.array(counts) > 0)).all()
+    if len(used) > 1:
+        assert used.max() <= LONGEST
+        assert (1 << (LONGEST - used)).sum() == 1 << LONGEST
+    codes = [format(code & 0xFFFF, f"0{code >> 16}b")[::-1] for code in codes_of(lengths).tolist() if code >> 16]
+    ordered = sorted(codes)
+    assert not any(after.startswith(before) for before, after in pairwise(ordered))
+
+
+@settings(max_examples=100, deadline=None)
+@given(st.lists(st.integers(1, 60), min_size=2, max_size=40))
+def test_codes_are_the_shortest(counts: list[int]) -> None:
+    """Against Huffman's own construction by a heap, where no code reaches the limit."""
+    heap = list(counts)
+    heapq.heapify(heap)
+    best = 0
+    while len(heap) > 1:
+        joined = heapq.heappop(heap) + heapq.heappop(heap)
+        best += joined
+        heapq.heappush(heap, joined)
+    lengths = code_lengths(np.array(counts), 16)
+    assert (lengths * counts).sum() == best
+
+
+def test_codes_too_long_are_cut() -> None:
+    fibonacci = [1, 1]
+    while len(fibonacci) < 40:
+        fibonacci.append(fibonacci[-1] + fibonacci[-2])
+    lengths = code_lengths(np.array(fibonacci), LONGEST)
+    assert lengths.max() == LONGEST
+    assert (1 << (LONGEST - lengths)).sum() == 1 << LONGEST
+    assert (np.diff(lengths) <= 0).all()
+
+
+@pytest.mark.parametrize(
+    ("height", "width", "sha256"),
+    [
+        (64, 48, "99f19bda7def797cdd0e77c9f75f6c46b884d0fa1ce05cdf80c2e6ef192bc933"),
+        (640, 480, "a19655d3053a49bfaf928f2b030395c818950d51d7a2689c7a580d4182ef0206"),
+    ],
+)
+def test_the_bytes_of_a_file_stay_the_same_for_ever(height: int, width: int, sha256: str) -> None:
+    """A data set made again must be the same; whoever changes these hashes changes every data set's files."""
+    index = np.arange(height * width)
+    picture = (index * index // 97 % 40).reshape(height, width)
+    sample = ((index * 2654435761 >> 7) % 25).reshape(height, width)
+    image = np.stack([picture * gain + sample * gain // 9 for gain in (31, 97, 55)], axis=-1)
+    assert hashlib.sha256(encode_png(image.astype(np.uint16), METADATA)).hexdigest() == sha256
