@@ -507,8 +507,13 @@ def encode_image(image: Image, form: Format, metadata: ImageMetadata) -> bytes:
     _check(image)
     if form == "jxl":
         return encode_jxl(image)
-    encode = {"png": encode_png, "tiff": encode_tiff, "exr": encode_exr, "dng": encode_dng}[form]
-    return encode(image, metadata)
+    encode: dict[str, Callable[[Image, ImageMetadata], bytes]] = {
+        "png": encode_png,
+        "tiff": encode_tiff,
+        "exr": encode_exr,
+        "dng": encode_dng,
+    }
+    return encode[form](image, metadata)
 
 
 def encode_pieces(image: Image, form: Format, metadata: ImageMetadata) -> Iterable[bytes | memoryview]:
