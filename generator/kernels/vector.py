@@ -426,7 +426,6 @@ FAULT_BYTES: Final = 4 * LANES
 _QUAD: Final = 4
 """Numbers of a pixel in a vector, a quarter of it: red, green, blue and padding."""
 _SHORTS: Final = ir.VectorType(I16, 2 * LANES)
-_EIGHT_WORDS: Final = ir.VectorType(I32, BLOCK)
 _PIXEL_PAIRS: Final = ((0, 2), (4, 6), (1, 3), (5, 7))
 """Which two of eight pixels share a vector, so that pixels are packed without crossing its quarters."""
 _ORDER: Final = tuple((_PIXEL_PAIRS[lane % _QUAD][lane // (2 * _QUAD)], lane // _QUAD % 2) for lane in range(LANES))

@@ -255,7 +255,6 @@ _ZERO: Final = np.float32(0)
 _NO_FLOOR: Final = np.float32(-1)
 """Least value where counts below black are kept: as far below 0 as saturation is above, where no noise reaches."""
 _ONE: Final = np.float32(1)
-_32: Final = np.uint64(32)
 
 
 @compiled

@@ -5,21 +5,17 @@ from __future__ import annotations
 import pickle
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Any
 
 import numpy as np
 import pytest
 
+from calibration.table.lut import Lut
 from foundation.errors import CropError, FormatError, InputError
-from generator.lights.gamut import Gamut
-from generator.lights.request import LightRequest, load_named_truths, named_lights
-
-if TYPE_CHECKING:
-    from calibration.table.lut import Lut
-from typing import TYPE_CHECKING, Any
-
 from generator.lights.choices import DrawnLights, ListedLights, RandomLights, SequentialLights, SimultaneousLights
+from generator.lights.gamut import Gamut
 from generator.lights.lighting import Mixture, plain
+from generator.lights.request import LightRequest, load_named_truths, named_lights
 
 
 def written(path: Path, text: str) -> Path:
