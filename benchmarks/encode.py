@@ -21,8 +21,7 @@ import numpy.typing as npt
 import skimage.data
 
 from benchmarks.generator import in_turns, natural_picture, noisy_table, report
-from generator.files.formats import FORMATS, ImageMetadata, encode_image
-from generator.files.png import encode_png
+from generator.files import FORMATS, ImageMetadata, encode_image
 from generator.kernels.rendering import draw_samples
 
 REPEATS = 3
@@ -68,15 +67,11 @@ def main() -> None:
                 "ours": ours,
                 "two": partial(at_once, pool, [ours, ours]),
             }
-            if form == "png":
-                calls["shared"] = partial(encode_png, image, METADATA, threads=2)
             took = in_turns(calls, time.perf_counter, REPEATS if picture.size > 10**7 else 20)
         pixels = picture.size / 3e6
         report(f"{form}, {name}, one thread", pixels / took["ours"], "Mpx/s")
         report(f"{form}, {name}, one thread", took["cv2"] / took["ours"], "ratio", "PNG by cv2.imencode")
         report(f"{form}, {name}, two threads", 2 * took["ours"] / took["two"], "ratio", "one thread")
-        if form == "png":
-            report(f"{form}, {name}, one image by two threads", took["ours"] / took["shared"], "ratio", "one thread")
 
 
 if __name__ == "__main__":

@@ -37,7 +37,7 @@ from benchmarks.generator import SAMPLES, noisy_table, report
 from calibration.table.lut import Lut, open_lut
 from foundation.processors import processor_count
 from generator.dataset.making import DatasetOptions, generate_dataset
-from generator.files.formats import encode_pieces
+from generator.files import encode_pieces
 from generator.pictures.sources import find_pictures
 from generator.stores.store import LocalStore
 

@@ -47,7 +47,7 @@ from generator.kernels.mixing import mix_samples
 from generator.kernels.planar import draw_planar
 from generator.kernels.rendering import draw_mosaic, draw_samples
 from generator.kernels.vector import GROUP, LANES, LINE, SAMPLE_BYTES, copy8, offset_at, prefetch_once
-from generator.masks.request import parse_masks
+from generator.masks.making import parse_masks
 from generator.rendering.black_points import Veil, without_veil
 
 SAMPLES = 25

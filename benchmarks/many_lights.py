@@ -19,11 +19,11 @@ import numpy.typing as npt
 from benchmarks.encode import METADATA, photograph
 from benchmarks.generator import SAMPLES, WHITE, in_turns, mask_weights, noisy_table, report
 from calibration.table.lut import Lut
-from generator.files.formats import encode_pieces
+from generator.files import encode_pieces
 from generator.kernels.mixing import mix_samples
 from generator.lights.lighting import Lighting, plain
+from generator.masks.making import parse_masks
 from generator.masks.maps import encode_maps
-from generator.masks.request import parse_masks
 
 KINDS = ("half-plane", "soft-edge", "spots", "smooth", "window")
 FULL = 65535

@@ -14,12 +14,10 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.generator import in_turns, noisy_table, photograph, report
-from generator.files.formats import ImageMetadata, encode_image
+from generator.files import ImageMetadata, encode_image
 from generator.kernels.rendering import draw_samples
-from generator.variation.exposures import parse_exposure
-from generator.variation.gradients import parse_gradient
 from generator.variation.iso_speed import parse_iso
-from generator.variation.variation import Variation, varied_by
+from generator.variation.variation import Variation, parse_exposure, parse_gradient, varied_by
 
 WIDTH, HEIGHT, WHITE = 3000, 2000, 12000
 

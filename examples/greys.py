@@ -23,11 +23,9 @@ from foundation.colorimetry import angles_deg
 from generator.kernels.dithering import nearest_nodes
 from generator.lights.choices import parse_lights
 from generator.pictures.picture import open_picture
-from generator.rendering.colorimetric import colorimetric_mixtures
-from generator.rendering.matrices import ColourMatrix
+from generator.rendering.colorimetric import NODES, colorimetric_mixtures
+from generator.rendering.matrices import ColourMatrix, matrix_for
 from generator.rendering.print_profiles import profile_of
-from generator.rendering.source_colours import NODES
-from generator.rendering.table_matrix import matrix_for
 
 GREYS = np.arange(32) * (32 * 32 + 32 + 1)
 """Source nodes of equal codes of red, green and blue."""

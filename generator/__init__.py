@@ -20,13 +20,12 @@ if TYPE_CHECKING:
     from calibration.table.lut import Lut
     from generator.dataset.making import Callbacks, DatasetOptions, Workers, generate_dataset
     from generator.dataset.reader import open_dataset
-    from generator.kernels.mixed_table import mixed_table
-    from generator.kernels.mixing import mix_samples
+    from generator.kernels.mixing import mix_samples, mixed_table
     from generator.kernels.planar import draw_batch, draw_planar
     from generator.kernels.rendering import draw_mosaic, draw_samples, render
     from generator.pictures.picture import read_picture
+    from generator.pictures.preview import flash
     from generator.pictures.sources import find_pictures
-    from generator.pictures.tonemap import flash
 
 __all__ = [
     "Callbacks",
@@ -56,10 +55,10 @@ _HOMES = {
     "draw_planar": "generator.kernels.planar",
     "draw_samples": "generator.kernels.rendering",
     "find_pictures": "generator.pictures.sources",
-    "flash": "generator.pictures.tonemap",
+    "flash": "generator.pictures.preview",
     "generate_dataset": "generator.dataset.making",
     "mix_samples": "generator.kernels.mixing",
-    "mixed_table": "generator.kernels.mixed_table",
+    "mixed_table": "generator.kernels.mixing",
     "open_dataset": "generator.dataset.reader",
     "read_picture": "generator.pictures.picture",
     "render": "generator.kernels.rendering",

@@ -152,7 +152,7 @@ def _plan(
 
 def _tint_caution(table: Lut, rendering: str | None) -> tuple[str, ...]:
     """Return a line about greys that are not grey, unless the user has said how to render."""
-    from generator.rendering.grey_tint import grey_tint_deg
+    from generator.rendering.colorimetric import grey_tint_deg
 
     tint = None if rendering else grey_tint_deg(table)
     if tint is None or tint[0] < CAUTION_DEG:

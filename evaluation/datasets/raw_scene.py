@@ -16,7 +16,7 @@ import numpy.typing as npt
 from evaluation.datasets.truths import Light, read_light
 from evaluation.scene import Image
 from foundation.errors import FormatError
-from generator.files.formats import decode_array
+from generator.files import decode_array
 
 Mask = npt.NDArray[np.bool_]
 """(H, W), True where a pixel must not be used."""

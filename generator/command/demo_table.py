@@ -31,11 +31,11 @@ BITS: Final = 4
 def table_folder(given: Path, cache: Path | None = None) -> Path:
     """Return the folder of a table: the one given, or that of the table to begin with, made if it is not there.
 
-    `cache`: where the table is kept; None for `generator.rendering.kept_mixtures.cache_folder`.
+    `cache`: where the table is kept; None for `generator.rendering.cell_mixtures.cache_folder`.
     """
     if str(given) != DEMO:
         return given
-    from generator.rendering.kept_mixtures import cache_folder
+    from generator.rendering.cell_mixtures import cache_folder
 
     cache = cache or cache_folder()
     if cache is None:

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from generator.likeness.pictures import BlackShares
     from generator.pictures.sources import Source
     from generator.statistics.statistics_file import RealStatistics
-    from generator.variation.exposures import ExposureChoice
+    from generator.variation.variation import ExposureChoice
 
 _LIKENESS = "Likeness"
 
@@ -281,9 +281,9 @@ def _photograph(
 ) -> npt.NDArray[np.uint16]:
     """Return the raw image of a picture as the dataset renders it, under one of the table's lights."""
     from generator.dataset.production.photographing import photograph
-    from generator.kernels.palette import replace_unfit_colours
+    from generator.kernels.choice import replace_unfit_colours
     from generator.lights.lighting import Lighting, plain
-    from generator.pictures.bits import keep_bits
+    from generator.pictures.picture import keep_bits
 
     picture = keep_bits(picture, rendered.bits)
     if rendered.rendering == "codes":

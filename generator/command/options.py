@@ -25,8 +25,7 @@ if TYPE_CHECKING:
     from generator.lights.request import LightRequest
     from generator.pictures.picture import Preparation
     from generator.pictures.sources import Source
-    from generator.variation.exposures import ExposureChoice
-    from generator.variation.variation import Variation
+    from generator.variation.variation import ExposureChoice, Variation
 
 _SOURCES = "Source pictures"
 _LIGHT = "Light"
@@ -341,7 +340,7 @@ class RenderingOptions:
     def of(self, options: DatasetOptions, table: Lut) -> DatasetOptions:
         """Return the options of a dataset with these; an InputError says which cannot be used."""
         from generator.rendering.black_points import parse_black_point
-        from generator.rendering.table_matrix import matrix_for
+        from generator.rendering.matrices import matrix_for
 
         rendering = self.rendering or options.rendering
         if rendering == "codes" and self.matrix is not None:
@@ -387,10 +386,8 @@ class VariationOptions:
 
     def variation(self, lut: Lut, like: ExposureChoice | None = None) -> Variation:
         """Return the variation of images of a table, exposed like a data set unless an option says how."""
-        from generator.variation.exposures import parse_exposure
-        from generator.variation.gradients import parse_gradient
         from generator.variation.iso_speed import known_of_table, parse_iso
-        from generator.variation.variation import varied_by
+        from generator.variation.variation import parse_exposure, parse_gradient, varied_by
 
         return varied_by(
             lut,

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 def matrix_sentence(matrix: ColourMatrix, camera: str, *, chosen: bool) -> str:
     """Return which colour matrix is taken, where it comes from, and what to mind if the table gave it."""
-    from generator.rendering.table_matrix import TABLE
+    from generator.rendering.matrices import TABLE
 
     told = f"colour matrix: {matrix.name} ({matrix.source})"
     if matrix.name != TABLE:

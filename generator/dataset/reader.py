@@ -48,7 +48,7 @@ from generator.dataset.production.records import (
     SourceRecord,
     shard_key,
 )
-from generator.files.formats import decode_image, from_full_scale
+from generator.files import decode_image, from_full_scale
 from generator.masks.maps import decode_ground_truth, decode_weights
 from generator.stores.places import DESCRIPTION
 from generator.stores.store import Store, open_store, read_bounded

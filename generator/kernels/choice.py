@@ -1,5 +1,8 @@
 """Which of a colour's samples a pixel gets: a pure function of (seed, image number, light's place, x, y).
 
+Beside that what all kernels share: the colours of a table, and their arguments, which are checked before compiled code
+reads their memory.
+
 Tiles, threads and workers cannot change a choice. The rule is part of the dataset format
 (`docs/decisions/0010-compiled-kernel.md` says why it is this one); all arithmetic is modulo 2³² but for p and q::
 
@@ -8,26 +11,39 @@ Tiles, threads and workers cannot change a choice. The rule is part of the datas
              h = (h ⊕ ⌊h/2¹⁵⌋) · 0x31848BAB
     sample   p = h S and q = (p mod 2³²) S, S the samples of a colour; ⌊p/2³²⌋ where x mod 16 < 8, else ⌊q/2³²⌋
 
-`place` is 0 but where lights are mixed per pixel: there it is the light's place among them. Rows are keyed by 96 random
-bits, so rows, images, seeds and places are as independent as Philox makes them. Within a row three keyed rounds of
-multiplying and shifting are needed: with one, pictures of two seeds are each other's with neighbours swapped; with two,
-pixels whose distance is near a power of two depend on each other. The two choices from one word are its first two
+`place` is 0 but where lights are mixed per pixel: there it is the light's place among them. Rows are keyed by 96
+random bits, so rows, images, seeds and places are as independent as Philox makes them. Within a row three keyed rounds
+of multiplying and shifting are needed: with one, pictures of two seeds are each other's with neighbours swapped; with
+two, pixels whose distance is near a power of two depend on each other. The two choices from one word are its first two
 digits in base S and differ from independent ones by less than S²/2³² of their probability.
 
 The multipliers are odd numbers found by others to spread changes well: C. Wellons, "Prospecting for hash functions",
 2018, and its collection of improved constants.
+
+A table lists the cells whose samples must not be used. A pixel of such a colour takes the nearest fit colour, and the
+number of those pixels is printed and recorded with the dataset; nothing is replaced in silence.
 """
 
 from __future__ import annotations
 
-from typing import Any, Final
+from functools import lru_cache
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
+import numpy.typing as npt
 from numpy import uint32, uint64
 
-from foundation.compiled import inlined
-from generator.kernels.vector import GROUP, LANES, LINE, choose, copy1, prefetch_once
+from foundation.compiled import compiled, inlined
+from foundation.errors import InputError, QualityError
+from generator.kernels.vector import GROUP, LANES, LINE, choose, copy1, offset_at, prefetch_once, write_colours
 from generator.philox import KEY_STEPS, MULTIPLIERS, ROUNDS, SAMPLES
+
+if TYPE_CHECKING:
+    from calibration.table.lut import Provenance
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+
+from generator.philox import key_of
 
 LEAD: Final = 2
 """Groups of pixels by which choosing offsets leads fetching samples, so that the processor computes while it waits."""
@@ -110,3 +126,255 @@ def choose_group(row: int, width: int, group: int, keys: Any, count: Any, bits: 
     """Write the offsets, uint32 bytes, of the samples of a row's pixels from x = 32 `group` on at `target`."""
     source = group_address(row, width, group, scratch)
     choose(source, uint32(LANES * group), keys[0], keys[1], keys[2], count, bits, target)
+
+
+def bits_of(colours: int) -> int:
+    """Return the bits a channel of a table with `colours` = 8**bits colours.
+
+    Examples
+    --------
+    >>> bits_of(32768)
+    5
+    """
+    for bits in range(1, 6):
+        if colours == 8**bits:
+            return bits
+    raise InputError(f"the samples are of {colours} colours, expected 8, 64, 512, 4096 or 32768")
+
+
+def channels_of(colours: npt.ArrayLike, bits: int) -> npt.NDArray[np.int64]:
+    """Return the codes (..., 3) int64, red, green, blue 0 … 2**bits − 1, of colour indices (...) int 0 … 8**bits − 1.
+
+    Examples
+    --------
+    >>> channels_of([0, 1, 32767], bits=5)
+    array([[ 0,  0,  0],
+           [ 0,  0,  1],
+           [31, 31, 31]])
+    """
+    colours = np.asarray(colours, dtype=np.int64)
+    mask = (1 << bits) - 1
+    return np.stack([colours >> 2 * bits & mask, colours >> bits & mask, colours & mask], axis=-1)
+
+
+def nearest_fit_colours(unfit: npt.ArrayLike, bits: int) -> npt.NDArray[np.int64]:
+    """Return for each unfit colour the nearest fit one.
+
+    Nearest by Euclidean distance of the codes; of several equally near the lowest index.
+
+    `unfit`: (N,) int, distinct colour indices 0 … 8**bits − 1. Returns (N,) int64 colour indices, none of them unfit.
+
+    Examples
+    --------
+    >>> nearest_fit_colours([0, 1], bits=2)
+    array([4, 2])
+    """
+    unfit = np.asarray(unfit, dtype=np.int64)
+    is_fit = np.ones(8**bits, dtype=bool)
+    is_fit[unfit] = False
+    fit = np.flatnonzero(is_fit)
+    if not fit.size:
+        raise QualityError(f"all {8**bits} colours of the table are unfit for use; build the table again")
+    codes = channels_of(fit, bits)
+    nearest = [
+        fit[np.argmin(((codes - channel) ** 2).sum(axis=1))] for channel in channels_of(unfit, bits).reshape(-1, 3)
+    ]
+    return np.array(nearest, dtype=np.int64).reshape(unfit.shape)
+
+
+def replace_unfit_colours(picture: npt.NDArray[np.uint8], provenance: Provenance) -> tuple[npt.NDArray[np.uint8], int]:
+    """Return `picture` with unfit colours replaced, and the number of pixels replaced.
+
+    `picture`: (H, W, 3) uint8 sRGB codes. Returns (H, W, 3) uint8, the same array if nothing had to be replaced; and
+    the count.
+
+    Examples
+    --------
+    >>> from types import SimpleNamespace
+    >>> stained = SimpleNamespace(bits=2, unfit=(SimpleNamespace(colour=0),))
+    >>> picture = np.array([[[0, 10, 20], [255, 255, 255]]], np.uint8)
+    >>> replaced, pixels = replace_unfit_colours(picture, stained)
+    >>> replaced, pixels
+    (array([[[  0,   0,  64],
+            [255, 255, 255]]], dtype=uint8), 1)
+    """
+    bits = provenance.bits
+    unfit = tuple(sorted({cell.colour for cell in provenance.unfit}))
+    if not unfit or not colours_in(picture, bits)[list(unfit)].any():
+        return picture, 0
+    is_unfit, instead = _replacements(unfit, bits)
+    replaced = np.array(picture, order="C")
+    return replaced, int(_replace(replaced, np.uint32(bits), is_unfit, instead))
+
+
+@lru_cache(maxsize=4)
+def _replacements(unfit: tuple[int, ...], bits: int) -> tuple[npt.NDArray[np.bool_], npt.NDArray[np.uint8]]:
+    """Return which colours of a table are unfit, (8**bits,) bool, and their replacements, (8**bits, 3) uint8."""
+    is_unfit, instead = np.zeros(8**bits, np.bool_), np.zeros((8**bits, 3), np.uint8)
+    is_unfit[list(unfit)] = True
+    instead[list(unfit)] = channels_of(nearest_fit_colours(unfit, bits), bits) << (8 - bits)
+    return is_unfit, instead
+
+
+def colours_in(picture: npt.NDArray[np.uint8], bits: int) -> npt.NDArray[np.bool_]:
+    """Return which colours of a table, (8**bits,) bool, are in a picture (H, W, 3) uint8.
+
+    Examples
+    --------
+    >>> np.flatnonzero(colours_in(np.array([[[0, 0, 0], [255, 255, 0]]], np.uint8), bits=5))
+    array([    0, 32736])
+    """
+    found = np.zeros(8**bits, np.bool_)
+    pixels = np.ascontiguousarray(picture)
+    scratch = np.ones(EDGE_BYTES + 2 * OFFSETS_BYTES + 1, np.uint8)
+    _find(pixels.ctypes.data, pixels.size // 3, np.uint32(bits), found.ctypes.data, scratch.ctypes.data)
+    return found
+
+
+@compiled
+def _find(pixels: int, count: int, bits: Any, found: int, scratch: int) -> None:
+    """Set the byte at `found` of each colour that is among the pixels to 1, the last byte of scratch memory."""
+    places, others = scratch + EDGE_BYTES, scratch + EDGE_BYTES + OFFSETS_BYTES
+    one = others + OFFSETS_BYTES
+    for group in range((count + GROUP - 1) // GROUP):
+        source = group_address(pixels, count, group, scratch)
+        write_colours(source, bits, uint32(1), places, uint32(0), others)
+        for i in range(min(GROUP, count - GROUP * group)):
+            copy1(one, found + offset_at(places + 4 * i))
+
+
+@inlined
+def _colour_at(picture: Any, y: int, x: int, bits: Any) -> Any:
+    low = np.uint32(8) - bits
+    red, green, blue = picture[y, x, 0] >> low, picture[y, x, 1] >> low, picture[y, x, 2] >> low
+    return red << np.uint32(2) * bits | green << bits | blue
+
+
+@compiled
+def _replace(picture: Any, bits: Any, is_unfit: Any, instead: Any) -> int:
+    count = 0
+    for y in range(picture.shape[0]):
+        for x in range(picture.shape[1]):
+            colour = _colour_at(picture, y, x, bits)
+            if is_unfit[colour]:
+                for channel in range(3):
+                    picture[y, x, channel] = instead[colour, channel]
+                count += 1
+    return count
+
+
+Samples = npt.NDArray[np.uint16]
+Picture = npt.NDArray[np.uint8]
+
+_PAGE: Final = 4096
+"""Bytes of a page, the smallest unit of memory protection on x86-64 and arm64; larger pages are whole multiples."""
+_OFFSETS: Final = 0xFFFFFFFF
+"""Most bytes of a light's samples: compiled code counts them in 32 bits."""
+
+
+def check_samples(samples: Samples) -> int:
+    """Return the bits a channel of a light's samples; they must be uint16 (8**bits, S, 3), S ≥ 1."""
+    if samples.dtype != np.uint16 or samples.ndim != 3 or samples.shape[2] != 3 or not samples.shape[1]:
+        raise InputError(f"the samples are {samples.dtype} {samples.shape}, expected uint16 (8**bits, samples, 3)")
+    if samples.nbytes > _OFFSETS:
+        raise InputError(f"the samples of a light take {samples.nbytes} bytes, expected at most {_OFFSETS}")
+    return bits_of(samples.shape[0])
+
+
+def check_tables(tables: Samples | Sequence[Samples]) -> list[Samples]:
+    """Return the samples of several lights as a list; they must be uint16 (8**bits, S, 3), all of one shape."""
+    checked = list(tables)
+    if not checked:
+        raise InputError("no light was given to mix; give at least one")
+    for table in checked:
+        check_samples(table)
+        if table.shape != checked[0].shape:
+            raise InputError(f"the lights' samples are {checked[0].shape} and {table.shape}, expected one shape")
+    return checked
+
+
+def check_picture(picture: Picture) -> None:
+    """Check that `picture` is uint8 (H, W, 3)."""
+    if picture.dtype != np.uint8 or picture.ndim != 3 or picture.shape[2] != 3:
+        raise InputError(f"the picture is {picture.dtype} {picture.shape}, expected uint8 (height, width, 3)")
+
+
+def check_out(
+    out: npt.NDArray[Any] | None, shape: tuple[int, ...], dtype: type[np.uint16] | type[np.float32]
+) -> npt.NDArray[Any]:
+    """Return `out`, of that shape and that dtype, or a new array of them if it is None."""
+    if out is None:
+        return np.empty(shape, dtype)
+    if out.dtype != dtype or out.shape != shape:
+        raise InputError(f"the target is {out.dtype} {out.shape}, expected {np.dtype(dtype)} {shape}")
+    if not out.flags.writeable:
+        raise InputError("the target may not be written to; give an array whose flags.writeable is True")
+    return out
+
+
+def check_seed(seed: int, image: int) -> np.uint64:
+    """Return the seed as uint64 after checking it and the image number."""
+    key_of(seed)
+    if not 0 <= image < 1 << 32:
+        raise InputError(f"the image number is {image}, expected 0 to 2^32 - 1")
+    return np.uint64(seed)
+
+
+def check_white_level(white_level: int) -> None:
+    """Check that `white_level` is 1 … 65535."""
+    if not 1 <= white_level <= 65535:
+        raise InputError(f"the white level is {white_level}, expected 1 to 65535")
+
+
+def check_weights(weights: npt.ArrayLike, lights: int) -> npt.NDArray[np.float64]:
+    """Return the weights (K,) of `lights` lights as (K,) float64."""
+    checked = np.asarray(weights, dtype=np.float64)
+    if checked.shape != (lights,) or not np.isfinite(checked).all() or (checked < 0).any():
+        raise InputError(f"the weights are {np.asarray(weights).tolist()}, expected {lights} finite numbers from 0")
+    return checked
+
+
+def packed_rows(picture: Picture) -> Picture:
+    """Return `picture` (H, W, 3) uint8 with the bytes of each row contiguous: itself, or a copy if they are not."""
+    return picture if picture.strides[1:] == (3, 1) else np.ascontiguousarray(picture)
+
+
+def readable(samples: Samples) -> Samples:
+    """Return samples (8**bits, S, 3) uint16 as a contiguous array behind which two more bytes can be read.
+
+    Samples, of six bytes, are fetched eight bytes at a time. The two bytes behind an array can be read if they are on
+    the page of its last byte, whoever owns them; if not, or if the samples are not contiguous, a copy is returned.
+    """
+    last = samples.ctypes.data + samples.nbytes - 1
+    if samples.flags.c_contiguous and last // _PAGE == (last + 2) // _PAGE:
+        return samples
+    padded = np.empty(samples.size + 1, np.uint16)
+    padded[:-1] = samples.reshape(-1)
+    return padded[:-1].reshape(samples.shape)
+
+
+def writable(target: npt.NDArray[np.uint16]) -> npt.NDArray[np.uint16]:
+    """Return `target`, (H, W, 3) or (H, W) uint16, if compiled code can write its rows, else a new array of its shape.
+
+    Rows must be contiguous and at even addresses. A new array is to be given to `copied_back` when it is filled.
+    """
+    piece = (6, 2) if target.ndim == 3 else (2,)
+    return target if target.strides[1:] == piece and target.flags.aligned else np.empty(target.shape, target.dtype)
+
+
+def copied_back(work: npt.NDArray[np.uint16], target: npt.NDArray[np.uint16]) -> npt.NDArray[np.uint16]:
+    """Return `target`, (H, W, 3) or (H, W) uint16, with the content of `work`: itself, or the array from `writable`."""
+    if work is not target:
+        target[...] = work
+    return target
+
+
+def run_in_threads(fill: Callable[[int, int], object], count: int, threads: int) -> None:
+    """Call `fill(first, end)` for as many parts of 0 … count − 1 as there are threads, a thread each."""
+    threads = min(threads, count)
+    if threads <= 1:
+        fill(0, count)
+        return
+    edges = [count * part // threads for part in range(threads + 1)]
+    with ThreadPoolExecutor(threads) as pool:
+        list(pool.map(fill, edges[:-1], edges[1:]))

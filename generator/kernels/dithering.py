@@ -32,8 +32,17 @@ from numpy import uint32
 
 from foundation.compiled import compiled, inlined, intrinsic
 from foundation.errors import InputError
-from generator.kernels.arguments import Picture, check_picture, check_seed, packed_rows, run_in_threads
-from generator.kernels.choice import OFFSETS_BYTES, SCRATCH_BYTES, group_address, row_words
+from generator.kernels.choice import (
+    OFFSETS_BYTES,
+    SCRATCH_BYTES,
+    Picture,
+    check_picture,
+    check_seed,
+    group_address,
+    packed_rows,
+    row_words,
+    run_in_threads,
+)
 from generator.kernels.vector import (
     ADDRESS,
     EIGHT,

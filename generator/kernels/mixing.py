@@ -2,17 +2,19 @@
 
 Light is additive: under lights i of weights w_i a colour's mean is Σ w_i m_i, m_i its mean under light i alone. Noise
 is not: a sample is x_i = m_i + n_i, where the variance of n_i is g m_i + r² (photons at gain g, and read noise r), and
-one exposure under all lights has the variance g Σ w_i m_i + r². A weighted mean of samples would have g Σ w_i² m_i, too
-quiet by half for two equal lights. Scaling deviations by the square root of the weight,
+one exposure under all lights has the variance g Σ w_i m_i + r². A weighted mean of samples would have g Σ w_i² m_i,
+too quiet by half for two equal lights. Scaling deviations by the square root of the weight,
 
     y = Σ w_i m_i + Σ √w_i (x_i − m_i),   x_i drawn for each light on its own,
 
-has the variance Σ w_i (g m_i + r²): photon noise exact for any weights, read noise exact where the weights sum to 1 and
-√(Σ w_i) times too large otherwise. Weight 1 of one light gives that light's samples to the last bit.
+has the variance Σ w_i (g m_i + r²): photon noise exact for any weights, read noise exact where the weights sum to 1
+and √(Σ w_i) times too large otherwise. Weight 1 of one light gives that light's samples to the last bit.
 
 What is approximate: m_i is the mean of the table's S samples and not of all paper of that colour; print and pixel
 patterns that deviate in proportion to the light count as noise (their mixture is too quiet by √(Σ w_i²) for lights of
 one brightness); samples clipped by the sensor stay clipped before they are mixed.
+
+Here are images, whose weights change from pixel to pixel, and whole tables (`mixed_table`).
 """
 
 from __future__ import annotations
@@ -26,46 +28,161 @@ from numpy import uint32
 
 from foundation.compiled import compiled, inlined
 from foundation.errors import InputError
-from generator.kernels import streaming
-from generator.kernels.arguments import (
+from generator import philox
+from generator.kernels import vector as streaming
+from generator.kernels.choice import (
+    OFFSETS_BYTES,
+    SCRATCH_BYTES,
     Picture,
     Samples,
+    bits_of,
     check_out,
     check_picture,
     check_seed,
     check_tables,
     check_weights,
     check_white_level,
+    colours_in,
+    group_address,
     packed_rows,
+    philox4x32,
+    prefetch_group,
     readable,
+    row_keys,
     run_in_threads,
     writable,
 )
-from generator.kernels.choice import OFFSETS_BYTES, SCRATCH_BYTES, group_address, prefetch_group, row_keys
-from generator.kernels.drawing import choose_first_groups, draw_groups
-from generator.kernels.palette import bits_of, colours_in
-from generator.kernels.streaming import first_line, line_buffer_bytes, stream_lines
+from generator.kernels.rendering import choose_first_groups, draw_groups
 from generator.kernels.vector import (
+    BLOCK,
+    FAULT_BYTES,
     GROUP,
     LANES,
     LINE,
-    SAMPLE_BYTES,
-    choose_for_colours,
-    prefetch,
-    store_fence,
-    write_colours,
-)
-from generator.kernels.vector_mixing import (
-    BLOCK,
-    FAULT_BYTES,
     MEAN_BYTES,
     PLAN_ENTRIES,
+    SAMPLE_BYTES,
     arrange_weights,
+    choose_for_colours,
+    first_line,
     interleave_weights,
+    line_buffer_bytes,
     mean4,
     mix,
+    prefetch,
+    store_fence,
+    stream_lines,
     weight_flags,
+    write_colours,
 )
+
+_MIXTURES: Final = np.uint32(philox.MIXTURES)
+
+
+@compiled
+def _mix_table(samples: Any, weight: float, seed: Any, place: int, shuffled: bool, chosen: Any, total: Any) -> None:
+    """Add one light to `total` (N, S, 3) float64, each chosen colour's samples in the order of a shuffle of its own."""
+    count = samples.shape[1]
+    root = np.sqrt(weight)
+    order = np.empty(count, np.uint32)
+    for i in range(count):
+        order[i] = i
+    words = np.empty(count + 3, np.uint32)
+    rest = np.empty(3)
+    for number, colour in enumerate(chosen):
+        drawn, sums = samples[colour], total[number]
+        if shuffled:
+            for i in range(0, count, 4):
+                words[i], words[i + 1], words[i + 2], words[i + 3] = philox4x32(
+                    np.uint32(colour), np.uint32(i // 4), np.uint32(place), _MIXTURES, seed
+                )
+            for i in range(count):
+                order[i] = i
+            for i in range(count - 1):
+                j = i + np.int64((np.uint64(words[i]) * np.uint64(count - i)) >> np.uint64(32))
+                order[i], order[j] = order[j], order[i]
+        red = green = blue = 0
+        for i in range(count):
+            red, green, blue = red + drawn[i, 0], green + drawn[i, 1], blue + drawn[i, 2]
+        for channel, mean in enumerate((red / count, green / count, blue / count)):
+            rest[channel] = (weight - root) * mean
+        for i in range(count):
+            sample = drawn[order[i]]
+            for channel in range(3):
+                sums[i, channel] += root * sample[channel] + rest[channel]
+
+
+@compiled
+def _round_table(total: Any, white: float, chosen: Any, out: Any) -> None:
+    for number, colour in enumerate(chosen):
+        for i in range(total.shape[1]):
+            for channel in range(3):
+                out[colour, i, channel] = np.uint16(min(max(total[number, i, channel] + 0.5, 0.0), white))
+
+
+def mixed_table(
+    tables: Samples | Sequence[Samples],
+    weights: npt.ArrayLike,
+    *,
+    white_level: int = 65535,
+    seed: int = 0,
+    colours: npt.NDArray[np.bool_] | None = None,
+) -> Samples:
+    """Return the samples of a light that is the mixture of some lights; the formula stands at the head of `mixing.py`.
+
+    The result is used as a light's samples: `draw_samples(mixed_table(...), picture)`. Each colour's samples of the
+    first light with a weight keep their order; those of each further light are shuffled on their own, so that the
+    lights' noises meet by chance.
+
+    Parameters
+    ----------
+    tables
+        (K, 8**bits, S, 3) uint16 or a sequence of K (8**bits, S, 3), linear camera RGB of the lights.
+    weights
+        (K,) float ≥ 0, what each light contributes; 1 is the light as it was photographed.
+    white_level
+        Saturation of the sensor, 1 … 65535: larger values are cut to it.
+    seed
+        Of the shuffles, 0 … 2⁶⁴ − 1.
+    colours
+        (8**bits,) bool, which colours are wanted, as from `palette.colours_in`; None for all. For a small picture it is
+        much less work. The samples of the others are 0; those of the wanted ones do not depend on it.
+
+    Returns
+    -------
+    ndarray
+        (8**bits, S, 3) uint16, linear camera RGB, rounded to the nearest count, halves up.
+
+    Raises
+    ------
+    InputError
+        A shape, type or number is not as above.
+
+    Examples
+    --------
+    >>> red, blue = np.zeros((2, 8, 25, 3), np.uint16)
+    >>> red[7], blue[7] = (800, 400, 200), (200, 400, 800)
+    >>> mixed_table([red, blue], [0.5, 0.25])[7, 0]
+    array([450, 300, 300], dtype=uint16)
+    """
+    lights = check_tables(tables)
+    checked = check_weights(weights, len(lights))
+    check_white_level(white_level)
+    key = check_seed(seed, 0)
+    shape = lights[0].shape
+    if colours is not None and (colours.shape != shape[:1] or colours.dtype != np.bool_):
+        raise InputError(f"the colours are {colours.dtype} {colours.shape}, expected bool ({shape[0]},)")
+    chosen = np.flatnonzero(np.ones(shape[0], np.bool_) if colours is None else colours)
+    total = np.zeros((len(chosen), *shape[1:]), np.float64)
+    shuffled = False
+    for place, (samples, weight) in enumerate(zip(lights, checked, strict=True)):
+        if weight > 0:
+            _mix_table(np.asarray(samples), float(weight), key, place, shuffled, chosen, total)
+            shuffled = True
+    out = np.zeros(shape, np.uint16)
+    _round_table(total, float(white_level), chosen, out)
+    return out
+
 
 SEGMENT_PIXELS: Final = 512
 """Pixels of a row that are mixed together, whole groups: their weights and offsets stay in the second-level cache."""

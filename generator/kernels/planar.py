@@ -1,7 +1,7 @@
 """Crops for training: float32, one plane a channel, of any window of a picture.
 
-A crop is the window of the image that `rendering.draw_samples` makes of the whole picture, mirrored if asked for, times
-a gain, in units of the sensor's saturation and cut off there:
+A crop is the window of the image that `rendering.draw_samples` makes of the whole picture, mirrored if asked for,
+times a gain, in units of the sensor's saturation and cut off there:
 
     out[c, y, x] = min(float32(sample) · float32(gain / white_level), 1)
 
@@ -25,16 +25,18 @@ from numpy import uint32
 
 from foundation.compiled import compiled
 from foundation.errors import InputError
-from generator.kernels.arguments import (
+from generator.kernels.choice import (
+    EDGE_BYTES,
+    OFFSETS_BYTES,
     check_out,
     check_picture,
     check_samples,
     check_white_level,
+    choose_group,
     packed_rows,
     readable,
     run_in_threads,
 )
-from generator.kernels.choice import EDGE_BYTES, OFFSETS_BYTES, choose_group
 from generator.kernels.dithering import (
     DITHER_BYTES,
     Cells,

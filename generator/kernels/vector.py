@@ -1,21 +1,24 @@
 """Steps of the kernels written in LLVM's own terms: vectors of 16 32-bit numbers, and loads and stores by address.
 
 numba compiles loops well, but does not put many pixels into one vector where bytes must be shuffled, and knows no load
-of eight bytes from any address. These functions can be called from compiled functions only. LLVM makes of them whatever
-the processor has: one vector of AVX-512, two of AVX2, four of NEON. Bytes change places within 16, which all can do.
+of eight bytes from any address. These functions can be called from compiled functions only. LLVM makes of them
+whatever the processor has: one vector of AVX-512, two of AVX2, four of NEON. Bytes change places within 16, which all
+can do.
 
 Addresses are plain integers; whoever calls must keep them inside arrays. What may be read or written beyond is said
-with each function.
+with each function. First come steps that all kernels share, then those that write past the caches an image that they
+could not keep, so that they keep the table, then those of `mixing.py`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Generator, Sequence
+from contextlib import contextmanager
 from typing import Any, Final
 
 from llvmlite import ir
 
-from foundation.compiled import intrinsic
+from foundation.compiled import inlined, intrinsic
 
 LANES: Final = 16
 """Numbers of 32 bits in a vector: one register of AVX-512."""
@@ -409,3 +412,330 @@ def prefetch_once(typing: Any, address: Any) -> Any:
     """Prefetch a line that is read once, so that it takes no place in the larger caches."""
     del typing, address
     return void(_prefetching(0), ADDRESS)
+
+
+BLOCK: Final = 8
+"""Pixels that are mixed at a time: their weights under two lights fill a vector of 16."""
+MEAN_BYTES: Final = 16
+"""Bytes of a colour's mean under one light: red, green, blue and padding, float32."""
+PLAN_ENTRIES: Final = 6
+"""Addresses that `mix` takes of each pair of lights."""
+FAULT_BYTES: Final = 4 * LANES
+"""Bytes of the 16 float32 that become NaN where a weight is faulty."""
+
+_QUAD: Final = 4
+"""Numbers of a pixel in a vector, a quarter of it: red, green, blue and padding."""
+_SHORTS: Final = ir.VectorType(I16, 2 * LANES)
+_PIXEL_PAIRS: Final = ((0, 2), (4, 6), (1, 3), (5, 7))
+"""Which two of eight pixels share a vector, so that pixels are packed without crossing its quarters."""
+_ORDER: Final = tuple((_PIXEL_PAIRS[lane % _QUAD][lane // (2 * _QUAD)], lane // _QUAD % 2) for lane in range(LANES))
+"""Pixel and light of each of a block's weights in the order of `arrange_weights`, in the quarters of `_PIXEL_PAIRS`."""
+
+
+@intrinsic
+def mean4(typing: Any, source: Any, count: Any, target: Any) -> Any:
+    """Write the mean of `count` ≥ 1 samples in a row as four float32, the fourth is padding.
+
+    Returns the largest number of the samples.
+    """
+    del typing, source, count, target
+
+    def generate(context: Any, builder: Builder, signature: Any, arguments: Sequence[Value]) -> Value:
+        from numba.core import cgutils
+
+        del context, signature
+        source, count, target = arguments
+        wide, real = ir.VectorType(I64, _QUAD), ir.VectorType(ir.DoubleType(), _QUAD)
+        total, most = (cgutils.alloca_once_value(builder, ir.Constant(wide, [0] * _QUAD)) for _ in range(2))
+        with cgutils.for_range(builder, count) as loop:
+            at = builder.add(source, builder.mul(loop.index, ir.Constant(I64, SAMPLE_BYTES)))
+            sample = builder.zext(load(builder, at, 0, ir.VectorType(I16, _QUAD)), wide)
+            builder.store(builder.add(builder.load(total), sample), total)
+            before = builder.load(most)
+            builder.store(builder.select(builder.icmp_unsigned(">", sample, before), sample, before), most)
+        mean = builder.fdiv(
+            builder.sitofp(builder.load(total), real), broadcast(builder, builder.sitofp(count, ir.DoubleType()), real)
+        )
+        store(builder, builder.fptrunc(mean, ir.VectorType(F32, _QUAD)), target, 0)
+        largest = ir.Constant(I64, 0)
+        for channel in range(3):
+            value = builder.extract_element(builder.load(most), ir.Constant(I32, channel))
+            largest = builder.select(builder.icmp_unsigned(">", value, largest), value, largest)
+        return largest
+
+    return signature("int64", ADDRESS, "int64", ADDRESS), generate
+
+
+def _for_each_line(builder: Builder, weights: Value, count: Value, do: Callable[[Value, Value], None]) -> None:
+    """Call `do` with the weights of each eight pixels under a pair of lights, WORDS, and the number of those eight."""
+    with _blocks(builder, count) as (block, begin):
+        do(load(builder, builder.add(weights, builder.shl(begin, ir.Constant(I64, 3))), 0, WORDS), block)
+
+
+def _any_nonzero(builder: Builder, words: Value) -> Value:
+    """Return two bits: whether one of the even lanes, and whether one of the odd lanes, is not 0."""
+    answer = ir.Constant(I64, 0)
+    for light in range(2):
+        lanes = constant(_EIGHT_WORDS, range(light, LANES, 2))
+        its = builder.shuffle_vector(words, words, lanes)
+        other = builder.bitcast(builder.icmp_unsigned("!=", its, constant(_EIGHT_WORDS, 0)), I8)
+        other = builder.zext(builder.icmp_unsigned("!=", other, ir.Constant(I8, 0)), I64)
+        answer = builder.or_(answer, builder.shl(other, ir.Constant(I64, light)))
+    return answer
+
+
+@intrinsic
+def weight_flags(typing: Any, weights: Any, count: Any) -> Any:
+    """Return four bits on the weights of two lights, two float32 for each of `count` ≥ 8 pixels.
+
+    Bits 0 and 1 are set where some weight of the first and of the second light is not 0, bits 2 and 3 where some weight
+    of theirs is not 1.
+    """
+    del typing, weights, count
+
+    def generate(context: Any, builder: Builder, signature: Any, arguments: Sequence[Value]) -> Value:
+        from numba.core import cgutils
+
+        del context, signature
+        ones = builder.bitcast(ir.Constant(FLOATS, [1.0] * LANES), WORDS)
+        found = [cgutils.alloca_once_value(builder, constant(WORDS, 0)) for _ in range(2)]
+
+        def see(line: Value, block: Value) -> None:
+            del block
+            for seen, other in zip(found, (line, builder.xor(line, ones)), strict=True):
+                builder.store(builder.or_(builder.load(seen), other), seen)
+
+        _for_each_line(builder, arguments[0], arguments[1], see)
+        lit, less = (_any_nonzero(builder, builder.load(seen)) for seen in found)
+        return builder.or_(lit, builder.shl(less, ir.Constant(I64, 2)))
+
+    return signature("int64", ADDRESS, "int64"), generate
+
+
+@intrinsic
+def interleave_weights(typing: Any, first: Any, first_step: Any, second: Any, second_step: Any, target: Any) -> Any:
+    """Write eight pixels' weights of two lights by turns, as `weight_flags` takes them; steps are bytes to the next."""
+    del typing, first, first_step, second, second_step, target
+
+    def emit(
+        builder: Builder, first: Value, first_step: Value, second: Value, second_step: Value, target: Value
+    ) -> None:
+        line = ir.Constant(FLOATS, ir.Undefined)
+        for lane in range(LANES):
+            weights, step = ((first, first_step), (second, second_step))[lane % 2]
+            at = builder.add(weights, builder.mul(step, ir.Constant(I64, lane // 2)))
+            line = builder.insert_element(line, load(builder, at, 0, F32), ir.Constant(I32, lane))
+        store(builder, line, target, 0)
+
+    return void(emit, ADDRESS, ADDRESS, ADDRESS, ADDRESS, ADDRESS)
+
+
+@intrinsic
+def arrange_weights(typing: Any, weights: Any, count: Any, target: Any) -> Any:
+    """Write the weights that `weight_flags` takes in the order in which `mix` takes them, 64 bytes for eight pixels.
+
+    Returns bits 0 and 1 of `weight_flags`.
+    """
+    del typing, weights, count, target
+
+    def generate(context: Any, builder: Builder, signature: Any, arguments: Sequence[Value]) -> Value:
+        from numba.core import cgutils
+
+        del context, signature
+        weights, count, target = arguments
+        lanes = constant(WORDS, [2 * pixel + light for pixel, light in _ORDER])
+        seen = cgutils.alloca_once_value(builder, constant(WORDS, 0))
+
+        def put(line: Value, block: Value) -> None:
+            builder.store(builder.or_(builder.load(seen), line), seen)
+            to = builder.add(target, builder.shl(block, ir.Constant(I64, 6)))
+            store(builder, builder.shuffle_vector(line, line, lanes), to, 0)
+
+        _for_each_line(builder, weights, count, put)
+        return _any_nonzero(builder, builder.load(seen))
+
+    return signature("int64", ADDRESS, "int64", ADDRESS), generate
+
+
+@contextmanager
+def _blocks(builder: Builder, count: Value) -> Generator[tuple[Value, Value]]:
+    """Loop over `count` ≥ 8 pixels eight by eight: yield the number of each eight, and the first of its pixels.
+
+    Where `count` is no multiple of eight, the last eight overlap the ones before.
+    """
+    from numba.core import cgutils
+
+    blocks = builder.lshr(builder.add(count, ir.Constant(I64, BLOCK - 1)), ir.Constant(I64, 3))
+    last = builder.sub(count, ir.Constant(I64, BLOCK))
+    with cgutils.for_range(builder, blocks) as loop:
+        begin = builder.shl(loop.index, ir.Constant(I64, 3))
+        yield loop.index, builder.select(builder.icmp_signed("<", begin, last), begin, last)
+
+
+def _store_pixels(builder: Builder, even: Value, odd: Value, target: Value) -> None:
+    """Write the red, green and blue of eight pixels as uint16, given those of even and of odd places as 32 bits."""
+    both = builder.bitcast(builder.or_(even, builder.shl(odd, constant(WORDS, 16))), _SHORTS)
+    # Of each quarter: red, red, green, green, blue, blue of two pixels, and two of padding.
+    lanes = [8 * quarter + lane for quarter in range(_QUAD) for lane in (0, 2, 4, 1, 3, 5)]
+    for part in (slice(0, 16), slice(16, 24)):
+        kind = ir.VectorType(I32, len(lanes[part]))
+        store(builder, builder.shuffle_vector(both, both, constant(kind, lanes[part])), target, 2 * part.start)
+
+
+def _pair(
+    builder: Builder, addresses: Sequence[Value], block: Value, place: Value, means: Value
+) -> tuple[list[Value], Value]:
+    """Return what a pair of lights adds to the pixels of even and of odd places, and a mark of faulty weights.
+
+    The mark is 16 float32: 0, or NaN where a weight is faulty.
+    """
+    weights, *rest = addresses
+    offsets, samples, mean_base = rest[:2], rest[2:4], rest[4]
+    name = f"llvm.sqrt.v{LANES}f32"
+    kind = ir.FunctionType(FLOATS, [FLOATS])
+    root_of = builder.module.globals.get(name) or ir.Function(builder.module, kind, name)
+    weight = load(builder, builder.add(weights, builder.shl(block, ir.Constant(I64, 6))), 0, FLOATS)
+    root = builder.call(root_of, [weight])
+    remainder = builder.fsub(weight, root)
+    # The root of a negative number, and 0 times infinity, are NaN.
+    fault = builder.fmul(root, ir.Constant(FLOATS, [0.0] * LANES))
+    sums: list[Value] = []
+    for lane, pixels in enumerate(_PIXEL_PAIRS):
+
+        def found(base: Value, places: Value, pixel: int, kind: Any) -> Value:
+            offset = builder.zext(load(builder, builder.add(places, place), 4 * pixel, I32), I64)
+            return load(builder, builder.add(base, offset), 0, kind)
+
+        def each(numbers: Value, lane: int = lane) -> Value:
+            """Return the numbers of a pair of pixels under both lights, four times each."""
+            lanes = [_QUAD * (place // _QUAD) + lane for place in range(LANES)]
+            return builder.shuffle_vector(numbers, numbers, constant(WORDS, lanes))
+
+        drawn = [
+            found(base, places, pixel, ir.VectorType(I16, 4))
+            for pixel in pixels
+            for base, places in zip(samples, offsets, strict=True)
+        ]
+        mean = [found(mean_base, means, pixel, ir.VectorType(F32, 2 * _QUAD)) for pixel in pixels]
+        noisy = builder.fmul(builder.sitofp(builder.zext(concatenated(builder, drawn), WORDS), FLOATS), each(root))
+        sums.append(builder.fadd(noisy, builder.fmul(concatenated(builder, mean), each(remainder))))
+    totals: list[Value] = []
+    for two in (sums[:2], sums[2:]):
+        parts = [
+            builder.shuffle_vector(
+                *two, constant(WORDS, [8 * pixel + _QUAD * light + i for pixel in range(4) for i in range(4)])
+            )
+            for light in range(2)
+        ]
+        totals.append(builder.fadd(*parts))
+    return totals, fault
+
+
+@intrinsic
+def mix(typing: Any, plan: Any, pairs: Any, count: Any, means: Any, faults: Any, white: Any, target: Any) -> Any:
+    """Write `count` ≥ 8 pixels under pairs of lights as uint16, rounded, from 0 to `white`; see `mixing.py`.
+
+    `plan` is the address of `PLAN_ENTRIES` addresses a pair: of the weights as `arrange_weights` has them, of the first
+    and second light's offsets in their samples, of the first and second light's samples, and of the means; `means` is
+    that of the offsets in the means. Of the 16 float32 at `faults` some become NaN as soon as a weight is negative,
+    infinite or NaN.
+    """
+    del typing, plan, pairs, count, means, faults, white, target
+
+    def emit(
+        builder: Builder,
+        plan: Value,
+        pairs: Value,
+        count: Value,
+        means: Value,
+        faults: Value,
+        white: Value,
+        target: Value,
+    ) -> None:
+        from numba.core import cgutils
+
+        def number(value: int) -> Value:
+            return ir.Constant(I64, value)
+
+        def addresses(pair: Value) -> list[Value]:
+            entry = builder.add(plan, builder.mul(pair, number(8 * PLAN_ENTRIES)))
+            return [load(builder, entry, 8 * i, I64) for i in range(PLAN_ENTRIES)]
+
+        zero, half = ir.Constant(FLOATS, [0.0] * LANES), ir.Constant(FLOATS, [0.5] * LANES)
+        most = broadcast(builder, white, FLOATS)
+        fault = cgutils.alloca_once_value(builder, load(builder, faults, 0, FLOATS))
+        sums = [cgutils.alloca_once(builder, FLOATS) for _ in range(2)]
+
+        def fill(total: Callable[[Value, Value], Sequence[Value]]) -> None:
+            with _blocks(builder, count) as (block, begin):
+                rounded: list[Value] = []
+                for value in total(block, builder.shl(begin, number(2))):
+                    lifted = builder.fadd(value, half)
+                    lifted = builder.select(builder.fcmp_ordered(">", lifted, zero), lifted, zero)
+                    rounded.append(builder.fptosi(minimum(builder, lifted, most), WORDS))
+                _store_pixels(
+                    builder, rounded[0], rounded[1], builder.add(target, builder.mul(begin, number(SAMPLE_BYTES)))
+                )
+
+        def of_pair(entries: Sequence[Value], block: Value, place: Value) -> Sequence[Value]:
+            totals, nothing = _pair(builder, entries, block, place, means)
+            builder.store(builder.fadd(builder.load(fault), nothing), fault)
+            return totals
+
+        def of_all(block: Value, place: Value) -> Sequence[Value]:
+            from numba.core import cgutils
+
+            for one in sums:
+                builder.store(zero, one)
+            with cgutils.for_range(builder, pairs) as loop:
+                for one, value in zip(sums, of_pair(addresses(loop.index), block, place), strict=True):
+                    builder.store(builder.fadd(builder.load(one), value), one)
+            return [builder.load(one) for one in sums]
+
+        with builder.if_else(builder.icmp_signed("==", pairs, number(1))) as (single, several):
+            with single:
+                entries = addresses(number(0))
+                fill(lambda block, place: of_pair(entries, block, place))
+            with several:
+                fill(of_all)
+        store(builder, builder.load(fault), faults, 0)
+
+    return void(emit, ADDRESS, "int64", "int64", ADDRESS, ADDRESS, "float32", ADDRESS)
+
+
+STREAMED_BYTES: Final = 24 << 20
+"""Bytes of an image from which it is streamed: the size of a desktop processor's last-level cache."""
+
+
+def line_buffer_bytes(segment_bytes: int) -> int:
+    """Return the bytes of memory for a segment that begins anywhere in a line, and a line behind it."""
+    return segment_bytes + 3 * LINE
+
+
+@inlined
+def first_line(buffer: int) -> int:
+    """Return the address of the first whole line in the memory at `buffer`."""
+    return (buffer + LINE - 1) & -LINE
+
+
+@inlined
+def stream_lines(lines: int, begin: int, stop: int, last: bool) -> int:
+    """Stream the content of `lines` to its target, from the line of address `begin` up to `stop`; both are even.
+
+    Nothing is written before `begin`. The last line, not full yet, is kept for the next call, and the number of its
+    bytes returned, unless this is the row's `last` segment.
+    """
+    source, to = lines, begin & -LINE
+    if begin > to:
+        for i in range(begin - to, min(LINE, stop - to), 2):
+            copy2(source + i, to + i)
+        source, to = source + LINE, to + LINE
+    while to + LINE <= stop:
+        stream_line(source, to)
+        source, to = source + LINE, to + LINE
+    if last:
+        for i in range(0, stop - to, 2):
+            copy2(source + i, to + i)
+    else:
+        copy_line(source, lines)
+    return stop - to

@@ -17,11 +17,10 @@ import numpy.typing as npt
 
 from foundation.errors import InputError, first_of
 from generator import philox
-from generator.lights.distributions import Distribution
+from generator.lights.distributions import Distribution, load_ground_truths
 from generator.lights.gamut import Gamut, Match, OutsideGamut, OutsideGamutError, black_body, rgb_of
-from generator.lights.ground_truths import load_ground_truths
 from generator.lights.lighting import LightChoice, Lighting, Mixture, parse_mixture, plain
-from generator.masks.weights import MaskPlan
+from generator.masks.making import MaskPlan
 from generator.named_numbers import parse_numbers
 
 if TYPE_CHECKING:

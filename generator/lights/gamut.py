@@ -9,8 +9,8 @@ lights suffice for any point (Carathéodory). Which are taken:
 3. else the three neighbours around it, which then match exactly.
 
 Neighbours are those of the Delaunay triangulation of the rb-chromaticities. Near lights have spectra near to what is
-wanted, so that not only white but every colour looks as it would under a real light of that chromaticity; far lights of
-the same mixed white would be a metamer of it.
+wanted, so that not only white but every colour looks as it would under a real light of that chromaticity; far lights
+of the same mixed white would be a metamer of it.
 """
 
 from __future__ import annotations

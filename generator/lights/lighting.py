@@ -21,7 +21,7 @@ import numpy as np
 import numpy.typing as npt
 
 from foundation.errors import InputError
-from generator.masks.weights import MaskMaker
+from generator.masks.making import MaskMaker
 
 if TYPE_CHECKING:
     from calibration.table.lut import Lut
@@ -78,8 +78,8 @@ class Mixture:
         `picture`: (H, W, 3) uint8, the picture they are for: of a small one, samples of other colours may be 0, and a
         light alone is not read whole. None: any pictures, of any size.
         """
-        from generator.kernels.mixed_table import mixed_table
-        from generator.kernels.palette import colours_in
+        from generator.kernels.choice import colours_in
+        from generator.kernels.mixing import mixed_table
         from generator.kernels.rendering import WHOLE_LIGHT_PIXELS, read_light
 
         self._require(lut)
@@ -173,7 +173,7 @@ class Lighting:
 
         `weights`: (H, W, lights) float32 ≥ 0, as `weights_of` returns them.
         """
-        from generator.masks.whites import mean_weights
+        from generator.masks.maps import mean_weights
 
         return np.asarray(mean_weights(weights) @ self.whites(lut))
 
@@ -183,7 +183,7 @@ class Lighting:
         `weights`: (H, W, lights) float32 ≥ 0, as `weights_of` returns them. Returns (H, W, 3) float32, r + g + b = 1:
         the chromaticity of the sum of the lights' whites, each times its weight in the pixel.
         """
-        from generator.masks.whites import chromaticities
+        from generator.masks.maps import chromaticities
 
         return chromaticities(weights, self.whites(lut))
 

@@ -7,7 +7,7 @@ from typing import Final
 import numpy as np
 
 from generator.statistics.statistics_file import RealStatistics
-from generator.variation.exposures import AutomaticExposure
+from generator.variation.variation import AutomaticExposure
 
 SHARE: Final = 0.01
 """Share of an image's pixels whose brightest channel is brighter than its exposure: so `evaluate describe` has it."""

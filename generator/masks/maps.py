@@ -2,20 +2,163 @@
 
 `masks/NNNNNN_k.png` holds the weight of light k = 0 … K − 1 in 16-bit grey, 65535 = 1, sum 65535, and
 `ground_truth/NNNNNN.png` r, g, b in 16 bits with r + g + b = 65535.
+A pixel's ground truth is the chromaticity of the sum of the lights' whites, each times its weight.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
 
+from foundation.compiled import compiled, inlined
 from foundation.errors import FormatError
-from generator.files.formats import encode_map
-from generator.masks.decoding import decode_values
-from generator.masks.weights import FULL, Weights
-from generator.masks.whites import quantised_chromaticities, quantised_weights
+from generator.files import encode_map
+from generator.masks.making import FULL, Weights, decode_values
+
+_ZERO: Final = np.float32(0)
+
+
+@inlined
+def _light_at(weights: Any, whites: Any, y: int, x: int) -> Any:
+    """Return linear red, green and blue of the light of a pixel."""
+    red = green = blue = _ZERO
+    for light in range(weights.shape[2]):
+        weight = weights[y, x, light]
+        red += weight * whites[light, 0]
+        green += weight * whites[light, 1]
+        blue += weight * whites[light, 2]
+    return red, green, blue
+
+
+@inlined
+def _quantised(red: Any, green: Any, blue: Any, full: Any) -> Any:
+    """Return r, g and b as whole parts of `full` that sum to it; green takes the errors of rounding."""
+    total = red + green + blue
+    first, last = np.int32(np.rint(red / total * full)), np.int32(np.rint(blue / total * full))
+    return first, np.int32(np.int32(full) - first - last), last
+
+
+@compiled
+def _chromaticities(weights: Any, whites: Any, out: Any) -> None:
+    for y in range(weights.shape[0]):
+        for x in range(weights.shape[1]):
+            red, green, blue = _light_at(weights, whites, y, x)
+            total = red + green + blue
+            out[y, x, 0], out[y, x, 1], out[y, x, 2] = red / total, green / total, blue / total
+
+
+@compiled
+def _quantise_chromaticities(weights: Any, whites: Any, full: Any, out: Any) -> None:
+    for y in range(weights.shape[0]):
+        for x in range(weights.shape[1]):
+            red, green, blue = _light_at(weights, whites, y, x)
+            out[y, x, 0], out[y, x, 1], out[y, x, 2] = _quantised(red, green, blue, full)
+
+
+@compiled
+def _quantise_chromaticities_of_two(weights: Any, whites: Any, full: Any, out: Any) -> None:
+    """Do the same for weights (H, 2 W) and `out` (H, 3 W), in a loop that the compiler vectorises."""
+    for y in range(weights.shape[0]):
+        for x in range(weights.shape[1] // 2):
+            one, other = weights[y, 2 * x], weights[y, 2 * x + 1]
+            # Added to 0 first, as for any number of lights, so that the bits are the same.
+            red = _ZERO + one * whites[0, 0] + other * whites[1, 0]
+            green = _ZERO + one * whites[0, 1] + other * whites[1, 1]
+            blue = _ZERO + one * whites[0, 2] + other * whites[1, 2]
+            out[y, 3 * x], out[y, 3 * x + 1], out[y, 3 * x + 2] = _quantised(red, green, blue, full)
+
+
+@compiled
+def _quantise_weights(weights: Any, full: Any, out: Any) -> None:
+    for y in range(weights.shape[0]):
+        for light in range(weights.shape[2]):
+            for x in range(weights.shape[1]):
+                out[light, y, x] = np.int32(np.rint(weights[y, x, light] * full))
+
+
+@compiled
+def _sums(weights: Any, out: Any) -> None:
+    for y in range(weights.shape[0]):
+        for light in range(weights.shape[2]):
+            row = 0.0
+            for x in range(weights.shape[1]):
+                row += weights[y, x, light]
+            out[light] += row
+
+
+def chromaticities(weights: npt.NDArray[np.float32], whites: npt.NDArray[np.float64]) -> npt.NDArray[np.float32]:
+    """Return the chromaticity of the sum of the lights' whites, each times its weight, in each pixel.
+
+    `weights`: (H, W, K) float32 ≥ 0, not all 0 in a pixel. `whites`: (K, 3) float64, linear camera RGB above 0. Returns
+    (H, W, 3) float32, r + g + b = 1, computed in float32, lights added up in their order.
+
+    Examples
+    --------
+    >>> whites = np.array([[400.0, 400.0, 200.0], [100.0, 400.0, 500.0]])
+    >>> chromaticities(np.array([[[1, 0], [0.5, 0.5]]], np.float32), whites)
+    array([[[0.4 , 0.4 , 0.2 ],
+            [0.25, 0.4 , 0.35]]], dtype=float32)
+    """
+    out = np.empty((*weights.shape[:2], 3), np.float32)
+    _chromaticities(weights, whites.astype(np.float32), out)
+    return out
+
+
+def quantised_chromaticities(
+    weights: npt.NDArray[np.float32], whites: npt.NDArray[np.float64], full: int
+) -> npt.NDArray[np.uint16]:
+    """Return `chromaticities` as whole parts of `full` ≤ 65535: (H, W, 3) uint16, of which each pixel sums to `full`.
+
+    Red and blue are rounded, green is the rest.
+
+    `weights`: (H, W, K) float32 ≥ 0, not all 0 in a pixel. `whites`: (K, 3) float64, linear camera RGB above 0.
+
+    Examples
+    --------
+    >>> whites = np.array([[400.0, 400.0, 200.0], [100.0, 400.0, 500.0]])
+    >>> quantised_chromaticities(np.array([[[0.5, 0.5]]], np.float32), whites, 65535)
+    array([[[16384, 26214, 22937]]], dtype=uint16)
+    """
+    height, width, lights = weights.shape
+    out = np.empty((height, width, 3), np.uint16)
+    numbers = whites.astype(np.float32), np.float32(full)
+    if lights == 2:
+        _quantise_chromaticities_of_two(weights.reshape(height, -1), *numbers, out.reshape(height, -1))
+    else:
+        _quantise_chromaticities(weights, *numbers, out)
+    return out
+
+
+def quantised_weights(weights: npt.NDArray[np.float32], full: int) -> npt.NDArray[np.uint16]:
+    """Return weights (H, W, K) float32 from 0 to 1 as whole parts of `full` ≤ 65535, rounded: (K, H, W) uint16.
+
+    Examples
+    --------
+    >>> quantised_weights(np.array([[[0.25, 0.75]]], np.float32), 1000)
+    array([[[250]],
+    <BLANKLINE>
+           [[750]]], dtype=uint16)
+    """
+    height, width, lights = weights.shape
+    out = np.empty((lights, height, width), np.uint16)
+    _quantise_weights(weights, np.float32(full), out)
+    return out
+
+
+def mean_weights(weights: npt.NDArray[np.float32]) -> npt.NDArray[np.float64]:
+    """Return the mean (K,) float64 of weights (H, W, K) float32, H and W ≥ 1.
+
+    Examples
+    --------
+    >>> mean_weights(np.array([[[1, 0], [0.5, 0.5]]], np.float32))
+    array([0.75, 0.25])
+    """
+    out = np.zeros(weights.shape[2], np.float64)
+    _sums(weights, out)
+    return out / (weights.shape[0] * weights.shape[1])
 
 
 def encode_maps(weights: Weights, whites: npt.NDArray[np.float64]) -> list[tuple[str, str, bytes]]:

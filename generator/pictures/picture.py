@@ -7,28 +7,287 @@ These steps turn a file's values into codes, in this order, so that one picture 
                   light, 1 = white, clipped and encoded with the sRGB curve (IEC 61966-2-1) unless the file calls itself
                   sRGB
     transparency  white shows through, as paper does in a print; mixed in the values that the file holds
-    profile       codes of another colour space become those of sRGB; see `generator.pictures.profiles`
+    profile       codes of another colour space become those of sRGB; see below
     orientation   turned as the file's EXIF or TIFF orientation asks
     size          only ever made smaller, on request, by averaging areas of codes
     crop          cut, on request, from the centre or at places that the picture's name and a seed choose
+
+AVIF pictures (AV1 Image File Format), which OpenImageIO's wheels do not read, come from Pillow, which has libavif. It
+makes codes of 8 bits of any depth and does not say which primaries and transfer function they are of. The file does
+(ISO/IEC 14496-12, box ``colr`` of type ``nclx``, with the code points of ITU-T H.273); what is not sRGB or BT.709 by
+them, such as pictures of high dynamic range, is refused: taken as sRGB, its colours would be wrong.
+
+A chart is printed from sRGB codes, so a picture in another space, such as Adobe RGB (1998) or Display P3, has to be
+converted or its colours come out dull. LittleCMS converts, by relative colorimetry (ICC.1:2022, clause 6.3.2), in 8
+bits; a profile that moves no code by more than one is sRGB under another name and is left alone.
+
+A camera set to Adobe RGB embeds no profile, but says so in its EXIF data (DCF 2.0, interoperability index R03).
 """
 
 from __future__ import annotations
 
-import tempfile
-from collections.abc import Generator
-from contextlib import contextmanager
+import io
+import struct
+import warnings
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
-from typing import Any, Final, Literal
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 import numpy.typing as npt
 
 from foundation.colorimetry import srgb_codes
-from foundation.errors import FormatError, InputError
-from generator.pictures.crop_places import random_places
-from generator.pictures.profiles import ADOBE_RGB, ASSUMED, from_adobe_rgb, to_srgb
+from foundation.errors import FormatError
+
+if TYPE_CHECKING:
+    from PIL.ImageCms import ImageCmsTransform
+import hashlib
+import tempfile
+from collections.abc import Generator
+from contextlib import contextmanager
+from typing import Any, Literal
+
+from foundation.errors import InputError
+from generator import philox
+
+_PRIMARIES: Final = frozenset({1, 2, 5, 6})
+"""Code points (H.273, table 2) that are sRGB's primaries, unspecified, or those of standard video, whose difference
+programs ignore as this one does."""
+
+_TRANSFERS: Final = frozenset({1, 2, 6, 13, 14, 15})
+"""Code points (H.273, table 3) that are sRGB's transfer function, unspecified, or BT.709's, written for it."""
+
+_ORIENTATION: Final = 0x0112
+"""The tag Orientation (TIFF 6.0)."""
+
+_HEAD: Final = 1 << 20
+"""Bytes in which the boxes before the pixels are looked for; they are some hundred."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class AvifPicture:
+    """What a file holds.
+
+    - `codes`: (H, W, 3) uint8.
+    - `alpha`: (H, W) float64, 0 … 1; None if it is opaque.
+    - `orientation`: 1 … 8, as the TIFF tag.
+    - `icc`: its colour profile, if it has one.
+    """
+
+    codes: npt.NDArray[np.uint8]
+    alpha: npt.NDArray[np.float64] | None
+    orientation: int
+    icc: bytes | None
+
+
+def read_avif(path: Path, most_pixels: int) -> AvifPicture:
+    """Return the picture in an AVIF file."""
+    from PIL import Image
+
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", Image.DecompressionBombWarning)
+            with Image.open(path, formats=["AVIF"]) as picture:
+                if picture.width * picture.height > most_pixels:
+                    raise FormatError(
+                        f"cannot read {path}: {picture.width}x{picture.height} px are more than {most_pixels}; "
+                        "make it smaller"
+                    )
+                icc = picture.info.get("icc_profile")
+                orientation = int(picture.getexif().get(_ORIENTATION, 1))
+                has_alpha = picture.mode in ("RGBA", "LA")
+                pixels = np.asarray(picture.convert("RGBA" if has_alpha else "RGB"))
+    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
+        reason = " ".join(str(error).replace(str(path), "").split()).rstrip(".") or type(error).__name__
+        raise FormatError(f"cannot read {path}: {reason}; use another copy, or convert it to PNG") from error
+    if not icc:
+        _require_srgb(path)
+    alpha = pixels[..., 3].astype(np.float64) / 255 if has_alpha and pixels[..., 3].min() < 255 else None
+    return AvifPicture(np.ascontiguousarray(pixels[..., :3]), alpha, orientation, icc or None)
+
+
+def _require_srgb(path: Path) -> None:
+    """Refuse a file whose codes are of another colour space."""
+    with path.open("rb") as stream:
+        head = stream.read(_HEAD)
+    place = head.find(b"colrnclx")
+    if place < 0 or place + 12 > len(head):
+        return
+    primaries, transfer = struct.unpack(">HH", head[place + 8 : place + 12])
+    if primaries not in _PRIMARIES or transfer not in _TRANSFERS:
+        raise FormatError(
+            f"cannot read {path}: its colours have primaries {primaries} and transfer function {transfer} of ITU-T "
+            "H.273, not those of sRGB; convert it to PNG in sRGB"
+        )
+
+
+ASSUMED: Final = "none, taken as sRGB"
+"""Remark on a picture without a profile."""
+
+ADOBE_RGB: Final = "Adobe RGB (1998) by EXIF, converted to sRGB"
+"""Remark on a picture that a camera made in that space."""
+
+_PROBE_STEPS: Final = 9
+"""Codes of each channel, every 32nd, of the grid of 729 colours that shows whether a profile is sRGB."""
+_ADOBE_GAMMA: Final = 563 / 256
+"""Adobe RGB (1998) Color Image Encoding, clause 4.3.1.2."""
+_ADOBE_TO_SRGB: Final = np.array(
+    [[1.39835574, -0.39835574, 0.0], [0.0, 1.0, 0.0], [0.0, -0.04292899, 1.04292899]], np.float32
+)
+"""Of linear light: the matrices of Adobe RGB (1998), clause 4.3.5.3, and IEC 61966-2-1; both have the white D65."""
+_STEPS: Final = 65535
+"""Steps of the table of encoded linear light: where the curve is steepest a step is a twentieth of a code."""
+_ROWS: Final = 256
+"""Rows that are converted together, so that their float32 take little memory beside the picture."""
+
+
+def to_srgb(codes: npt.NDArray[np.uint8], icc: bytes | None) -> tuple[npt.NDArray[np.uint8], str]:
+    """Return the sRGB codes of a picture, and how its profile was treated.
+
+    `codes`: (H, W, 3) uint8 in the space of the profile; a grey profile is applied where the channels are alike. `icc`:
+    the embedded profile; None where there is none. Returns (H, W, 3) uint8, the same array if no code changes; and a
+    remark, such as ``"Display P3, converted to sRGB"``.
+
+    Examples
+    --------
+    >>> codes, remark = to_srgb(np.zeros((2, 2, 3), np.uint8), icc=None)
+    >>> remark
+    'none, taken as sRGB'
+    """
+    if icc is None:
+        return codes, ASSUMED
+    transform, mode, word = _transform(icc)
+    if mode == "L" and (codes != codes[..., :1]).any():
+        return codes, f"{word.rpartition(', ')[0]} of grey, not applied to colours, taken as sRGB"
+    if transform is None:
+        return codes, word
+    from PIL import Image, ImageCms
+
+    picture = Image.fromarray(codes if mode == "RGB" else np.ascontiguousarray(codes[..., 0]))
+    converted = ImageCms.applyTransform(picture, transform)
+    return np.array(converted, dtype=np.uint8), word
+
+
+def from_adobe_rgb(codes: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
+    """Return the sRGB codes (H, W, 3) uint8 of Adobe RGB (1998) codes (H, W, 3) uint8, clipped to the gamut of sRGB.
+
+    Examples
+    --------
+    >>> from_adobe_rgb(np.array([[[128, 128, 128], [200, 100, 50]]], np.uint8))
+    array([[[129, 129, 129],
+            [227, 100,  42]]], dtype=uint8)
+    """
+    linear = (np.arange(256, dtype=np.float32) / 255) ** _ADOBE_GAMMA
+    encoded = srgb_codes(np.arange(_STEPS + 1) / _STEPS)
+    out = np.empty_like(codes)
+    for top in range(0, len(codes), _ROWS):
+        wanted = linear[codes[top : top + _ROWS]] @ _ADOBE_TO_SRGB.T
+        out[top : top + _ROWS] = encoded[np.rint(np.clip(wanted, 0, 1) * _STEPS).astype(np.uint16)]
+    return out
+
+
+@lru_cache(maxsize=16)
+def _transform(icc: bytes) -> tuple[ImageCmsTransform | None, str, str]:
+    """Return the transform of a profile or None, the mode of its pictures, and the remark."""
+    from PIL import Image, ImageCms
+
+    try:
+        profile = ImageCms.ImageCmsProfile(io.BytesIO(icc))
+        # Clause 7.2.6: the data colour space field.
+        space = icc[16:20].decode("latin-1").strip()
+        name = " ".join(ImageCms.getProfileDescription(profile).split()) or "unnamed"
+        mode = {"RGB": "RGB", "GRAY": "L"}.get(space)
+        if mode is None:
+            return None, "RGB", f"{name} of {space} colours, not applied, taken as sRGB"
+        srgb = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB"))  # pyright: ignore[reportUnknownMemberType, reportUnknownArgumentType]
+        transform = ImageCms.buildTransform(profile, srgb, mode, "RGB", ImageCms.Intent.RELATIVE_COLORIMETRIC)
+    except (ImageCms.PyCMSError, OSError, ValueError) as error:
+        return None, "RGB", f"damaged ({' '.join(str(error).split())}), not applied, taken as sRGB"
+    steps = np.rint(np.linspace(0, 255, 256 if mode == "L" else _PROBE_STEPS)).astype(np.uint8)
+    probe = steps[None] if mode == "L" else np.stack(np.meshgrid(steps, steps, steps), axis=-1).reshape(1, -1, 3)
+    seen = np.array(ImageCms.applyTransform(Image.fromarray(probe), transform), dtype=np.int16)
+    if np.abs(seen - (probe[..., None] if mode == "L" else probe)).max() <= 1:
+        return None, mode, f"{name}, is sRGB"
+    return transform, mode, f"{name}, converted to sRGB"
+
+
+_CANDIDATES: Final = 8
+"""Places of which a further crop takes the best; chosen, not measured: with one, crops may be nearly the same."""
+
+
+def random_places(
+    free: tuple[int, int],
+    size: tuple[int, int],
+    count: int,
+    seed: int,
+    name: str,
+    first: tuple[int, int] | None = None,
+) -> list[tuple[int, int]]:
+    """Return `count` different places of crops in a picture.
+
+    Candidate n is made of the first two words of Philox with counter (a + n mod 2³², b, number, 6); a, b, number are
+    the first three words of the SHA-256 of the picture's name. The first crop is at candidate 0, or at `first`. Each
+    further one is at that of the next eight candidates which overlaps least with the crops before it, the first of
+    equals, as in best-candidate sampling (D. Mitchell, "Spectrally optimal sampling for distribution ray tracing",
+    SIGGRAPH 1991), where its eight are all taken, at the first free place after them, row by row.
+
+    `free`: columns and rows at which a crop can begin, 1 or more; together `count` or more places. `size`: width and
+    height of a crop, px. `first`: column and row of the first crop, px; None for a random place. Returns column and row
+    of each, px.
+
+    Examples
+    --------
+    >>> sorted(random_places((2, 2), (8, 8), 4, seed=0, name="a.png"))
+    [(0, 0), (0, 1), (1, 0), (1, 1)]
+    """
+    digest = hashlib.sha256(name.encode("utf-8", "surrogateescape")).digest()
+    a, b, number = (int.from_bytes(digest[at : at + 4], "little") for at in (0, 4, 8))
+    tried = (a + np.arange(1 + _CANDIDATES * (count - 1), dtype=np.int64)) % (1 << 32)
+    across, down, _, _ = philox.words(seed, tried, b, number, philox.CROPS)
+    candidates = [
+        (int(column) * free[0] >> 32, int(row) * free[1] >> 32) for column, row in zip(across, down, strict=True)
+    ]
+    places = candidates[:1] if first is None else [first]
+    for crop in range(1, count):
+        begin = 1 + _CANDIDATES * (crop - 1)
+        left = [place for place in candidates[begin : begin + _CANDIDATES] if place not in places]
+        if left:
+            places.append(min(left, key=lambda place: max(_overlap(place, other, size) for other in places)))
+            continue
+        last = candidates[begin + _CANDIDATES - 1]
+        start, total = last[1] * free[0] + last[0], free[0] * free[1]
+        following = (((start + step) % total % free[0], (start + step) % total // free[0]) for step in range(total))
+        places.append(next(place for place in following if place not in places))
+    return places
+
+
+def _overlap(one: tuple[int, int], other: tuple[int, int], size: tuple[int, int]) -> int:
+    """Return the pixels that crops at two places share."""
+    wide, high = (max(0, side - abs(a - b)) for side, a, b in zip(size, one, other, strict=True))
+    return wide * high
+
+
+def clear_bits(codes: npt.NDArray[np.uint8], bits: int) -> npt.NDArray[np.uint8]:
+    """Return codes (...) uint8 with their lowest `bits` bits, 0 … 8, set to zero.
+
+    Examples
+    --------
+    >>> clear_bits(np.array([7, 8, 200, 255], np.uint8), 3)
+    array([  0,   8, 200, 248], dtype=uint8)
+    """
+    if not 0 <= bits <= 8:
+        raise InputError(f"{bits} bits of a code of 8 were to be set to zero, expected 0 to 8")
+    return codes & np.uint8(0xFF << bits & 0xFF)
+
+
+def keep_bits(codes: npt.NDArray[np.uint8], bits: int | None) -> npt.NDArray[np.uint8]:
+    """Return codes (...) uint8 of which the highest `bits` bits, 0 … 8, are kept.
+
+    All of them, the same array, if None.
+    """
+    return codes if bits is None else clear_bits(codes, 8 - bits)
+
 
 Picture = npt.NDArray[np.uint8]
 
@@ -216,8 +475,6 @@ def _read(path: Path, data: bytes | None) -> _Values:
     if not path.is_file():
         raise FormatError(f"cannot read {path}: there is no such file; name a picture")
     if path.suffix.lower() == ".avif":
-        from generator.pictures.avif import read_avif
-
         picture = read_avif(path, LARGEST_PICTURE)
         return _Values(picture.codes, picture.alpha, False, False, picture.orientation, picture.icc, False)
     with _named_in_text(path) as name:

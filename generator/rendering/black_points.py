@@ -1,8 +1,8 @@
 """The print's own black, taken out of what the camera saw of it.
 
-A print is never black: its surface scatters a few hundredths of the light, which lies on every colour like a veil. With
-b what the camera sees of the chart's black cell under a light and W the light's white, a share v of it is taken out of
-a sample x, channel by channel::
+A print is never black: its surface scatters a few hundredths of the light, which lies on every colour like a veil.
+With b what the camera sees of the chart's black cell under a light and W the light's white, a share v of it is taken
+out of a sample x, channel by channel::
 
     y = (x - v b) / (1 - v b / W)
 
@@ -39,7 +39,7 @@ import numpy.typing as npt
 from foundation.compiled import compiled
 from foundation.errors import InputError, QualityError
 from generator import philox
-from generator.kernels.palette import nearest_fit_colours
+from generator.kernels.choice import nearest_fit_colours
 
 if TYPE_CHECKING:
     from calibration.table.lut import Lut

@@ -2,42 +2,121 @@
 
 What the camera should see of a source colour is a = C · linear sRGB, C being the colour matrix of its body. The
 print's black is not black and its paper not white, so black goes to the print's black point b and white to its white
-point w, as black point compensation does between two media (ISO 18619:2015; there in XYZ, here in camera RGB): t = b
-+ (w - b) a.
+point w, as black point compensation does between two media (ISO 18619:2015; there in XYZ, here in camera RGB): t = b +
+(w - b) a.
 
-Mixtures of cells are exact for the lights of a table one by one, which are made once and kept. A mixture of lights,
-or several lights on an image, are one light more with nearly every image. There the mixtures are those of the table's
-light that is nearest, but colours near grey, by which the eye and every estimator know a light, are mixed anew for
-the very light of the image.
+Mixtures of cells are exact for the lights of a table one by one, which are made once and kept. A mixture of lights, or
+several lights on an image, are one light more with nearly every image. There the mixtures are those of the table's
+light that is nearest, but colours near grey, by which the eye and every estimator know a light, are mixed anew for the
+very light of the image.
+
+Source colours are nodes: of each channel 32 sRGB codes 255 k / 31, k = 0 … 31. A picture's codes lie between nodes,
+and are shared out among them by dithering.
 """
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+import numpy.typing as npt
+
+from calibration.radiometry.greys import tint_deg
+from foundation.colorimetry import decode_srgb
+from generator.kernels.choice import channels_of
+from generator.rendering.matrices import ColourMatrix
+
+if TYPE_CHECKING:
+    from calibration.table.lut import Lut
 import json
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import lru_cache
 from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
-
-import numpy as np
-import numpy.typing as npt
 
 from foundation.colorimetry import angles_deg
 from foundation.errors import QualityError
 from foundation.hashing import sha256_of
 from generator.lights.gamut import black_body
 from generator.lights.lighting import Lighting, Mixture, mixture_of, plain
-from generator.rendering import cell_mixtures, print_profiles, source_colours
-from generator.rendering.cell_mixtures import CellMixtures, mix_cells, mixtures_of, near_grey
-from generator.rendering.kept_mixtures import are_kept, keep_mixtures, load_mixtures
-from generator.rendering.matrices import ColourMatrix
+from generator.rendering import cell_mixtures, print_profiles
+from generator.rendering.cell_mixtures import (
+    CellMixtures,
+    are_kept,
+    keep_mixtures,
+    load_mixtures,
+    mix_cells,
+    mixtures_of,
+    near_grey,
+)
+from generator.rendering.matrices import matrix_for
 from generator.rendering.print_profiles import PrintProfile, mixed_profile, profile_of
-from generator.rendering.table_matrix import matrix_for
 
-if TYPE_CHECKING:
-    from calibration.table.lut import Lut
+NODE_BITS: Final = 5
+"""Bits of a channel of the source nodes: at 32 codes a channel, interpolating between nodes errs by less than the
+samples of a cell differ."""
+
+NODES: Final = 8**NODE_BITS
+"""Number of source nodes."""
+
+
+def node_codes() -> npt.NDArray[np.float64]:
+    """Return the sRGB codes 0 … 1 of the source nodes, (32768, 3) float64; node (r << 10) | (g << 5) | b.
+
+    Examples
+    --------
+    >>> node_codes()[[0, 31, 32767]].tolist()
+    [[0.0, 0.0, 0.0], [0.0, 0.0, 1.0], [1.0, 1.0, 1.0]]
+    """
+    return channels_of(np.arange(NODES), NODE_BITS) / (2.0**NODE_BITS - 1)
+
+
+def source_colours(matrix: ColourMatrix) -> npt.NDArray[np.float64]:
+    """Return what the camera should see of each source node, over white: clip(C · linear sRGB, 0, 1).
+
+    `matrix`: linear sRGB to camera RGB, rows of sum 1, so that a grey is a grey to the camera, too. Returns (32768, 3)
+    float64, 0 … 1.
+
+    Examples
+    --------
+    >>> from generator.rendering.matrices import camera_matrix
+    >>> source_colours(camera_matrix("550D"))[[0, 31, 32767]].round(3).tolist()
+    [[0.0, 0.0, 0.0], [0.079, 0.238, 0.748], [1.0, 1.0, 1.0]]
+    """
+    return np.clip(decode_srgb(node_codes()) @ matrix.rows.T, 0.0, 1.0)
+
+
+DARKEST: Final = 0.1
+"""Share of white below which a grey is left out: the tint of ink black is not what a picture's greys suffer from."""
+
+
+def grey_tint_deg(lut: Lut) -> tuple[float, int] | None:
+    """Return the largest angle between a grey of the print and the light, and the light it was found under.
+
+    Greys are the chart's cells with three equal codes between black and white, as the camera sees them under the light
+    of the table that is brightest in its darkest channel; cells that are unfit or dark are left out.
+
+    Returns the angle in degrees, and the number of the light; None where the chart has no such grey.
+
+    Examples
+    --------
+    >>> from pathlib import Path
+    >>> from calibration.table.lut import open_lut
+    >>> angle, light = grey_tint_deg(open_lut(Path("lut")))
+    >>> round(angle, 1), light
+    (0.6, 0)
+    """
+    bits, light = lut.provenance.bits, int(np.argmax(lut.white.min(axis=1)))
+    levels = np.arange(1, (1 << bits) - 1)
+    cells = levels * (1 | 1 << bits | 1 << 2 * bits)
+    unfit = [cell.colour for cell in lut.provenance.unfit]
+    cells = cells[~np.isin(cells, unfit)]
+    white = lut.white[light]
+    greys = lut.samples[light, cells].mean(axis=1, dtype=np.float64)
+    greys = greys[(greys / white).min(axis=1) > DARKEST]
+    return (float(tint_deg(white, greys).max()), light) if len(greys) else None
+
 
 BLACK_WITHIN_DEG: Final = 0.4
 """Angle to grey of the black that is asked of a print, degrees: a little less than the half that greys may be off."""
@@ -64,7 +143,7 @@ def wanted_colours(profile: PrintProfile, matrix: ColourMatrix) -> npt.NDArray[n
     `matrix`: linear sRGB to the camera's RGB.
     """
     black = black_point(profile)
-    return black + (profile.white - black) * source_colours.source_colours(matrix)
+    return black + (profile.white - black) * source_colours(matrix)
 
 
 def black_point(profile: PrintProfile) -> float:
@@ -149,7 +228,7 @@ def _mixtures(lut: Lut, light: Mixture, rows: tuple[float, ...], folder: Path | 
     matrix = ColourMatrix("", np.array(rows).reshape(3, 3), "")
     first, *others = light.lights
     key = _key(lut, light, rows)
-    found = load_mixtures(key, source_colours.NODES, folder)
+    found = load_mixtures(key, NODES, folder)
     if found is not None:
         return found
     if others:
@@ -219,6 +298,6 @@ def _libraries(version_of: Callable[[str], str]) -> dict[str, str]:
 @lru_cache(maxsize=1)
 def _code() -> str:
     """Return a hash of the code that computes mixtures, so that those of older code are not taken for its own."""
-    modules = (print_profiles, source_colours, cell_mixtures)
+    modules = (print_profiles, cell_mixtures)
     files = [Path(str(module.__file__)) for module in modules] + [Path(__file__)]
     return sha256_of(b"".join(file.read_bytes() for file in files))

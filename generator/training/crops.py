@@ -28,16 +28,16 @@ import numpy.typing as npt
 
 from foundation.errors import InputError
 from generator import philox
+from generator.kernels.choice import replace_unfit_colours
 from generator.kernels.dithering import CellTable, checked_cells
-from generator.kernels.palette import replace_unfit_colours
 from generator.kernels.planar import draw_batch
 from generator.lights.lighting import Lighting, Mixture
 from generator.rendering import Rendering
 from generator.rendering.black_points import KEEP, BlackPoint, veil_of
 from generator.training.recycling import Recycled
+from generator.variation.exposing import add_noise
 from generator.variation.iso_speed import IsoSpeed
 from generator.variation.sensor_noise import SensorNoise
-from generator.variation.training_noise import add_noise
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -374,7 +374,7 @@ class _Cells:
 
     def __init__(self, lut: Lut, lights: Sequence[Mixture], matrix: ColourMatrix | None) -> None:
         from generator.rendering.colorimetric import ColorimetricRendering
-        from generator.rendering.table_matrix import matrix_for
+        from generator.rendering.matrices import matrix_for
 
         self._lut = lut
         self._lights = lights

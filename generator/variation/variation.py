@@ -3,27 +3,346 @@
 In this order: the light falls off, then it is exposed, then noise is what it would have been, then counts are rounded
 and cut at saturation. All of it happens in one pass (`exposing`). The ground truth is the light's, which neither
 exposure nor noise changes.
+
+Where light falls off, the light of a pixel is that of the image times, in each channel,
+
+    (1 − w) + w · end,        0 < end ≤ 1,
+
+where w, 0 … 1, is the mask of a second light (`generator.masks`), drawn anew for each image. So nowhere is it brighter
+than the light that was photographed, and noise can always be added to what it was. The end is 2 to the power of minus
+some stops, times the tint where one is asked for.
+
+Where the end has no tint, the chromaticity of the light is the same in every pixel, and the ground truth is that of
+the light. With a tint the image has two lights of one name, and masks and maps as other images of several lights have.
+
+The factor of an exposure is drawn for each image from the words of Philox with counter (0, 0, number of the image,
+12), or chosen by the image itself, as a camera's automatic exposure does: so that a share of its pixels reaches a
+level.
 """
 
 from __future__ import annotations
 
+import math
+from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Final
+from itertools import pairwise
+from statistics import NormalDist
+from typing import TYPE_CHECKING, Any, Final, Protocol
 
 import numpy as np
 import numpy.typing as npt
 
 from foundation.errors import InputError
+from generator import philox
+from generator.masks.making import MadeMasks, RandomStreams, Shape, SmoothFields, Weights, parse_shape
+from generator.named_numbers import Range, parse_numbers
 from generator.variation.exposing import brightness_reached, expose
-from generator.variation.exposures import ExposureChoice
-from generator.variation.gradients import Gradient
 from generator.variation.iso_speed import IsoSpeed
 from generator.variation.sensor_noise import SensorNoise, measured_noise
 
 if TYPE_CHECKING:
     from calibration.table.lut import Lut
 
+
 Three = tuple[float, float, float]
+
+_GRADIENT_OPTIONS: Final[dict[str, Range]] = {"stops": (0.0, 6.0), "least": (0.0, 6.0), "colour": (0.0, 1.0)}
+
+
+@dataclass(frozen=True)
+class Falloff:
+    """The uneven light of one image.
+
+    - `masks`: (height, width, 2) weights of the light itself, and of its far end.
+    - `end`: red, green and blue light at the far end over that of the image, above 0 up to 1.
+    """
+
+    masks: MadeMasks
+    end: Three
+
+    def weights(self, height: int, width: int) -> Weights:
+        """Return (height, width, 2) float32 from 0 to 1 in whole 65535ths that sum to 1 in every pixel."""
+        return self.masks.weights(height, width, 2)
+
+
+@dataclass(frozen=True)
+class Gradient:
+    """How light falls off on each image.
+
+    - `shape`: where, as of the masks of two lights.
+    - `stops`, `least`: the far end is darker by a number of stops between `least` and `stops`, each as likely.
+    - `colour`: most that ln(R/G) and ln(B/G) of the far end differ from those of the light, each drawn evenly and on
+      its own.
+    """
+
+    shape: Shape = SmoothFields()  # noqa: RUF009  frozen
+    stops: float = 1.0
+    least: float = 0.0
+    colour: float = 0.0
+
+    def __post_init__(self) -> None:
+        if not (0 <= self.least <= self.stops < math.inf and 0 <= self.colour < math.inf):
+            raise InputError(
+                f"a gradient of {self.least:g} to {self.stops:g} stops and colour {self.colour:g} was asked for; "
+                "expected rising stops from 0, and a colour from 0"
+            )
+
+    def of_image(self, seed: int, number: int) -> Falloff:
+        """Return the uneven light of image `number`: words of Philox with counter (0, 64, number, 13), masks below."""
+        drawn = [(int(word) + 0.5) / (1 << 32) for word in philox.words(seed, 0, 64, number, philox.GRADIENTS)]
+        level = 2.0 ** -(self.least + (self.stops - self.least) * drawn[0])
+        red, blue = (math.exp(self.colour * (2 * place - 1)) for place in drawn[1:3])
+        most = max(red, 1.0, blue)
+        end = (level * red / most, level / most, level * blue / most)
+        return Falloff(MadeMasks(self.shape, RandomStreams(seed, number, philox.GRADIENTS)), end)
+
+    def describe(self) -> dict[str, Any]:
+        """Return the shape and the numbers as plain values."""
+        return {**self.shape.describe(), "stops": self.stops, "least": self.least, "colour": self.colour}
+
+
+def described_gradient(record: Mapping[str, Any]) -> Gradient:
+    """Return the gradient that `Gradient.describe` described.
+
+    Examples
+    --------
+    >>> described_gradient(Gradient(stops=2.0).describe()) == Gradient(stops=2.0)
+    True
+    """
+    kind = str(record.get("masks"))
+    # A half plane is a soft edge of no width, which only its name says.
+    given = {name: value for name, value in record.items() if name != "masks" and value is not None}
+    if kind == "half-plane":
+        given.pop("width", None)
+    return parse_gradient(f"{kind}:{','.join(f'{name}={value}' for name, value in given.items())}")
+
+
+def parse_gradient(text: str) -> Gradient:
+    """Return the gradient that a text names: a kind of masks with its numbers, and ``stops``, ``least``, ``colour``.
+
+    Examples
+    --------
+    >>> parse_gradient("soft-edge:width=.8,stops=2").stops
+    2.0
+    """
+    kind, _, rest = text.strip().partition(":")
+    entries = [entry for entry in rest.split(",") if entry.strip()]
+    own = [entry for entry in entries if entry.partition("=")[0].strip().lower() in _GRADIENT_OPTIONS]
+    numbers = parse_numbers(",".join(own), _GRADIENT_OPTIONS, f"the gradient {kind}")
+    others = ",".join(entry for entry in entries if entry not in own)
+    shape = parse_shape(f"{kind}:{others}" if others else kind)
+    stops = numbers.get("stops", max(Gradient.stops, numbers.get("least", 0.0)))
+    return Gradient(shape, stops, numbers.get("least", Gradient.least), numbers.get("colour", Gradient.colour))
+
+
+MOST: Final = 8.0
+"""Largest factor of an automatic exposure unless said otherwise: 3 stops, as cameras' own limits of automatic ISO."""
+
+_STOPS: Range = (-12.0, 6.0)
+"""Least and most stops: 2⁻¹² of a 14-bit sensor's range is within its noise, 2⁶ shows nothing but the table's noise."""
+_TAILS: Final = 3.0
+"""Standard deviations at which a normal distribution of stops is cut, 0.3 % of it."""
+
+_EXPOSURE_OPTIONS: Final[dict[str, dict[str, Range]]] = {
+    "stops": {"low": _STOPS, "high": _STOPS},
+    "normal": {"mean": _STOPS, "sd": (0.0, 6.0)},
+    "clip": {"share": (0.0, 0.9), "most": (0.01, 64.0)},
+    "level": {"share": (0.0, 0.9), "low": (0.001, 1.0), "high": (0.001, 1.0), "most": (0.01, 64.0)},
+}
+
+
+class ExposureChoice(Protocol):
+    """The factor on the counts of each image."""
+
+    @property
+    def seen(self) -> float | None:
+        """Share of an image's brightest pixels that the factor depends on; None where it does not."""
+        ...
+
+    def factor(self, seed: int, number: int, brightness: float) -> float:
+        """Return the factor > 0 of image `number`.
+
+        `brightness`: largest channel, over saturation, that the share `seen` of the pixels reaches; any number where
+        that is None.
+        """
+        ...
+
+    def describe(self) -> dict[str, Any]:
+        """Return the kind and its numbers as plain values."""
+        ...
+
+
+@dataclass(frozen=True)
+class DrawnExposure:
+    """A factor of 2 to the power of stops, drawn by quantiles: of probability 0 … 1 in even steps, linear between.
+
+    Two quantiles are an even distribution between them, one is a fixed factor.
+
+    Examples
+    --------
+    >>> round(DrawnExposure((-1.0, -1.0)).factor(seed=0, number=7, brightness=0.0), 3)
+    0.5
+    """
+
+    stops: tuple[float, ...]
+
+    def __post_init__(self) -> None:
+        _check_quantiles(self.stops, "stops of exposure")
+
+    @property
+    def seen(self) -> float | None:
+        """None: the image does not matter."""
+        return None
+
+    def factor(self, seed: int, number: int, brightness: float) -> float:
+        """Return the factor of image `number`; see `ExposureChoice.factor`."""
+        del brightness
+        return 2.0 ** _quantile(self.stops, _uniform(seed, number))
+
+    def describe(self) -> dict[str, Any]:
+        """Return the kind and its numbers."""
+        return {"exposure": "stops", "quantiles": list(self.stops)}
+
+
+@dataclass(frozen=True)
+class NormalExposure:
+    """A factor of 2 to the power of stops from a normal distribution, cut at 3 standard deviations."""
+
+    mean: float
+    sd: float
+
+    def __post_init__(self) -> None:
+        if not (math.isfinite(self.mean) and 0 <= self.sd < math.inf):
+            raise InputError(f"stops of mean {self.mean} and sd {self.sd} were asked for, expected numbers, sd from 0")
+
+    @property
+    def seen(self) -> float | None:
+        """None: the image does not matter."""
+        return None
+
+    def factor(self, seed: int, number: int, brightness: float) -> float:
+        """Return the factor of image `number`; see `ExposureChoice.factor`."""
+        del brightness
+        tail = NormalDist().cdf(-_TAILS)
+        place = tail + (1 - 2 * tail) * _uniform(seed, number)
+        return 2.0 ** (self.mean + self.sd * NormalDist().inv_cdf(place))
+
+    def describe(self) -> dict[str, Any]:
+        """Return the kind and its numbers."""
+        return {"exposure": "normal", "mean": self.mean, "sd": self.sd}
+
+
+@dataclass(frozen=True)
+class AutomaticExposure:
+    """The factor with which a share of the pixels reaches a level: automatic exposure.
+
+    - `share`: of the pixels, the brightest by their largest channel; 0 lets none reach the level.
+    - `levels`: over saturation, 0 … 1: quantiles that each image's level is drawn by, as of `DrawnExposure`, in the
+      logarithm. Level 1 clips that share.
+    - `most`: largest factor, so that a dark picture stays dark.
+
+    Examples
+    --------
+    >>> AutomaticExposure(share=0.01, levels=(1.0,)).factor(seed=0, number=0, brightness=0.25)
+    4.0
+    """
+
+    share: float
+    levels: tuple[float, ...] = (1.0,)
+    most: float = MOST
+
+    def __post_init__(self) -> None:
+        _check_quantiles(self.levels, "levels of exposure")
+        if not (0 <= self.share < 1 and min(self.levels) > 0 and max(self.levels) <= 1 and 0 < self.most < math.inf):
+            raise InputError(
+                f"an exposure of share {self.share}, levels {self.levels} and most {self.most} was asked for; expected "
+                "a share from 0 and below 1, levels above 0 up to 1, and a factor above 0"
+            )
+
+    @property
+    def seen(self) -> float | None:
+        """The share of the pixels."""
+        return self.share
+
+    def factor(self, seed: int, number: int, brightness: float) -> float:
+        """Return the factor of image `number`; see `ExposureChoice.factor`."""
+        logarithms = tuple(math.log(level) for level in self.levels)
+        level = math.exp(_quantile(logarithms, _uniform(seed, number)))
+        return min(level / brightness, self.most) if brightness > 0 else self.most
+
+    def describe(self) -> dict[str, Any]:
+        """Return the kind and its numbers."""
+        return {"exposure": "automatic", "share": self.share, "levels": list(self.levels), "most": self.most}
+
+
+def parse_exposure(text: str) -> ExposureChoice:
+    """Return the exposure that a text names.
+
+    A number is a factor; ``stops:low=-2,high=1`` draws evenly in stops, ``normal:mean=-1,sd=.5`` normally;
+    ``clip:share=.01`` clips that share of the pixels; ``level:share=.01,low=.3,high=.9`` lets that share of them reach
+    a level between those, over saturation. ``most=4`` limits the factor of the last two.
+
+    Examples
+    --------
+    >>> parse_exposure("stops:low=-2,high=1")
+    DrawnExposure(stops=(-2.0, 1.0))
+    >>> parse_exposure("clip:share=.01")
+    AutomaticExposure(share=0.01, levels=(1.0,), most=8.0)
+    """
+    kind, _, rest = text.strip().partition(":")
+    if kind not in _EXPOSURE_OPTIONS:
+        return _fixed(text)
+    given = parse_numbers(rest, _EXPOSURE_OPTIONS[kind], f"the exposure {kind}")
+    needed = {"stops": ("low", "high"), "normal": ("mean", "sd"), "clip": ("share",), "level": ("share", "low")}[kind]
+    missing = [name for name in needed if name not in given]
+    if missing:
+        raise InputError(f"the exposure {text!r} lacks {' and '.join(missing)}; write for example {_EXAMPLES[kind]}")
+    if "low" in given and given.get("high", given["low"]) < given["low"]:
+        raise InputError(f"the exposure {text!r}: low is above high; exchange them")
+    if kind == "stops":
+        return DrawnExposure((given["low"], given["high"]))
+    if kind == "normal":
+        return NormalExposure(given["mean"], given["sd"])
+    levels = (1.0,) if kind == "clip" else (given["low"], given.get("high", given["low"]))
+    return AutomaticExposure(given["share"], levels, given.get("most", MOST))
+
+
+_EXAMPLES: Final = {
+    "stops": "stops:low=-2,high=1",
+    "normal": "normal:mean=-1,sd=.5",
+    "clip": "clip:share=.01",
+    "level": "level:share=.01,low=.3,high=.9",
+}
+
+
+def _fixed(text: str) -> ExposureChoice:
+    least, most = (2.0**stops for stops in _STOPS)
+    try:
+        factor = float(text)
+    except ValueError:
+        factor = math.nan
+    if not least <= factor <= most:
+        raise InputError(
+            f"{text!r} is no exposure; write a factor from {least:.2g} to {most:g}, or {', '.join(_EXAMPLES.values())}"
+        )
+    return DrawnExposure((math.log2(factor),))
+
+
+def _check_quantiles(quantiles: tuple[float, ...], what: str) -> None:
+    ordered = all(low <= high for low, high in pairwise(quantiles))
+    if not quantiles or not ordered or not all(map(math.isfinite, quantiles)):
+        raise InputError(f"the {what} are {quantiles}, expected one or more rising numbers")
+
+
+def _quantile(quantiles: tuple[float, ...], place: float) -> float:
+    steps: npt.NDArray[np.float64] = np.linspace(0.0, 1.0, len(quantiles))
+    return float(np.interp(place, steps, quantiles))
+
+
+def _uniform(seed: int, number: int) -> float:
+    """Return a number between 0 and 1."""
+    return (int(philox.words(seed, 0, 0, number, philox.EXPOSURES)[0]) + 0.5) / (1 << 32)
+
 
 _TRIALS: Final = 2
 """Exposures tried until the share of the pixels that reach a level is the one asked for, noise included: of 60

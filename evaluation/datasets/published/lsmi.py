@@ -38,7 +38,7 @@ from evaluation.datasets.raw_scene import Mask, RawScene, polygon_mask
 from evaluation.datasets.truths import Light, check_light, read_text
 from evaluation.scene import Image, Scene, SceneSet
 from foundation.errors import FormatError, InputError, first_of
-from generator.files.formats import decode_array
+from generator.files import decode_array
 
 _SONY: Final = (128.0, 4095.0)
 """Black level and saturation of Sony's .tiff files (1_make_mixture_map.py)."""

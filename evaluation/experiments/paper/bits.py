@@ -2,7 +2,7 @@
 
 Real linear images are tone mapped by Flash to codes of 8 bits, the lowest n bits of each code are set to zero, and the
 reversed operator takes them back to linear; then methods estimate their lights. Flash's k and scale are those of the
-image before (`generator.pictures.tonemap`), so that with n = 0 only the rounding to whole codes is left. Masked pixels
+image before (`generator.pictures.preview`), so that with n = 0 only the rounding to whole codes is left. Masked pixels
 have no say in k and scale.
 """
 
@@ -26,8 +26,8 @@ from evaluation.results.result import Result
 from evaluation.results.tables import Table
 from evaluation.scene import Image, Scene
 from foundation.processors import ordered_map
-from generator.pictures.bits import clear_bits
-from generator.pictures.tonemap import Flash, fit_flash
+from generator.pictures.picture import clear_bits
+from generator.pictures.preview import Flash, fit_flash
 
 BITS: Final = tuple(range(8))
 """Numbers of bits set to zero, as in the paper's figure."""

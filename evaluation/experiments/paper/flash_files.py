@@ -30,8 +30,8 @@ from foundation.errors import FormatError, InputError
 from foundation.files import reading_error, whole_folder, write_whole
 from foundation.foreign_folders import is_inside_name, read_inside
 from foundation.processors import ordered_map
-from generator.pictures.bits import clear_bits
-from generator.pictures.tonemap import Flash
+from generator.pictures.picture import clear_bits
+from generator.pictures.preview import Flash
 
 TABLE: Final = "flash.csv"
 COLUMNS: Final = ("image", "codes", "mask", "k", "scale", "gamma", "largest", "r", "g", "b")

@@ -27,7 +27,7 @@ from evaluation.methods.standard import standard_methods
 from evaluation.metrics import ErrorKind
 from evaluation.results.tables import Table
 from foundation.errors import InputError
-from generator.kernels.palette import replace_unfit_colours
+from generator.kernels.choice import replace_unfit_colours
 from generator.kernels.rendering import draw_samples
 
 if TYPE_CHECKING:

@@ -24,7 +24,7 @@ from foundation.colorimetry import decode_srgb
 from foundation.errors import FormatError, InputError
 from generator.lights.lighting import parse_mixture
 from generator.rendering.matrices import ColourMatrix
-from generator.variation.gradients import Falloff, described_gradient
+from generator.variation.variation import Falloff, described_gradient
 
 _LINEAR: Final = decode_srgb(np.arange(256) / 255)
 """Linear light 0 … 1 of each code."""

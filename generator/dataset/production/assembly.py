@@ -44,7 +44,7 @@ from generator.dataset.production.records import (
     image_key,
 )
 from generator.dataset.production.workplace import Workplace
-from generator.files.formats import suffix_of
+from generator.files import suffix_of
 from generator.stores.places import DESCRIPTION
 from generator.stores.store import Store
 

@@ -1,7 +1,7 @@
 """What is recorded of the light of one image: its lights, their mean, and the maps that lie beside the image.
 
 An image under one light has that light's ground truth, however its intensity falls off. Where it falls off with a tint
-(`generator.variation.gradients`) the light stands in the records twice, as it is at the near and at the far end, and
+(`generator.variation.variation`) the light stands in the records twice, as it is at the near and at the far end, and
 masks and maps say how much of either reaches a pixel.
 """
 
@@ -41,8 +41,7 @@ def image_light(
 
     `weights`: (H, W, K) float32, of each of K lights in each pixel; None of one light.
     """
-    from generator.masks.maps import encode_maps
-    from generator.masks.whites import mean_weights
+    from generator.masks.maps import encode_maps, mean_weights
 
     labels = [mixture.label for mixture in lighting.mixtures]
     whites = lighting.whites(lut)

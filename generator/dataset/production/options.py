@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Final, get_args
 
 from foundation.errors import InputError
 from generator.dataset.production.records import Layout, Scale
-from generator.files.formats import FORMATS, Format
+from generator.files import FORMATS, Format
 from generator.rendering import Rendering
 from generator.rendering.black_points import KEEP, BlackPoint
 from generator.rendering.matrices import ColourMatrix
@@ -38,7 +38,7 @@ class DatasetOptions:
     Attributes
     ----------
     form
-        File format of the images; see `generator.files.formats`.
+        File format of the images; see `generator.files`.
     layout
         How images lie: each in its file, or those of a shard in a tar or Parquet file.
     previews
@@ -66,7 +66,7 @@ class DatasetOptions:
         Bits kept of each code of the pictures, the others set to zero before they are printed; None keeps those that
         the table tells apart.
     scale
-        ``"table"`` stores counts as they are; ``"full"`` stretches them over 16 bits, see `generator.files.full_scale`.
+        ``"table"`` stores counts as they are; ``"full"`` stretches them over 16 bits, see `generator.files`.
     split_exact
         Whether parts have exactly the sizes of `split`, and not on average.
 
@@ -112,7 +112,7 @@ class DatasetOptions:
 
     def describe_rendering(self, lut: Lut) -> dict[str, Any]:
         """Return how images are rendered as plain values; nothing for codes with the print's black kept."""
-        from generator.rendering.table_matrix import matrix_for
+        from generator.rendering.matrices import matrix_for
 
         described: dict[str, Any] = {}
         if self.rendering == "colorimetric":

@@ -45,7 +45,7 @@ def photograph(
     from generator.kernels.dithering import dither, nearest_nodes
     from generator.kernels.mixing import mix_samples
     from generator.kernels.rendering import WHOLE_LIGHT_PIXELS, draw_samples
-    from generator.rendering.gamut_summaries import summarise
+    from generator.rendering.cell_mixtures import summarise
 
     # The hash of the table stands for its samples in the dataset's description.
     for mixture in lighting.mixtures:
@@ -87,7 +87,7 @@ def _samples(
 
     A picture that is `dithered` while it is drawn may show any. `grey` is as of `black_points.veil_of`.
     """
-    from generator.kernels.palette import colours_in
+    from generator.kernels.choice import colours_in
     from generator.kernels.rendering import WHOLE_LIGHT_PIXELS
     from generator.rendering.black_points import veil_of, without_veil
 
@@ -110,7 +110,7 @@ def _rendering(lut: Lut, name: str, rows: tuple[float, ...], source: str) -> Col
 
 def rendering_of(lut: Lut, options: DatasetOptions) -> ColorimetricRendering:
     """Return the rendering by colour that the options ask for; it keeps what it has found out of a table."""
-    from generator.rendering.table_matrix import matrix_for
+    from generator.rendering.matrices import matrix_for
 
     matrix = options.matrix or matrix_for(lut)
     return _rendering(lut, matrix.name, tuple(matrix.rows.ravel().tolist()), matrix.source)

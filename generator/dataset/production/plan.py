@@ -24,7 +24,7 @@ from foundation.version import software
 from generator.dataset.production.layouts.by_name import require_libraries
 from generator.dataset.production.options import DatasetOptions
 from generator.dataset.production.records import SPLITS, Layout, Light, Split, TableRecord
-from generator.files.formats import Format, libraries_of
+from generator.files import Format, libraries_of
 
 if TYPE_CHECKING:
     from calibration.table.lut import Lut

@@ -12,7 +12,7 @@ from typing import Any, Final, Literal
 from pydantic import BaseModel, ConfigDict, Field, SerializerFunctionWrapHandler, model_serializer
 
 from calibration.citation import OriginRecord
-from generator.files.formats import Format
+from generator.files import Format
 
 FORMAT: Final = "crop.dataset"
 VERSION: Final = 2

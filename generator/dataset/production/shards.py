@@ -36,8 +36,7 @@ from generator.dataset.production.records import (
 from generator.dataset.production.workers import SILENT, Callbacks
 from generator.dataset.production.workplace import Workplace
 from generator.lights.lighting import Lighting
-from generator.pictures.bits import keep_bits
-from generator.pictures.picture import Cut
+from generator.pictures.picture import Cut, keep_bits
 from generator.pictures.sources import Source
 from generator.stores.store import Pieces
 
@@ -199,8 +198,8 @@ def _wanted(job: ShardJob, position: int) -> list[tuple[int, int, Lighting]]:
 
 
 def _read(job: ShardJob, lut: Lut, place: int) -> _ReadSource:
-    from generator.files.formats import smallest_side
-    from generator.kernels.palette import replace_unfit_colours
+    from generator.files import smallest_side
+    from generator.kernels.choice import replace_unfit_colours
 
     source: Source = job.sources[place]
     scene = source.read()
@@ -241,7 +240,7 @@ def _read(job: ShardJob, lut: Lut, place: int) -> _ReadSource:
 def _make(
     job: ShardJob, lut: Lut, writer: ShardWriter, number: int, source: _ReadSource, crop: int, lighting: Lighting
 ) -> Sample:
-    from generator.files.formats import (
+    from generator.files import (
         FULL,
         ImageMetadata,
         encode_pieces,

@@ -14,7 +14,7 @@ from evaluation.datasets import open_scenes
 from evaluation.scene import MixedScene
 from generator.dataset.making import DatasetOptions, generate_dataset
 from generator.lights.choices import ListedLights, SimultaneousLights
-from generator.masks.request import parse_masks
+from generator.masks.making import parse_masks
 from generator.pictures.sources import random_scenes
 from tests.evaluation.datasets import contract
 

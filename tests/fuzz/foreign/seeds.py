@@ -22,7 +22,7 @@ from experiment.session.plan import plan_steps
 from experiment.session.records import Check, Judgement
 from generator.dataset.making import DatasetOptions, generate_dataset
 from generator.lights.choices import ListedLights, SimultaneousLights
-from generator.masks.request import parse_masks
+from generator.masks.making import parse_masks
 from generator.pictures.sources import random_scenes
 
 if TYPE_CHECKING:

@@ -21,7 +21,7 @@ from generator.dataset.making import DatasetOptions, generate_dataset
 from generator.dataset.production.exact_split import exact_parts, sizes_of
 from generator.dataset.production.options import STRETCHED, Scale
 from generator.dataset.reader import Dataset, open_dataset
-from generator.files.formats import FULL, from_full_scale, to_full_scale
+from generator.files import FULL, from_full_scale, to_full_scale
 from generator.pictures.sources import find_pictures, random_scenes
 
 if TYPE_CHECKING:

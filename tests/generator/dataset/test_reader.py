@@ -11,7 +11,7 @@ from foundation.errors import FormatError
 from generator.dataset.making import DatasetOptions, generate_dataset
 from generator.dataset.reader import open_dataset
 from generator.lights.choices import ListedLights, SimultaneousLights
-from generator.masks.request import parse_masks
+from generator.masks.making import parse_masks
 from generator.pictures.sources import random_scenes
 
 pytestmark = pytest.mark.slow

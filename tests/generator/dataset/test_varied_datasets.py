@@ -22,13 +22,11 @@ from generator.dataset.reader import Dataset, open_dataset
 from generator.dataset.verification import file_faults
 from generator.kernels.rendering import render
 from generator.lights.choices import RandomLights, SimultaneousLights
-from generator.masks.request import parse_masks
+from generator.masks.making import parse_masks
 from generator.pictures.picture import Preparation, read_picture
 from generator.pictures.sources import find_pictures
-from generator.variation.exposures import parse_exposure
-from generator.variation.gradients import parse_gradient
 from generator.variation.iso_speed import parse_iso
-from generator.variation.variation import Variation, varied_by
+from generator.variation.variation import Variation, parse_exposure, parse_gradient, varied_by
 
 pytestmark = pytest.mark.slow
 

@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 
 from drivers.raw.rawfile import camera_matrix, decode_raw
 from foundation.errors import InputError
-from generator.files.formats import ImageMetadata, decode_image, encode_image
+from generator.files import ImageMetadata, decode_image, encode_image
 
 WHITES = {
     "candle": (1945.3, 492.3, 105.1),

@@ -22,18 +22,18 @@ from hypothesis.extra import numpy as hnp
 from PIL import Image
 
 from foundation.errors import FormatError, InputError
-from generator.files.formats import (
+from generator.files import (
     FORMATS,
     Format,
     ImageMetadata,
     decode_image,
+    decode_png,
+    decode_tiff,
     encode_image,
     encode_preview,
     libraries_of,
     suffix_of,
 )
-from generator.files.png import decode_png
-from generator.files.tiff import decode_tiff
 
 METADATA = ImageMetadata(white_level=11536, white=(2046.0, 1579.5, 4520.0), camera="Canon EOS 550D")
 WHOLE: tuple[Format, ...] = ("png", "tiff", "exr", "jxl")

@@ -135,7 +135,7 @@ def test_kernels_that_dither_draw_what_they_draw_from_the_code_picture(width: in
 
 
 def test_an_image_that_is_streamed_is_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
-    from generator.kernels import streaming
+    from generator.kernels import vector as streaming
 
     rng = np.random.default_rng(8)
     picture = rng.integers(0, 256, (5, 1701, 3)).astype(np.uint8)

@@ -10,9 +10,8 @@ import numpy.typing as npt
 import pytest
 
 from foundation.errors import InputError
-from generator.kernels import streaming
-from generator.kernels.mixed_table import mixed_table
-from generator.kernels.mixing import mix_samples
+from generator.kernels import vector as streaming
+from generator.kernels.mixing import mix_samples, mixed_table
 from generator.kernels.rendering import draw_samples
 
 if TYPE_CHECKING:

@@ -19,7 +19,7 @@ from foundation.colorimetry import angles_deg
 from generator.kernels.mixing import mix_samples
 from generator.kernels.rendering import draw_samples
 from generator.lights.lighting import Lighting, Mixture, plain
-from generator.masks.request import parse_masks
+from generator.masks.making import parse_masks
 
 pytestmark = pytest.mark.slow
 

@@ -12,8 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from foundation.errors import InputError
-from generator.kernels import streaming
-from generator.kernels.palette import bits_of
+from generator.kernels import vector as streaming
+from generator.kernels.choice import bits_of
 from generator.kernels.rendering import PATTERNS, draw_mosaic, draw_samples, render
 
 if TYPE_CHECKING:

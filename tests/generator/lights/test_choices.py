@@ -23,7 +23,7 @@ from generator.lights.choices import (
 )
 from generator.lights.gamut import Gamut
 from generator.lights.lighting import LightChoice, Lighting, Mixture, plain
-from generator.masks.request import parse_masks
+from generator.masks.making import parse_masks
 
 if TYPE_CHECKING:
     from calibration.table.lut import Lut

@@ -1,4 +1,4 @@
-"""Distributions of lights, and the choices that draw from them."""
+"""Distributions of lights, the files that they are made from, and the choices that draw from them."""
 
 from __future__ import annotations
 
@@ -11,11 +11,132 @@ import pytest
 from scipy.stats import chisquare, kstest
 
 from foundation.errors import FormatError, InputError
+from generator import philox
 from generator.lights.choices import DrawnLights
-from generator.lights.distributions import Distribution, Fitted, Gaussian, Uniform, parse_distribution
-from generator.lights.gamut import Gamut, rb_of
+from generator.lights.distributions import (
+    Distribution,
+    Fitted,
+    Gaussian,
+    LogKernels,
+    Uniform,
+    load_ground_truths,
+    parse_distribution,
+)
+from generator.lights.gamut import Gamut, rb_of, rgb_of
 from generator.lights.lighting import LightChoice
 from generator.philox import CHROMATICITIES, words
+from generator.statistics.image_numbers import log_chroma
+from tests.data_files import available
+from tests.generator.statistics.stats_files import write_stats
+
+
+def clusters() -> npt.NDArray[np.float64]:
+    """Return 200 lights in two clusters, as daylight and lamps are: (200, 3), sum 1."""
+    random = np.random.default_rng(4)
+    middle = np.where(np.arange(200) % 4 == 0, 1, 0)
+    places = np.array([[-0.75, -0.4], [-0.3, -1.1]])[middle] + random.normal(0, 0.05, (200, 2))
+    lights = np.stack([np.exp(places[:, 0]), np.ones(200), np.exp(places[:, 1])], axis=1)
+    return lights / lights.sum(axis=1, keepdims=True)
+
+
+def drawn(density: LogKernels, count: int = 40000) -> npt.NDArray[np.float64]:
+    words = philox.words(3, np.arange(count), 0, 0, philox.CHROMATICITIES)
+    return log_chroma(rgb_of(density.draw(words)))
+
+
+def test_draws_have_the_lights_mean_covariance_and_clusters() -> None:
+    lights = clusters()
+    places, made = log_chroma(lights), drawn(LogKernels.of(lights))
+    # 40 000 draws: means within 4 standard errors, variances within 4 %.
+    assert made.mean(axis=0) == pytest.approx(places.mean(axis=0), abs=0.005)
+    assert np.cov(made.T) == pytest.approx(np.cov(places.T, bias=True), rel=0.04)
+    # Between the clusters there are no lights, and with Scott's whole factor 6 % of the draws would lie there.
+    across = (made - places[1]) @ (places[0] - places[1]) / np.square(places[0] - places[1]).sum()
+    assert ((across > 0.4) & (across < 0.6)).mean() < 0.02
+    assert (across > 0.5).mean() == pytest.approx(0.25, abs=0.02)
+
+
+def test_channel_gains_move_the_density_and_change_nothing_else() -> None:
+    lights, gains = clusters(), np.array([2.0, 1.0, 0.3])
+    moved = drawn(LogKernels.of(lights * gains), 100) - drawn(LogKernels.of(lights), 100)
+    assert moved == pytest.approx(np.log(gains[[0, 2]])[None].repeat(100, axis=0))
+
+
+def test_a_file_of_statistics_is_a_distribution(tmp_path: Path) -> None:
+    path = write_stats(tmp_path / "s.json", clusters(), {})
+    found = parse_distribution(str(path))
+    assert isinstance(found, LogKernels)
+    assert found.describe()["lights"] == 200
+    assert found.describe()["file"] == "s.json"
+
+
+@pytest.mark.parametrize(
+    "lights", [[[1, 1, 1]], [[1, 1, 1], [1, 1, 2]], [[1, 1, 1], [1, 1, 2], [1, 1, 3]], [[0.3, 0.4, 0.3]] * 5]
+)
+def test_lights_without_breadth_have_no_density(lights: list[list[float]]) -> None:
+    with pytest.raises(FormatError, match=r"do not lie on a line; take them as they are with --match s\.json"):
+        LogKernels.of(np.array(lights, dtype=float), "s.json")
+
+
+CUBEPLUS = [0.16238344, 0.45326359, 0.38435297]
+NUS = [0.507292583011997, 0.809736795789161, 0.294924662865143]
+REAL = {
+    "gt/cubeplus_12_rows.csv": (12, CUBEPLUS),
+    "gt/nus_18_rows.csv": (18, NUS),
+    "gt/cubeplus_gt_1707.csv": (1707, CUBEPLUS),
+    "gt/nus8_gt_1853.csv": (1853, NUS),
+}
+"""Number of lights and the first of them, by file."""
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "File,GT_R,GT_G,GT_B\na.png,1,2,3\n\nb.png,0.5,0,1e-3\n",
+        'image,source,illumination,r,g,b\n0.png,"a,b",7,1,2,3\n1.png,c,8,0.5,0,0.001\n',
+        "1 2 3\n0.5 0 0.001\n",
+        "\ufeff 1,2,3\r\n0.5;0;0.001\r\n",
+    ],
+)
+def test_ground_truths_of_every_layout(tmp_path: Path, text: str) -> None:
+    path = tmp_path / "gt"
+    path.write_bytes(text.encode())
+    np.testing.assert_array_equal(load_ground_truths(path), [[1, 2, 3], [0.5, 0, 0.001]])
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "is empty"),
+        ("File,R,Green\na,1,2\n", "line 1: no columns GT_R,GT_G,GT_B or r,g,b; found file,r,green"),
+        ("r,g,b\n", "holds no ground truth"),
+        ("1 2 3\n4 5\n", "line 2: '4 5' is no ground truth: expected 3 numbers, found 2"),
+        ("r,g,b\n1,2\n", "line 2: '1,2' is no ground truth"),
+        ("1 2 3\n\n1 x 3\n", "line 3: '1 x 3' is no ground truth"),
+        ("1 2 -3\n", "expected numbers from 0"),
+        ("nan 2 3\n", "expected numbers from 0"),
+        ("0 0 0\n", "sum above 0"),
+    ],
+)
+def test_a_bad_ground_truth_is_named_with_its_line(tmp_path: Path, text: str, message: str) -> None:
+    path = tmp_path / "gt.csv"
+    path.write_text(text)
+    with pytest.raises(FormatError, match=message):
+        load_ground_truths(path)
+
+
+def test_a_missing_file_is_named(tmp_path: Path) -> None:
+    with pytest.raises(FormatError, match=r"cannot read ground truths .*none\.csv"):
+        load_ground_truths(tmp_path / "none.csv")
+
+
+@pytest.mark.parametrize("path", available(*REAL), ids=lambda path: path.name)
+def test_real_ground_truths_are_read(path: Path) -> None:
+    lights = load_ground_truths(path)
+    number, first = REAL[f"gt/{path.name}"]
+    assert lights.shape == (number, 3)
+    assert lights[0].tolist() == first
+
 
 CORNERS = np.array([[0.8, 0.1, 0.1], [0.1, 0.8, 0.1], [0.1, 0.1, 0.8]])
 GAMUT = Gamut(np.array([*CORNERS, [0.3, 0.4, 0.3]]))

@@ -18,12 +18,10 @@ from hypothesis.extra import numpy as hnp
 
 from foundation.colorimetry import angles_deg
 from foundation.errors import FormatError
-from generator.files.formats import encode_map
+from generator.files import encode_map
 from generator.lights.lighting import Lighting, plain
-from generator.masks.given import find_masks
+from generator.masks.making import FULL, find_masks, parse_masks
 from generator.masks.maps import decode_ground_truth, decode_weights, encode_maps
-from generator.masks.request import parse_masks
-from generator.masks.weights import FULL
 
 if TYPE_CHECKING:
     from calibration.table.lut import Lut

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from foundation.errors import FormatError, InputError
-from generator.pictures.crop_places import random_places
-from generator.pictures.picture import Preparation, open_picture
+from generator.pictures.picture import Preparation, open_picture, random_places
 
 
 @pytest.fixture

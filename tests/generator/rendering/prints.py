@@ -6,7 +6,7 @@ import numpy as np
 import numpy.typing as npt
 
 from foundation.colorimetry import decode_srgb
-from generator.kernels.palette import channels_of
+from generator.kernels.choice import channels_of
 
 Array = npt.NDArray[np.float64]
 

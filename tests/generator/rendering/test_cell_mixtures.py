@@ -1,12 +1,21 @@
-"""Mixtures of cells show what is wanted, in the mean and with cells near to it."""
+"""Mixtures of cells show what is wanted, in the mean and with cells near to it.
+
+Mixtures are kept for the next time, and damaged ones are as good as none.
+
+Which source nodes a picture has, and what a print makes of them.
+"""
 
 from __future__ import annotations
+
+import os
+from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 import pytest
 
 from foundation.colorimetry import angles_deg
+from generator.kernels.dithering import nearest_nodes
 from generator.rendering.cell_mixtures import (
     _AXES,  # pyright: ignore[reportPrivateUsage]  # what differences cost is no part of the result
     BRIGHTNESS_COST,
@@ -14,10 +23,114 @@ from generator.rendering.cell_mixtures import (
     MET_WITHIN,
     SLOTS,
     WIDE_SPREAD_COST,
+    CellMixtures,
+    cache_folder,
+    keep_mixtures,
+    load_mixtures,
     mix_cells,
+    summarise,
 )
+from generator.rendering.colorimetric import NODES, node_codes
 from generator.rendering.print_profiles import PrintProfile
 from tests.generator.rendering.prints import printed
+
+
+@pytest.fixture
+def mixtures() -> CellMixtures:
+    rng = np.random.default_rng(4)
+    return CellMixtures(
+        np.sort(rng.integers(0, 32768, (7, 16)), axis=1).astype(np.uint16),
+        rng.random((7, 3)).astype(np.float32),
+        rng.random((7, 3)).astype(np.float32),
+    )
+
+
+def test_what_is_kept_is_found(mixtures: CellMixtures, tmp_path: Path) -> None:
+    folder = tmp_path / "not yet there"
+    assert load_mixtures("ab12", 7, folder) is None
+    keep_mixtures("ab12", mixtures, folder)
+    found = load_mixtures("ab12", 7, folder)
+    assert found is not None
+    for name in ("cells", "colours", "wanted"):
+        kept, given = getattr(found, name), getattr(mixtures, name)
+        assert kept.dtype == given.dtype
+        np.testing.assert_array_equal(kept, given)
+    assert [path.suffix for path in folder.iterdir()] == [".mixtures"]
+
+
+@pytest.mark.parametrize("place", [0, 25, 100, -1])
+def test_a_damaged_file_is_none(mixtures: CellMixtures, tmp_path: Path, place: int) -> None:
+    keep_mixtures("ab12", mixtures, tmp_path)
+    path = tmp_path / "ab12.mixtures"
+    content = bytearray(path.read_bytes())
+    content[place] ^= 1
+    path.write_bytes(content)
+    assert load_mixtures("ab12", 7, tmp_path) is None
+    keep_mixtures("ab12", mixtures, tmp_path)
+    assert load_mixtures("ab12", 7, tmp_path) is not None
+
+
+@pytest.mark.parametrize("content", [b"", b"something else", b"CroP cell mixtures 1\n"])
+def test_a_foreign_or_cut_file_is_none(tmp_path: Path, content: bytes) -> None:
+    (tmp_path / "ab12.mixtures").write_bytes(content)
+    assert load_mixtures("ab12", 7, tmp_path) is None
+
+
+def test_mixtures_of_another_size_are_none(mixtures: CellMixtures, tmp_path: Path) -> None:
+    keep_mixtures("ab12", mixtures, tmp_path)
+    assert load_mixtures("ab12", 8, tmp_path) is None
+
+
+def test_where_nothing_can_be_kept_nothing_is(mixtures: CellMixtures, tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("in the way")
+    keep_mixtures("ab12", mixtures, tmp_path / "file" / "below")
+    assert load_mixtures("ab12", 7, tmp_path / "file" / "below") is None
+
+
+def test_the_folder_is_the_one_of_the_system(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    assert cache_folder() == tmp_path / "croplab"
+    monkeypatch.setenv("XDG_CACHE_HOME", "here")
+    monkeypatch.setenv("HOME", str(tmp_path))
+    monkeypatch.setattr("sys.platform", "linux")
+    assert cache_folder() == tmp_path / ".cache" / "croplab"
+    monkeypatch.setattr("sys.platform", "darwin")
+    assert cache_folder() == tmp_path / "Library" / "Caches" / "croplab"
+
+
+def test_what_was_kept_first_makes_room(
+    mixtures: CellMixtures, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "notes.txt").write_text("not ours")
+    for number in range(3):
+        keep_mixtures(f"{number}", mixtures, tmp_path)
+        os.utime(tmp_path / f"{number}.mixtures", ns=(number, number))
+    size = (tmp_path / "0.mixtures").stat().st_size
+    monkeypatch.setattr("generator.rendering.cell_mixtures.MOST_BYTES", 3 * size)
+    keep_mixtures("3", mixtures, tmp_path)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["1.mixtures", "2.mixtures", "3.mixtures", "notes.txt"]
+
+
+def test_every_pixel_counts_as_the_node_nearest_to_it() -> None:
+    picture = np.random.default_rng(5).integers(0, 256, (9, 11, 3)).astype(np.uint8)
+    nodes = [int(np.square(node_codes() - pixel / 255).sum(axis=1).argmin()) for pixel in picture.reshape(-1, 3)]
+    np.testing.assert_array_equal(nearest_nodes(picture), np.bincount(nodes, minlength=NODES))
+
+
+def test_what_is_missed_counts_by_pixels() -> None:
+    rng = np.random.default_rng(6)
+    wanted = rng.uniform(0.1, 0.9, (NODES, 3)).astype(np.float32)
+    seen = (wanted * rng.uniform(0.9, 1.1, wanted.shape)).astype(np.float32)
+    picture = rng.integers(0, 256, (20, 30, 3)).astype(np.uint8)
+    counts = nearest_nodes(picture)
+    summary = summarise(CellMixtures(np.zeros((NODES, 32), np.uint16), seen, wanted), counts.astype(np.float64))
+    each = np.repeat(np.arange(NODES), counts)
+    cosines = (seen[each] * wanted[each]).sum(axis=1, dtype=np.float64)
+    cosines /= np.linalg.norm(seen[each].astype(float), axis=1) * np.linalg.norm(wanted[each].astype(float), axis=1)
+    assert summary.distance_deg == pytest.approx(np.degrees(np.arccos(np.minimum(cosines, 1))).mean(), rel=1e-4)
+    off = np.abs(seen[each] / wanted[each] - 1).max(axis=1) > 0.02
+    assert summary.outside == pytest.approx(off.mean())
+    assert 0 < summary.outside < 1
 
 
 def profile(bits: int = 4, tint: float = 0.0) -> PrintProfile:

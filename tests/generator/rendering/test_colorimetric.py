@@ -11,19 +11,18 @@ import pytest
 from foundation.colorimetry import angles_deg
 from foundation.errors import InputError, QualityError
 from generator.lights.lighting import Lighting, Mixture, plain
-from generator.masks.request import parse_masks
+from generator.masks.making import parse_masks
 from generator.rendering.cell_mixtures import CellMixtures, mix_cells
 from generator.rendering.colorimetric import (
     BLACK_WITHIN_DEG,
+    NODES,
     ColorimetricRendering,
     black_point,
     colorimetric_mixtures,
     wanted_colours,
 )
-from generator.rendering.matrices import ColourMatrix
+from generator.rendering.matrices import ColourMatrix, fitted_matrix, matrix_for
 from generator.rendering.print_profiles import PrintProfile, profile_of
-from generator.rendering.source_colours import NODES
-from generator.rendering.table_matrix import fitted_matrix, matrix_for
 from tests.generator.rendering.conftest import MakeTable
 from tests.generator.rendering.prints import MATRIX
 

@@ -10,7 +10,7 @@ import pytest
 
 from calibration.table.lut import Lut
 from generator.cli import main
-from generator.rendering.grey_tint import grey_tint_deg
+from generator.rendering.colorimetric import grey_tint_deg
 from tests.generator.conftest import MakeLut
 
 
@@ -55,7 +55,7 @@ def test_generate_tells_a_tint(
     def found(_: Lut) -> tuple[float, int]:
         return 4.72, 3
 
-    monkeypatch.setattr("generator.rendering.grey_tint.grey_tint_deg", found)
+    monkeypatch.setattr("generator.rendering.colorimetric.grey_tint_deg", found)
     assert main(["lut", "out", "--sources", "grey.png", "--no-preview", *more]) == 0
     line = "greys of this print are up to 4.7 degrees off the light (under light 3)"
     assert (line in capsys.readouterr().out) is told

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from foundation.errors import FormatError
-from generator.lights.ground_truths import load_ground_truths
+from generator.lights.distributions import load_ground_truths
 from generator.statistics.statistics_file import read_statistics
 from tests.generator.statistics.stats_files import write_stats
 

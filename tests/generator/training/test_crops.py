@@ -139,7 +139,7 @@ def test_unfit_colours_take_their_stand_ins(make_lut: MakeLut) -> None:
     lut = make_lut(bits=BITS, unfit=(63,))
     white = np.full((8, 8, 3), 255, np.uint8)
     images = Crops(lut, gallery_of([white]), (4, 4), lights=[1], flip=False, length=9).batch(np.arange(9)).images
-    from generator.kernels.palette import nearest_fit_colours
+    from generator.kernels.choice import nearest_fit_colours
 
     wanted = lut.samples[1, int(nearest_fit_colours([63], BITS)[0])].astype(np.float32) / lut.provenance.white_level
     values = images.transpose(0, 2, 3, 1).reshape(-1, 1, 3)

@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from evaluation.datasets import open_scenes
 from foundation.errors import FormatError, InputError
-from generator.lights.ground_truths import load_ground_truths
+from generator.lights.distributions import load_ground_truths
 
 _TEXTS = (".csv", ".txt")
 """Endings of files of text."""

@@ -13,7 +13,7 @@ from typing import Any, Final
 
 from generator.dataset.production.cards.facts import citation_of, name_of, option, summary_of
 from generator.dataset.production.records import GROUND_TRUTH, SOURCES, Description
-from generator.files.formats import suffix_of
+from generator.files import suffix_of
 
 CONFORMS_TO: Final = "http://mlcommons.org/croissant/1.0"
 

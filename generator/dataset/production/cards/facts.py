@@ -9,7 +9,7 @@ from typing import Any, Final
 
 from calibration.citation import bibtex, origin_lines, table_title
 from generator.dataset.production.records import Description
-from generator.files.formats import FULL
+from generator.files import FULL
 
 DATASHEET: Final = "DATASHEET.md"
 CROISSANT: Final = "croissant.json"

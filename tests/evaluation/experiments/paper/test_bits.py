@@ -14,7 +14,7 @@ from evaluation.experiments.paper.bits import bits_methods, bits_removed, bits_t
 from evaluation.experiments.running import evaluate
 from evaluation.methods.standard import standard_methods
 from foundation.errors import InputError
-from generator.pictures.tonemap import fit_flash
+from generator.pictures.preview import fit_flash
 
 
 @dataclass(frozen=True, eq=False)

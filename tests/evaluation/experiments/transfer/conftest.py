@@ -22,9 +22,8 @@ from generator.dataset.making import DatasetOptions, generate_dataset
 from generator.lights.choices import LightChoice, ListedLights
 from generator.pictures.picture import UNPREPARED, Preparation
 from generator.pictures.sources import find_pictures
-from generator.variation.gradients import parse_gradient
 from generator.variation.sensor_noise import SensorNoise
-from generator.variation.variation import NO_VARIATION, Variation
+from generator.variation.variation import NO_VARIATION, Variation, parse_gradient
 
 LIGHTS = np.array([[4000.0, 8000, 3000], [3000, 8000, 6000]])
 """Counts of white under the two lights of the table."""

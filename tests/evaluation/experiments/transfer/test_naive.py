@@ -15,7 +15,7 @@ from evaluation.scene import MixedScene
 from foundation.errors import FormatError
 from generator.lights.choices import ListedLights, SimultaneousLights
 from generator.lights.lighting import mixture_of
-from generator.masks.request import parse_masks
+from generator.masks.making import parse_masks
 from generator.pictures.picture import Preparation
 from generator.rendering.matrices import ColourMatrix
 from tests.evaluation.experiments.transfer.conftest import BOTH, LIGHTS, Maker, save_pictures, write_table

@@ -27,7 +27,7 @@ from generator.dataset.production.records import Layout
 from generator.dataset.reader import Dataset, open_dataset
 from generator.dataset.verification import file_faults
 from generator.lights.choices import ListedLights, SimultaneousLights
-from generator.masks.request import parse_masks
+from generator.masks.making import parse_masks
 from generator.pictures.sources import SourcePicture, random_scenes
 from tests.generator.groups import grouped
 

@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 
 from foundation.errors import InputError
-from generator.masks.request import parse_masks
-from generator.variation.exposures import AutomaticExposure, DrawnExposure, parse_exposure
-from generator.variation.gradients import parse_gradient
+from generator.masks.making import parse_masks
+from generator.variation.variation import AutomaticExposure, DrawnExposure, parse_exposure, parse_gradient
 
 
 def stops(text: str, count: int = 4000) -> list[float]:

@@ -1,0 +1,601 @@
+"""A 16-bit linear image as the bytes of a file, losslessly, and back; masks and previews beside it.
+
+    png     16-bit RGB; read by everything; the smallest of photographs
+    tiff    16-bit RGB, uncompressed: the fastest to write and to read
+    exr     OpenEXR, 32-bit float, which holds every 16-bit number (half does not); compressed by zip
+    jxl     JPEG XL, lossless, 16 bits: the smallest of smooth pictures
+    dng     a raw file: the Bayer mosaic of the image, two thirds of the values left out, as by a sensor
+
+Every encoder releases the interpreter's lock while it computes (not while it copies uncompressed pixels into the
+file). Beside image and file a PNG takes some megabytes, however large. `docs/decisions/0011-image-files.md` says what
+else was weighed.
+
+**PNG** (ISO/IEC 15948). Chunks are written here around `generator.deflate`; one of data holds a band of rows. Values
+are the image's own: no gAMA, cICP or iCCP chunk, since camera RGB is no display's and some readers would convert, and
+no sBIT, since values lie at the lower end of the 16 bits. Maps are smooth: of differences to the row above ISA-L makes
+as few bytes as OpenCV's writer does, in a fifth of its time; its bytes depend on its version and may on the processor.
+
+**TIFF** 6.0 as every reader can read it: one uncompressed strip. The zstd codec is missing from widespread readers,
+and deflate, at the speed of their TIFF writers, costs more time than it saves room.
+
+**OpenEXR**, scan lines under zip, saturation at the white level. Written here, since the libraries at hand write to
+named files only. Source: "OpenEXR File Layout" and "Technical Introduction to OpenEXR", version 2 of the file, one
+part; the reordering and prediction before zip are those of the reference implementation (ImfZip).
+
+**JPEG XL** (ISO/IEC 18181) at its lowest effort; it has no place for the image's metadata.
+
+**DNG** 1.7.1, chapters 2 and 4. Each photosite of the RGGB pattern takes its own channel of its pixel. Black is 0,
+white the table's saturation, AsShotNeutral the ground truth, so that a raw program shows neutral things as neutral.
+The colour matrix is the one that LibRaw holds for the table's camera or, for a camera unknown to it, that of linear
+sRGB: neutral things stay neutral with both, other colours are right with the first only. The file names CroP as its
+maker, so that no program applies facts of the camera's own files to it, such as their black level.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import math
+import struct
+import tempfile
+import threading
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final, Literal, get_args
+
+import numpy as np
+import numpy.typing as npt
+from isal import isal_zlib
+
+from drivers.raw.rawfile import Matrix, camera_matrix
+from drivers.tiff import CFA, D65, RGB, Tags, TiffTag, ValueType, head, rationals, text
+from foundation.errors import FormatError, InputError
+from generator.deflate import WIDEST, Packer
+
+Image = npt.NDArray[np.uint16]
+Format = Literal["png", "tiff", "exr", "jxl", "dng"]
+FORMATS: Final[tuple[Format, ...]] = get_args(Format)
+
+_threads = threading.local()
+"""Each thread's packer of PNG, with its working memory."""
+
+
+@dataclass(frozen=True)
+class ImageMetadata:
+    """Light and camera of one image.
+
+    - `white_level`: value of saturation, 1 … 65535, in the units of the image.
+    - `white`: linear camera RGB of an achromatic surface under the image's light, of any length: the ground truth.
+    - `camera`: maker and model, as the table has it.
+    """
+
+    white_level: int
+    white: tuple[float, float, float]
+    camera: str
+
+    def to_json(self) -> str:
+        """Return one line of JSON in ASCII, for formats with a place for a text."""
+        values = {"white_level": self.white_level, "white": self.white, "camera": self.camera}
+        return json.dumps({"format": "crop.image", "values": "linear camera RGB, black 0", **values})
+
+
+FULL: Final = 65535
+"""Largest number of 16 bits, which saturation becomes."""
+
+
+def to_full_scale(image: Image, white_level: int) -> Image:
+    """Return counts (...) uint16 stretched so that saturation is 65535; what is above the white level is cut at it.
+
+    A raw image of 0 … 11 536 looks nearly black to a program that takes the largest number of a type for white. With
+    white level w a count v becomes ⌊65535 v / w⌉, which grows by more than 1 from count to count, so that no two become
+    the same, and ⌊w s / 65535⌉ is v again: nothing is lost.
+
+    Examples
+    --------
+    >>> to_full_scale(np.array([0, 1, 1000, 11536], np.uint16), 11536)
+    array([    0,     6,  5681, 65535], dtype=uint16)
+    """
+    white = np.uint32(white_level)
+    counts = np.minimum(image, np.uint16(white_level)).astype(np.uint32)
+    return ((counts * np.uint32(FULL) + white // np.uint32(2)) // white).astype(np.uint16)
+
+
+def from_full_scale(image: Image, white_level: int) -> Image:
+    """Return the counts (...) uint16 that `to_full_scale` stretched."""
+    stretched = image.astype(np.uint32) * np.uint32(white_level)
+    return ((stretched + np.uint32(FULL // 2)) // np.uint32(FULL)).astype(np.uint16)
+
+
+SIGNATURE: Final = b"\x89PNG\r\n\x1a\n"
+"""The first bytes of every PNG file (clause 5.2)."""
+TALLEST: Final = (1 << 31) - 1
+"""Largest size in the format (clause 11.2.2)."""
+BAND: Final = 1 << 18
+"""Most pixels of a band, unless a row has more: 1.5 MiB, so that an image of any size needs little memory."""
+_ZLIB: Final = bytes([0x78, 0x01])
+"""Deflate, a window of 32 KiB, packed fast (RFC 1950, 2.2)."""
+_LEVEL: Final = 1
+"""Level of ISA-L's compression, of 0 to 3, for maps and for what OpenEXR's prediction leaves: both are smooth."""
+_UP: Final = 2
+"""The filter type Up (clause 9.2)."""
+_GREY: Final = 0
+_RGB: Final = 2
+"""Colour types (clause 11.2.2)."""
+
+
+def encode_png(image: Image, metadata: ImageMetadata) -> bytes:
+    """Return the file of `image` (H, W, 3) uint16."""
+    return b"".join(map(bytes, png_pieces(image, metadata)))
+
+
+def png_pieces(image: Image, metadata: ImageMetadata) -> Iterator[bytes | memoryview]:
+    """Yield the file of `image` (H, W, 3) uint16 piece by piece; the memory of each is used again for the next."""
+    height, width, _ = image.shape
+    if width > WIDEST or height > TALLEST:
+        raise InputError(
+            f"an image of {width}x{height} px is too large for PNG: {WIDEST} columns and {TALLEST} rows at most; "
+            "make it smaller"
+        )
+    yield _head(width, height, _RGB)
+    yield from _chunk(b"tEXt", b"Description\0" + metadata.to_json().encode("ascii"))
+    rows = max(1, BAND // width)
+    checksum = 1
+    for top in range(0, height, rows):
+        last = top + rows >= height
+        data, plain = _packer().pack(np.ascontiguousarray(image[top : top + rows]), last=last)
+        checksum = int(isal_zlib.adler32(plain.data, checksum))  # pyright: ignore  # its stub leaves the function out
+        yield from _chunk(b"IDAT", b"" if top else _ZLIB, data.data, struct.pack(">I", checksum) if last else b"")
+    yield from _chunk(b"IEND")
+
+
+def _packer() -> Packer:
+    """Return the calling thread's own packer."""
+    if not hasattr(_threads, "packer"):
+        _threads.packer = Packer()
+    return _threads.packer
+
+
+def encode_map(values: Image) -> bytes:
+    """Return smooth `values` (H, W) or (H, W, 3) uint16, such as a mask of weights, as the bytes of a PNG."""
+    height, width = values.shape[:2]
+    plain = values.astype(">u2").view(np.uint8).reshape(height, -1)
+    rows = np.empty((height, 1 + plain.shape[1]), np.uint8)
+    rows[:, 0] = _UP
+    rows[0, 1:] = plain[0]
+    np.subtract(plain[1:], plain[:-1], out=rows[1:, 1:])
+    head = _head(width, height, _GREY if values.ndim == 2 else _RGB)
+    packed = isal_zlib.compress(rows.data, _LEVEL)
+    return b"".join([head, *_chunk(b"IDAT", packed), *_chunk(b"IEND")])
+
+
+def _head(width: int, height: int, colour: int) -> bytes:
+    size = struct.pack(">IIBBBBB", width, height, 16, colour, 0, 0, 0)
+    return SIGNATURE + b"".join(_chunk(b"IHDR", size))
+
+
+def _chunk(kind: bytes, *parts: bytes | memoryview) -> Iterator[bytes | memoryview]:
+    """Yield the pieces of a chunk (clause 5.3)."""
+    checksum = isal_zlib.crc32(kind)
+    for part in parts:
+        checksum = isal_zlib.crc32(part, checksum)
+    yield struct.pack(">I", sum(len(part) for part in parts)) + kind
+    yield from filter(None, parts)
+    yield struct.pack(">I", checksum)
+
+
+def decode_png(data: bytes) -> npt.NDArray[np.generic]:
+    """Return what a PNG holds, (H, W) or (H, W, channels), RGB, uint8 or uint16, as it stands there."""
+    import cv2
+
+    # OpenCV would read other formats, too.
+    found = None
+    if data.startswith(SIGNATURE):
+        found = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), cv2.IMREAD_UNCHANGED)
+    if found is None:
+        raise ValueError("no whole PNG file")
+    if found.ndim == 2:
+        return found
+    return cv2.cvtColor(found, cv2.COLOR_BGR2RGB if found.shape[2] == 3 else cv2.COLOR_BGRA2RGBA)
+
+
+LARGEST_SIDE: Final = (1 << 31) - 1
+"""Largest number of a signed 32-bit integer, which counts the columns of a window and the bytes of a chunk."""
+
+_MAGIC_AND_VERSION: Final = struct.pack("<ii", 20000630, 2)
+"""First bytes of every OpenEXR file of version 2 with scan lines in one part."""
+_ZIP: Final = 3
+"""Number of the compression ZIP_COMPRESSION."""
+_LINES: Final = 16
+"""Scan lines that ZIP_COMPRESSION packs together."""
+_FLOAT: Final = 2
+"""Number of the pixel type FLOAT."""
+
+
+def encode_exr(image: Image, metadata: ImageMetadata) -> bytes:
+    """Return the file of `image` (H, W, 3) uint16."""
+    height, width, _ = image.shape
+    if 12 * width * _LINES > LARGEST_SIDE:
+        raise InputError(f"an image of {width}x{height} px is too wide for EXR; choose png or tiff, or make it smaller")
+    start = _header(width, height, metadata)
+    chunks = [_scan_lines(image, y) for y in range(0, height, _LINES)]
+    sizes = np.array([len(chunk) for chunk in chunks], dtype=np.uint64)
+    offsets = np.full(len(chunks), len(start) + 8 * len(chunks), dtype="<u8")
+    offsets[1:] += np.cumsum(sizes[:-1], dtype=np.uint64)
+    return b"".join([start, offsets.tobytes(), *chunks])
+
+
+def decode_exr(data: bytes) -> Image:
+    """Return the image (H, W, 3) uint16 of a file's bytes."""
+    import OpenImageIO as oiio  # noqa: N813
+
+    # OpenImageIO reads named files only.
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "image.exr"
+        path.write_bytes(data)
+        stream = oiio.ImageInput.open(str(path))
+        if stream is None:
+            raise ValueError(oiio.geterror())
+        values = stream.read_image("float")
+        if values is None:
+            raise ValueError(stream.geterror())
+    values = np.asarray(values)
+    image = values.astype(np.uint16) if values.size and values.min() >= 0 and values.max() <= 65535 else None
+    if image is None or not np.array_equal(image, values):
+        raise ValueError("its values are not whole numbers 0 to 65535")
+    return image
+
+
+def _header(width: int, height: int, metadata: ImageMetadata) -> bytes:
+    window = struct.pack("<4i", 0, 0, width - 1, height - 1)
+    channel = struct.pack("<iB3xii", _FLOAT, 0, 1, 1)
+    attributes = [
+        _attribute("channels", "chlist", b"".join(name + b"\0" + channel for name in (b"B", b"G", b"R")) + b"\0"),
+        _attribute("compression", "compression", bytes([_ZIP])),
+        _attribute("crop:camera", "string", metadata.camera.encode()),
+        _attribute("crop:white", "v3f", struct.pack("<3f", *metadata.white)),
+        _attribute("crop:white_level", "int", struct.pack("<i", metadata.white_level)),
+        _attribute("dataWindow", "box2i", window),
+        _attribute("displayWindow", "box2i", window),
+        _attribute("lineOrder", "lineOrder", b"\0"),
+        _attribute("pixelAspectRatio", "float", struct.pack("<f", 1)),
+        _attribute("screenWindowCenter", "v2f", struct.pack("<2f", 0, 0)),
+        _attribute("screenWindowWidth", "float", struct.pack("<f", 1)),
+    ]
+    return _MAGIC_AND_VERSION + b"".join(attributes) + b"\0"
+
+
+def _attribute(name: str, kind: str, value: bytes) -> bytes:
+    return name.encode() + b"\0" + kind.encode() + b"\0" + struct.pack("<i", len(value)) + value
+
+
+def _scan_lines(image: Image, y: int) -> bytes:
+    """Return the chunk of the scan lines from `y` on: channels B, G, R of a line, then the next line."""
+    lines = image[y : y + _LINES, :, ::-1].transpose(0, 2, 1).astype("<f4", order="C")
+    raw = lines.reshape(-1).view(np.uint8)
+    # Bytes of even and of odd places are parted, then differences taken: so noise and exponents stand apart.
+    apart = np.concatenate([raw[0::2], raw[1::2]])
+    apart[1:] = apart[1:] - apart[:-1] + np.uint8(128)
+    data = isal_zlib.compress(apart.data, _LEVEL)
+    # Data that do not become smaller are stored without reordering.
+    body = data if len(data) < raw.nbytes else raw.tobytes()
+    return struct.pack("<ii", y, len(body)) + body
+
+
+def encode_jxl(image: Image) -> bytes:
+    """Return the file of `image` (H, W, 3) uint16, all 16 bits kept."""
+    codecs = imagecodecs()
+    try:
+        return bytes(codecs.jpegxl_encode(np.ascontiguousarray(image), effort=1, lossless=True, numthreads=1))
+    except codecs.JpegxlError as error:
+        raise InputError(
+            f"an image of {image.shape[1]}x{image.shape[0]} px cannot be written as JPEG XL: {error}; choose png"
+        ) from error
+
+
+def decode_jxl(data: bytes) -> npt.NDArray[np.generic]:
+    """Return what a JPEG XL file holds, (H, W, channels) or (H, W), uint8, uint16 or float32 as it is stored."""
+    return np.asarray(imagecodecs().jpegxl_decode(data, numthreads=1))
+
+
+def imagecodecs() -> Any:
+    """Return the module that has libjxl; a plain installation does without its 90 MB."""
+    try:
+        import imagecodecs as module
+    except ImportError as error:
+        raise InputError("JPEG XL needs imagecodecs: pip install imagecodecs; or choose png") from error
+    return module
+
+
+def encode_tiff(image: Image, metadata: ImageMetadata) -> bytes:
+    """Return the file of `image` (H, W, 3) uint16."""
+    height, width, channels = image.shape
+    tags: Tags = {
+        TiffTag.NEW_SUBFILE_TYPE: (ValueType.LONG, [0]),  # the picture itself
+        TiffTag.IMAGE_WIDTH: (ValueType.LONG, [width]),
+        TiffTag.IMAGE_LENGTH: (ValueType.LONG, [height]),
+        TiffTag.BITS_PER_SAMPLE: (ValueType.SHORT, [16] * channels),
+        TiffTag.COMPRESSION: (ValueType.SHORT, [1]),  # none
+        TiffTag.PHOTOMETRIC_INTERPRETATION: (ValueType.SHORT, [RGB]),
+        TiffTag.IMAGE_DESCRIPTION: text(metadata.to_json()),
+        TiffTag.SAMPLES_PER_PIXEL: (ValueType.SHORT, [channels]),
+        TiffTag.ROWS_PER_STRIP: (ValueType.LONG, [height]),
+        TiffTag.PLANAR_CONFIGURATION: (ValueType.SHORT, [1]),  # pixel by pixel
+        TiffTag.SAMPLE_FORMAT: (ValueType.SHORT, [1] * channels),  # unsigned integers
+    }
+    try:
+        start = head(tags, image.nbytes)
+    except ValueError as error:
+        raise InputError(
+            f"an image of {width}x{height} px is too large for TIFF: {error}; choose png or exr, or make it smaller"
+        ) from error
+    return b"".join([start, np.ascontiguousarray(image, dtype="<u2").data])
+
+
+def decode_tiff(data: bytes) -> npt.NDArray[np.generic]:
+    """Return the first picture of a TIFF, (H, W) or (H, W, channels), uint8, uint16, float32 or whatever is stored.
+
+    OpenCV's reader is not used: of pictures stored plane by plane, and of files that are cut off, it makes others.
+    """
+    import tifffile
+
+    with tifffile.TiffFile(io.BytesIO(data)) as file:
+        page = file.pages.first
+        found = np.asarray(page.asarray())
+        # Planes that are stored one after another come as the first axis.
+        return np.moveaxis(found, 0, -1) if page.axes.startswith("S") and found.ndim == 3 else found
+
+
+SMALLEST_SIDE = 22
+"""Photosites along a side below which LibRaw takes a file for no raw file."""
+
+_SRGB: Matrix = ((3.2406, -1.5372, -0.4986), (-0.9689, 1.8758, 0.0415), (0.0557, -0.2040, 1.0570))
+"""From XYZ to linear sRGB, IEC 61966-2-1."""
+
+
+def encode_dng(image: Image, metadata: ImageMetadata) -> bytes:
+    """Return the file of `image` (H, W, 3) uint16, uncompressed."""
+    height, width, _ = image.shape
+    if min(height, width) < SMALLEST_SIDE:
+        raise InputError(
+            f"an image of {width}x{height} px is too small for DNG: raw programs open none below "
+            f"{SMALLEST_SIDE}x{SMALLEST_SIDE}; choose png or tiff"
+        )
+    neutral = _neutral(metadata)
+    matrix = camera_matrix(metadata.camera) or _SRGB
+    model = f"{metadata.camera} generated".strip()
+    tags: Tags = {
+        TiffTag.NEW_SUBFILE_TYPE: (ValueType.LONG, [0]),  # the picture itself
+        TiffTag.IMAGE_WIDTH: (ValueType.LONG, [width]),
+        TiffTag.IMAGE_LENGTH: (ValueType.LONG, [height]),
+        TiffTag.BITS_PER_SAMPLE: (ValueType.SHORT, [16]),
+        TiffTag.COMPRESSION: (ValueType.SHORT, [1]),  # none
+        TiffTag.PHOTOMETRIC_INTERPRETATION: (ValueType.SHORT, [CFA]),
+        TiffTag.IMAGE_DESCRIPTION: text(metadata.to_json()),
+        TiffTag.MAKE: text("CroP"),
+        TiffTag.MODEL: text(model),
+        TiffTag.ORIENTATION: (ValueType.SHORT, [1]),  # as it lies
+        TiffTag.SAMPLES_PER_PIXEL: (ValueType.SHORT, [1]),
+        TiffTag.ROWS_PER_STRIP: (ValueType.LONG, [height]),
+        TiffTag.PLANAR_CONFIGURATION: (ValueType.SHORT, [1]),
+        TiffTag.CFA_REPEAT_PATTERN_DIM: (ValueType.SHORT, [2, 2]),
+        TiffTag.CFA_PATTERN: (ValueType.BYTE, [0, 1, 1, 2]),  # red, green, green, blue
+        TiffTag.DNG_VERSION: (ValueType.BYTE, [1, 4, 0, 0]),
+        TiffTag.DNG_BACKWARD_VERSION: (ValueType.BYTE, [1, 1, 0, 0]),
+        TiffTag.UNIQUE_CAMERA_MODEL: text(f"CroP {model}"),
+        TiffTag.CFA_PLANE_COLOR: (ValueType.BYTE, [0, 1, 2]),
+        TiffTag.CFA_LAYOUT: (ValueType.SHORT, [1]),  # rectangular
+        TiffTag.BLACK_LEVEL: (ValueType.SHORT, [0]),
+        TiffTag.WHITE_LEVEL: (ValueType.SHORT, [metadata.white_level]),
+        TiffTag.COLOR_MATRIX_1: (
+            ValueType.SRATIONAL,
+            [part for row in matrix for entry in row for part in (round(10000 * entry), 10000)],
+        ),
+        TiffTag.AS_SHOT_NEUTRAL: rationals(*neutral),
+        TiffTag.CALIBRATION_ILLUMINANT_1: (ValueType.SHORT, [D65]),
+    }
+    try:
+        start = head(tags, 2 * height * width)
+    except ValueError as error:
+        raise InputError(
+            f"an image of {width}x{height} px is too large for DNG: {error}; choose png, or make it smaller"
+        ) from error
+    return b"".join([start, mosaic_of(image).data])
+
+
+def mosaic_of(image: Image) -> Image:
+    """Return the RGGB mosaic (H, W) uint16, little-endian, of `image` (H, W, 3) uint16.
+
+    Examples
+    --------
+    >>> mosaic_of(np.full((2, 4, 3), (10, 20, 30), np.uint16))
+    array([[10, 20, 10, 20],
+           [20, 30, 20, 30]], dtype=uint16)
+    """
+    counts = np.empty(image.shape[:2], "<u2")
+    counts[0::2, 0::2] = image[0::2, 0::2, 0]
+    counts[0::2, 1::2] = image[0::2, 1::2, 1]
+    counts[1::2, 0::2] = image[1::2, 0::2, 1]
+    counts[1::2, 1::2] = image[1::2, 1::2, 2]
+    return counts
+
+
+def half_size(counts: Image) -> Image:
+    """Return linear RGB (H // 2, W // 2, 3) uint16 of an RGGB mosaic (H, W) uint16.
+
+    Each 2×2 block becomes a pixel: red, the mean of both greens rounded up, blue.
+
+    Examples
+    --------
+    >>> half_size(np.array([[10, 20], [25, 30]], np.uint16))
+    array([[[10, 23, 30]]], dtype=uint16)
+    """
+    height, width = (size // 2 * 2 for size in counts.shape)
+    image = np.empty((height // 2, width // 2, 3), np.uint16)
+    image[..., 0] = counts[0:height:2, 0:width:2]
+    greens = counts[0:height:2, 1:width:2].astype(np.uint32) + counts[1:height:2, 0:width:2]
+    image[..., 1] = (greens + 1) // 2
+    image[..., 2] = counts[1:height:2, 1:width:2]
+    return image
+
+
+def _neutral(metadata: ImageMetadata) -> tuple[float, float, float]:
+    """Return the light's white over its largest channel, as AsShotNeutral has it."""
+    if not 1 <= metadata.white_level <= 65535:
+        raise InputError(f"the white level is {metadata.white_level}; DNG expects 1 to 65535")
+    largest = max(metadata.white)
+    if not all(math.isfinite(part) and part > largest * 1e-5 for part in metadata.white):
+        raise InputError(
+            f"the light's white is {metadata.white}, DNG expects every channel above 0; choose png, tiff, exr or jxl"
+        )
+    red, green, blue = (part / largest for part in metadata.white)
+    return red, green, blue
+
+
+_LIBRARIES: Final[dict[Format, tuple[str, ...]]] = {
+    "png": (),
+    "tiff": (),
+    "exr": ("isal",),
+    "jxl": ("imagecodecs",),
+    "dng": ("rawpy",),
+}
+"""Distributions that encode a format, or for a raw file name its colour matrix."""
+
+_JPEG_QUALITY: Final = 92
+"""Of previews, on libjpeg's scale to 100: no blocks are visible."""
+
+
+_LONGEST_JPEG: Final = 65500
+"""Longest side that libjpeg writes, px (its JPEG_MAX_DIMENSION)."""
+
+_DEFLATE_RATIO: Final = 1032
+"""Bytes that deflate makes of one at most (RFC 1951: 258 of two bits)."""
+
+
+def suffix_of(form: Format) -> str:
+    """Return the suffix of file names of that format, such as ``.png``."""
+    return f".{form}"
+
+
+def libraries_of(form: Format) -> tuple[str, ...]:
+    """Return the distributions whose version may change the bytes of a file of that format; none if CroP encodes it."""
+    if form == "jxl":
+        imagecodecs()
+    return _LIBRARIES[form]
+
+
+def smallest_side(form: Format) -> int:
+    """Return the least width and height, px, of an image in that format."""
+    return SMALLEST_SIDE if form == "dng" else 1
+
+
+def encode_image(image: Image, form: Format, metadata: ImageMetadata) -> bytes:
+    """Return `image` as the bytes of a file.
+
+    `image`: (H, W, 3) uint16, linear camera RGB.
+
+    Examples
+    --------
+    >>> image = np.full((4, 6, 3), 1000, np.uint16)
+    >>> data = encode_image(image, "png", ImageMetadata(white_level=4095, white=(0.4, 1.0, 0.7), camera="Maker Model"))
+    >>> data[1:4]
+    b'PNG'
+    >>> decode_image(data, "png", "a.png")[0, 0]
+    array([1000, 1000, 1000], dtype=uint16)
+    """
+    _check(image)
+    if form == "jxl":
+        return encode_jxl(image)
+    encode: dict[str, Callable[[Image, ImageMetadata], bytes]] = {
+        "png": encode_png,
+        "tiff": encode_tiff,
+        "exr": encode_exr,
+        "dng": encode_dng,
+    }
+    return encode[form](image, metadata)
+
+
+def encode_pieces(image: Image, form: Format, metadata: ImageMetadata) -> Iterable[bytes | memoryview]:
+    """Return the file of `image` (H, W, 3) uint16 in pieces, whose memory may be used again for the next one.
+
+    Pieces of a PNG are encoded one after the other, so that a file of any size needs little memory.
+    """
+    _check(image)
+    if form == "png":
+        return png_pieces(image, metadata)
+    return (encode_image(image, form, metadata),)
+
+
+def _check(image: Image) -> None:
+    if image.dtype != np.uint16 or image.ndim != 3 or image.shape[2] != 3 or not image.size:
+        raise InputError(f"the image is {image.dtype} {image.shape}, expected uint16 (height, width, 3)")
+
+
+def decode_image(data: bytes, form: Format, what: str) -> Image:
+    """Return the image that `encode_image` made a file of.
+
+    `data`: the file's bytes. Returns (H, W, 3) uint16, as it was encoded; of `dng` (H // 2, W // 2, 3), the half-size
+    linear RGB of its mosaic: red, the mean of both greens, rounded up, and blue of each 2×2 block.
+    """
+    if form == "dng":
+        from drivers.raw.rawfile import decode_raw
+
+        return half_size(decode_raw(data, Path(what)).counts)
+    require_plausible(data, what)
+    try:
+        image = decode_array(data, form)
+    except InputError:
+        raise
+    except Exception as error:
+        reason = " ".join(str(error).split()) or type(error).__name__
+        raise FormatError(f"{what} cannot be read as {form}: {reason}; make it again") from error
+    if image.dtype != np.uint16 or image.ndim != 3 or image.shape[2] != 3:
+        raise FormatError(f"{what} holds {image.dtype} {image.shape}, expected uint16 (height, width, 3)")
+    return image.astype(np.uint16, copy=False)
+
+
+def require_plausible(data: bytes, what: str) -> None:
+    """Refuse a PNG file that claims more pixels or bytes than it can hold; says nothing of other formats.
+
+    Deflate makes at most 1032 bytes of one (zlib's "Maximum Compression Factor"): a decoder that believed the head
+    would fill memory before it found that there is nothing (ISO/IEC 15948, 5.3 and 11.2.2).
+
+    `data`: the file's bytes.
+    """
+    if len(data) < 26 or not data.startswith(SIGNATURE):
+        return
+    width, height, depth, colour = struct.unpack(">IIBB", data[16:26])
+    channels = {2: 3, 4: 2, 6: 4}.get(colour, 1)
+    claimed = height * (1 + width * channels * depth // 8)
+    if claimed > _DEFLATE_RATIO * len(data):
+        raise FormatError(f"{what} claims {width}x{height} px, which its {len(data)} bytes cannot hold; make it again")
+    place = 8
+    while place + 12 <= len(data):
+        (size,) = struct.unpack(">I", data[place : place + 4])
+        if size > len(data) - place - 12:
+            left = len(data) - place - 12
+            raise FormatError(f"{what}: a part of the PNG claims {size} bytes where {left} are left; make it again")
+        place += size + 12
+
+
+def decode_array(data: bytes, form: Format) -> npt.NDArray[np.generic]:
+    """Return the array in a file's bytes, (H, W) or (H, W, channels), uint8, uint16 or float32, as it stands there."""
+    decode: dict[str, Callable[[bytes], npt.NDArray[np.generic]]] = {
+        "png": decode_png,
+        "tiff": decode_tiff,
+        "jxl": decode_jxl,
+        "exr": decode_exr,
+    }
+    return decode[form](data)
+
+
+def encode_preview(picture: npt.NDArray[np.uint8]) -> bytes:
+    """Return `picture` (H, W, 3) uint8, RGB, as the bytes of a JPEG file."""
+    import simplejpeg
+
+    if max(picture.shape) > _LONGEST_JPEG:
+        raise InputError(
+            f"a preview of {picture.shape[1]}x{picture.shape[0]} px cannot be written as JPEG; make it smaller"
+        )
+    pixels = np.ascontiguousarray(picture)
+    return simplejpeg.encode_jpeg(pixels, _JPEG_QUALITY, colorspace="RGB", colorsubsampling="420")
