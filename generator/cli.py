@@ -15,7 +15,6 @@ from foundation.json_output import JsonOutput, json_output
 from foundation.processors import processor_count
 from foundation.trust.secret_texts import masked, printable
 from generator.command.demo_table import table_folder
-from generator.command.grouping import grouped
 from generator.command.likeness_options import LikenessOptions, choose
 from generator.command.options import (
     CommonOptions,
@@ -26,13 +25,14 @@ from generator.command.options import (
     RenderingOptions,
     VariationOptions,
     WorkOptions,
+    grouped,
 )
-from generator.command.rendering_told import cells_sentences, matrix_sentence
+from generator.command.output import cells_sentences, matrix_sentence
 
 if TYPE_CHECKING:
     from calibration.table.lut import Lut
-    from generator.dataset.production.plan import Plan
-    from generator.dataset.production.workers import Workers
+    from generator.dataset.making import Workers
+    from generator.dataset.plan import Plan
     from generator.dataset.reader import Dataset
 
 app = new_app()
@@ -81,7 +81,7 @@ def generate(
             _draw_sheet(_verify(work.verify, work.workers, told), work.verify, sheet)
         elif work.finish is not None:
             from generator.dataset.making import finish_dataset
-            from generator.dataset.production.workplace import holds_dataset
+            from generator.dataset.workplace import holds_dataset
 
             loaded()
             was_there = holds_dataset(work.finish)
@@ -132,9 +132,8 @@ def _plan(
 ) -> Plan:
     """Return the plan of a dataset whose place is free, or holds a dataset, which may be the one planned."""
     from calibration.table.lut import open_lut
-    from generator.dataset.production.options import DatasetOptions
-    from generator.dataset.production.plan import Plan
-    from generator.dataset.production.workplace import holds_dataset, require_free_place
+    from generator.dataset.plan import DatasetOptions, Plan
+    from generator.dataset.workplace import holds_dataset, require_free_place
 
     if not holds_dataset(out):
         require_free_place(out)
@@ -165,7 +164,7 @@ def _tint_caution(table: Lut, rendering: str | None) -> tuple[str, ...]:
 
 
 def _make_whole(plan: Plan, out: str, workers: Workers, told: JsonOutput) -> Dataset:
-    from generator.command.progress import shown_progress
+    from generator.command.output import shown_progress
     from generator.dataset.making import make_dataset
 
     _print_cells(plan, range(plan.shards))
@@ -176,9 +175,8 @@ def _make_whole(plan: Plan, out: str, workers: Workers, told: JsonOutput) -> Dat
 
 
 def _make_share(plan: Plan, out: str, shard: str, workers: Workers, told: JsonOutput) -> None:
-    from generator.command.progress import shown_progress
-    from generator.dataset.making import make_share
-    from generator.dataset.production.workers import parse_share
+    from generator.command.output import shown_progress
+    from generator.dataset.making import make_share, parse_share
 
     share = parse_share(shard)
     shards = range(share[0], plan.shards, share[1])
@@ -247,10 +245,9 @@ def _verify(out: str, workers: int | None, told: JsonOutput) -> Dataset:
     """Print every fault of a dataset and return it; a QualityError if there is one."""
     from foundation.console import progress
     from foundation.errors import QualityError
-    from generator.dataset.production.workers import Workers
-    from generator.dataset.reader import open_dataset
-    from generator.dataset.verification import file_faults
-    from generator.stores.places import is_remote
+    from generator.dataset.making import Workers
+    from generator.dataset.reader import file_faults, open_dataset
+    from generator.stores import is_remote
 
     by_default = max(processor_count(), _STORE_READERS if is_remote(out) else 1)
     at_once = Workers(count=by_default if workers is None else workers).count
@@ -276,8 +273,8 @@ def _check_sheet(contact_sheet: Path, out: str | None, shard: str | None, again:
 
     One that is there is refused unless a dataset is, too, where the command may have made both before.
     """
-    from generator.dataset.production.workplace import holds_dataset
-    from generator.stores.places import is_remote, local_path
+    from generator.dataset.workplace import holds_dataset
+    from generator.stores import is_remote, local_path
 
     if shard is not None:
         raise InputError(

@@ -9,20 +9,18 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final
 
 from foundation.errors import InputError
-from generator.command.grouping import option
-from generator.command.options import LightOptions, PictureOptions, VariationOptions
+from generator.command.options import LightOptions, PictureOptions, VariationOptions, option
 
 if TYPE_CHECKING:
     import numpy as np
     import numpy.typing as npt
 
     from calibration.table.lut import Lut
-    from generator.dataset.production.options import DatasetOptions
+    from generator.dataset.plan import DatasetOptions
     from generator.lights.lighting import LightChoice
-    from generator.likeness.drawing import DrawnPictures
-    from generator.likeness.pictures import BlackShares
+    from generator.likeness.real_data import BlackShares, DrawnPictures
     from generator.pictures.sources import Source
-    from generator.statistics.statistics_file import RealStatistics
+    from generator.statistics import RealStatistics
     from generator.variation.exposures import ExposureChoice
 
 _LIKENESS = "Likeness"
@@ -138,11 +136,16 @@ def _like(
     seed: int,
     workers: int,
 ) -> Chosen:
-    from generator.likeness.drawing import cautions, drawn_sources
-    from generator.likeness.exposing import exposure_sentence, like_exposure
-    from generator.likeness.remedies import light_caution, remedies
-    from generator.likeness.sizes import like_size
-    from generator.statistics.statistics_file import read_statistics
+    from generator.likeness.real_data import (
+        cautions,
+        drawn_sources,
+        exposure_sentence,
+        light_caution,
+        like_exposure,
+        like_size,
+        remedies,
+    )
+    from generator.statistics import read_statistics
 
     target = read_statistics(path)
     record: dict[str, Any] = {
@@ -247,8 +250,7 @@ def _drawn(
 ) -> DrawnPictures:
     """Return which pictures are drawn by what they look like under the light nearest to the target's."""
     from foundation.console import progress
-    from generator.likeness.drawing import draw_pictures
-    from generator.likeness.pictures import measure_pictures, reference_light
+    from generator.likeness.real_data import draw_pictures, measure_pictures, reference_light
     from generator.rendering.black_points import KEEP
 
     reference = reference_light(lut, target.lights)
@@ -264,9 +266,9 @@ def _drawn(
 
 def _black_under(lut: Lut, light: int, rendered: DatasetOptions) -> BlackShares:
     """Return the print's black under a light of the table; a QualityError where it is as bright as half of white."""
-    from generator.dataset.production.photographing import rendering_of
+    from generator.dataset.shards import rendering_of
     from generator.lights.lighting import Lighting, plain
-    from generator.likeness.pictures import BlackShares
+    from generator.likeness.real_data import BlackShares
     from generator.rendering.black_points import veil_of
 
     grey = None
@@ -280,7 +282,7 @@ def _photograph(
     lut: Lut, light: int, rendered: DatasetOptions, seed: int, picture: npt.NDArray[np.uint8], number: int
 ) -> npt.NDArray[np.uint16]:
     """Return the raw image of a picture as the dataset renders it, under one of the table's lights."""
-    from generator.dataset.production.photographing import photograph
+    from generator.dataset.shards import photograph
     from generator.kernels.palette import replace_unfit_colours
     from generator.lights.lighting import Lighting, plain
     from generator.pictures.bits import keep_bits

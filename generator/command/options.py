@@ -1,15 +1,18 @@
-"""The options of the command `generate`, a group for each panel of its help.
+"""The options of the command `generate`: a frozen dataclass for each panel of its help, which `grouped` makes a command of.
 
 Libraries that take long to load are imported when a group makes something of its options.
 """
 
 from __future__ import annotations
 
+import dataclasses
+import functools
+import inspect
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal, get_type_hints
 
 import typer
 
@@ -17,17 +20,50 @@ from foundation.console import Quiet, Verbose, Version
 from foundation.errors import InputError
 from foundation.json_output import AsJson
 from foundation.processors import processor_count
-from generator.command.grouping import option
-from generator.dataset.production.workers import Workers
+from generator.dataset.making import Workers
 
 if TYPE_CHECKING:
     from calibration.table.lut import Lut
-    from generator.dataset.production.options import DatasetOptions
+    from generator.dataset.plan import DatasetOptions
     from generator.lights.request import LightRequest
     from generator.pictures.picture import Preparation
     from generator.pictures.sources import Source
     from generator.variation.exposures import ExposureChoice
     from generator.variation.variation import Variation
+
+
+def grouped(function: Callable[..., None]) -> Callable[..., None]:
+    """Return a command for typer with one parameter for each field of the groups that `function` takes.
+
+    `function`: each of its parameters is annotated with a frozen dataclass, whose fields are ``Annotated`` with typer's
+    ``Option`` or ``Argument`` and have defaults. No two groups share a field's name.
+    """
+    groups = {name: hint for name, hint in get_type_hints(function).items() if name != "return"}
+    parameters: dict[str, inspect.Parameter] = {}
+    members: dict[str, list[str]] = {}
+    for name, group in groups.items():
+        hints = get_type_hints(group, include_extras=True)
+        members[name] = [field.name for field in dataclasses.fields(group)]
+        for field in dataclasses.fields(group):
+            if field.name in parameters:
+                raise TypeError(f"two groups of options have a field {field.name}; rename one of them")
+            parameters[field.name] = inspect.Parameter(
+                field.name, inspect.Parameter.KEYWORD_ONLY, default=field.default, annotation=hints[field.name]
+            )
+
+    @functools.wraps(function)
+    def command(**options: Any) -> None:
+        function(**{name: groups[name](**{field: options[field] for field in members[name]}) for name in groups})
+
+    command.__signature__ = inspect.Signature(list(parameters.values()))  # type: ignore[attr-defined]
+    command.__annotations__ = {name: parameter.annotation for name, parameter in parameters.items()}
+    return command
+
+
+def option(metavar: str | None, text: str, panel: str, **more: Any) -> Any:
+    """Return typer's option with its help; a default of None is not shown, since the help says what it means."""
+    return typer.Option(metavar=metavar, help=text, rich_help_panel=panel, **more)
+
 
 _SOURCES = "Source pictures"
 _LIGHT = "Light"
@@ -287,7 +323,7 @@ class ImageOptions:
         self, shard_images: int, reading: Mapping[str, Any], variation: Variation, crops: int, weighted: bool = False
     ) -> DatasetOptions:
         """Return what the dataset is to be; an InputError says which option cannot be used."""
-        from generator.dataset.production.options import DatasetOptions, parse_split
+        from generator.dataset.plan import DatasetOptions, parse_split
 
         return DatasetOptions(
             form=self.format,

@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from foundation.errors import FormatError
 from generator.named_numbers import is_number
-from generator.statistics.statistics_file import read_lights
+from generator.statistics import read_lights
 
 TRIPLES: Final = (
     ("gt_r", "gt_g", "gt_b"),

@@ -16,7 +16,7 @@ import numpy.typing as npt
 from foundation.errors import FormatError
 from generator.lights.gamut import rb_of
 from generator.philox import Words, standard_normal
-from generator.statistics.image_numbers import log_chroma
+from generator.statistics import log_chroma
 
 _OF_SCOTT: Final = 0.5
 """Share of Scott's factor n^(−1/6), which is for one normal cloud: real lights lie in clusters. Measured on four real

@@ -8,9 +8,9 @@ import sys
 
 import pytest
 
-from generator.command import progress
-from generator.command.progress import shown_progress
-from generator.dataset.production.workers import SILENT
+from generator.command import output as progress
+from generator.command.output import shown_progress
+from generator.dataset.shards import SILENT
 
 
 class _Terminal(io.StringIO):

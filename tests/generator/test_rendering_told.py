@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from generator.cli import main
-from generator.command.rendering_told import matrix_sentence
+from generator.command.output import matrix_sentence
 from generator.rendering.matrices import SOURCE, camera_matrix
 from tests.generator.conftest import MakeLut
 

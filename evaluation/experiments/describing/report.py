@@ -13,7 +13,7 @@ from evaluation.experiments.describing.quantities import QUANTITIES
 from evaluation.reports.description_figures import chroma_figure, lights_figure, luminance_figure, noise_figure
 from evaluation.reports.page import Part, figure_part, heading, page, paragraph, row_part, table_part
 from evaluation.results.tables import Table
-from generator.statistics.image_numbers import CHROMA_EDGES, LUMINANCE_EDGES, log_chroma
+from generator.statistics import CHROMA_EDGES, LUMINANCE_EDGES, log_chroma
 
 
 def figures_table(description: DataDescription) -> Table:

@@ -28,8 +28,7 @@ from experiment.session.folder import Session
 from experiment.session.mending.redaction import held_secrets
 from experiment.session.mending.verification import unsound_files
 from foundation.errors import CropError
-from generator.dataset.reader import open_dataset
-from generator.dataset.verification import file_faults
+from generator.dataset.reader import file_faults, open_dataset
 from tests.fuzz.foreign.mutations import CANARY, mutate
 from tests.fuzz.foreign.seeds import Seed
 

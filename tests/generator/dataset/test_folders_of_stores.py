@@ -12,7 +12,7 @@ from fsspec.implementations.memory import MemoryFileSystem
 from fsspec.registry import register_implementation
 
 from foundation.errors import InputError
-from generator.stores.store import RemoteStore
+from generator.stores import RemoteStore
 
 
 class FolderedStore(MemoryFileSystem):

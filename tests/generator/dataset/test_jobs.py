@@ -18,8 +18,7 @@ from foundation.errors import FormatError, InputError
 from generator import open_lut, read_picture, render
 from generator.cli import main
 from generator.dataset.making import DatasetOptions, generate_dataset
-from generator.dataset.production.exact_split import exact_parts, sizes_of
-from generator.dataset.production.options import STRETCHED, Scale
+from generator.dataset.plan import STRETCHED, Scale, exact_parts, sizes_of
 from generator.dataset.reader import Dataset, open_dataset
 from generator.files.formats import FULL, from_full_scale, to_full_scale
 from generator.pictures.sources import find_pictures, random_scenes

@@ -17,11 +17,10 @@ import pytest
 from foundation.errors import InputError
 from generator.cli import main
 from generator.dataset.making import finish_dataset, generate_dataset, make_share
-from generator.dataset.production.options import DatasetOptions
-from generator.dataset.production.plan import Plan
-from generator.dataset.production.shards import make_shard
-from generator.dataset.production.workplace import workplace
+from generator.dataset.plan import DatasetOptions, Plan
 from generator.dataset.reader import open_dataset
+from generator.dataset.shards import make_shard
+from generator.dataset.workplace import workplace
 from generator.kernels.dithering import dither
 from generator.kernels.mixing import mix_samples
 from generator.kernels.rendering import draw_samples

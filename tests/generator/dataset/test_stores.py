@@ -27,13 +27,12 @@ from generator.dataset.making import (
     make_dataset,
     make_share,
 )
-from generator.dataset.production.shards import make_elsewhere
-from generator.dataset.production.workplace import workplace
-from generator.dataset.reader import open_dataset
-from generator.dataset.verification import file_faults
+from generator.dataset.reader import file_faults, open_dataset
+from generator.dataset.shards import make_elsewhere
+from generator.dataset.workplace import workplace
 from generator.lights.choices import ListedLights
 from generator.pictures.sources import find_pictures, random_scenes
-from generator.stores.store import LocalStore, RemoteStore, open_store
+from generator.stores import LocalStore, RemoteStore, open_store
 from tests.generator.groups import grouped
 
 pytestmark = pytest.mark.slow
@@ -248,7 +247,7 @@ def test_a_program_that_was_forked_synchronises_its_files(tmp_path: Path) -> Non
     program = (
         "import os, signal, sys\n"
         "from pathlib import Path\n"
-        "from generator.stores.store import LocalStore\n"
+        "from generator.stores import LocalStore\n"
         "store = LocalStore(Path(sys.argv[1]))\n"
         "store.put('a', b'1'); store.sync(['a'])\n"
         "child = os.fork()\n"

@@ -13,7 +13,7 @@ from generator import philox
 from generator.lights.distributions import parse_distribution
 from generator.lights.gamut import rgb_of
 from generator.lights.log_kernels import LogKernels
-from generator.statistics.image_numbers import log_chroma
+from generator.statistics import log_chroma
 from tests.generator.statistics.stats_files import write_stats
 
 

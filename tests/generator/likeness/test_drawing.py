@@ -10,10 +10,16 @@ import numpy.typing as npt
 import pytest
 
 from foundation.errors import InputError
-from generator.likeness.drawing import BY_QUANTILES, BY_SPREAD, cautions, draw_pictures, drawn_sources
-from generator.likeness.pictures import MeasuredPictures
+from generator.likeness.real_data import (
+    BY_QUANTILES,
+    BY_SPREAD,
+    MeasuredPictures,
+    cautions,
+    draw_pictures,
+    drawn_sources,
+)
 from generator.pictures.sources import Source, random_scenes
-from generator.statistics.statistics_file import RealStatistics
+from generator.statistics import RealStatistics
 
 Values = dict[str, npt.NDArray[np.float64]]
 

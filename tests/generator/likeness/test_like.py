@@ -15,7 +15,7 @@ import pytest
 from generator.cli import main
 from generator.dataset.reader import open_dataset
 from generator.lights.gamut import Gamut
-from generator.statistics.image_numbers import cell_means, numbers_of_cells
+from generator.statistics import cell_means, numbers_of_cells
 from tests.generator.likeness.tables import make_table
 from tests.generator.statistics.stats_files import write_stats
 

@@ -5,9 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from generator.dataset.production.options import DatasetOptions
-from generator.likeness.drawing import DrawnPictures, Reached
-from generator.likeness.remedies import remedies
+from generator.dataset.plan import DatasetOptions
+from generator.likeness.real_data import DrawnPictures, Reached, remedies
 from generator.rendering.black_points import BlackPoint
 
 PLAIN = DatasetOptions()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from generator.statistics.image_numbers import cell_means, numbers_of_cells
+from generator.statistics import cell_means, numbers_of_cells
 
 
 def test_cells_of_a_picture_are_means_over_their_pixels() -> None:

@@ -10,7 +10,7 @@ import pytest
 
 from foundation.errors import FormatError
 from generator.lights.ground_truths import load_ground_truths
-from generator.statistics.statistics_file import read_statistics
+from generator.statistics import read_statistics
 from tests.generator.statistics.stats_files import write_stats
 
 LIGHTS = [[0.3, 0.4, 0.3], [0.4, 0.4, 0.2], [0.2, 0.5, 0.3]]

@@ -7,7 +7,7 @@ import threading
 import numpy as np
 import numpy.typing as npt
 
-from generator.training.recycling import KEPT, Recycled
+from generator.training.crops import KEPT, Recycled
 
 SHAPE = (4, 3, 32, 32)
 

@@ -28,6 +28,12 @@ SOURCES: Final = "sources.csv"
 SOURCE_COLUMNS: Final = ("position", "name", "sha256", "width", "height", "replaced_pixels", "split", "profile")
 TRUTHS: Final = "gt.txt"
 SUMS: Final = "SHA256SUMS"
+DATASHEET: Final = "DATASHEET.md"
+CROISSANT: Final = "croissant.json"
+CARD: Final = "README.md"
+
+COMPLETED_BY_HAND: Final = (CARD, DATASHEET, CROISSANT)
+"""Files that a lab completes, so that no hash of them is recorded; nothing of this software reads them."""
 
 Triple = tuple[float, float, float]
 Details = dict[str, int | float | str]

@@ -15,10 +15,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from foundation.errors import InputError
-from generator.dataset.making import DatasetOptions, generate_dataset
-from generator.dataset.production.options import parse_split
-from generator.dataset.production.plan import split_of
-from generator.dataset.production.workers import parse_share
+from generator.dataset.making import DatasetOptions, generate_dataset, parse_share
+from generator.dataset.plan import parse_split, split_of
 from generator.pictures.sources import find_pictures
 
 if TYPE_CHECKING:

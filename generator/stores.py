@@ -7,7 +7,7 @@ Rules that hold inside:
   costs one wait, not many.
 - An object store has no rename and needs none: an object appears when its last byte has arrived.
 
-A name is a path below the store's place, with forward slashes.
+A place is a path or a URL as a user writes it; a name is a path below it, with forward slashes.
 """
 
 from __future__ import annotations
@@ -25,11 +25,64 @@ from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, BinaryIO, Final, Protocol, cast
 
-from foundation.errors import CropError, FormatError, StorageError
+from foundation.errors import CropError, FormatError, InputError, StorageError
 from foundation.files import is_partial, partial_path, reading_error, storage_error, sync_folder
 from foundation.trust.foreign_folders import is_inside_name, open_inside
 from foundation.trust.secret_texts import masked
-from generator.stores.places import filesystem, is_remote, local_path
+
+if TYPE_CHECKING:
+    from fsspec.spec import AbstractFileSystem
+
+
+DESCRIPTION: Final = "dataset.json"
+"""Name of the file that marks a place as a complete dataset; it is written last."""
+
+
+def is_remote(place: str) -> bool:
+    """Return whether `place` is a URL of a store and not a path of this machine (file:// is a path).
+
+    Examples
+    --------
+    >>> is_remote("s3://bucket/dataset"), is_remote("file:///data/dataset"), is_remote("dataset")
+    (True, False, False)
+    """
+    scheme, found, _ = place.partition("://")
+    return bool(found) and scheme not in ("file", "local")
+
+
+def local_path(place: str | Path) -> Path:
+    """Return the path of a place of this machine, of which file:// may be the first part; it ends in a name.
+
+    Examples
+    --------
+    >>> local_path("file:///data/dataset").as_posix()
+    '/data/dataset'
+    """
+    text = str(place)
+    for scheme in ("file://", "local://"):
+        text = text.removeprefix(scheme)
+    path = Path(text)
+    if text and path.name in ("", ".."):
+        path = path.resolve()
+    if not path.name:
+        raise InputError(f"{str(place)!r} names no place; name a folder, such as dataset")
+    return path
+
+
+def filesystem(url: str) -> tuple[AbstractFileSystem, str]:
+    """Return the store of a URL, by fsspec, and the path in it."""
+    from fsspec.core import url_to_fs
+
+    try:
+        return url_to_fs(url)
+    except Exception as error:
+        # A store may connect here, and has errors of its own (ftplib's are no OSError).
+        reason = " ".join(str(error).split()).rstrip(".")
+        raise InputError(
+            f"cannot reach {url}: {reason}; name a store that fsspec knows, and install its library (s3://: s3fs, "
+            "gs://: gcsfs, az://: adlfs)"
+        ) from error
+
 
 Pieces = Iterable[bytes | memoryview]
 """A file's bytes in order; a piece is valid until the next is asked for."""
@@ -45,9 +98,6 @@ for a size where none is given, and each question hands the interpreter's lock t
 _WITH_FOLDERS: Final = frozenset({"ftp", "sftp", "ssh", "smb", "webdav", "webdavs", "hdfs", "arrow_hdfs"})
 """Stores by fsspec's names in which a file lies in a folder that has to be there; an object store might make a bucket
 of it."""
-
-if TYPE_CHECKING:
-    from fsspec.spec import AbstractFileSystem
 
 
 class Store(Protocol):

@@ -1,4 +1,4 @@
-"""One shard, from its sources to the record that says it is done.
+"""One shard, from its sources to the record that says it is done: pictures are read, photographed and written.
 
 Rules that hold inside:
 
@@ -6,13 +6,19 @@ Rules that hold inside:
 - Its record is written last, when all else has been synchronised with the disk: a shard with a record is whole. The
   program may be killed at any instruction, and any number of programs may make the same shard at once.
 - At most about three pictures are in memory for each worker.
+
+An image under one light has that light's ground truth, however its intensity falls off. Where it falls off with a tint
+(`generator.variation.gradients`) the light stands in the records twice, as it is at the near and at the far end, and
+masks and maps say how much of either reaches a pixel.
 """
 
 from __future__ import annotations
 
+import hashlib
+import math
 import threading
 from collections import deque
-from collections.abc import Generator
+from collections.abc import Callable, Generator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -20,32 +26,230 @@ from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
+import numpy as np
+import numpy.typing as npt
+
 from foundation.errors import FormatError, InputError
-from generator.dataset.production.image_light import image_light
-from generator.dataset.production.layouts.by_name import open_writer
-from generator.dataset.production.layouts.samples import Sample, ShardWriter
-from generator.dataset.production.photographing import photograph
-from generator.dataset.production.plan import ShardJob, light_of, split_of, versions
-from generator.dataset.production.records import (
-    Details,
-    ImageRecord,
-    ShardRecord,
-    Skipped,
-    SourceRecord,
-)
-from generator.dataset.production.workers import SILENT, Callbacks
-from generator.dataset.production.workplace import Workplace
-from generator.lights.lighting import Lighting
+from generator.dataset.layouts import Sample, ShardWriter, open_writer
+from generator.dataset.plan import DatasetOptions, ShardJob, light_of, split_of, versions
+from generator.dataset.records import Details, ImageRecord, LightRow, ShardRecord, Skipped, SourceRecord, Triple
+from generator.dataset.workplace import Workplace
+from generator.lights.lighting import Lighting, Mixture
 from generator.pictures.bits import keep_bits
-from generator.pictures.picture import Cut
+from generator.pictures.picture import Cut, Picture
 from generator.pictures.sources import Source
-from generator.stores.store import Pieces
+from generator.stores import Pieces
+from generator.variation.variation import Varied
 
 if TYPE_CHECKING:
     from calibration.table.lut import Lut
+    from generator.kernels.dithering import CellTable
+    from generator.rendering.cell_mixtures import CellMixtures
+    from generator.rendering.colorimetric import ColorimetricRendering
+
+
+_threads: Final = threading.local()
+
+
+def photograph(
+    lut: Lut,
+    picture: Picture,
+    lighting: Lighting,
+    options: DatasetOptions,
+    seed: int,
+    number: int,
+    white_level: int,
+    black_taken: float | None = None,
+) -> tuple[npt.NDArray[np.uint16], npt.NDArray[np.float32] | None, Details]:
+    """Return the raw image of a picture's print.
+
+    `picture`: (H, W, 3) uint8, sRGB codes; where they are those of the print, of colours that the table has samples of.
+    `black_taken`: share of the print's black that is taken out, 0 … 1; None for what the options say. Returns (H, W, 3)
+    uint16, linear camera RGB; of several lights the weights (H, W, K) float32 of each in each pixel, else None; and
+    what is recorded of the rendering.
+    """
+    from generator.kernels.dithering import dither, nearest_nodes
+    from generator.kernels.mixing import mix_samples
+    from generator.kernels.rendering import WHOLE_LIGHT_PIXELS, draw_samples
+    from generator.rendering.gamut_summaries import summarise
+
+    # The hash of the table stands for its samples in the dataset's description.
+    for mixture in lighting.mixtures:
+        for light in mixture.lights:
+            lut.require_unchanged(light)
+    share = options.black_point.share(seed, number) if black_taken is None else black_taken
+    cells = grey = None
+    details: Details = {}
+    if options.rendering == "colorimetric":
+        rendering = rendering_of(lut, options)
+        for light in rendering.light_of(lighting).lights:
+            lut.require_unchanged(light)
+        mixtures = rendering.mixtures_for(lighting)
+        cells, name = _table(mixtures, lut.provenance.bits)
+        grey = mixtures.black
+        missed = summarise(mixtures, nearest_nodes(picture).astype(np.float64))
+        outside, distance = round(missed.outside, 6), round(missed.distance_deg, 6)
+        details |= {"cells": name, "outside": outside, "distance": distance}
+    if options.black_point.kind != "keep":
+        details["black_taken"] = share
+    alone = lighting.masks is None and len(lighting.mixtures[0].lights) == 1 and not share
+    if cells is not None and not (alone or (lighting.masks is None and picture.size >= 3 * WHOLE_LIGHT_PIXELS)):
+        # Which samples are to be mixed, or freed of black, is known by the cells.
+        picture, cells = dither(picture, cells, lut.provenance.bits, seed, number), None
+    drawn_dithered = cells is not None
+    tables = [_samples(lut, mixture, picture, share, seed, drawn_dithered, grey) for mixture in lighting.mixtures]
+    if lighting.masks is None:
+        out = _reused(picture.shape)
+        return draw_samples(tables[0], picture, seed=seed, image=number, cells=cells, out=out), None, details
+    weights = lighting.weights_of(*picture.shape[:2])
+    image = mix_samples(tables, picture, weights, white_level=white_level, seed=seed, image=number)
+    return image, weights, details
+
+
+def _samples(
+    lut: Lut, mixture: Mixture, picture: Picture, share: float, seed: int, dithered: bool, grey: float | None
+) -> npt.NDArray[np.uint16]:
+    """Return the samples of a light without a share of the print's black, at least those of a picture's colours.
+
+    A picture that is `dithered` while it is drawn may show any. `grey` is as of `black_points.veil_of`.
+    """
+    from generator.kernels.palette import colours_in
+    from generator.kernels.rendering import WHOLE_LIGHT_PIXELS
+    from generator.rendering.black_points import veil_of, without_veil
+
+    samples = mixture.samples(lut, seed, picture)
+    if not share:
+        return samples
+    small = not dithered and picture.size < 3 * WHOLE_LIGHT_PIXELS
+    colours = colours_in(picture, lut.provenance.bits) if small else None
+    veil = veil_of(lut, mixture, share, grey)
+    return without_veil(samples, veil, lut.provenance.white_level, colours)
+
+
+@lru_cache(maxsize=4)
+def _rendering(lut: Lut, name: str, rows: tuple[float, ...], source: str) -> ColorimetricRendering:
+    from generator.rendering.colorimetric import ColorimetricRendering
+    from generator.rendering.matrices import ColourMatrix
+
+    return ColorimetricRendering(lut, ColourMatrix(name, np.array(rows).reshape(3, 3), source))
+
+
+def rendering_of(lut: Lut, options: DatasetOptions) -> ColorimetricRendering:
+    """Return the rendering by colour that the options ask for; it keeps what it has found out of a table."""
+    from generator.rendering.table_matrix import matrix_for
+
+    matrix = options.matrix or matrix_for(lut)
+    return _rendering(lut, matrix.name, tuple(matrix.rows.ravel().tolist()), matrix.source)
+
+
+@lru_cache(maxsize=8)
+def _table(mixtures: CellMixtures, bits: int) -> tuple[CellTable, str]:
+    """Return the cells of mixtures to draw from, and what they are called: the first 16 digits of their SHA-256."""
+    from generator.kernels.dithering import checked_cells
+
+    digest = hashlib.sha256(mixtures.cells.astype("<u2").tobytes()).hexdigest()
+    return checked_cells(mixtures.cells, bits), digest[:16]
+
+
+def _reused(shape: tuple[int, ...]) -> npt.NDArray[np.uint16]:
+    """Return an array uint16 of any content in memory of the calling thread, which its next call overwrites.
+
+    Fresh pages take as long to map as the drawing into them.
+    """
+    size = math.prod(shape)
+    memory: npt.NDArray[np.uint16] | None = getattr(_threads, "memory", None)
+    if memory is None or memory.size < size:
+        _threads.memory = memory = np.empty(size, np.uint16)
+    return memory[:size].reshape(shape)
+
+
+@dataclass(frozen=True, eq=False)
+class ImageLight:
+    """The light of one image.
+
+    - `truth`: chromaticity, sum 1, of the light averaged over the pixels.
+    - `maps`: kind, what follows the image's number in the file's name, and the bytes of each map beside the image.
+    """
+
+    truth: Triple
+    rows: list[LightRow]
+    maps: list[tuple[str, str, bytes]]
+
+
+def image_light(
+    lut: Lut, lighting: Lighting, weights: npt.NDArray[np.float32] | None, varied: Varied, tints: bool
+) -> ImageLight:
+    """Return the light of an image.
+
+    `weights`: (H, W, K) float32, of each of K lights in each pixel; None of one light.
+    """
+    from generator.masks.maps import encode_maps
+    from generator.masks.whites import mean_weights
+
+    labels = [mixture.label for mixture in lighting.mixtures]
+    whites = lighting.whites(lut)
+    intensity = None
+    if tints:
+        weights, labels = varied.weights, labels * 2
+        whites = np.concatenate([whites, whites * np.array(varied.end)])
+    elif weights is not None:
+        intensity = varied.intensity()
+    rows = [
+        LightRow(illumination=label, truth=chromaticity(white)) for label, white in zip(labels, whites, strict=True)
+    ]
+    if weights is None:
+        return ImageLight(rows[0].truth, rows, [])
+    reaching = weights if intensity is None else weights * intensity[..., None]
+    truth = chromaticity(np.asarray(mean_weights(reaching) @ whites))
+    return ImageLight(truth, rows, encode_maps(weights, whites))
+
+
+def chromaticity(white: npt.NDArray[np.float64]) -> Triple:
+    """Return (r, g, b) of sum 1 of linear RGB (3,) float64."""
+    red, green, blue = (float(part) for part in white / white.sum())
+    return red, green, blue
+
 
 LARGEST_COUNT: Final = 65535
 """Largest value of 16 bits."""
+
+
+def _ignore(*arguments: object) -> None:
+    del arguments
+
+
+@dataclass(frozen=True)
+class Callbacks:
+    """What is called while images are made, always from the calling thread.
+
+    Attributes
+    ----------
+    on_done
+        Takes how many of the planned images were made by an earlier call; called once, before the first is made.
+    on_image
+        Called after each image.
+    on_skip
+        Takes the name of a source that cannot be read, the reason, and the number of images that are left out.
+    on_wait
+        Takes a sentence for the user where the work waits for somebody to do something.
+
+    Examples
+    --------
+    >>> left_out = []
+    >>> callbacks = Callbacks(on_skip=lambda name, reason, images: left_out.append(name))
+    >>> callbacks.on_skip("bad.png", "bad.png is no picture", 2)
+    >>> left_out
+    ['bad.png']
+    """
+
+    on_done: Callable[[int], None] = _ignore
+    on_image: Callable[[], None] = _ignore
+    on_skip: Callable[[str, str, int], None] = _ignore
+    on_wait: Callable[[str], None] = _ignore
+
+
+SILENT: Final = Callbacks()
+"""Callbacks that do nothing."""
 
 
 @dataclass(frozen=True)
@@ -169,14 +373,14 @@ def make_elsewhere(job: ShardJob, place: Workplace) -> ShardDone:
     def skip(name: str, reason: str, images: int) -> None:
         skipped.append((name, reason, images))
 
-    lut = _table(job.table, job.table_sha256)
+    lut = _table_of(job.table, job.table_sha256)
     with ThreadPoolExecutor(1) as pool:
         record = make_shard(job, lut, place, pool, 1, Callbacks(on_skip=skip))
     return ShardDone(len(record.images), tuple(skipped))
 
 
 @lru_cache(maxsize=2)
-def _table(folder: Path, sha256: str) -> Lut:
+def _table_of(folder: Path, sha256: str) -> Lut:
     from calibration.table.lut import open_lut
 
     lut = open_lut(folder)

@@ -11,12 +11,9 @@ from typing import TYPE_CHECKING, get_args
 import pytest
 
 from calibration.citation.record import NOT_RECORDED, OriginRecord
+from generator.dataset.cards import CONFORMS_TO, OPEN, card, datasheet, kind_of, size_category
 from generator.dataset.making import DatasetOptions, generate_dataset
-from generator.dataset.production.cards.croissant import CONFORMS_TO
-from generator.dataset.production.cards.datasheet import OPEN, datasheet
-from generator.dataset.production.cards.facts import kind_of
-from generator.dataset.production.cards.hugging_face import card, size_category
-from generator.dataset.production.records import Description, Layout, Split
+from generator.dataset.records import Description, Layout, Split
 from generator.pictures.sources import random_scenes
 
 if TYPE_CHECKING:

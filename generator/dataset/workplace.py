@@ -30,9 +30,8 @@ from pydantic import ValidationError
 from foundation.errors import FormatError, InputError
 from foundation.files import partial_path, publish_folder, require_free, storage_error
 from foundation.trust.held_folders import LOCK_FILE, held_folder
-from generator.dataset.production.records import ShardRecord, shard_key
-from generator.stores.places import DESCRIPTION, is_remote, local_path
-from generator.stores.store import LocalStore, RemoteStore, Store, open_store
+from generator.dataset.records import ShardRecord, shard_key
+from generator.stores import DESCRIPTION, LocalStore, RemoteStore, Store, is_remote, local_path, open_store
 
 PLAN: Final = "plan.json"
 RECORDS: Final = "shards"

@@ -17,11 +17,12 @@ from typing import Any
 from foundation.errors import FormatError
 from foundation.hashing import HashingWriter
 from foundation.version import software
-from generator.dataset.production.cards.croissant import croissant
-from generator.dataset.production.cards.datasheet import datasheet
-from generator.dataset.production.cards.facts import CARD, COMPLETED_BY_HAND, CROISSANT, DATASHEET
-from generator.dataset.production.cards.hugging_face import card
-from generator.dataset.production.records import (
+from generator.dataset.cards import card, croissant, datasheet
+from generator.dataset.records import (
+    CARD,
+    COMPLETED_BY_HAND,
+    CROISSANT,
+    DATASHEET,
     GROUND_TRUTH,
     GROUND_TRUTH_COLUMNS,
     IMAGES,
@@ -43,10 +44,9 @@ from generator.dataset.production.records import (
     TableRecord,
     image_key,
 )
-from generator.dataset.production.workplace import Workplace
+from generator.dataset.workplace import Workplace
 from generator.files.formats import suffix_of
-from generator.stores.places import DESCRIPTION
-from generator.stores.store import Store
+from generator.stores import DESCRIPTION, Store
 
 
 class NothingMadeError(FormatError):

@@ -16,6 +16,7 @@ import pytest
 
 from foundation.errors import FormatError, InputError
 from foundation.trust.held_folders import FolderLock, held_folder
+from generator.dataset import layouts as plain_files
 from generator.dataset.making import (
     DatasetOptions,
     Plan,
@@ -25,10 +26,9 @@ from generator.dataset.making import (
     make_dataset,
     make_share,
 )
-from generator.dataset.production.layouts import plain_files
-from generator.dataset.production.records import ShardRecord
-from generator.dataset.production.workplace import Workplace, workplace
 from generator.dataset.reader import Dataset
+from generator.dataset.records import ShardRecord
+from generator.dataset.workplace import Workplace, workplace
 from generator.lights.choices import ListedLights, RandomLights
 from generator.pictures.sources import random_scenes
 from tests.generator.groups import grouped
@@ -227,7 +227,7 @@ def test_a_share_that_waited_for_the_whole_is_refused(
         (tmp_path / "whole").rename(out)
         return held_folder(*arguments, **named)
 
-    monkeypatch.setattr("generator.dataset.production.workplace.held_folder", finished_meanwhile)
+    monkeypatch.setattr("generator.dataset.workplace.held_folder", finished_meanwhile)
     with pytest.raises(InputError, match="already exists; name another place"):
         make_share(plan_of(lut), out, (0, 2))
     assert not (tmp_path / ".out.partial").exists()

@@ -15,8 +15,8 @@ import psutil
 import pytest
 
 from foundation.errors import InputError
-from generator.dataset.making import Callbacks, DatasetOptions, Workers, generate_dataset
-from generator.dataset.production.workers import SILENT, parse_engine
+from generator.dataset.making import Callbacks, DatasetOptions, Workers, generate_dataset, parse_engine
+from generator.dataset.shards import SILENT
 from generator.lights.choices import RandomLights
 from generator.pictures.sources import find_pictures, random_scenes
 
@@ -203,7 +203,7 @@ def test_an_unknown_engine_is_refused(name: str) -> None:
 def test_a_scheduler_that_does_not_answer(
     make_lut: Callable[..., Lut], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("generator.dataset.production.engines.CONNECT_S", 0.2)
+    monkeypatch.setattr("generator.dataset.making.CONNECT_S", 0.2)
     with pytest.raises(InputError, match=r"no Dask scheduler answers at 127\.0\.0\.1:1: .*; start one with dask"):
         generate_dataset(
             make_lut(), tmp_path / "out", random_scenes(2, 24, 16), [0], workers=Workers("dask://127.0.0.1:1")

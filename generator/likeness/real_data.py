@@ -1,26 +1,143 @@
-"""Source pictures drawn so that together they are like a real data set.
+"""Generated data made like a real data set: its pictures, its exposure, its size.
 
-Each picture gets a weight by which all of them together have the target's distribution of luminance, chroma and
-grey-world offset (`balancing`). Pictures are then drawn by systematic sampling (L. Kish, Survey Sampling, 1965): each
-as often as its weight says, rounded up or down at random, so that a good one may come several times and is then printed
-under another light each time.
+Each source picture is measured as the camera would see it, and gets a weight by which all of them together have the
+target's distribution of luminance, chroma and grey-world offset (`balancing`). Pictures are then drawn by systematic
+sampling (L. Kish, Survey Sampling, 1965): each as often as its weight says, rounded up or down at random, so that a
+good one may come several times and is then printed under another light each time.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Final
+from functools import partial
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 import numpy.typing as npt
 
-from foundation.errors import InputError
+from foundation.errors import FormatError, InputError
+from foundation.processors import ordered_map
 from generator import philox
 from generator.likeness.balancing import LEAST_EFFECTIVE, balance, effective_size
-from generator.likeness.pictures import MeasuredPictures
 from generator.pictures.sources import Source, SourcePicture
-from generator.statistics.statistics_file import RealStatistics
+from generator.statistics import CELLS, RealStatistics, cell_means, log_chroma, numbers_of_cells
+from generator.variation.exposures import AutomaticExposure
+
+if TYPE_CHECKING:
+    from calibration.table.lut import Lut
+    from generator.dataset.plan import DatasetOptions
+
+
+TRIED_SHARES: Final = (0.0, 0.3, 0.5, 0.65, 0.75, 0.83, 0.88, 0.92, 0.96, 1.0)
+"""Shares of the print's black that are tried with each picture: chosen so that what is left shrinks by a third from one
+to the next, since the shadows of real images differ by factors, and at last is nothing."""
+
+Photograph = Callable[[npt.NDArray[np.uint8], int], npt.NDArray[np.uint16]]
+"""From a picture (H, W, 3) uint8 and the number of an image to its raw image (H, W, 3) uint16 under one light."""
+
+
+@dataclass(frozen=True, eq=False)
+class MeasuredPictures:
+    """Numbers of source pictures as the camera would see them.
+
+    - `values`: (N,) float64 each, by the names of `image_numbers.numbers_of_cells`; NaN of a picture that has no such
+      number.
+    - `unreadable`: (N,) bool, pictures that cannot be read or cut, of which every number is NaN.
+    - `shares`: shares of the print's black, 0 … 1, at which each picture was measured, or none: then N is the number of
+      pictures times shares, those of a picture one after the other.
+    """
+
+    values: Mapping[str, npt.NDArray[np.float64]]
+    unreadable: npt.NDArray[np.bool_]
+    shares: tuple[float, ...] = ()
+
+    @property
+    def variants(self) -> int:
+        """How often each picture was measured."""
+        return max(1, len(self.shares))
+
+
+@dataclass(frozen=True)
+class BlackShares:
+    """Of a print's black, shares that are tried with each picture.
+
+    - `black`: (3,) what the camera sees of the print's black under the light of the measurement, counts.
+    - `shares`: what is taken out of it, 0 … 1, at least one.
+    """
+
+    black: tuple[float, float, float]
+    shares: tuple[float, ...] = TRIED_SHARES
+
+
+def reference_light(lut: Lut, lights: npt.NDArray[np.float64]) -> int:
+    """Return the light of a table nearest to the mean of lights (L, 3) float64 above 0 in ln(R/G) and ln(B/G)."""
+    apart = log_chroma(lut.white) - log_chroma(lights).mean(axis=0)
+    return int(np.square(apart).sum(axis=1).argmin())
+
+
+def measure_pictures(
+    sources: Sequence[Source],
+    photograph: Photograph,
+    white: npt.NDArray[np.float64],
+    cells: int = CELLS,
+    workers: int = 1,
+    on_picture: Callable[[int, int], None] | None = None,
+    black: BlackShares | None = None,
+) -> MeasuredPictures:
+    """Return the numbers of source pictures, photographed one after the other.
+
+    `photograph`: how each, (H, W, 3) uint8, becomes a raw image (H, W, 3) uint16. `white`: (3,) float64 above 0, the
+    light of these images in linear camera RGB. `black`: shares of the print's black that are taken out of the cells of
+    each photograph, which was taken with all of it; None leaves photographs as they are.
+    """
+    found: list[dict[str, float] | None] = []
+    measure = partial(_measure, photograph=photograph, white=white, cells=cells, black=black)
+    shares = black.shares if black else ()
+    for done, numbers in enumerate(ordered_map(measure, enumerate(sources), workers), 1):
+        found += [None] * max(1, len(shares)) if numbers is None else numbers
+        if on_picture:
+            on_picture(done, len(sources))
+    names = next((numbers.keys() for numbers in found if numbers is not None), ())
+    values = {name: np.array([np.nan if numbers is None else numbers[name] for numbers in found]) for name in names}
+    return MeasuredPictures(values, np.array([numbers is None for numbers in found]), shares)
+
+
+def _measure(
+    numbered: tuple[int, Source],
+    photograph: Photograph,
+    white: npt.NDArray[np.float64],
+    cells: int,
+    black: BlackShares | None,
+) -> list[dict[str, float]] | None:
+    """Return the numbers of a picture with each share, or None if it cannot be read: the dataset would leave it out."""
+    number, source = numbered
+    try:
+        read = source.read()
+    except FormatError:
+        return None
+    crops = [cut.picture for cut in read.cuts] or [read.picture]
+    means = [cell_means(photograph(crop, number), white, cells) for crop in crops]
+    by_share: list[dict[str, float]] = []
+    for share in black.shares if black else (None,):
+        taken = means if black is None or share is None else [_without(mean, black, share, white) for mean in means]
+        found = [numbers_of_cells(mean)[0] for mean in taken]
+        # Crops of a picture are drawn together, so what they are together counts.
+        by_share.append({name: float(np.mean([numbers[name] for numbers in found])) for name in found[0]})
+    return by_share
+
+
+def _without(
+    means: npt.NDArray[np.float64], black: BlackShares, share: float, white: npt.NDArray[np.float64]
+) -> npt.NDArray[np.float64]:
+    """Return cells (h, w, 3) float64, divided by their light, without a share of the black: as `black_points` has it.
+
+    What is done there to samples is done here to means of cells, which is the same but where a sample is darker than
+    what is taken out of it.
+    """
+    part = share * np.array(black.black) / white
+    return np.maximum(means - part * white.mean(), 0) / (1 - part)
+
 
 _Array = npt.NDArray[np.float64]
 
@@ -278,3 +395,126 @@ def _reached(name: str, real: _Array, before: _Array, after: _Array) -> list[Rea
 def _short(value: float) -> float:
     """Return a number with six significant digits: other machines find the same, whatever their last bits."""
     return float(f"{value:.6g}")
+
+
+def remedies(drawn: DrawnPictures, options: DatasetOptions) -> list[str]:
+    """Return which options bring figures nearer that are not alike, a line each; none where all are."""
+    apart = {made.name: made for made in drawn.reached if not made.is_alike}
+    if not apart:
+        return []
+    told: list[str] = []
+    shadows, chroma = apart.get("luminance_1"), apart.get("chroma_spread")
+    bright = shadows is not None and shadows.after > shadows.wanted
+    pale = chroma is not None and chroma.after < chroma.wanted
+    if (bright or pale) and options.rendering == "codes":
+        told.append(
+            "--rendering colorimetric: by codes a picture has the contrast and chroma of the print, mostly less than "
+            "the scene's"
+        )
+    if (shadows is not None or pale) and options.black_point.kind != "like":
+        told.append(
+            "--black-point like: the print's own black lifts shadows and makes colours pale, and of each picture as "
+            "much of it is taken out as makes it like the real ones"
+        )
+    told.append(
+        "more pictures with --sources, or several crops of each (--crop WxH --crops N): there is more to choose from"
+    )
+    return [f"what may help: {line}" for line in told]
+
+
+def light_caution(lut: Lut, target: RealStatistics) -> str:
+    """Return that pictures were measured under one light of the table, and how figures of the images are had."""
+    light = lut.illuminations[reference_light(lut, target.lights)]
+    return (
+        f"figures drawn are of pictures measured under one light, {light.index} of the table; for those of the images, "
+        f"each under its own light, run evaluate describe on the dataset with --against {target.file}"
+    )
+
+
+SHARE: Final = 0.01
+"""Share of an image's pixels whose brightest channel is brighter than its exposure: so `evaluate describe` has it."""
+
+_LEAST: Final = 0.001
+"""Least exposure that is followed: below it an image is black."""
+
+
+def like_exposure(target: RealStatistics) -> AutomaticExposure | None:
+    """Return the exposure by which images reach the levels that those of a real data set reach.
+
+    Returns the levels drawn by eleven quantiles; None where the real data set's saturation is not known.
+    """
+    known = target.known("exposure")
+    if not known.size:
+        return None
+    levels = np.percentile(known, np.linspace(0, 100, 11), method="hazen")
+    return AutomaticExposure(SHARE, tuple(float(f"{level:.6g}") for level in np.clip(levels, _LEAST, 1.0)))
+
+
+def exposure_sentence(target: RealStatistics) -> str:
+    """Return in one line how images are exposed."""
+    known = target.known("exposure")
+    if not known.size:
+        return f"exposure: that of {target.name} is not known without its saturation; images are exposed as the table"
+    low, middle, high = np.percentile(known, (10, 50, 90), method="hazen")
+    return f"exposure: {middle:.2f} of saturation in the median, {low:.2f} to {high:.2f} in eight of ten images"
+
+
+_LOOKED_AT: Final = 200
+"""Pictures whose size is looked at, evenly spread over the list: a tenth of them is then known to a few percent."""
+
+_TOO_SMALL: Final = 10
+"""Percent of the pictures that may be too small for the crop, and are left out."""
+
+_LEAST_SIDE: Final = 16
+"""Least side of images, px: below it their cells say nothing of scenes."""
+
+
+@dataclass(frozen=True)
+class LikeSize:
+    """A size of images.
+
+    - `width`, `height`: what pictures are cut to, px.
+    - `wanted`: width and height of most images of the real data set, px.
+    """
+
+    width: int
+    height: int
+    wanted: tuple[int, int]
+
+    def describe(self) -> dict[str, Any]:
+        """Return what `dataset.json` records."""
+        return {"crop": [self.width, self.height], "wanted": list(self.wanted)}
+
+    def sentence(self) -> str:
+        """Return in one line which size it is."""
+        same = (self.width, self.height) == self.wanted
+        end = "" if same else ", as large as nine of ten pictures allow in that shape"
+        return "size: {}x{} px{}; most real images have {}x{}".format(self.width, self.height, end, *self.wanted)
+
+
+def like_size(target: RealStatistics, sources: Sequence[Source]) -> LikeSize | None:
+    """Return the size of most real images, made smaller in that shape where pictures are smaller.
+
+    Returns none for thumbnails, whose size and shape are not those of the photographs.
+    """
+    if target.layout == "thumbnails" or not target.sizes:
+        return None
+    width, height, _ = target.sizes[0]
+    scales: list[float] = []
+    for place in np.unique(np.linspace(0, len(sources) - 1, min(len(sources), _LOOKED_AT)).astype(int)):
+        try:
+            high, wide = sources[int(place)].read().picture.shape[:2]
+        except FormatError:
+            continue
+        scales.append(min(wide / width, high / height))
+    if not scales:
+        raise InputError("none of the pictures can be read; name others with --sources")
+    scale = min(1.0, float(np.percentile(scales, _TOO_SMALL, method="lower")))
+    # Whole pixels below, so that the pictures that decide the scale are not too small by a fraction of one.
+    size = LikeSize(int(width * scale + 1e-9), int(height * scale + 1e-9), (width, height))
+    if min(size.width, size.height) < _LEAST_SIDE:
+        raise InputError(
+            f"pictures cut to the shape of {width}x{height} px would be {size.width}x{size.height} px, expected "
+            f"{_LEAST_SIDE} px a side or more; name larger ones, or leave size out of --like-in"
+        )
+    return size

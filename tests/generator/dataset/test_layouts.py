@@ -22,10 +22,8 @@ import pytest
 
 from foundation.errors import FormatError, InputError, StorageError
 from generator.dataset.making import DatasetOptions, generate_dataset
-from generator.dataset.production.cards.facts import COMPLETED_BY_HAND
-from generator.dataset.production.records import Layout
-from generator.dataset.reader import Dataset, open_dataset
-from generator.dataset.verification import file_faults
+from generator.dataset.reader import Dataset, file_faults, open_dataset
+from generator.dataset.records import COMPLETED_BY_HAND, Layout
 from generator.lights.choices import ListedLights, SimultaneousLights
 from generator.masks.request import parse_masks
 from generator.pictures.sources import SourcePicture, random_scenes
@@ -310,7 +308,7 @@ def test_the_layout_parquet_says_what_it_needs(make: Make, monkeypatch: pytest.M
     def find_spec(name: str) -> None:
         del name
 
-    monkeypatch.setattr("generator.dataset.production.layouts.parquet.find_spec", find_spec)
+    monkeypatch.setattr("generator.dataset.layouts.find_spec", find_spec)
     with pytest.raises(InputError, match=r"needs pyarrow; install it with: pip install pyarrow"):
         make("parquet")
 
