@@ -2,7 +2,7 @@
 
 The numbers of one image are a function of its cells with the light divided out, so that a picture as the camera would
 see it and a photograph of another camera are measured alike. `evaluate describe` makes the figures of a data set of
-them and writes `STATS.json` (docs/formats.md), of which `generate --like` takes lights, sizes and the numbers of images.
+them and writes `STATS.json` (docs/formats.md), of which `generate --like` takes lights, sizes and numbers.
 """
 
 from __future__ import annotations

@@ -24,10 +24,8 @@ from pathlib import Path
 
 import numpy as np
 
-from evaluation.datasets.names import IMAGE_ENDINGS, Folder
+from evaluation.datasets.files import IMAGE_ENDINGS, Folder, Light, Mask, RawScene, light_of, number_of, read_rows
 from evaluation.datasets.options import DataOptions, stated
-from evaluation.datasets.raw_scene import Mask, RawScene
-from evaluation.datasets.truths import Light, light_of, number_of, read_rows
 from evaluation.scene import Image, SceneSet
 from foundation.errors import FormatError, InputError, first_of
 

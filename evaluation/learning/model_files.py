@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from evaluation.datasets.identities import identities
+from evaluation.datasets.identity import identities
 from evaluation.learning.feature_learner import FeatureLearner, LearnedMethod, truths_of
 from evaluation.learning.standard import standard_learners
 from evaluation.methods.method import Method

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from evaluation.methods.pixels import usable
+from evaluation.methods.prepared import usable
 from evaluation.scene import Image
 
 _LEAST_SHARE = 0.5

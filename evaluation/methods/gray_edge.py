@@ -16,8 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from evaluation.methods.pixels import unit
-from evaluation.methods.prepared import PreparedImage
+from evaluation.methods.prepared import PreparedImage, unit
 from evaluation.scene import Image
 
 

@@ -42,9 +42,8 @@ from typing import TYPE_CHECKING, cast
 
 from evaluation.methods.gray_edge import GrayEdge
 from evaluation.methods.green_stability import FAMILIES
-from evaluation.methods.patchwise import PATCHES, PatchwiseMethod
-from evaluation.methods.resized import ResizedMethod
 from evaluation.methods.standard import local_methods, standard_methods
+from evaluation.methods.wrapped import PATCHES, PatchwiseMethod, ResizedMethod
 from foundation.errors import InputError
 
 if TYPE_CHECKING:

@@ -13,8 +13,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from evaluation.methods.pixels import GREY, unit
-from evaluation.methods.prepared import PreparedImage
+from evaluation.methods.prepared import GREY, PreparedImage, unit
 from evaluation.scene import Image
 
 _MANY = 1 << 16
@@ -76,7 +75,7 @@ def _sum_of_products(
 
     Of large images some pixels say between which bins the limits are; where they prove wrong, all pixels say it.
     """
-    from evaluation.methods.filters.projections import BINS, count_projections, sum_outer_bins
+    from evaluation.methods.pixel_loops import BINS, count_projections, sum_outer_bins
 
     image: Any = prepared.image
     step = BINS / float(direction @ peaks)

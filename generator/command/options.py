@@ -1,4 +1,4 @@
-"""The options of the command `generate`: a frozen dataclass for each panel of its help, which `grouped` makes a command of.
+"""The options of the command `generate`: a frozen dataclass for each panel of its help.
 
 Libraries that take long to load are imported when a group makes something of its options.
 """

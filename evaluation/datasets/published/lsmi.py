@@ -32,10 +32,8 @@ from typing import Any, Final, cast
 import numpy as np
 import numpy.typing as npt
 
-from evaluation.datasets.names import Folder
+from evaluation.datasets.files import Folder, Light, Mask, RawScene, check_light, polygon_mask, read_text
 from evaluation.datasets.options import DataOptions, choose, stated
-from evaluation.datasets.raw_scene import Mask, RawScene, polygon_mask
-from evaluation.datasets.truths import Light, check_light, read_text
 from evaluation.scene import Image, Scene, SceneSet
 from foundation.errors import FormatError, InputError, first_of
 from generator.files.formats import decode_array

@@ -18,7 +18,7 @@ import numpy.typing as npt
 from evaluation.experiments.running import truths_of
 from evaluation.methods.gray_edge import GrayEdge
 from evaluation.methods.method import Method
-from evaluation.methods.pixels import usable
+from evaluation.methods.prepared import usable
 from evaluation.methods.standard import standard_methods
 from evaluation.metrics import ErrorKind
 from evaluation.results.answers import SceneAnswer, read_light, results_of

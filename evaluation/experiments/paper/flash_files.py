@@ -24,7 +24,7 @@ import numpy as np
 import numpy.typing as npt
 
 from evaluation.experiments.paper.bits import fitted_codes
-from evaluation.methods.pixels import usable
+from evaluation.methods.prepared import usable
 from evaluation.scene import Scene, SceneSet
 from foundation.errors import FormatError, InputError
 from foundation.files import reading_error, whole_folder, write_whole

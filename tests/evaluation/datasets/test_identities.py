@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from evaluation.datasets.identities import identities, known_again
+from evaluation.datasets.identity import identities, known_again
 from evaluation.scene import Scene
 from tests.evaluation.experiments.transfer.conftest import Maker, save_pictures, write_table
 from tests.evaluation.made_up import Wall

@@ -12,8 +12,7 @@ import numpy as np
 import pytest
 
 from evaluation.datasets import LAYOUTS, DataOptions, layout_of, open_scenes
-from evaluation.datasets.names import Folder
-from evaluation.datasets.raw_scene import RawScene
+from evaluation.datasets.files import Folder, RawScene
 from evaluation.scene import MixedScene
 from foundation.errors import FormatError, InputError
 from tests.evaluation.datasets import contract
@@ -90,8 +89,8 @@ def test_opening_reads_no_image(name: str, place_of: Place, monkeypatch: pytest.
     def never(*given: object) -> None:
         pytest.fail("an image is read")
 
-    monkeypatch.setattr("evaluation.datasets.raw_scene.decode_image", never)
-    monkeypatch.setattr("evaluation.datasets.published.peaks.decode_image", never)
+    monkeypatch.setattr("evaluation.datasets.files.decode_image", never)
+    monkeypatch.setattr("evaluation.datasets.published.cube.decode_image", never)
     monkeypatch.setattr(np, "load", never)
     assert open_scenes(place, options=options_of(COPIES[name])).scenes
 

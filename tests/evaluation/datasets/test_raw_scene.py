@@ -15,8 +15,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from evaluation.datasets.names import Folder, natural, present
-from evaluation.datasets.raw_scene import decode_image, polygon_mask, subtract_black
+from evaluation.datasets.files import Folder, decode_image, natural, polygon_mask, present, subtract_black
 from foundation.errors import FormatError
 from tests.data_files import shipped
 from tests.evaluation.datasets.made_up import image_of, write_png, write_tiff

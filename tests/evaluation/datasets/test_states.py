@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from evaluation.datasets import open_scenes
-from evaluation.datasets.states import first_copies, state_of
+from evaluation.datasets.identity import first_copies, state_of
 from evaluation.experiments.folds import draw_scene_folds
 from tests.evaluation.datasets.made_up import image_of, write_png
 

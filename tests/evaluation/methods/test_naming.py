@@ -11,9 +11,8 @@ from evaluation.methods.gray_edge import GrayEdge
 from evaluation.methods.green_stability import FAMILIES, family, family_names
 from evaluation.methods.method import Learner
 from evaluation.methods.naming import find_method
-from evaluation.methods.patchwise import PatchwiseMethod
-from evaluation.methods.resized import ResizedMethod
 from evaluation.methods.standard import standard_methods
+from evaluation.methods.wrapped import PatchwiseMethod, ResizedMethod
 from foundation.errors import InputError
 
 TEN_LINES = """\

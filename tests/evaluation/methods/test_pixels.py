@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from evaluation.methods.pixels import usable
+from evaluation.methods.prepared import usable
 
 if TYPE_CHECKING:
     pass

@@ -5,12 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from evaluation.methods.filters.shrinking import shrink
 from evaluation.methods.gray_edge import GrayEdge
-from evaluation.methods.pixels import GREY
-from evaluation.methods.prepared import PreparedImage
-from evaluation.methods.resized import ResizedMethod
+from evaluation.methods.prepared import GREY, PreparedImage, shrink
 from evaluation.methods.standard import standard_methods
+from evaluation.methods.wrapped import ResizedMethod
 from evaluation.metrics import recovery_error
 
 

@@ -1,8 +1,15 @@
-"""Errors where several lights fall on an image: by pixel against the map of lights, and by region against each light.
+"""How far estimates are off: angular errors, their summaries, and errors by pixel where several lights fall.
 
-The definitions are those of D. Kim et al., "Large scale multi-illuminant (LSMI) dataset for developing white balance
-algorithm under mixed illumination", ICCV 2021, as its authors' program computes them (github.com/DY112/LSMI-dataset,
-commit 0de53b8: `get_MAE` of SVWB_Unet/metrics.py, `test` of SVWB_Unet/solver.py):
+Angular errors are those of the paper's section 4.1; all angles are degrees. Percentiles are MATLAB's `prctile`, as in
+the programs that the field's tables were made with: the i-th of n sorted errors stands at 100 (i − ½) / n percent,
+between two of them a straight line joins, and beyond the first and last they are those (Hazen's definition; R. J.
+Hyndman, Y. Fan, "Sample quantiles in statistical packages", The American Statistician 50(4), 1996, definition 5).
+NumPy's own default is another: quartiles lie a quarter of the distance between two neighbouring errors further in.
+
+Under several lights errors are by pixel against the map of lights, and by region against each light. The definitions
+are those of D. Kim et al., "Large scale multi-illuminant (LSMI) dataset for developing white balance algorithm under
+mixed illumination", ICCV 2021, as its authors' program computes them (github.com/DY112/LSMI-dataset, commit 0de53b8:
+`get_MAE` of SVWB_Unet/metrics.py, `test` of SVWB_Unet/solver.py):
 
 MAE_illum
     The angle between the estimated and the true light of a pixel, averaged over an image's pixels that are not masked,
@@ -20,13 +27,72 @@ angle between their estimates and that light, averaged over them. Errors by pixe
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
-from typing import Any, Final
+from dataclasses import astuple, dataclass
+from typing import Any, Final, Literal
 
 import numpy as np
 import numpy.typing as npt
 
-from evaluation.metrics.angular import recovery_error, reproduction_error
+from foundation.angles import angles_deg
+from foundation.errors import InputError
+
+ErrorKind = Literal["reproduction", "recovery"]
+
+_ZERO: Final = 1e-12
+"""What replaces 0 in an estimate, over its largest channel: the angle is that of the limit to a double's last digit."""
+
+
+def recovery_error(estimate: npt.ArrayLike, truth: npt.ArrayLike) -> npt.NDArray[np.float64]:
+    """Return the angle between estimated and true light, degrees (paper, equation 3).
+
+    Parameters
+    ----------
+    estimate, truth
+        (..., 3) float or int, linear camera RGB of any length > 0.
+
+    Returns
+    -------
+    ndarray
+        (...) float64, 0 … 180.
+
+    Examples
+    --------
+    >>> round(float(recovery_error([1, 1, 0], [1, 0, 0])), 6)
+    45.0
+    >>> recovery_error([[0.2, 0.6, 0.2], [0.3, 0.4, 0.3]], [1, 1, 1]).round(3)
+    array([29.496,  8.049])
+    """
+    return angles_deg(estimate, truth)
+
+
+def reproduction_error(estimate: npt.ArrayLike, truth: npt.ArrayLike) -> npt.NDArray[np.float64]:
+    """Return the angle between the white surface after correction and white, degrees (paper, equation 4).
+
+    Parameters
+    ----------
+    estimate, truth
+        (..., 3) float or int, linear camera RGB of any length > 0; a channel of the estimate at zero gives the limit.
+
+    Returns
+    -------
+    ndarray
+        (...) float64, 0 … 54.74: arccos(1/√3), white corrected to a single channel.
+
+    Examples
+    --------
+    Unlike the recovery error it stays the same when the light, true and estimated, is filtered:
+
+    >>> estimate, truth, glass = np.array([1, 1, 1]), np.array([2, 1, 1]), np.array([0.5, 1, 3])
+    >>> round(float(reproduction_error(estimate, truth)), 3)
+    19.471
+    >>> round(float(reproduction_error(estimate * glass, truth * glass)), 3)
+    19.471
+    """
+    given = np.asarray(estimate, dtype=np.float64)
+    floor = _ZERO * given.max(axis=-1, keepdims=True)
+    corrected = np.asarray(truth, dtype=np.float64) / np.maximum(given, floor)
+    return angles_deg(corrected, np.ones_like(corrected))
+
 
 _Array = npt.NDArray[np.float64]
 
@@ -35,9 +101,7 @@ DOMINANT: Final = 0.5
 
 _ROWS_OF: Final = 1 << 19
 """Pixels that are worked on at a time: some 100 MB of intermediate results whatever the image's size."""
-
-_ZERO: Final = 1e-12
-"""What replaces 0 in a light that is divided by, over its largest channel; see `angular.reproduction_error`."""
+"""What replaces 0 in a light that is divided by, over its largest channel; see `reproduction_error`."""
 
 
 @dataclass(frozen=True)
@@ -175,3 +239,107 @@ def _gains(lights: _Array) -> _Array:
     """Return the gains (N, 3) that correct for lights (N, 3) and leave green as it is."""
     floored = np.maximum(lights, _ZERO * lights.max(axis=1, keepdims=True))
     return floored[:, 1:2] / floored
+
+
+SMALL_DEG: Final = 3.0
+"""Errors below it are counted as small: the limit that many papers of the field take for an acceptable error."""
+
+
+@dataclass(frozen=True)
+class Summary:
+    """The numbers that sum up the errors of a method on a data set, degrees: first the paper's six, in its order.
+
+    Attributes
+    ----------
+    mean, median
+        Of all errors.
+    trimean
+        (Q1 + 2 Q2 + Q3) / 4.
+    best25, worst25
+        Means of the errors up to the 25th and from the 75th percentile.
+    avg
+        Geometric mean of the five (J. T. Barron, "Convolutional color constancy", ICCV 2015).
+    p95
+        95th percentile.
+    maximum
+        The largest error.
+    below3
+        Share of the errors below 3 degrees, 0 … 1.
+    """
+
+    mean: float
+    median: float
+    trimean: float
+    best25: float
+    worst25: float
+    avg: float
+    p95: float
+    maximum: float
+    below3: float
+
+    def as_tuple(self) -> tuple[float, ...]:
+        """Return the six numbers of the paper's tables."""
+        return astuple(self)[:6]
+
+
+def summarise(errors: npt.ArrayLike) -> Summary:
+    """Return the summary of errors (N,) float, N ≥ 1, degrees.
+
+    Raises
+    ------
+    InputError
+        There is no error to summarise, or one is NaN or infinite.
+
+    Examples
+    --------
+    >>> summary = summarise([1, 2, 3, 4, 10])
+    >>> summary.as_tuple()
+    (4.0, 3.0, 3.3125, 1.0, 10.0, 3.31...)
+    >>> summary.p95, summary.maximum, summary.below3
+    (10.0, 10.0, 0.4)
+    """
+    values = np.asarray(errors, dtype=np.float64).ravel()
+    if not values.size or not np.isfinite(values).all():
+        raise InputError(
+            f"{values.size} errors, {int((~np.isfinite(values)).sum())} of them not finite: nothing to sum up"
+        )
+    q1, q2, q3, p95 = (float(level) for level in percentiles(values, (25, 50, 75, 95)))
+    parts = (
+        float(values.mean()),
+        q2,
+        (q1 + 2 * q2 + q3) / 4,
+        float(values[values <= q1].mean()),
+        float(values[values >= q3].mean()),
+    )
+    return Summary(
+        *parts,
+        avg=float(np.prod(np.asarray(parts) ** 0.2)),
+        p95=p95,
+        maximum=float(values.max()),
+        below3=float((values < SMALL_DEG).mean()),
+    )
+
+
+def percentiles(errors: npt.ArrayLike, levels: tuple[float, ...]) -> npt.NDArray[np.float64]:
+    """Return percentiles (L,) float64 of errors (N,) float, N ≥ 1, at levels of 0 … 100, as MATLAB's `prctile`.
+
+    Examples
+    --------
+    >>> percentiles([1, 2, 3, 4], (25, 50, 95))
+    array([1.5, 2.5, 4. ])
+    """
+    # NumPy calls MATLAB's definition after Hazen.
+    return np.percentile(np.asarray(errors, dtype=np.float64), levels, method="hazen")
+
+
+__all__ = [
+    "ErrorKind",
+    "MapError",
+    "RegionError",
+    "Summary",
+    "measure_map",
+    "percentiles",
+    "recovery_error",
+    "reproduction_error",
+    "summarise",
+]

@@ -1,4 +1,10 @@
-"""Whether the images of a data set are still those that they were: what a run that goes on has to know."""
+"""By what images are known without decoding them: whether they are others' copies, or still those that they were.
+
+A model file keeps of what it was trained on each image's name and light, or the picture that it was generated from, so
+that a test on the same images is noticed. A name counts without folder and ending, capitals and case being one; a light
+as chromaticities to four digits, since copies of a data set hold it to different ones. What was renamed, or is held to
+another ground truth, is not known again. A run that goes on asks whether the files changed meanwhile.
+"""
 
 from __future__ import annotations
 
@@ -6,17 +12,70 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from hashlib import sha256
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Final
 
 import numpy as np
+import numpy.typing as npt
 
+from evaluation.datasets.files import RawScene
 from evaluation.datasets.generated import GeneratedScene
-from evaluation.datasets.raw_scene import RawScene
 from evaluation.datasets.thumbnails import Thumbnail
 from evaluation.scene import Scene
 from foundation.errors import CropError
 from foundation.hashing import sha256_of
+
+
+def identities(scenes: Sequence[Scene]) -> npt.NDArray[np.uint64]:
+    """Return by what scenes are known again: (N, 2) uint64, the first 64 bits of SHA-256.
+
+    The first is of the image: name and light; of a generated one its source picture, whatever the light. The second is
+    of the name, by which a generated image and the photograph that it was made from find each other.
+    """
+    sources: dict[int, dict[str, str]] = {}
+    rows: list[tuple[int, int]] = []
+    for scene in scenes:
+        if isinstance(scene, GeneratedScene):
+            known = sources.setdefault(id(scene.dataset), _sources(scene))
+            source = scene.entry.source
+            rows.append((_number("source", known[source]), _number("generated", _stem(source))))
+        else:
+            total = max(float(scene.truth.sum()), np.finfo(float).tiny)
+            light = " ".join(f"{part:.4f}" for part in scene.truth / total)
+            rows.append((_number("image", f"{_stem(scene.name)} {light}"), _number("real", _stem(scene.name))))
+    return np.array(rows, dtype=np.uint64).reshape(-1, 2)
+
+
+def known_again(scenes: Sequence[Scene], trained: npt.NDArray[np.uint64]) -> tuple[str, ...]:
+    """Return the names of the scenes that are among others, whose identities (N, 2) uint64 are given."""
+    images = {int(one) for one in trained[:, 0]}
+    names = {int(one) for one in trained[:, 1]}
+    return tuple(
+        scene.name
+        for scene, (own, _) in zip(scenes, identities(scenes).tolist(), strict=True)
+        if own in images or _counterpart(scene) in names
+    )
+
+
+def _counterpart(scene: Scene) -> int:
+    """Return the second identity that a photograph's generated image has, or a generated image's photograph."""
+    if isinstance(scene, GeneratedScene):
+        return _number("real", _stem(scene.entry.source))
+    return _number("generated", _stem(scene.name))
+
+
+def _sources(scene: GeneratedScene) -> dict[str, str]:
+    seed = scene.dataset.description.seed
+    return {record.name: record.sha256 or f"{record.name} of seed {seed}" for record in scene.dataset.sources}
+
+
+def _stem(name: str) -> str:
+    return PurePosixPath(name).stem.lower()
+
+
+def _number(kind: str, text: str) -> int:
+    return int(sha256_of(f"{kind}\t{text}".encode())[:16], 16)
+
 
 _FILES = ("path", "mask_path", "shares_path")
 """Fields of a scene that name its files."""

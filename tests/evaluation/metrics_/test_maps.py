@@ -8,7 +8,8 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from evaluation.metrics import maps, measure_map, recovery_error, reproduction_error
+from evaluation import metrics as maps
+from evaluation.metrics import measure_map, recovery_error, reproduction_error
 
 RED, WHITE = np.array([1.0, 0.5, 0.5]), np.array([1.0, 1, 1])
 LIGHTS = np.stack([RED, WHITE])

@@ -1,4 +1,18 @@
-"""Cube++ and SimpleCube++: 4890 images of Canon EOS 550D and 600D, and 2234 of them reduced four times.
+"""Cube, Cube+, Cube++ and SimpleCube++: images of two Canon cameras with a SpyderCube in their lower right corner.
+
+Cube and Cube+: 1365 and 1707 images of a Canon EOS 550D with a SpyderCube in their lower right corner.
+
+    cube+_gt.txt         r g b a line; line N is the light of image N (cube_gt.txt: Cube)
+    cube+_left_gt.txt    the same of the left and right grey face of the SpyderCube, optional
+    cube+_right_gt.txt
+    1.PNG … 1707.PNG     16 bits, half-size demosaiced raw, 2601 × 1732; beside it, or in folders PNG…
+
+N. Banić, K. Koščević, S. Lončarić, "Unsupervised learning for color constancy", arXiv:1712.00436, and the data set's
+page, ipg.fer.hr/ipg/resources/color_constancy: black 2048 is to be subtracted, the calibration cube is masked by
+leaving out the lower right rectangle from row 1050 and column 2050, and clipped pixels as `Peaks` says. Layout, black
+level and rectangle were held against four public preprocessing programs; not verified against a real copy.
+
+Cube++ and SimpleCube++: 4890 images of Canon EOS 550D and 600D, and 2234 of them reduced four times.
 
     gt.csv            image, then r, g, b of mean, left, right, left_white, right_white (mean_r …), r + g + b = 1
     properties.csv    of each image what it shows, and MakerNotes:NormalWhiteLevel; optional
@@ -16,18 +30,153 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
-from evaluation.datasets.names import Folder, gather, present
+import numpy as np
+
+from evaluation.datasets.files import (
+    Folder,
+    Light,
+    Mask,
+    RawScene,
+    box_mask,
+    decode_image,
+    gather,
+    light_of,
+    number_of,
+    present,
+    read_lights,
+    read_rows,
+    subtract_black,
+)
 from evaluation.datasets.options import DataOptions, choose, stated
-from evaluation.datasets.published.peaks import PEAK_RULE, Peaks, PeakScene
-from evaluation.datasets.raw_scene import Mask, box_mask
-from evaluation.datasets.truths import Light, light_of, number_of, read_rows
 from evaluation.scene import Image, SceneSet
 from foundation.errors import FormatError, InputError
 
+BELOW_PEAK = 2
+"""The authors' advice, see above: the two values below an image's largest count as clipped too."""
+
+PEAK_RULE = (
+    "in each image from m - 2, m its largest value in any channel (advice of the authors of Cube+, "
+    "ipg.fer.hr/ipg/resources/color_constancy)"
+)
+"""The rule in the words of a treatment."""
+
+
+@dataclass(frozen=True)
+class Peaks:
+    """The largest values of images that were read, so that asking for a saturation reads none a second time.
+
+    They are the threshold of clipping where a data set states no other. The authors of Cube and Cube+ looked at
+    histograms of their images and advise, for an image whose largest value in any channel is m, to discard every pixel
+    with a channel from m - 2. (Their page itself was not at hand; two independent public preprocessing programs apply
+    this rule.)
+    """
+
+    _known: dict[str, float] = field(default_factory=dict[str, float])
+
+    def learn(self, path: str, image: Image) -> None:
+        """Keep the largest value of an image (H, W, 3) of any dtype, as it is in its file."""
+        self._known[path] = float(np.max(image))
+
+    def of(self, path: str) -> float:
+        """Return the largest value of the image in a file, which is read if it was not before."""
+        if path not in self._known:
+            self.learn(path, decode_image(path))
+        return self._known[path]
+
+
+@dataclass(frozen=True, slots=True)
+class PeakScene(RawScene):
+    """An image whose saturation is taken from its own largest value unless `white` is given.
+
+    `peaks`: of all images of the data set.
+    """
+
+    peaks: Peaks = field(default_factory=Peaks)
+
+    @property
+    def saturation(self) -> float:
+        """Value from which a pixel is clipped, in the units that `read` gives; reads the image if nothing did yet."""
+        white = self.peaks.of(self.path) - BELOW_PEAK if self.white is None else self.white
+        return white - self.black
+
+    def read(self) -> tuple[Image, Mask | None]:
+        """Return the image (H, W, 3), linear camera RGB with black at 0, and its mask (H, W) bool or None."""
+        image = decode_image(self.path)
+        if self.white is None:
+            self.peaks.learn(self.path, image)
+        lower = subtract_black(image, self.black)
+        return lower, self.mask(lower)
+
+
 BLACK = 2048
+"""Black level of the 550D's files; the data set's page."""
+CUBE_ROW, CUBE_COLUMN = 1050, 2050
+"""From where the calibration cube's rectangle reaches to the lower right corner, px; the data set's page."""
+
+_OWN = {"cube+_gt.txt": ("Cube+", 1707), "cube_gt.txt": ("Cube", 1365)}
+"""Name and number of images by the file of ground truths; arXiv:1712.00436."""
+
+
+@dataclass(frozen=True, slots=True)
+class CubePlusScene(PeakScene):
+    """An image of Cube or Cube+."""
+
+    def mask(self, image: Image) -> Mask:
+        """Return (H, W) bool, True in the rectangle of the cube, of an image (H, W, 3)."""
+        height, width = image.shape[:2]
+        if height <= CUBE_ROW or width <= CUBE_COLUMN:
+            raise FormatError(
+                f"{self.path} is {width} × {height}, expected 2601 × 1732: the calibration cube is masked from row "
+                f"{CUBE_ROW} and column {CUBE_COLUMN}; use the original files, or a folder of images with a CSV"
+            )
+        return box_mask((height, width), slice(CUBE_ROW, None), slice(CUBE_COLUMN, None))
+
+
+def is_cube_plus(folder: Folder) -> bool:
+    """Return whether a folder looks like Cube or Cube+."""
+    return any(folder.has(name) for name in _OWN)
+
+
+def open_cube_plus(place: str, options: DataOptions, listed: Folder | None = None) -> SceneSet:
+    """Return Cube+ or Cube; images are read when they are used."""
+    folder = listed or Folder(Path(place))
+    file = next((name for name in _OWN if folder.has(name)), None)
+    if file is None:
+        raise FormatError(f"{place} is no copy of Cube+: it has no cube+_gt.txt; fetch it from the data set's page")
+    name, published = _OWN[file]
+    faces = {face: folder.path / file.replace("_gt", f"_{face}_gt") for face in ("left", "right")}
+    truths = {"own": folder.path / file} | {face: path for face, path in faces.items() if path.is_file()}
+    truth = choose(options.truth, truths, "truth", place) or "own"
+    lights = read_lights(truths[truth])
+    parts = [part for part_name, part in folder.folders.items() if part_name.upper().startswith("PNG")]
+    images = gather([folder, *parts])
+    looked = f"{folder.path} (itself and its folders PNG…: {', '.join(part.path.name for part in parts) or 'none'})"
+    kept, note = present([str(number) for number in range(1, len(lights) + 1)], images, file, looked, options.partial)
+    black = BLACK if options.black is None else options.black
+    peaks = Peaks()
+    return SceneSet(
+        name=name,
+        layout="cube-plus",
+        place=place,
+        scenes=tuple(
+            CubePlusScene(
+                f"{number + 1}.PNG", images[str(number + 1)], lights[number], black, options.saturation, peaks
+            )
+            for number in kept
+        ),
+        treatment={
+            "images": note + ("" if len(kept) == published else f"; the published {name} has {published}"),
+            "black level": stated(options.black, f"{BLACK}, subtracted (the data set's page)"),
+            "saturation": stated(options.saturation, PEAK_RULE),
+            "mask": f"the calibration cube: rows from {CUBE_ROW} and columns from {CUBE_COLUMN} (the data set's page)",
+            "ground truth": f"{truths[truth].name}" + ("" if truth == "own" else f", the {truth} face of the cube"),
+        },
+    )
+
+
 """Black level of both cameras' files: "approximately 2048, not subtracted" (description.md)."""
 SIZE = (1728, 2592)
 """Height and width of Cube++, px (description.md)."""
