@@ -29,7 +29,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from evaluation.methods.prepared import GREY, PreparedImage, unit
+from evaluation.methods.prepared import GREY, PreparedImage, PreparedMethod, unit
 from evaluation.scene import Image
 
 SIGMA = 0.5
@@ -139,7 +139,7 @@ def grayness(strip: npt.NDArray[np.float32]) -> tuple[npt.NDArray[np.float32], n
 
 
 @dataclass(frozen=True)
-class GraynessIndex:
+class GraynessIndex(PreparedMethod):
     """Mean colour of the pixels with the lowest grayness index.
 
     - `name`: its name in tables.
@@ -159,14 +159,8 @@ class GraynessIndex:
     name: str = "Grayness Index"
     share: float = 0.001
 
-    def estimate(
-        self, image: Image, saturation: float | None = None, mask: npt.NDArray[np.bool_] | None = None
-    ) -> npt.NDArray[np.float64]:
-        """Return the light (3,) float64, camera RGB of length 1; see `method.Method.estimate`."""
-        return self.estimate_prepared(PreparedImage(image, saturation, mask))
-
     def estimate_prepared(self, prepared: PreparedImage) -> npt.NDArray[np.float64]:
-        """Return the same of a prepared image: (3,) float64."""
+        """Return the light of a prepared image: (3,) float64, camera RGB of length 1."""
         chosen = self.find(prepared)
         return unit(prepared.image[chosen].mean(axis=0, dtype=np.float64)) if chosen.any() else GREY
 
@@ -265,7 +259,7 @@ def angle_to_grey(strip: npt.NDArray[np.float32]) -> tuple[npt.NDArray[np.float3
 
 
 @dataclass(frozen=True)
-class MeanShiftedGrayPixel:
+class MeanShiftedGrayPixel(PreparedMethod):
     """Mean colour of the largest cluster of gray pixels.
 
     - `name`: its name in tables.
@@ -275,14 +269,8 @@ class MeanShiftedGrayPixel:
     name: str = "Mean-shifted Gray Pixel"
     share: float = 0.01
 
-    def estimate(
-        self, image: Image, saturation: float | None = None, mask: npt.NDArray[np.bool_] | None = None
-    ) -> npt.NDArray[np.float64]:
-        """Return the light (3,) float64, camera RGB of length 1; see `method.Method.estimate`."""
-        return self.estimate_prepared(PreparedImage(image, saturation, mask))
-
     def estimate_prepared(self, prepared: PreparedImage) -> npt.NDArray[np.float64]:
-        """Return the same of a prepared image: (3,) float64."""
+        """Return the light of a prepared image: (3,) float64, camera RGB of length 1."""
         index, usable = index_map(prepared, angle_to_grey)
         chosen = greyest(index, usable, self.share)
         if not chosen.any():

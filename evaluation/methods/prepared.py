@@ -31,45 +31,6 @@ Methods then return this very array, which distinguishes it from an estimate tha
 GREY.setflags(write=False)
 
 
-def usable(
-    image: npt.NDArray[np.integer[Any]] | npt.NDArray[np.floating[Any]],
-    saturation: float | None,
-    mask: npt.NDArray[np.bool_] | None,
-    border: int,
-) -> npt.NDArray[np.bool_]:
-    """Return (H, W) bool, True where a pixel may be used.
-
-    Left out are pixels of which a channel is saturated, with their eight neighbours; masked pixels; and `border` px
-    along every edge (J. van de Weijer's reference program of the Gray-Edge framework, 2007).
-
-    `image`: (H, W, 3) of any integer or float dtype, linear camera RGB. `saturation`: value from which a channel is
-    saturated; None if none is. `mask`: (H, W) bool, True where a pixel must not be used; None if every one may be.
-    `border`: pixels left out along every edge, px.
-
-    Examples
-    --------
-    >>> image = np.zeros((5, 6, 3))
-    >>> image[0, 0] = 900
-    >>> usable(image, saturation=800, mask=None, border=0).astype(int)
-    array([[0, 0, 1, 1, 1, 1],
-           [0, 0, 1, 1, 1, 1],
-           [1, 1, 1, 1, 1, 1],
-           [1, 1, 1, 1, 1, 1],
-           [1, 1, 1, 1, 1, 1]])
-    """
-    height, width = image.shape[:2]
-    free = np.ones((height, width), dtype=bool)
-    if saturation is not None:
-        free &= ~dilate_clipped(image, saturation)
-    if mask is not None:
-        free = free & ~mask
-    if border:
-        inside = np.zeros((height, width), dtype=bool)
-        inside[border:-border, border:-border] = True
-        free = free & inside
-    return np.asarray(free, dtype=bool)
-
-
 def dilate_clipped(
     image: npt.NDArray[np.integer[Any]] | npt.NDArray[np.floating[Any]], saturation: float
 ) -> npt.NDArray[np.bool_]:
@@ -153,11 +114,17 @@ _ALL = np.zeros((0, 0), dtype=bool)
 
 @runtime_checkable
 class PreparedMethod(Protocol):
-    """A method that can use what other methods have found of an image."""
+    """A method that can use what other methods have found of an image; a `Method` that inherits it has `estimate`."""
 
     def estimate_prepared(self, prepared: PreparedImage) -> npt.NDArray[np.float64]:
-        """Return what `Method.estimate` returns of the same image: (3,) float64 of length 1, or `pixels.GREY`."""
+        """Return what `Method.estimate` returns of the same image: (3,) float64 of length 1, or `GREY`."""
         ...
+
+    def estimate(
+        self, image: Image, saturation: float | None = None, mask: npt.NDArray[np.bool_] | None = None
+    ) -> npt.NDArray[np.float64]:
+        """Return the light (3,) float64, camera RGB of length 1; see `method.Method.estimate`."""
+        return self.estimate_prepared(PreparedImage(image, saturation, mask))
 
 
 class PreparedImage:
@@ -236,7 +203,19 @@ class PreparedImage:
         return self._free
 
     def usable(self, border: int = 0) -> npt.NDArray[np.bool_]:
-        """Return (H, W) bool, True where a pixel may be used and lies `border` px within every edge."""
+        """Return (H, W) bool, True where a pixel may be used and lies `border` px within every edge.
+
+        Examples
+        --------
+        >>> image = np.zeros((5, 6, 3))
+        >>> image[0, 0] = 900
+        >>> PreparedImage(image, saturation=800).usable().astype(int)
+        array([[0, 0, 1, 1, 1, 1],
+               [0, 0, 1, 1, 1, 1],
+               [1, 1, 1, 1, 1, 1],
+               [1, 1, 1, 1, 1, 1],
+               [1, 1, 1, 1, 1, 1]])
+        """
         free = self.free()
         if not border:
             return free if free.size else np.ones((self.height, self.width), dtype=bool)
@@ -344,7 +323,7 @@ class PreparedImage:
 
 
 def estimate(method: Method, prepared: PreparedImage) -> npt.NDArray[np.float64]:
-    """Return a method's estimate of a prepared image: (3,) float64 of length 1, or `pixels.GREY`.
+    """Return a method's estimate of a prepared image: (3,) float64 of length 1, or `GREY`.
 
     Examples
     --------
@@ -369,12 +348,7 @@ def estimate_all(
     `image`: (H, W, 3) uint16, float32 or float64. `saturation`, `mask`: see `Method.estimate`; the mask is (H, W) bool.
     """
     prepared = PreparedImage(image, saturation, mask)
-    return [
-        method.estimate_prepared(prepared)
-        if isinstance(method, PreparedMethod)
-        else method.estimate(image, saturation, mask)
-        for method in methods
-    ]
+    return [estimate(method, prepared) for method in methods]
 
 
 def _readable(image: npt.NDArray[Any]) -> Any:

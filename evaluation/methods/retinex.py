@@ -28,7 +28,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from evaluation.methods.prepared import GREY, PreparedImage, unit
+from evaluation.methods.prepared import GREY, PreparedImage, PreparedMethod, unit
 from evaluation.scene import Image
 from foundation.compiled import compiled
 
@@ -90,7 +90,7 @@ SPRAYS = 1000
 
 
 @dataclass(frozen=True)
-class ColorSparrow:
+class ColorSparrow(PreparedMethod):
     """Mean of local lights by random sprays.
 
     - `name`: its name in tables.
@@ -112,14 +112,8 @@ class ColorSparrow:
     kernel: int = 5
     seed: int = 0
 
-    def estimate(
-        self, image: Image, saturation: float | None = None, mask: npt.NDArray[np.bool_] | None = None
-    ) -> npt.NDArray[np.float64]:
-        """Return the light (3,) float64, camera RGB of length 1; see `method.Method.estimate`."""
-        return self.estimate_prepared(PreparedImage(image, saturation, mask))
-
     def estimate_prepared(self, prepared: PreparedImage) -> npt.NDArray[np.float64]:
-        """Return the same of a prepared image: (3,) float64."""
+        """Return the light of a prepared image: (3,) float64, camera RGB of length 1."""
         import cv2
 
         rows, columns = np.arange(0, prepared.height, self.step), np.arange(0, prepared.width, self.step)
@@ -152,7 +146,7 @@ def _sprays(seed: int, count: int) -> npt.NDArray[np.float64]:
 
 
 @dataclass(frozen=True)
-class ImprovedWhitePatch:
+class ImprovedWhitePatch(PreparedMethod):
     """Mean of the maxima of each channel over random samples of pixels.
 
     - `name`: its name in tables.
@@ -172,14 +166,8 @@ class ImprovedWhitePatch:
     samples: int = 20
     seed: int = 0
 
-    def estimate(
-        self, image: Image, saturation: float | None = None, mask: npt.NDArray[np.bool_] | None = None
-    ) -> npt.NDArray[np.float64]:
-        """Return the light (3,) float64, camera RGB of length 1; see `method.Method.estimate`."""
-        return self.estimate_prepared(PreparedImage(image, saturation, mask))
-
     def estimate_prepared(self, prepared: PreparedImage) -> npt.NDArray[np.float64]:
-        """Return the same of a prepared image: (3,) float64."""
+        """Return the light of a prepared image: (3,) float64, camera RGB of length 1."""
         free = prepared.free()
         flat = prepared.image.reshape(-1, 3)
         places = np.flatnonzero(free) if free.size else None
@@ -192,7 +180,7 @@ class ImprovedWhitePatch:
 
 
 @dataclass(frozen=True)
-class SurfaceReflectance:
+class SurfaceReflectance(PreparedMethod):
     """Ratio of the sum of values to the sum of locally normalised values.
 
     - `name`: its name in tables.
@@ -211,14 +199,8 @@ class SurfaceReflectance:
     name: str = "Local Surface Reflectance"
     patches: int = 10
 
-    def estimate(
-        self, image: Image, saturation: float | None = None, mask: npt.NDArray[np.bool_] | None = None
-    ) -> npt.NDArray[np.float64]:
-        """Return the light (3,) float64, camera RGB of length 1; see `method.Method.estimate`."""
-        return self.estimate_prepared(PreparedImage(image, saturation, mask))
-
     def estimate_prepared(self, prepared: PreparedImage) -> npt.NDArray[np.float64]:
-        """Return the same of a prepared image: (3,) float64."""
+        """Return the light of a prepared image: (3,) float64, camera RGB of length 1."""
         rows, columns = (
             np.arange(min(self.patches, size) + 1) * size // min(self.patches, size)
             for size in (prepared.height, prepared.width)

@@ -34,10 +34,9 @@ from evaluation.methods.gray_edge import GrayEdge
 from evaluation.methods.gray_pixels import GraynessIndex, LocalGraynessIndex, MeanShiftedGrayPixel
 from evaluation.methods.method import LocalMethod, Method
 from evaluation.methods.pca import BrightDark
-from evaluation.methods.prepared import GREY, PreparedImage, unit
+from evaluation.methods.prepared import GREY, PreparedImage, PreparedMethod, unit
 from evaluation.methods.retinex import ColorSparrow, ImprovedWhitePatch, SurfaceReflectance
 from evaluation.methods.wrapped import PatchwiseMethod
-from evaluation.scene import Image
 
 _TOP = 16383
 """Value that white gets: a quarter of uint16, so that a channel multiplied by up to 4 is not cut off."""
@@ -47,7 +46,7 @@ _ROWS = 256
 
 
 @dataclass(frozen=True)
-class OpenCvGrayWorld:
+class OpenCvGrayWorld(PreparedMethod):
     """Gray-world of OpenCV's xphoto over the pixels that are not too colourful: what a program that uses OpenCV gets.
 
     `GrayworldWB` corrects an image; the light is what it divides by: for each channel the sum before over the sum
@@ -66,14 +65,8 @@ class OpenCvGrayWorld:
 
     name: str = "Gray-world (OpenCV)"
 
-    def estimate(
-        self, image: Image, saturation: float | None = None, mask: npt.NDArray[np.bool_] | None = None
-    ) -> npt.NDArray[np.float64]:
-        """Return the light (3,) float64, camera RGB of length 1; see `method.Method.estimate`."""
-        return self.estimate_prepared(PreparedImage(image, saturation, mask))
-
     def estimate_prepared(self, prepared: PreparedImage) -> npt.NDArray[np.float64]:
-        """Return the same of a prepared image: (3,) float64."""
+        """Return the light of a prepared image: (3,) float64, camera RGB of length 1."""
         import cv2
 
         xphoto: Any = cv2.xphoto

@@ -21,7 +21,7 @@ import numpy as np
 import numpy.typing as npt
 
 from evaluation.methods.method import Method
-from evaluation.methods.prepared import GREY, PreparedImage, estimate
+from evaluation.methods.prepared import GREY, PreparedImage, PreparedMethod, estimate
 from evaluation.scene import Image
 
 PATCHES = 8
@@ -133,7 +133,7 @@ def _interpolate(
 
 
 @dataclass(frozen=True)
-class ResizedMethod:
+class ResizedMethod(PreparedMethod):
     """A method that sees images no larger than a given size.
 
     `longest`: longer side that images are shrunk to, px; smaller images are left as they are.
@@ -158,12 +158,6 @@ class ResizedMethod:
         """The method's name in tables, with the size."""
         return f"{self.method.name} at {self.longest} px"
 
-    def estimate(
-        self, image: Image, saturation: float | None = None, mask: npt.NDArray[np.bool_] | None = None
-    ) -> npt.NDArray[np.float64]:
-        """Return the light (3,) float64, camera RGB of length 1; see `method.Method.estimate`."""
-        return self.estimate_prepared(PreparedImage(image, saturation, mask))
-
     def estimate_prepared(self, prepared: PreparedImage) -> npt.NDArray[np.float64]:
-        """Return the same of a prepared image: (3,) float64."""
+        """Return the light of a prepared image: (3,) float64, camera RGB of length 1."""
         return estimate(self.method, prepared.at_most(self.longest))

@@ -1,4 +1,4 @@
-"""Methods on smaller images."""
+"""Which pixels of an image methods use, and methods on smaller images."""
 
 from __future__ import annotations
 
@@ -10,6 +10,19 @@ from evaluation.methods.prepared import GREY, PreparedImage, shrink
 from evaluation.methods.standard import standard_methods
 from evaluation.methods.wrapped import ResizedMethod
 from evaluation.metrics import recovery_error
+
+
+def test_which_pixels_are_used() -> None:
+    image = np.ones((7, 9, 3))
+    image[3, 4, 1] = 10
+    mask = np.zeros((7, 9), dtype=bool)
+    mask[1, 1] = True
+    used = PreparedImage(image, 10, mask).usable(1)
+    expected = np.zeros((7, 9), dtype=bool)
+    expected[1:6, 1:8] = True
+    expected[2:5, 3:6] = False
+    expected[1, 1] = False
+    np.testing.assert_array_equal(used, expected)
 
 
 def test_a_smaller_image_is_the_mean_of_usable_pixels() -> None:
