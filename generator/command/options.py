@@ -20,10 +20,10 @@ from foundation.console import Quiet, Verbose, Version
 from foundation.errors import InputError
 from foundation.json_output import AsJson
 from foundation.processors import processor_count
-from generator.dataset.making import Workers
 
 if TYPE_CHECKING:
     from calibration.table.lut import Lut
+    from generator.dataset.making import Workers
     from generator.dataset.plan import DatasetOptions
     from generator.lights.request import LightRequest
     from generator.pictures.picture import Preparation
@@ -60,9 +60,9 @@ def grouped(function: Callable[..., None]) -> Callable[..., None]:
     return command
 
 
-def option(metavar: str | None, text: str, panel: str, **more: Any) -> Any:
-    """Return typer's option with its help; a default of None is not shown, since the help says what it means."""
-    return typer.Option(metavar=metavar, help=text, rich_help_panel=panel, **more)
+def option(metavar: str | None, text: str, panel: str, *names: str, **more: Any) -> Any:
+    """Return typer's option with its help; `names` are its own where those of its field, or a --no-, would not do."""
+    return typer.Option(*names, metavar=metavar, help=text, rich_help_panel=panel, **more)
 
 
 _SOURCES = "Source pictures"
@@ -106,11 +106,7 @@ class PictureOptions:
     crop: Annotated[str | None, option("WxH", "Cut pictures to this size; smaller ones are left out.", _SOURCES)] = None
     cover: Annotated[
         bool,
-        typer.Option(
-            "--cover",
-            help="Make pictures as small as still covers the crop before they are cut.",
-            rich_help_panel=_SOURCES,
-        ),
+        option(None, "Make pictures as small as still covers the crop before they are cut.", _SOURCES, "--cover"),
     ] = False
     crop_at: Annotated[
         Literal["centre", "random"] | None,
@@ -241,18 +237,8 @@ class LightOptions:
         """Return the options as the generator's lights take them."""
         from generator.lights.request import LightRequest
 
-        return LightRequest(
-            illuminations=self.illuminations,
-            light=tuple(self.light or ()),
-            random=self.random,
-            distribution=self.distribution,
-            nearest=self.nearest,
-            match=self.match,
-            lights_by_name=self.lights_by_name,
-            outside=self.outside,
-            lights_per_image=self.lights_per_image,
-            masks=self.masks,
-        )
+        options: dict[str, Any] = {**vars(self), "light": tuple(self.light or ())}
+        return LightRequest(**options)
 
 
 @dataclass(frozen=True)
@@ -286,11 +272,12 @@ class ImageOptions:
     ] = None
     exact_split: Annotated[
         bool,
-        typer.Option(
-            "--exact-split",
-            help="With --split, parts of exactly these sizes, such as 700,200,100 of 1000 pictures; copies of a "
+        option(
+            None,
+            "With --split, parts of exactly these sizes, such as 700,200,100 of 1000 pictures; copies of a "
             "picture stay in one part.",
-            rich_help_panel=_IMAGES,
+            _IMAGES,
+            "--exact-split",
         ),
     ] = False
     bits: Annotated[
@@ -478,6 +465,8 @@ class WorkOptions:
 
     def makers(self) -> Workers:
         """Return who makes the images: as many as there are processors unless a number is given."""
+        from generator.dataset.making import Workers
+
         return Workers(self.engine, processor_count() if self.workers is None else self.workers)
 
 

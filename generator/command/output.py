@@ -12,14 +12,13 @@ from typing import TYPE_CHECKING, Final
 
 from foundation.console import shows_progress
 from foundation.trust.secret_texts import printable
-from generator.dataset.shards import SILENT, Callbacks
 
 if TYPE_CHECKING:
     from rich.progress import Progress
 
     from generator.dataset.plan import Plan
+    from generator.dataset.shards import Callbacks
     from generator.rendering.matrices import ColourMatrix
-
 
 SOON_S: Final = 0.5
 """Work that is done within so many seconds gets no bar but its last line: what draws bars takes a tenth to load."""
@@ -31,6 +30,8 @@ def shown_progress(images: int) -> Generator[Callbacks]:
 
     On a terminal that is a bar; elsewhere, and where the work is done at once, one line at the end.
     """
+    from generator.dataset.shards import SILENT, Callbacks
+
     if not shows_progress():
         yield SILENT
         return

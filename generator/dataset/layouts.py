@@ -31,7 +31,7 @@ from __future__ import annotations
 import io
 import json
 import tarfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
@@ -108,11 +108,6 @@ class ShardWriter(Protocol):
     def close(self) -> list[FileSum]:
         """Finish all files, bring them to the disk and return them in the order of their names or numbers."""
         ...
-
-
-def in_memory(sample: Sample) -> Sample:
-    """Return a sample whose bytes are all computed and in memory of their own."""
-    return replace(sample, files=tuple((kind, ending, (joined(data),)) for kind, ending, data in sample.files))
 
 
 def metadata_of(sample: Sample) -> dict[str, Any]:
@@ -192,39 +187,50 @@ class FolderWriter:
         self._thread.shutdown(cancel_futures=True)
 
 
-class TarWriter:
-    """Writes the images of a shard to `data/000003.tar`, or to one file for each part of the dataset."""
-
-    def __init__(self, store: Store, shard: int) -> None:
-        self._store = store
-        self._shard = shard_key(shard)
-        self._stack = ExitStack()
-        self._open: dict[str, tuple[tarfile.TarFile, HashingWriter]] = {}
-
-    def store(self, sample: Sample) -> Sample:
-        """Return the sample encoded: a tar file takes its members one after the other."""
-        return in_memory(sample)
+class _Container(Protocol):
+    """A file of a shard in which the files of several images lie, while it is written."""
 
     def append(self, sample: Sample) -> None:
         """Write an image and what belongs to it."""
-        name = f"{sample.split or 'data'}/{self._shard}.tar"
+        ...
+
+    def close(self) -> None:
+        """Write the end of the file."""
+        ...
+
+    def give_up(self) -> None:
+        """Write no end of a file that will not be."""
+        ...
+
+
+class JoinedWriter:
+    """The images of a shard in one file, `data/000003.tar` or `.parquet`, or in one for each part of the dataset.
+
+    `begin` makes such a file of the stream that it is written to.
+    """
+
+    def __init__(self, store: Store, shard: int, ending: str, begin: Callable[[HashingWriter], _Container]) -> None:
+        self._store, self._begin = store, begin
+        self._name = f"{shard_key(shard)}.{ending}"
+        self._stack = ExitStack()
+        self._open: dict[str, tuple[_Container, HashingWriter]] = {}
+
+    def store(self, sample: Sample) -> Sample:
+        """Return the sample with its bytes computed: such a file takes its images one after the other."""
+        return replace(sample, files=tuple((kind, ending, (joined(data),)) for kind, ending, data in sample.files))
+
+    def append(self, sample: Sample) -> None:
+        """Write an image and what belongs to it."""
+        name = f"{sample.split or 'data'}/{self._name}"
         if name not in self._open:
             hashed = HashingWriter(self._stack.enter_context(self._store.create(name)))
-            tar = tarfile.open(fileobj=cast("Any", hashed), mode="w", format=tarfile.USTAR_FORMAT)  # noqa: SIM115
-            self._open[name] = (tar, hashed)
-        tar = self._open[name][0]
-        text = json.dumps(metadata_of(sample), ensure_ascii=False) + "\n"
-        for kind, ending, pieces in (*sample.files, ("images", ".json", (text.encode(),))):
-            data = b"".join(pieces)
-            header = tarfile.TarInfo(member_name(kind, sample.key, ending))
-            header.size = len(data)
-            header.mode = 0o644
-            tar.addfile(header, io.BytesIO(data))
+            self._open[name] = (self._begin(hashed), hashed)
+        self._open[name][0].append(sample)
 
     def close(self) -> list[FileSum]:
         """Finish the files, bring them to the disk and return them."""
-        for tar, _ in self._open.values():
-            tar.close()
+        for container, _ in self._open.values():
+            container.close()
         self._stack.close()
         self._store.sync(self._open)
         return [FileSum(name=name, sha256=self._open[name][1].sha256) for name in sorted(self._open)]
@@ -233,7 +239,32 @@ class TarWriter:
         return self
 
     def __exit__(self, *error: *ExitReason) -> None:
+        """Leave no half file behind."""
+        for container, _ in self._open.values():
+            container.give_up()
         self._stack.__exit__(*error)
+
+
+class _Tar:
+    """A tar file of images and what belongs to each."""
+
+    def __init__(self, stream: HashingWriter) -> None:
+        self._tar = tarfile.open(fileobj=cast("Any", stream), mode="w", format=tarfile.USTAR_FORMAT)  # noqa: SIM115
+
+    def append(self, sample: Sample) -> None:
+        text = json.dumps(metadata_of(sample), ensure_ascii=False) + "\n"
+        for kind, ending, pieces in (*sample.files, ("images", ".json", (text.encode(),))):
+            data = joined(pieces)
+            header = tarfile.TarInfo(member_name(kind, sample.key, ending))
+            header.size = len(data)
+            header.mode = 0o644
+            self._tar.addfile(header, io.BytesIO(data))
+
+    def close(self) -> None:
+        self._tar.close()
+
+    def give_up(self) -> None:
+        pass
 
 
 def _read_tar_member(store: Store, container: str, file: str) -> bytes:
@@ -328,24 +359,34 @@ def schema(previews: bool, maps: bool, details: bool) -> pa.Schema:
     return pa.schema([(name, kind) for name, kind, _ in kept]).with_metadata({"huggingface": info})
 
 
-class _Part:
-    """One file that is being written."""
+class _Parquet:
+    """A Parquet file with one row an image."""
 
-    def __init__(self, stream: BinaryIO, columns: pa.Schema) -> None:
+    def __init__(self, stream: HashingWriter, columns: pa.Schema) -> None:
         import pyarrow.parquet as pq
 
-        self.hashed = HashingWriter(stream)
         self._schema = columns
         # Images are compressed already, and the few numbers beside them are not worth a reader's trouble.
         self._writer: pq.ParquetWriter = pq.ParquetWriter(
-            self.hashed, self._schema, compression="none", use_dictionary=False, write_statistics=["number"]
+            stream, self._schema, compression="none", use_dictionary=False, write_statistics=["number"]
         )
         self._rows: list[dict[str, Any]] = []
         self._size = 0
 
-    def append(self, row: dict[str, Any], size: int) -> None:
+    def append(self, sample: Sample) -> None:
+        metadata = metadata_of(sample)
+        row: dict[str, Any] = {"number": metadata.pop("image"), **metadata, "masks": []}
+        if "details" in row:
+            row["details"] = json.dumps(row["details"], ensure_ascii=False)
+        for kind, ending, pieces in sample.files:
+            data = joined(pieces)
+            self._size += len(data)
+            file = {"bytes": data, "path": f"{sample.key}{ending}"}
+            if kind == "masks":
+                row["masks"].append(file)
+            else:
+                row[_COLUMNS[kind]] = file
         self._rows.append(row)
-        self._size += size
         if self._size >= _GROUP_BYTES or len(self._rows) >= _GROUP_ROWS:
             self._flush()
 
@@ -354,7 +395,6 @@ class _Part:
         self._writer.close()
 
     def give_up(self) -> None:
-        """Keep pyarrow from writing the end of a file that will not be."""
         self._writer.is_open = False
 
     def _flush(self) -> None:
@@ -363,58 +403,6 @@ class _Part:
         if self._rows:
             self._writer.write_table(pa.Table.from_pylist(self._rows, self._schema))
         self._rows, self._size = [], 0
-
-
-class ParquetWriter:
-    """Writes the images of a shard to `data/000003.parquet`, or to one file for each part of the dataset."""
-
-    def __init__(self, store: Store, shard: int, previews: bool, maps: bool, details: bool) -> None:
-        self._store = store
-        self._shard = shard_key(shard)
-        self._schema = schema(previews, maps, details)
-        self._stack = ExitStack()
-        self._parts: dict[str, _Part] = {}
-
-    def store(self, sample: Sample) -> Sample:
-        """Return the sample encoded: a Parquet file takes its rows one after the other."""
-        return in_memory(sample)
-
-    def append(self, sample: Sample) -> None:
-        """Write the row of an image."""
-        name = f"{sample.split or 'data'}/{self._shard}.parquet"
-        if name not in self._parts:
-            self._parts[name] = _Part(self._stack.enter_context(self._store.create(name)), self._schema)
-        metadata = metadata_of(sample)
-        row: dict[str, Any] = {"number": metadata.pop("image"), **metadata, "masks": []}
-        if "details" in row:
-            row["details"] = json.dumps(row["details"], ensure_ascii=False)
-        size = 0
-        for kind, ending, pieces in sample.files:
-            data = b"".join(pieces)
-            size += len(data)
-            file = {"bytes": data, "path": f"{sample.key}{ending}"}
-            if kind == "masks":
-                row["masks"].append(file)
-            else:
-                row[_COLUMNS[kind]] = file
-        self._parts[name].append(row, size)
-
-    def close(self) -> list[FileSum]:
-        """Finish the files, bring them to the disk and return them."""
-        for part in self._parts.values():
-            part.close()
-        self._stack.close()
-        self._store.sync(self._parts)
-        return [FileSum(name=name, sha256=self._parts[name].hashed.sha256) for name in sorted(self._parts)]
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *error: *ExitReason) -> None:
-        """Leave no half file behind."""
-        for part in self._parts.values():
-            part.give_up()
-        self._stack.__exit__(*error)
 
 
 def _cell_of(file: str) -> tuple[str, int | None]:
@@ -473,9 +461,10 @@ def open_writer(layout: Layout, store: Store, shard: int, *, previews: bool, map
         case "folder":
             return FolderWriter(store)
         case "webdataset":
-            return TarWriter(store, shard)
+            return JoinedWriter(store, shard, "tar", _Tar)
         case "parquet":
-            return ParquetWriter(store, shard, previews, maps, details)
+            columns = schema(previews, maps, details)
+            return JoinedWriter(store, shard, "parquet", lambda stream: _Parquet(stream, columns))
 
 
 def read_member(layout: str, store: Store, container: str, file: str) -> bytes:

@@ -196,7 +196,7 @@ def test_names_of_engines(name: str, address: str | None) -> None:
 
 @pytest.mark.parametrize("name", ["ray", "dask://", "dask://node7", "tcp://node7:8786", ""])
 def test_an_unknown_engine_is_refused(name: str) -> None:
-    with pytest.raises(InputError, match="is no engine; use local, dask, or dask://HOST:PORT"):
+    with pytest.raises(InputError, match="dask://HOST:PORT"):
         parse_engine(name)
 
 
@@ -204,7 +204,7 @@ def test_a_scheduler_that_does_not_answer(
     make_lut: Callable[..., Lut], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("generator.dataset.making.CONNECT_S", 0.2)
-    with pytest.raises(InputError, match=r"no Dask scheduler answers at 127\.0\.0\.1:1: .*; start one with dask"):
+    with pytest.raises(InputError, match=r"127\.0\.0\.1:1"):
         generate_dataset(
             make_lut(), tmp_path / "out", random_scenes(2, 24, 16), [0], workers=Workers("dask://127.0.0.1:1")
         )

@@ -146,7 +146,7 @@ class TestExactSplit:
         # Three copies fit into the part of three alone, and have it before others.
         for seed in range(20):
             assert Counter(exact_parts(some, (1 / 2, 1 / 3, 1 / 6), seed)) == {"train": 3, "validation": 2, "test": 1}
-        with pytest.raises(InputError, match=r"3 copies of .*png stay in one part, and none .* exactly 2,2,2 has room"):
+        with pytest.raises(InputError, match=r"3.*2,2,2"):
             exact_parts(some, (1 / 3, 1 / 3, 1 / 3), 1)
 
     def test_datasets_are_divided_so_in_every_layout_and_share(self, lut: Lut) -> None:

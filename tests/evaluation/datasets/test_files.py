@@ -1,4 +1,4 @@
-"""Decoding and subtracting black, held against plain arithmetic."""
+"""Files of data sets: names, decoding and subtracting black, held against plain arithmetic."""
 
 from __future__ import annotations
 
@@ -64,10 +64,10 @@ def test_what_is_no_such_image(tmp_path: Path) -> None:
             decode_image(str(tmp_path / name))
         assert name in str(told.value)
     (tmp_path / "a.exr").write_bytes(b"")
-    with pytest.raises(FormatError, match=r"a\.exr ends in '\.exr', expected"):
+    with pytest.raises(FormatError, match=r"a\.exr.*'\.exr'"):
         decode_image(str(tmp_path / "a.exr"))
     (tmp_path / "grey.png").write_bytes(imagecodecs.png_encode(np.zeros((3, 4), np.uint16)))
-    with pytest.raises(FormatError, match=r"grey\.png holds an image \(3, 4\)"):
+    with pytest.raises(FormatError, match=r"grey\.png.*3.*4"):
         decode_image(str(tmp_path / "grey.png"))
 
 

@@ -1,4 +1,4 @@
-"""Errors by pixel and by region against images whose errors are known, and LSMI's figures formulated anew."""
+"""Errors against angles known from geometry, summaries against MATLAB and numbers by hand, maps against LSMI."""
 
 from __future__ import annotations
 
@@ -7,9 +7,51 @@ import math
 import numpy as np
 import numpy.typing as npt
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from evaluation import metrics as maps
-from evaluation.metrics import measure_map, recovery_error, reproduction_error
+from evaluation.metrics import measure_map, percentiles, recovery_error, reproduction_error, summarise
+from foundation.errors import InputError
+
+lights = st.tuples(*[st.floats(0.01, 100)] * 3)
+
+
+def test_recovery_is_the_angle_between_the_lights() -> None:
+    assert recovery_error([1, 0, 0], [0, 2, 0]) == pytest.approx(90)
+    assert recovery_error([1, 1, 0], [1, 0, 0]) == pytest.approx(45)
+    assert recovery_error([1, 1, 1], [1, 0, 0]) == pytest.approx(math.degrees(math.acos(1 / math.sqrt(3))))
+
+
+def test_reproduction_is_the_angle_of_the_corrected_white() -> None:
+    # White (2, 1, 1) under an estimate of grey stays (2, 1, 1): cos = 4 / (sqrt 6 sqrt 3).
+    assert reproduction_error([1, 1, 1], [2, 1, 1]) == pytest.approx(math.degrees(math.acos(4 / math.sqrt(18))))
+    # One channel of the estimate at zero: the corrected white is that channel alone.
+    assert reproduction_error([0, 1, 1], [1, 1, 1]) == pytest.approx(math.degrees(math.acos(1 / math.sqrt(3))))
+
+
+@settings(deadline=None)
+@given(lights, lights, st.floats(0.001, 1000))
+def test_brightness_does_not_matter(estimate: tuple[float, ...], truth: tuple[float, ...], scale: float) -> None:
+    for error in (recovery_error, reproduction_error):
+        angle = error(estimate, truth)
+        assert error(np.multiply(estimate, scale), truth) == pytest.approx(float(angle), abs=1e-6)
+        assert 0 <= angle <= 90
+        assert error(estimate, estimate) == pytest.approx(0, abs=1e-6)
+
+
+@settings(deadline=None)
+@given(lights, lights)
+def test_reproduction_does_not_change_with_the_light(estimate: tuple[float, ...], truth: tuple[float, ...]) -> None:
+    # Finlayson's argument for it: a change of light scales estimate and truth alike.
+    light = np.array([3.0, 0.5, 1.7])
+    moved = reproduction_error(np.multiply(estimate, light), np.multiply(truth, light))
+    assert moved == pytest.approx(float(reproduction_error(estimate, truth)), abs=1e-6)
+
+
+def test_small_angles_keep_their_digits() -> None:
+    assert recovery_error([1, 1e-9, 0], [1, 0, 0]) == pytest.approx(math.degrees(1e-9), rel=1e-6)
+
 
 RED, WHITE = np.array([1.0, 0.5, 0.5]), np.array([1.0, 1, 1])
 LIGHTS = np.stack([RED, WHITE])
@@ -105,3 +147,42 @@ def test_an_estimate_without_a_channel() -> None:
     error = measure_map(np.array([1.0, 1, 0]), weights @ LIGHTS, weights, LIGHTS, weights @ LIGHTS)
     assert error.reproduction == pytest.approx(math.degrees(math.acos(1 / math.sqrt(3))))
     assert np.isfinite(error.rgb)
+
+
+def test_the_summary_of_eight_errors() -> None:
+    # By MATLAB's prctile the errors stand at 6.25, 18.75, 31.25 ... percent: Q1 = 2.5, Q2 = 4.5, Q3 = 6.5.
+    summary = summarise([8, 1, 7, 2, 6, 3, 5, 4])
+    assert summary.as_tuple() == pytest.approx((4.5, 4.5, 4.5, 1.5, 7.5, (4.5**3 * 1.5 * 7.5) ** 0.2))
+    assert summary.maximum == 8
+    assert summary.below3 == 2 / 8  # 3 itself is not below 3.
+
+
+def test_the_summary_of_five_errors() -> None:
+    # At 10, 30, 50, 70, 90 percent: Q1 = 1 + 0.75 = 1.75, Q3 = 4 + 0.25 * 6 = 5.5; with 1, 2, 3, 4, 10.
+    summary = summarise([1, 2, 3, 4, 10])
+    assert summary.as_tuple()[:5] == pytest.approx((4, 3, (1.75 + 6 + 5.5) / 4, 1, 10))
+
+
+def test_the_95th_percentile_of_twenty_errors() -> None:
+    # The 19th of 20 stands at 92.5 percent, the 20th at 97.5: half-way.
+    assert summarise(np.arange(1, 21)).p95 == pytest.approx(19.5)
+
+
+def test_percentiles_are_matlab_s() -> None:
+    # prctile([1 2 3 4 5 6], [25 50 75]): 1.5 places in steps of 100 / 6 from 8.33 percent; the ends stay the ends.
+    assert percentiles([6, 5, 4, 3, 2, 1], (25, 50, 75)) == pytest.approx((2, 3.5, 5))
+    assert percentiles([6, 5, 4, 3, 2, 1], (0, 5, 100)) == pytest.approx((1, 1, 6))
+
+
+def test_one_error_is_every_statistic() -> None:
+    assert summarise([7.0]).as_tuple() == pytest.approx((7.0,) * 6)
+
+
+def test_perfect_estimates_have_an_average_of_zero() -> None:
+    assert summarise(np.zeros(9)).avg == 0
+
+
+@pytest.mark.parametrize("errors", [[], [1.0, math.nan], [math.inf]])
+def test_nothing_to_sum_up_is_said(errors: list[float]) -> None:
+    with pytest.raises(InputError, match="nothing to sum up"):
+        summarise(errors)
