@@ -69,11 +69,11 @@ class LikenessOptions:
 
 @dataclass(frozen=True)
 class Chosen:
-    """Sources and lights of a dataset, and what is recorded and told of how they were chosen.
+    """Sources and lights of a dataset, and what is recorded and printed of how they were chosen.
 
     - `sources`, `choice`: the sources and the lights.
     - `reading`: how sources were read, as plain values.
-    - `told`: lines to print.
+    - `lines`: lines to print.
     - `crops`: crops of each picture.
     - `weighted`: whether sources were drawn by weights.
     - `exposure`: how images are exposed; None as the table.
@@ -82,7 +82,7 @@ class Chosen:
     sources: tuple[Source, ...]
     choice: LightChoice
     reading: Mapping[str, Any]
-    told: tuple[str, ...] = ()
+    lines: tuple[str, ...] = ()
     crops: int = 1
     weighted: bool = False
     exposure: ExposureChoice | None = None
@@ -155,19 +155,19 @@ def _like(
         "images": target.images,
         "in": parts,
     }
-    told = cautions(target)
+    lines = cautions(target)
     if "size" in parts:
         size = like_size(target, pictures.find(seed))
         if size is None:
-            told.append(f"size: {target.name} is of thumbnails, whose size is not followed; pictures keep theirs")
+            lines.append(f"size: {target.name} is of thumbnails, whose size is not followed; pictures keep theirs")
         else:
             pictures = replace(pictures, crop=f"{size.width}x{size.height}", cover=True)
             record["size"] = size.describe()
-            told.append(size.sentence())
+            lines.append(size.sentence())
     if "lights" in parts:
         light = replace(light, distribution=str(path))
         record["lights"], sentence = _lights_within(lut, target)
-        told.append(sentence)
+        lines.append(sentence)
     exposure = None
     if "exposure" in parts:
         exposure = like_exposure(target)
@@ -176,16 +176,16 @@ def _like(
                 f"{target.file} knows no exposure, since the saturation of {target.name} was not known; describe it "
                 "with --saturation, or leave exposure out of --like-in"
             )
-        told.append(exposure_sentence(target))
+        lines.append(exposure_sentence(target))
     sources = pictures.find(seed)
     if "pictures" in parts:
         drawn = _drawn(lut, target, sources, rendered, likeness.draw, seed, workers)
         sources = drawn_sources(sources, drawn)
         record["pictures"] = drawn.describe()
-        told += [*drawn.sentences(), *remedies(drawn, rendered), light_caution(lut, target)]
+        lines += [*drawn.sentences(), *remedies(drawn, rendered), light_caution(lut, target)]
     choice = light.request().choose(lut, seed, [source.name for source in sources], pictures.crops)
     reading = {**pictures.preparation(seed).describe(), "like": record}
-    return Chosen(sources, choice, reading, tuple(told), pictures.crops, "pictures" in parts, exposure)
+    return Chosen(sources, choice, reading, tuple(lines), pictures.crops, "pictures" in parts, exposure)
 
 
 def _parts(
@@ -306,12 +306,12 @@ def _same_scenes(lut: Lut, place: str, pictures: PictureOptions, light: LightOpt
     found = prepared.find(seed) if prepared.sources else ()
     sources = scenes_of(dataset, found)
     reading = {**prepared.preparation(seed).describe(), "lights_of": {"pictures_seed": seed}}
-    told = [
+    lines = [
         f"{place} was made with {name.replace('_', ' ')}; here it is what the options say"
         for name in ("variation", "rendering", "black_point")
         if name in dataset.description.options
     ]
-    return Chosen(sources, lights_of(dataset, lut), reading, tuple(told), prepared.crops)
+    return Chosen(sources, lights_of(dataset, lut), reading, tuple(lines), prepared.crops)
 
 
 def _prepared_as(pictures: PictureOptions, made: Mapping[str, Any], place: str) -> PictureOptions:

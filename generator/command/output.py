@@ -36,11 +36,11 @@ def shown_progress(images: int) -> Generator[Callbacks]:
         yield SILENT
         return
     with ExitStack() as shown:
-        told = _Images(images, shown)
+        count = _Images(images, shown)
         try:
-            yield Callbacks(on_done=told.leave_out, on_image=told.advance, on_skip=told.skip, on_wait=told.warn)
+            yield Callbacks(on_done=count.leave_out, on_image=count.advance, on_skip=count.skip, on_wait=count.warn)
         finally:
-            told.end()
+            count.end()
 
 
 class _Images:
@@ -124,13 +124,13 @@ def matrix_sentence(matrix: ColourMatrix, camera: str, *, chosen: bool) -> str:
     """Return which colour matrix is taken, where it comes from, and what to mind if the table gave it."""
     from generator.rendering.table_matrix import TABLE
 
-    told = f"colour matrix: {matrix.name} ({matrix.source})"
+    sentence = f"colour matrix: {matrix.name} ({matrix.source})"
     if matrix.name != TABLE:
-        return told
+        return sentence
     why = "" if chosen else f"that of {camera} is not known, so this one was fitted; "
     return (
-        f"{told}; {why}if the print's colours were not managed, its faults are in the matrix as well: --matrix NAME "
-        "or FILE takes that of a camera"
+        f"{sentence}; {why}if the print's colours were not managed, its faults are in the matrix as well: --matrix "
+        "NAME or FILE takes that of a camera"
     )
 
 

@@ -245,7 +245,7 @@ class DrawnPictures:
         }
 
     def sentences(self) -> list[str]:
-        """Return what is to be told of it, a line each."""
+        """Return what is to be said of it, a line each."""
         head = (
             f"{len(self.places)} draws of {self.distinct} pictures, of {int((self.weights > 0).sum())} measured; their "
             f"weights are worth {self.effective:.0f} equal ones"
@@ -253,8 +253,8 @@ class DrawnPictures:
         black: list[str] = []
         if self.blacks is not None:
             low, middle, high = np.percentile(self.blacks, (10, 50, 90), method="hazen")
-            told = f"{middle:.2f} in the median, {low:.2f} to {high:.2f} of eight images of ten"
-            black.append(f"share of the print's black taken out: {told}")
+            shares = f"{middle:.2f} in the median, {low:.2f} to {high:.2f} of eight images of ten"
+            black.append(f"share of the print's black taken out: {shares}")
         return [head, *black, *(made.sentence() for made in self.reached)]
 
 
@@ -339,16 +339,16 @@ def drawn_sources(sources: Sequence[Source], drawn: DrawnPictures) -> tuple[Weig
 
 def cautions(target: RealStatistics) -> list[str]:
     """Return what makes a target less to be trusted than it looks."""
-    told: list[str] = []
+    lines: list[str] = []
     if target.may_be_encoded:
-        told.append(
+        lines.append(
             f"the images of {target.name} are in the median {float(np.median(target.known('luminance_50'))):.2f} as "
             "bright as their highlights, raw ones about .15 to .2: if they are encoded for a display, describe linear "
             "ones"
         )
     if target.images < _FEW:
-        told.append(f"{target.name} has {target.images} images: what they are like is known roughly, and followed so")
-    return told
+        lines.append(f"{target.name} has {target.images} images: what they are like is known roughly, and followed so")
+    return lines
 
 
 def _weights(
@@ -402,24 +402,24 @@ def remedies(drawn: DrawnPictures, options: DatasetOptions) -> list[str]:
     apart = {made.name: made for made in drawn.reached if not made.is_alike}
     if not apart:
         return []
-    told: list[str] = []
+    lines: list[str] = []
     shadows, chroma = apart.get("luminance_1"), apart.get("chroma_spread")
     bright = shadows is not None and shadows.after > shadows.wanted
     pale = chroma is not None and chroma.after < chroma.wanted
     if (bright or pale) and options.rendering == "codes":
-        told.append(
+        lines.append(
             "--rendering colorimetric: by codes a picture has the contrast and chroma of the print, mostly less than "
             "the scene's"
         )
     if (shadows is not None or pale) and options.black_point.kind != "like":
-        told.append(
+        lines.append(
             "--black-point like: the print's own black lifts shadows and makes colours pale, and of each picture as "
             "much of it is taken out as makes it like the real ones"
         )
-    told.append(
+    lines.append(
         "more pictures with --sources, or several crops of each (--crop WxH --crops N): there is more to choose from"
     )
-    return [f"what may help: {line}" for line in told]
+    return [f"what may help: {line}" for line in lines]
 
 
 def light_caution(lut: Lut, target: RealStatistics) -> str:

@@ -75,8 +75,8 @@ def charts(
         other = read_mask(mask)
         if overlap(boxes[number], other) < _ALIKE:
             raise FormatError(
-                f"{mask} has the chart of {names[number]} in {_told(other)}, but {_COORDS} of {path}, row "
-                f"{number + 1}, in {_told(boxes[number])}, expected the same chart in both; restore the one that is "
+                f"{mask} has the chart of {names[number]} in {_named(other)}, but {_COORDS} of {path}, row "
+                f"{number + 1}, in {_named(boxes[number])}, expected the same chart in both; restore the one that is "
                 f"wrong, or move {_MASKS} away to use the .mat alone"
             )
         compared += 1
@@ -123,7 +123,7 @@ def _rounded(value: float) -> int:
     return max(math.floor(value + 0.5), 1)
 
 
-def _told(box: Box) -> str:
+def _named(box: Box) -> str:
     return f"rows {box[0]} to {box[1]} and columns {box[2]} to {box[3]}"
 
 
@@ -190,21 +190,19 @@ def open_nus8(place: str, options: DataOptions, listed: Folder | None = None) ->
     camera = choose(options.camera, tables, "camera", place)
     scenes: list[RawScene] = []
     notes: list[str] = []
-    levels: list[str] = []
+    blacks: list[str] = []
+    whites: list[str] = []
     sources: dict[str, list[str]] = {}
     for name, path in tables.items():
         if camera in (None, name):
-            found, note, level, source = _open_camera(folder, name, path, options)
+            found, note, (black, white), source = _open_camera(folder, name, path, options)
             scenes.extend(found)
             published = _PUBLISHED.get(name, len(found))
             of = "" if len(found) == published else f" (published: {published})"
             notes.append(f"{name} {note}{of}")
-            levels.append(f"{name} {level}")
+            blacks.append(f"{name} {black:g}")
+            whites.append(f"{name} {white:g}")
             sources.setdefault(source, []).append(name)
-    black = "darkness_level of the camera's .mat, subtracted: " + ", ".join(level.split("/")[0] for level in levels)
-    white = "from saturation_level of the camera's .mat: " + ", ".join(
-        f"{level.split(' ')[0]} {level.split('/')[1]}" for level in levels
-    )
     return SceneSet(
         name=f"NUS {camera}" if camera else ("NUS 8" if len(tables) > 1 else f"NUS {next(iter(tables))}"),
         layout="nus8",
@@ -212,8 +210,12 @@ def open_nus8(place: str, options: DataOptions, listed: Folder | None = None) ->
         scenes=tuple(scenes),
         treatment={
             "images": ", ".join(notes),
-            "black level": stated(options.black, black),
-            "saturation": stated(options.saturation, white),
+            "black level": stated(
+                options.black, f"darkness_level of the camera's .mat, subtracted: {', '.join(blacks)}"
+            ),
+            "saturation": stated(
+                options.saturation, f"from saturation_level of the camera's .mat: {', '.join(whites)}"
+            ),
             "mask": "the chart: "
             + "; ".join(f"of {', '.join(of)} by {how}" if len(sources) > 1 else how for how, of in sources.items()),
             "ground truth": "groundtruth_illuminants of the .mat",
@@ -227,8 +229,10 @@ def _tables(folder: Folder) -> Iterator[Path]:
         yield from (place.path / name for name in place.files if name.endswith(_ENDING) and len(name) > len(_ENDING))
 
 
-def _open_camera(root: Folder, camera: str, path: Path, options: DataOptions) -> tuple[list[RawScene], str, str, str]:
-    """Return the scenes of a camera, a note on their number, "black/white" of its levels, and the charts' source."""
+def _open_camera(
+    root: Folder, camera: str, path: Path, options: DataOptions
+) -> tuple[list[RawScene], str, tuple[float, float], str]:
+    """Return the scenes of a camera, a note on their number, black and white level, and the charts' source."""
     content = read_mat(path)
     lights = table(content, "groundtruth_illuminants", path, 3)
     folder, images = _images(root, camera, path)
@@ -257,7 +261,7 @@ def _open_camera(root: Folder, camera: str, path: Path, options: DataOptions) ->
         )
         for number in kept
     ]
-    return scenes, note, f"{black:g}/{white:g}", source
+    return scenes, note, (black, white), source
 
 
 def _images(root: Folder, camera: str, path: Path) -> tuple[Path, dict[str, str]]:
