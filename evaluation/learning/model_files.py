@@ -62,7 +62,7 @@ class TrainingRecord:
     date
         ISO 8601, UTC.
     images
-        (N, 2) uint64, by what each image is known again, see `datasets.identities`; no row in a file that was made
+        (N, 2) uint64, by what each image is known again, see `datasets.identity`; no row in a file that was made
         before model files had them.
     """
 
