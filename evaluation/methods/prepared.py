@@ -327,7 +327,7 @@ def usable(
 ) -> npt.NDArray[np.bool_]:
     """Return (H, W) bool, True where a pixel may be used, for a method that prepares nothing.
 
-    See `PreparedImage.usable`. `image`: (H, W, 3), linear camera RGB. `saturation`, `mask`: as `Method.estimate` has them.
+    See `PreparedImage.usable`. `image`: (H, W, 3), linear camera RGB. `saturation`, `mask`: as of `Method.estimate`.
     `border`: px along every edge.
     """
     return PreparedImage(image, saturation, mask).usable(border)
