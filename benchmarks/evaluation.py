@@ -22,7 +22,7 @@ import numpy as np
 import numpy.typing as npt
 
 from benchmarks.generator import noisy_table, photograph, report
-from evaluation.methods.filters.gaussian import gaussian_kernel
+from evaluation.methods.gaussian import gaussian_kernel
 from evaluation.methods.gray_edge import GrayEdge
 from evaluation.methods.method import Method
 from evaluation.methods.pca import BrightDark

@@ -39,7 +39,7 @@ from foundation.processors import processor_count
 from generator.dataset.making import DatasetOptions, generate_dataset
 from generator.files import encode_pieces
 from generator.pictures.sources import find_pictures
-from generator.stores.store import LocalStore
+from generator.stores import LocalStore
 
 SMALL_PICTURES = 400
 """Pictures of 512 px: as many make what a data set takes once a small part."""

@@ -14,7 +14,6 @@ from foundation.errors import InputError
 from foundation.processors import processor_count
 from foundation.secret_texts import masked, printable
 from generator.command.demo_table import table_folder
-from generator.command.grouping import grouped
 from generator.command.likeness_options import LikenessOptions, choose
 from generator.command.options import (
     CommonOptions,
@@ -25,13 +24,14 @@ from generator.command.options import (
     RenderingOptions,
     VariationOptions,
     WorkOptions,
+    grouped,
 )
-from generator.command.rendering_told import cells_sentences, matrix_sentence
+from generator.command.output import cells_sentences, matrix_sentence
 
 if TYPE_CHECKING:
     from calibration.table.lut import Lut
-    from generator.dataset.production.plan import Plan
-    from generator.dataset.production.workers import Workers
+    from generator.dataset.making import Workers
+    from generator.dataset.plan import Plan
     from generator.dataset.reader import Dataset
 
 app = new_app()
@@ -74,18 +74,18 @@ def generate(
     sheet = images.contact_sheet
     if sheet is not None:
         _check_sheet(sheet, work.verify or work.finish or places.out, work.shard, again=work.verify is None)
-    with json_output("generate", common.as_json) as told:
+    with json_output("generate", common.as_json) as output:
         if work.verify is not None:
             loaded()
-            _draw_sheet(_verify(work.verify, work.workers, told), work.verify, sheet)
+            _draw_sheet(_verify(work.verify, work.workers, output), work.verify, sheet)
         elif work.finish is not None:
             from generator.dataset.making import finish_dataset
-            from generator.dataset.production.workplace import holds_dataset
+            from generator.dataset.workplace import holds_dataset
 
             loaded()
             was_there = holds_dataset(work.finish)
             dataset = finish_dataset(work.finish)
-            _print_summary(dataset, work.finish, told, was_there)
+            _print_summary(dataset, work.finish, output, was_there)
             _draw_sheet(dataset, work.finish, sheet)
         else:
             if places.lut is None or places.out is None:
@@ -100,12 +100,12 @@ def generate(
             plan = _plan(places.lut, places.out, pictures, light, likeness, rendering, variation, images, work)
             there = made_before(plan, places.out)
             if there is not None:
-                _print_summary(there, places.out, told, was_there=True)
+                _print_summary(there, places.out, output, was_there=True)
                 _draw_sheet(there, places.out, sheet)
             elif work.shard is not None:
-                _make_share(plan, places.out, work.shard, workers, told)
+                _make_share(plan, places.out, work.shard, workers, output)
             else:
-                dataset = _make_whole(plan, places.out, workers, told)
+                dataset = _make_whole(plan, places.out, workers, output)
                 _draw_sheet(dataset, places.out, sheet)
 
 
@@ -131,16 +131,15 @@ def _plan(
 ) -> Plan:
     """Return the plan of a dataset whose place is free, or holds a dataset, which may be the one planned."""
     from calibration.table.lut import open_lut
-    from generator.dataset.production.options import DatasetOptions
-    from generator.dataset.production.plan import Plan
-    from generator.dataset.production.workplace import holds_dataset, require_free_place
+    from generator.dataset.plan import DatasetOptions, Plan
+    from generator.dataset.workplace import holds_dataset, require_free_place
 
     if not holds_dataset(out):
         require_free_place(out)
     table = open_lut(table_folder(lut))
     rendered = rendering.of(DatasetOptions(bits=images.bits), table)
     chosen = choose(table, likeness, pictures, light, variation, rendered, images.seed, processor_count())
-    for line in (*chosen.told, *_tint_caution(table, rendering.rendering)):
+    for line in (*chosen.lines, *_tint_caution(table, rendering.rendering)):
         print(line)
     varied = variation.variation(table, chosen.exposure)
     options = images.dataset_options(work.shard_images, chosen.reading, varied, chosen.crops, chosen.weighted)
@@ -163,28 +162,27 @@ def _tint_caution(table: Lut, rendering: str | None) -> tuple[str, ...]:
     )
 
 
-def _make_whole(plan: Plan, out: str, workers: Workers, told: JsonOutput) -> Dataset:
-    from generator.command.progress import shown_progress
+def _make_whole(plan: Plan, out: str, workers: Workers, output: JsonOutput) -> Dataset:
+    from generator.command.output import shown_progress
     from generator.dataset.making import make_dataset
 
     _print_cells(plan, range(plan.shards))
     with shown_progress(plan.total) as callbacks:
         dataset = make_dataset(plan, out, workers, callbacks)
-    _print_summary(dataset, out, told)
+    _print_summary(dataset, out, output)
     return dataset
 
 
-def _make_share(plan: Plan, out: str, shard: str, workers: Workers, told: JsonOutput) -> None:
-    from generator.command.progress import shown_progress
-    from generator.dataset.making import make_share
-    from generator.dataset.production.workers import parse_share
+def _make_share(plan: Plan, out: str, shard: str, workers: Workers, output: JsonOutput) -> None:
+    from generator.command.output import shown_progress
+    from generator.dataset.making import make_share, parse_share
 
     share = parse_share(shard)
     shards = range(share[0], plan.shards, share[1])
     _print_cells(plan, shards)
     with shown_progress(sum(map(plan.images_of, shards))) as callbacks:
         done, every = make_share(plan, out, share, workers, callbacks)
-    told.add(dataset=masked(out), shard=shard, shards_done=done, shards=every)
+    output.add(dataset=masked(out), shard=shard, shards_done=done, shards=every)
     finish = f"make a dataset of them with generate --finish {out}"
     left = finish if done == every else "others are still to be made"
     print(masked(f"{done} of {every} shards of {out} are done; {left}"))
@@ -196,7 +194,7 @@ def _print_cells(plan: Plan, shards: range) -> None:
         print(line, flush=True)
 
 
-def _print_summary(dataset: Dataset, out: str, told: JsonOutput, was_there: bool = False) -> None:
+def _print_summary(dataset: Dataset, out: str, output: JsonOutput, was_there: bool = False) -> None:
     made = dataset.description
     lights = len({light for entry in dataset.entries for light in entry.lights})
     # A picture that was drawn several times is a source each time; one that was made and not read has no hash.
@@ -204,7 +202,7 @@ def _print_summary(dataset: Dataset, out: str, told: JsonOutput, was_there: bool
     pictures = _counted(made.sources, "picture")
     if different < made.sources:
         pictures += f", {different} of them different,"
-    told.add(
+    output.add(
         dataset=masked(out),
         made=not was_there,
         images=made.images,
@@ -242,14 +240,13 @@ def _counted(number: int, thing: str) -> str:
     return f"{number} {thing}{'' if number == 1 else 's'}"
 
 
-def _verify(out: str, workers: int | None, told: JsonOutput) -> Dataset:
+def _verify(out: str, workers: int | None, output: JsonOutput) -> Dataset:
     """Print every fault of a dataset and return it; a QualityError if there is one."""
     from foundation.console import progress
     from foundation.errors import QualityError
-    from generator.dataset.production.workers import Workers
-    from generator.dataset.reader import open_dataset
-    from generator.dataset.verification import file_faults
-    from generator.stores.places import is_remote
+    from generator.dataset.making import Workers
+    from generator.dataset.reader import file_faults, open_dataset
+    from generator.stores import is_remote
 
     by_default = max(processor_count(), _STORE_READERS if is_remote(out) else 1)
     at_once = Workers(count=by_default if workers is None else workers).count
@@ -258,14 +255,14 @@ def _verify(out: str, workers: int | None, told: JsonOutput) -> Dataset:
         for fault in file_faults(out, shown, workers=at_once):
             print(printable(fault))
             faults.append(printable(fault))
-    told.add(dataset=masked(out), faults=faults)
+    output.add(dataset=masked(out), faults=faults)
     if faults:
         raise QualityError(
             f"{out} is not as it was made: {_counted(len(faults), 'fault')}, listed above; make it again, or copy it "
             "again"
         )
     dataset = open_dataset(out)
-    told.add(images=dataset.description.images)
+    output.add(images=dataset.description.images)
     print(f"{masked(out)}: {_counted(dataset.description.images, 'image')}, every file as it was made")
     return dataset
 
@@ -275,8 +272,8 @@ def _check_sheet(contact_sheet: Path, out: str | None, shard: str | None, again:
 
     One that is there is refused unless a dataset is, too, where the command may have made both before.
     """
-    from generator.dataset.production.workplace import holds_dataset
-    from generator.stores.places import is_remote, local_path
+    from generator.dataset.workplace import holds_dataset
+    from generator.stores import is_remote, local_path
 
     if shard is not None:
         raise InputError(

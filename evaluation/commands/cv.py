@@ -124,7 +124,7 @@ def cv(
 
 def _parted_copies(data: SceneSet, folds: npt.NDArray[np.int64]) -> list[str]:
     """Return a sentence where images (N,) int64 by their folds are copies of images of other folds."""
-    from evaluation.datasets.states import first_copies
+    from evaluation.datasets.identity import first_copies
     from foundation.errors import counted, first_of
 
     names = [scene.name for scene in data.scenes]

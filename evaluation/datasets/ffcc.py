@@ -13,9 +13,8 @@ from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
 
-from evaluation.datasets.names import Folder
+from evaluation.datasets.files import BesideTextScene, Folder, Mask, decode_image, subtract_black
 from evaluation.datasets.options import DataOptions, stated
-from evaluation.datasets.raw_scene import BesideTextScene, Mask, decode_image, subtract_black
 from evaluation.scene import Image, SceneSet
 from foundation.errors import FormatError, first_of
 

@@ -7,14 +7,15 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from evaluation.datasets.ffcc import is_ffcc, open_ffcc
+from evaluation.datasets.files import Folder
 from evaluation.datasets.generated import open_generated
-from evaluation.datasets.names import Folder
 from evaluation.datasets.options import DataOptions
 from evaluation.datasets.plain_folder import is_plain_folder, open_plain_folder
-from evaluation.datasets.published.cube_plus import is_cube_plus, open_cube_plus
-from evaluation.datasets.published.cube_plus_plus import (
+from evaluation.datasets.published.cube import (
+    is_cube_plus,
     is_cube_plus_plus,
     is_simple_cube,
+    open_cube_plus,
     open_cube_plus_plus,
     open_simple_cube,
 )

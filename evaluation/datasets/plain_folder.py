@@ -17,17 +17,15 @@ refused, so that none is left out unseen. Pictures for the eye are refused: JPEG
 from __future__ import annotations
 
 import os
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
 import numpy as np
 
-from evaluation.datasets.names import IMAGE_ENDINGS, Folder
+from evaluation.datasets.files import IMAGE_ENDINGS, Folder, Light, Mask, RawScene, light_of, number_of, read_rows
 from evaluation.datasets.options import DataOptions, stated
-from evaluation.datasets.raw_scene import Mask, RawScene
-from evaluation.datasets.truths import Light, light_of, number_of, read_rows
 from evaluation.scene import Image, SceneSet
 from foundation.errors import FormatError, InputError, first_of
 
@@ -168,10 +166,7 @@ def _table_of(place: Path, listed: Folder | None) -> Path:
 
 def _tables(folder: Folder) -> list[str]:
     """Return the names of the .csv files of a folder that have the columns of such a table."""
-    return list(_with_columns(folder))
-
-
-def _with_columns(folder: Folder) -> Iterator[str]:
+    found: list[str] = []
     for name in [name for name in folder.files if name.lower().endswith(".csv")][:_MOST]:
         try:
             with (folder.path / name).open(encoding="utf-8-sig") as file:
@@ -179,7 +174,8 @@ def _with_columns(folder: Folder) -> Iterator[str]:
         except (OSError, UnicodeDecodeError):
             continue
         if all(column in head for column in COLUMNS):
-            yield name
+            found.append(name)
+    return found
 
 
 @dataclass(frozen=True)
@@ -275,9 +271,10 @@ def _without_row(
     """
     folders = {file.rpartition(os.sep)[0] or "." for file in images}
     root = Folder(path.parent)
+    looked_at = [listing.folder for listing in listings.values() if listing.files]
     among: list[str] = []
     elsewhere: list[str] = []
-    for folder in {os.path.normpath(each.path): each for each in (*_folders_of(listings), *root.within(1))}.values():
+    for folder in {os.path.normpath(each.path): each for each in (*looked_at, *root.within(1))}.values():
         at = os.path.normpath(folder.path)
         files = [os.path.normpath(f"{at}{os.sep}{file}") for file in folder.files if _ending(file) in IMAGE_ENDINGS]
         (among if at in folders else elsewhere).extend(
@@ -294,10 +291,6 @@ def _without_row(
         )
     notes = ((among, "beside them"), (elsewhere, "in other folders there"))
     return ", ".join(f"{len(files)} {what} without a row in {path.name} left out" for files, what in notes if files)
-
-
-def _folders_of(listings: Mapping[str, _Listing]) -> Iterator[Folder]:
-    return (listing.folder for listing in listings.values() if listing.files)
 
 
 def _scene(

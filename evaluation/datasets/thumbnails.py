@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from evaluation.datasets.truths import check_light
+from evaluation.datasets.files import check_light
 from evaluation.scene import SceneSet
 from foundation.errors import FormatError
 

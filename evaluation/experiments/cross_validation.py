@@ -18,7 +18,7 @@ from evaluation.learning.feature_learner import (
     truths_of,
 )
 from evaluation.methods.method import Learner
-from evaluation.methods.pixels import unit
+from evaluation.methods.prepared import unit
 from evaluation.results.answers import NO_PIXEL, SceneAnswer, read_light, results_of
 from evaluation.results.result import Result
 from evaluation.scene import Scene

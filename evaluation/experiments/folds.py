@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from evaluation.datasets.states import first_copies
+from evaluation.datasets.identity import first_copies
 from evaluation.scene import Scene, SceneSet
 from foundation.errors import FormatError, InputError, counted, first_of
 from generator.named_numbers import is_number

@@ -17,8 +17,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from evaluation.datasets.identities import known_again
-from evaluation.datasets.states import state_of
+from evaluation.datasets.identity import known_again, state_of
 from evaluation.experiments.folds import folds_to_csv
 from evaluation.experiments.running import SceneMethod, answer_scenes, truths_of
 from evaluation.experiments.suspicions import suspicions

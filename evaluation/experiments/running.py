@@ -20,8 +20,7 @@ import numpy as np
 import numpy.typing as npt
 
 from evaluation.methods.method import Learner, LocalMethod, Method
-from evaluation.methods.pixels import GREY
-from evaluation.methods.prepared import PreparedImage, PreparedMethod
+from evaluation.methods.prepared import GREY, PreparedImage, PreparedMethod
 from evaluation.metrics import MapError, measure_map
 from evaluation.results.answers import SceneAnswer, read_light, results_of
 from evaluation.results.result import Result

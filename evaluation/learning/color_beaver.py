@@ -25,7 +25,7 @@ import numpy.typing as npt
 from evaluation.learning.feature_learner import FeatureLearner, Features
 from evaluation.learning.working_size import lights_from_chromaticities
 from evaluation.methods.gray_edge import GrayEdge
-from evaluation.methods.pixels import GREY
+from evaluation.methods.prepared import GREY
 from evaluation.scene import Image
 
 _ELITE = 4

@@ -16,7 +16,7 @@ from typing import Any, Protocol
 import numpy as np
 import numpy.typing as npt
 
-from evaluation.methods.pixels import GREY, unit
+from evaluation.methods.prepared import GREY, unit
 from evaluation.scene import Image, Scene
 from foundation.errors import InputError
 from foundation.processors import ordered_map

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from evaluation.datasets.identities import identities
+from evaluation.datasets.identity import identities
 from evaluation.learning.feature_learner import FeatureLearner, LearnedMethod, truths_of
 from evaluation.learning.standard import standard_learners
 from evaluation.methods.method import Method
@@ -62,7 +62,7 @@ class TrainingRecord:
     date
         ISO 8601, UTC.
     images
-        (N, 2) uint64, by what each image is known again, see `datasets.identities`; no row in a file that was made
+        (N, 2) uint64, by what each image is known again, see `datasets.identity`; no row in a file that was made
         before model files had them.
     """
 

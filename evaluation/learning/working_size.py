@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from evaluation.methods.pixels import usable
+from evaluation.methods.prepared import PreparedImage
 from evaluation.scene import Image
 
 _LEAST_SHARE = 0.5
@@ -19,7 +19,7 @@ def reduce(
     """Return an image reduced by a whole factor, and which of its pixels are usable.
 
     Each pixel is the mean of the usable pixels of a block; blocks at the right and lower edge may be smaller. Pixels
-    are usable as `methods.pixels.usable` has it, without a border. The largest usable value becomes 1, so that no
+    are usable as `PreparedImage.usable` has them. The largest usable value becomes 1, so that no
     feature depends on the exposure or on the unit of the image. Memory: a byte a pixel and some rows of the image.
 
     `image`: (H, W, 3) uint16, float32 or float64, linear camera RGB. `saturation`: value from which a channel is
@@ -36,7 +36,7 @@ def reduce(
     array([[0.833, 1.   ],
            [1.   , 1.   ]], dtype=float32)
     """
-    used = usable(image, saturation, mask, 0)
+    used = PreparedImage(image, saturation, mask).usable()
     factor = -(-max(image.shape[:2]) // longest)
     if factor == 1:
         small = np.where(used[..., None], image, 0).astype(np.float32)

@@ -16,13 +16,11 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from evaluation.methods.pixels import unit
-from evaluation.methods.prepared import PreparedImage
-from evaluation.scene import Image
+from evaluation.methods.prepared import PreparedImage, PreparedMethod, unit
 
 
 @dataclass(frozen=True)
-class GrayEdge:
+class GrayEdge(PreparedMethod):
     """One method of the framework.
 
     Attributes
@@ -73,12 +71,6 @@ class GrayEdge:
             return self.border
         return math.floor(self.sigma) + 1 if self.sigma else 0
 
-    def estimate(
-        self, image: Image, saturation: float | None = None, mask: npt.NDArray[np.bool_] | None = None
-    ) -> npt.NDArray[np.float64]:
-        """Return the light (3,) float64, camera RGB of length 1; see `method.Method.estimate`."""
-        return self.estimate_prepared(PreparedImage(image, saturation, mask))
-
     def estimate_prepared(self, prepared: PreparedImage) -> npt.NDArray[np.float64]:
-        """Return the same of a prepared image: (3,) float64."""
+        """Return the light of a prepared image: (3,) float64, camera RGB of length 1."""
         return unit(prepared.norm(self.order, self.sigma, self.p, self.left_out))

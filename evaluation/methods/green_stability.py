@@ -17,8 +17,7 @@ import numpy.typing as npt
 
 from evaluation.methods.gray_edge import GrayEdge
 from evaluation.methods.method import Method
-from evaluation.methods.pixels import GREY
-from evaluation.methods.prepared import estimate_all
+from evaluation.methods.prepared import GREY, estimate_all
 from evaluation.scene import Scene
 from foundation.errors import InputError
 

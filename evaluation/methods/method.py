@@ -28,7 +28,7 @@ class Method(Protocol):
     def estimate(
         self, image: Image, saturation: float | None = None, mask: npt.NDArray[np.bool_] | None = None
     ) -> npt.NDArray[np.float64]:
-        """Return the estimated light (3,) float64, camera RGB of length 1; `pixels.GREY` itself if no pixel is usable.
+        """Return the estimated light (3,) float64, camera RGB of length 1; `GREY` of `prepared` if no pixel is usable.
 
         Parameters
         ----------

@@ -42,9 +42,8 @@ from typing import TYPE_CHECKING, cast
 
 from evaluation.methods.gray_edge import GrayEdge
 from evaluation.methods.green_stability import FAMILIES
-from evaluation.methods.patchwise import PATCHES, PatchwiseMethod
-from evaluation.methods.resized import ResizedMethod
 from evaluation.methods.standard import local_methods, standard_methods
+from evaluation.methods.wrapped import PATCHES, PatchwiseMethod, ResizedMethod
 from foundation.errors import InputError
 
 if TYPE_CHECKING:
@@ -109,7 +108,7 @@ def find_method(text: str) -> Method | Learner:
             found = cast("object", found())
         except (Exception, SystemExit) as error:
             raise InputError(
-                f"{wanted} cannot be made without arguments: {_told(error)}; give its parameters defaults, or name a "
+                f"{wanted} cannot be made without arguments: {_fault(error)}; give its parameters defaults, or name a "
                 "value of the file instead of the class"
             ) from error
     return checked_method(found, wanted)
@@ -169,7 +168,7 @@ def checked_method(found: object, place: str) -> Method | Learner:
     try:
         name = getattr(found, "name", None)
     except Exception as error:
-        raise InputError(f"the name of {place} fails: {_told(error)}; correct it") from error
+        raise InputError(f"the name of {place} fails: {_fault(error)}; correct it") from error
     if not isinstance(name, str) or not name:
         raise InputError(f'{place} has no name; add name = "…", the text that stands in the tables')
     return cast("Method | Learner", found)
@@ -200,7 +199,7 @@ def _module_of_file(path: Path) -> ModuleType:
         spec.loader.exec_module(module)
     except (Exception, SystemExit) as error:
         del sys.modules[name]
-        raise InputError(f"{path} fails while it is loaded: {_told(error, whole)}; correct it") from error
+        raise InputError(f"{path} fails while it is loaded: {_fault(error, whole)}; correct it") from error
     return module
 
 
@@ -217,10 +216,10 @@ def _module_by_name(name: str) -> ModuleType:
             ) from error
         raise InputError(f"module {name} needs {missing!r}, which is not installed; install it") from error
     except (Exception, SystemExit) as error:
-        raise InputError(f"module {name} fails while it is loaded: {_told(error)}; correct it") from error
+        raise InputError(f"module {name} fails while it is loaded: {_fault(error)}; correct it") from error
 
 
-def _told(error: BaseException, file: Path | None = None) -> str:
+def _fault(error: BaseException, file: Path | None = None) -> str:
     """Return what went wrong, with the last line of `file` that it went through, or the last file and line at all.
 
     The lines of this file, which called what failed, are of no use to who wrote it: without others there is none.

@@ -13,9 +13,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from evaluation.methods.pixels import GREY, unit
-from evaluation.methods.prepared import PreparedImage
-from evaluation.scene import Image
+from evaluation.methods.prepared import GREY, PreparedImage, PreparedMethod, unit
 
 _MANY = 1 << 16
 """Pixels from which some of them say where the limits are: below, counting all takes under a millisecond."""
@@ -26,7 +24,7 @@ _DEVIATIONS = 4.0
 
 
 @dataclass(frozen=True)
-class BrightDark:
+class BrightDark(PreparedMethod):
     """Principal direction of the brightest and darkest pixels.
 
     Pixels are projected on the direction of their mean. The light is the first eigenvector of the uncentred
@@ -49,14 +47,8 @@ class BrightDark:
     name: str = "PCA bright and dark"
     share: float = 0.035
 
-    def estimate(
-        self, image: Image, saturation: float | None = None, mask: npt.NDArray[np.bool_] | None = None
-    ) -> npt.NDArray[np.float64]:
-        """Return the light (3,) float64, camera RGB of length 1; see `method.Method.estimate`."""
-        return self.estimate_prepared(PreparedImage(image, saturation, mask))
-
     def estimate_prepared(self, prepared: PreparedImage) -> npt.NDArray[np.float64]:
-        """Return the same of a prepared image: (3,) float64.
+        """Return the light of a prepared image: (3,) float64, camera RGB of length 1.
 
         The pixels at either end are found by a histogram of the projections and by sorting its two bins at the limits,
         so nothing of the image's size is made. Of pixels with equal projections those that come first are the lower.
@@ -76,7 +68,7 @@ def _sum_of_products(
 
     Of large images some pixels say between which bins the limits are; where they prove wrong, all pixels say it.
     """
-    from evaluation.methods.filters.projections import BINS, count_projections, sum_outer_bins
+    from evaluation.methods.pixel_loops import BINS, count_projections, sum_outer_bins
 
     image: Any = prepared.image
     step = BINS / float(direction @ peaks)

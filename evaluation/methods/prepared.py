@@ -21,8 +21,83 @@ import numpy as np
 import numpy.typing as npt
 
 from evaluation.methods.method import Method
-from evaluation.methods.pixels import dilate_clipped
 from evaluation.scene import Image
+
+GREY = np.full(3, 3**-0.5)
+"""The estimate (3,) float64 where no pixel is usable, or every one is black: no colour cast.
+
+Methods then return this very array, which distinguishes it from an estimate that happens to be grey.
+"""
+GREY.setflags(write=False)
+
+
+def dilate_clipped(
+    image: npt.NDArray[np.integer[Any]] | npt.NDArray[np.floating[Any]], saturation: float
+) -> npt.NDArray[np.bool_]:
+    """Return (H, W) bool, True where a channel is saturated or a neighbour's is.
+
+    The image is (H, W, 3) of any dtype.
+    """
+    import cv2
+
+    from evaluation.methods.pixel_loops import mark_clipped
+
+    clipped = np.zeros(image.shape[:2], dtype=np.uint8)
+    kind: Any = image.dtype
+    if kind.kind in "iu":
+        if saturation > np.iinfo(kind).max:
+            return clipped.view(np.bool_)
+        limit = kind.type(max(0, math.ceil(saturation)))
+    else:
+        limit = kind.type(saturation)
+    native: Any = np.ascontiguousarray(image, dtype=kind.newbyteorder("="))
+    if mark_clipped(native, limit, clipped):
+        clipped = cv2.dilate(clipped, np.ones((3, 3), np.uint8))
+    return np.asarray(clipped).view(np.bool_)
+
+
+def unit(estimate: npt.ArrayLike) -> npt.NDArray[np.float64]:
+    """Return `estimate` (3,) as float64 scaled to length 1, or `GREY` where it is zero or not finite.
+
+    Examples
+    --------
+    >>> unit([3, 4, 0])
+    array([0.6, 0.8, 0. ])
+    >>> unit([0, 0, 0]) is GREY
+    True
+    """
+    vector = np.asarray(estimate, dtype=np.float64)
+    length = float(np.linalg.norm(vector))
+    return vector / length if np.isfinite(length) and length > 0 else GREY
+
+
+def shrink(
+    image: Image, usable: npt.NDArray[np.bool_], longest: int, least: float = 0.5
+) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.bool_]]:
+    """Return an image whose longer side is `longest` px, and where it must not be used.
+
+    A pixel is the mean, weighted by area, of the usable pixels that it stands for.
+
+    `image`: (H, W, 3) uint16, float32 or float64. `usable`: (H, W) bool, True where a pixel may be used. `longest`: px,
+    below the longer side. `least`: share of a pixel's area, 0 … 1, that must be exceeded by what is usable of it.
+    Returns (h, w, 3) float32, 0 where nothing is usable; (h, w) bool, True where no more of a pixel is usable than
+    `least`.
+    """
+    import cv2
+
+    height, width = usable.shape
+    factor = longest / max(height, width)
+    size = (max(1, round(width * factor)), max(1, round(height * factor)))
+    share = np.asarray(cv2.resize(usable.astype(np.float32), size, interpolation=cv2.INTER_AREA))
+    planes: list[npt.NDArray[np.float32]] = []
+    for channel in range(3):
+        kept = np.where(usable, image[..., channel], 0).astype(np.float32)
+        planes.append(np.asarray(cv2.resize(kept, size, interpolation=cv2.INTER_AREA), dtype=np.float32))
+    found = np.stack(planes, axis=-1) / np.maximum(share, np.finfo(np.float32).tiny)[..., None]
+    masked = share <= least
+    found[share <= 0] = 0
+    return found.astype(np.float32), masked
+
 
 KEPT_PIXELS = 1 << 20
 """Pixels up to which derivatives are kept for the next method: 12 MB each."""
@@ -39,11 +114,17 @@ _ALL = np.zeros((0, 0), dtype=bool)
 
 @runtime_checkable
 class PreparedMethod(Protocol):
-    """A method that can use what other methods have found of an image."""
+    """A method that can use what other methods have found of an image; a `Method` that inherits it has `estimate`."""
 
     def estimate_prepared(self, prepared: PreparedImage) -> npt.NDArray[np.float64]:
-        """Return what `Method.estimate` returns of the same image: (3,) float64 of length 1, or `pixels.GREY`."""
+        """Return what `Method.estimate` returns of the same image: (3,) float64 of length 1, or `GREY`."""
         ...
+
+    def estimate(
+        self, image: Image, saturation: float | None = None, mask: npt.NDArray[np.bool_] | None = None
+    ) -> npt.NDArray[np.float64]:
+        """Return the light (3,) float64, camera RGB of length 1; see `method.Method.estimate`."""
+        return self.estimate_prepared(PreparedImage(image, saturation, mask))
 
 
 class PreparedImage:
@@ -122,7 +203,19 @@ class PreparedImage:
         return self._free
 
     def usable(self, border: int = 0) -> npt.NDArray[np.bool_]:
-        """Return (H, W) bool, True where a pixel may be used and lies `border` px within every edge."""
+        """Return (H, W) bool, True where a pixel may be used and lies `border` px within every edge.
+
+        Examples
+        --------
+        >>> image = np.zeros((5, 6, 3))
+        >>> image[0, 0] = 900
+        >>> PreparedImage(image, saturation=800).usable().astype(int)
+        array([[0, 0, 1, 1, 1, 1],
+               [0, 0, 1, 1, 1, 1],
+               [1, 1, 1, 1, 1, 1],
+               [1, 1, 1, 1, 1, 1],
+               [1, 1, 1, 1, 1, 1]])
+        """
         free = self.free()
         if not border:
             return free if free.size else np.ones((self.height, self.width), dtype=bool)
@@ -137,7 +230,7 @@ class PreparedImage:
         Whole numbers are summed exactly, floats in float64.
         """
         if border not in self._moments:
-            from evaluation.methods.filters.loops import float_moments, whole_moments
+            from evaluation.methods.pixel_loops import float_moments, whole_moments
 
             if self.image.dtype == np.uint16:
                 whole, count = whole_moments(cast("Any", self.image), self.free(), border)
@@ -172,7 +265,7 @@ class PreparedImage:
         return self._norms[key]
 
     def _sum_powers(self, order: int, sigma: float, p: float, border: int, scale: float) -> npt.NDArray[np.float64]:
-        from evaluation.methods.filters.loops import sum_powers
+        from evaluation.methods.pixel_loops import sum_powers
 
         sums = np.zeros(3)
         shape = (self.height, self.width)
@@ -193,7 +286,7 @@ class PreparedImage:
         key = (order, float(sigma))
         if key in self._derivatives:
             return self._derivatives[key]
-        from evaluation.methods.filters.gaussian import differentiated_tiles, put_tile
+        from evaluation.methods.gaussian import differentiated_tiles, put_tile
 
         found = np.empty((self.height, self.width, 3), dtype=np.float32)
         for top, left, tile in differentiated_tiles(self.image, order, sigma, self.scale):
@@ -210,8 +303,6 @@ class PreparedImage:
         if max(self.height, self.width) <= longest:
             return self
         if longest not in self._smaller:
-            from evaluation.methods.filters.shrinking import shrink
-
             image, mask = shrink(self.image, self.usable(0), longest)
             self._smaller[longest] = PreparedImage(image, None, mask)
         return self._smaller[longest]
@@ -221,7 +312,7 @@ class PreparedImage:
 
         A row may go on beyond the image. Most derivatives are wanted once: only what is asked for again is kept.
         """
-        from evaluation.methods.filters.gaussian import differentiated_tiles
+        from evaluation.methods.gaussian import differentiated_tiles
 
         key = (order, float(sigma))
         if key in self._asked and self.height * self.width <= KEPT_PIXELS:
@@ -231,8 +322,19 @@ class PreparedImage:
             yield from differentiated_tiles(self.image, order, sigma, self.scale)
 
 
+def usable(
+    image: Image, saturation: float | None, mask: npt.NDArray[np.bool_] | None, border: int = 0
+) -> npt.NDArray[np.bool_]:
+    """Return (H, W) bool, True where a pixel may be used, for a method that prepares nothing.
+
+    See `PreparedImage.usable`. `image`: (H, W, 3), linear camera RGB. `saturation`, `mask`: as of `Method.estimate`.
+    `border`: px along every edge.
+    """
+    return PreparedImage(image, saturation, mask).usable(border)
+
+
 def estimate(method: Method, prepared: PreparedImage) -> npt.NDArray[np.float64]:
-    """Return a method's estimate of a prepared image: (3,) float64 of length 1, or `pixels.GREY`.
+    """Return a method's estimate of a prepared image: (3,) float64 of length 1, or `GREY`.
 
     Examples
     --------
@@ -257,12 +359,7 @@ def estimate_all(
     `image`: (H, W, 3) uint16, float32 or float64. `saturation`, `mask`: see `Method.estimate`; the mask is (H, W) bool.
     """
     prepared = PreparedImage(image, saturation, mask)
-    return [
-        method.estimate_prepared(prepared)
-        if isinstance(method, PreparedMethod)
-        else method.estimate(image, saturation, mask)
-        for method in methods
-    ]
+    return [estimate(method, prepared) for method in methods]
 
 
 def _readable(image: npt.NDArray[Any]) -> Any:

@@ -13,8 +13,8 @@ Where they come from::
     Gray-Edge, order 2  the same                                                2, 1, 1
     PCA                 D. Cheng et al., 2014; see `pca.py`                     -
 
-and, each in its own file with its source and constants: improved White-Patch, Color Sparrow, Local Surface Reflectance
-(`retinex`), grayness index and mean-shifted gray pixel (`gray_pixels`), and what OpenCV offers (`opencv.py`).
+and, with their sources and constants: improved White-Patch, Color Sparrow, Local Surface Reflectance (`retinex`),
+grayness index and mean-shifted gray pixel (`gray_pixels`), and what OpenCV offers (`OpenCvGrayWorld`).
 
 The paper's tables have the first three, Shades-of-Gray with p = 2 as here. The other constants are those with which the
 methods stand in the tables of the NUS dataset. Every method of the framework is built from its equation alone, without
@@ -24,20 +24,65 @@ the preprocessing that a source may add (for White-Patch: no median filter).
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from evaluation.methods.gray_edge import GrayEdge
-from evaluation.methods.gray_pixels.grayness import GraynessIndex
-from evaluation.methods.gray_pixels.local_grayness import LocalGraynessIndex
-from evaluation.methods.gray_pixels.mean_shifted import MeanShiftedGrayPixel
+from evaluation.methods.gray_pixels import GraynessIndex, LocalGraynessIndex, MeanShiftedGrayPixel
 from evaluation.methods.method import LocalMethod, Method
-from evaluation.methods.opencv import OpenCvGrayWorld
-from evaluation.methods.patchwise import PatchwiseMethod
 from evaluation.methods.pca import BrightDark
-from evaluation.methods.retinex.color_sparrow import ColorSparrow
-from evaluation.methods.retinex.improved_white_patch import ImprovedWhitePatch
-from evaluation.methods.retinex.surface_reflectance import SurfaceReflectance
+from evaluation.methods.prepared import GREY, PreparedImage, PreparedMethod, unit
+from evaluation.methods.retinex import ColorSparrow, ImprovedWhitePatch, SurfaceReflectance
+from evaluation.methods.wrapped import PatchwiseMethod
+
+_TOP = 16383
+"""Value that white gets: a quarter of uint16, so that a channel multiplied by up to 4 is not cut off."""
+
+_ROWS = 256
+"""Rows that are scaled at a time, so that no float64 copy of a large image is made."""
+
+
+@dataclass(frozen=True)
+class OpenCvGrayWorld(PreparedMethod):
+    """Gray-world of OpenCV's xphoto over the pixels that are not too colourful: what a program that uses OpenCV gets.
+
+    `GrayworldWB` corrects an image; the light is what it divides by: for each channel the sum before over the sum
+    after. Masked and saturated pixels are given to it as black. Two others of xphoto are left out: `SimpleWB` stretches
+    each channel between percentiles, offset included, and so is no estimate of a light; `LearningBasedWB` (D. Cheng et
+    al., CVPR 2015) of OpenCV 5.0 gives one of several lights for the same image from call to call, degrees apart.
+
+    `name`: its name in tables.
+
+    Examples
+    --------
+    >>> image = np.random.default_rng(0).uniform(0.1, 1, (40, 60, 1)) * [0.5, 1.0, 0.7]
+    >>> OpenCvGrayWorld().estimate(image).round(2)
+    array([0.38, 0.76, 0.53])
+    """
+
+    name: str = "Gray-world (OpenCV)"
+
+    def estimate_prepared(self, prepared: PreparedImage) -> npt.NDArray[np.float64]:
+        """Return the light of a prepared image: (3,) float64, camera RGB of length 1."""
+        import cv2
+
+        xphoto: Any = cv2.xphoto
+        usable = prepared.usable(0)
+        peak = float(prepared.moments()[2].max())
+        if not peak:
+            return GREY
+        given = np.zeros(prepared.image.shape, dtype=np.uint16)
+        for top in range(0, prepared.height, _ROWS):
+            rows = np.s_[top : top + _ROWS]
+            part = np.where(usable[rows][..., None], prepared.image[rows], 0)[..., ::-1]
+            given[rows] = np.rint(part / peak * _TOP)
+        after = np.asarray(xphoto.createGrayworldWB().balanceWhite(given)).reshape(-1, 3).sum(axis=0, dtype=np.float64)
+        before = given.reshape(-1, 3).sum(axis=0, dtype=np.float64)
+        return unit(np.divide(before, after, out=np.zeros(3), where=after > 0)[::-1])
+
 
 STANDARD = ("white-patch", "gray-world", "shades-of-gray", "general-gray-world", "gray-edge-1", "gray-edge-2", "pca")
 """Names of the methods that stand in most tables of the field; the others may take seconds on a large image."""

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from evaluation.methods.pixels import GREY
+from evaluation.methods.prepared import GREY
 from evaluation.metrics import MapError, RegionError, recovery_error, reproduction_error
 from evaluation.results.result import MapErrors, Result
 

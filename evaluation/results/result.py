@@ -18,7 +18,7 @@ COLUMNS = ("method", "mean", "median", "trimean", "best25", "worst25", "avg")
 
 @dataclass(frozen=True, eq=False)
 class MapErrors:
-    """The errors of one method on the images under several lights, by pixel and by region; see `metrics.maps`.
+    """The errors of one method on the images under several lights, by pixel and by region; see `metrics.MapError`.
 
     - `images`: (M,) int64, the numbers of those images among the scenes, rising.
     - `pixel`: kind of error to (M,) float64, degrees: the mean over each image's pixels; the recovery error is LSMI's

@@ -9,20 +9,18 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final
 
 from foundation.errors import InputError
-from generator.command.grouping import option
-from generator.command.options import LightOptions, PictureOptions, VariationOptions
+from generator.command.options import LightOptions, PictureOptions, VariationOptions, option
 
 if TYPE_CHECKING:
     import numpy as np
     import numpy.typing as npt
 
     from calibration.table.lut import Lut
-    from generator.dataset.production.options import DatasetOptions
+    from generator.dataset.plan import DatasetOptions
     from generator.lights.lighting import LightChoice
-    from generator.likeness.drawing import DrawnPictures
-    from generator.likeness.pictures import BlackShares
+    from generator.likeness.real_data import BlackShares, DrawnPictures
     from generator.pictures.sources import Source
-    from generator.statistics.statistics_file import RealStatistics
+    from generator.statistics import RealStatistics
     from generator.variation.variation import ExposureChoice
 
 _LIKENESS = "Likeness"
@@ -71,11 +69,11 @@ class LikenessOptions:
 
 @dataclass(frozen=True)
 class Chosen:
-    """Sources and lights of a dataset, and what is recorded and told of how they were chosen.
+    """Sources and lights of a dataset, and what is recorded and printed of how they were chosen.
 
     - `sources`, `choice`: the sources and the lights.
     - `reading`: how sources were read, as plain values.
-    - `told`: lines to print.
+    - `lines`: lines to print.
     - `crops`: crops of each picture.
     - `weighted`: whether sources were drawn by weights.
     - `exposure`: how images are exposed; None as the table.
@@ -84,7 +82,7 @@ class Chosen:
     sources: tuple[Source, ...]
     choice: LightChoice
     reading: Mapping[str, Any]
-    told: tuple[str, ...] = ()
+    lines: tuple[str, ...] = ()
     crops: int = 1
     weighted: bool = False
     exposure: ExposureChoice | None = None
@@ -138,11 +136,16 @@ def _like(
     seed: int,
     workers: int,
 ) -> Chosen:
-    from generator.likeness.drawing import cautions, drawn_sources
-    from generator.likeness.exposing import exposure_sentence, like_exposure
-    from generator.likeness.remedies import light_caution, remedies
-    from generator.likeness.sizes import like_size
-    from generator.statistics.statistics_file import read_statistics
+    from generator.likeness.real_data import (
+        cautions,
+        drawn_sources,
+        exposure_sentence,
+        light_caution,
+        like_exposure,
+        like_size,
+        remedies,
+    )
+    from generator.statistics import read_statistics
 
     target = read_statistics(path)
     record: dict[str, Any] = {
@@ -152,19 +155,19 @@ def _like(
         "images": target.images,
         "in": parts,
     }
-    told = cautions(target)
+    lines = cautions(target)
     if "size" in parts:
         size = like_size(target, pictures.find(seed))
         if size is None:
-            told.append(f"size: {target.name} is of thumbnails, whose size is not followed; pictures keep theirs")
+            lines.append(f"size: {target.name} is of thumbnails, whose size is not followed; pictures keep theirs")
         else:
             pictures = replace(pictures, crop=f"{size.width}x{size.height}", cover=True)
             record["size"] = size.describe()
-            told.append(size.sentence())
+            lines.append(size.sentence())
     if "lights" in parts:
         light = replace(light, distribution=str(path))
         record["lights"], sentence = _lights_within(lut, target)
-        told.append(sentence)
+        lines.append(sentence)
     exposure = None
     if "exposure" in parts:
         exposure = like_exposure(target)
@@ -173,16 +176,16 @@ def _like(
                 f"{target.file} knows no exposure, since the saturation of {target.name} was not known; describe it "
                 "with --saturation, or leave exposure out of --like-in"
             )
-        told.append(exposure_sentence(target))
+        lines.append(exposure_sentence(target))
     sources = pictures.find(seed)
     if "pictures" in parts:
         drawn = _drawn(lut, target, sources, rendered, likeness.draw, seed, workers)
         sources = drawn_sources(sources, drawn)
         record["pictures"] = drawn.describe()
-        told += [*drawn.sentences(), *remedies(drawn, rendered), light_caution(lut, target)]
+        lines += [*drawn.sentences(), *remedies(drawn, rendered), light_caution(lut, target)]
     choice = light.request().choose(lut, seed, [source.name for source in sources], pictures.crops)
     reading = {**pictures.preparation(seed).describe(), "like": record}
-    return Chosen(sources, choice, reading, tuple(told), pictures.crops, "pictures" in parts, exposure)
+    return Chosen(sources, choice, reading, tuple(lines), pictures.crops, "pictures" in parts, exposure)
 
 
 def _parts(
@@ -247,8 +250,7 @@ def _drawn(
 ) -> DrawnPictures:
     """Return which pictures are drawn by what they look like under the light nearest to the target's."""
     from foundation.console import progress
-    from generator.likeness.drawing import draw_pictures
-    from generator.likeness.pictures import measure_pictures, reference_light
+    from generator.likeness.real_data import draw_pictures, measure_pictures, reference_light
     from generator.rendering.black_points import KEEP
 
     reference = reference_light(lut, target.lights)
@@ -264,9 +266,9 @@ def _drawn(
 
 def _black_under(lut: Lut, light: int, rendered: DatasetOptions) -> BlackShares:
     """Return the print's black under a light of the table; a QualityError where it is as bright as half of white."""
-    from generator.dataset.production.photographing import rendering_of
+    from generator.dataset.shards import rendering_of
     from generator.lights.lighting import Lighting, plain
-    from generator.likeness.pictures import BlackShares
+    from generator.likeness.real_data import BlackShares
     from generator.rendering.black_points import veil_of
 
     grey = None
@@ -280,7 +282,7 @@ def _photograph(
     lut: Lut, light: int, rendered: DatasetOptions, seed: int, picture: npt.NDArray[np.uint8], number: int
 ) -> npt.NDArray[np.uint16]:
     """Return the raw image of a picture as the dataset renders it, under one of the table's lights."""
-    from generator.dataset.production.photographing import photograph
+    from generator.dataset.shards import photograph
     from generator.kernels.choice import replace_unfit_colours
     from generator.lights.lighting import Lighting, plain
     from generator.pictures.picture import keep_bits
@@ -304,12 +306,12 @@ def _same_scenes(lut: Lut, place: str, pictures: PictureOptions, light: LightOpt
     found = prepared.find(seed) if prepared.sources else ()
     sources = scenes_of(dataset, found)
     reading = {**prepared.preparation(seed).describe(), "lights_of": {"pictures_seed": seed}}
-    told = [
+    lines = [
         f"{place} was made with {name.replace('_', ' ')}; here it is what the options say"
         for name in ("variation", "rendering", "black_point")
         if name in dataset.description.options
     ]
-    return Chosen(sources, lights_of(dataset, lut), reading, tuple(told), prepared.crops)
+    return Chosen(sources, lights_of(dataset, lut), reading, tuple(lines), prepared.crops)
 
 
 def _prepared_as(pictures: PictureOptions, made: Mapping[str, Any], place: str) -> PictureOptions:

@@ -1,31 +1,67 @@
-"""The options of the command `generate`, a group for each panel of its help.
+"""The options of the command `generate`: a frozen dataclass for each panel of its help.
 
 Libraries that take long to load are imported when a group makes something of its options.
 """
 
 from __future__ import annotations
 
+import dataclasses
+import functools
+import inspect
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal, get_type_hints
 
 import typer
 
 from foundation.console import AsJson, Quiet, Verbose, Version
 from foundation.errors import InputError
 from foundation.processors import processor_count
-from generator.command.grouping import option
-from generator.dataset.production.workers import Workers
 
 if TYPE_CHECKING:
     from calibration.table.lut import Lut
-    from generator.dataset.production.options import DatasetOptions
+    from generator.dataset.making import Workers
+    from generator.dataset.plan import DatasetOptions
     from generator.lights.request import LightRequest
     from generator.pictures.picture import Preparation
     from generator.pictures.sources import Source
     from generator.variation.variation import ExposureChoice, Variation
+
+
+def grouped(function: Callable[..., None]) -> Callable[..., None]:
+    """Return a command for typer with one parameter for each field of the groups that `function` takes.
+
+    `function`: each of its parameters is annotated with a frozen dataclass, whose fields are ``Annotated`` with typer's
+    ``Option`` or ``Argument`` and have defaults. No two groups share a field's name.
+    """
+    groups = {name: hint for name, hint in get_type_hints(function).items() if name != "return"}
+    parameters: dict[str, inspect.Parameter] = {}
+    members: dict[str, list[str]] = {}
+    for name, group in groups.items():
+        hints = get_type_hints(group, include_extras=True)
+        members[name] = [field.name for field in dataclasses.fields(group)]
+        for field in dataclasses.fields(group):
+            if field.name in parameters:
+                raise TypeError(f"two groups of options have a field {field.name}; rename one of them")
+            parameters[field.name] = inspect.Parameter(
+                field.name, inspect.Parameter.KEYWORD_ONLY, default=field.default, annotation=hints[field.name]
+            )
+
+    @functools.wraps(function)
+    def command(**options: Any) -> None:
+        function(**{name: groups[name](**{field: options[field] for field in members[name]}) for name in groups})
+
+    command.__signature__ = inspect.Signature(list(parameters.values()))  # type: ignore[attr-defined]
+    command.__annotations__ = {name: parameter.annotation for name, parameter in parameters.items()}
+    return command
+
+
+def option(metavar: str | None, text: str, panel: str, *names: str, **more: Any) -> Any:
+    """Return typer's option with its help; `names` are its own where those of its field, or a --no-, would not do."""
+    return typer.Option(*names, metavar=metavar, help=text, rich_help_panel=panel, **more)
+
 
 _SOURCES = "Source pictures"
 _LIGHT = "Light"
@@ -68,11 +104,7 @@ class PictureOptions:
     crop: Annotated[str | None, option("WxH", "Cut pictures to this size; smaller ones are left out.", _SOURCES)] = None
     cover: Annotated[
         bool,
-        typer.Option(
-            "--cover",
-            help="Make pictures as small as still covers the crop before they are cut.",
-            rich_help_panel=_SOURCES,
-        ),
+        option(None, "Make pictures as small as still covers the crop before they are cut.", _SOURCES, "--cover"),
     ] = False
     crop_at: Annotated[
         Literal["centre", "random"] | None,
@@ -203,18 +235,8 @@ class LightOptions:
         """Return the options as the generator's lights take them."""
         from generator.lights.request import LightRequest
 
-        return LightRequest(
-            illuminations=self.illuminations,
-            light=tuple(self.light or ()),
-            random=self.random,
-            distribution=self.distribution,
-            nearest=self.nearest,
-            match=self.match,
-            lights_by_name=self.lights_by_name,
-            outside=self.outside,
-            lights_per_image=self.lights_per_image,
-            masks=self.masks,
-        )
+        options: dict[str, Any] = {**vars(self), "light": tuple(self.light or ())}
+        return LightRequest(**options)
 
 
 @dataclass(frozen=True)
@@ -248,11 +270,12 @@ class ImageOptions:
     ] = None
     exact_split: Annotated[
         bool,
-        typer.Option(
-            "--exact-split",
-            help="With --split, parts of exactly these sizes, such as 700,200,100 of 1000 pictures; copies of a "
+        option(
+            None,
+            "With --split, parts of exactly these sizes, such as 700,200,100 of 1000 pictures; copies of a "
             "picture stay in one part.",
-            rich_help_panel=_IMAGES,
+            _IMAGES,
+            "--exact-split",
         ),
     ] = False
     bits: Annotated[
@@ -285,7 +308,7 @@ class ImageOptions:
         self, shard_images: int, reading: Mapping[str, Any], variation: Variation, crops: int, weighted: bool = False
     ) -> DatasetOptions:
         """Return what the dataset is to be; an InputError says which option cannot be used."""
-        from generator.dataset.production.options import DatasetOptions, parse_split
+        from generator.dataset.plan import DatasetOptions, parse_split
 
         return DatasetOptions(
             form=self.format,
@@ -438,6 +461,8 @@ class WorkOptions:
 
     def makers(self) -> Workers:
         """Return who makes the images: as many as there are processors unless a number is given."""
+        from generator.dataset.making import Workers
+
         return Workers(self.engine, processor_count() if self.workers is None else self.workers)
 
 

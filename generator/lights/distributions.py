@@ -25,8 +25,7 @@ from foundation.errors import FormatError, InputError
 from generator.lights.gamut import rb_of
 from generator.named_numbers import is_number, parse_numbers
 from generator.philox import Words, standard_normal
-from generator.statistics.image_numbers import log_chroma
-from generator.statistics.statistics_file import read_lights
+from generator.statistics import log_chroma, read_lights
 
 _OF_SCOTT: Final = 0.5
 """Share of Scott's factor n^(−1/6), which is for one normal cloud: real lights lie in clusters. Measured on four real

@@ -21,12 +21,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from foundation.errors import FormatError, InputError, first_of
-from generator.dataset.production.records import GROUND_TRUTH, Light
 from generator.dataset.reader import Dataset, open_dataset
+from generator.dataset.records import GROUND_TRUTH, Light
 from generator.lights.lighting import Lighting, Mixture, mixture_of, parse_mixture
 from generator.masks.making import GivenMaskPlan, find_masks
 from generator.pictures.sources import RandomScene, Source, SourcePicture
-from generator.stores.places import is_remote, local_path
+from generator.stores import is_remote, local_path
 
 if TYPE_CHECKING:
     from calibration.table.lut import Lut

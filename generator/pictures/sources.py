@@ -19,7 +19,7 @@ from foundation.hashing import file_sha256, sha256_of, stream_sha256
 from foundation.secret_texts import masked
 from generator import philox
 from generator.pictures.picture import LARGEST_SIDE, UNPREPARED, Cut, Picture, Preparation, open_picture
-from generator.stores.places import DESCRIPTION, filesystem, is_remote, local_path
+from generator.stores import DESCRIPTION, filesystem, is_remote, local_path
 
 if TYPE_CHECKING:
     from fsspec.spec import AbstractFileSystem

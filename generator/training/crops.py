@@ -19,6 +19,10 @@ Needs no PyTorch; `torch_crops` has the data sets that do::
 
 from __future__ import annotations
 
+import contextlib
+import mmap
+import weakref
+from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final, get_args
@@ -34,8 +38,6 @@ from generator.kernels.planar import draw_batch
 from generator.lights.lighting import Lighting, Mixture
 from generator.rendering import Rendering
 from generator.rendering.black_points import KEEP, BlackPoint, veil_of
-from generator.training.recycling import Recycled
-from generator.variation.exposing import add_noise
 from generator.variation.iso_speed import IsoSpeed
 from generator.variation.sensor_noise import SensorNoise
 
@@ -45,6 +47,45 @@ if TYPE_CHECKING:
     from calibration.table.lut import Lut
     from generator.rendering.matrices import ColourMatrix
     from generator.training.gallery import Gallery
+
+
+KEPT: Final = 2
+"""Pieces of memory that are kept for later: a loop still refers to one batch while it gets the next."""
+
+
+class Recycled:
+    """Makes large arrays in memory that is used again: the system clears each page that a program has not had before.
+
+    Clearing takes half as long as the drawing of a batch. An array gives its memory back when it and all views of it
+    are gone; memory to which a view still refers is never used again. Threads may share it.
+    """
+
+    def __init__(self) -> None:
+        self._free: deque[mmap.mmap] = deque(maxlen=KEPT)
+
+    def array(self, shape: tuple[int, ...]) -> npt.NDArray[np.float32]:
+        """Return an array float32 of any content.
+
+        Returns (...) float32, C order.
+        """
+        size = 4 * int(np.prod(shape))
+        memory = self._memory(size)
+        # Views refer to `values`, since what is below it is no array; so it lives as long as the last of them.
+        values = np.frombuffer(memory, dtype=np.float32)
+        weakref.finalize(values, self._free.append, memory).atexit = False
+        return values.reshape(shape)
+
+    def _memory(self, size: int) -> mmap.mmap:
+        with contextlib.suppress(IndexError):
+            while len(memory := self._free.pop()) != size:
+                pass
+            return memory
+        memory = mmap.mmap(-1, size, mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
+        # Large pages where the system has them: a five-hundredth of the faults.
+        if hasattr(mmap, "MADV_HUGEPAGE"):
+            memory.madvise(mmap.MADV_HUGEPAGE)
+        return memory
+
 
 __all__ = ["Batch", "Crops"]
 

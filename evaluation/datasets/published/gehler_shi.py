@@ -28,11 +28,19 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from evaluation.datasets.names import Folder, gather, present
+from evaluation.datasets.files import (
+    Folder,
+    Mask,
+    RawScene,
+    check_light,
+    gather,
+    numbers_in,
+    polygon_mask,
+    present,
+    read_text,
+)
 from evaluation.datasets.options import DataOptions, choose, stated
 from evaluation.datasets.published.matlab import read_mat, table
-from evaluation.datasets.raw_scene import Mask, RawScene, polygon_mask
-from evaluation.datasets.truths import check_light, numbers_in, read_text
 from evaluation.scene import Image, SceneSet
 from foundation.errors import FormatError, InputError
 

@@ -17,10 +17,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from evaluation.datasets.names import Folder
+from evaluation.datasets.files import BesideTextScene, Folder, read_text
 from evaluation.datasets.options import DataOptions, choose, stated
-from evaluation.datasets.raw_scene import BesideTextScene
-from evaluation.datasets.truths import read_text
 from evaluation.scene import SceneSet
 from foundation.errors import FormatError, first_of
 

@@ -32,10 +32,8 @@ from typing import Any, Final, cast
 import numpy as np
 import numpy.typing as npt
 
-from evaluation.datasets.names import Folder
+from evaluation.datasets.files import Folder, Light, Mask, RawScene, check_light, polygon_mask, read_text
 from evaluation.datasets.options import DataOptions, choose, stated
-from evaluation.datasets.raw_scene import Mask, RawScene, polygon_mask
-from evaluation.datasets.truths import Light, check_light, read_text
 from evaluation.scene import Image, Scene, SceneSet
 from foundation.errors import FormatError, InputError, first_of
 from generator.files import decode_array
@@ -144,7 +142,7 @@ def open_lsmi(place: str, options: DataOptions, listed: Folder | None = None) ->
     camera = choose(options.camera, cameras, "camera", place)
     part, count = _subset(options.subset, place)
     scenes: list[Scene] = []
-    levels: list[str] = []
+    levels: list[tuple[str, str]] = []
     notes: list[str] = []
     for name, known in cameras.items():
         if camera in (None, name):
@@ -156,7 +154,7 @@ def open_lsmi(place: str, options: DataOptions, listed: Folder | None = None) ->
             levels.append(reader.stated())
     if not scenes:
         raise FormatError(f"{place} has no .tiff of {options.subset or 'any place'}; make them with 0_cvt2tiff.py")
-    black, white = zip(*(level.split("; ") for level in levels), strict=True)
+    black, white = zip(*levels, strict=True)
     return SceneSet(
         name="LSMI" + "".join(f" {chosen}" for chosen in (camera, options.subset) if chosen),
         layout="lsmi",
@@ -225,12 +223,12 @@ class _Camera:
         """Whether 2_preprocess_data.py made this folder: its images lie by part, not by place."""
         return any(part in self.folder.folders for part in _PARTS)
 
-    def stated(self) -> str:
-        """Return black level and saturation in words, between them "; "."""
+    def stated(self) -> tuple[str, str]:
+        """Return black level and saturation in words."""
         black, white, source = self.levels()
         if self.prepared:
-            return f"0 of {self.name}: {source}; none of {self.name}: resized pixels do not show what was clipped"
-        return f"{black:g} of {self.name}, subtracted ({source}); from {white:g} of {self.name} ({source})"
+            return f"0 of {self.name}: {source}", f"none of {self.name}: resized pixels do not show what was clipped"
+        return f"{black:g} of {self.name}, subtracted ({source})", f"from {white:g} of {self.name} ({source})"
 
     def levels(self) -> tuple[float, float | None, str]:
         """Return black level, saturation, and their source."""

@@ -16,7 +16,7 @@ import numpy.typing as npt
 
 from evaluation.scene import Image, MixedScene, Scene
 from foundation.errors import FormatError
-from generator.statistics.image_numbers import CELLS, cell_borders
+from generator.statistics import CELLS, cell_borders
 
 LEVELS: Final = 4096
 """Steps of a share of saturation in which exposures are counted: 12 bits, a quarter of a raw file's."""

@@ -18,7 +18,7 @@ from evaluation.experiments.folds import group_of
 from evaluation.scene import MixedScene, SceneSet
 from foundation.errors import InputError
 from foundation.processors import ordered_map
-from generator.statistics.image_numbers import CELLS, CHROMA_EDGES, LUMINANCE_EDGES, log_chroma
+from generator.statistics import CELLS, CHROMA_EDGES, LUMINANCE_EDGES, log_chroma
 
 OF_LIGHTS: Final = {"light_red": 0, "light_blue": 1}
 """Numbers that each light has, and not each image: places of ln(R/G) and ln(B/G)."""

@@ -8,7 +8,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from generator.statistics.image_numbers import log_chroma
+from generator.statistics import log_chroma
 
 _COMPARED: Final = 1000
 """Lights of a set that the energy distance is taken of, at most: distances of all pairs are held."""

@@ -12,7 +12,7 @@ import numpy.typing as npt
 from evaluation.experiments.describing.cells import LEVELS, Cells, reduce_scene
 from evaluation.experiments.describing.noise import measure_blocks, relative_noise
 from evaluation.scene import MixedScene, Scene
-from generator.statistics.image_numbers import CELLS, numbers_of_cells, percentile
+from generator.statistics import CELLS, numbers_of_cells, percentile
 
 _NOISE_FROM: Final = 0.1
 """Signal from which blocks tell an image's noise, over the 99th percentile of its green: shot noise rules there."""

@@ -9,7 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Final, Literal
 
-from generator.statistics.image_numbers import GREY_DEG, LUMINANCE_PERCENTS
+from generator.statistics import GREY_DEG, LUMINANCE_PERCENTS
 
 Summed = Literal["median", "mean", "spread"]
 """How numbers of images become one of the set; the spread is their standard deviation."""

@@ -15,7 +15,7 @@ from evaluation.reports.description_figures import chroma_figure, lights_figure,
 from evaluation.reports.page import table_part
 from evaluation.results.tables import Table
 from foundation import pages
-from generator.statistics.image_numbers import CHROMA_EDGES, LUMINANCE_EDGES, log_chroma
+from generator.statistics import CHROMA_EDGES, LUMINANCE_EDGES, log_chroma
 
 
 def figures_table(description: DataDescription) -> Table:

@@ -22,8 +22,7 @@ from evaluation.experiments.describing.noise import NoiseCurve, NoiseLevel
 from evaluation.experiments.describing.quantities import QUANTITIES
 from foundation.errors import FormatError
 from foundation.version import software
-from generator.statistics.image_numbers import CHROMA_EDGES, LUMINANCE_EDGES
-from generator.statistics.statistics_file import FORMAT, VERSION, lights_of, read_content
+from generator.statistics import CHROMA_EDGES, FORMAT, LUMINANCE_EDGES, VERSION, lights_of, read_content
 
 QUANTILES: Final = (0, 1, 5, 10, 25, 50, 75, 90, 95, 99, 100)
 """Percents at which the distribution of a number over the images is written."""

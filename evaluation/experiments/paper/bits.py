@@ -18,7 +18,7 @@ import numpy.typing as npt
 from evaluation.experiments.running import truths_of
 from evaluation.methods.gray_edge import GrayEdge
 from evaluation.methods.method import Method
-from evaluation.methods.pixels import usable
+from evaluation.methods.prepared import PreparedImage
 from evaluation.methods.standard import standard_methods
 from evaluation.metrics import ErrorKind
 from evaluation.results.answers import SceneAnswer, read_light, results_of
@@ -130,7 +130,7 @@ def bits_removed(
     def answers_for(scene: Scene) -> list[list[SceneAnswer]]:
         image, mask = scene.read()
         # Clipped pixels are known before the reduction only; they have their say in the operator, as in a camera.
-        left_out = ~usable(image, scene.saturation, mask, border=0)
+        left_out = ~PreparedImage(image, scene.saturation, mask).usable()
         versions: list[Image] = [image, *reduce_colours(image, bits, mask)]
         return [[read_light(method.estimate(version, None, left_out)) for method in methods] for version in versions]
 

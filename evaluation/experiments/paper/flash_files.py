@@ -24,7 +24,7 @@ import numpy as np
 import numpy.typing as npt
 
 from evaluation.experiments.paper.bits import fitted_codes
-from evaluation.methods.pixels import usable
+from evaluation.methods.prepared import PreparedImage
 from evaluation.scene import Scene, SceneSet
 from foundation.errors import FormatError, InputError
 from foundation.files import reading_error, whole_folder, write_whole
@@ -76,7 +76,7 @@ def write_codes(
             scene, name = numbered
             image, mask = scene.read()
             found = fitted_codes(image, mask)
-            left_out = ~usable(image, scene.saturation, mask, border=0)
+            left_out = ~PreparedImage(image, scene.saturation, mask).usable()
             _write_png(folder / "codes" / name, clear_bits(found.codes, cleared)[..., ::-1])
             if left_out.any():
                 _write_png(folder / "masks" / name, left_out.astype(np.uint8) * np.uint8(255))

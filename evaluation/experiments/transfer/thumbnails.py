@@ -9,7 +9,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from evaluation.methods.filters.shrinking import shrink
+from evaluation.methods.prepared import shrink
 from evaluation.scene import Image, Scene
 from foundation.processors import ordered_map
 

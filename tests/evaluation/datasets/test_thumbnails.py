@@ -34,12 +34,12 @@ def test_values(tmp_path: Path) -> None:
     [
         ({"gt": np.ones((3, 3))}, r"images \(2, 4, 5, 3\), gt \(3, 3\)"),
         ({"gt": np.array([[1, 1, 1], [1, -1, 1]])}, "gt of b: 1 -1 1 is no light"),
-        ({"images": np.ones((2, 4, 5, 3), np.uint8)}, "has images of uint8, expected uint16"),
+        ({"images": np.ones((2, 4, 5, 3), np.uint8)}, "uint8.*uint16"),
         ({"images": np.ones((2, 4, 5))}, r"images \(2, 4, 5\)"),
         ({"names": ["a"]}, r"names \(1,\)"),
         ({"gt": [["a", "b", "c"]] * 2}, "is no archive of thumbnails"),
-        ({"names": ["a", "a"]}, "has two images named 'a'"),
-        ({"names": ["a", "b\n"]}, r"has an image named 'b\\n'"),
+        ({"names": ["a", "a"]}, "'a'"),
+        ({"names": ["a", "b\n"]}, r"'b\\n'"),
         ({"images": np.full((2, 4, 5, 3), np.nan, np.float32)}, "a has pixels that are not finite"),
     ],
 )

@@ -13,7 +13,7 @@ import pytest
 from evaluation.experiments.cross_validation import cross_validate
 from evaluation.experiments.folds import draw_folds
 from evaluation.learning.regression_trees import RegressionTrees
-from evaluation.methods.pixels import GREY, unit
+from evaluation.methods.prepared import GREY, unit
 from evaluation.scene import Scene
 from foundation.errors import InputError
 from tests.evaluation.learning.made_up_world import MadeUp, world

@@ -14,7 +14,7 @@ import pytest
 from evaluation.experiments.running import evaluate
 from evaluation.methods import GrayEdge
 from evaluation.methods.naming import find_method
-from evaluation.methods.pixels import GREY
+from evaluation.methods.prepared import GREY
 from evaluation.metrics import recovery_error
 from evaluation.scene import Scene
 from foundation.errors import FormatError, InputError

@@ -12,7 +12,7 @@ import pytest
 from evaluation.learning.feature_learner import FeatureLearner, LearnedMethod
 from evaluation.learning.model_files import load_model, save_model
 from evaluation.learning.standard import standard_learners
-from evaluation.methods.pixels import GREY
+from evaluation.methods.prepared import GREY
 from evaluation.metrics import recovery_error
 from foundation.errors import InputError
 from tests.evaluation.learning.made_up_world import constant_light, world

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from evaluation.datasets.identities import known_again
+from evaluation.datasets.identity import known_again
 from evaluation.learning.feature_learner import LearnedMethod
 from evaluation.learning.model_files import load_model, save_model, scenes_sha256
 from evaluation.learning.regression_trees import RegressionTrees

@@ -9,11 +9,9 @@ import numpy.typing as npt
 import pytest
 from scipy import ndimage
 
-from evaluation.methods import GrayEdge
-from evaluation.methods.filters import gaussian
-from evaluation.methods.filters.gaussian import differentiate, gaussian_kernel
-from evaluation.methods.pixels import GREY
-from evaluation.methods.prepared import PreparedImage
+from evaluation.methods import GrayEdge, gaussian
+from evaluation.methods.gaussian import differentiate, gaussian_kernel
+from evaluation.methods.prepared import GREY, PreparedImage
 from evaluation.metrics import recovery_error
 
 pytestmark = pytest.mark.slow

@@ -8,10 +8,10 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from evaluation.methods.gray_pixels.local_grayness import LocalGraynessIndex
+from evaluation.methods.gray_pixels import LocalGraynessIndex
 from evaluation.methods.method import LocalMethod
-from evaluation.methods.patchwise import PatchwiseMethod, fill_unknown
 from evaluation.methods.standard import local_methods, standard_methods
+from evaluation.methods.wrapped import PatchwiseMethod, fill_unknown
 from evaluation.metrics import recovery_error
 
 RED, BLUE = np.array([0.5, 0.3, 0.2]), np.array([0.2, 0.3, 0.5])

@@ -9,8 +9,7 @@ import numpy.typing as npt
 import pytest
 
 from evaluation.methods import standard_methods
-from evaluation.methods.pixels import GREY
-from evaluation.methods.prepared import estimate_all
+from evaluation.methods.prepared import GREY, estimate_all
 from evaluation.metrics import recovery_error
 
 LIGHT = np.array([0.5, 1.0, 0.7])

@@ -26,8 +26,7 @@ from calibration.table.zarr_store import fetch
 from experiment.session.folder import Session
 from experiment.session.repair import held_secrets, unsound_files
 from foundation.errors import CropError
-from generator.dataset.reader import open_dataset
-from generator.dataset.verification import file_faults
+from generator.dataset.reader import file_faults, open_dataset
 from tests.fuzz.foreign.mutations import CANARY, mutate
 from tests.fuzz.foreign.seeds import Seed
 

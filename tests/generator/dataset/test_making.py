@@ -198,7 +198,7 @@ def test_nothing_is_left_of_a_dataset_that_cannot_be(
     unlike: Any = (1, 2)
     with pytest.raises(InputError, match="the split 1,2 is to be three shares from 0 that sum to 1"):
         generate_dataset(lut, tmp_path / "out", sources, [0], options=DatasetOptions(split=unlike))
-    with pytest.raises(InputError, match="'bmp' is no format of a dataset; use one of png, tiff, exr, jxl, dng"):
+    with pytest.raises(InputError, match="'bmp'"):
         DatasetOptions(form=cast("Any", "bmp"))
     assert contents(tmp_path) == before
     assert not list(tmp_path.glob(".out*"))

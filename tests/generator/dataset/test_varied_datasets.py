@@ -18,8 +18,7 @@ from evaluation.scene import MixedScene
 from foundation.errors import InputError
 from generator.cli import main
 from generator.dataset.making import DatasetOptions, Workers, generate_dataset
-from generator.dataset.reader import Dataset, open_dataset
-from generator.dataset.verification import file_faults
+from generator.dataset.reader import Dataset, file_faults, open_dataset
 from generator.kernels.rendering import render
 from generator.lights.choices import RandomLights, SimultaneousLights
 from generator.masks.making import parse_masks
@@ -131,7 +130,7 @@ def test_a_place_begun_with_another_variation_is_refused(
     lut: Lut, pictures: Path, tmp_path: Path, make: Make, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     from generator.dataset.making import make_share
-    from generator.dataset.production.plan import Plan
+    from generator.dataset.plan import Plan
 
     def plan(variation: Variation) -> Plan:
         options = DatasetOptions(variation=variation, shard_images=3)

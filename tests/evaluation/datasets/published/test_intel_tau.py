@@ -42,9 +42,9 @@ def test_a_camera_and_a_part(copy: Path) -> None:
     data = open_scenes(copy, options=DataOptions(camera="nikon_d810", subset="field_1_cameras"))
     assert data.name == "INTEL-TAU Nikon_D810 field_1_cameras"
     assert [scene.name for scene in data.scenes] == NAMES[2:]
-    with pytest.raises(FormatError, match="no image of Nikon_D810 in lab_printouts"):
+    with pytest.raises(FormatError, match=r"Nikon_D810.*lab_printouts"):
         open_scenes(copy, options=DataOptions(camera="Nikon_D810", subset="lab_printouts"))
-    with pytest.raises(InputError, match="has no subset 'lab_realscene'; it has field_1_cameras, lab_printouts"):
+    with pytest.raises(InputError, match=r"'lab_realscene'.*field_1_cameras.*lab_printouts"):
         open_scenes(copy, options=DataOptions(subset="lab_realscene"))
     assert [scene.name for scene in open_scenes(copy / "Canon_5DSR").scenes] == NAMES[:2]
 
@@ -66,11 +66,11 @@ def test_the_authors_folds(copy: Path) -> None:
 def test_pairs_that_are_not_whole(copy: Path) -> None:
     light = copy / "Canon_5DSR/field_1_cameras/C_5DSR_field_002.wp"
     light.rename(light.with_name("C_5DSR_field_9.wp"))
-    with pytest.raises(FormatError, match=r"lacks the \.wp files of 1 images \(C_5DSR_field_2\)"):
+    with pytest.raises(FormatError, match=r"1.*C_5DSR_field_2"):
         open_scenes(copy)
     light.with_name("C_5DSR_field_9.wp").rename(light)
     (copy / "Canon_5DSR/field_1_cameras/C_5DSR_field_9.wp").write_text("1 1 1")
-    with pytest.raises(FormatError, match=r"lacks the \.tiff files of 1 lights \(C_5DSR_field_9\.wp\)"):
+    with pytest.raises(FormatError, match=r"1.*C_5DSR_field_9\.wp"):
         open_scenes(copy)
     assert len(open_scenes(copy, options=DataOptions(partial=True)).scenes) == 3
 
@@ -78,5 +78,5 @@ def test_pairs_that_are_not_whole(copy: Path) -> None:
 def test_a_light_that_is_none_is_named_when_it_is_used(copy: Path) -> None:
     (copy / "Canon_5DSR/field_1_cameras/C_5DSR_field_002.wp").write_text("0.3 0.5")
     scene = open_scenes(copy).scenes[0]
-    with pytest.raises(FormatError, match=r"C_5DSR_field_002\.wp: 0\.3 0\.5 is no light"):
+    with pytest.raises(FormatError, match=r"C_5DSR_field_002\.wp.*0\.3.*0\.5"):
         _ = scene.truth

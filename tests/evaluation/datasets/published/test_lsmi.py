@@ -93,7 +93,7 @@ def test_parts(copy: Path, subset: str, names: list[str]) -> None:
 def test_a_part_without_a_place_is_told(copy: Path) -> None:
     with pytest.raises(FormatError, match=r"has no \.tiff of val"):
         open_scenes(copy, options=DataOptions(subset="val"))
-    with pytest.raises(InputError, match="has no subset 'all'; it has train, val, test, single"):
+    with pytest.raises(InputError, match="'all'"):
         open_scenes(copy, options=DataOptions(subset="all"))
 
 
@@ -113,7 +113,7 @@ def test_the_prepared_form(prepared: Path) -> None:
 
 def test_levels_of_another_camera_come_from_its_raw_file(copy: Path) -> None:
     (copy / "sony").rename(copy / "galaxy")
-    with pytest.raises(InputError, match=r"galaxy has no raw file of galaxy .* --black and --saturation"):
+    with pytest.raises(InputError, match=r"--black.*--saturation"):
         open_scenes(copy)
     given = open_scenes(copy, options=DataOptions(black=64, saturation=1023))
     assert given.scenes[0].saturation == 1023 - 64
@@ -127,10 +127,10 @@ def test_levels_of_another_camera_come_from_its_raw_file(copy: Path) -> None:
 @pytest.mark.parametrize(
     ("key", "value", "message"),
     [
-        ("Light2", None, r"meta\.json, Place1 has no Light2, expected red, green, blue; run 1_make_mixture_map\.py"),
-        ("Light2", [1, 1], "Light2: 1 1 is no light"),
-        ("Light2", ["a", 1, 1], r"Light2 is .*, expected three numbers"),
-        ("MCCCoord", None, "has no MCCCoord with mcc1, mcc2, mcc3"),
+        ("Light2", None, r"meta\.json.*Place1.*Light2.*1_make_mixture_map\.py"),
+        ("Light2", [1, 1], "Light2.*1.*1"),
+        ("Light2", ["a", 1, 1], "Light2"),
+        ("MCCCoord", None, "MCCCoord.*mcc1.*mcc2.*mcc3"),
         ("MCCCoord", {"mcc1": [], "mcc2": [], "mcc3": []}, "other than four corners"),
     ],
 )
@@ -146,10 +146,10 @@ def test_what_is_wrong_in_the_metadata_is_named(copy: Path, key: str, value: obj
 def test_files_that_are_missing(copy: Path) -> None:
     camera = copy / "sony"
     (camera / "Place1" / "Place1_12.npy").unlink()
-    with pytest.raises(FormatError, match=r"Place1_12\.npy is missing: .* run 1_make_mixture_map\.py"):
+    with pytest.raises(FormatError, match=r"Place1_12\.npy.*1_make_mixture_map\.py"):
         open_scenes(copy)
     shutil.rmtree(camera / "Place1")
-    with pytest.raises(FormatError, match=r"lacks the \.tiff files of 1 of 2 places \(Place1\)"):
+    with pytest.raises(FormatError, match=r"1.*2.*Place1"):
         open_scenes(copy)
     data = open_scenes(copy, options=DataOptions(partial=True))
     assert [scene.name for scene in data.scenes] == ["sony/Place2_1.tiff", "sony/Place2_123.tiff"]

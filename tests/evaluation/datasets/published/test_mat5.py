@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from scipy.io import loadmat, savemat
 from scipy.sparse import csc_array
 
-from evaluation.datasets.published.mat5 import check_mat5
+from evaluation.datasets.published.matlab import check_mat5
 
 pytestmark = pytest.mark.slow
 

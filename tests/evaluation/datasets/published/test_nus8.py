@@ -52,7 +52,7 @@ def test_levels_mask_and_truth_of_each_camera(copy: Path) -> None:
 def test_one_camera(copy: Path) -> None:
     data = open_scenes(copy, options=DataOptions(camera="sonya57"))
     assert (data.name, len(data.scenes)) == ("NUS SonyA57", 2)
-    with pytest.raises(InputError, match="has no camera 'Canon600D'; it has NikonD5200, SonyA57"):
+    with pytest.raises(InputError, match=r"'Canon600D'.*NikonD5200.*SonyA57"):
         open_scenes(copy, options=DataOptions(camera="Canon600D"))
     assert open_scenes(copy / "SonyA57").name == "NUS SonyA57"
 
@@ -70,13 +70,13 @@ def test_without_names_the_order_of_files_counts_and_must_be_complete(copy: Path
     change(copy / "SonyA57" / "SonyA57_gt.mat", all_image_names=None)
     assert [scene.truth[0] for scene in open_scenes(copy / "SonyA57").scenes] == [0.1, 0.2]
     (copy / "SonyA57" / "SonyA57_0001.PNG").unlink()
-    with pytest.raises(FormatError, match="has 2 lights for 1 images of SonyA57"):
+    with pytest.raises(FormatError, match=r"2.*1.*SonyA57"):
         open_scenes(copy / "SonyA57", options=DataOptions(partial=True))
 
 
 def test_a_missing_image(copy: Path) -> None:
     (copy / "SonyA57" / "SonyA57_0003.PNG").unlink()
-    with pytest.raises(FormatError, match=r"lacks 1 of the 2 images of SonyA57_gt\.mat \(SonyA57_0003\)"):
+    with pytest.raises(FormatError, match=r"1.*2.*SonyA57_gt\.mat.*SonyA57_0003"):
         open_scenes(copy)
     assert len(open_scenes(copy, options=DataOptions(partial=True)).scenes) == 3
 
@@ -100,13 +100,14 @@ def test_a_chart_outside_of_the_image_is_refused(copy: Path) -> None:
 @pytest.mark.parametrize(
     ("variables", "message"),
     [
-        ({"darkness_level": None}, "expected darkness_level among them"),
+        ({"darkness_level": None}, "darkness_level"),
         ({"saturation_level": [[1, 2]]}, r"saturation_level is \[\[1, 2\]\], expected one number"),
-        ({"saturation_level": [[100]]}, "saturation 100 is not above black 128"),
-        ({"CC_coords": np.ones((3, 4))}, "2 images and 3 CC_coords"),
-        ({"groundtruth_illuminants": np.ones((2, 2))}, r"groundtruth_illuminants is \(2, 2\), expected"),
-        ({"groundtruth_illuminants": np.zeros((2, 3))}, "row 1 of groundtruth_illuminants: 0 0 0 is no light"),
-        ({"all_image_names": np.ones((2, 1))}, "all_image_names holds .*, expected names of images"),
+        ({"saturation_level": [[100]]}, "saturation 100 .* black 128"),
+        ({"saturation_level": [[128]]}, "saturation 128 .* black 128"),
+        ({"CC_coords": np.ones((3, 4))}, "2.*3.*CC_coords"),
+        ({"groundtruth_illuminants": np.ones((2, 2))}, "groundtruth_illuminants.*2.*2"),
+        ({"groundtruth_illuminants": np.zeros((2, 3))}, "1.*groundtruth_illuminants.*0.*0.*0"),
+        ({"all_image_names": np.ones((2, 1))}, "all_image_names"),
     ],
 )
 def test_what_is_wrong_in_a_table_is_named(copy: Path, variables: dict[str, object], message: str) -> None:
@@ -119,7 +120,7 @@ def test_what_is_wrong_in_a_table_is_named(copy: Path, variables: dict[str, obje
 
 def test_a_damaged_table(copy: Path) -> None:
     (copy / "SonyA57" / "SonyA57_gt.mat").write_bytes(b"MATLAB 5.0 MAT-file" + bytes(200))
-    with pytest.raises(FormatError, match=r"SonyA57_gt\.mat cannot be read"):
+    with pytest.raises(FormatError, match=r"SonyA57_gt\.mat"):
         open_scenes(copy)
 
 
@@ -158,7 +159,7 @@ def test_without_any_chart_nothing_is_opened(copy: Path) -> None:
     change(copy / "SonyA57" / "SonyA57_gt.mat", CC_coords=None)
     folder = write_masks(copy, "5.7,2.2,4.2,2.2", "1,1,0.4,7")
     (folder / "SonyA57_0003_mask.txt").unlink()
-    with pytest.raises(FormatError, match=r"no CC_coords, and 1 of its images have no CHECKER.*\(SonyA57_0003\)"):
+    with pytest.raises(FormatError, match=r"CC_coords.*1.*CHECKER.*SonyA57_0003"):
         open_scenes(copy)
     (copy / "SonyA57" / "SonyA57_0003.PNG").unlink()  # Of an image that is not there no chart is needed.
     assert len(open_scenes(copy, options=DataOptions(partial=True)).scenes) == 3
@@ -175,7 +176,7 @@ def test_text_files_that_agree_are_said_and_the_table_is_applied(copy: Path) -> 
 
 def test_text_files_that_have_the_chart_elsewhere_are_an_error_naming_both(copy: Path) -> None:
     write_masks(copy, "2.2,5.7,2.2,4.2", "1,1,0.4,7")  # Rows and columns in each other's place.
-    with pytest.raises(FormatError, match=r"columns 2 to 4, but CC_coords of .*, row 1, in") as told:
+    with pytest.raises(FormatError, match=r"2.*4.*CC_coords.*1") as told:
         open_scenes(copy)
     for name in ("SonyA57_0001_mask.txt", "SonyA57_gt.mat"):
         assert name in str(told.value)

@@ -10,7 +10,7 @@ import pytest
 from evaluation.experiments.describing import DataDescription, describe, figures
 from evaluation.experiments.describing.against import FigureCompared, compare_figures, sentence
 from evaluation.experiments.describing.quantities import QUANTITIES
-from generator.likeness.drawing import TITLES
+from generator.likeness.real_data import TITLES
 from tests.evaluation.experiments.describing.scenes import random_set
 
 pytestmark = pytest.mark.slow

@@ -7,7 +7,7 @@ import numpy.typing as npt
 import pytest
 
 from evaluation.experiments.describing.lights import energy_distance, light_distribution
-from generator.statistics.image_numbers import log_chroma
+from generator.statistics import log_chroma
 
 
 def lights_at(points: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:

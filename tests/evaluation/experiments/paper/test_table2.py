@@ -10,7 +10,7 @@ import numpy.typing as npt
 import pytest
 
 from evaluation.experiments.paper.table2 import LEARNERS, table2, table2_tables
-from evaluation.methods.pixels import unit
+from evaluation.methods.prepared import unit
 from evaluation.metrics import recovery_error
 from evaluation.scene import Scene
 from foundation.errors import InputError

@@ -1,0 +1,160 @@
+"""By what images are known without decoding them: whether they are others' copies, or still those that they were.
+
+A model file keeps of what it was trained on each image's name and light, or the picture that it was generated from, so
+that a test on the same images is noticed. A name counts without folder and ending, capitals and case being one; a light
+as chromaticities to four digits, since copies of a data set hold it to different ones. What was renamed, or is held to
+another ground truth, is not known again. A run that goes on asks whether the files changed meanwhile.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
+from hashlib import sha256
+from pathlib import Path, PurePosixPath
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from evaluation.datasets.files import RawScene
+from evaluation.datasets.generated import GeneratedScene
+from evaluation.datasets.thumbnails import Thumbnail
+from evaluation.scene import Scene
+from foundation.errors import CropError
+from foundation.hashing import sha256_of
+
+
+def identities(scenes: Sequence[Scene]) -> npt.NDArray[np.uint64]:
+    """Return by what scenes are known again: (N, 2) uint64, the first 64 bits of SHA-256.
+
+    The first is of the image: name and light; of a generated one its source picture, whatever the light. The second is
+    of the name, by which a generated image and the photograph that it was made from find each other.
+    """
+    sources: dict[int, dict[str, str]] = {}
+    rows: list[tuple[int, int]] = []
+    for scene in scenes:
+        if isinstance(scene, GeneratedScene):
+            known = sources.setdefault(id(scene.dataset), _sources(scene))
+            source = scene.entry.source
+            rows.append((_number("source", known[source]), _number("generated", _stem(source))))
+        else:
+            total = max(float(scene.truth.sum()), np.finfo(float).tiny)
+            light = " ".join(f"{part:.4f}" for part in scene.truth / total)
+            rows.append((_number("image", f"{_stem(scene.name)} {light}"), _number("real", _stem(scene.name))))
+    return np.array(rows, dtype=np.uint64).reshape(-1, 2)
+
+
+def known_again(scenes: Sequence[Scene], trained: npt.NDArray[np.uint64]) -> tuple[str, ...]:
+    """Return the names of the scenes that are among others, whose identities (N, 2) uint64 are given."""
+    images = {int(one) for one in trained[:, 0]}
+    names = {int(one) for one in trained[:, 1]}
+    return tuple(
+        scene.name
+        for scene, (own, _) in zip(scenes, identities(scenes).tolist(), strict=True)
+        if own in images or _counterpart(scene) in names
+    )
+
+
+def _counterpart(scene: Scene) -> int:
+    """Return the second identity that a photograph's generated image has, or a generated image's photograph."""
+    if isinstance(scene, GeneratedScene):
+        return _number("real", _stem(scene.entry.source))
+    return _number("generated", _stem(scene.name))
+
+
+def _sources(scene: GeneratedScene) -> dict[str, str]:
+    seed = scene.dataset.description.seed
+    return {record.name: record.sha256 or f"{record.name} of seed {seed}" for record in scene.dataset.sources}
+
+
+def _stem(name: str) -> str:
+    return PurePosixPath(name).stem.lower()
+
+
+def _number(kind: str, text: str) -> int:
+    return int(sha256_of(f"{kind}\t{text}".encode())[:16], 16)
+
+
+_FILES = ("path", "mask_path", "shares_path")
+"""Fields of a scene that name its files."""
+
+_PIECE: Final = 1 << 20
+"""Bytes of a file that are compared: a hundred thousand pixels and more, of which no two photographs agree in all."""
+
+_SUMS = "SHA256SUMS"
+"""The file of a generated dataset that holds the hashes of all others."""
+
+
+def state_of(scenes: Sequence[Scene]) -> str:
+    """Return a text, 64 hexadecimal digits, that becomes another when the images of scenes do.
+
+    No image is decoded. Of a file count its length and when it was written, as `make` and `rsync` do; of a dataset made
+    by `generate` the hashes that it holds; of thumbnails in memory their pixels. Scenes of other kinds count as never
+    changing.
+    """
+    state = sha256()
+    known: dict[int, str] = {}
+    for scene in scenes:
+        for part in _parts(scene, known):
+            state.update(f"{part}\n".encode())
+    return state.hexdigest()
+
+
+def first_copies(scenes: Sequence[Scene]) -> list[int]:
+    """Return for each of N scenes the place of the first one with the same pixels: its own where there is none before.
+
+    A copy in another fold is an image that a method was trained on. Of files are compared the lengths, and where these
+    are equal a piece from the middle, whose noise no second photograph has. Other scenes than files and thumbnails in
+    memory are no copies of each other.
+    """
+    lengths = Counter(_length(scene) for scene in scenes)
+    seen: dict[tuple[int, str], int] = {}
+    found: list[int] = []
+    for place, scene in enumerate(scenes):
+        length = _length(scene)
+        known = length is not None and lengths[length] > 1
+        found.append(seen.setdefault((length or 0, _piece(scene)), place) if known else place)
+    return found
+
+
+def _length(scene: Scene) -> int | None:
+    if isinstance(scene, Thumbnail):
+        return scene.image.nbytes
+    with suppress(OSError):
+        if isinstance(scene, RawScene):
+            return Path(scene.path).stat().st_size
+    return None
+
+
+def _piece(scene: Scene) -> str:
+    if isinstance(scene, Thumbnail):
+        return sha256_of(np.ascontiguousarray(scene.image))
+    assert isinstance(scene, RawScene)
+    try:
+        with Path(scene.path).open("rb") as stream:
+            stream.seek(max(0, (Path(scene.path).stat().st_size - _PIECE) // 2))
+            return sha256_of(stream.read(_PIECE))
+    except OSError:
+        return scene.path  # What cannot be read is told when the image is.
+
+
+def _parts(scene: Scene, known: dict[int, str]) -> Iterator[str]:
+    if isinstance(scene, Thumbnail):
+        yield f"{scene.image.dtype} {scene.image.shape} {sha256_of(np.ascontiguousarray(scene.image))}"
+    elif isinstance(scene, GeneratedScene):
+        dataset = scene.dataset
+        if id(dataset) not in known:
+            known[id(dataset)] = ""
+            # An old dataset has no such file; then its truths alone tell it from others.
+            with suppress(CropError, OSError):
+                known[id(dataset)] = sha256_of(dataset.store.get(_SUMS))
+            yield known[id(dataset)]
+    elif isinstance(scene, RawScene):
+        for path in (getattr(scene, name, "") for name in _FILES):
+            # A file that is missing is told when the image is read.
+            with suppress(OSError):
+                if path:
+                    found = Path(path).stat()
+                    yield f"{found.st_size} {found.st_mtime_ns}"

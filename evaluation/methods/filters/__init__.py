@@ -1,1 +1,0 @@
-"""Loops over pixels and filters of images, compiled, in tiles: what the methods are made of."""

@@ -1,1 +1,0 @@
-"""Methods of the Retinex family: local maxima stand for white."""

@@ -1,0 +1,503 @@
+"""What a dataset is to be, before a pixel is touched: every image has its number, every number its shard.
+
+A dataset is a function of its table, its list of sources, the choice of lights, the seed and the options. Image number
+`(position · crops + c) · lights_each + k` shows crop c of the source at `position` (the one, or the whole, unless
+several are asked for) under the k-th light of scene `position · crops + c`, whether or not the sources before it can be
+read. Shard i holds the numbers from i · n up to (i + 1) · n, n the images of a shard. So any worker can make any shard
+at any time, and a shard made twice is the same twice.
+
+Each source falls into a part by its own hash. Where parts are to have exactly the sizes asked for, all sources are
+ranked together by a hash of the seed and their name, and cut by their number: pictures of one name, and copies of one
+file, whatever their names, stay together; of files, only those of one length are read to find copies.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import importlib.metadata
+import json
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property, lru_cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final, get_args
+
+from foundation.errors import InputError
+from foundation.hashing import file_sha256
+from foundation.secret_texts import masked_values
+from foundation.version import software
+from generator.dataset.layouts import require_libraries
+from generator.dataset.records import SPLITS, Layout, Light, Scale, Split, TableRecord
+from generator.files import FORMATS, Format, libraries_of
+from generator.pictures.sources import PictureFile
+from generator.rendering import Rendering
+from generator.rendering.black_points import KEEP, BlackPoint
+from generator.rendering.matrices import ColourMatrix
+from generator.stores import is_remote
+from generator.variation.variation import NO_VARIATION, Variation
+
+if TYPE_CHECKING:
+    from calibration.table.lut import Lut
+    from generator.lights.lighting import LightChoice
+    from generator.pictures.sources import Source
+
+
+SHARD_IMAGES: Final = 256
+"""Images of a shard unless said otherwise: all that a kill can cost, for each shard that was being made."""
+
+RENDERING: Final[Rendering] = "codes"
+"""Rendering unless said otherwise: the paper's."""
+STRETCHED: Final[tuple[Format, ...]] = ("png", "tiff", "jxl")
+"""Formats without a place for the white level that readers use, whose counts may be stretched over 16 bits."""
+
+RENDERING_VERSION: Final = 3
+"""Of colorimetric rendering: rises when its rules change, so that other pixels come of the same options.
+1 took the grey in the print's black cell out where 2 takes the grey that black was mapped to; 3 tries more cells for
+greys that 2 left off by .2 degrees and more."""
+
+
+@dataclass(frozen=True)
+class DatasetOptions:
+    """What a dataset is to be, beside its table, sources, lights and seed.
+
+    Attributes
+    ----------
+    form
+        File format of the images; see `generator.files`.
+    layout
+        How images lie: each in its file, or those of a shard in a tar or Parquet file.
+    previews
+        Whether tone-mapped pictures go with them.
+    split
+        Shares of train, validation and test, 0 … 1, sum 1; None leaves the dataset undivided.
+    shard_images
+        Images of one shard, 1 or more.
+    variation
+        What differs from image to image beside scene and light; see `generator.variation`.
+    crops
+        Crops of each picture, 1 or more; of more than one the sources must have as many.
+    reading
+        How sources were read, as plain values; recorded only.
+    weighted
+        Whether sources were drawn by weights, which are recorded of each image.
+    rendering
+        ``"codes"``: codes of a picture are those of the print, the paper's way; ``"colorimetric"``: the print shows
+        the camera the picture's colours.
+    matrix
+        Linear sRGB to the camera's RGB, for colorimetric rendering; None for that of the table's camera.
+    black_point
+        What becomes of the print's black.
+    bits
+        Bits kept of each code of the pictures, the others set to zero before they are printed; None keeps those that
+        the table tells apart.
+    scale
+        ``"table"`` stores counts as they are; ``"full"`` stretches them over 16 bits, see `generator.files`.
+    split_exact
+        Whether parts have exactly the sizes of `split`, and not on average.
+
+    Raises
+    ------
+    InputError
+        An option is none of these.
+
+    Examples
+    --------
+    >>> DatasetOptions(layout="parquet", split=(0.8, 0.1, 0.1)).shard_images
+    256
+    >>> DatasetOptions(split=(0.8, 0.1, 0.2))
+    Traceback (most recent call last):
+    foundation.errors.InputError: the split 0.8,0.1,0.2 is to be three shares from 0 that sum to 1, such as 0.8,0.1,0.1
+    """
+
+    form: Format = "png"
+    layout: Layout = "folder"
+    previews: bool = True
+    split: tuple[float, float, float] | None = None
+    shard_images: int = SHARD_IMAGES
+    variation: Variation = NO_VARIATION
+    crops: int = 1
+    reading: Mapping[str, Any] = field(default_factory=dict[str, Any])
+    weighted: bool = False
+    rendering: Rendering = RENDERING
+    matrix: ColourMatrix | None = None
+    black_point: BlackPoint = KEEP
+    bits: int | None = None
+    scale: Scale = "table"
+    split_exact: bool = False
+
+    @property
+    def has_details(self) -> bool:
+        """Whether options do something to each image that is recorded of it: `images.csv` lists it then."""
+        return self.variation.is_on or self.crops > 1 or self.weighted or self.is_rendered
+
+    @property
+    def is_rendered(self) -> bool:
+        """Whether images are not rendered by codes with the print's black kept."""
+        return self.rendering != "codes" or self.black_point.kind != "keep"
+
+    def describe_rendering(self, lut: Lut) -> dict[str, Any]:
+        """Return how images are rendered as plain values; nothing for codes with the print's black kept."""
+        from generator.rendering.matrices import matrix_for
+
+        described: dict[str, Any] = {}
+        if self.rendering == "colorimetric":
+            used = self.matrix or matrix_for(lut)
+            rows = [[float(part) for part in row] for row in used.rows]
+            matrix = {"name": used.name, "source": used.source, "rows": rows}
+            described["rendering"] = {"name": self.rendering, "version": RENDERING_VERSION, "matrix": matrix}
+        if self.black_point.kind != "keep":
+            described["black_point"] = self.black_point.label
+        return described
+
+    def __post_init__(self) -> None:
+        for what, value, known in (
+            ("format", self.form, FORMATS),
+            ("layout", self.layout, get_args(Layout)),
+            ("rendering", self.rendering, get_args(Rendering)),
+            ("scale", self.scale, get_args(Scale)),
+        ):
+            if value not in known:
+                raise InputError(f"{value!r} is no {what} of a dataset; use one of {', '.join(known)}")
+        if self.rendering == "codes" and self.matrix is not None:
+            raise InputError("a colour matrix is for colorimetric rendering; choose that, or leave the matrix out")
+        if self.shard_images < 1:
+            raise InputError(f"shards of {self.shard_images} images were asked for, expected 1 or more")
+        if self.bits is not None and not 1 <= self.bits <= 8:
+            raise InputError(f"{self.bits} bits of each code were to be kept, expected 1 to 8")
+        if self.scale == "full" and self.form not in STRETCHED:
+            raise InputError(
+                f"counts of {self.form} are not stretched: the file says what white is; use one of "
+                f"{', '.join(STRETCHED)}, or leave the scale as it is"
+            )
+        if self.split_exact and self.split is None:
+            raise InputError("exact parts were asked for without their sizes; give a split such as 0.8,0.1,0.1")
+        if self.crops < 1:
+            raise InputError(f"{self.crops} crops of each picture were asked for, expected 1 or more")
+        split = self.split
+        if split is not None and not (len(split) == 3 and min(split) >= 0 and abs(sum(split) - 1) < 1e-6):
+            shares = ",".join(f"{share:g}" for share in split)
+            raise InputError(f"the split {shares} is to be three shares from 0 that sum to 1, such as 0.8,0.1,0.1")
+
+
+def parse_split(text: str) -> tuple[float, float, float]:
+    """Return the shares of train, validation and test of a text such as `0.8,0.1,0.1` or `80,10,10`.
+
+    Two numbers are train and test.
+
+    Examples
+    --------
+    >>> parse_split("80,10,10"), parse_split("3,1")
+    ((0.8, 0.1, 0.1), (0.75, 0.0, 0.25))
+    """
+    try:
+        parts = [float(part) for part in text.split(",")]
+    except ValueError:
+        parts = []
+    if len(parts) == 2:
+        parts.insert(1, 0.0)
+    if len(parts) != 3 or not min(parts) >= 0 or not 0 < sum(parts) < float("inf"):
+        raise InputError(f"the split {text!r} is to be shares of train, validation and test, such as 0.8,0.1,0.1")
+    total = sum(parts)
+    return parts[0] / total, parts[1] / total, parts[2] / total
+
+
+def exact_parts(sources: Sequence[Source], shares: tuple[float, float, float], seed: int) -> tuple[Split, ...]:
+    """Return the part of each source; parts have the sizes of `sizes_of`."""
+    wanted: dict[Split, int] = dict(zip(SPLITS, sizes_of(len(sources), shares), strict=True))
+    groups: dict[str, list[int]] = defaultdict(list)
+    copies = _copies(sources)
+    for place, source in enumerate(sources):
+        groups[copies.get(place, f"name {source.name}")].append(place)
+    ranked = sorted(groups, key=lambda key: hashlib.sha256(f"split {seed} {key}".encode()).digest())
+    parts: dict[int, Split] = {}
+    # Copies first, while there is room; a stable sort keeps the order of the hashes among groups of one size.
+    for key in sorted(ranked, key=lambda key: -len(groups[key])):
+        group = groups[key]
+        part: Split | None = next((name for name in SPLITS if wanted[name] >= len(group)), None)
+        if part is None:
+            raise InputError(
+                f"{len(group)} copies of {sources[group[0]].name} stay in one part, and none of the parts of exactly "
+                f"{','.join(map(str, sizes_of(len(sources), shares)))} has room for them; leave copies out, or ask for "
+                "other sizes"
+            )
+        wanted[part] -= len(group)
+        parts.update((place, part) for place in group)
+    return tuple(parts[place] for place in range(len(sources)))
+
+
+def sizes_of(count: int, shares: tuple[float, float, float]) -> tuple[int, int, int]:
+    """Return how many of `count` sources each part has: shares rounded by largest remainders.
+
+    Examples
+    --------
+    >>> sizes_of(10, (0.8, 0.1, 0.1)), sizes_of(11, (0.8, 0.1, 0.1)), sizes_of(1000, (0.7, 0.2, 0.1))
+    ((8, 1, 1), (9, 1, 1), (700, 200, 100))
+    """
+    # Shares are quotients: a product that should be whole may be off by its last bits.
+    exact = [round(share * count, 6) for share in shares]
+    sizes = [int(size) for size in exact]
+    by_remainder = sorted(range(3), key=lambda part: (sizes[part] - exact[part], part))
+    for part in by_remainder[: count - sum(sizes)]:
+        sizes[part] += 1
+    return sizes[0], sizes[1], sizes[2]
+
+
+def _copies(sources: Sequence[Source]) -> dict[int, str]:
+    """Return by place what tells the content of files that may be copies of others: those that are as long."""
+    by_length: dict[int, list[int]] = defaultdict(list)
+    for place, source in enumerate(map(_file_of, sources)):
+        if isinstance(source, PictureFile) and not is_remote(source.location):
+            try:
+                by_length[Path(source.location).stat().st_size].append(place)
+            except OSError:
+                # It is left out, and named, where it is to be read.
+                continue
+    found: dict[int, str] = {}
+    for places in by_length.values():
+        for place in places if len(places) > 1 else ():
+            source = _file_of(sources[place])
+            if isinstance(source, PictureFile):
+                try:
+                    found[place] = f"file {file_sha256(Path(source.location))}"
+                except OSError:
+                    continue
+    return found
+
+
+def _file_of(source: Source) -> Source:
+    """Return what a source with a weight, or one that must be as it was, is of."""
+    return getattr(source, "source", source)
+
+
+_WORD: Final = 1 << 64
+"""Values of the eight bytes of a hash that place a source among the parts."""
+
+
+@dataclass(frozen=True)
+class ShardJob:
+    """Everything that a worker on any machine needs to make one shard.
+
+    - `table`, `table_sha256`: the table's folder, and its hash to compare with what is found there.
+    - `shard`, `first`, `stop`: its number, its first image number and the one after its last.
+    - `position`: place of the first of `sources` in the whole list.
+    - `sources`: the sources that its images show.
+    - `choice`, `seed`, `options`: those of the plan.
+    - `versions`: versions of the libraries that the bytes depend on; a worker must have the same.
+    - `parts`: the part of each of `sources`, where they were decided together; empty where each is by itself.
+    """
+
+    table: Path
+    table_sha256: str
+    shard: int
+    first: int
+    stop: int
+    position: int
+    sources: tuple[Source, ...]
+    choice: LightChoice
+    seed: int
+    options: DatasetOptions
+    versions: dict[str, str]
+    parts: tuple[Split, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class Plan:
+    """A dataset to be made."""
+
+    lut: Lut
+    sources: Sequence[Source]
+    choice: LightChoice
+    seed: int
+    options: DatasetOptions
+
+    def __post_init__(self) -> None:
+        from generator.philox import key_of
+
+        key_of(self.seed)
+        if not self.sources or not self.choice.lights_each:
+            raise InputError(
+                f"{len(self.sources)} pictures under {self.choice.lights_each} lights make no image; name some of both"
+            )
+        if self.total > 1 << 32:
+            raise InputError(f"{self.total} images are more than a dataset holds, 2^32; make several, each with a seed")
+        if self.options.variation.tints and any(lighting.masks for lighting in self.choice.lightings_of(0)):
+            raise InputError(
+                "a gradient with a colour and several lights an image were both asked for, but masks tell either; "
+                "leave out colour, or ask for one light"
+            )
+        kept = self.options.bits
+        if self.options.rendering == "codes" and kept is not None and kept > self.lut.provenance.bits:
+            raise InputError(
+                f"{kept} bits of each code were to be kept, where the table has {self.lut.provenance.bits}; ask for "
+                "fewer"
+            )
+        require_libraries(self.options.layout)
+
+    @cached_property
+    def parts(self) -> tuple[Split, ...]:
+        """The part of each source, where parts have exact sizes; empty otherwise."""
+        if not self.options.split_exact or self.options.split is None:
+            return ()
+
+        return exact_parts(self.sources, self.options.split, self.seed)
+
+    @property
+    def total(self) -> int:
+        """Images planned."""
+        return len(self.sources) * self.images_each
+
+    @property
+    def images_each(self) -> int:
+        """Images of each source."""
+        return self.options.crops * self.choice.lights_each
+
+    @property
+    def shards(self) -> int:
+        """Shards they are cut into."""
+        return -(-self.total // self.options.shard_images)
+
+    def images_of(self, shard: int) -> int:
+        """Return how many images are planned for a shard."""
+        return min(self.options.shard_images, self.total - shard * self.options.shard_images)
+
+    def job(self, shard: int) -> ShardJob:
+        """Return the task of shard number `shard`."""
+        first = shard * self.options.shard_images
+        stop = first + self.images_of(shard)
+        each = self.images_each
+        places = range(first // each, (stop - 1) // each + 1)
+        return ShardJob(
+            table=self.lut.folder.resolve(),
+            table_sha256=self.lut.sha256,
+            shard=shard,
+            first=first,
+            stop=stop,
+            position=places[0],
+            sources=tuple(self.sources[place] for place in places),
+            choice=self.choice,
+            seed=self.seed,
+            options=self.options,
+            versions=versions(self.options.form, self.options.layout),
+            parts=tuple(self.parts[place] for place in places) if self.parts else (),
+        )
+
+    def identity(self) -> dict[str, Any]:
+        """Return plain values that two plans share exactly if they make the same bytes."""
+        # Copies of a file are told by its content, which is not in the list of sources.
+        parts = {"parts": hashlib.sha256(" ".join(self.parts).encode()).hexdigest()} if self.parts else {}
+        return {
+            "format": "crop.plan",
+            "version": 1,
+            "software": software(),
+            "libraries": versions(self.options.form, self.options.layout),
+            "table": table_of(self.lut).model_dump(mode="json"),
+            "seed": self.seed,
+            "options": self.recorded_options(),
+            "images": self.total,
+            "lights_each": self.choice.lights_each,
+            "shards": self.shards,
+            "sources": {"count": len(self.sources), "sha256": sources_sha256(self.sources)},
+            **parts,
+        }
+
+    def recorded_options(self) -> dict[str, Any]:
+        """Return the options as `dataset.json` has them; through JSON, so that they compare with what is read back."""
+        options = self.options
+        recorded = {
+            "format": options.form,
+            "layout": options.layout,
+            **options.reading,
+            **options.describe_rendering(self.lut),
+            "lights": self.choice.describe(),
+            "previews": options.previews,
+            "split": dict(zip(SPLITS, options.split, strict=True)) if options.split else None,
+            "shard_images": options.shard_images,
+        }
+        # What is off is no key: such datasets keep their bytes.
+        if options.variation.is_on:
+            recorded["variation"] = options.variation.describe()
+        if options.crops > 1:
+            recorded["crops"] = options.crops
+        if options.bits is not None:
+            recorded["bits"] = options.bits
+        if options.scale != "table":
+            recorded["scale"] = options.scale
+        if options.split_exact:
+            recorded["split_exact"] = True
+        # A data set is published: addresses in it have no secrets.
+        return json.loads(json.dumps(masked_values(recorded)))
+
+
+def split_of(shares: tuple[float, float, float] | None, seed: int, sha256: str | None, name: str) -> Split | None:
+    """Return the part of the dataset that a source belongs to.
+
+    Decided by the seed and the source's content, or its name where it has no file, and by no other source, so that two
+    copies of one file, whatever their names, are in the same part. The shares hold on average.
+
+    `shares`: of train, validation and test; sum 1. None leaves it undivided.
+    """
+    if shares is None:
+        return None
+    word = hashlib.sha256(f"split {seed} {sha256 or name}".encode()).digest()[:8]
+    place = int.from_bytes(word, "big") / _WORD
+    bound = 0.0
+    for part, share in zip(SPLITS, shares, strict=True):
+        bound += share
+        if place < bound and share:
+            return part
+    return max(zip(shares, SPLITS, strict=True))[1]
+
+
+def sources_sha256(sources: Sequence[Source]) -> str:
+    """Return a hash over the list of sources: the name of each, and how it is made or read.
+
+    Where a file lies and what is in it are left out: a list is the same on every machine, and its files are hashed when
+    they are read.
+    """
+    digest = hashlib.sha256()
+    for source in sources:
+        digest.update(json.dumps(source.to_json(), sort_keys=True).encode() + b"\n")
+    return digest.hexdigest()
+
+
+@lru_cache
+def versions(form: Format, layout: Layout) -> dict[str, str]:
+    """Return the versions of the libraries that decode sources, find lights and encode images, by their names.
+
+    Other versions may give other bytes.
+    """
+    names = {"isal", "numpy", "OpenImageIO", "opencv-contrib-python-headless", "pillow", "scipy", "simplejpeg"}
+    if layout == "parquet":
+        names.add("pyarrow")
+    return {name: importlib.metadata.version(name) for name in sorted(names | {*libraries_of(form)})}
+
+
+def table_of(lut: Lut) -> TableRecord:
+    """Return the record of the table."""
+    provenance = lut.provenance
+    return TableRecord(
+        sha256=lut.sha256,
+        camera=provenance.camera,
+        bits=provenance.bits,
+        samples=lut.samples.shape[2],
+        white_level=provenance.white_level,
+        software=provenance.software,
+        computed=provenance.computed,
+        lights=len(lut.illuminations),
+        origin=provenance.origin,
+    )
+
+
+def light_of(lut: Lut, light: int) -> Light:
+    """Return the record of light number `light` of the table."""
+    shown = lut.illuminations[light]
+    red, green, blue = (float(part) for part in lut.white[light])
+    return Light(
+        illumination=light,
+        kind=shown.kind,
+        cct_k=shown.cct_k,
+        codes=shown.colour.codes,
+        white=(red, green, blue),
+        name=shown.name,
+    )

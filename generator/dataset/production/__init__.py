@@ -1,1 +1,0 @@
-"""A dataset made piece by piece, by any number of workers, and put together."""

@@ -1,0 +1,483 @@
+"""One shard, from its sources to the record that says it is done: pictures are read, photographed and written.
+
+Rules that hold inside:
+
+- A shard's bytes depend on its job alone: not on the workers, on other shards, or on how often it is made.
+- Its record is written last, when all else has been synchronised with the disk: a shard with a record is whole. The
+  program may be killed at any instruction, and any number of programs may make the same shard at once.
+- At most about three pictures are in memory for each worker.
+
+An image under one light has that light's ground truth, however its intensity falls off. Where it falls off with a tint
+(`generator.variation.variation`) the light stands in the records twice, as it is at the near and at the far end, and
+masks and maps say how much of either reaches a pixel.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+import threading
+from collections import deque
+from collections.abc import Callable, Generator
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+import numpy.typing as npt
+
+from foundation.errors import FormatError, InputError
+from generator.dataset.layouts import Sample, ShardWriter, open_writer
+from generator.dataset.plan import DatasetOptions, ShardJob, light_of, split_of, versions
+from generator.dataset.records import Details, ImageRecord, LightRow, ShardRecord, Skipped, SourceRecord, Triple
+from generator.dataset.workplace import Workplace
+from generator.lights.lighting import Lighting, Mixture
+from generator.pictures.picture import Cut, Picture, keep_bits
+from generator.pictures.sources import Source
+from generator.stores import Pieces
+from generator.variation.variation import Varied
+
+if TYPE_CHECKING:
+    from calibration.table.lut import Lut
+    from generator.kernels.dithering import CellTable
+    from generator.rendering.cell_mixtures import CellMixtures
+    from generator.rendering.colorimetric import ColorimetricRendering
+
+
+_threads: Final = threading.local()
+
+
+def photograph(
+    lut: Lut,
+    picture: Picture,
+    lighting: Lighting,
+    options: DatasetOptions,
+    seed: int,
+    number: int,
+    white_level: int,
+    black_taken: float | None = None,
+) -> tuple[npt.NDArray[np.uint16], npt.NDArray[np.float32] | None, Details]:
+    """Return the raw image of a picture's print.
+
+    `picture`: (H, W, 3) uint8, sRGB codes; where they are those of the print, of colours that the table has samples of.
+    `black_taken`: share of the print's black that is taken out, 0 … 1; None for what the options say. Returns (H, W, 3)
+    uint16, linear camera RGB; of several lights the weights (H, W, K) float32 of each in each pixel, else None; and
+    what is recorded of the rendering.
+    """
+    from generator.kernels.dithering import dither, nearest_nodes
+    from generator.kernels.mixing import mix_samples
+    from generator.kernels.rendering import WHOLE_LIGHT_PIXELS, draw_samples
+    from generator.rendering.cell_mixtures import summarise
+
+    # The hash of the table stands for its samples in the dataset's description.
+    for mixture in lighting.mixtures:
+        for light in mixture.lights:
+            lut.require_unchanged(light)
+    share = options.black_point.share(seed, number) if black_taken is None else black_taken
+    cells = grey = None
+    details: Details = {}
+    if options.rendering == "colorimetric":
+        rendering = rendering_of(lut, options)
+        for light in rendering.light_of(lighting).lights:
+            lut.require_unchanged(light)
+        mixtures = rendering.mixtures_for(lighting)
+        cells, name = _table(mixtures, lut.provenance.bits)
+        grey = mixtures.black
+        missed = summarise(mixtures, nearest_nodes(picture).astype(np.float64))
+        outside, distance = round(missed.outside, 6), round(missed.distance_deg, 6)
+        details |= {"cells": name, "outside": outside, "distance": distance}
+    if options.black_point.kind != "keep":
+        details["black_taken"] = share
+    alone = lighting.masks is None and len(lighting.mixtures[0].lights) == 1 and not share
+    if cells is not None and not (alone or (lighting.masks is None and picture.size >= 3 * WHOLE_LIGHT_PIXELS)):
+        # Which samples are to be mixed, or freed of black, is known by the cells.
+        picture, cells = dither(picture, cells, lut.provenance.bits, seed, number), None
+    drawn_dithered = cells is not None
+    tables = [_samples(lut, mixture, picture, share, seed, drawn_dithered, grey) for mixture in lighting.mixtures]
+    if lighting.masks is None:
+        out = _reused(picture.shape)
+        return draw_samples(tables[0], picture, seed=seed, image=number, cells=cells, out=out), None, details
+    weights = lighting.weights_of(*picture.shape[:2])
+    image = mix_samples(tables, picture, weights, white_level=white_level, seed=seed, image=number)
+    return image, weights, details
+
+
+def _samples(
+    lut: Lut, mixture: Mixture, picture: Picture, share: float, seed: int, dithered: bool, grey: float | None
+) -> npt.NDArray[np.uint16]:
+    """Return the samples of a light without a share of the print's black, at least those of a picture's colours.
+
+    A picture that is `dithered` while it is drawn may show any. `grey` is as of `black_points.veil_of`.
+    """
+    from generator.kernels.choice import colours_in
+    from generator.kernels.rendering import WHOLE_LIGHT_PIXELS
+    from generator.rendering.black_points import veil_of, without_veil
+
+    samples = mixture.samples(lut, seed, picture)
+    if not share:
+        return samples
+    small = not dithered and picture.size < 3 * WHOLE_LIGHT_PIXELS
+    colours = colours_in(picture, lut.provenance.bits) if small else None
+    veil = veil_of(lut, mixture, share, grey)
+    return without_veil(samples, veil, lut.provenance.white_level, colours)
+
+
+@lru_cache(maxsize=4)
+def _rendering(lut: Lut, name: str, rows: tuple[float, ...], source: str) -> ColorimetricRendering:
+    from generator.rendering.colorimetric import ColorimetricRendering
+    from generator.rendering.matrices import ColourMatrix
+
+    return ColorimetricRendering(lut, ColourMatrix(name, np.array(rows).reshape(3, 3), source))
+
+
+def rendering_of(lut: Lut, options: DatasetOptions) -> ColorimetricRendering:
+    """Return the rendering by colour that the options ask for; it keeps what it has found out of a table."""
+    from generator.rendering.matrices import matrix_for
+
+    matrix = options.matrix or matrix_for(lut)
+    return _rendering(lut, matrix.name, tuple(matrix.rows.ravel().tolist()), matrix.source)
+
+
+@lru_cache(maxsize=8)
+def _table(mixtures: CellMixtures, bits: int) -> tuple[CellTable, str]:
+    """Return the cells of mixtures to draw from, and what they are called: the first 16 digits of their SHA-256."""
+    from generator.kernels.dithering import checked_cells
+
+    digest = hashlib.sha256(mixtures.cells.astype("<u2").tobytes()).hexdigest()
+    return checked_cells(mixtures.cells, bits), digest[:16]
+
+
+def _reused(shape: tuple[int, ...]) -> npt.NDArray[np.uint16]:
+    """Return an array uint16 of any content in memory of the calling thread, which its next call overwrites.
+
+    Fresh pages take as long to map as the drawing into them.
+    """
+    size = math.prod(shape)
+    memory: npt.NDArray[np.uint16] | None = getattr(_threads, "memory", None)
+    if memory is None or memory.size < size:
+        _threads.memory = memory = np.empty(size, np.uint16)
+    return memory[:size].reshape(shape)
+
+
+@dataclass(frozen=True, eq=False)
+class ImageLight:
+    """The light of one image.
+
+    - `truth`: chromaticity, sum 1, of the light averaged over the pixels.
+    - `maps`: kind, what follows the image's number in the file's name, and the bytes of each map beside the image.
+    """
+
+    truth: Triple
+    rows: list[LightRow]
+    maps: list[tuple[str, str, bytes]]
+
+
+def image_light(
+    lut: Lut, lighting: Lighting, weights: npt.NDArray[np.float32] | None, varied: Varied, tints: bool
+) -> ImageLight:
+    """Return the light of an image.
+
+    `weights`: (H, W, K) float32, of each of K lights in each pixel; None of one light.
+    """
+    from generator.masks.maps import encode_maps, mean_weights
+
+    labels = [mixture.label for mixture in lighting.mixtures]
+    whites = lighting.whites(lut)
+    intensity = None
+    if tints:
+        weights, labels = varied.weights, labels * 2
+        whites = np.concatenate([whites, whites * np.array(varied.end)])
+    elif weights is not None:
+        intensity = varied.intensity()
+    rows = [
+        LightRow(illumination=label, truth=chromaticity(white)) for label, white in zip(labels, whites, strict=True)
+    ]
+    if weights is None:
+        return ImageLight(rows[0].truth, rows, [])
+    reaching = weights if intensity is None else weights * intensity[..., None]
+    truth = chromaticity(np.asarray(mean_weights(reaching) @ whites))
+    return ImageLight(truth, rows, encode_maps(weights, whites))
+
+
+def chromaticity(white: npt.NDArray[np.float64]) -> Triple:
+    """Return (r, g, b) of sum 1 of linear RGB (3,) float64."""
+    red, green, blue = (float(part) for part in white / white.sum())
+    return red, green, blue
+
+
+LARGEST_COUNT: Final = 65535
+"""Largest value of 16 bits."""
+
+
+def _ignore(*arguments: object) -> None:
+    del arguments
+
+
+@dataclass(frozen=True)
+class Callbacks:
+    """What is called while images are made, always from the calling thread.
+
+    Attributes
+    ----------
+    on_done
+        Takes how many of the planned images were made by an earlier call; called once, before the first is made.
+    on_image
+        Called after each image.
+    on_skip
+        Takes the name of a source that cannot be read, the reason, and the number of images that are left out.
+    on_wait
+        Takes a sentence for the user where the work waits for somebody to do something.
+
+    Examples
+    --------
+    >>> left_out = []
+    >>> callbacks = Callbacks(on_skip=lambda name, reason, images: left_out.append(name))
+    >>> callbacks.on_skip("bad.png", "bad.png is no picture", 2)
+    >>> left_out
+    ['bad.png']
+    """
+
+    on_done: Callable[[int], None] = _ignore
+    on_image: Callable[[], None] = _ignore
+    on_skip: Callable[[str, str, int], None] = _ignore
+    on_wait: Callable[[str], None] = _ignore
+
+
+SILENT: Final = Callbacks()
+"""Callbacks that do nothing."""
+
+
+@dataclass(frozen=True)
+class _ReadSource:
+    """The crops of a source, or all of it, and what is recorded of it.
+
+    Where sRGB codes are those of the print, they are codes that the table has samples of.
+    """
+
+    cuts: tuple[Cut, ...]
+    record: SourceRecord
+    black_taken: float | None
+
+
+class ShardCancelled(Exception):
+    """A shard was given up because something else failed; whoever caused it handles it."""
+
+
+def make_shard(
+    job: ShardJob,
+    lut: Lut,
+    place: Workplace,
+    pool: ThreadPoolExecutor,
+    workers: int,
+    callbacks: Callbacks = SILENT,
+    cancelled: threading.Event | None = None,
+) -> ShardRecord:
+    """Make a shard and commit its record."""
+    sources: list[SourceRecord] = []
+    skipped: list[Skipped] = []
+    images: list[ImageRecord] = []
+    used: set[int] = set()
+    pending: deque[Future[Sample]] = deque()
+    reading: deque[Future[_ReadSource]] = deque()
+
+    def finish_one(writer: ShardWriter) -> None:
+        sample = pending.popleft().result()
+        writer.append(sample)
+        images.append(sample.record)
+        callbacks.on_image()
+
+    with _writer_of(job, place) as writer, _cancelling(pending, reading):
+        for row, source in enumerate(job.sources):
+            while len(reading) <= workers and row + len(reading) < len(job.sources):
+                reading.append(pool.submit(_read, job, lut, row + len(reading)))
+            try:
+                read = reading.popleft().result()
+            except FormatError as error:
+                skipped.append(Skipped(position=job.position + row, name=source.name))
+                callbacks.on_skip(source.name, str(error), len(_wanted(job, job.position + row)))
+                continue
+            sources.append(read.record)
+            for number, crop, lighting in _wanted(job, job.position + row):
+                while len(pending) >= 2 * workers:
+                    finish_one(writer)
+                if cancelled is not None and cancelled.is_set():
+                    raise ShardCancelled
+                used.update(light for mixture in lighting.mixtures for light in mixture.lights)
+                pending.append(pool.submit(_make, job, lut, writer, number, read, crop, lighting))
+        while pending:
+            finish_one(writer)
+        files = writer.close()
+    record = ShardRecord(
+        shard=job.shard,
+        sources=sources,
+        skipped=skipped,
+        images=images,
+        files=files,
+        lights=[light_of(lut, light) for light in sorted(used)],
+    )
+    place.commit(record)
+    return record
+
+
+def _writer_of(job: ShardJob, place: Workplace) -> ShardWriter:
+    options = job.options
+    lightings = job.choice.lightings_of(job.position * options.crops)
+    maps = options.variation.tints or any(lighting.masks is not None for lighting in lightings)
+    return open_writer(
+        options.layout, place.files, job.shard, previews=options.previews, maps=maps, details=options.has_details
+    )
+
+
+@contextmanager
+def _cancelling(*queues: deque[Future[Any]]) -> Generator[None]:
+    """Cancel what still waits for a thread if the block fails."""
+    try:
+        yield
+    except BaseException:
+        for queue in queues:
+            for future in queue:
+                future.cancel()
+        raise
+
+
+@dataclass(frozen=True)
+class ShardDone:
+    """Result of a task: how many images its shard has, and of each source that cannot be read name, reason, images."""
+
+    images: int
+    skipped: tuple[tuple[str, str, int], ...]
+
+
+def make_elsewhere(job: ShardJob, place: Workplace) -> ShardDone:
+    """Make a shard in a program of its own, which opens the table itself: the task of an engine's worker.
+
+    A shard that is done already is not made again.
+    """
+    if place.has(job.shard):
+        return ShardDone(len(place.load(job.shard).images), ())
+    found = versions(job.options.form, job.options.layout)
+    if found != job.versions:
+        differing = [name for name in job.versions if found.get(name) != job.versions[name]]
+        raise InputError(
+            "a worker has other libraries than the plan was made with: "
+            + ", ".join(f"{name} {found.get(name)} for {job.versions[name]}" for name in differing)
+            + "; install the same on every machine"
+        )
+    skipped: list[tuple[str, str, int]] = []
+
+    def skip(name: str, reason: str, images: int) -> None:
+        skipped.append((name, reason, images))
+
+    lut = _table_of(job.table, job.table_sha256)
+    with ThreadPoolExecutor(1) as pool:
+        record = make_shard(job, lut, place, pool, 1, Callbacks(on_skip=skip))
+    return ShardDone(len(record.images), tuple(skipped))
+
+
+@lru_cache(maxsize=2)
+def _table_of(folder: Path, sha256: str) -> Lut:
+    from calibration.table.lut import open_lut
+
+    lut = open_lut(folder)
+    if lut.sha256 != sha256:
+        raise InputError(
+            f"the table {folder} of a worker is not that of the plan; give every machine the same table at that path"
+        )
+    return lut
+
+
+def _wanted(job: ShardJob, position: int) -> list[tuple[int, int, Lighting]]:
+    """Return number, crop and lighting of each image of the source at `position` that is in the shard."""
+    crops, each = job.options.crops, job.choice.lights_each
+    numbered = (
+        ((position * crops + crop) * each + place, crop, lighting)
+        for crop in range(crops)
+        for place, lighting in enumerate(job.choice.lightings_of(position * crops + crop))
+    )
+    return [wanted for wanted in numbered if job.first <= wanted[0] < job.stop]
+
+
+def _read(job: ShardJob, lut: Lut, place: int) -> _ReadSource:
+    from generator.files import smallest_side
+    from generator.kernels.choice import replace_unfit_colours
+
+    source: Source = job.sources[place]
+    scene = source.read()
+    whole = (Cut(0, 0, scene.picture),) if job.options.crops == 1 else scene.cuts
+    if len(whole) != job.options.crops:
+        raise InputError(
+            f"{source.name} has {max(1, len(whole))} crops, expected {job.options.crops}; give the preparation of "
+            "pictures and the options of the dataset the same number, and leave random scenes out"
+        )
+    whole = tuple(replace(cut, picture=keep_bits(cut.picture, job.options.bits)) for cut in whole)
+    if job.options.rendering == "codes":
+        fit = [replace_unfit_colours(cut.picture, lut.provenance) for cut in whole]
+    else:
+        # Mixtures of cells hold fit ones alone.
+        fit = [(cut.picture, 0) for cut in whole]
+    height, width = scene.picture.shape[:2]
+    least = smallest_side(job.options.form)
+    if min(height, width) < least:
+        raise FormatError(
+            f"{source.name} is {width}x{height} px, too small for {job.options.form}, which takes {least}x{least} and "
+            "more; choose another format, or leave it out"
+        )
+    record = SourceRecord(
+        position=job.position + place,
+        name=source.name,
+        sha256=scene.sha256,
+        profile=scene.profile,
+        width=width,
+        height=height,
+        replaced_pixels=sum(replaced for _, replaced in fit),
+        split=job.parts[place] if job.parts else split_of(job.options.split, job.seed, scene.sha256, source.name),
+        weight=scene.weight,
+    )
+    cuts = tuple(replace(cut, picture=picture) for cut, (picture, _) in zip(whole, fit, strict=True))
+    return _ReadSource(cuts, record, scene.black_taken)
+
+
+def _make(
+    job: ShardJob, lut: Lut, writer: ShardWriter, number: int, source: _ReadSource, crop: int, lighting: Lighting
+) -> Sample:
+    from generator.files import (
+        FULL,
+        ImageMetadata,
+        encode_pieces,
+        encode_preview,
+        suffix_of,
+        to_full_scale,
+    )
+    from generator.pictures.preview import preview_of
+
+    options, cut = job.options, source.cuts[crop]
+    height, width = cut.picture.shape[:2]
+    white_level = lut.provenance.white_level
+    # What exceeds saturation may be below it once it is exposed anew, and is cut then.
+    most = LARGEST_COUNT if options.variation.is_on else white_level
+    taken = source.black_taken
+    image, weights, rendered = photograph(lut, cut.picture, lighting, options, job.seed, number, most, taken)
+    varied = options.variation.apply(image, white_level, job.seed, number)
+    light = image_light(lut, lighting, weights, varied, options.variation.tints)
+    stored, level = (image, white_level) if options.scale == "table" else (to_full_scale(image, white_level), FULL)
+    metadata = ImageMetadata(level, light.truth, lut.provenance.camera)
+    files: list[tuple[str, str, Pieces]] = [
+        ("images", suffix_of(options.form), encode_pieces(stored, options.form, metadata)),
+        *((kind, ending, (data,)) for kind, ending, data in light.maps),
+    ]
+    if options.previews:
+        files.append(("previews", ".jpg", (encode_preview(preview_of(image, white_level)),)))
+    details: Details = {"crop": crop, "left": cut.left, "top": cut.top} if options.crops > 1 else {}
+    if source.record.weight is not None:
+        details["weight"] = source.record.weight
+    record = ImageRecord(
+        number=number,
+        position=source.record.position,
+        truth=light.truth,
+        lights=light.rows,
+        details=details | rendered | varied.details,
+    )
+    return writer.store(Sample(record, source.record.name, source.record.split, width, height, tuple(files)))

@@ -1,1 +1,0 @@
-"""Where files lie: a folder of this machine, or an object store."""

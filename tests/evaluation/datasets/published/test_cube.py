@@ -1,0 +1,207 @@
+"""Cube+, Cube++ and SimpleCube++: values computed by hand on made-up copies."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from evaluation.datasets import DataOptions, open_scenes
+from foundation.errors import FormatError, InputError
+from tests.evaluation.datasets.made_up import cube_plus, cube_plus_plus, image_of, simple_cube, write_png
+
+pytestmark = pytest.mark.slow
+
+
+@pytest.fixture
+def copy(tmp_path: Path) -> Path:
+    cube_plus(tmp_path)
+    return tmp_path
+
+
+def test_levels_mask_and_truth(copy: Path) -> None:
+    data = open_scenes(copy)
+    assert [scene.name for scene in data.scenes] == ["1.PNG", "2.PNG", "3.PNG"]
+    np.testing.assert_array_equal(
+        [scene.truth for scene in data.scenes], [[0.1, 0.5, 0.4], [0.2, 0.5, 0.3], [0.3, 0.5, 0.2]]
+    )
+    image, mask = data.scenes[2].read()
+    assert image.dtype == np.uint16
+    assert image[0, 0].tolist() == [9000 - 2048, 0, 7000 - 2048]  # 100 is below black.
+    assert image[5, 5].tolist() == [952, 2952, 1952]
+    assert mask is not None
+    assert mask.sum() == 100
+    assert mask[1050:, 2050:].all()
+    # The largest value is 9000, and the authors discard pixels from m - 2.
+    assert data.scenes[2].saturation == 9000 - 2 - 2048
+    assert data.scenes[0].saturation == 6950  # Asked before the image is read.
+    assert "the published Cube+ has 1707" in data.treatment["images"]
+
+
+def test_the_left_face(copy: Path) -> None:
+    data = open_scenes(copy, options=DataOptions(truth="left"))
+    assert data.scenes[1].truth.tolist() == [0.25, 0.5, 0.25]
+    assert "cube+_left_gt.txt" in data.treatment["ground truth"]
+    with pytest.raises(InputError, match="'right'"):
+        open_scenes(copy, options=DataOptions(truth="right"))
+
+
+def test_cube_is_told_from_cube_plus(copy: Path) -> None:
+    (copy / "cube+_gt.txt").rename(copy / "cube_gt.txt")
+    data = open_scenes(copy)
+    assert data.name == "Cube"
+    assert "the published Cube has 1365" in data.treatment["images"]
+
+
+def test_missing_images(copy: Path) -> None:
+    (copy / "2.PNG").unlink()
+    with pytest.raises(FormatError, match=r"lacks 1 of the 3 images of cube\+_gt.txt \(2\); .* --partial"):
+        open_scenes(copy)
+    data = open_scenes(copy, options=DataOptions(partial=True))
+    assert [scene.name for scene in data.scenes] == ["1.PNG", "3.PNG"]
+    assert data.scenes[1].truth.tolist() == [0.3, 0.5, 0.2]
+    assert "1 of the 3 of cube+_gt.txt is not in this copy and left out" in data.treatment["images"]
+
+
+def test_superfluous_images(copy: Path) -> None:
+    write_png(copy / "4.png", image_of(4, 4))
+    with pytest.raises(FormatError, match=r"has 1 images that cube\+_gt.txt does not know \(4\)"):
+        open_scenes(copy)
+    (copy / "4.png").unlink()
+    write_png(copy / "PNG" / "1.PNG", image_of(4, 4))
+    with pytest.raises(FormatError, match=r"1\.PNG.*1\.PNG"):
+        open_scenes(copy)
+
+
+def test_a_reduced_copy_is_refused_since_its_cube_would_not_be_masked(copy: Path) -> None:
+    write_png(copy / "1.PNG", image_of(866, 1300))
+    with pytest.raises(FormatError, match=r"1\.PNG.*1300.*866.*2601.*1732"):
+        open_scenes(copy).scenes[0].read()
+
+
+@pytest.mark.parametrize("line", ["0.2 0.5", "0.2 0.5 red", "0.2 0.5 -0.1", "0 0 0", "nan 0.5 0.5", ""])
+def test_a_line_that_is_no_light_is_named(copy: Path, line: str) -> None:
+    (copy / "cube+_gt.txt").write_text(f"0.1 0.5 0.4\n{line}\n0.3 0.5 0.2\n")
+    with pytest.raises(FormatError, match=r"cube\+_gt\.txt, line 2: .* restore the file"):
+        open_scenes(copy)
+
+
+def test_an_image_of_eight_bits_is_refused(copy: Path) -> None:
+    write_png(copy / "1.PNG", np.zeros((1060, 2060, 3), np.uint8))
+    with pytest.raises(FormatError, match=r"1\.PNG.*8.*RGB.*16"):
+        open_scenes(copy).scenes[0].read()
+
+
+def test_images_in_a_folder_that_is_not_looked_into_are_told_where_they_should_be(copy: Path) -> None:
+    (copy / "images").mkdir()
+    for path in copy.rglob("*.PNG"):
+        path.rename(copy / "images" / path.name)
+    with pytest.raises(
+        FormatError, match=r"\(itself and its folders PNG…: [^)]*\) lacks 3 of the 3 images of cube\+_gt"
+    ):
+        open_scenes(copy)
+
+
+@pytest.fixture
+def whole(tmp_path: Path) -> Path:
+    cube_plus_plus(tmp_path)
+    return tmp_path
+
+
+@pytest.fixture
+def simple(tmp_path: Path) -> Path:
+    simple_cube(tmp_path)
+    return tmp_path
+
+
+def test_the_mean_is_taken_where_there_is_one(whole: Path) -> None:
+    data = open_scenes(whole)
+    assert [scene.name for scene in data.scenes] == ["00_0001.png"]
+    assert data.scenes[0].truth.tolist() == [0.15, 0.5, 0.35]
+    assert "1 of these have no mean and are left out" in data.treatment["images"]
+    assert "the published Cube++ has 4890" in data.treatment["images"]
+
+
+@pytest.mark.parametrize(
+    ("truth", "light"),
+    [
+        ("left", [0.1, 0.5, 0.4]),
+        ("right", [0.2, 0.5, 0.3]),
+        ("left-white", [0.11, 0.5, 0.39]),
+        ("RIGHT_white", [0.21, 0.5, 0.29]),
+    ],
+)
+def test_each_face(whole: Path, truth: str, light: list[float]) -> None:
+    data = open_scenes(whole, options=DataOptions(truth=truth))
+    assert [scene.truth.tolist() for scene in data.scenes] == [light, light]
+    assert data.treatment["ground truth"] == f"{truth.lower().replace('-', '_')} of gt.csv"
+
+
+def test_levels_and_mask(whole: Path) -> None:
+    own, other = open_scenes(whole, options=DataOptions(truth="left")).scenes
+    image, mask = own.read()
+    assert image[0, 0].tolist() == [6952, 0, 4952]
+    assert image[1, 1].tolist() == [952, 2952, 1952]
+    assert mask is not None
+    assert mask.sum() == 1000 * 700
+    assert mask[728:, 1892:].all()
+    assert own.saturation == 8000 - 2048  # MakerNotes:NormalWhiteLevel of its row.
+    assert other.saturation == 9000 - 2 - 2048  # Its row has none: the largest value less 2.
+
+
+def test_without_properties_saturation_is_the_peak(whole: Path) -> None:
+    (whole / "properties.csv").unlink()
+    data = open_scenes(whole)
+    assert "m - 2" in data.treatment["saturation"]
+    assert data.scenes[0].saturation == 9000 - 2 - 2048
+
+
+def test_a_white_level_below_black_is_refused(whole: Path) -> None:
+    (whole / "properties.csv").write_text("image,MakerNotes:NormalWhiteLevel\n00_0001,1000\n")
+    with pytest.raises(FormatError, match=r"properties\.csv.*2.*1000"):
+        open_scenes(whole)
+
+
+def test_another_size_is_refused(whole: Path) -> None:
+    write_png(whole / "PNG" / "00_0001.png", image_of(432, 648))
+    with pytest.raises(FormatError, match=r"is 648 × 432, expected 2592 × 1728"):
+        open_scenes(whole).scenes[0].read()
+
+
+def test_missing_columns_and_truths(whole: Path) -> None:
+    table = (whole / "gt.csv").read_text()
+    (whole / "gt.csv").write_text(table.replace("mean_b", "mean_blue"))
+    with pytest.raises(FormatError, match=r"gt\.csv.*mean_b"):
+        open_scenes(whole)
+    (whole / "gt.csv").write_text(table.replace("0.15,0.5,0.35", "nan,nan,nan"))
+    with pytest.raises(InputError, match="'mean'"):
+        open_scenes(whole)
+    (whole / "gt.csv").write_text(table.replace("0.15,0.5,0.35", "0.15,,0.35"))
+    with pytest.raises(FormatError, match=r"gt\.csv.*2.*mean_g"):
+        open_scenes(whole)
+
+
+def test_simple_cube(simple: Path) -> None:
+    data = open_scenes(simple)
+    assert [(scene.name, scene.truth.tolist()) for scene in data.scenes] == [
+        ("00_0003.png", [0.15, 0.5, 0.35]),
+        ("01_0004.png", [0.2, 0.5, 0.3]),
+    ]
+    image, mask = data.scenes[1].read()
+    assert mask is not None
+    assert mask.sum() == 250 * 175
+    assert mask[182:, 473:].all()
+    assert image[181, 472].tolist() == [952, 2952, 1952]
+    assert data.scenes[1].saturation == 9000 - 2 - 2048
+    assert data.treatment["images"] == "train 1, test 1; the published SimpleCube++ has 2234"
+
+
+def test_a_part_of_simple_cube(simple: Path) -> None:
+    data = open_scenes(simple, options=DataOptions(subset="test"))
+    assert [scene.name for scene in data.scenes] == ["01_0004.png"]
+    with pytest.raises(InputError, match="'val'"):
+        open_scenes(simple, options=DataOptions(subset="val"))
+    (simple / "test" / "PNG" / "01_0004.png").unlink()
+    with pytest.raises(FormatError, match=r"1.*1.*test/gt\.csv.*01_0004"):
+        open_scenes(simple)

@@ -1,0 +1,133 @@
+"""Files of data sets: names, decoding and subtracting black, held against plain arithmetic."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import subprocess
+from pathlib import Path
+
+import imagecodecs
+import numpy as np
+import pytest
+import rawpy
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+
+from evaluation.datasets.files import Folder, decode_image, natural, polygon_mask, present, subtract_black
+from foundation.errors import FormatError
+from tests.data_files import shipped
+from tests.evaluation.datasets.made_up import image_of, write_png, write_tiff
+
+IMAGES = arrays(np.uint16, st.tuples(st.integers(1, 5), st.integers(1, 5), st.just(3)))
+
+
+@given(IMAGES, st.one_of(st.integers(0, 70000), st.floats(0, 70000)))
+def test_black_is_subtracted_and_nothing_falls_below_it(
+    image: np.ndarray[tuple[int, ...], np.dtype[np.uint16]], black: float
+) -> None:
+    lower = subtract_black(image.copy(), black)
+    expected = np.maximum(image.astype(np.float64) - black, 0)
+    np.testing.assert_allclose(lower, expected, rtol=1e-6, atol=5e-3)
+    assert lower.dtype == (np.uint16 if float(black).is_integer() else np.float32)
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_floats_stay_floats(dtype: type[np.float32]) -> None:
+    image = np.array([[[0.5, 0.25, 2.0], [-1, 0, 1]]], dtype)
+    assert subtract_black(image.copy(), 0)[0, 1].tolist() == [0, 0, 1]
+    lower = subtract_black(image, 0.25)
+    assert lower.dtype == dtype
+    assert lower.tolist() == [[[0.25, 0, 1.75], [0, 0, 0.75]]]
+
+
+def test_red_is_first_in_every_format(tmp_path: Path) -> None:
+    write_png(tmp_path / "a.png", image_of(3, 4))
+    write_tiff(tmp_path / "a.tif", image_of(3, 4))
+    np.save(tmp_path / "a.npy", image_of(3, 4))
+    for ending in ("png", "tif", "npy"):
+        np.testing.assert_array_equal(decode_image(str(tmp_path / f"a.{ending}")), image_of(3, 4))
+
+
+def test_what_is_no_such_image(tmp_path: Path) -> None:
+    cases = {
+        "grey.npy": (np.zeros((3, 4), np.uint16), r"\(3, 4\), expected \(height, width, 3\)"),
+        "alpha.npy": (np.zeros((3, 4, 4), np.uint16), r"\(3, 4, 4\), expected"),
+        "ints.npy": (np.zeros((3, 4, 3), np.int64), "holds int64, expected uint16"),
+        "nan.npy": (np.full((3, 4, 3), np.nan), "values that are not finite"),
+        "objects.npy": (np.array([[["a", "b", "c"]]], object), "cannot be read"),
+    }
+    for name, (values, message) in cases.items():
+        np.save(tmp_path / name, values, allow_pickle=True)
+        with pytest.raises(FormatError, match=message) as told:
+            decode_image(str(tmp_path / name))
+        assert name in str(told.value)
+    (tmp_path / "a.exr").write_bytes(b"")
+    with pytest.raises(FormatError, match=r"a\.exr.*'\.exr'"):
+        decode_image(str(tmp_path / "a.exr"))
+    (tmp_path / "grey.png").write_bytes(imagecodecs.png_encode(np.zeros((3, 4), np.uint16)))
+    with pytest.raises(FormatError, match=r"grey\.png.*3.*4"):
+        decode_image(str(tmp_path / "grey.png"))
+
+
+def test_one_byte_that_is_wrong_is_noticed(tmp_path: Path) -> None:
+    noisy = np.random.default_rng(0).integers(0, 65536, (40, 40, 3)).astype(np.uint16)
+    write_png(tmp_path / "a.png", noisy)
+    data = bytearray((tmp_path / "a.png").read_bytes())
+    data[len(data) // 2] ^= 1
+    (tmp_path / "a.png").write_bytes(data)
+    with pytest.raises(FormatError, match="cannot be read"):
+        decode_image(str(tmp_path / "a.png"))
+
+
+def test_a_polygon_given_the_other_way_round_is_the_same() -> None:
+    corners = np.array([[1.0, 1], [6, 2], [5, 6], [0, 5]])
+    np.testing.assert_array_equal(polygon_mask((8, 8), corners), polygon_mask((8, 8), corners[::-1]))
+    assert polygon_mask((8, 8), corners)[3, 3]
+    assert not polygon_mask((8, 8), corners)[0, 7]
+
+
+def test_numbers_in_names_sort_by_value() -> None:
+    names = ["10.png", "9.png", "IMG_0010.png", "IMG_9.png", "a", "1a10", "1a9"]
+    assert sorted(names, key=natural) == ["1a9", "1a10", "9.png", "10.png", "IMG_9.png", "IMG_0010.png", "a"]
+
+
+def test_a_name_twice_in_a_list_is_told(tmp_path: Path) -> None:
+    with pytest.raises(FormatError, match="gt names b twice"):
+        present(["a", "b", "b"], {"a": "a.png", "b": "b.png"}, "gt", tmp_path, partial=False)
+
+
+def test_a_file_for_a_folder_is_told(tmp_path: Path) -> None:
+    (tmp_path / "a").write_text("")
+    with pytest.raises(FormatError, match="a cannot be read"):
+        _ = Folder(tmp_path / "a").files
+
+
+def test_the_advice_for_a_picture_of_eight_bits_gives_the_colours_of_the_mosaic(tmp_path: Path) -> None:
+    # Without -D the same program writes white-balanced sRGB of 16 bits, which nothing tells from camera RGB afterwards.
+    write_png(tmp_path / "eight.png", image_of(4, 4).astype(np.uint8))
+    with pytest.raises(FormatError) as told:
+        decode_image(str(tmp_path / "eight.png"))
+    advice = re.search(r"dcraw((?: -\w)+)", str(told.value))
+    assert advice is not None
+    assert advice[0] in (Path(__file__).parents[3] / "docs" / "reference" / "datasets.md").read_text(encoding="utf-8")
+    assert advice[1].split() == ["-h", "-D", "-4", "-T"]
+    dcraw = shutil.which("dcraw")
+    if dcraw is None:
+        return
+    raw, made = str(shipped("raw/canon_eos_550d_colorchart.dng")), tmp_path / "made.tiff"
+    done = subprocess.run([dcraw, "-c", *advice[1].split(), raw], check=True, capture_output=True, timeout=60)
+    made.write_bytes(done.stdout)
+    means = subtract_black(decode_image(str(made)), 2056).mean(axis=(0, 1))
+    with rawpy.imread(raw) as opened:
+        levels, colours = opened.raw_image_visible.astype(float) - 2056, opened.raw_colors_visible
+        red, green, blue, second = (np.maximum(levels[colours == colour], 0).mean() for colour in range(4))
+    expected = np.array([red, (green + second) / 2, blue])
+    np.testing.assert_allclose(means / means.sum(), expected / expected.sum(), atol=1e-3)
+
+
+def test_a_black_level_is_subtracted_from_planes_as_from_pixels() -> None:
+    planes = np.arange(60, dtype=np.uint16).reshape(3, 4, 5)
+    expected = np.maximum(np.moveaxis(planes.astype(np.int64), 0, 2) - 30, 0)
+    np.testing.assert_array_equal(subtract_black(np.moveaxis(planes, 0, 2), 30.0), expected)

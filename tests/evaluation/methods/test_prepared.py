@@ -1,0 +1,66 @@
+"""Which pixels of an image methods use, and methods on smaller images."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from evaluation.methods.gray_edge import GrayEdge
+from evaluation.methods.prepared import GREY, PreparedImage, shrink, usable
+from evaluation.methods.standard import standard_methods
+from evaluation.methods.wrapped import ResizedMethod
+from evaluation.metrics import recovery_error
+
+
+def test_which_pixels_are_used() -> None:
+    image = np.ones((7, 9, 3))
+    image[3, 4, 1] = 10
+    mask = np.zeros((7, 9), dtype=bool)
+    mask[1, 1] = True
+    used = usable(image, 10, mask, 1)
+    expected = np.zeros((7, 9), dtype=bool)
+    expected[1:6, 1:8] = True
+    expected[2:5, 3:6] = False
+    expected[1, 1] = False
+    np.testing.assert_array_equal(used, expected)
+
+
+def test_a_smaller_image_is_the_mean_of_usable_pixels() -> None:
+    image = np.arange(4 * 6 * 3, dtype=np.uint16).reshape(4, 6, 3)
+    usable = np.ones((4, 6), dtype=bool)
+    usable[0, 0] = usable[:2, 2:4] = False
+    usable[2, 4] = usable[3, 5] = False
+    found, masked = shrink(image, usable, 3)
+    np.testing.assert_allclose(found[0, 0], image[[0, 1, 1], [1, 0, 1]].mean(axis=0), rtol=1e-6)
+    np.testing.assert_allclose(found[1, 1], image[2:4, 2:4].mean(axis=(0, 1)), rtol=1e-6)
+    np.testing.assert_array_equal(masked, [[False, True, False], [False, False, True]])
+
+
+def test_an_image_that_is_no_larger_is_left_as_it_is() -> None:
+    image = np.random.default_rng(0).integers(0, 9000, (40, 50, 3)).astype(np.uint16)
+    method = standard_methods()["gray-edge-2"]
+    assert np.array_equal(ResizedMethod(method, 50).estimate(image, 8000), method.estimate(image, 8000))
+    assert PreparedImage(image).at_most(49) is not PreparedImage(image).at_most(50)
+
+
+def test_independent_noise_misleads_second_derivatives_until_it_is_averaged_away() -> None:
+    # Grey things under a warm light, and noise that knows nothing of the light: half of what is bright in blue.
+    light, random = np.array([1.0, 0.8, 0.3]), np.random.default_rng(0)
+    tiles = random.uniform(500, 3000, (12, 16, 1)).repeat(40, axis=0).repeat(40, axis=1)
+    image = np.maximum(tiles * light + random.normal(0, 60, (480, 640, 3)), 0)
+    method = standard_methods()["gray-edge-2"]
+    at_full_size, at_80 = (recovery_error(one.estimate(image), light) for one in (method, ResizedMethod(method, 80)))
+    assert at_full_size > 8
+    assert at_80 < 1
+    assert recovery_error(GrayEdge("", 2, 1, 6).estimate(image), light) < 2
+    assert recovery_error(method.estimate(tiles * light), light) < 0.01
+
+
+def test_no_pixel_left_is_grey() -> None:
+    image = np.full((64, 64, 3), 100, np.uint16)
+    assert ResizedMethod(standard_methods()["gray-world"], 8).estimate(image, 100) is GREY
+
+
+def test_no_size_is_refused() -> None:
+    with pytest.raises(ValueError, match="expected 1 or more"):
+        ResizedMethod(standard_methods()["gray-world"], 0)

@@ -1,0 +1,188 @@
+"""Card, datasheet and Croissant metadata: what the Hub and loaders read, and what is left to the makers."""
+
+from __future__ import annotations
+
+import json
+import re
+from importlib import import_module
+from pathlib import Path
+from typing import TYPE_CHECKING, get_args
+
+import pytest
+
+from calibration.citation import NOT_RECORDED, OriginRecord
+from generator.dataset.cards import CONFORMS_TO, OPEN, card, datasheet, kind_of, size_category
+from generator.dataset.making import DatasetOptions, generate_dataset
+from generator.dataset.records import Description, Layout, Split
+from generator.pictures.sources import random_scenes
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from calibration.table.lut import Lut
+    from generator.dataset.reader import Dataset
+
+SECTIONS = (
+    "Motivation",
+    "Composition",
+    "Collection process",
+    "Preprocessing, cleaning, labelling",
+    "Uses",
+    "Distribution",
+    "Maintenance",
+)
+"""The sections of Gebru et al., 2021, in their order."""
+
+ORIGIN = OriginRecord(
+    rig="lab",
+    camera_serial="00ff",
+    camera_serial_is="hash",
+    lens="EF50mm | f/1.8 <II>",
+    iso=100,
+    aperture=8.0,
+    shutter_s=0.5,
+    exposure_by="raw files",
+    first_frame="2026-03-01T21:30:00+00:00",
+    last_frame="2026-03-02T04:00:00+00:00",
+    authors=["Family, Given"],
+    licence="CC-BY-4.0",
+    note="one line\n---\nand another",
+)
+
+
+def dataset_in(out: Path, lut: Lut, layout: Layout) -> Dataset:
+    options = DatasetOptions(layout=layout, shard_images=4, split=(0.6, 0.2, 0.2), previews=False)
+    return generate_dataset(lut, out, random_scenes(4, 24, 16, 8), [1, 0], seed=3, options=options)
+
+
+@pytest.fixture(params=get_args(Layout))
+def made(request: pytest.FixtureRequest, make_lut: Callable[..., Lut], tmp_path: Path) -> Dataset:
+    return dataset_in(tmp_path / "out", make_lut(), request.param)
+
+
+@pytest.fixture
+def plain(make_lut: Callable[..., Lut], tmp_path: Path) -> Dataset:
+    return dataset_in(tmp_path / "out", make_lut(), "folder")
+
+
+def place_of(made: Dataset) -> Path:
+    return Path(made.store.place)
+
+
+def with_origin(made: Dataset, origin: OriginRecord | None, **table: object) -> Description:
+    known = made.description.table.model_copy(update={"origin": origin, **table})
+    return made.description.model_copy(update={"table": known})
+
+
+def test_the_card_is_what_the_hub_reads(made: Dataset) -> None:
+    # The Hub's own client reads the front matter and refuses what it cannot use.
+    hub = import_module("huggingface_hub")
+    read = hub.DatasetCard((place_of(made) / "README.md").read_text())
+    assert read.data.license == "unknown"
+    assert read.data.size_categories == ["n<1K"]
+    assert "color-constancy" in read.data.tags
+    files = [entry for config in read.data.to_dict()["configs"] for entry in config["data_files"]]
+    splits = made.description.splits
+    named: set[Split] = {part for part, images in splits.items() if images}  # pyright: ignore[reportAssignmentType]
+    folder = made.description.options["layout"] == "folder"
+    assert {entry["split"] for entry in files} == ({"train"} if folder else named)
+    for entry in files:
+        assert list(place_of(made).glob(entry["path"])), entry
+
+
+def test_the_data_set_of_a_folder_loads_by_its_card(plain: Dataset, tmp_path: Path) -> None:
+    load = import_module("datasets").load_dataset
+    rows = load(str(place_of(plain)), split="train", cache_dir=str(tmp_path / "cache"))
+    assert [row["image"] for row in rows] == [entry.image for entry in plain.entries]
+
+
+@pytest.mark.parametrize(("images", "name"), [(999, "n<1K"), (1000, "1K<n<10K"), (2_000_000, "1M<n<10M")])
+def test_sizes_are_the_hubs(images: int, name: str) -> None:
+    assert size_category(images) == name
+
+
+def test_the_datasheet_has_its_sections_and_marks_what_is_open(made: Dataset) -> None:
+    text = datasheet(made.description)
+    assert tuple(re.findall(r"^## (.+)$", text, re.MULTILINE)) == SECTIONS
+    assert "${" not in text
+    said = re.search(r"(\d+) questions are marked", text)
+    assert said is not None
+    assert int(said[1]) == text.count(OPEN)
+    # Each question has an answer or the mark.
+    for question, answer in re.findall(r"^\*\*([^*\n]+\?)\*\*\n\n(.+?)(?=\n\n|\Z)", text, re.MULTILINE | re.DOTALL):
+        assert answer.strip(), question
+    assert text == (place_of(made) / "DATASHEET.md").read_text()
+
+
+def test_a_table_without_an_origin_is_said_to_have_none(plain: Dataset) -> None:
+    for text in (card(plain.description), datasheet(plain.description)):
+        assert f"| Lens | {NOT_RECORDED} |" in text
+        assert f"| Licence | {NOT_RECORDED} |" in text
+        assert "does not record whether its frames were photographed or simulated" in text
+
+
+def test_what_a_table_says_is_carried_and_breaks_no_line(plain: Dataset) -> None:
+    described = with_origin(plain, ORIGIN)
+    for text in (card(described), datasheet(described)):
+        assert "| Lens | EF50mm \\| f/1.8 &lt;II> |" in text
+        assert "| Note | one line --- and another |" in text
+        assert "author = {Family, Given}" in text
+    assert "The table: CC-BY-4.0." in datasheet(described)
+    # The front matter is closed once, whatever the table says.
+    assert card(described).count("\n---\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("origin", "computed", "word"),
+    [
+        (OriginRecord(rig="lab"), None, "raw frames of a printed chart"),
+        (OriginRecord(rig="simulated"), None, "simulated laboratory"),
+        (None, {"by": "sim table"}, "computed from spectra"),
+        (OriginRecord(rig="lab"), {"by": "sim table"}, "computed from spectra"),
+    ],
+)
+def test_nothing_that_was_not_photographed_is_called_so(
+    plain: Dataset, origin: OriginRecord | None, computed: dict[str, str] | None, word: str
+) -> None:
+    assert word in kind_of(with_origin(plain, origin, computed=computed))
+
+
+def test_the_titles_lights_are_the_tables(plain: Dataset) -> None:
+    assert plain.description.table.lights == 4
+    assert len(plain.description.lights) == 2
+    assert "under 4 lights" in card(plain.description)
+
+
+def test_croissant_names_what_is_there(made: Dataset) -> None:
+    """MLCommons Croissant 1.0: resources have their hash, fields a source that exists."""
+    root = place_of(made)
+    text = json.loads((root / "croissant.json").read_text())
+    assert text["conformsTo"] == CONFORMS_TO
+    listed = dict(line.split("  ")[::-1] for line in (root / "SHA256SUMS").read_text().splitlines())
+    resources = {entry["@id"]: entry for entry in text["distribution"]}
+    for entry in resources.values():
+        if entry["@type"] == "cr:FileObject":
+            assert entry["sha256"] == listed[entry["contentUrl"]]
+        else:
+            found = {path for pattern in entry["includes"] for path in root.glob(pattern)}
+            assert len(found) == len(listed.keys() & {path.relative_to(root).as_posix() for path in found}) > 0
+    records = text["recordSet"]
+    named = [*resources, *(one["@id"] for one in records), *(one["@id"] for each in records for one in each["field"])]
+    assert len(named) == len(set(named))
+    for record in records:
+        for field in record["field"]:
+            source = field["source"]
+            (resource,) = [source[kind]["@id"] for kind in ("fileObject", "fileSet") if kind in source]
+            assert resource in resources
+            if resource == "ground_truth.csv":
+                header = (root / "ground_truth.csv").read_text().splitlines()[0]
+                assert source["extract"]["column"] in header.split(",")
+
+
+def test_mlcommons_own_reader_takes_it(made: Dataset) -> None:
+    library = pytest.importorskip("mlcroissant", reason="the reader of MLCommons is not installed")
+    dataset = library.Dataset(str(place_of(made) / "croissant.json"))
+    assert not dataset.metadata.ctx.issues.errors
+    rows = list(dataset.records("ground_truth"))
+    assert [row["ground_truth/image"].decode() for row in rows] == [entry.image for entry in made.entries]
+    assert [row["ground_truth/r"] for row in rows] == pytest.approx([entry.truth[0] for entry in made.entries])

@@ -1,0 +1,338 @@
+"""Layouts: the same images in folders, tar and Parquet files, read back by the programs that they are for."""
+
+from __future__ import annotations
+
+import gc
+import hashlib
+import io
+import json
+import subprocess
+import sys
+import tarfile
+from collections.abc import Callable
+from dataclasses import dataclass
+from importlib import import_module
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+import pytest
+
+from foundation.errors import FormatError, InputError, StorageError
+from generator.dataset.making import DatasetOptions, generate_dataset
+from generator.dataset.reader import Dataset, file_faults, open_dataset
+from generator.dataset.records import COMPLETED_BY_HAND, Layout
+from generator.lights.choices import ListedLights, SimultaneousLights
+from generator.masks.making import parse_masks
+from generator.pictures.sources import SourcePicture, random_scenes
+from tests.generator.groups import grouped
+
+pytestmark = pytest.mark.slow
+
+if TYPE_CHECKING:
+    from calibration.table.lut import Lut
+
+    Make = Callable[..., Dataset]
+
+SCENES = random_scenes(9, 28, 24, 8)
+LAYOUTS: tuple[Layout, ...] = ("folder", "webdataset", "parquet")
+
+
+@pytest.fixture
+def make(make_lut: Callable[..., Lut], tmp_path: Path) -> Make:
+    """Return a maker of datasets of 18 images in shards of 5."""
+    lut = make_lut()
+
+    def call(layout: Layout, lights: Any = (2, 0), **options: Any) -> Dataset:
+        out = tmp_path / f"{layout}-{len(list(tmp_path.iterdir()))}"
+        wishes: dict[str, Any] = {"seed": 3, "layout": layout, "shard_images": 5, **options}
+        return generate_dataset(lut, out, SCENES, lights, **grouped(**wishes))
+
+    return call
+
+
+def decoded(data: bytes) -> npt.NDArray[np.uint16]:
+    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    assert image is not None
+    return np.asarray(image[..., ::-1], dtype=np.uint16)
+
+
+def place_of(made: Dataset) -> Path:
+    return Path(made.store.place)
+
+
+@pytest.mark.parametrize("form", ["png", "tiff", "exr", "jxl", "dng"])
+def test_every_format_is_the_same_image_in_every_layout(make: Make, form: str) -> None:
+    folder, tar, parquet = (make(layout, form=form) for layout in LAYOUTS)
+    assert folder.entries == tar.entries == parquet.entries
+    assert [entry.image for entry in folder.entries] == [f"{number:06d}.{form}" for number in range(18)]
+    for entry in folder.entries[::4]:
+        image = folder.read_image(entry)
+        assert image.shape == ((12, 14, 3) if form == "dng" else (24, 28, 3))
+        for other in (tar, parquet):
+            np.testing.assert_array_equal(other.read_image(entry), image)
+            assert other.read_preview(entry) == folder.read_preview(entry) != None  # noqa: E711
+
+
+READER = """
+import hashlib, json, sys
+import webdataset
+for sample in webdataset.WebDataset(sys.argv[1:], shardshuffle=False):
+    digests = {key: hashlib.sha256(sample[key]).hexdigest() for key in ("png", "preview.jpg")}
+    print(json.dumps([sample["__key__"], json.loads(sample["json"]), digests]))
+"""
+
+
+def test_the_webdataset_package_reads_the_shards(make: Make) -> None:
+    made = make("webdataset", split=(0.6, 0.0, 0.4))
+    files = make("folder", split=(0.6, 0.0, 0.4))
+    lines = (place_of(files) / "SHA256SUMS").read_text().splitlines()
+    sums = {name: digest for digest, name in (line.split("  ") for line in lines)}
+    entries = {entry.image: entry for entry in made.entries}
+    for part in ("train", "test"):
+        urls = sorted((place_of(made) / part).glob("*.tar"))
+        # In a program of its own, because the package leaves files open.
+        read = subprocess.run([sys.executable, "-c", READER, *urls], capture_output=True, text=True, check=True)
+        for key, metadata, digests in map(json.loads, read.stdout.splitlines()):
+            entry = entries.pop(f"{key}.png")
+            assert digests == {"png": sums[f"images/{key}.png"], "preview.jpg": sums[f"previews/{key}.jpg"]}
+            assert metadata["truth"] == pytest.approx(entry.truth, abs=1e-9)
+            assert (metadata["source"], metadata["split"], metadata["width"]) == (entry.source, part, 28)
+            assert entry.split == part
+    assert not entries
+
+
+def test_equal_tar_files_whoever_makes_them(make: Make) -> None:
+    made = make("webdataset")
+    (first, *_) = sorted((place_of(made) / "data").iterdir())
+    with tarfile.open(first) as tar:
+        headers = tar.getmembers()
+    assert [header.name for header in headers[:3]] == ["000000.png", "000000.preview.jpg", "000000.json"]
+    assert {(header.uid, header.gid, header.uname, header.mtime, header.mode) for header in headers} == {
+        (0, 0, "", 0, 0o644)
+    }
+
+
+@pytest.fixture
+def hugging_face(monkeypatch: pytest.MonkeyPatch, tmp_path_factory: pytest.TempPathFactory) -> Any:
+    """Return the package `datasets`, without network and with its files in a folder of the test."""
+    cache = tmp_path_factory.mktemp("hugging-face")
+    monkeypatch.setenv("HF_HUB_OFFLINE", "1")
+    monkeypatch.setenv("HF_HOME", str(cache))
+    monkeypatch.setenv("HF_DATASETS_CACHE", str(cache / "datasets"))
+    datasets = import_module("datasets")
+    datasets.disable_progress_bars()
+    return datasets
+
+
+def test_hugging_face_reads_the_shards(make: Make, hugging_face: Any, tmp_path: Path) -> None:
+    made = make("parquet", split=(0.6, 0.0, 0.4))
+    files = {part: str(place_of(made) / part / "*.parquet") for part in ("train", "test")}
+    loaded = hugging_face.load_dataset("parquet", data_files=files, cache_dir=str(tmp_path / "cache"))
+    assert set(loaded) == {"train", "test"}
+    entries = {entry.image: entry for entry in made.entries}
+    for part, rows in loaded.items():
+        assert type(rows.features["image"]).__name__ == "Image"
+        for row in rows:
+            entry = entries.pop(row["image"]["path"])
+            np.testing.assert_array_equal(decoded(row["image"]["bytes"]), made.read_image(entry))
+            assert row["preview"].size == (28, 24), "previews are decoded, as pictures"
+            assert row["number"] == int(entry.image[:6])
+            assert (row["source"], row["split"]) == (entry.source, part) == (entry.source, entry.split)
+            assert row["truth"] == pytest.approx(entry.truth, abs=1e-9)
+            assert [light["illumination"] for light in row["lights"]] == list(entry.lights)
+    assert not entries
+
+
+@dataclass(frozen=True)
+class Gone:
+    """A source on a disk that is not there any more."""
+
+    name: str = "gone"
+
+    def read(self) -> SourcePicture:
+        raise StorageError("the disk is gone")
+
+    def to_json(self) -> dict[str, Any]:
+        return {}
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_a_shard_that_cannot_be_ended_is_given_up_quietly(
+    make_lut: Callable[..., Lut], tmp_path: Path, layout: Layout, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """A writer that ends its file when it is thrown away finds the file closed; pytest fails for that."""
+    with pytest.raises(StorageError, match="the disk is gone"):
+        generate_dataset(make_lut(), tmp_path / "out", (*SCENES, Gone()), [0], options=DatasetOptions(layout=layout))
+    gc.collect()
+    assert capfd.readouterr() == ("", "")
+
+
+@pytest.mark.parametrize("layout", ["webdataset", "parquet"])
+def test_hugging_face_finds_the_parts_by_the_card(
+    make: Make, hugging_face: Any, tmp_path: Path, layout: Layout
+) -> None:
+    made = make(layout, split=(0.6, 0.0, 0.4), previews=False)
+    loaded = hugging_face.load_dataset(str(place_of(made)), cache_dir=str(tmp_path / "cache"))
+    assert {part: rows.num_rows for part, rows in loaded.items()} == {
+        part: images for part, images in made.description.splits.items() if images
+    }
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_several_lights_in_an_image(make: Make, make_lut: Callable[..., Lut], layout: Layout) -> None:
+    choice = SimultaneousLights(ListedLights((2, 0)), 2, parse_masks("half-plane", 2, 5))
+    made = make(layout, choice)
+    entry = made.entries[3]
+    assert entry.lights == ("2", "0")
+    assert len(made.entries) == 9
+    assert np.sum(entry.truth) == pytest.approx(1)
+    text = (place_of(made) / "ground_truth.csv").read_text().splitlines()
+    assert [line.split(",")[0] for line in text[7:9]] == ["000003.png", "000003.png"]
+    if layout == "folder":
+        files = [(place_of(made) / "masks" / f"000003_{light}.png").read_bytes() for light in (0, 1)]
+        weights = np.stack([grey(file) for file in files], axis=-1) / 65535
+        truths = decoded((place_of(made) / "ground_truth" / "000003.png").read_bytes()) / 65535
+    elif layout == "webdataset":
+        with tarfile.open(place_of(made) / "data" / "000000.tar") as tar:
+            members = {member.name: tar.extractfile(member) for member in tar.getmembers()}
+            maps = {name: stream.read() for name, stream in members.items() if stream is not None}
+        weights = np.stack([grey(maps[f"000003.masks_{light}.png"]) for light in (0, 1)], axis=-1) / 65535
+        truths = decoded(maps["000003.ground_truth.png"]) / 65535
+    else:
+        table = import_module("pyarrow.parquet").read_table(place_of(made) / "data" / "000000.parquet").to_pylist()
+        weights = np.stack([grey(mask["bytes"]) for mask in table[3]["masks"]], axis=-1) / 65535
+        truths = decoded(table[3]["ground_truth"]["bytes"]) / 65535
+    assert weights.shape == (24, 28, 2)
+    np.testing.assert_allclose(weights.sum(axis=2), 1, atol=1e-6)
+    np.testing.assert_allclose(made.read_weights(entry), weights, atol=1e-7)
+    np.testing.assert_allclose(made.read_ground_truth_map(entry), truths, atol=1e-7)
+    single = make(layout, split=(0.5, 0.5, 0.0))
+    for read in (single.read_weights, single.read_ground_truth_map):
+        with pytest.raises(InputError, match=r"000002\.png"):
+            read(single.entries[2])
+    # Where one light is alone, the map is that light; and the mean of the lights is that of their parts.
+    alone = weights[..., 0] == 1
+    assert 0 < alone.sum() < alone.size
+    np.testing.assert_allclose(truths[alone], np.broadcast_to(entry.truths[0], (alone.sum(), 3)), atol=2e-5)
+    whites = np.array([light.white for light in sorted(made.description.lights, key=lambda light: -light.illumination)])
+    mean = weights.mean(axis=(0, 1)) @ whites
+    np.testing.assert_allclose(mean / mean.sum(), entry.truth, atol=1e-6)
+
+
+def grey(data: bytes) -> npt.NDArray[np.uint16]:
+    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    assert image is not None
+    return np.asarray(image, dtype=np.uint16)
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_verifying_names_what_is_not_as_it_was_made(make: Make, layout: Layout) -> None:
+    folder = place_of(make(layout, split=(0.5, 0.2, 0.3)))
+    verified: list[tuple[int, int]] = []
+    assert list(file_faults(folder, lambda done, total: verified.append((done, total)), workers=3)) == []
+    names = {path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()}
+    files = len(names - {"SHA256SUMS", *COMPLETED_BY_HAND})
+    assert verified == [(done + 1, files) for done in range(files)]
+    victim = sorted(path for path in folder.rglob("00000*") if path.suffix in (".png", ".tar", ".parquet"))[0]
+    data = bytearray(victim.read_bytes())
+    data[len(data) // 2] ^= 1
+    victim.write_bytes(bytes(data))
+    (folder / "gt.txt").unlink()
+    (folder / "notes.txt").write_text("mine")
+    # Its makers answer the questions left open.
+    (folder / "DATASHEET.md").write_text("answered")
+    assert sorted(file_faults(folder)) == sorted(
+        [
+            f"{victim.relative_to(folder).as_posix()} has changed",
+            "gt.txt is missing",
+            "notes.txt is no part of the dataset",
+        ]
+    )
+    with pytest.raises(FormatError, match=r"dataset\.json"):
+        list(file_faults(folder.parent))
+
+
+@pytest.mark.parametrize("layout", ["webdataset", "parquet"])
+def test_damaged_shards_are_named(make: Make, layout: Layout) -> None:
+    made = make(layout)
+    (file,) = (place_of(made) / "data").glob("000002.*")
+    entry = made.entries[12]
+    file.write_bytes(file.read_bytes()[: file.stat().st_size // 3])
+    with pytest.raises(FormatError, match=rf"{file.name} (is damaged|holds no 000012)"):
+        made.read_image(entry)
+    file.unlink()
+    with pytest.raises(FormatError, match=rf"cannot read .*{file.name}: No such file"):
+        made.read_image(entry)
+
+
+@pytest.mark.parametrize("layout", ["webdataset", "parquet"])
+def test_an_image_whose_name_lost_its_ending_is_read_or_refused(make: Make, layout: Layout) -> None:
+    """A tar file has it under its whole name, a Parquet file under its number."""
+    made = make(layout)
+    table = place_of(made) / "ground_truth.csv"
+    table.write_text(table.read_text().replace("000000.png", "000000"))
+    found = open_dataset(place_of(made))
+    if layout == "webdataset":
+        with pytest.raises(FormatError, match="holds no 000000"):
+            found.read_image(found.entries[0])
+    else:
+        np.testing.assert_array_equal(found.read_image(found.entries[0]), made.read_image(made.entries[0]))
+    np.testing.assert_array_equal(found.read_image(found.entries[1]), made.read_image(made.entries[1]))
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+@pytest.mark.parametrize("name", ["000000../outside/canary.png", "../000000.png", "٠٠٠٠٠٠.png", "000000", "0.0/0.png"])
+def test_an_image_is_a_number_with_an_ending_and_no_path(make: Make, layout: Layout, name: str) -> None:
+    table = place_of(make(layout)) / "ground_truth.csv"
+    table.write_text(table.read_text().replace("000000.png", name), encoding="utf-8")
+    if name == "000000":
+        assert open_dataset(table.parent).entries[0].image == name
+    else:
+        with pytest.raises(FormatError, match="is not in the order of the images"):
+            open_dataset(table.parent)
+
+
+@pytest.mark.parametrize("name", ["0.png", "000000.tiff", "1" * 11 + ".png", "1" * 5000 + ".png"])
+def test_a_number_comes_once_and_has_few_digits(make: Make, name: str) -> None:
+    table = place_of(make("folder")) / "ground_truth.csv"
+    text = table.read_text()
+    table.write_text(text.replace("\n000001.png,", f"\n{name},"))
+    with pytest.raises(FormatError, match="is not in the order of the images"):
+        open_dataset(table.parent)
+
+
+def test_the_layout_parquet_says_what_it_needs(make: Make, monkeypatch: pytest.MonkeyPatch) -> None:
+    def find_spec(name: str) -> None:
+        del name
+
+    monkeypatch.setattr("generator.dataset.layouts.find_spec", find_spec)
+    with pytest.raises(InputError, match=r"needs pyarrow; install it with: pip install pyarrow"):
+        make("parquet")
+
+
+def test_a_dataset_of_version_1_is_read(make: Make) -> None:
+    made = make("folder", split=None)
+    folder = place_of(made)
+    content = json.loads((folder / "dataset.json").read_text())
+    sources = [source.model_dump(exclude={"split", "profile"}) for source in made.sources]
+    for key in ("planned", "pixels", "replaced_pixels", "splits"):
+        del content[key]
+    content |= {"version": 1, "sources": sources}
+    content["options"] = {key: content["options"][key] for key in ("format", "lights", "previews")} | {"max_side": None}
+    (folder / "dataset.json").write_text(json.dumps(content))
+    (folder / "sources.csv").unlink()
+    old = open_dataset(folder)
+    assert old.entries == made.entries
+    assert (old.description.sources, old.description.pixels, old.description.planned) == (9, 9 * 28 * 24, 18)
+    assert old.sources == made.sources
+    np.testing.assert_array_equal(old.read_image(old.entries[5]), made.read_image(made.entries[5]))
+
+
+def test_hashes_are_of_the_files(make: Make) -> None:
+    folder = place_of(make("parquet"))
+    for line in io.StringIO((folder / "SHA256SUMS").read_text()):
+        digest, name = line.rstrip("\n").split("  ")
+        assert hashlib.sha256((folder / name).read_bytes()).hexdigest() == digest

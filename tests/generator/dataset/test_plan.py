@@ -1,0 +1,100 @@
+"""Parts of a dataset: by source, by chance, and nobody's business but the source's own."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from foundation.errors import InputError
+from generator.dataset.making import DatasetOptions, generate_dataset, parse_share
+from generator.dataset.plan import parse_split, split_of
+from generator.pictures.sources import find_pictures
+
+if TYPE_CHECKING:
+    from calibration.table.lut import Lut
+
+SHARES = (0.7, 0.1, 0.2)
+
+
+def test_shares_hold_on_average() -> None:
+    count = 20_000
+    parts = Counter(split_of(SHARES, 5, None, f"picture-{number}") for number in range(count))
+    for part, share in zip(("train", "validation", "test"), SHARES, strict=True):
+        # Six standard deviations of a binomial count: chance alone fails one of the three in 2·10⁸ runs.
+        assert abs(parts[part] - share * count) < 6 * math.sqrt(count * share * (1 - share))
+
+
+@given(st.text(), st.integers(0, 2**64 - 1), st.sampled_from([(1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)]))
+def test_a_part_of_everything_has_everything(name: str, seed: int, shares: tuple[float, float, float]) -> None:
+    part = split_of(shares, seed, None, name)
+    assert part == ("train", "validation", "test")[shares.index(1.0)]
+
+
+def test_seeds_divide_differently() -> None:
+    one = [split_of((0.5, 0.0, 0.5), 1, None, str(number)) for number in range(200)]
+    other = [split_of((0.5, 0.0, 0.5), 2, None, str(number)) for number in range(200)]
+    # Equal places are binomial (200, 1/2); beyond 60 … 140 lies chance 2·10⁻⁸.
+    assert 60 < sum(a == b for a, b in zip(one, other, strict=True)) < 140
+    assert split_of(None, 1, None, "a") is None
+
+
+def write(path: Path, seed: int) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    codes = np.random.default_rng(seed).integers(0, 256, (6, 7, 3)).astype(np.uint8)
+    path.write_bytes(cv2.imencode(".png", codes)[1].tobytes())
+
+
+def test_parts_are_of_sources_and_stay_when_others_come(make_lut: Callable[..., Lut], tmp_path: Path) -> None:
+    lut = make_lut()
+    folder = tmp_path / "pictures"
+    for number in range(12):
+        write(folder / f"{number:02d}.png", number)
+        write(folder / "copies" / f"copy of {number}.png", number)
+    options = DatasetOptions(split=(0.5, 0.2, 0.3))
+    made = generate_dataset(lut, tmp_path / "out", find_pictures([folder]), [0, 1, 2], seed=6, options=options)
+    parts: dict[str, set[str | None]] = {}
+    for entry in made.entries:
+        parts.setdefault(entry.source, set()).add(entry.split)
+    assert all(len(of_source) == 1 for of_source in parts.values()), "no source is in two parts"
+    for number in range(12):
+        assert parts[f"{number:02d}.png"] == parts[f"copies/copy of {number}.png"], "two copies of a file go together"
+    for part in ("train", "validation", "test"):
+        named = (tmp_path / "out" / "splits" / f"{part}.txt").read_text().split()
+        assert named == [entry.image for entry in made.entries if entry.split == part]
+        assert len(named) == made.description.splits[part]
+    assert {source.name: {source.split} for source in made.sources} == parts
+    for number in range(12, 20):
+        write(folder / f"0{number}.png", number)
+    more = generate_dataset(lut, tmp_path / "more", find_pictures([folder]), [3], seed=6, options=options)
+    now = {entry.source: {entry.split} for entry in more.entries}
+    assert {name: now[name] for name in parts} == parts
+
+
+@pytest.mark.parametrize(
+    ("text", "shares"),
+    [("0.8,0.1,0.1", (0.8, 0.1, 0.1)), ("80,10,10", (0.8, 0.1, 0.1)), ("3,1", (0.75, 0.0, 0.25)), ("0,0,1", (0, 0, 1))],
+)
+def test_shares_as_they_are_written(text: str, shares: tuple[float, float, float]) -> None:
+    assert parse_split(text) == pytest.approx(shares)
+
+
+@pytest.mark.parametrize("text", ["", "1", "a,b", "1,1,1,1", "-1,2", "0,0", "nan,1", "inf,1,1"])
+def test_what_are_no_shares(text: str) -> None:
+    with pytest.raises(InputError, match="is to be shares of train, validation and test"):
+        parse_split(text)
+
+
+def test_shares_of_the_work() -> None:
+    assert parse_share("3/16") == (3, 16)
+    for text in ("16/16", "3", "-1/4", "a/b", "3/"):
+        with pytest.raises(InputError, match="I/N"):
+            parse_share(text)

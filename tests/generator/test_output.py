@@ -1,0 +1,119 @@
+"""What is shown of the work on images: lines or a bar, the colour matrix, and lights whose cells are found first."""
+
+from __future__ import annotations
+
+import io
+import logging
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from generator.cli import main
+from generator.command import output as progress
+from generator.command.output import matrix_sentence, shown_progress
+from generator.dataset.shards import SILENT
+from generator.rendering.matrices import SOURCE, camera_matrix
+from tests.generator.conftest import MakeLut
+
+
+class _Terminal(io.StringIO):
+    def isatty(self) -> bool:
+        return True
+
+
+def _told() -> None:
+    with shown_progress(4) as callbacks:
+        callbacks.on_done(1)
+        callbacks.on_image()
+        callbacks.on_skip("bad\x1b[2J.png", "it is no picture", 1)
+        callbacks.on_image()
+
+
+def test_a_file_gets_lines(capsys: pytest.CaptureFixture[str]) -> None:
+    _told()
+    lines = capsys.readouterr().err.splitlines()
+    assert lines[:2] == ["1 images were made by an earlier run", "left out bad\\x1b[2J.png: it is no picture"]
+    assert lines[2].startswith("images 2/2 ")
+    assert len(lines) == 3
+
+
+def test_a_terminal_gets_a_bar_when_it_takes_longer(monkeypatch: pytest.MonkeyPatch) -> None:
+    for soon, bar in ((1e6, False), (-1.0, True)):
+        terminal = _Terminal()
+        monkeypatch.setattr(sys, "stderr", terminal)
+        monkeypatch.setattr(progress, "SOON_S", soon)
+        _told()
+        assert ("━" in terminal.getvalue()) == bar
+        assert "2/2" in terminal.getvalue()
+        assert "\x1b[2J" not in terminal.getvalue()
+
+
+def test_who_wants_errors_alone_gets_nothing(
+    capsys: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level(logging.ERROR)
+    with shown_progress(1) as callbacks:
+        assert callbacks is SILENT
+    assert capsys.readouterr().err == ""
+
+
+pytestmark = pytest.mark.slow
+
+
+@pytest.fixture
+def place(make_lut: MakeLut, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    make_lut()
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    assert cv2.imwrite("grey.png", np.full((8, 8, 3), 128, np.uint8))
+    return tmp_path
+
+
+@pytest.mark.parametrize(
+    ("more", "told", "not_told"),
+    [
+        ((), "that of Test camera is not known, so this one was fitted; if the print's colours were", "dcraw"),
+        (("--matrix", "table"), "colour matrix: table (least squares", "is not known"),
+        (("--matrix", "Canon EOS 600D"), f"colour matrix: Canon EOS 600D ({SOURCE})", "faults"),
+        (("--matrix", "none"), "colour matrix: none (none asked for", "faults"),
+    ],
+)
+def test_the_matrix_is_told(
+    place: Path, capsys: pytest.CaptureFixture[str], more: tuple[str, ...], told: str, not_told: str
+) -> None:
+    wish = ("--sources", "grey.png", "--illuminations", "1", "--no-preview", "--rendering", "colorimetric")
+    assert main(["lut", "out", *wish, *more]) == 0
+    printed = capsys.readouterr().out
+    assert told in printed
+    assert not_told not in printed
+
+
+def test_by_codes_no_matrix_is_told(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["lut", "out", "--sources", "grey.png", "--illuminations", "1", "--no-preview"]) == 0
+    assert "colour matrix" not in capsys.readouterr().out
+
+
+def test_the_tables_own_camera_needs_no_advice() -> None:
+    known = camera_matrix("Canon EOS 550D")
+    assert known is not None
+    assert matrix_sentence(known, "Canon EOS 550D", chosen=False) == f"colour matrix: Canon EOS 550D ({SOURCE})"
+
+
+def test_lights_whose_cells_are_to_be_found_are_told_once(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    wish = ("--random-scenes", "2", "--size", "24x20", "--no-preview", "--rendering", "colorimetric")
+
+    def told(*arguments: str, matrix: str = "none") -> str:
+        assert main(["lut", *arguments, *wish, "--matrix", matrix]) == 0
+        return capsys.readouterr().out
+
+    assert "finding the cells of 2 lights on the way" in told("first", "--illuminations", "1,2")
+    assert "finding the cells" not in told("again", "--illuminations", "1,2", "--seed", "3")
+    # A mixture takes the cells of the light nearest to it, light 2 here, whose white is that of the mixture nearly.
+    assert "finding the cells" not in told("mixed", "--light", "1:0.05+2:0.95")
+    assert "finding the cells of 1 light on" in told("more", "--illuminations", "1-3")
+    # Another matrix has other cells. The first share of two scenes under three lights, two images each, has two lights.
+    share = ("--illuminations", "0,1,2", "--shard-images", "2", "--shard", "0/3")
+    assert "finding the cells of 2 lights on" in told("share", *share, matrix="Canon EOS 600D")
