@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
     from evaluation.experiments.comparing import Matched
     from evaluation.metrics import ErrorKind
-    from evaluation.results.errors_file import MethodErrors
+    from evaluation.results.files import MethodErrors
 
 _FEW = 3
 """Comparisons of which everything is printed unasked: of more, one would have to look for what they come to."""
@@ -69,9 +69,10 @@ def compare(
     told: JsonOutput,
 ) -> None:
     """Compare methods on the same images."""
-    from evaluation.experiments import comparing, comparison_report
-    from evaluation.reports.terminal import show_notes, show_tables
-    from evaluation.results.errors_file import read_errors
+    from evaluation.experiments import comparing
+    from evaluation.experiments import comparing as comparison_report
+    from evaluation.reports.table_output import show_notes, show_tables
+    from evaluation.results.files import read_errors
     from foundation.errors import InputError
     from foundation.files import require_free
 

@@ -7,8 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from evaluation.commands.data_options import DataReading, with_data_options
-from evaluation.commands.result_options import PrintedError, PrintedStatistics
+from evaluation.commands.options import DataReading, PrintedError, PrintedStatistics, with_data_options
 from evaluation.commands.train import LEARNERS_HELP
 from foundation.console import EXIT_CODES
 from foundation.json_output import JsonOutput, with_json
@@ -83,13 +82,13 @@ def cv(
     told: JsonOutput,
 ) -> None:
     """Cross-validate methods on a data set."""
-    from evaluation.commands.choosing import require_order
-    from evaluation.experiments.cross_validation import cross_validate
+    from evaluation.commands.options import require_order
     from evaluation.experiments.folds import choose_folds, folds_to_csv
     from evaluation.experiments.run_folder import describe_run, write_run
-    from evaluation.reports.terminal import show_notes, show_tables
+    from evaluation.experiments.running import cross_validate
+    from evaluation.reports.table_output import show_notes, show_tables
     from evaluation.results.method_records import describe_method
-    from evaluation.results.summary_tables import summary_table
+    from evaluation.results.tables import summary_table
     from foundation.console import orderly_end, progress
     from foundation.files import require_free, require_free_file, write_whole
     from foundation.processors import processor_count
@@ -144,7 +143,7 @@ def _parted_copies(data: SceneSet, folds: npt.NDArray[np.int64]) -> list[str]:
 
 def _chosen(text: str) -> tuple[list[Learner], list[str]]:
     """Return the learners that a text names, after the constant light, and why some of `all` are left out."""
-    from evaluation.commands.choosing import choose_learners
+    from evaluation.commands.options import choose_learners
     from evaluation.learning.constant_light import ConstantLight
     from evaluation.learning.feature_learner import what_is_missing
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from evaluation.commands.data_options import DataReading, with_data_options
+from evaluation.commands.options import DataReading, with_data_options
 from foundation.console import EXIT_CODES, shows_progress
 from foundation.json_output import JsonOutput, with_json
 
@@ -76,9 +76,9 @@ def describe(
     from dataclasses import replace
 
     from evaluation.experiments.describing import report as reporting
-    from evaluation.experiments.describing.against import compare_figures, sentence
-    from evaluation.experiments.describing.statistics_json import statistics_to_json
-    from evaluation.reports.terminal import show_notes, show_tables
+    from evaluation.experiments.describing.description import statistics_to_json
+    from evaluation.experiments.describing.report import compare_figures, sentence
+    from evaluation.reports.table_output import show_notes, show_tables
     from foundation.errors import InputError
     from foundation.files import require_free_file, write_whole
     from foundation.processors import processor_count
@@ -118,7 +118,7 @@ def _described(place: str, reading: DataReading, cells: int, workers: int) -> Da
     from rich.progress import Progress
 
     from evaluation.experiments.describing import describe
-    from evaluation.experiments.describing.statistics_json import read_statistics
+    from evaluation.experiments.describing.description import read_statistics
     from foundation.errors import InputError
 
     if reading.layout is None and place.endswith(".json") and Path(place).is_file():

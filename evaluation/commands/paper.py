@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from evaluation.commands.data_options import DataReading, with_data_options
+from evaluation.commands.options import DataReading, with_data_options
 from foundation.console import EXIT_CODES, new_app, shows_progress
 from foundation.json_output import JsonOutput, with_json
 
@@ -110,11 +110,10 @@ def table1(
     told: JsonOutput,
 ) -> None:
     """Run plain methods on eight generated data sets."""
-    from evaluation.experiments.paper.hot import hot_rows
+    from evaluation.experiments.paper.material import read_truths
     from evaluation.experiments.paper.published import cell_name
     from evaluation.experiments.paper.reporting import table1_report
-    from evaluation.experiments.paper.scenes.truths import read_truths
-    from evaluation.experiments.paper.table1 import settings, size_dependence
+    from evaluation.experiments.paper.table1 import hot_rows, settings, size_dependence
     from evaluation.experiments.paper.table1 import table1 as run
     from foundation.processors import processor_count
 
@@ -185,13 +184,13 @@ def table2(
     told: JsonOutput,
 ) -> None:
     """Train learned methods on real and on generated images."""
-    from evaluation.commands.choosing import choose_learners
+    from evaluation.commands.options import choose_learners
     from evaluation.datasets import open_scenes
     from evaluation.experiments.folds import choose_folds
     from evaluation.experiments.paper.reporting import table2_report
     from evaluation.experiments.paper.table2 import table2 as run
     from evaluation.experiments.paper.table2 import table2_tables
-    from evaluation.experiments.transfer.overlap import trainable_images
+    from evaluation.experiments.transfer.plan import trainable_images
     from evaluation.learning.standard import standard_learners
     from foundation.processors import processor_count
 
@@ -248,7 +247,7 @@ def bits(
     told: JsonOutput,
 ) -> None:
     """Run methods on images whose colours were reduced."""
-    from evaluation.experiments.paper.bits import bits_methods, bits_removed
+    from evaluation.experiments.paper.colour_reduction import bits_methods, bits_removed
     from evaluation.experiments.paper.reporting import bits_report
     from foundation.processors import processor_count
 
@@ -284,7 +283,7 @@ def flash(
     told: JsonOutput,
 ) -> None:
     """Write tone-mapped codes of linear images."""
-    from evaluation.experiments.paper.flash_files import write_codes
+    from evaluation.experiments.paper.colour_reduction import write_codes
     from foundation.processors import processor_count
 
     _require_free(out)
@@ -315,7 +314,7 @@ def flash_inverse(
     told: JsonOutput,
 ) -> None:
     """Write the linear images of codes."""
-    from evaluation.experiments.paper.flash_files import write_linear
+    from evaluation.experiments.paper.colour_reduction import write_linear
     from foundation.console import progress
     from foundation.processors import processor_count
 
@@ -377,8 +376,8 @@ def chromaticities(
     told: JsonOutput,
 ) -> None:
     """Show the chromaticities of tables' lights."""
+    from evaluation.experiments.paper.material import read_truths
     from evaluation.experiments.paper.reporting import chromaticities_report
-    from evaluation.experiments.paper.scenes.truths import read_truths
 
     _require_free(out)
     report = chromaticities_report(_open(luts), [read_truths(place) for place in truths or ()])
@@ -395,7 +394,7 @@ def _treatment(data: SceneSet) -> str:
 def _finish(report: PaperReport, conditions: Sequence[str], out: Path | None, told: JsonOutput) -> None:
     """Print the tables and write the folder, if one was named."""
     from evaluation.experiments.paper.reporting import write_report
-    from evaluation.reports.terminal import show_notes, show_tables
+    from evaluation.reports.table_output import show_notes, show_tables
 
     show_notes(told, conditions)
     for table in report.tables:
@@ -417,7 +416,7 @@ def _pictures(place: str, matrix: str) -> tuple[Sequence[Source], str, str]:
     """Return the source pictures at a place, what was done to get them, and their name."""
     from evaluation.datasets import open_scenes
     from evaluation.datasets.opening import layout_of
-    from evaluation.experiments.paper.scenes.developing import developed
+    from evaluation.experiments.paper.material import developed
     from foundation.errors import FormatError, InputError
     from generator import find_pictures
     from generator.rendering.matrices import choose_matrix

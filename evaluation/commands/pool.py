@@ -48,10 +48,8 @@ def pool(
     told: JsonOutput,
 ) -> None:
     """Pool the results of several transfers."""
-    from evaluation.experiments.pooling.pool import pool_transfers
-    from evaluation.experiments.pooling.reading import read_transfer
-    from evaluation.experiments.pooling.report import make_tables, save_pool
-    from evaluation.reports.terminal import show_notes, show_tables
+    from evaluation.experiments.pool import make_tables, pool_transfers, read_transfer, save_pool
+    from evaluation.reports.table_output import show_notes, show_tables
     from foundation.errors import InputError
     from foundation.files import require_free
 

@@ -8,15 +8,13 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from evaluation.commands.choosing import METHOD_HELP
-from evaluation.commands.data_options import DataReading, with_data_options
-from evaluation.commands.result_options import PrintedError, PrintedStatistics
+from evaluation.commands.options import METHOD_HELP, DataReading, PrintedError, PrintedStatistics, with_data_options
 from foundation.console import EXIT_CODES
 from foundation.json_output import JsonOutput, with_json
 
 if TYPE_CHECKING:
     from evaluation.metrics import ErrorKind
-    from evaluation.results.run import Run
+    from evaluation.results.result import Run
 
 HELP = f"""Estimate the light of every image of a data set and sum up the errors.
 
@@ -92,7 +90,7 @@ def run(
     told: JsonOutput,
 ) -> None:
     """Evaluate methods on a data set."""
-    from evaluation.commands.choosing import choose_estimates, choose_methods
+    from evaluation.commands.options import choose_estimates, choose_methods
     from evaluation.experiments.run_folder import run_methods
     from evaluation.results.result import images_csv, table_csv
     from foundation.console import orderly_end, progress
@@ -136,8 +134,8 @@ def _require_free(csv: Path | None, images: Path | None, out: Path | None) -> No
 
 def _print(made: Run, error: ErrorKind, further: bool) -> None:
     """Print the tables, what was done to the images, and what else is to be said."""
-    from evaluation.reports.terminal import print_table
-    from evaluation.results.summary_tables import lights_tables, summary_table
+    from evaluation.reports.table_output import print_table
+    from evaluation.results.tables import lights_tables, summary_table
 
     print_table(summary_table(made.subject, made.results, error, further))
     for table in lights_tables(made.subject, made.results, error):
@@ -150,7 +148,7 @@ def _print(made: Run, error: ErrorKind, further: bool) -> None:
 
 def _tell(made: Run, told: JsonOutput) -> None:
     """Add every statistic of every kind of error, and what was done to the images."""
-    from evaluation.results.summary_tables import statistics_rows
+    from evaluation.results.tables import statistics_rows
 
     table = statistics_rows(made.subject, made.results)
     rows = [dict(zip(table.columns, row, strict=True)) for row in table.rows]

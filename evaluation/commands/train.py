@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from evaluation.commands.data_options import DataReading, with_data_options
+from evaluation.commands.options import DataReading, with_data_options
 from foundation.console import EXIT_CODES
 from foundation.json_output import JsonOutput, with_json
 
@@ -52,7 +52,7 @@ def train(
     told: JsonOutput,
 ) -> None:
     """Train a method on a data set."""
-    from evaluation.commands.choosing import choose_learners, require_order
+    from evaluation.commands.options import choose_learners, require_order
     from evaluation.learning.feature_learner import (
         FeatureLearner,
         extract,
@@ -61,7 +61,7 @@ def train(
         truths_of,
     )
     from evaluation.learning.model_files import provenance_of, save_model
-    from evaluation.reports.terminal import show_notes
+    from evaluation.reports.table_output import show_notes
     from foundation.clock import SystemClock
     from foundation.console import orderly_end, progress
     from foundation.errors import InputError

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from evaluation.commands.data_options import DataReading, with_data_options
+from evaluation.commands.options import DataReading, with_data_options
 from foundation.console import EXIT_CODES
 from foundation.json_output import JsonOutput, with_json
 
@@ -17,9 +17,8 @@ if TYPE_CHECKING:
     import numpy as np
     import numpy.typing as npt
 
-    from evaluation.experiments.transfer.material import AnyLearner
     from evaluation.experiments.transfer.plan import TransferPlan
-    from evaluation.experiments.transfer.rows import TransferRow
+    from evaluation.experiments.transfer.rows import AnyLearner, TransferRow
     from evaluation.methods.method import Method
     from evaluation.scene import SceneSet
 
@@ -133,12 +132,11 @@ def transfer(
 
     from evaluation.datasets import open_scenes
     from evaluation.experiments.folds import FOLDS, choose_folds
-    from evaluation.experiments.transfer.figures import figures_of
-    from evaluation.experiments.transfer.outcome import TransferOutcome, save_outcome
+    from evaluation.experiments.transfer.outcome import TransferOutcome, figures_of, save_outcome
     from evaluation.experiments.transfer.plan import is_generated, plan_transfer
     from evaluation.experiments.transfer.rows import count_images
     from evaluation.experiments.transfer.rows import transfer as run_transfer
-    from evaluation.reports.terminal import show_notes, show_tables
+    from evaluation.reports.table_output import show_notes, show_tables
     from evaluation.results.method_records import describe_method
     from foundation.console import orderly_end, progress
     from foundation.files import require_free
@@ -192,7 +190,7 @@ def transfer(
 
 def _learners(text: str) -> tuple[list[AnyLearner], tuple[str, ...]]:
     """Return the learned methods of a list and the constant light, and why some of `all` are left out."""
-    from evaluation.commands.choosing import choose_learners
+    from evaluation.commands.options import choose_learners
     from evaluation.learning.constant_light import ConstantLight
     from evaluation.learning.feature_learner import what_is_missing
     from foundation.errors import InputError
@@ -211,7 +209,7 @@ def _learners(text: str) -> tuple[list[AnyLearner], tuple[str, ...]]:
 
 
 def _references(text: str) -> list[Method]:
-    from evaluation.commands.choosing import choose_methods
+    from evaluation.commands.options import choose_methods
 
     return [] if text.strip().lower() == "none" else choose_methods(text.split(","))
 

@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 import typer
 
-from evaluation.commands.data_options import DataReading, with_data_options
+from evaluation.commands.options import DataReading, with_data_options
 from foundation.console import EXIT_CODES
 from foundation.json_output import JsonOutput, with_json
 
@@ -58,7 +58,7 @@ def tune(
 ) -> None:
     """Choose a method's parameters on a data set."""
     from evaluation.experiments.tuning import settings_of, tune_family, tuning_rows, tuning_table
-    from evaluation.reports.terminal import show_notes, show_tables
+    from evaluation.reports.table_output import show_notes, show_tables
     from evaluation.results.tables import table_to_csv
     from foundation.console import orderly_end, progress
     from foundation.files import require_free_file, write_whole

@@ -14,7 +14,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from types import ModuleType
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -23,9 +24,6 @@ from evaluation.learning.feature_learner import FeatureLearner, Features, requir
 from evaluation.learning.working_size import reduce
 from evaluation.scene import Image
 from foundation.errors import InputError
-
-if TYPE_CHECKING:
-    from types import ModuleType
 
 _KERNEL = 5
 """Side of the first convolution, px; the others have 3."""

@@ -1,38 +1,348 @@
-"""The result folder of a transfer: tables, every image's errors, folds, and how all was made."""
+"""The result folder of a transfer: tables, every image's errors, folds, and how all was made.
+
+What rows of results come to: statistics with their intervals, and ratios of rows.
+
+With several seeds a statistic is the mean of those of the seeds, not that of their errors together, and a resample is
+of images: one that is drawn counts in every seed. So the interval says what other test images would have given; how
+much another seed gives is stated apart.
+
+The tables of a transfer: errors, their intervals, ratios; and the paper's own ratios to stand beside them.
+"""
 
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
 
+from evaluation.experiments.bootstrap import STATISTICS, ErrorSample, bca, resamples
 from evaluation.experiments.folds import folds_to_csv
-from evaluation.experiments.transfer.figures import TransferFigures
 from evaluation.experiments.transfer.plan import TransferPlan, is_generated
-from evaluation.experiments.transfer.rows import TransferRow
-from evaluation.experiments.transfer.tables import (
-    errors_table,
-    intervals_table,
-    long_table,
-    naive_ratios_table,
-    paper_ratios_table,
-    real_ratios_table,
-)
-from evaluation.reports.latex import table_to_latex
-from evaluation.reports.page import table_part
+from evaluation.experiments.transfer.rows import NAIVE, TransferRow
+from evaluation.metrics import ErrorKind
+from evaluation.reports.table_output import table_part, table_to_latex
+from evaluation.results.files import errors_csv
 from evaluation.results.result import Result
-from evaluation.results.run_files import errors_csv
 from evaluation.results.tables import Table, table_to_csv
 from evaluation.scene import SceneSet
 from foundation import pages
+from foundation.errors import InputError
 from foundation.files import whole_folder, write_whole
 from foundation.plots import FAINT, INK, series_style, svg_of
 from foundation.version import software
+
+COUNT: Final = 2000
+"""Resamples: as many as `bootstrap.interval` takes by default."""
+LEVEL: Final = 0.95
+"""Confidence of an interval: the usual one."""
+
+Floats = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Figure:
+    """A number with the ends of its confidence interval; all NaN where it has none."""
+
+    value: float
+    low: float
+    high: float
+
+
+@dataclass(frozen=True)
+class RowFigures:
+    """What one row comes to.
+
+    - `statistics`: in the order of `bootstrap.STATISTICS`, degrees.
+    - `spread`: standard deviation of each statistic over the seeds, degrees; None with a single one.
+    """
+
+    row: TransferRow
+    statistics: tuple[Figure, ...]
+    spread: tuple[float, ...] | None
+
+
+@dataclass(frozen=True)
+class RowRatio:
+    """What a row comes to in parts of another with the same method, image by image on the same resamples.
+
+    - `row`, `base`: the row, and what it is held to.
+    - `ratios`: in the order of `bootstrap.STATISTICS`.
+    """
+
+    row: TransferRow
+    base: TransferRow
+    ratios: tuple[Figure, ...]
+
+
+@dataclass(frozen=True)
+class TransferFigures:
+    """All that is told of the rows.
+
+    - `error`: the kind of error.
+    - `rows`: every row with its statistics.
+    - `to_real`: every row that was trained elsewhere against the same method's real cross-validation.
+    - `to_naive`: every generated row against the naive rows of the same pictures and lights.
+    - `to_base`: every other row against those that were asked for, of the same method.
+    """
+
+    error: ErrorKind
+    rows: tuple[RowFigures, ...]
+    to_real: tuple[RowRatio, ...]
+    to_naive: tuple[RowRatio, ...]
+    to_base: tuple[RowRatio, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class _Replicates:
+    """Statistics of one row: of itself (6,), of resamples (B, 6), and without each image (N, 6); means over seeds."""
+
+    estimate: Floats
+    resampled: Floats
+    without: Floats
+
+
+def figures_of(
+    rows: Sequence[TransferRow], error: ErrorKind, seed: int = 0, base: str | None = None
+) -> TransferFigures:
+    """Return statistics, intervals and ratios of rows on the same test images.
+
+    `base`: `TransferRow.training` of rows that every other one is held to as well, with x for × and in any case; None
+    for no such ratios.
+    """
+    bases = _named(rows, base)
+    samples = [[ErrorSample.of(result.errors[error]) for result in row.results] for row in rows]
+    drawn: list[list[Floats]] = [[] for _ in rows]
+    for counts in resamples(len(samples[0][0].order), seed, COUNT):
+        for batches, several in zip(drawn, samples, strict=True):
+            batches.append(np.mean([one.statistics(counts) for one in several], axis=0))
+    known = [
+        _Replicates(
+            np.mean([one.estimate() for one in several], axis=0),
+            np.concatenate(batches),
+            np.mean([one.without_each() for one in several], axis=0),
+        )
+        for several, batches in zip(samples, drawn, strict=True)
+    ]
+    listed = tuple(
+        RowFigures(
+            row,
+            tuple(_figure(one.estimate[place], one.resampled[:, place], one.without[:, place]) for place in _PLACES),
+            _spread(several),
+        )
+        for row, one, several in zip(rows, known, samples, strict=True)
+    )
+
+    def ratio(number: int, base: int) -> RowRatio:
+        one, other = known[number], known[base]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            parts = [one.estimate / other.estimate, one.resampled / other.resampled, one.without / other.without]
+        ratios = tuple(_figure(parts[0][place], parts[1][:, place], parts[2][:, place]) for place in _PLACES)
+        return RowRatio(rows[number], rows[base], ratios)
+
+    to_real = [
+        ratio(number, base)
+        for number, row in enumerate(rows)
+        for base, other in enumerate(rows)
+        if other.kind == "cross-validation"
+        and other.method == row.method
+        and row.kind not in ("cross-validation", "none")
+    ]
+    to_naive = [
+        ratio(number, base)
+        for number, row in enumerate(rows)
+        for base, other in enumerate(rows)
+        if row.kind == "generated" and other.kind in NAIVE and (other.method, other.data) == (row.method, row.data)
+    ]
+    to_base = [
+        ratio(number, other)
+        for number, row in enumerate(rows)
+        for other in bases
+        if number not in bases and rows[other].method == row.method
+    ]
+    return TransferFigures(error, listed, tuple(to_real), tuple(to_naive), tuple(to_base))
+
+
+def _named(rows: Sequence[TransferRow], base: str | None) -> list[int]:
+    """Return the places of the rows that were trained in the way of that name."""
+    if base is None:
+        return []
+    trained = [(number, row) for number, row in enumerate(rows) if row.kind != "none"]
+    found = [number for number, row in trained if _plain(row.training) == _plain(base)]
+    if not found:
+        known = dict.fromkeys(row.training for _, row in trained)
+        raise InputError(f"no row was trained on {base!r}; expected one of: {'; '.join(known)}")
+    methods = {rows[number].method for number in found}
+    if not any(row.method in methods for number, row in trained if number not in found):
+        raise InputError(f"no method was trained on anything but {base!r}; add results to hold to it, or leave it out")
+    return found
+
+
+def _plain(training: str) -> str:
+    return " ".join(training.casefold().replace("×", " x ").split())
+
+
+_PLACES: Final = range(len(STATISTICS))
+"""Places of the statistics in arrays."""
+
+
+def _figure(value: float, replicates: Floats, without: Floats) -> Figure:
+    if not np.isfinite(value):
+        return Figure(np.nan, np.nan, np.nan)
+    return Figure(float(value), *bca(float(value), replicates, [without], LEVEL))
+
+
+def _spread(several: Sequence[ErrorSample]) -> tuple[float, ...] | None:
+    if len(several) < 2:
+        return None
+    deviations = np.std([one.estimate() for one in several], axis=0, ddof=1)
+    return tuple(float(part) for part in deviations)
+
+
+HEADS: Final = ("Mean", "Med.", "Tri.", "Best 25%", "Worst 25%", "Avg.")
+"""Heads of the statistics, in their order: all six stand in every table, since any one of them misleads alone."""
+
+_PAPER: Final = {
+    "Regression trees (simple features)": ((2.54, 1.66, 1.89, 0.45, 6.07, 1.85), (1.57, 0.89, 1.04, 0.20, 4.15, 1.04)),
+    "Smart Color Cat": ((2.47, 1.43, 1.76, 0.40, 6.21, 1.73), (2.27, 1.35, 1.61, 0.34, 5.72, 1.58)),
+    "Color Beaver (using Gray-world)": ((1.73, 0.74, 0.97, 0.37, 4.75, 1.17), (1.49, 0.77, 0.98, 0.21, 3.94, 0.99)),
+}
+"""Degrees on Cube+: trained on generated images, and cross-validated on Cube+ (paper, table 2)."""
+
+
+def errors_table(found: TransferFigures, name: str, images: int) -> Table:
+    """Return the statistics of every row; of several seeds their means."""
+    notes = [
+        f"{row.row.method}, {row.row.training}: no light in {guessed.sum()} images; grey stands in for it"
+        for row in found.rows
+        if (guessed := row.row.results[0].guessed).any()
+    ]
+    if any(row.spread for row in found.rows):
+        median = [row.spread[1] for row in found.rows if row.spread]
+        notes.append(
+            f"Means over seeds; the standard deviation of a median over seeds is up to {max(median):.2f} degrees."
+        )
+    return Table(
+        f"{name}: {found.error} angular error of {images} images, degrees",
+        ("Method", "Trained on", "Images", *HEADS),
+        tuple((*_heads(row.row), *(figure.value for figure in row.statistics)) for row in found.rows),
+        notes=tuple(notes),
+    )
+
+
+def intervals_table(found: TransferFigures, name: str) -> Table:
+    """Return the confidence intervals of every row's statistics."""
+    return Table(
+        f"{name}: {LEVEL * 100:.0f} % intervals of these errors, degrees",
+        ("Method", "Trained on", "Images", *HEADS),
+        tuple(
+            (*_heads(row.row), *(f"{figure.low:.2f} – {figure.high:.2f}" for figure in row.statistics))
+            for row in found.rows
+        ),
+        notes=("BCa bootstrap over the test images: what other images of the same kind would have given.",),
+    )
+
+
+def real_ratios_table(found: TransferFigures, name: str) -> Table:
+    """Return every row in parts of the same method's cross-validation on the test images, real ones or not."""
+    made = any(one.base.data for one in found.to_real)
+    base = f"cross-validation on {name} (generated)" if made else "real cross-validation"
+    good = "as good as images of the test set, which are generated, not real" if made else "as good as real images"
+    return Table(
+        f"{name}: errors in parts of the same method's {base}",
+        ("Method", "Trained on", *HEADS),
+        tuple((one.row.method, one.row.training, *_ratio_cells(one)) for one in found.to_real),
+        notes=(f"With {LEVEL * 100:.0f} % intervals, paired by test image. 1: {good}.",),
+    )
+
+
+def naive_ratios_table(found: TransferFigures, name: str) -> Table | None:
+    """Return the generated rows in parts of the naive ones; None if there was no naive baseline."""
+    if not found.to_naive:
+        return None
+    return Table(
+        f"{name}: errors with generated images in parts of those with the same pictures and lights, but no table",
+        ("Method", "In parts of", *HEADS),
+        tuple((one.row.method, one.base.training, *_ratio_cells(one)) for one in found.to_naive),
+        notes=("Paired by test image. Below 1: the table is worth something to this method.",),
+    )
+
+
+def base_ratios_table(found: TransferFigures, name: str) -> Table | None:
+    """Return every row in parts of the row that was asked for; None if none was."""
+    if not found.to_base:
+        return None
+    return Table(
+        f"{name}: errors in parts of those of the same method, trained on {found.to_base[0].base.training}",
+        ("Method", "Trained on", *HEADS),
+        tuple((one.row.method, one.row.training, *_ratio_cells(one)) for one in found.to_base),
+        notes=("Paired by test image. Sets of other pictures or lights are held together with the choice of them.",),
+    )
+
+
+def paper_ratios_table() -> Table:
+    """Return the paper's ratios, of its table 2.
+
+    Examples
+    --------
+    >>> paper_ratios_table().texts()[2]
+    ('Color Beaver (using Gray-world)', '0.74 / 0.77', '1.16', '0.96', '0.99', '1.76', '1.21', '1.18')
+    """
+    rows = [
+        (
+            method,
+            f"{generated[1]:.2f} / {real[1]:.2f}",
+            *(one / other for one, other in zip(generated, real, strict=True)),
+        )
+        for method, (generated, real) in _PAPER.items()
+    ]
+    return Table(
+        "The paper, Cube+: generated in parts of real cross-validation",
+        ("Method", "Medians, degrees", *HEADS),
+        tuple(rows),
+        notes=("Paper, table 2; Canon EOS 550D, Cube+ images as source pictures and as the test.",),
+    )
+
+
+def long_table(found: TransferFigures) -> Table:
+    """Return all numbers for other programs: a row for each method, training and statistic."""
+    to_real = {(one.row.method, one.row.training): one for one in found.to_real}
+    rows: list[tuple[str | float | None, ...]] = []
+    for row in found.rows:
+        ratio = to_real.get((row.row.method, row.row.training))
+        for place, statistic in enumerate(STATISTICS):
+            spread = row.spread[place] if row.spread else None
+            parts = _three(ratio.ratios[place]) if ratio else (None, None, None)
+            who = (row.row.method, row.row.kind, row.row.data, row.row.images, len(row.row.results))
+            rows.append((*who, found.error, statistic, *_three(row.statistics[place]), spread, *parts))
+    return Table("All numbers", _LONG, tuple(rows))
+
+
+_LONG: Final = (
+    *("method", "training", "data", "images", "seeds", "error", "statistic"),
+    *("degrees", "low", "high", "seed_sd", "ratio_to_real", "ratio_low", "ratio_high"),
+)
+"""Columns of the file for other programs; empty where a row has no such number."""
+
+
+def _heads(row: TransferRow) -> tuple[str, str, int | None]:
+    return row.method, row.training, row.images or None
+
+
+def _ratio_cells(ratio: RowRatio) -> tuple[str, ...]:
+    return tuple(
+        f"{figure.value:.2f} ({figure.low:.2f} – {figure.high:.2f})" if math.isfinite(figure.value) else "–"
+        for figure in ratio.ratios
+    )
+
+
+def _three(figure: Figure) -> tuple[float | None, ...]:
+    return tuple(number if math.isfinite(number) else None for number in (figure.value, figure.low, figure.high))
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from evaluation.cli import main
-from evaluation.commands.choosing import choose_estimates, choose_learners, choose_methods
+from evaluation.commands.options import choose_estimates, choose_learners, choose_methods
 from evaluation.learning.standard import standard_learners
 from evaluation.methods import standard_methods
 from evaluation.methods.standard import STANDARD

@@ -10,7 +10,7 @@ import typer
 from typer.testing import CliRunner
 
 from evaluation.cli import main
-from evaluation.commands.data_options import DataReading, with_data_options
+from evaluation.commands.options import DataReading, with_data_options
 from evaluation.datasets import LAYOUTS, DataOptions
 from foundation.errors import InputError
 from tests.evaluation.datasets.made_up import nus8

@@ -18,7 +18,7 @@ from evaluation.experiments.running import evaluate
 from evaluation.learning.model_files import StoredMethod, provenance_of
 from evaluation.learning.standard import standard_learners
 from evaluation.methods import GrayEdge
-from evaluation.results.errors_file import read_errors
+from evaluation.results.files import read_errors
 from evaluation.scene import Scene, SceneSet
 from foundation.clock import SystemClock
 from foundation.errors import InputError

@@ -7,7 +7,7 @@ from math import inf, nan
 
 import pytest
 
-from evaluation.reports.forest import ForestLine, Interval, forest_plot, round_numbers
+from evaluation.experiments.pool import ForestLine, Interval, forest_plot, round_numbers
 
 PANELS = ("Med.", "Mean")
 

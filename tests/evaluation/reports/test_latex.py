@@ -6,7 +6,7 @@ import re
 
 import pytest
 
-from evaluation.reports.latex import escape_latex, table_to_latex, tables_to_latex
+from evaluation.reports.table_output import escape_latex, table_to_latex, tables_to_latex
 from evaluation.results.tables import Table
 
 HEADS = ("Algorithm", "Mean", "Best 25%")

@@ -14,10 +14,8 @@ import pytest
 from evaluation.experiments.run_folder import describe_run
 from evaluation.experiments.running import evaluate
 from evaluation.methods import GrayEdge
-from evaluation.reports import error_figures
-from evaluation.reports.developed import developed
-from evaluation.reports.error_figures import error_curves, error_planes
-from evaluation.reports.run_page import chosen_images, run_page
+from evaluation.reports import run_page as error_figures
+from evaluation.reports.run_page import chosen_images, developed, error_curves, error_planes, run_page
 from evaluation.results.result import Result
 from tests.evaluation.made_up import MixedWall, Wall, as_set, walls
 from tests.foundation.test_pages import checked

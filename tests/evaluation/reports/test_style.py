@@ -8,8 +8,8 @@ from html import unescape
 import numpy as np
 import pytest
 
-from evaluation.reports.error_figures import error_curves, error_planes
-from evaluation.reports.scatter import error_scatter
+from evaluation.experiments.comparing import error_scatter
+from evaluation.reports.run_page import error_curves, error_planes
 from evaluation.results.result import Result
 
 NAMES = ["a $\\bad{x$ b", "$y_1$", "_mine"]

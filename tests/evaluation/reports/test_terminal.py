@@ -6,7 +6,7 @@ import re
 
 import pytest
 
-from evaluation.reports.terminal import print_table
+from evaluation.reports.table_output import print_table
 from evaluation.results.tables import Table
 
 TABLE = Table(

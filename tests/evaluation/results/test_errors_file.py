@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from evaluation.results.errors_file import read_errors
+from evaluation.results.files import read_errors
 from foundation.errors import FormatError, InputError
 
 HEAD = "image,method,estimate_r,estimate_g,estimate_b,truth_r,truth_g,truth_b,recovery,reproduction,guessed"

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from evaluation.results.estimates import read_estimates
+from evaluation.results.files import read_estimates
 from foundation.errors import FormatError, InputError
 
 IMAGES = ["a/one.png", "a/two.png", "three.v1.png"]

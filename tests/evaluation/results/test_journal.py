@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 
+from evaluation.experiments.run_folder import AnswerJournal, read_journal
 from evaluation.metrics import MapError, RegionError
-from evaluation.results.answers import SceneAnswer
-from evaluation.results.journal import AnswerJournal, read_journal
+from evaluation.results.result import SceneAnswer
 from foundation.errors import InputError
 
 IDENTITY = {"methods": [{"name": "A", "settings": {"p": 1 / 3}}], "software": "x 1", "several lights": (False, True)}

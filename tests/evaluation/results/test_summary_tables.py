@@ -9,7 +9,8 @@ import pytest
 
 from evaluation.experiments.running import evaluate
 from evaluation.metrics import recovery_error, summarise
-from evaluation.results.summary_tables import Subject, lights_tables, statistics_rows, summary_table
+from evaluation.results.result import Subject
+from evaluation.results.tables import lights_tables, statistics_rows, summary_table
 from evaluation.scene import MixedScene, Scene
 from tests.evaluation.made_up import MixedWall, walls
 

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from evaluation.experiments.describing import DataDescription, describe, figures
-from evaluation.experiments.describing.against import FigureCompared, compare_figures, sentence
-from evaluation.experiments.describing.quantities import QUANTITIES
+from evaluation.experiments.describing.description import QUANTITIES
+from evaluation.experiments.describing.report import FigureCompared, compare_figures, sentence
 from generator.likeness.drawing import TITLES
 from tests.evaluation.experiments.describing.scenes import random_set
 

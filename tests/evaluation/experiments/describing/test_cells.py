@@ -6,7 +6,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from evaluation.experiments.describing.cells import LEVELS, Cells, reduce_scene
+from evaluation.experiments.describing.description import LEVELS, Cells, reduce_scene
 from foundation.errors import FormatError
 from tests.evaluation.experiments.describing.scenes import Made, MadeMixture
 
@@ -34,7 +34,7 @@ def by_loop(image: npt.NDArray[np.float64], usable: npt.NDArray[np.bool_], side:
 
 @pytest.mark.parametrize("band", [1, 700, 1 << 18])
 def test_means_of_usable_pixels(band: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("evaluation.experiments.describing.cells._BAND_PIXELS", band)
+    monkeypatch.setattr("evaluation.experiments.describing.description._BAND_PIXELS", band)
     random = np.random.default_rng(1)
     image = random.uniform(0, 1000, (45, 71, 3)) * LIGHT
     mask = random.random((45, 71)) < 0.3
@@ -68,7 +68,7 @@ def test_small_images_keep_their_pixels_and_side_zero_keeps_all() -> None:
 
 @pytest.mark.parametrize("band", [1, 1 << 18])
 def test_each_pixel_of_a_mixture_is_divided_by_its_own_light(band: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("evaluation.experiments.describing.cells._BAND_PIXELS", band)
+    monkeypatch.setattr("evaluation.experiments.describing.description._BAND_PIXELS", band)
     lights = np.array([[0.6, 1.0, 0.3], [0.3, 1.0, 0.8]])
     image = np.repeat(lights, 40, axis=0) * np.full((50, 1, 1), 100.0)
     scene = MadeMixture("m", lights.mean(axis=0), image, lights=lights)

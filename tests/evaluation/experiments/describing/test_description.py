@@ -10,7 +10,7 @@ import pytest
 
 from evaluation.datasets import open_scenes
 from evaluation.experiments.describing import describe, figures
-from evaluation.experiments.describing.statistics_json import read_statistics, statistics_to_json
+from evaluation.experiments.describing.description import read_statistics, statistics_to_json
 from evaluation.scene import SceneSet
 from foundation.errors import FormatError, InputError
 from tests.data_files import available

@@ -6,7 +6,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from evaluation.experiments.describing.lights import energy_distance, light_distribution
+from evaluation.experiments.describing.description import energy_distance, light_distribution
 from generator.statistics.image_numbers import log_chroma
 
 

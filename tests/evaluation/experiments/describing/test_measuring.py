@@ -6,7 +6,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from evaluation.experiments.describing.measuring import measure_scene
+from evaluation.experiments.describing.description import measure_scene
 from tests.evaluation.experiments.describing.scenes import Made, MadeMixture
 
 LIGHT = np.array([0.5, 1.0, 0.75])

@@ -6,7 +6,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from evaluation.experiments.describing.noise import measure_blocks, photon_transfer, relative_noise
+from evaluation.experiments.describing.description import measure_blocks, photon_transfer, relative_noise
 
 
 def blocks_of(image: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:

@@ -6,8 +6,8 @@ from dataclasses import replace
 from pathlib import Path
 
 from evaluation.experiments.describing import describe
+from evaluation.experiments.describing.description import read_statistics, statistics_to_json
 from evaluation.experiments.describing.report import seen_notes
-from evaluation.experiments.describing.statistics_json import read_statistics, statistics_to_json
 from tests.evaluation.experiments.describing.scenes import random_set
 
 

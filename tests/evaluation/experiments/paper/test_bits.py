@@ -10,7 +10,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from evaluation.experiments.paper.bits import bits_methods, bits_removed, bits_table, clear_bits, reduce_colours
+from evaluation.experiments.paper.colour_reduction import (
+    bits_methods,
+    bits_removed,
+    bits_table,
+    clear_bits,
+    reduce_colours,
+)
 from evaluation.experiments.running import evaluate
 from evaluation.methods.standard import standard_methods
 from foundation.errors import InputError

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from evaluation.experiments.paper.facts import noise_table, print_colours, print_table, table_noise
+from evaluation.experiments.paper.table1 import noise_table, print_colours, print_table, table_noise
 from tests.evaluation.experiments.paper.conftest import LIGHTS, TableMaker
 
 

@@ -12,7 +12,7 @@ import pytest
 
 from evaluation.cli import main
 from evaluation.datasets import open_scenes
-from evaluation.experiments.paper.bits import bits_methods, bits_removed, reduce_colours
+from evaluation.experiments.paper.colour_reduction import bits_methods, bits_removed, reduce_colours
 from evaluation.experiments.running import evaluate
 from evaluation.scene import SceneSet
 

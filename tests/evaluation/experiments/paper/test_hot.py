@@ -5,8 +5,15 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from evaluation.experiments.paper.hot import HotPhotosites, HotScene, hot_photosites, hot_rows, hot_table
-from evaluation.experiments.paper.table1 import settings, table1
+from evaluation.experiments.paper.table1 import (
+    HotPhotosites,
+    HotScene,
+    hot_photosites,
+    hot_rows,
+    hot_table,
+    settings,
+    table1,
+)
 from foundation.errors import InputError
 from generator.pictures.sources import random_scenes
 from tests.evaluation.experiments.paper.conftest import TableMaker

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from evaluation.experiments.paper.reduction import PANEL, reduction_strip, reduction_table
+from evaluation.experiments.paper.colour_reduction import PANEL, reduction_strip, reduction_table
 
 
 def test_each_panel_has_its_bits_cleared() -> None:

@@ -13,10 +13,8 @@ import pytest
 
 from evaluation.datasets.opening import open_scenes
 from evaluation.experiments.bootstrap import paired
-from evaluation.experiments.pooling.pool import pool_transfers
-from evaluation.experiments.pooling.reading import TransferResults, read_transfer
-from evaluation.experiments.pooling.report import make_tables, save_pool
-from evaluation.experiments.transfer.figures import figures_of
+from evaluation.experiments.pool import TransferResults, make_tables, pool_transfers, read_transfer, save_pool
+from evaluation.experiments.transfer.outcome import figures_of
 from evaluation.experiments.transfer.rows import Kind, TransferRow
 from evaluation.metrics import summarise
 from evaluation.results.result import Result

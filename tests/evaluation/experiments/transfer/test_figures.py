@@ -9,7 +9,7 @@ import numpy.typing as npt
 import pytest
 
 from evaluation.experiments.bootstrap import STATISTICS, intervals, paired
-from evaluation.experiments.transfer.figures import figures_of
+from evaluation.experiments.transfer.outcome import figures_of
 from evaluation.experiments.transfer.rows import Kind, TransferRow
 from evaluation.metrics import summarise
 from evaluation.results.result import Result

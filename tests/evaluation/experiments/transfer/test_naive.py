@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from evaluation.datasets.generated import GeneratedMixedScene, GeneratedScene, open_generated
-from evaluation.experiments.transfer.naive import naive_image, naive_scenes
-from evaluation.experiments.transfer.pictures import find_sources
+from evaluation.experiments.transfer.plan import find_sources, naive_image, naive_scenes
 from evaluation.scene import MixedScene
 from foundation.errors import FormatError
 from generator.lights.choices import ListedLights, SimultaneousLights

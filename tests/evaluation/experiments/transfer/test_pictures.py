@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from evaluation.datasets.generated import GeneratedScene
-from evaluation.experiments.transfer.pictures import find_sources
+from evaluation.experiments.transfer.plan import find_sources
 from foundation.errors import FormatError, InputError
 from generator.dataset.making import DatasetOptions, generate_dataset
 from generator.dataset.reader import Dataset

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from evaluation.datasets.thumbnails import Thumbnail
-from evaluation.experiments.transfer.overlap import shared_images, trainable_images
-from evaluation.experiments.transfer.plan import plan_transfer
+from evaluation.experiments.transfer.plan import plan_transfer, shared_images, trainable_images
 from evaluation.scene import SceneSet
 from foundation.errors import InputError
 from tests.evaluation.experiments.transfer.conftest import Maker, save_pictures, write_table

@@ -5,17 +5,17 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from evaluation.experiments.transfer.figures import figures_of
-from evaluation.experiments.transfer.rows import Kind, TransferRow
-from evaluation.experiments.transfer.tables import (
+from evaluation.experiments.transfer.outcome import (
     HEADS,
     errors_table,
+    figures_of,
     intervals_table,
     long_table,
     naive_ratios_table,
     paper_ratios_table,
     real_ratios_table,
 )
+from evaluation.experiments.transfer.rows import Kind, TransferRow
 from evaluation.results.result import Result
 from evaluation.results.tables import table_to_csv
 

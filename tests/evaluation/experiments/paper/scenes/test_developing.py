@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from evaluation.experiments.paper.scenes.developing import DevelopedSource, develop, developed
+from evaluation.experiments.paper.material import DevelopedSource, develop, developed
 from evaluation.scene import SceneSet
 from foundation.errors import InputError
 from foundation.srgb import decode_srgb, srgb_codes

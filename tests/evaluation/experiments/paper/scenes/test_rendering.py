@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from evaluation.experiments.paper.scenes.rendering import ScaledSource, lights_at_random, lights_like, rendered
+from evaluation.experiments.paper.material import ScaledSource, lights_at_random, lights_like, rendered
 from foundation.errors import InputError
 from generator import DatasetOptions, generate_dataset
 from generator.lights.choices import RandomLights, nearest_lights

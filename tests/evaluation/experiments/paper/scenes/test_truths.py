@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from evaluation.experiments.paper.scenes.truths import read_truths
+from evaluation.experiments.paper.material import read_truths
 from foundation.errors import FormatError, InputError
 
 TEXT = "File,GT_R,GT_G,GT_B\nA/1.png,1,2,3\nB/1.png,4,5,6\n\nA/2.png,7,8,9\n"
