@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from evaluation.commands.options import AngularError, argument, option
 from foundation.console import EXIT_CODES
 from foundation.json_output import JsonOutput, with_json
 
@@ -36,28 +37,20 @@ nothing unless asked with --out.
 
 @with_json("evaluate compare")
 def compare(
-    results: Annotated[
-        list[str],
-        typer.Argument(metavar="RESULTS", help="Results folder, or its errors.csv.", show_default=False),
-    ],
+    results: Annotated[list[str], argument("RESULTS", "Results folder, or its errors.csv.")],
     method: Annotated[
         list[str] | None,
-        typer.Option(
-            metavar="NAME",
-            help="Method to compare, as the tables call it or by its name for evaluate run; give it more than once for "
+        option(
+            "NAME",
+            "Method to compare, as the tables call it or by its name for evaluate run; give it more than once for "
             "several. With two RESULTS, FIRST=SECOND compares methods of different names. \\[default: all]",
-            show_default=False,
         ),
     ] = None,
-    error: Annotated[
-        Literal["reproduction", "recovery"], typer.Option(help="Angular error to compare.")
-    ] = "reproduction",
+    error: Annotated[AngularError, typer.Option(help="Angular error to compare.")] = "reproduction",
     out: Annotated[
         Path | None,
-        typer.Option(
-            metavar="FOLDER",
-            help="Write tables (CSV, LaTeX), the images' errors and a page with scatters to this new folder too.",
-            show_default=False,
+        option(
+            "FOLDER", "Write tables (CSV, LaTeX), the images' errors and a page with scatters to this new folder too."
         ),
     ] = None,
     images: Annotated[

@@ -1,4 +1,4 @@
-"""The options of every command that reads a data set: which layout, which part of it, which levels.
+"""What the commands share: options that several have, the data set that they read, and the methods that they name.
 
 A command has one parameter `reading: DataReading`, and `@with_data_options` puts the options in its place::
 
@@ -6,11 +6,7 @@ A command has one parameter `reading: DataReading`, and `@with_data_options` put
     def run(dataset: Annotated[str, typer.Argument()], *, reading: DataReading) -> None:
         data = reading.open(dataset)
 
-The options of commands that print a table of methods' errors: which angular error, which statistics.
-
-Which methods a command's options name: the suite's own, the user's classes, model files, learners.
-
-The order in which a text is tried: a file that ends in .npz is a model; a name of `standard_methods` or
+The order in which a text is tried as a method: a file that ends in .npz is a model; a name of `standard_methods` or
 `standard_learners`; then module:Class or path/file.py:Class.
 """
 
@@ -18,21 +14,59 @@ from __future__ import annotations
 
 import functools
 import inspect
-from collections.abc import Callable
+import itertools
+from collections.abc import Callable, Generator, Iterable, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal, cast, get_type_hints
 
 import typer
 
 if TYPE_CHECKING:
     from evaluation.datasets.options import DataOptions
-    from evaluation.scene import SceneSet
-from collections.abc import Iterable, Sequence
-from pathlib import Path
-
-if TYPE_CHECKING:
     from evaluation.methods.method import Learner, Method
     from evaluation.results.files import GivenEstimates
+    from evaluation.scene import SceneSet
+
+
+def option(metavar: str, text: str, *names: str, **limits: Any) -> Any:
+    """Return a typer option whose help says its default, where there is one."""
+    return typer.Option(*names, metavar=metavar, help=text, show_default=False, **limits)
+
+
+def argument(metavar: str, text: str) -> Any:
+    """Return a typer argument."""
+    return typer.Argument(metavar=metavar, help=text, show_default=False)
+
+
+def thread_option(text: str = "") -> Any:
+    """Return the option --workers; `text` is what else its help says of the threads."""
+    return option("N", f"Threads{text}. \\[default: one a processor]", min=1)
+
+
+Data = Annotated[str, argument("DATA", "Folder or file of the data set, or its URL.")]
+
+AngularError = Literal["reproduction", "recovery"]
+
+PrintedError = Annotated[
+    AngularError, typer.Option(help="Angular error that is printed, and drawn in the report; files have both.")
+]
+
+PrintedStatistics = Annotated[
+    Literal["paper", "all"],
+    typer.Option(help="Print the paper's six statistics, or also 95th percentile, maximum and share below 3°."),
+]
+
+
+@contextmanager
+def image_steps(count: int) -> Generator[Callable[[], None]]:
+    """Show how many of `count` images are done, and yield what moves that on by one; Ctrl-C ends the block orderly."""
+    from foundation.console import orderly_end, progress
+
+    with orderly_end(), progress("images") as advance:
+        steps = itertools.count(1)
+        yield lambda: advance(next(steps), count)
 
 
 _PANEL = "Reading the data"
@@ -107,8 +141,7 @@ _OPTIONS: dict[str, Any] = {
         ),
     ],
     "black": Annotated[
-        float | None,
-        _option("LEVEL", "Black level, in the units of the files. \\[default: the layout's]", "--black"),
+        float | None, _option("LEVEL", "Black level, in the units of the files. \\[default: the layout's]", "--black")
     ],
     "saturation": Annotated[
         float | None,
@@ -156,17 +189,6 @@ def with_data_options(command: Callable[..., None]) -> Callable[..., None]:
     return with_options
 
 
-PrintedError = Annotated[
-    Literal["reproduction", "recovery"],
-    typer.Option(help="Angular error that is printed, and drawn in the report; files have both."),
-]
-
-PrintedStatistics = Annotated[
-    Literal["paper", "all"],
-    typer.Option(help="Print the paper's six statistics, or also 95th percentile, maximum and share below 3°."),
-]
-
-
 METHOD_HELP = (
     "Method: a name of --methods, also with parameters (shades-of-gray:p=4, gray-edge-1:p=4:sigma=2), a model file "
     "(MODEL.npz of evaluate train), module:Class, or file.py:Class for a class of your own. Give it more than once for "
@@ -179,13 +201,6 @@ def choose_methods(texts: Iterable[str]) -> list[Method]:
     """Return the methods that texts name, each once, in their order.
 
     `standard` are the seven of `STANDARD`, `all` every one of `standard_methods`.
-
-    Raises
-    ------
-    InputError
-        A text names no method, or one that has to be trained first.
-    FormatError
-        A model file is none.
 
     Examples
     --------
@@ -204,11 +219,6 @@ def choose_methods(texts: Iterable[str]) -> list[Method]:
 def choose_learners(texts: Iterable[str]) -> list[Learner]:
     """Return the learners that texts name, each once, in their order; `all` are those of `standard_learners`.
 
-    Raises
-    ------
-    InputError
-        A text names no learner.
-
     Examples
     --------
     >>> [learner.name for learner in choose_learners(["regression-trees"])]
@@ -222,13 +232,24 @@ def choose_learners(texts: Iterable[str]) -> list[Learner]:
     return [_learner(text) for text in dict.fromkeys(wanted)]
 
 
+def choose_beside_constant(text: str) -> tuple[list[Learner], list[str]]:
+    """Return the learners that a text names between commas, and why some of `all` are left out.
+
+    The constant light is not among them: it stands beside all others unasked.
+    """
+    from evaluation.learning.constant_light import ConstantLight
+    from evaluation.learning.feature_learner import what_is_missing
+
+    texts = [part.strip() for part in text.split(",")]
+    explicit = {learner.name for learner in choose_learners(part for part in texts if part.lower() != "all")}
+    named = [learner for learner in choose_learners(texts) if learner.name != ConstantLight().name]
+    missing = {learner.name: what_is_missing(learner) for learner in named if learner.name not in explicit}
+    left_out = [f"{name} is left out: {reason}" for name, reason in missing.items() if reason]
+    return [learner for learner in named if not missing.get(learner.name)], left_out
+
+
 def require_order(command: str, method: str, data: str) -> None:
     """Refuse METHOD and DATA of `evaluate cv` and `evaluate train` in the wrong order.
-
-    Raises
-    ------
-    InputError
-        `method` is the place of a data set, and `data` names methods.
 
     Examples
     --------
@@ -250,15 +271,7 @@ regression-trees .
 
 
 def choose_estimates(texts: Sequence[str], images: Sequence[str]) -> list[GivenEstimates]:
-    """Return the files of estimates that texts name, as FILE.csv or NAME=FILE.csv, for the images of a data set.
-
-    Raises
-    ------
-    InputError
-        A file cannot be read, or is not of these images.
-    FormatError
-        A file is no table of estimates.
-    """
+    """Return the files of estimates that texts name, as FILE.csv or NAME=FILE.csv, for the images of a data set."""
     from evaluation.results.files import read_estimates
 
     found: list[GivenEstimates] = []

@@ -3,19 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from evaluation.commands.options import DataReading, with_data_options
-from foundation.console import EXIT_CODES, new_app, shows_progress
+from evaluation.commands.options import (
+    AngularError,
+    DataReading,
+    argument,
+    choose_learners,
+    image_steps,
+    option,
+    thread_option,
+    with_data_options,
+)
+from foundation.console import EXIT_CODES, new_app
 from foundation.json_output import JsonOutput, with_json
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Generator
-
     from evaluation.experiments.paper.reporting import PaperReport
     from evaluation.scene import SceneSet
     from generator import Lut
@@ -32,17 +38,11 @@ all of them as made with full tables of both cameras.
 
 app = new_app(no_args_is_help=True)
 
-Luts = Annotated[
-    list[Path], typer.Argument(metavar="LUT", help="Tables made by build-lut, a folder each.", show_default=False)
-]
-Kind = Annotated[Literal["reproduction", "recovery"], typer.Option(help="Angular error to print.")]
-Out = Annotated[
-    Path | None, typer.Option(metavar="FOLDER", help="Write page, tables and figures here.", show_default=False)
-]
+Luts = Annotated[list[Path], argument("LUT", "Tables made by build-lut, a folder each.")]
+Kind = Annotated[AngularError, typer.Option(help="Angular error to print.")]
+Out = Annotated[Path | None, option("FOLDER", "Write page, tables and figures here.")]
 Seed = Annotated[int, typer.Option(metavar="N", help="Of all that is drawn at random.", min=0)]
-Workers = Annotated[
-    int | None, typer.Option(metavar="N", help="Threads. \\[default: one a processor]", min=1, show_default=False)
-]
+Workers = Annotated[int | None, thread_option()]
 
 _NOT_C1 = (
     "The paper's pictures and ground truths are C1, the 259 images of the Canon 1Ds Mark III of NUS; its numbers stand "
@@ -66,20 +66,18 @@ def table1(
     luts: Luts,
     pictures: Annotated[
         str,
-        typer.Option(
-            metavar="PLACE",
-            help="The scenes: a folder of photographs, or a real data set, whose raw images are developed to sRGB "
+        option(
+            "PLACE",
+            "The scenes: a folder of photographs, or a real data set, whose raw images are developed to sRGB "
             "with their ground truths.",
-            show_default=False,
         ),
     ],
     lights_like: Annotated[
         str,
-        typer.Option(
-            metavar="TRUTHS",
-            help="Ground truths whose nearest lights are one choice of lights: FILE.csv, FILE.csv#START for the rows "
+        option(
+            "TRUTHS",
+            "Ground truths whose nearest lights are one choice of lights: FILE.csv, FILE.csv#START for the rows "
             "whose names begin so, or a data set.",
-            show_default=False,
         ),
     ],
     matrix: Annotated[
@@ -125,7 +123,7 @@ def table1(
     names = cell_name(called, [scene.name for scene in scenes]), cell_name(truths.name, truths.images)
     chosen = settings(opened, scenes, truths.lights, side, seed, names)
     threads = workers or processor_count()
-    with _progress(sum(len(part.scenes) for part in chosen)) as step:
+    with image_steps(sum(len(part.scenes) for part in chosen)) as step:
         blocks = run(chosen, threads, step)
     found = size_dependence(opened, scenes, truths.lights, sides, seed, threads, names)
     raised = hot_rows(chosen, shares, seed, threads)
@@ -158,16 +156,13 @@ the real one, and tests on the real one. The paper's numbers stand beside those 
 @with_data_options
 def table2(
     data: Annotated[str, typer.Argument(metavar="DATA", help="Real data set; the paper's is Cube+.")],
-    generated: Annotated[
-        str, typer.Option(metavar="PLACE", help="Data set made by generate, to train on.", show_default=False)
-    ],
+    generated: Annotated[str, option("PLACE", "Data set made by generate, to train on.")],
     methods: Annotated[
         str,
-        typer.Option(
-            metavar="LIST",
-            help="Methods that learn, between commas: names, module:Class or file.py:Class. "
+        option(
+            "LIST",
+            "Methods that learn, between commas: names, module:Class or file.py:Class. "
             "\\[default: smart-color-cat, regression-trees, color-beaver]",
-            show_default=False,
         ),
     ] = "smart-color-cat,regression-trees,color-beaver",
     folds: Annotated[str, typer.Option(metavar="N|FILE", help="Folds of the cross-validation, or their file.")] = "3",
@@ -184,7 +179,6 @@ def table2(
     told: JsonOutput,
 ) -> None:
     """Train learned methods on real and on generated images."""
-    from evaluation.commands.options import choose_learners
     from evaluation.datasets import open_scenes
     from evaluation.experiments.folds import choose_folds
     from evaluation.experiments.paper.reporting import table2_report
@@ -208,7 +202,7 @@ def table2(
     )
     unseen = (f"{shared_images}. They were {fate}.",) if shared_images else ()
     drawn, _ = choose_folds(real, folds, seed)
-    with _progress(2 * count) as step:
+    with image_steps(2 * count) as step:
         found = run(real.scenes, training, learners, drawn, seed, workers or processor_count(), step)
     is_cube = real.layout == "cube-plus"
     conditions = (
@@ -253,7 +247,7 @@ def bits(
 
     _require_free(out)
     opened = reading.open(data)
-    with _progress(len(opened.scenes)) as step:
+    with image_steps(len(opened.scenes)) as step:
         found = bits_removed(opened.scenes, bits_methods(sigma), workers=workers or processor_count(), on_scene=step)
     first = f"{opened.name}, {len(opened.scenes)} images. Gray-Edge at a scale of {sigma:g} px."
     conditions = (first, _treatment(opened))
@@ -275,7 +269,7 @@ images, also codes that another program has changed.
 @with_data_options
 def flash(
     data: Annotated[str, typer.Argument(metavar="DATA", help="Real data set of linear images.")],
-    out: Annotated[Path, typer.Option(metavar="FOLDER", help="New folder of codes.", show_default=False)],
+    out: Annotated[Path, option("FOLDER", "New folder of codes.")],
     clear: Annotated[int, typer.Option(metavar="N", help="Bits of each code set to zero.", min=0, max=8)] = 0,
     workers: Workers = None,
     *,
@@ -288,7 +282,7 @@ def flash(
 
     _require_free(out)
     opened = reading.open(data)
-    with _progress(len(opened.scenes)) as step:
+    with image_steps(len(opened.scenes)) as step:
         write_codes(opened, out, clear, workers or processor_count(), step)
     told.add(folder=out, data_set=opened.name, images=len(opened.scenes), cleared=clear)
     print(f"{out}: codes of {len(opened.scenes)} images of {opened.name}, {clear} bits of each set to zero")
@@ -307,8 +301,8 @@ run reads them.
 @app.command("flash-inverse", help=_INVERSE)
 @with_json("evaluate paper flash-inverse")
 def flash_inverse(
-    folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="Folder of codes.", show_default=False)],
-    out: Annotated[Path, typer.Option(metavar="LINEAR", help="New folder of linear images.", show_default=False)],
+    folder: Annotated[Path, argument("FOLDER", "Folder of codes.")],
+    out: Annotated[Path, option("LINEAR", "New folder of linear images.")],
     workers: Workers = None,
     *,
     told: JsonOutput,
@@ -337,10 +331,7 @@ the figure is there only.
 @app.command("reduction", help=_REDUCTION)
 @with_json("evaluate paper reduction")
 def reduction(
-    picture: Annotated[Path, typer.Argument(metavar="PICTURE", help="Any picture file.", show_default=False)],
-    out: Out = None,
-    *,
-    told: JsonOutput,
+    picture: Annotated[Path, argument("PICTURE", "Any picture file.")], out: Out = None, *, told: JsonOutput
 ) -> None:
     """Show a picture with its colours reduced."""
     from evaluation.experiments.paper.reporting import reduction_report
@@ -365,10 +356,8 @@ def chromaticities(
     luts: Luts,
     truths: Annotated[
         list[str] | None,
-        typer.Option(
-            metavar="TRUTHS",
-            help="Ground truths to show beside the lights: FILE.csv, FILE.csv#START, or a data set. Repeatable.",
-            show_default=False,
+        option(
+            "TRUTHS", "Ground truths to show beside the lights: FILE.csv, FILE.csv#START, or a data set. Repeatable."
         ),
     ] = None,
     out: Out = None,
@@ -455,14 +444,3 @@ def _require_free(out: Path | None) -> None:
 
     if out is not None:
         require_free(out, "the report")
-
-
-@contextmanager
-def _progress(total: int) -> Generator[Callable[[], None]]:
-    """Show a bar of so many images, and yield what moves it on by one."""
-    from rich.console import Console
-    from rich.progress import Progress
-
-    with Progress(console=Console(stderr=True), disable=not shows_progress()) as progress:
-        task: Any = progress.add_task("images", total=total)
-        yield lambda: progress.advance(task)

@@ -6,9 +6,18 @@ import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import typer
-
-from evaluation.commands.options import METHOD_HELP, DataReading, PrintedError, PrintedStatistics, with_data_options
+from evaluation.commands.options import (
+    METHOD_HELP,
+    Data,
+    DataReading,
+    PrintedError,
+    PrintedStatistics,
+    choose_estimates,
+    choose_methods,
+    option,
+    thread_option,
+    with_data_options,
+)
 from foundation.console import EXIT_CODES
 from foundation.json_output import JsonOutput, with_json
 
@@ -33,64 +42,44 @@ A run with --out that was stopped goes on when the same command is given again.
 @with_json("evaluate run")
 @with_data_options
 def run(
-    data: Annotated[
-        str, typer.Argument(metavar="DATA", help="Folder or file of the data set, or its URL.", show_default=False)
-    ],
-    method: Annotated[list[str] | None, typer.Option(metavar="METHOD", help=METHOD_HELP, show_default=False)] = None,
+    data: Data,
+    method: Annotated[list[str] | None, option("METHOD", METHOD_HELP)] = None,
     methods: Annotated[
         str | None,
-        typer.Option(
-            metavar="LIST",
-            help="Methods between commas. standard: white-patch, gray-world, shades-of-gray, general-gray-world, "
+        option(
+            "LIST",
+            "Methods between commas. standard: white-patch, gray-world, shades-of-gray, general-gray-world, "
             "gray-edge-1, gray-edge-2, pca. all: these and improved-white-patch, color-sparrow, "
             "local-surface-reflectance, grayness-index, mean-shifted-gray-pixel, opencv-grayworld, of which some take "
             "seconds on large images. \\[default: standard, unless --method or --estimates is given]",
-            show_default=False,
         ),
     ] = None,
     estimates: Annotated[
         list[str] | None,
-        typer.Option(
-            metavar="FILE.csv",
-            help="Estimates of another program: columns image,r,g,b, a line an image. NAME=FILE.csv names them in the "
+        option(
+            "FILE.csv",
+            "Estimates of another program: columns image,r,g,b, a line an image. NAME=FILE.csv names them in the "
             "tables. Give it more than once for several.",
-            show_default=False,
         ),
     ] = None,
     error: PrintedError = "reproduction",
     statistics: PrintedStatistics = "paper",
     out: Annotated[
         Path | None,
-        typer.Option(
-            metavar="RESULTS",
-            help="Write everything to this new folder: tables, each image's errors, report.html, LaTeX.",
-            show_default=False,
-        ),
+        option("RESULTS", "Write everything to this new folder: tables, each image's errors, report.html, LaTeX."),
     ] = None,
-    csv: Annotated[
-        Path | None, typer.Option(metavar="OUT.csv", help="Write the table to this new file too.", show_default=False)
-    ] = None,
+    csv: Annotated[Path | None, option("OUT.csv", "Write the table to this new file too.")] = None,
     images: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="OUT.csv", help="Write each image's estimates and errors to this new file.", show_default=False
-        ),
+        Path | None, option("OUT.csv", "Write each image's estimates and errors to this new file.")
     ] = None,
     workers: Annotated[
-        int | None,
-        typer.Option(
-            metavar="N",
-            help="Threads, one image each; classes of yours are called by one at a time. \\[default: one a processor]",
-            min=1,
-            show_default=False,
-        ),
+        int | None, thread_option(", one image each; classes of yours are called by one at a time")
     ] = None,
     *,
     reading: DataReading,
     told: JsonOutput,
 ) -> None:
     """Evaluate methods on a data set."""
-    from evaluation.commands.options import choose_estimates, choose_methods
     from evaluation.experiments.run_folder import run_methods
     from evaluation.results.result import images_csv, table_csv
     from foundation.console import orderly_end, progress
