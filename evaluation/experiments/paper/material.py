@@ -24,7 +24,7 @@ import csv
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 import numpy.typing as npt
@@ -33,11 +33,13 @@ from evaluation.datasets import open_scenes
 from evaluation.scene import Image, Scene, SceneSet
 from foundation.errors import FormatError, InputError
 from foundation.srgb import srgb_codes
-from generator import Lut
 from generator.lights.choices import RandomLights, nearest_lights
 from generator.lights.ground_truths import load_ground_truths
 from generator.pictures.sources import Source, SourcePicture
 from generator.rendering.matrices import ColourMatrix
+
+if TYPE_CHECKING:
+    from generator import Lut
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,7 +14,7 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 import numpy.typing as npt
@@ -42,8 +42,10 @@ from evaluation.results.tables import Table, table_to_csv
 from foundation import pages, plots
 from foundation.files import whole_folder
 from foundation.plots import FAINT, INK, legend_label, series_style, svg_of
-from generator import Lut
 from generator.lights.choices import nearest_lights
+
+if TYPE_CHECKING:
+    from generator import Lut
 
 
 @dataclass(frozen=True, eq=False)

@@ -24,7 +24,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Final, TypeVar
+from typing import TYPE_CHECKING, Final, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -45,10 +45,12 @@ from evaluation.results.result import Result
 from evaluation.results.tables import Table
 from foundation.angles import angles_deg
 from foundation.errors import InputError, counted
-from generator import Lut
 from generator.kernels.palette import replace_unfit_colours
 from generator.kernels.rendering import draw_samples
 from generator.pictures.sources import Source, random_scenes
+
+if TYPE_CHECKING:
+    from generator import Lut
 
 DAYLIGHT_K: Final = 5600.0
 """The black body, kelvin, under which the print's colours are looked at: near what pictures are balanced for."""
