@@ -71,9 +71,9 @@ def cv(
     told: JsonOutput,
 ) -> None:
     """Cross-validate methods on a data set."""
+    from evaluation.experiments.cross_validation import cross_validate
     from evaluation.experiments.folds import choose_folds, folds_to_csv
     from evaluation.experiments.run_folder import describe_run, write_run
-    from evaluation.experiments.running import cross_validate
     from evaluation.learning.constant_light import ConstantLight
     from evaluation.reports.table_output import show_notes, show_tables
     from evaluation.results.method_records import describe_method

@@ -26,8 +26,9 @@ if TYPE_CHECKING:
     import numpy as np
     import numpy.typing as npt
 
+    from evaluation.experiments.cross_validation import AnyLearner
     from evaluation.experiments.transfer.plan import TransferPlan
-    from evaluation.experiments.transfer.rows import AnyLearner, TransferRow
+    from evaluation.experiments.transfer.rows import TransferRow
     from evaluation.methods.method import Method
     from evaluation.scene import SceneSet
 

@@ -15,7 +15,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from types import ModuleType
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import numpy.typing as npt
@@ -46,25 +46,14 @@ class ConvNet(FeatureLearner):
     - `rate`: learning rate of Adam, which falls to zero along a cosine.
     """
 
+    key: ClassVar[str] = "convnet"
+    title: ClassVar[str] = "Convolutional network"
+    needs: ClassVar[tuple[str, str] | None] = "torch", "pip install torch"
+
     working_size: int = 64
     width: int = 16
     epochs: int = 60
     rate: float = 3e-3
-
-    @property
-    def key(self) -> str:
-        """Its name on the command line and in model files."""
-        return "convnet"
-
-    @property
-    def name(self) -> str:
-        """Its name in tables."""
-        return "Convolutional network"
-
-    @property
-    def needs(self) -> tuple[str, str]:
-        """What training needs: the module, and the command that installs it."""
-        return "torch", "pip install torch"
 
     def features(
         self, image: Image, saturation: float | None = None, mask: npt.NDArray[np.bool_] | None = None

@@ -31,7 +31,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import numpy.typing as npt
@@ -253,6 +253,9 @@ class LogChroma(FeatureLearner):
     - `pretraining`, `training`: iterations of L-BFGS with each loss.
     """
 
+    key: ClassVar[str] = "log-chroma"
+    title: ClassVar[str] = "Log-chroma (FFCC family)"
+
     working_size: int = 64
     least: float = 2.0**-8
     crossentropy: float = 2.0**-8.25
@@ -270,16 +273,6 @@ class LogChroma(FeatureLearner):
     def __post_init__(self) -> None:
         if not 1 <= self.working_size <= _LARGEST:
             raise ValueError(f"a working size of {self.working_size} px; expected 1 to {_LARGEST}")
-
-    @property
-    def key(self) -> str:
-        """Its name on the command line and in model files."""
-        return "log-chroma"
-
-    @property
-    def name(self) -> str:
-        """Its name in tables."""
-        return "Log-chroma (FFCC family)"
 
     def features(
         self, image: Image, saturation: float | None = None, mask: npt.NDArray[np.bool_] | None = None

@@ -15,9 +15,10 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
+from evaluation.experiments.cross_validation import cross_validate
 from evaluation.experiments.paper.published import TABLE2
 from evaluation.experiments.paper.table1 import NUMBERS
-from evaluation.experiments.running import cross_validate, evaluate, fit_anew
+from evaluation.experiments.running import evaluate, fit_anew
 from evaluation.methods.method import Learner
 from evaluation.metrics import ErrorKind
 from evaluation.results.result import Result

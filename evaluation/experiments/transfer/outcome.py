@@ -1,12 +1,10 @@
-"""The result folder of a transfer: tables, every image's errors, folds, and how all was made.
-
-What rows of results come to: statistics with their intervals, and ratios of rows.
+"""What a transfer comes to: statistics with their intervals, ratios of rows, their tables, and the results folder.
 
 With several seeds a statistic is the mean of those of the seeds, not that of their errors together, and a resample is
 of images: one that is drawn counts in every seed. So the interval says what other test images would have given; how
 much another seed gives is stated apart.
 
-The tables of a transfer: errors, their intervals, ratios; and the paper's own ratios to stand beside them.
+The paper's own ratios stand beside ours.
 """
 
 from __future__ import annotations
@@ -16,13 +14,14 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 from evaluation.experiments.bootstrap import STATISTICS, ErrorSample, bca, resamples
 from evaluation.experiments.folds import folds_to_csv
+from evaluation.experiments.paper.published import TABLE2
 from evaluation.experiments.transfer.plan import TransferPlan, is_generated
 from evaluation.experiments.transfer.rows import NAIVE, TransferRow
 from evaluation.metrics import ErrorKind
@@ -45,9 +44,8 @@ LEVEL: Final = 0.95
 Floats = npt.NDArray[np.float64]
 
 
-@dataclass(frozen=True)
-class Figure:
-    """A number with the ends of its confidence interval; all NaN where it has none."""
+class Figure(NamedTuple):
+    """A number with the ends of its confidence interval; NaN where it is not known."""
 
     value: float
     low: float
@@ -207,12 +205,8 @@ def _spread(several: Sequence[ErrorSample]) -> tuple[float, ...] | None:
 HEADS: Final = ("Mean", "Med.", "Tri.", "Best 25%", "Worst 25%", "Avg.")
 """Heads of the statistics, in their order: all six stand in every table, since any one of them misleads alone."""
 
-_PAPER: Final = {
-    "Regression trees (simple features)": ((2.54, 1.66, 1.89, 0.45, 6.07, 1.85), (1.57, 0.89, 1.04, 0.20, 4.15, 1.04)),
-    "Smart Color Cat": ((2.47, 1.43, 1.76, 0.40, 6.21, 1.73), (2.27, 1.35, 1.61, 0.34, 5.72, 1.58)),
-    "Color Beaver (using Gray-world)": ((1.73, 0.74, 0.97, 0.37, 4.75, 1.17), (1.49, 0.77, 0.98, 0.21, 3.94, 0.99)),
-}
-"""Degrees on Cube+: trained on generated images, and cross-validated on Cube+ (paper, table 2)."""
+SHOWN: Final = (1, 0, 4)
+"""Places in `bootstrap.STATISTICS` of what forest plots show: median, mean and worst quarter."""
 
 
 def errors_table(found: TransferFigures, name: str, images: int) -> Table:
@@ -253,11 +247,10 @@ def real_ratios_table(found: TransferFigures, name: str) -> Table:
     made = any(one.base.data for one in found.to_real)
     base = f"cross-validation on {name} (generated)" if made else "real cross-validation"
     good = "as good as images of the test set, which are generated, not real" if made else "as good as real images"
-    return Table(
+    return _ratios_table(
         f"{name}: errors in parts of the same method's {base}",
-        ("Method", "Trained on", *HEADS),
-        tuple((one.row.method, one.row.training, *_ratio_cells(one)) for one in found.to_real),
-        notes=(f"With {LEVEL * 100:.0f} % intervals, paired by test image. 1: {good}.",),
+        [(one, one.row.training) for one in found.to_real],
+        f"With {LEVEL * 100:.0f} % intervals, paired by test image. 1: {good}.",
     )
 
 
@@ -265,11 +258,11 @@ def naive_ratios_table(found: TransferFigures, name: str) -> Table | None:
     """Return the generated rows in parts of the naive ones; None if there was no naive baseline."""
     if not found.to_naive:
         return None
-    return Table(
+    return _ratios_table(
         f"{name}: errors with generated images in parts of those with the same pictures and lights, but no table",
-        ("Method", "In parts of", *HEADS),
-        tuple((one.row.method, one.base.training, *_ratio_cells(one)) for one in found.to_naive),
-        notes=("Paired by test image. Below 1: the table is worth something to this method.",),
+        [(one, one.base.training) for one in found.to_naive],
+        "Paired by test image. Below 1: the table is worth something to this method.",
+        "In parts of",
     )
 
 
@@ -277,12 +270,29 @@ def base_ratios_table(found: TransferFigures, name: str) -> Table | None:
     """Return every row in parts of the row that was asked for; None if none was."""
     if not found.to_base:
         return None
-    return Table(
+    return _ratios_table(
         f"{name}: errors in parts of those of the same method, trained on {found.to_base[0].base.training}",
-        ("Method", "Trained on", *HEADS),
-        tuple((one.row.method, one.row.training, *_ratio_cells(one)) for one in found.to_base),
-        notes=("Paired by test image. Sets of other pictures or lights are held together with the choice of them.",),
+        [(one, one.row.training) for one in found.to_base],
+        "Paired by test image. Sets of other pictures or lights are held together with the choice of them.",
     )
+
+
+def _ratios_table(
+    title: str, ratios: Sequence[tuple[RowRatio, str]], note: str, second_head: str = "Trained on"
+) -> Table:
+    """Return ratios with their intervals, each with what its second column says."""
+    rows = tuple(
+        (
+            one.row.method,
+            said,
+            *(
+                f"{figure.value:.2f} ({figure.low:.2f} – {figure.high:.2f})" if math.isfinite(figure.value) else "–"
+                for figure in one.ratios
+            ),
+        )
+        for one, said in ratios
+    )
+    return Table(title, ("Method", second_head, *HEADS), rows, notes=(note,))
 
 
 def paper_ratios_table() -> Table:
@@ -293,14 +303,11 @@ def paper_ratios_table() -> Table:
     >>> paper_ratios_table().texts()[2]
     ('Color Beaver (using Gray-world)', '0.74 / 0.77', '1.16', '0.96', '0.99', '1.76', '1.21', '1.18')
     """
-    rows = [
-        (
-            method,
-            f"{generated[1]:.2f} / {real[1]:.2f}",
-            *(one / other for one, other in zip(generated, real, strict=True)),
-        )
-        for method, (generated, real) in _PAPER.items()
-    ]
+    rows: list[tuple[str | float, ...]] = []
+    for method, generated in TABLE2["generated"].items():
+        real = TABLE2["real"][method]
+        ratios = (one / other for one, other in zip(generated.as_tuple(), real.as_tuple(), strict=True))
+        rows.append((method, f"{generated.median:.2f} / {real.median:.2f}", *ratios))
     return Table(
         "The paper, Cube+: generated in parts of real cross-validation",
         ("Method", "Medians, degrees", *HEADS),
@@ -334,15 +341,122 @@ def _heads(row: TransferRow) -> tuple[str, str, int | None]:
     return row.method, row.training, row.images or None
 
 
-def _ratio_cells(ratio: RowRatio) -> tuple[str, ...]:
-    return tuple(
-        f"{figure.value:.2f} ({figure.low:.2f} – {figure.high:.2f})" if math.isfinite(figure.value) else "–"
-        for figure in ratio.ratios
-    )
-
-
 def _three(figure: Figure) -> tuple[float | None, ...]:
-    return tuple(number if math.isfinite(number) else None for number in (figure.value, figure.low, figure.high))
+    return tuple(number if math.isfinite(number) else None for number in figure)
+
+
+_LINE_INCHES: Final = 0.24
+"""Height of a line: a label of 9 points and some air."""
+
+_WIDEST: Final = 4.0
+"""An interval is drawn up to this factor beyond the outermost ratio, so that a wide one does not squeeze the others."""
+
+_NARROWEST: Final = 1.25
+"""The axis reaches from 1 over this to this at least: else differences that mean nothing would fill the figure."""
+
+_ROUND: Final = (1.0, 1.1, 1.25, 1.5, 2.0, 3.0, 5.0, 7.0, 8.0, 9.0)
+"""Round numbers of a decade: dense about 1 on both sides."""
+
+_MOST_TICKS: Final = 6
+"""Numbers on an axis at most: a panel is two inches wide."""
+
+
+@dataclass(frozen=True)
+class ForestLine:
+    """A line of a forest plot.
+
+    - `label`: what stands to the left.
+    - `ratios`: for each panel; none for a line that heads those below it.
+    - `series`: number of its colour, counted from 0; lines that belong together share one.
+    - `whole`: whether it is of the whole, and not of a part.
+    """
+
+    label: str
+    ratios: tuple[Figure, ...] = ()
+    series: int = 0
+    whole: bool = True
+
+
+def forest_plot(lines: Sequence[ForestLine], panels: Sequence[str]) -> bytes:
+    """Return a forest plot as SVG: ratios with their intervals, each on a line, of several statistics side by side.
+
+    The form is that of meta-analyses (S. Lewis and M. Clarke, "Forest plots: trying to see the wood and the trees", BMJ
+    322, 2001): a diamond for the whole, a square for each part of it, a line at 1, and a logarithmic axis, on which 2
+    and 1/2 are equally far from 1.
+    """
+    return svg_of(_draw, lines, panels, inches=(8.8, 0.9 + _LINE_INCHES * len(lines)))
+
+
+def _draw(figure: Any, lines: Sequence[ForestLine], panels: Sequence[str]) -> None:
+    grid = figure.subplots(1, len(panels), squeeze=False, sharey=True, sharex=True)[0]
+    low, high = _range(lines)
+    for number, (axes, title) in enumerate(zip(grid, panels, strict=True)):
+        axes.axvline(1, color=FAINT, linewidth=1, zorder=1)
+        for place, line in enumerate(lines):
+            if line.ratios:
+                _draw_ratio(axes, place, line, line.ratios[number])
+        axes.set(title=title, xscale="log", xlim=(low, high), xlabel="ratio")
+        ticks = round_numbers(low, high)
+        axes.set_xticks(ticks, [f"{tick:g}" for tick in ticks])
+        axes.minorticks_off()
+        axes.grid(visible=False, axis="y")
+        axes.tick_params(axis="y", length=0, labelcolor=INK)
+    grid[0].set_yticks(range(len(lines)), [line.label for line in lines])
+    for text, line in zip(grid[0].get_yticklabels(), lines, strict=True):
+        text.set(fontweight="normal" if line.ratios else "bold", color=INK if line.whole else FAINT)
+    grid[0].set_ylim(len(lines) - 0.5, -0.5)
+
+
+def _draw_ratio(axes: Any, place: int, line: ForestLine, ratio: Figure) -> None:
+    value, low, high = ratio
+    if not _positive(value):
+        return
+    colour = series_style(line.series)["color"]
+    if _positive(low) and _positive(high):
+        width, shown = (1.8, 1.0) if line.whole else (1.0, 0.7)
+        axes.plot([low, high], [place, place], color=colour, linewidth=width, alpha=shown, zorder=2)
+    marker, size = ("D", 6.5) if line.whole else ("s", 4)
+    axes.plot([value], [place], marker, color=colour, markersize=size, markeredgewidth=0, zorder=3)
+
+
+def _range(lines: Sequence[ForestLine]) -> tuple[float, float]:
+    """Return the ends of the axis: all ratios, and intervals as far as they leave those room."""
+    values = [ratio[0] for line in lines for ratio in line.ratios if _positive(ratio[0])]
+    ends = [end for line in lines for ratio in line.ratios for end in ratio[1:] if _positive(end)]
+    least, most = min([1 / _NARROWEST, *values]), max([_NARROWEST, *values])
+    low = max(min([least, *ends]), least / _WIDEST)
+    high = min(max([most, *ends]), most * _WIDEST)
+    return low / 1.03, high * 1.03
+
+
+def round_numbers(low: float, high: float) -> list[float]:
+    """Return round numbers from `low` to `high`, which 1 lies between, far enough apart to be read in a panel.
+
+    Examples
+    --------
+    >>> round_numbers(0.75, 1.3), round_numbers(0.6, 2.2)
+    ([0.8, 0.9, 1.0, 1.1, 1.25], [0.8, 1.0, 1.25, 2.0])
+    """
+    apart = (high / low) ** (1 / _MOST_TICKS)
+    powers = range(math.floor(math.log10(low)), math.ceil(math.log10(high)) + 1)
+    known = {round(part * 10.0**power, 12) for power in powers for part in _ROUND}
+    ticks = [1.0]
+    for tick in sorted(known):
+        if ticks[-1] * apart <= tick <= high:
+            ticks.append(tick)
+    for tick in sorted(known, reverse=True):
+        if low <= tick <= ticks[0] / apart:
+            ticks.insert(0, tick)
+    return ticks
+
+
+def _positive(number: float) -> bool:
+    return math.isfinite(number) and number > 0
+
+
+def shown_ratios(ratio: RowRatio) -> tuple[Figure, ...]:
+    """Return the ratios of the statistics that a forest plot shows."""
+    return tuple(ratio.ratios[place] for place in SHOWN)
 
 
 @dataclass(frozen=True, eq=False)
@@ -413,11 +527,16 @@ def report_page(outcome: TransferOutcome) -> str:
         *(table_part(table) for table in outcome.tables()),
     ]
     if outcome.figures.to_real:
-        picture = svg_of(_draw_ratios, outcome.figures, inches=(8.5, 1 + 0.28 * len(outcome.figures.to_real)))
+        methods = list(dict.fromkeys(one.row.method for one in outcome.figures.to_real))
+        lines = [
+            ForestLine(f"{one.row.method}, {one.row.training}", shown_ratios(one), methods.index(one.row.method))
+            for one in outcome.figures.to_real
+        ]
+        picture = forest_plot(lines, [HEADS[place] for place in SHOWN])
         parts.append(
             pages.figure(
                 picture,
-                f"Median error in parts of the same method's cross-validation on {test.name}, with 95 % intervals; the "
+                f"Errors in parts of the same method's cross-validation on {test.name}, with 95 % intervals; the "
                 "vertical line is that cross-validation. Left of it a row's images train better than the test set's "
                 "own do.",
             )
@@ -434,22 +553,6 @@ def _training_sets(outcome: TransferOutcome) -> str:
     named = {some.data: some.kind for some in reversed(outcome.plan.training)}
     listed = [f"{name} ({'not generated' if named[name] == 'other' else 'generated'})" for name in sorted(named)]
     return ", ".join(listed)
-
-
-def _draw_ratios(figure: Any, found: TransferFigures) -> None:
-    axes = figure.subplots()
-    methods = list(dict.fromkeys(one.row.method for one in found.to_real))
-    for place, one in enumerate(found.to_real):
-        ratio = one.ratios[1]
-        look = {"color": series_style(methods.index(one.row.method))["color"]}
-        axes.plot([ratio.low, ratio.high], [place, place], **look)
-        axes.plot([ratio.value], [place], "o", **look)
-    axes.axvline(1, color=FAINT, linewidth=1)
-    axes.set_yticks(range(len(found.to_real)), [f"{one.row.method}, {one.row.training}" for one in found.to_real])
-    axes.tick_params(axis="y", labelcolor=INK)
-    axes.invert_yaxis()
-    axes.set_xscale("log")
-    axes.set_xlabel("ratio of medians")
 
 
 def _provenance(outcome: TransferOutcome) -> dict[str, Any]:

@@ -1,9 +1,4 @@
-"""Train on one data set, test on another: a row of results for each method and each way of training it.
-
-Images made small for learning: training and test images of one size, noise and fine detail averaged alike.
-
-A data set as learners take it: features extracted once, then any part of it to train on or to test.
-"""
+"""Train on one data set, test on another: a row of results for each method and each way of training it."""
 
 from __future__ import annotations
 
@@ -14,180 +9,23 @@ from typing import Final, Literal
 import numpy as np
 import numpy.typing as npt
 
-from evaluation.experiments.folds import require_apart
-from evaluation.experiments.running import answer_scenes, evaluate, fit_anew
-from evaluation.learning.constant_light import ConstantLight
-from evaluation.learning.feature_learner import (
-    FeatureLearner,
-    Features,
-    LearnedMethod,
-    extract,
-    fit_extracted,
-    truths_of,
+from evaluation.experiments.cross_validation import (
+    AnyLearner,
+    Material,
+    Places,
+    cross_fit,
+    estimate_on,
+    fit_on,
+    gather,
+    result_of,
 )
-from evaluation.methods.filters.shrinking import shrink
-from evaluation.methods.method import Learner, Method
-from evaluation.results.result import NO_PIXEL, Result, SceneAnswer, read_light, results_of
-from evaluation.scene import Image, Scene
+from evaluation.experiments.folds import require_apart
+from evaluation.experiments.running import evaluate
+from evaluation.learning.constant_light import ConstantLight
+from evaluation.methods.method import Method
+from evaluation.results.result import Result
+from evaluation.scene import Scene
 from foundation.errors import InputError
-from foundation.processors import ordered_map
-
-_COVERED: Final = 1e-3
-"""Share of a pixel's area of which more must be usable; less is rounding of areas rather than a colour."""
-
-
-@dataclass(frozen=True, eq=False)
-class SmallScene:
-    """A scene made small, in memory.
-
-    - `name`: the image's name.
-    - `truth`: (3,) float64, linear camera RGB of the light, of any length.
-    - `image`: (H, W, 3) float32, linear camera RGB, in the unit of the image that it was.
-    - `mask`: (H, W) bool, True where no pixel was usable; None if every one was.
-    - `saturation`: none where clipped pixels were left out; that of the image where it was small already.
-    """
-
-    name: str
-    truth: npt.NDArray[np.float64]
-    image: Image
-    mask: npt.NDArray[np.bool_] | None
-    saturation: float | None
-
-    def read(self) -> tuple[Image, npt.NDArray[np.bool_] | None]:
-        """Return the image (H, W, 3) and its mask (H, W) bool."""
-        return self.image, self.mask
-
-
-def make_small(
-    scenes: Sequence[Scene], side: int, workers: int = 1, on_scene: Callable[[], None] | None = None
-) -> tuple[SmallScene, ...]:
-    """Return scenes of which no side is longer than `side`, px; see `shrink_image`.
-
-    `side`: longest side allowed, px.
-    """
-
-    def small(scene: Scene) -> SmallScene:
-        image, mask = scene.read()
-        if max(image.shape[:2]) <= side:
-            return SmallScene(scene.name, scene.truth, image, mask, scene.saturation)
-        return SmallScene(scene.name, scene.truth, *shrink_image(image, side, scene.saturation, mask), None)
-
-    made: list[SmallScene] = []
-    for scene in ordered_map(small, scenes, workers):
-        made.append(scene)
-        if on_scene:
-            on_scene()
-    return tuple(made)
-
-
-def shrink_image(
-    image: Image, side: int, saturation: float | None = None, mask: npt.NDArray[np.bool_] | None = None
-) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.bool_]]:
-    """Return an image made small by averaging areas, without clipped and masked pixels.
-
-    `image`: (H, W, 3) uint16, float32 or float64, linear camera RGB. `side`: longest side of the result, px.
-    `saturation`: value from which a channel is clipped; None if none is. `mask`: (H, W) bool, True where a pixel must
-    not be used, or None. Returns the image (h, w, 3) float32, and (h, w) bool, True where no pixel was usable; the
-    image is 0 there.
-
-    Examples
-    --------
-    >>> image = np.zeros((2, 4, 3), np.float32)
-    >>> image[:, 0], image[:, 1], image[0, 2] = 10, 30, 900
-    >>> small, mask = shrink_image(image, side=2, saturation=900)
-    >>> small[..., 0], mask
-    (array([[20.,  0.]], dtype=float32), array([[False, False]]))
-    """
-    usable = np.ones(image.shape[:2], dtype=bool)
-    if saturation is not None:
-        usable &= (image < saturation).all(axis=2)
-    if mask is not None:
-        usable &= ~mask
-    small, empty = shrink(image, usable, side, _COVERED)
-    small[empty] = 0
-    return small, empty
-
-
-Places = npt.NDArray[np.int64]
-"""(P,) int64: which scenes of a data set, from 0."""
-
-AnyLearner = Learner | FeatureLearner
-"""A learner of either kind: of scenes, or of features."""
-
-
-@dataclass(frozen=True, eq=False)
-class Material:
-    """Scenes with all that some learners take from them.
-
-    - `scenes`: N scenes.
-    - `truths`: (N, 3) float64, linear camera RGB of any length.
-    - `features`: for each learner its features of each scene, (...) of its own dtype or None where no pixel is usable;
-      None for a learner that reads the scenes itself.
-    """
-
-    scenes: tuple[Scene, ...]
-    truths: npt.NDArray[np.float64]
-    features: tuple[Sequence[Features | None] | None, ...]
-
-    @property
-    def everything(self) -> Places:
-        """All places, (N,) int64."""
-        return np.arange(len(self.scenes))
-
-
-def gather(
-    scenes: Sequence[Scene],
-    learners: Sequence[AnyLearner],
-    side: int | None = None,
-    workers: int = 1,
-    on_scene: Callable[[], None] | None = None,
-) -> Material:
-    """Return the material of scenes for learners; each image is read once for all that extract features.
-
-    `side`: longest side that images are made small to first, px, in memory; None leaves them as they are.
-    """
-    truths = truths_of(scenes)
-    if side is not None:
-        scenes, on_scene = make_small(scenes, side, workers, on_scene), None
-    extracting = [learner for learner in learners if isinstance(learner, FeatureLearner)]
-    given = iter(extract(scenes, extracting, workers, on_scene) if extracting else ())
-    features = tuple(next(given) if isinstance(learner, FeatureLearner) else None for learner in learners)
-    if on_scene and not extracting:
-        for _ in scenes:
-            on_scene()
-    return Material(tuple(scenes), truths, features)
-
-
-def fit_on(learner: AnyLearner, number: int, material: Material, places: Places, seed: int) -> Method:
-    """Return the learner fitted to the scenes at `places` (P,) int64; `number` is its place among the learners."""
-    features = material.features[number]
-    if isinstance(learner, FeatureLearner) and features is not None:
-        return fit_extracted(learner, [features[place] for place in _list(places)], material.truths[places], seed)
-    scenes = [material.scenes[place] for place in _list(places)]
-    return fit_anew(learner, scenes, seed)
-
-
-def estimate_on(method: Method, number: int, material: Material, places: Places) -> list[SceneAnswer]:
-    """Return what a fitted method answers for the scenes at `places` (P,) int64, P answers."""
-    features = material.features[number]
-    if not isinstance(method, LearnedMethod) or features is None:
-        scenes = [material.scenes[place] for place in _list(places)]
-        return [answer for (answer,) in answer_scenes(scenes, [method])]
-    given = [features[place] for place in _list(places)]
-    seen = [one for one in given if one is not None]
-    lights = iter(method.model.lights(np.stack(seen)) if seen else ())
-    return [SceneAnswer(None, NO_PIXEL) if one is None else read_light(next(lights)) for one in given]
-
-
-def result_of(name: str, answers: Sequence[SceneAnswer], truths: npt.NDArray[np.float64]) -> Result:
-    """Return the result that N answers make, held to truths (N, 3) float64."""
-    (result,) = results_of([name], truths, [[answer] for answer in answers])
-    return result
-
-
-def _list(places: Places) -> list[int]:
-    return [int(place) for place in places.tolist()]
-
 
 Kind = Literal["cross-validation", "generated", "naive", "naive with matrix", "other", "none"]
 """How a method was trained: on other folds of the test set, on generated images, on their naive counterparts, on a data
@@ -307,7 +145,8 @@ def transfer(
     trials = gather(test, learners, side, workers, on_scene)
     parts = [
         TransferRow(
-            *(learner.name, "cross-validation", generated, _least(folds)), _crossed(learner, number, trials, folds)
+            *(learner.name, "cross-validation", generated, _least(folds)),
+            tuple(cross_fit(learner, number, trials, each, seed) for seed, each in enumerate(folds)),
         )
         for number, learner in enumerate(learners)
     ]
@@ -341,20 +180,6 @@ def _used(drawn: Sequence[Places]) -> Places:
 def _least(folds: Sequence[npt.NDArray[np.int64]]) -> int:
     """Return the images of the smallest part that is trained on."""
     return min(len(each) - int(np.bincount(each).max()) for each in folds)
-
-
-def _crossed(
-    learner: AnyLearner, number: int, trials: Material, folds: Sequence[npt.NDArray[np.int64]]
-) -> tuple[Result, ...]:
-    results: list[Result] = []
-    for seed, each in enumerate(folds):
-        answers: dict[int, SceneAnswer] = {}
-        for fold in np.unique(each):
-            inside = np.flatnonzero(each == fold)
-            method = fit_on(learner, number, trials, np.flatnonzero(each != fold), seed)
-            answers |= zip(inside.tolist(), estimate_on(method, number, trials, inside), strict=True)
-        results.append(result_of(learner.name, [answers[place] for place in range(len(each))], trials.truths))
-    return tuple(results)
 
 
 def _tested(learner: AnyLearner, number: int, lessons: Material, places: Places, trials: Material, seed: int) -> Result:

@@ -10,8 +10,8 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
+from evaluation.experiments.cross_validation import cross_validate
 from evaluation.experiments.folds import draw_folds
-from evaluation.experiments.running import cross_validate
 from evaluation.learning.regression_trees import RegressionTrees
 from evaluation.methods.pixels import GREY, unit
 from evaluation.scene import Scene

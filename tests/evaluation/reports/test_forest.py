@@ -7,7 +7,7 @@ from math import inf, nan
 
 import pytest
 
-from evaluation.experiments.pool import ForestLine, Interval, forest_plot, round_numbers
+from evaluation.experiments.transfer.outcome import Figure, ForestLine, forest_plot, round_numbers
 
 PANELS = ("Med.", "Mean")
 
@@ -18,8 +18,8 @@ def markers(svg: bytes) -> list[tuple[float, float]]:
     return [(float(x), float(y)) for x, y in uses]
 
 
-def line(label: str, *ratios: Interval, whole: bool = True) -> ForestLine:
-    return ForestLine(label, ratios, whole=whole)
+def line(label: str, *ratios: tuple[float, float, float], whole: bool = True) -> ForestLine:
+    return ForestLine(label, tuple(Figure(*ratio) for ratio in ratios), whole=whole)
 
 
 def test_ratios_stand_on_a_logarithmic_axis_from_top_to_bottom() -> None:

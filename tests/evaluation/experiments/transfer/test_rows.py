@@ -9,8 +9,8 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
+from evaluation.experiments.cross_validation import cross_validate
 from evaluation.experiments.folds import draw_folds
-from evaluation.experiments.running import cross_validate
 from evaluation.experiments.transfer.outcome import TransferFigures, figures_of
 from evaluation.experiments.transfer.rows import TrainingSet, TransferRow, draw_images, transfer
 from evaluation.learning.constant_light import ConstantLight

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from evaluation.experiments.transfer.rows import SmallScene, make_small, shrink_image
+from evaluation.experiments.cross_validation import SmallScene, make_small, shrink_image
 
 
 def test_areas_are_averaged_by_hand() -> None:
