@@ -9,8 +9,6 @@ D. V. Hinkley, *Bootstrap Methods and their Application* (1997), section 5.4.
 
 Nothing here corrects for images that belong together, such as frames of one scene: their intervals are too narrow.
 
-Statistics of resampled errors, and the ends of BCa intervals: what `bootstrap` is made of.
-
 A resample is a count of each image. What it comes to is read off the cumulative counts along the sorted errors, so
 nothing is sorted again, and statistics are those of `evaluation.metrics.summarise`, ties and percentiles included.
 """

@@ -4,16 +4,10 @@ The same images lie under both, so everything is paired: the signed-rank test (F
 ranking methods", Biometrics Bulletin 1 (1945) 80-83), whose recommendation for colour constancy is S. D. Hordley,
 G. D. Finlayson, "Reevaluation of color constancy algorithm performance", JOSA A 23 (2006) 1008-1020; intervals of the
 differences and ratios of all statistics (`bootstrap.paired`); and the images on which the two differ most.
-
-The scatter of two methods' errors, an image a point.
-
-A comparison's tables, page and files.
 """
 
 from __future__ import annotations
 
-import csv
-import io
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,6 +21,7 @@ from evaluation.experiments.bootstrap import STATISTICS, Compared, paired
 from evaluation.metrics import ErrorKind
 from evaluation.reports.table_output import table_part, tables_to_latex
 from evaluation.results.files import MethodErrors
+from evaluation.results.result import csv_text
 from evaluation.results.tables import PAPER_COLUMNS, Table, table_to_csv
 from foundation import pages
 from foundation.angles import angles_deg
@@ -405,12 +400,10 @@ def _statistics_csv(comparisons: Sequence[Comparison]) -> str:
 
 
 def _images_csv(comparisons: Sequence[Comparison]) -> str:
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(("first", "second", "image", "first_deg", "second_deg", "difference_deg"))
+    rows = [("first", "second", "image", "first_deg", "second_deg", "difference_deg")]
     for made in comparisons:
         matched = made.matched
         for image, one, other in zip(matched.images, matched.one, matched.other, strict=True):
             numbers = (f"{number:.6f}" for number in (one, other, one - other))
-            writer.writerow((*matched.names, image, *numbers))
-    return text.getvalue()
+            rows.append((*matched.names, image, *numbers))
+    return csv_text(rows)

@@ -4,10 +4,9 @@ While methods run, `.RESULTS.partial` holds the answers for each image so far. A
 settings and software goes on there, wherever it was killed; its folder is the same to the last byte as that of a run
 that was left alone. When all images are done, the files are written there and the folder gets its name.
 
-What was answered so far of a run that goes on: a file that grows by one line an image, and is taken up after a kill.
-
-Each line is a checksum (CRC-32 of what follows, eight hexadecimal digits), the image's number, and its answers as JSON.
-The first line says whose answers they are. A line that a kill or a crash left half, and all after it, are cut off.
+The answers are a file that grows by one line an image. Each line is a checksum (CRC-32 of what follows, eight
+hexadecimal digits), the image's number, and its answers as JSON; the first says whose answers they are. A line that a
+kill or a crash left half, and all after it, are cut off.
 """
 
 from __future__ import annotations
@@ -28,7 +27,7 @@ from evaluation.datasets.states import state_of
 from evaluation.experiments.folds import folds_to_csv
 from evaluation.experiments.running import SceneMethod, answer_scenes, require_truths
 from evaluation.experiments.suspicions import suspicions
-from evaluation.learning.model_files import StoredMethod, TrainingRecord
+from evaluation.learning.model_files import StoredMethod, TrainingRecord, scenes_sha256
 from evaluation.methods.method import Method
 from evaluation.metrics import ErrorKind
 from evaluation.reports.run_page import MOST_SHOWN, chosen_images, developed, run_page
@@ -40,7 +39,6 @@ from evaluation.results.tables import lights_tables, statistics_rows, summary_ta
 from evaluation.scene import MixedScene, Scene, SceneSet
 from foundation.errors import InputError, first_of
 from foundation.files import make_folder, partial_path, publish_folder, require_free, storage_error, write_whole
-from foundation.hashing import sha256_of
 from foundation.processors import ordered_map
 from foundation.trust.held_folders import LOCK_FILE, held_folder
 from foundation.version import software
@@ -208,7 +206,7 @@ def describe_run(
         layout=data.layout,
         place=data.place,
         treatment=data.treatment,
-        data_sha256=_data_sha256(data.scenes),
+        data_sha256=scenes_sha256(data.scenes),
         truths=np.stack([scene.truth for scene in data.scenes]),
         results=results,
         methods=tuple(methods),
@@ -247,15 +245,6 @@ def _seen_before(name: str, record: TrainingRecord, data: SceneSet, sha256: str)
     if len(record.images):
         return f"{told}none of these has the name and light, or the source picture, of one of them"
     return f"{told}whether these are among them is not known"
-
-
-def _data_sha256(scenes: Sequence[Scene]) -> str:
-    """Return what `learning.model_files.scenes_sha256` returns, also of lights without a channel."""
-    shares = [scene.truth / scene.truth.sum() for scene in scenes]
-    lines = [
-        f"{scene.name}\t{' '.join(f'{part:.9f}' for part in row)}" for scene, row in zip(scenes, shares, strict=True)
-    ]
-    return sha256_of("\n".join(lines).encode())
 
 
 def _require_same(

@@ -10,13 +10,9 @@ of the bivariate von Mises distribution that has their moments is the light (sec
 *What is ours.* The bias is learned and the gain map of equation 5 is not, as in the authors' published program. The
 torus is de-aliased by the lights themselves: of the chromas that fall on one bin, the one nearest to the middle of the
 training lights' range is meant, where the paper has grey light or grey world (section 3.3). Training lights that spread
-over more than three quarters of the paper's torus of two natural logarithms get bins of twice the width. Training is
-described in `log_chroma_training.py`.
+over more than three quarters of the paper's torus of two natural logarithms get bins of twice the width.
 
-Fit the filters and the bias of `log_chroma.py`.
-
-J. T. Barron, Y.-T. Tsai, "Fast Fourier color constancy", CVPR 2017, sections 3 and 4 and its supplement. The loss of
-the first iterations is convex, the cross-entropy between the softmax and the bin of the true light; that of the others
+*Training* is as in sections 3 and 4 of the paper and in its supplement. The loss of the first iterations is convex, the cross-entropy between the softmax and the bin of the true light; that of the others
 is the negative log-likelihood of the true light under the fitted bivariate von Mises distribution, taken as a normal
 one on the unrolled torus (equations 9 to 13). The penalties, squares of the parameters and of their differences
 between neighbouring bins, are diagonal in Fourier space, where L-BFGS runs on parameters scaled so that the penalty is

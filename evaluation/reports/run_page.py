@@ -1,11 +1,8 @@
 """The report of a run: summary, how the data were treated, error curves, the chromaticity plane, and images.
 
-Figures of angular errors: how many images are below each, and which lights they belong to.
-
-Images as they look when an estimate or the truth is applied: made small, white balanced, with the curve of sRGB.
-
-No colour matrix is applied, so the colours are the camera's own: less saturated than a photograph, but a cast shows as
-it would there. The exposure is the same for all pictures of an image.
+Images are shown as recorded, corrected by the estimate, and by the truth: made small, white balanced, with the curve of
+sRGB. No colour matrix is applied, so the colours are the camera's own: less saturated than a photograph, but a cast
+shows as it would there. The exposure is the same for all pictures of an image.
 """
 
 from __future__ import annotations

@@ -1,11 +1,8 @@
-"""Tables on a terminal: names are folded where it is narrow, numbers are never cut.
+"""A table of results as people read it: on a terminal, as LaTeX, as a piece of a page.
 
-Tables for papers, in the layout of the paper's Tables 1 and 2; plain LaTeX that needs no package.
-
-The tables are floats with a caption. Heads of several words are stacked; several tables with the same heads become
-one, each under its title.
-
-A table of results as a piece of a page.
+On a terminal names are folded where it is narrow, numbers are never cut. LaTeX has the layout of the paper's tables 1
+and 2 and needs no package: floats with a caption, heads of several words stacked; several tables with the same heads
+become one, each under its title.
 """
 
 from __future__ import annotations

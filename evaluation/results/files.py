@@ -1,23 +1,19 @@
-"""The errors of each image as a results folder keeps them in `errors.csv`, read back.
+"""The files of a results folder that other programs read, and their estimates: `errors.csv`, `run.json`.
 
-A line has the columns `image`, `method`, the estimate, the truth (`truth_r`, `truth_g`, `truth_b`), `recovery` and
-`reproduction` in degrees, and `guessed`. Columns are found by their names, so others may stand between them. A file
-without the truth's columns, or without `guessed`, is read too: its truths are not known, and no image is guessed.
+A line of `errors.csv` has the columns `image`, `method`, the estimate, the truth (`truth_r`, `truth_g`, `truth_b`),
+`recovery` and `reproduction` in degrees, and `guessed`. Columns are found by their names, so others may stand between
+them. A file without the truth's columns, or without `guessed`, is read too: its truths are not known, and no image is
+guessed.
 
-The files of a results folder that other programs read, as text.
-
-Estimates that another program has made, as a CSV file: `image,r,g,b`, one line an image of the data set.
-
-The columns are found by their names, others may stand between them; a file without a head has those four. Commas,
-semicolons or tabs separate. An image is named as the data set names it, or without its extension. Every image of the
-data set has one line and no other image has any: a file of another part of the data set is refused rather than judged
-on what both happen to have.
+Estimates that another program has made are `image,r,g,b`, one line an image of the data set, with a head or without;
+commas, semicolons or tabs separate. An image is named as the data set names it, or without its extension. Every image
+of the data set has one line and no other image has any: a file of another part of the data set is refused rather than
+judged on what both happen to have.
 """
 
 from __future__ import annotations
 
 import csv
-import io
 import json
 import math
 from collections import defaultdict
@@ -30,7 +26,7 @@ import numpy as np
 import numpy.typing as npt
 
 from evaluation.metrics import ErrorKind
-from evaluation.results.result import Result
+from evaluation.results.result import Result, csv_text
 from evaluation.scene import Scene
 from foundation.errors import FormatError, InputError, counted, first_of
 from foundation.hashing import sha256_of
@@ -153,25 +149,21 @@ def errors_csv(images: Sequence[str], truths: npt.NDArray[np.float64], results: 
     """
     shares = truths / truths.sum(axis=1, keepdims=True)
     given = [result.estimates / result.estimates.sum(axis=1, keepdims=True) for result in results]
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    lights = ("r", "g", "b", "truth_r", "truth_g", "truth_b")
-    writer.writerow(("image", "method", *lights, *_KINDS, "guessed", "cause"))
+    rows: list[tuple[object, ...]] = [("image", "method", *_ESTIMATE, *_TRUTH, *_KINDS, "guessed", "cause")]
     for place, image in enumerate(images):
         for result, estimates in zip(results, given, strict=True):
             numbers = (*estimates[place], *shares[place])
             errors = (result.errors[kind][place] for kind in _KINDS)
             cause = (result.causes or {}).get(place, "")
-            writer.writerow(
-                [
+            rows.append(
+                (
                     *(image, result.method),
                     *(f"{part:.9f}" for part in numbers),
                     *(f"{error:.6f}" for error in errors),
-                    int(result.guessed[place]),
-                    cause,
-                ]
+                    *(int(result.guessed[place]), cause),
+                )
             )
-    return text.getvalue()
+    return csv_text(rows)
 
 
 def several_lights_csv(images: Sequence[str], results: Sequence[Result]) -> tuple[str, str]:
@@ -181,27 +173,20 @@ def several_lights_csv(images: Sequence[str], results: Sequence[Result]) -> tupl
     MAE_rgb); of the second image, method, light (its number from 0), share (of the image's judged pixels), recovery,
     reproduction. Degrees; empty where no pixel of an image is judged.
     """
-    pixels, regions = io.StringIO(), io.StringIO()
-    by_pixel, by_region = csv.writer(pixels, lineterminator="\n"), csv.writer(regions, lineterminator="\n")
-    by_pixel.writerow(("image", "method", "pixel_recovery", "pixel_reproduction", "pixel_rgb"))
-    by_region.writerow(("image", "method", "light", "share", "recovery", "reproduction"))
+    pixels: list[tuple[object, ...]] = [("image", "method", "pixel_recovery", "pixel_reproduction", "pixel_rgb")]
+    regions: list[tuple[object, ...]] = [("image", "method", "light", "share", "recovery", "reproduction")]
     for result in results:
         maps = result.maps
         if maps is None:
             continue
         for place, number in enumerate(maps.images):
             errors = (maps.pixel["recovery"][place], maps.pixel["reproduction"][place], maps.rgb[place])
-            by_pixel.writerow([images[number], result.method, *map(_degrees, errors)])
+            pixels.append((images[number], result.method, *map(_degrees, errors)))
         for place, number in enumerate(maps.region_images):
             errors = (maps.region["recovery"][place], maps.region["reproduction"][place])
-            by_region.writerow(
-                [
-                    *(images[number], result.method, int(maps.region_lights[place])),
-                    f"{maps.region_shares[place]:.6f}",
-                    *map(_degrees, errors),
-                ]
-            )
-    return pixels.getvalue(), regions.getvalue()
+            light, share = int(maps.region_lights[place]), f"{maps.region_shares[place]:.6f}"
+            regions.append((images[number], result.method, light, share, *map(_degrees, errors)))
+    return csv_text(pixels), csv_text(regions)
 
 
 def run_json(content: Mapping[str, Any]) -> str:

@@ -1,8 +1,6 @@
-"""What a method made of a data set: its estimates and their errors, and both as CSV text.
+"""A run as values: what methods answered for each image, the results that answers make, and the run that they belong to.
 
-What methods answered for one image, before it becomes a part of results; a line of JSON each while a run goes on.
-
-A run as a value: what was evaluated, how, and what came out; everything that a results folder is made from.
+An answer is a line of JSON while a run goes on; results are also tables of CSV.
 """
 
 from __future__ import annotations
@@ -10,7 +8,7 @@ from __future__ import annotations
 import csv
 import io
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
@@ -20,6 +18,14 @@ import numpy.typing as npt
 from evaluation.methods.pixels import GREY
 from evaluation.metrics import ErrorKind, MapError, RegionError, Summary, recovery_error, reproduction_error, summarise
 from evaluation.scene import Scene
+
+
+def csv_text(rows: Iterable[Sequence[object]]) -> str:
+    """Return rows as CSV text, RFC 4180 with lines that end with LF."""
+    text = io.StringIO()
+    csv.writer(text, lineterminator="\n").writerows(rows)
+    return text.getvalue()
+
 
 COLUMNS = ("method", "mean", "median", "trimean", "best25", "worst25", "avg")
 
@@ -102,12 +108,8 @@ def table_csv(results: Sequence[Result], kind: ErrorKind) -> str:
     method,mean,median,trimean,best25,worst25,avg
     Gray-world,2.500000,2.500000,2.500000,1.000000,4.000000,2.286525
     """
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(COLUMNS)
-    for result in results:
-        writer.writerow([result.method, *(f"{number:.6f}" for number in result.summary(kind).as_tuple())])
-    return text.getvalue()
+    rows = [(result.method, *(f"{number:.6f}" for number in result.summary(kind).as_tuple())) for result in results]
+    return csv_text([COLUMNS, *rows])
 
 
 def images_csv(scenes: Sequence[Scene], results: Sequence[Result]) -> str:
@@ -115,15 +117,13 @@ def images_csv(scenes: Sequence[Scene], results: Sequence[Result]) -> str:
 
     Estimates are scaled to r + g + b = 1, errors are degrees.
     """
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(("image", "method", "r", "g", "b", "recovery", "reproduction"))
+    rows: list[tuple[str, ...]] = [("image", "method", "r", "g", "b", "recovery", "reproduction")]
     for place, scene in enumerate(scenes):
         for result in results:
             light = result.estimates[place] / result.estimates[place].sum()
             errors = (result.errors["recovery"][place], result.errors["reproduction"][place])
-            writer.writerow([scene.name, result.method, *(f"{part:.6f}" for part in (*light, *errors))])
-    return text.getvalue()
+            rows.append((scene.name, result.method, *(f"{part:.6f}" for part in (*light, *errors))))
+    return csv_text(rows)
 
 
 NO_PIXEL = "no usable pixel"

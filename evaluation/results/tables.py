@@ -1,15 +1,11 @@
 """A table of results as a value: what commands print, pages show, papers set and other programs read.
 
-Every command of `evaluate` makes one of these and hands it to `reports.terminal`, `reports.latex` or `reports.page`;
-as CSV it is written here.
-
-The tables that sum up results: the paper's six columns, every statistic, and errors under several lights.
+Every command of `evaluate` makes one of these and hands it to `reports.table_output`; as CSV it is written here. So are
+the tables that sum up results: the paper's six columns, every statistic, and errors under several lights.
 """
 
 from __future__ import annotations
 
-import csv
-import io
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
@@ -17,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from evaluation.metrics import ErrorKind, summarise
-from evaluation.results.result import NO_PIXEL, Result, Subject
+from evaluation.results.result import NO_PIXEL, Result, Subject, csv_text
 from foundation.errors import first_of
 
 Cell = str | float | None
@@ -89,12 +85,11 @@ def table_to_csv(table: Table) -> str:
     "a, b",0.333333333,9
     c,,0
     """
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(table.columns)
-    for row in table.rows:
-        writer.writerow(["" if cell is None else f"{cell:.9g}" if isinstance(cell, float) else cell for cell in row])
-    return text.getvalue()
+    cells = [
+        ["" if cell is None else f"{cell:.9g}" if isinstance(cell, float) else cell for cell in row]
+        for row in table.rows
+    ]
+    return csv_text([table.columns, *cells])
 
 
 PAPER_COLUMNS = ("Algorithm", "Mean", "Med.", "Tri.", "Best 25%", "Worst 25%", "Avg.")

@@ -1,32 +1,19 @@
-"""A data set's description: its figures, lights, noise and sizes, made image by image.
+"""What a data set's images and lights are, in figures: measured image by image, written as `STATS.json`, read back.
 
-The figures by which a data set is described, each with its definition.
+All figures but noise, exposure and clipping are of images reduced to at most 64 x 64 cells with the light divided out:
+means over a cell's usable pixels. Statistics of scenes depend on the size at which they are taken, since averaging
+takes away noise, texture and chroma, so images of all sizes and shapes are reduced to the same number of cells;
+images of fewer pixels keep them. Luminance is the mean of the three channels.
 
-All but noise, exposure and clipping are of images reduced to at most 64 x 64 cells with the light divided out
-(`cells`); luminance is there the mean of the three channels.
+Noise is what an image's flattest blocks show, and the photon-transfer curve that it follows. A block of 8 x 8 pixels
+has the standard deviation that the Laplacian of J. Immerkaer, "Fast noise variance estimation", Computer Vision and
+Image Understanding 64 (1996) 300-302, leaves of it: what lies on a plane, it does not see. Texture it does see, so the
+flattest tenth of the blocks speaks for the noise, and an image that is texture all over has its noise overstated. Noise
+that neighbouring pixels share, as after demosaicing, scaling or compression, is understated: that of a thumbnail is
+what averaging has left, not the camera's.
 
-An image as cells: means over its usable pixels, with the light divided out.
-
-Statistics of scenes depend on the size at which they are taken: averaging takes away noise, texture and chroma. All
-images are therefore reduced to at most `CELLS` cells a side first, whatever their size and shape, as thumbnails of real
-data sets are. Images of fewer pixels keep them.
-
-Noise of images as their flattest blocks show it, and the photon-transfer curve that it follows.
-
-A block of 8 x 8 pixels has the standard deviation that the Laplacian of J. Immerkaer, "Fast noise variance
-estimation", Computer Vision and Image Understanding 64 (1996) 300-302, leaves of it: what lies on a plane, it does not
-see. Texture it does see, so the flattest tenth of the blocks speaks for the noise, and an image that is texture all
-over has its noise overstated. Noise that neighbouring pixels share, as after demosaicing, scaling or compression, is
-understated: that of a thumbnail is what averaging has left, not the camera's.
-
-The distribution of a data set's lights in the plane of ln(R/G) and ln(B/G).
-
-The numbers of one image that a data set's figures are made of.
-
-`STATS.json`: a data set's description as a file, to be compared with others and to generate data like it.
-
-The format is versioned and documented in docs/formats.md. Numbers are written with six significant digits; a figure
-that is not known of an image is null.
+Lights lie in the plane of ln(R/G) and ln(B/G). The file's format is versioned and documented in docs/formats.md:
+numbers with six significant digits, null for a figure that is not known of an image.
 """
 
 from __future__ import annotations

@@ -1,13 +1,9 @@
-"""A description's tables and page, alone or beside another's.
-
-One data set beside another, figure by figure: how real is what was generated.
+"""A description's tables and page, alone or beside another's: how real is what was generated.
 
 Images of the two have nothing to do with each other: each set is resampled by itself (`bootstrap.independent`). Two
 figures are called alike where the one lies within a quarter of the other: a ratio of 1/1.25 … 1.25, or, for figures
 with a sign, a difference within a quarter of the other's spread over its images. The quarter is a convention. Real
 photographs of two cameras by one group (Canon 600D and 1Ds Mark III of NUS) are alike by it in 18 of 21 figures.
-
-Figures of data sets: their luminance, chroma, lights and noise, one set or two beside each other.
 """
 
 from __future__ import annotations

@@ -5,9 +5,7 @@ reversed operator takes them back to linear; then methods estimate their lights.
 image before (`generator.pictures.tonemap`), so that with n = 0 only the rounding to whole codes is left. Masked pixels
 have no say in k and scale.
 
-Flash and its inverse in files: linear images as codes of 8 bits, and codes as linear images (section 4.2).
-
-A folder of codes lies so::
+In files, linear images become codes of 8 bits and codes linear images; a folder of codes lies so::
 
     codes/NAME.png   8-bit RGB, the image tone mapped, of whose codes the lowest bits may be zero
     masks/NAME.png   not 0 where a pixel is masked or clipped, where there is such a pixel
@@ -16,8 +14,6 @@ A folder of codes lies so::
 Codes may be changed by any program before they are taken back, or be replaced by a JPEG of the same name: what that
 does to methods is then seen. The linear images are TIFF files of 32-bit floats in the units of the data set, with a
 table of their lights, as `evaluation.datasets.plain_folder` reads them.
-
-The same picture with 0 … 7 bits of each code set to zero: the paper's figure of colour reduction (section 4.2).
 """
 
 from __future__ import annotations

@@ -1,11 +1,10 @@
-"""Scenes generated in memory: what `generate` would write, without a data set on the disk.
+"""What table 1 is made of: pictures, ground truths for lights like theirs, and scenes generated in memory.
 
 Image number i of a set shows source i under the i-th light that was chosen. Its samples are chosen as `generate` with
 the same seed chooses them, so a set that is worth keeping can be written by that command, to the same numbers.
 
-Pictures for the generator from real raw images whose light is known: sRGB codes as a raw converter would make them.
-
-The paper prints "the sRGB images of the Canon 1Ds Mark III" (section 4.3), which the camera or a program of its maker
+Pictures come from real raw images whose light is known: sRGB codes as a raw converter would make them. The paper
+prints "the sRGB images of the Canon 1Ds Mark III" (section 4.3), which the camera or a program of its maker
 had developed; nobody has published how. Ours, with the ground truth at hand:
 
 1. the image is divided by its light, green kept, and cut where the first channel clips, so that clipped skies become
@@ -15,7 +14,7 @@ had developed; nobody has published how. Ours, with the ground truth at hand:
    "99th-percentile white point", and cut to 0 … 1;
 4. the curve of IEC 61966-2-1 and eight bits.
 
-Ground truths of a data set, for lights like its own: from a file of text, or from the data set itself.
+Ground truths come from a file of text, or from the data set itself.
 """
 
 from __future__ import annotations

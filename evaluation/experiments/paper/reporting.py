@@ -1,11 +1,8 @@
 """Each experiment's results as a folder: a page, tables as CSV and LaTeX, figures as SVG or PNG.
 
-The rb-chromaticities of a table's lights as the camera sees them on an achromatic surface (section 3.1 and 3.3).
-
-What the paper's two figures show for the EOS 550D and the 6D Mark II, and beside them the ground truths of real data
-sets: which of their lights a table can stand for.
-
-The figures of section 4 as SVG: medians against bits set to zero, against sizes, and chromaticities of lights.
+Chromaticities of lights (sections 3.1 and 3.3) are those of the white under each light of a table, as its camera sees
+it: what the paper's two figures show for the EOS 550D and the 6D Mark II, and beside them the ground truths of real
+data sets, to see which of their lights a table can stand for.
 """
 
 from __future__ import annotations

@@ -5,11 +5,8 @@ to the ground truths of a real data set, and drawn from all of the table) make e
 the size nor the number of its images, nor how many lights it drew. Ours: as many random scenes as pictures, squares of
 `side` px; pictures scaled to a longest side of `side` px; one light for each image.
 
-What a table holds that explains its row of table 1: how noisy the print's white is, and how grey the print is.
-
-What a few hot photosites in a table do to White-Patch.
-
-The paper's 550D tables give White-Patch mean errors of 9 to 26°, which noise cannot: the largest of thousands of normal
+Beside it stands what a table holds that explains its row: how noisy the print's white is, how grey the print is, and
+what a few hot photosites do to White-Patch. The paper's 550D tables give White-Patch mean errors of 9 to 26°, which noise cannot: the largest of thousands of normal
 deviates lies a few standard deviations above the mean, some percent of a white. A photosite whose dark signal is high
 can be above every white of its channel, and the largest value of an image is then its. The simulated sensors have shot
 and read noise and, unless a room asks for them, no such photosites, and `build-lut` is told nothing of any; here some

@@ -1,21 +1,16 @@
 """What a transfer is to be: data sets opened, compared and cut to what may be trained on, before the work begins.
 
-Images that training and test share: a method that has seen a test image, or its scene, is not tested.
+A method that has seen a test image, or its scene, is not tested. Generated images are compared by their source
+pictures: with another generated set by the hash of the file, with real images by the name, since a print of a
+photograph that is a test image shows the test image's scene. Real images are compared by name and by their pixels. A
+name is compared without folder and ending, capitals and case being one.
 
-Generated images are compared by their source pictures: with another generated set by the hash of the file, with real
-images by the name, since a print of a photograph that is a test image shows the test image's scene. Real images are
-compared by name and by their pixels. A name is compared without folder and ending, capitals and case being one.
-
-Find the source pictures of a generated data set again, by name and hash, and read them as they were read for it.
-
-The naive baseline: a picture's linear light times the colour of a light, beside what a table makes of it.
-
-For each image of a generated data set a scene of the same picture under the same light, as bright and as finely
-quantised, without a print, a camera or noise: codes become linear light by the sRGB curve, colours those of the camera
-by its matrix if one is given, and each channel is multiplied by the light. What a learned method gains by training on
-the generated image instead is what the table is worth. Several lights share the pixels of the counterpart by the masks
-of the generated image, and light falls off as it does there. What `generate --exposure` and `--iso` did to the
-generated image is not done to its counterpart.
+The naive baseline is, for each image of a generated data set, a scene of the same picture under the same light, as
+bright and as finely quantised, without a print, a camera or noise: codes become linear light by the sRGB curve, colours
+those of the camera by its matrix if one is given, and each channel is multiplied by the light. What a learned method
+gains by training on the generated image instead is what the table is worth. Several lights share the pixels of the
+counterpart by the masks of the generated image, and light falls off as it does there. What `generate --exposure` and
+`--iso` did to the generated image is not done to its counterpart. Its pictures are found again by name and hash.
 """
 
 from __future__ import annotations
