@@ -400,7 +400,7 @@ def _statistics_csv(comparisons: Sequence[Comparison]) -> str:
 
 
 def _images_csv(comparisons: Sequence[Comparison]) -> str:
-    rows = [("first", "second", "image", "first_deg", "second_deg", "difference_deg")]
+    rows: list[tuple[str, ...]] = [("first", "second", "image", "first_deg", "second_deg", "difference_deg")]
     for made in comparisons:
         matched = made.matched
         for image, one, other in zip(matched.images, matched.one, matched.other, strict=True):

@@ -12,11 +12,12 @@ torus is de-aliased by the lights themselves: of the chromas that fall on one bi
 training lights' range is meant, where the paper has grey light or grey world (section 3.3). Training lights that spread
 over more than three quarters of the paper's torus of two natural logarithms get bins of twice the width.
 
-*Training* is as in sections 3 and 4 of the paper and in its supplement. The loss of the first iterations is convex, the cross-entropy between the softmax and the bin of the true light; that of the others
-is the negative log-likelihood of the true light under the fitted bivariate von Mises distribution, taken as a normal
-one on the unrolled torus (equations 9 to 13). The penalties, squares of the parameters and of their differences
-between neighbouring bins, are diagonal in Fourier space, where L-BFGS runs on parameters scaled so that the penalty is
-half their squared length (preconditioning, section 4.2).
+*Training* is as in sections 3 and 4 of the paper and in its supplement. The loss of the first iterations is convex, the
+cross-entropy between the softmax and the bin of the true light; that of the others is the negative log-likelihood of
+the true light under the fitted bivariate von Mises distribution, taken as a normal one on the unrolled torus (equations
+9 to 13). The penalties, squares of the parameters and of their differences between neighbouring bins, are diagonal in
+Fourier space, where L-BFGS runs on parameters scaled so that the penalty is half their squared length (preconditioning,
+section 4.2).
 
 The Fourier transforms of real arrays are symmetric; instead of the paper's packing of their independent parts, the
 scaled parameters stay in the plane of bins and pass through Fourier space and back, a symmetric linear map. Gradients

@@ -1,4 +1,4 @@
-"""A run as values: what methods answered for each image, the results that answers make, and the run that they belong to.
+"""A run as values: what methods answered for each image, the results that answers make, and the run of them.
 
 An answer is a line of JSON while a run goes on; results are also tables of CSV.
 """

@@ -6,11 +6,11 @@ the size nor the number of its images, nor how many lights it drew. Ours: as man
 `side` px; pictures scaled to a longest side of `side` px; one light for each image.
 
 Beside it stands what a table holds that explains its row: how noisy the print's white is, how grey the print is, and
-what a few hot photosites do to White-Patch. The paper's 550D tables give White-Patch mean errors of 9 to 26°, which noise cannot: the largest of thousands of normal
-deviates lies a few standard deviations above the mean, some percent of a white. A photosite whose dark signal is high
-can be above every white of its channel, and the largest value of an image is then its. The simulated sensors have shot
-and read noise and, unless a room asks for them, no such photosites, and `build-lut` is told nothing of any; here some
-are put into a table that is read, and nothing is written.
+what a few hot photosites do to White-Patch. The paper's 550D tables give White-Patch mean errors of 9 to 26°, which
+noise cannot: the largest of thousands of normal deviates lies a few standard deviations above the mean, some percent of
+a white. A photosite whose dark signal is high can be above every white of its channel, and the largest value of an
+image is then its. The simulated sensors have shot and read noise and, unless a room asks for them, no such photosites,
+and `build-lut` is told nothing of any; here some are put into a table that is read, and nothing is written.
 
 A hot photosite is one of a table's values (colour, sample, channel), the same under every light as on a sensor that
 stands still. Its dark signal, drawn evenly from 0 to saturation, is added, and the sum cut below saturation, since

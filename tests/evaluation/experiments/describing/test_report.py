@@ -1,15 +1,20 @@
-"""Figures of two sets are told apart where they differ, and not where they do not."""
+"""Figures of two sets are told apart where they differ, and not where they do not.
+
+What is said of two descriptions before they are compared.
+"""
 
 from __future__ import annotations
 
 import dataclasses
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from evaluation.experiments.describing import DataDescription, describe, figures
-from evaluation.experiments.describing.description import QUANTITIES
-from evaluation.experiments.describing.report import FigureCompared, compare_figures, sentence
+from evaluation.experiments.describing.description import QUANTITIES, read_statistics, statistics_to_json
+from evaluation.experiments.describing.report import FigureCompared, compare_figures, seen_notes, sentence
 from generator.likeness.drawing import TITLES
 from tests.evaluation.experiments.describing.scenes import random_set
 
@@ -90,3 +95,14 @@ def test_intervals_of_spreads_cover() -> None:
 def test_generate_calls_figures_by_the_same_names() -> None:
     titles = {quantity.name: quantity.title for quantity in QUANTITIES}
     assert {name: titles[name] for name in TITLES} == TITLES
+
+
+def test_only_images_that_share_a_picture_make_intervals_too_narrow(tmp_path: Path) -> None:
+    alone = replace(describe(random_set("alone", 4)), layout="generated")
+    assert alone.groups == len(alone.images)
+    shared = replace(alone, name="shared", groups=2)
+    (tmp_path / "shared.json").write_text(statistics_to_json(shared))
+    read = read_statistics(str(tmp_path / "shared.json"))
+    assert read.groups == 2
+    (told,) = [note for note in seen_notes(alone, read) if "too narrow" in note]
+    assert told.startswith(f"The {len(alone.images)} images of shared are of 2 pictures or places")
