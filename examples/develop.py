@@ -1,7 +1,7 @@
 """Develop the raw images of a real data set to sRGB pictures, to generate from: white balanced by their ground truths.
 
 Usage: python examples/develop.py DATA FOLDER [--matrix CAMERA] [--side PX]. DATA is any data set that evaluate reads.
-How it is done says evaluation/experiments/paper/scenes/developing.py; the pictures are PNG, named after the images.
+How it is done says evaluation/experiments/paper/material.py; the pictures are PNG, named after the images.
 """
 
 from __future__ import annotations
@@ -12,8 +12,7 @@ from pathlib import Path, PurePosixPath
 import cv2
 
 from evaluation.datasets import open_scenes
-from evaluation.experiments.paper.scenes.developing import developed
-from evaluation.experiments.paper.scenes.rendering import ScaledSource
+from evaluation.experiments.paper.material import ScaledSource, developed
 from generator.rendering.matrices import choose_matrix
 
 

@@ -30,8 +30,7 @@ import numpy.typing as npt
 from scipy.spatial import Delaunay, cKDTree
 from scipy.stats import gaussian_kde
 
-from evaluation.experiments.bootstrap import STATISTICS, Statistic
-from evaluation.experiments.resampling import ErrorSample, bca, resamples
+from evaluation.experiments.bootstrap import STATISTICS, ErrorSample, Statistic, bca, resamples
 from evaluation.learning.feature_learner import FeatureLearner
 from evaluation.learning.standard import standard_learners
 from evaluation.metrics import recovery_error

@@ -26,7 +26,7 @@ _INTERVAL = re.compile(r"(?<=\d) – (?=[-−]?\d)")
 
 
 @dataclass(frozen=True)
-class Page:
+class RenderedPage:
     """A page: its text, and its content security policy for a server that sends it."""
 
     text: str
@@ -41,7 +41,7 @@ def render(
     styles: Sequence[str] = (),
     connects: bool = False,
     **values: Any,
-) -> Page:
+) -> RenderedPage:
     """Return the page that a template of a package makes of values, among them its `title`.
 
     `scripts` and `styles` are files beside the template, put into the page in that order, the styles after the common
@@ -56,7 +56,7 @@ def render(
         f"{'''connect-src 'self'; img-src 'self' data:''' if connects else 'img-src data:'}"
     )
     found = _environment(package).get_template(template)
-    return Page(found.render(script=script, style=style, policy=Markup(policy), **values), policy)
+    return RenderedPage(found.render(script=script, style=style, policy=Markup(policy), **values), policy)
 
 
 def page(title: str, parts: Sequence[Markup]) -> str:

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from evaluation.commands.options import AngularError, argument, option
 from foundation.console import EXIT_CODES, JsonOutput, with_json
 
 if TYPE_CHECKING:
@@ -14,7 +15,7 @@ if TYPE_CHECKING:
 
     from evaluation.experiments.comparing import Matched
     from evaluation.metrics import ErrorKind
-    from evaluation.results.errors_file import MethodErrors
+    from evaluation.results.files import MethodErrors
 
 _FEW = 3
 """Comparisons of which everything is printed unasked: of more, one would have to look for what they come to."""
@@ -35,28 +36,20 @@ nothing unless asked with --out.
 
 @with_json("evaluate compare")
 def compare(
-    results: Annotated[
-        list[str],
-        typer.Argument(metavar="RESULTS", help="Results folder, or its errors.csv.", show_default=False),
-    ],
+    results: Annotated[list[str], argument("RESULTS", "Results folder, or its errors.csv.")],
     method: Annotated[
         list[str] | None,
-        typer.Option(
-            metavar="NAME",
-            help="Method to compare, as the tables call it or by its name for evaluate run; give it more than once for "
+        option(
+            "NAME",
+            "Method to compare, as the tables call it or by its name for evaluate run; give it more than once for "
             "several. With two RESULTS, FIRST=SECOND compares methods of different names. \\[default: all]",
-            show_default=False,
         ),
     ] = None,
-    error: Annotated[
-        Literal["reproduction", "recovery"], typer.Option(help="Angular error to compare.")
-    ] = "reproduction",
+    error: Annotated[AngularError, typer.Option(help="Angular error to compare.")] = "reproduction",
     out: Annotated[
         Path | None,
-        typer.Option(
-            metavar="FOLDER",
-            help="Write tables (CSV, LaTeX), the images' errors and a page with scatters to this new folder too.",
-            show_default=False,
+        option(
+            "FOLDER", "Write tables (CSV, LaTeX), the images' errors and a page with scatters to this new folder too."
         ),
     ] = None,
     images: Annotated[
@@ -68,9 +61,10 @@ def compare(
     told: JsonOutput,
 ) -> None:
     """Compare methods on the same images."""
-    from evaluation.experiments import comparing, comparison_report
-    from evaluation.reports.terminal import show_notes, show_tables
-    from evaluation.results.errors_file import read_errors
+    from evaluation.experiments import comparing
+    from evaluation.experiments import comparing as comparison_report
+    from evaluation.reports.table_output import show_notes, show_tables
+    from evaluation.results.files import read_errors
     from foundation.errors import InputError
     from foundation.files import require_free
 

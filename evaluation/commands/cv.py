@@ -7,8 +7,19 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from evaluation.commands.data_options import DataReading, with_data_options
-from evaluation.commands.result_options import PrintedError, PrintedStatistics
+from evaluation.commands.options import (
+    Data,
+    DataReading,
+    PrintedError,
+    PrintedStatistics,
+    argument,
+    choose_beside_constant,
+    image_steps,
+    option,
+    require_order,
+    thread_option,
+    with_data_options,
+)
 from evaluation.commands.train import LEARNERS_HELP
 from foundation.console import EXIT_CODES, JsonOutput, with_json
 
@@ -16,7 +27,6 @@ if TYPE_CHECKING:
     import numpy as np
     import numpy.typing as npt
 
-    from evaluation.methods.method import Learner
     from evaluation.scene import SceneSet
 
 HELP = f"""Cross-validate methods that learn: train on all folds but one and estimate the images of that one, for each.
@@ -38,22 +48,14 @@ the table of evaluate run; writes nothing unless asked: --out writes the results
 @with_json("evaluate cv")
 @with_data_options
 def cv(
-    method: Annotated[
-        str,
-        typer.Argument(
-            metavar="METHOD", help=f"{LEARNERS_HELP}, all, module:Class or file.py:Class.", show_default=False
-        ),
-    ],
-    data: Annotated[
-        str, typer.Argument(metavar="DATA", help="Folder or file of the data set, or its URL.", show_default=False)
-    ],
+    method: Annotated[str, argument("METHOD", f"{LEARNERS_HELP}, all, module:Class or file.py:Class.")],
+    data: Data,
     *,
     folds: Annotated[
         str | None,
-        typer.Option(
-            metavar="N|FILE.csv",
-            help="Number of folds to draw, or a file with the columns image,fold. \\[default: the data's own, or 3]",
-            show_default=False,
+        option(
+            "N|FILE.csv",
+            "Number of folds to draw, or a file with the columns image,fold. \\[default: the data's own, or 3]",
         ),
     ] = None,
     seed: Annotated[
@@ -61,40 +63,27 @@ def cv(
     ] = 0,
     error: PrintedError = "reproduction",
     statistics: PrintedStatistics = "paper",
-    out: Annotated[
-        Path | None,
-        typer.Option(metavar="RESULTS", help="Write everything to this new folder.", show_default=False),
-    ] = None,
-    save_folds: Annotated[
-        Path | None,
-        typer.Option(metavar="OUT.csv", help="Write the folds to this new file.", show_default=False),
-    ] = None,
-    workers: Annotated[
-        int | None,
-        typer.Option(
-            metavar="N",
-            help="Threads that read images; no number depends on it. \\[default: one a processor]",
-            min=1,
-            show_default=False,
-        ),
-    ] = None,
+    out: Annotated[Path | None, option("RESULTS", "Write everything to this new folder.")] = None,
+    save_folds: Annotated[Path | None, option("OUT.csv", "Write the folds to this new file.")] = None,
+    workers: Annotated[int | None, thread_option(" that read images; no number depends on it")] = None,
     reading: DataReading,
     told: JsonOutput,
 ) -> None:
     """Cross-validate methods on a data set."""
-    from evaluation.commands.choosing import require_order
     from evaluation.experiments.cross_validation import cross_validate
     from evaluation.experiments.folds import choose_folds, folds_to_csv
     from evaluation.experiments.run_folder import describe_run, write_run
-    from evaluation.reports.terminal import show_notes, show_tables
+    from evaluation.learning.constant_light import ConstantLight
+    from evaluation.reports.table_output import show_notes, show_tables
     from evaluation.results.method_records import describe_method
-    from evaluation.results.summary_tables import summary_table
-    from foundation.console import orderly_end, progress
+    from evaluation.results.tables import summary_table
+    from foundation.console import orderly_end
     from foundation.files import require_free, require_free_file, write_whole
     from foundation.processors import processor_count
 
     require_order("cv", method, data)
-    learners, left_out = _chosen(method)
+    others, left_out = choose_beside_constant(method)
+    learners = [ConstantLight(), *others]
     if out is not None:
         require_free(out, "the results")
     if save_folds is not None:
@@ -103,9 +92,8 @@ def cv(
     parts, origin = choose_folds(found, folds, seed)
     count, threads = len(found.scenes), workers or processor_count()
     with orderly_end():
-        with progress("images") as advance:
-            steps = iter(range(1, count + 1))
-            results = cross_validate(found.scenes, learners, parts, seed, threads, lambda: advance(next(steps), count))
+        with image_steps(count) as step:
+            results = cross_validate(found.scenes, learners, parts, seed, threads, step)
         notes = (
             f"cross-validated in {len(set(parts.tolist()))} folds, {origin}; seed {seed}",
             *left_out,
@@ -139,24 +127,3 @@ def _parted_copies(data: SceneSet, folds: npt.NDArray[np.int64]) -> list[str]:
         f"{counted(len(apart), 'image is a copy', 'images are copies')} of images of other folds ({first_of(apart)}): "
         "tested on what was trained on"
     ]
-
-
-def _chosen(text: str) -> tuple[list[Learner], list[str]]:
-    """Return the learners that a text names, after the constant light, and why some of `all` are left out."""
-    from evaluation.commands.choosing import choose_learners
-    from evaluation.learning.constant_light import ConstantLight
-    from evaluation.learning.feature_learner import what_is_missing
-
-    texts = [part.strip() for part in text.split(",")]
-    explicit = {learner.name for learner in choose_learners(part for part in texts if part.lower() != "all")}
-    constant = ConstantLight()
-    others = [learner for learner in choose_learners(texts) if learner.name != constant.name]
-    chosen: list[Learner] = [constant]
-    left_out: list[str] = []
-    for learner in others:
-        missing = what_is_missing(learner)
-        if missing and learner.name not in explicit:
-            left_out.append(f"{learner.name} is left out: {missing}")
-        else:
-            chosen.append(learner)
-    return chosen, left_out

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from evaluation.commands.data_options import DataReading, with_data_options
-from foundation.console import EXIT_CODES, JsonOutput, shows_progress, with_json
+from evaluation.commands.options import DataReading, argument, image_steps, option, thread_option, with_data_options
+from foundation.console import EXIT_CODES, JsonOutput, with_json
 
 if TYPE_CHECKING:
     from evaluation.experiments.describing import DataDescription
@@ -31,42 +31,20 @@ Prints tables, and with --against one sentence for each figure: within 25 % or n
 @with_json("evaluate describe")
 @with_data_options
 def describe(
-    data: Annotated[
-        str,
-        typer.Argument(metavar="DATA", help="Folder, file or URL of it, or a STATS.json.", show_default=False),
-    ],
-    against: Annotated[
-        str | None,
-        typer.Option(metavar="DATA", help="Data set, or STATS.json, to hold it beside.", show_default=False),
-    ] = None,
-    out: Annotated[
-        Path | None,
-        typer.Option(metavar="STATS.json", help="Write DATA's description to this new file.", show_default=False),
-    ] = None,
-    report: Annotated[
-        Path | None,
-        typer.Option(metavar="PAGE.html", help="Write a page with figures to this new file.", show_default=False),
-    ] = None,
-    against_layout: Annotated[
-        str | None, typer.Option(metavar="NAME", help="Layout of the data set beside it.", show_default=False)
-    ] = None,
-    against_camera: Annotated[
-        str | None, typer.Option(metavar="NAME", help="Camera of the data set beside it.", show_default=False)
-    ] = None,
-    against_subset: Annotated[
-        str | None, typer.Option(metavar="NAME", help="Part of the data set beside it.", show_default=False)
-    ] = None,
-    against_truth: Annotated[
-        str | None, typer.Option(metavar="NAME", help="Ground truth of the data set beside it.", show_default=False)
-    ] = None,
+    data: Annotated[str, argument("DATA", "Folder, file or URL of it, or a STATS.json.")],
+    against: Annotated[str | None, option("DATA", "Data set, or STATS.json, to hold it beside.")] = None,
+    out: Annotated[Path | None, option("STATS.json", "Write DATA's description to this new file.")] = None,
+    report: Annotated[Path | None, option("PAGE.html", "Write a page with figures to this new file.")] = None,
+    against_layout: Annotated[str | None, option("NAME", "Layout of the data set beside it.")] = None,
+    against_camera: Annotated[str | None, option("NAME", "Camera of the data set beside it.")] = None,
+    against_subset: Annotated[str | None, option("NAME", "Part of the data set beside it.")] = None,
+    against_truth: Annotated[str | None, option("NAME", "Ground truth of the data set beside it.")] = None,
     against_partial: Annotated[
         bool, typer.Option("--against-partial", help="Take what is there of the data set beside it.")
     ] = False,
     cells: Annotated[int, typer.Option(help="Cells a side that images are reduced to; 0: none.", min=0)] = 64,
     seed: Annotated[int, typer.Option(help="Of the bootstrap.", min=0)] = 0,
-    workers: Annotated[
-        int | None, typer.Option(metavar="N", help="Threads. \\[default: one a processor]", min=1, show_default=False)
-    ] = None,
+    workers: Annotated[int | None, thread_option()] = None,
     *,
     reading: DataReading,
     told: JsonOutput,
@@ -75,9 +53,9 @@ def describe(
     from dataclasses import replace
 
     from evaluation.experiments.describing import report as reporting
-    from evaluation.experiments.describing.against import compare_figures, sentence
-    from evaluation.experiments.describing.statistics_json import statistics_to_json
-    from evaluation.reports.terminal import show_notes, show_tables
+    from evaluation.experiments.describing.description import statistics_to_json
+    from evaluation.experiments.describing.report import compare_figures, sentence
+    from evaluation.reports.table_output import show_notes, show_tables
     from foundation.errors import InputError
     from foundation.files import require_free_file, write_whole
     from foundation.processors import processor_count
@@ -113,11 +91,8 @@ def describe(
 
 
 def _described(place: str, reading: DataReading, cells: int, workers: int) -> DataDescription:
-    from rich.console import Console
-    from rich.progress import Progress
-
     from evaluation.experiments.describing import describe
-    from evaluation.experiments.describing.statistics_json import read_statistics
+    from evaluation.experiments.describing.description import read_statistics
     from foundation.errors import InputError
 
     if reading.layout is None and place.endswith(".json") and Path(place).is_file():
@@ -128,6 +103,5 @@ def _described(place: str, reading: DataReading, cells: int, workers: int) -> Da
             )
         return read_statistics(place)
     data = reading.open(place)
-    with Progress(console=Console(stderr=True), disable=not shows_progress()) as progress:
-        task = progress.add_task(data.name, total=len(data.scenes))
-        return describe(data, cells, workers, lambda: progress.advance(task))
+    with image_steps(len(data.scenes)) as step:
+        return describe(data, cells, workers, step)

@@ -3,18 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from evaluation.commands.data_options import DataReading, with_data_options
-from foundation.console import EXIT_CODES, JsonOutput, new_app, shows_progress, with_json
+from evaluation.commands.options import (
+    AngularError,
+    DataReading,
+    argument,
+    choose_learners,
+    image_steps,
+    option,
+    thread_option,
+    with_data_options,
+)
+from foundation.console import EXIT_CODES, JsonOutput, new_app, with_json
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Generator
-
     from evaluation.experiments.paper.reporting import PaperReport
     from evaluation.scene import SceneSet
     from generator import Lut
@@ -31,17 +37,11 @@ all of them as made with full tables of both cameras.
 
 app = new_app(no_args_is_help=True)
 
-Luts = Annotated[
-    list[Path], typer.Argument(metavar="LUT", help="Tables made by build-lut, a folder each.", show_default=False)
-]
-Kind = Annotated[Literal["reproduction", "recovery"], typer.Option(help="Angular error to print.")]
-Out = Annotated[
-    Path | None, typer.Option(metavar="FOLDER", help="Write page, tables and figures here.", show_default=False)
-]
+Luts = Annotated[list[Path], argument("LUT", "Tables made by build-lut, a folder each.")]
+Kind = Annotated[AngularError, typer.Option(help="Angular error to print.")]
+Out = Annotated[Path | None, option("FOLDER", "Write page, tables and figures here.")]
 Seed = Annotated[int, typer.Option(metavar="N", help="Of all that is drawn at random.", min=0)]
-Workers = Annotated[
-    int | None, typer.Option(metavar="N", help="Threads. \\[default: one a processor]", min=1, show_default=False)
-]
+Workers = Annotated[int | None, thread_option()]
 
 _NOT_C1 = (
     "The paper's pictures and ground truths are C1, the 259 images of the Canon 1Ds Mark III of NUS; its numbers stand "
@@ -65,20 +65,18 @@ def table1(
     luts: Luts,
     pictures: Annotated[
         str,
-        typer.Option(
-            metavar="PLACE",
-            help="The scenes: a folder of photographs, or a real data set, whose raw images are developed to sRGB "
+        option(
+            "PLACE",
+            "The scenes: a folder of photographs, or a real data set, whose raw images are developed to sRGB "
             "with their ground truths.",
-            show_default=False,
         ),
     ],
     lights_like: Annotated[
         str,
-        typer.Option(
-            metavar="TRUTHS",
-            help="Ground truths whose nearest lights are one choice of lights: FILE.csv, FILE.csv#START for the rows "
+        option(
+            "TRUTHS",
+            "Ground truths whose nearest lights are one choice of lights: FILE.csv, FILE.csv#START for the rows "
             "whose names begin so, or a data set.",
-            show_default=False,
         ),
     ],
     matrix: Annotated[
@@ -109,11 +107,10 @@ def table1(
     told: JsonOutput,
 ) -> None:
     """Run plain methods on eight generated data sets."""
-    from evaluation.experiments.paper.hot import hot_rows
+    from evaluation.experiments.paper.material import read_truths
     from evaluation.experiments.paper.published import cell_name
     from evaluation.experiments.paper.reporting import table1_report
-    from evaluation.experiments.paper.scenes.truths import read_truths
-    from evaluation.experiments.paper.table1 import settings, size_dependence
+    from evaluation.experiments.paper.table1 import hot_rows, settings, size_dependence
     from evaluation.experiments.paper.table1 import table1 as run
     from foundation.processors import processor_count
 
@@ -125,7 +122,7 @@ def table1(
     names = cell_name(called, [scene.name for scene in scenes]), cell_name(truths.name, truths.images)
     chosen = settings(opened, scenes, truths.lights, side, seed, names)
     threads = workers or processor_count()
-    with _progress(sum(len(part.scenes) for part in chosen)) as step:
+    with image_steps(sum(len(part.scenes) for part in chosen)) as step:
         blocks = run(chosen, threads, step)
     found = size_dependence(opened, scenes, truths.lights, sides, seed, threads, names)
     raised = hot_rows(chosen, shares, seed, threads)
@@ -158,16 +155,13 @@ the real one, and tests on the real one. The paper's numbers stand beside those 
 @with_data_options
 def table2(
     data: Annotated[str, typer.Argument(metavar="DATA", help="Real data set; the paper's is Cube+.")],
-    generated: Annotated[
-        str, typer.Option(metavar="PLACE", help="Data set made by generate, to train on.", show_default=False)
-    ],
+    generated: Annotated[str, option("PLACE", "Data set made by generate, to train on.")],
     methods: Annotated[
         str,
-        typer.Option(
-            metavar="LIST",
-            help="Methods that learn, between commas: names, module:Class or file.py:Class. "
+        option(
+            "LIST",
+            "Methods that learn, between commas: names, module:Class or file.py:Class. "
             "\\[default: smart-color-cat, regression-trees, color-beaver]",
-            show_default=False,
         ),
     ] = "smart-color-cat,regression-trees,color-beaver",
     folds: Annotated[str, typer.Option(metavar="N|FILE", help="Folds of the cross-validation, or their file.")] = "3",
@@ -184,13 +178,12 @@ def table2(
     told: JsonOutput,
 ) -> None:
     """Train learned methods on real and on generated images."""
-    from evaluation.commands.choosing import choose_learners
     from evaluation.datasets import open_scenes
     from evaluation.experiments.folds import choose_folds
     from evaluation.experiments.paper.reporting import table2_report
     from evaluation.experiments.paper.table2 import table2 as run
     from evaluation.experiments.paper.table2 import table2_tables
-    from evaluation.experiments.transfer.overlap import trainable_images
+    from evaluation.experiments.transfer.plan import trainable_images
     from evaluation.learning.standard import standard_learners
     from foundation.processors import processor_count
 
@@ -208,7 +201,7 @@ def table2(
     )
     unseen = (f"{shared_images}. They were {fate}.",) if shared_images else ()
     drawn, _ = choose_folds(real, folds, seed)
-    with _progress(2 * count) as step:
+    with image_steps(2 * count) as step:
         found = run(real.scenes, training, learners, drawn, seed, workers or processor_count(), step)
     is_cube = real.layout == "cube-plus"
     conditions = (
@@ -247,13 +240,13 @@ def bits(
     told: JsonOutput,
 ) -> None:
     """Run methods on images whose colours were reduced."""
-    from evaluation.experiments.paper.bits import bits_methods, bits_removed
+    from evaluation.experiments.paper.colour_reduction import bits_methods, bits_removed
     from evaluation.experiments.paper.reporting import bits_report
     from foundation.processors import processor_count
 
     _require_free(out)
     opened = reading.open(data)
-    with _progress(len(opened.scenes)) as step:
+    with image_steps(len(opened.scenes)) as step:
         found = bits_removed(opened.scenes, bits_methods(sigma), workers=workers or processor_count(), on_scene=step)
     first = f"{opened.name}, {len(opened.scenes)} images. Gray-Edge at a scale of {sigma:g} px."
     conditions = (first, _treatment(opened))
@@ -275,7 +268,7 @@ images, also codes that another program has changed.
 @with_data_options
 def flash(
     data: Annotated[str, typer.Argument(metavar="DATA", help="Real data set of linear images.")],
-    out: Annotated[Path, typer.Option(metavar="FOLDER", help="New folder of codes.", show_default=False)],
+    out: Annotated[Path, option("FOLDER", "New folder of codes.")],
     clear: Annotated[int, typer.Option(metavar="N", help="Bits of each code set to zero.", min=0, max=8)] = 0,
     workers: Workers = None,
     *,
@@ -283,12 +276,12 @@ def flash(
     told: JsonOutput,
 ) -> None:
     """Write tone-mapped codes of linear images."""
-    from evaluation.experiments.paper.flash_files import write_codes
+    from evaluation.experiments.paper.colour_reduction import write_codes
     from foundation.processors import processor_count
 
     _require_free(out)
     opened = reading.open(data)
-    with _progress(len(opened.scenes)) as step:
+    with image_steps(len(opened.scenes)) as step:
         write_codes(opened, out, clear, workers or processor_count(), step)
     told.add(folder=out, data_set=opened.name, images=len(opened.scenes), cleared=clear)
     print(f"{out}: codes of {len(opened.scenes)} images of {opened.name}, {clear} bits of each set to zero")
@@ -307,14 +300,14 @@ run reads them.
 @app.command("flash-inverse", help=_INVERSE)
 @with_json("evaluate paper flash-inverse")
 def flash_inverse(
-    folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="Folder of codes.", show_default=False)],
-    out: Annotated[Path, typer.Option(metavar="LINEAR", help="New folder of linear images.", show_default=False)],
+    folder: Annotated[Path, argument("FOLDER", "Folder of codes.")],
+    out: Annotated[Path, option("LINEAR", "New folder of linear images.")],
     workers: Workers = None,
     *,
     told: JsonOutput,
 ) -> None:
     """Write the linear images of codes."""
-    from evaluation.experiments.paper.flash_files import write_linear
+    from evaluation.experiments.paper.colour_reduction import write_linear
     from foundation.console import progress
     from foundation.processors import processor_count
 
@@ -337,10 +330,7 @@ the figure is there only.
 @app.command("reduction", help=_REDUCTION)
 @with_json("evaluate paper reduction")
 def reduction(
-    picture: Annotated[Path, typer.Argument(metavar="PICTURE", help="Any picture file.", show_default=False)],
-    out: Out = None,
-    *,
-    told: JsonOutput,
+    picture: Annotated[Path, argument("PICTURE", "Any picture file.")], out: Out = None, *, told: JsonOutput
 ) -> None:
     """Show a picture with its colours reduced."""
     from evaluation.experiments.paper.reporting import reduction_report
@@ -365,10 +355,8 @@ def chromaticities(
     luts: Luts,
     truths: Annotated[
         list[str] | None,
-        typer.Option(
-            metavar="TRUTHS",
-            help="Ground truths to show beside the lights: FILE.csv, FILE.csv#START, or a data set. Repeatable.",
-            show_default=False,
+        option(
+            "TRUTHS", "Ground truths to show beside the lights: FILE.csv, FILE.csv#START, or a data set. Repeatable."
         ),
     ] = None,
     out: Out = None,
@@ -376,8 +364,8 @@ def chromaticities(
     told: JsonOutput,
 ) -> None:
     """Show the chromaticities of tables' lights."""
+    from evaluation.experiments.paper.material import read_truths
     from evaluation.experiments.paper.reporting import chromaticities_report
-    from evaluation.experiments.paper.scenes.truths import read_truths
 
     _require_free(out)
     report = chromaticities_report(_open(luts), [read_truths(place) for place in truths or ()])
@@ -394,7 +382,7 @@ def _treatment(data: SceneSet) -> str:
 def _finish(report: PaperReport, conditions: Sequence[str], out: Path | None, told: JsonOutput) -> None:
     """Print the tables and write the folder, if one was named."""
     from evaluation.experiments.paper.reporting import write_report
-    from evaluation.reports.terminal import show_notes, show_tables
+    from evaluation.reports.table_output import show_notes, show_tables
 
     show_notes(told, conditions)
     for table in report.tables:
@@ -416,7 +404,7 @@ def _pictures(place: str, matrix: str) -> tuple[Sequence[Source], str, str]:
     """Return the source pictures at a place, what was done to get them, and their name."""
     from evaluation.datasets import open_scenes
     from evaluation.datasets.opening import layout_of
-    from evaluation.experiments.paper.scenes.developing import developed
+    from evaluation.experiments.paper.material import developed
     from foundation.errors import FormatError, InputError
     from generator import find_pictures
     from generator.rendering.matrices import choose_matrix
@@ -455,14 +443,3 @@ def _require_free(out: Path | None) -> None:
 
     if out is not None:
         require_free(out, "the report")
-
-
-@contextmanager
-def _progress(total: int) -> Generator[Callable[[], None]]:
-    """Show a bar of so many images, and yield what moves it on by one."""
-    from rich.console import Console
-    from rich.progress import Progress
-
-    with Progress(console=Console(stderr=True), disable=not shows_progress()) as progress:
-        task: Any = progress.add_task("images", total=total)
-        yield lambda: progress.advance(task)

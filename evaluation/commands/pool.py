@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 import typer
 
+from evaluation.commands.options import AngularError, argument, option
 from foundation.console import EXIT_CODES, JsonOutput, with_json
 
 HELP = f"""Pool the results of several transfers, such as one for each of several cameras.
@@ -25,32 +26,22 @@ tables.tex, report.html with forest plots, and run.json.
 
 @with_json("evaluate pool")
 def pool(
-    results: Annotated[
-        list[str], typer.Argument(metavar="RESULTS", help="Results folders of transfers.", show_default=False)
-    ],
+    results: Annotated[list[str], argument("RESULTS", "Results folders of transfers.")],
     error: Annotated[
-        Literal["reproduction", "recovery"] | None,
+        AngularError | None,
         typer.Option(help="Angular error to sum up. \\[default: that of the transfers]", show_default=False),
     ] = None,
     base: Annotated[
         str | None,
-        typer.Option(
-            metavar="TRAINED_ON",
-            help="Also hold every row to the one trained on this, named as in the column, with x for ×.",
-            show_default=False,
-        ),
+        option("TRAINED_ON", "Also hold every row to the one trained on this, named as in the column, with x for ×."),
     ] = None,
-    out: Annotated[
-        Path | None, typer.Option(metavar="FOLDER", help="Write the results to this new folder.", show_default=False)
-    ] = None,
+    out: Annotated[Path | None, option("FOLDER", "Write the results to this new folder.")] = None,
     *,
     told: JsonOutput,
 ) -> None:
     """Pool the results of several transfers."""
-    from evaluation.experiments.pooling.pool import pool_transfers
-    from evaluation.experiments.pooling.reading import read_transfer
-    from evaluation.experiments.pooling.report import make_tables, save_pool
-    from evaluation.reports.terminal import show_notes, show_tables
+    from evaluation.experiments.pool import make_tables, pool_transfers, read_transfer, save_pool
+    from evaluation.reports.table_output import show_notes, show_tables
     from foundation.errors import InputError
     from foundation.files import require_free
 

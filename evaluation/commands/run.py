@@ -6,16 +6,23 @@ import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import typer
-
-from evaluation.commands.choosing import METHOD_HELP
-from evaluation.commands.data_options import DataReading, with_data_options
-from evaluation.commands.result_options import PrintedError, PrintedStatistics
+from evaluation.commands.options import (
+    METHOD_HELP,
+    Data,
+    DataReading,
+    PrintedError,
+    PrintedStatistics,
+    choose_estimates,
+    choose_methods,
+    option,
+    thread_option,
+    with_data_options,
+)
 from foundation.console import EXIT_CODES, JsonOutput, with_json
 
 if TYPE_CHECKING:
     from evaluation.metrics import ErrorKind
-    from evaluation.results.run import Run
+    from evaluation.results.result import Run
 
 HELP = f"""Estimate the light of every image of a data set and sum up the errors.
 
@@ -34,64 +41,44 @@ A run with --out that was stopped goes on when the same command is given again.
 @with_json("evaluate run")
 @with_data_options
 def run(
-    data: Annotated[
-        str, typer.Argument(metavar="DATA", help="Folder or file of the data set, or its URL.", show_default=False)
-    ],
-    method: Annotated[list[str] | None, typer.Option(metavar="METHOD", help=METHOD_HELP, show_default=False)] = None,
+    data: Data,
+    method: Annotated[list[str] | None, option("METHOD", METHOD_HELP)] = None,
     methods: Annotated[
         str | None,
-        typer.Option(
-            metavar="LIST",
-            help="Methods between commas. standard: white-patch, gray-world, shades-of-gray, general-gray-world, "
+        option(
+            "LIST",
+            "Methods between commas. standard: white-patch, gray-world, shades-of-gray, general-gray-world, "
             "gray-edge-1, gray-edge-2, pca. all: these and improved-white-patch, color-sparrow, "
             "local-surface-reflectance, grayness-index, mean-shifted-gray-pixel, opencv-grayworld, of which some take "
             "seconds on large images. \\[default: standard, unless --method or --estimates is given]",
-            show_default=False,
         ),
     ] = None,
     estimates: Annotated[
         list[str] | None,
-        typer.Option(
-            metavar="FILE.csv",
-            help="Estimates of another program: columns image,r,g,b, a line an image. NAME=FILE.csv names them in the "
+        option(
+            "FILE.csv",
+            "Estimates of another program: columns image,r,g,b, a line an image. NAME=FILE.csv names them in the "
             "tables. Give it more than once for several.",
-            show_default=False,
         ),
     ] = None,
     error: PrintedError = "reproduction",
     statistics: PrintedStatistics = "paper",
     out: Annotated[
         Path | None,
-        typer.Option(
-            metavar="RESULTS",
-            help="Write everything to this new folder: tables, each image's errors, report.html, LaTeX.",
-            show_default=False,
-        ),
+        option("RESULTS", "Write everything to this new folder: tables, each image's errors, report.html, LaTeX."),
     ] = None,
-    csv: Annotated[
-        Path | None, typer.Option(metavar="OUT.csv", help="Write the table to this new file too.", show_default=False)
-    ] = None,
+    csv: Annotated[Path | None, option("OUT.csv", "Write the table to this new file too.")] = None,
     images: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="OUT.csv", help="Write each image's estimates and errors to this new file.", show_default=False
-        ),
+        Path | None, option("OUT.csv", "Write each image's estimates and errors to this new file.")
     ] = None,
     workers: Annotated[
-        int | None,
-        typer.Option(
-            metavar="N",
-            help="Threads, one image each; classes of yours are called by one at a time. \\[default: one a processor]",
-            min=1,
-            show_default=False,
-        ),
+        int | None, thread_option(", one image each; classes of yours are called by one at a time")
     ] = None,
     *,
     reading: DataReading,
     told: JsonOutput,
 ) -> None:
     """Evaluate methods on a data set."""
-    from evaluation.commands.choosing import choose_estimates, choose_methods
     from evaluation.experiments.run_folder import run_methods
     from evaluation.results.result import images_csv, table_csv
     from foundation.console import orderly_end, progress
@@ -135,8 +122,8 @@ def _require_free(csv: Path | None, images: Path | None, out: Path | None) -> No
 
 def _print(made: Run, error: ErrorKind, further: bool) -> None:
     """Print the tables, what was done to the images, and what else is to be said."""
-    from evaluation.reports.terminal import print_table
-    from evaluation.results.summary_tables import lights_tables, summary_table
+    from evaluation.reports.table_output import print_table
+    from evaluation.results.tables import lights_tables, summary_table
 
     print_table(summary_table(made.subject, made.results, error, further))
     for table in lights_tables(made.subject, made.results, error):
@@ -149,7 +136,7 @@ def _print(made: Run, error: ErrorKind, further: bool) -> None:
 
 def _tell(made: Run, told: JsonOutput) -> None:
     """Add every statistic of every kind of error, and what was done to the images."""
-    from evaluation.results.summary_tables import statistics_rows
+    from evaluation.results.tables import statistics_rows
 
     table = statistics_rows(made.subject, made.results)
     rows = [dict(zip(table.columns, row, strict=True)) for row in table.rows]

@@ -7,7 +7,17 @@ from typing import Annotated
 
 import typer
 
-from evaluation.commands.data_options import DataReading, with_data_options
+from evaluation.commands.options import (
+    Data,
+    DataReading,
+    argument,
+    choose_learners,
+    image_steps,
+    option,
+    require_order,
+    thread_option,
+    with_data_options,
+)
 from foundation.console import EXIT_CODES, JsonOutput, with_json
 
 LEARNERS_HELP = "regression-trees, smart-color-cat, color-beaver, log-chroma, kernel-ridge, convnet or constant-light"
@@ -29,40 +39,20 @@ another; the tables say what it was trained on.
 @with_json("evaluate train")
 @with_data_options
 def train(
-    method: Annotated[str, typer.Argument(metavar="METHOD", help=f"One of {LEARNERS_HELP}.", show_default=False)],
-    data: Annotated[
-        str, typer.Argument(metavar="DATA", help="Folder or file of the data set, or its URL.", show_default=False)
-    ],
+    method: Annotated[str, argument("METHOD", f"One of {LEARNERS_HELP}.")],
+    data: Data,
     *,
-    out: Annotated[
-        Path, typer.Option(metavar="MODEL.npz", help="The new file to write the model to.", show_default=False)
-    ],
+    out: Annotated[Path, option("MODEL.npz", "The new file to write the model to.")],
     seed: Annotated[int, typer.Option(metavar="N", help="Of all that is random in the training.", min=0)] = 0,
-    workers: Annotated[
-        int | None,
-        typer.Option(
-            metavar="N",
-            help="Threads that read images; the model does not depend on it. \\[default: one a processor]",
-            min=1,
-            show_default=False,
-        ),
-    ] = None,
+    workers: Annotated[int | None, thread_option(" that read images; the model does not depend on it")] = None,
     reading: DataReading,
     told: JsonOutput,
 ) -> None:
     """Train a method on a data set."""
-    from evaluation.commands.choosing import choose_learners, require_order
-    from evaluation.learning.feature_learner import (
-        FeatureLearner,
-        extract,
-        fit_extracted,
-        require_installed,
-        truths_of,
-    )
+    from evaluation.learning.feature_learner import FeatureLearner, extract, fit_extracted, require_installed, truths_of
     from evaluation.learning.model_files import provenance_of, save_model
-    from evaluation.reports.terminal import show_notes
+    from evaluation.reports.table_output import show_notes
     from foundation.clock import SystemClock
-    from foundation.console import orderly_end, progress
     from foundation.errors import InputError
     from foundation.files import require_free_file
     from foundation.processors import processor_count
@@ -84,11 +74,8 @@ def train(
     found = reading.open(data)
     truths = truths_of(found.scenes)
     count = len(found.scenes)
-    with orderly_end(), progress("images") as advance:
-        steps = iter(range(1, count + 1))
-        (features,) = extract(
-            found.scenes, [learner], workers or processor_count(), lambda: advance(next(steps), count)
-        )
+    with image_steps(count) as step:
+        (features,) = extract(found.scenes, [learner], workers or processor_count(), step)
         fitted = fit_extracted(learner, features, truths, seed)
         record = provenance_of(found, seed, SystemClock())
         save_model(out, fitted, record)

@@ -7,7 +7,16 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from evaluation.commands.data_options import DataReading, with_data_options
+from evaluation.commands.options import (
+    AngularError,
+    DataReading,
+    choose_beside_constant,
+    choose_methods,
+    image_steps,
+    option,
+    thread_option,
+    with_data_options,
+)
 from foundation.console import EXIT_CODES, JsonOutput, with_json
 
 if TYPE_CHECKING:
@@ -16,7 +25,7 @@ if TYPE_CHECKING:
     import numpy as np
     import numpy.typing as npt
 
-    from evaluation.experiments.transfer.material import AnyLearner
+    from evaluation.experiments.cross_validation import AnyLearner
     from evaluation.experiments.transfer.plan import TransferPlan
     from evaluation.experiments.transfer.rows import TransferRow
     from evaluation.methods.method import Method
@@ -42,87 +51,61 @@ report.html and run.json.
 @with_json("evaluate transfer")
 @with_data_options
 def transfer(
-    train: Annotated[
-        list[str],
-        typer.Option(metavar="GENERATED", help="Data set to train on; may be repeated.", show_default=False),
-    ],
-    test: Annotated[str, typer.Option(metavar="REAL", help="Data set to test on.", show_default=False)],
+    train: Annotated[list[str], option("GENERATED", "Data set to train on; may be repeated.")],
+    test: Annotated[str, option("REAL", "Data set to test on.")],
     methods: Annotated[str, typer.Option(metavar="LIST", help="Learned methods between commas, or all.")] = "all",
     statistics: Annotated[
         str,
-        typer.Option(
-            metavar="LIST",
-            help="Statistics methods for reference between commas, all or none. "
+        option(
+            "LIST",
+            "Statistics methods for reference between commas, all or none. "
             "\\[default: gray-world, shades-of-gray, gray-edge-1]",
-            show_default=False,
         ),
     ] = "gray-world,shades-of-gray,gray-edge-1",
     folds: Annotated[
         str | None,
-        typer.Option(
-            metavar="N|FILE",
-            help="Folds of real cross-validation: a number, or a CSV file image,fold. \\[default: those of the "
+        option(
+            "N|FILE",
+            "Folds of real cross-validation: a number, or a CSV file image,fold. \\[default: those of the "
             "data set's authors, else 3]",
-            show_default=False,
         ),
     ] = None,
-    naive: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="PICTURES", help="Folder of the pictures that --train was generated from.", show_default=False
-        ),
-    ] = None,
+    naive: Annotated[Path | None, option("PICTURES", "Folder of the pictures that --train was generated from.")] = None,
     matrix: Annotated[
         str | None,
-        typer.Option(
-            metavar="CAMERA|FILE|none",
-            help="Colour matrix of the naive baseline: of a camera, or a file of 3 x 3 numbers, linear sRGB to camera. "
+        option(
+            "CAMERA|FILE|none",
+            "Colour matrix of the naive baseline: of a camera, or a file of 3 x 3 numbers, linear sRGB to camera. "
             "\\[default: the camera of the table]",
-            show_default=False,
         ),
     ] = None,
     only: Annotated[
         Path | None,
-        typer.Option(
-            metavar="FILE",
-            help="CSV file with a column image: only these are tested; cross-validation still trains on all others.",
-            show_default=False,
+        option(
+            "FILE", "CSV file with a column image: only these are tested; cross-validation still trains on all others."
         ),
     ] = None,
     images: Annotated[
         int | None,
-        typer.Option(
-            metavar="N",
-            help="Training images of every generated and naive row. \\[default: all of the smallest set]",
-            min=1,
-            show_default=False,
-        ),
+        option("N", "Training images of every generated and naive row. \\[default: all of the smallest set]", min=1),
     ] = None,
     seeds: Annotated[
         int, typer.Option(metavar="K", help="Seeds of learners, training images and drawn folds.", min=1)
     ] = 1,
     side: Annotated[
         int | None,
-        typer.Option(
-            metavar="PX",
-            help="Make all images this small first, averaging areas, so that training and test images are alike.",
+        option(
+            "PX",
+            "Make all images this small first, averaging areas, so that training and test images are alike.",
             min=1,
-            show_default=False,
         ),
     ] = None,
     shared: Annotated[
         Literal["refuse", "leave-out", "keep"], typer.Option(help="Training images that share a picture with the test.")
     ] = "refuse",
-    error: Annotated[
-        Literal["reproduction", "recovery"], typer.Option(help="Angular error to sum up.")
-    ] = "reproduction",
-    out: Annotated[
-        Path | None, typer.Option(metavar="FOLDER", help="Write the results to this new folder.", show_default=False)
-    ] = None,
-    workers: Annotated[
-        int | None,
-        typer.Option(metavar="N", help="Threads. \\[default: one a processor]", min=1, show_default=False),
-    ] = None,
+    error: Annotated[AngularError, typer.Option(help="Angular error to sum up.")] = "reproduction",
+    out: Annotated[Path | None, option("FOLDER", "Write the results to this new folder.")] = None,
+    workers: Annotated[int | None, thread_option()] = None,
     *,
     reading: DataReading,
     told: JsonOutput,
@@ -132,14 +115,12 @@ def transfer(
 
     from evaluation.datasets import open_scenes
     from evaluation.experiments.folds import FOLDS, choose_folds
-    from evaluation.experiments.transfer.figures import figures_of
-    from evaluation.experiments.transfer.outcome import TransferOutcome, save_outcome
+    from evaluation.experiments.transfer.outcome import TransferOutcome, figures_of, save_outcome
     from evaluation.experiments.transfer.plan import is_generated, plan_transfer
     from evaluation.experiments.transfer.rows import count_images
     from evaluation.experiments.transfer.rows import transfer as run_transfer
-    from evaluation.reports.terminal import show_notes, show_tables
+    from evaluation.reports.table_output import show_notes, show_tables
     from evaluation.results.method_records import describe_method
-    from foundation.console import orderly_end, progress
     from foundation.files import require_free
     from foundation.processors import processor_count
 
@@ -158,11 +139,10 @@ def transfer(
     smallest = min(len(some.scenes) for some in plan.training)
     wanted = smallest if images is None else images
     count = count_images(tested.scenes, plan.training, len(drawn), wanted)
-    with orderly_end(), progress("images") as advance:
-        steps = iter(range(1, count + 1))
+    with image_steps(count) as step:
         rows = run_transfer(
             *(tested.scenes, plan.training, learners, drawn, wanted, references),
-            *(side, threads, lambda: advance(next(steps), count)),
+            *(side, threads, step),
             generated=tested.name if is_generated(tested) else "",
         )
     rows = tuple(replace(row, results=tuple(result.at(places) for result in row.results)) for row in rows)
@@ -189,28 +169,20 @@ def transfer(
         save_outcome(outcome, out)
 
 
-def _learners(text: str) -> tuple[list[AnyLearner], tuple[str, ...]]:
+def _learners(text: str) -> tuple[list[AnyLearner], list[str]]:
     """Return the learned methods of a list and the constant light, and why some of `all` are left out."""
-    from evaluation.commands.choosing import choose_learners
     from evaluation.learning.constant_light import ConstantLight
-    from evaluation.learning.feature_learner import what_is_missing
     from foundation.errors import InputError
 
-    constant = ConstantLight()
-    named = {each.name for each in choose_learners(part for part in text.split(",") if part.strip().lower() != "all")}
-    found = [each for each in choose_learners(text.split(",")) if each.name != constant.name]
-    missing = {each.name: what_is_missing(each) for each in found if each.name not in named}
-    left_out = tuple(f"{name} is left out: {reason}" for name, reason in missing.items() if reason)
-    chosen = [each for each in found if not missing.get(each.name)]
+    chosen, left_out = choose_beside_constant(text)
     titles = [each.name for each in chosen]
     for title in titles:
         if titles.count(title) > 1:
             raise InputError(f"two methods are called {title}; give one another name: names head the rows")
-    return [*chosen, constant], left_out
+    return [*chosen, ConstantLight()], left_out
 
 
 def _references(text: str) -> list[Method]:
-    from evaluation.commands.choosing import choose_methods
 
     return [] if text.strip().lower() == "none" else choose_methods(text.split(","))
 

@@ -3,11 +3,19 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 import typer
 
-from evaluation.commands.data_options import DataReading, with_data_options
+from evaluation.commands.options import (
+    AngularError,
+    Data,
+    DataReading,
+    image_steps,
+    option,
+    thread_option,
+    with_data_options,
+)
 from foundation.console import EXIT_CODES, JsonOutput, with_json
 
 FAMILIES_HELP = "shades-of-gray, general-gray-world, gray-edge-1 or gray-edge-2"
@@ -31,35 +39,21 @@ evaluate run DATA --method SETTING evaluates one. Writes nothing unless asked wi
 @with_data_options
 def tune(
     family: Annotated[str, typer.Argument(metavar="FAMILY", help=f"{FAMILIES_HELP}, or one of these with @PIXELS.")],
-    data: Annotated[
-        str, typer.Argument(metavar="DATA", help="Folder or file of the data set, or its URL.", show_default=False)
-    ],
+    data: Data,
     *,
-    out: Annotated[
-        Path | None,
-        typer.Option(metavar="OUT.csv", help="Write the settings to this new file.", show_default=False),
-    ] = None,
+    out: Annotated[Path | None, option("OUT.csv", "Write the settings to this new file.")] = None,
     errors: Annotated[
-        Literal["reproduction", "recovery"] | None,
+        AngularError | None,
         typer.Option(help="Show these errors beside the criterion; the choice stays without them.", show_default=False),
     ] = None,
-    workers: Annotated[
-        int | None,
-        typer.Option(
-            metavar="N",
-            help="Threads, one image each; no number depends on it. \\[default: one a processor]",
-            min=1,
-            show_default=False,
-        ),
-    ] = None,
+    workers: Annotated[int | None, thread_option(", one image each; no number depends on it")] = None,
     reading: DataReading,
     told: JsonOutput,
 ) -> None:
     """Choose a method's parameters on a data set."""
     from evaluation.experiments.tuning import settings_of, tune_family, tuning_rows, tuning_table
-    from evaluation.reports.terminal import show_notes, show_tables
+    from evaluation.reports.table_output import show_notes, show_tables
     from evaluation.results.tables import table_to_csv
-    from foundation.console import orderly_end, progress
     from foundation.files import require_free_file, write_whole
     from foundation.processors import processor_count
 
@@ -68,9 +62,8 @@ def tune(
         require_free_file(out, "the settings")
     found = reading.open(data)
     count, threads = len(found.scenes), workers or processor_count()
-    with orderly_end(), progress("images") as advance:
-        steps = iter(range(1, count + 1))
-        tuned = tune_family(family, found.name, found.scenes, errors, threads, lambda: advance(next(steps), count))
+    with image_steps(count) as step:
+        tuned = tune_family(family, found.name, found.scenes, errors, threads, step)
     if out is not None:
         write_whole(out, table_to_csv(tuning_rows(tuned)))
     show_tables(told, [tuning_table(tuned)])

@@ -10,16 +10,76 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Final
+from pathlib import Path
+from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
+from markupsafe import Markup
 
-from evaluation.experiments.bootstrap import Compared, paired
+from evaluation.experiments.bootstrap import STATISTICS, Compared, paired
 from evaluation.metrics import ErrorKind
-from evaluation.results.errors_file import MethodErrors
+from evaluation.reports.table_output import table_part, tables_to_latex
+from evaluation.results.files import MethodErrors
+from evaluation.results.result import csv_text
+from evaluation.results.tables import PAPER_COLUMNS, Table, table_to_csv
+from foundation import pages
 from foundation.colorimetry import angles_deg
 from foundation.errors import InputError, counted
+from foundation.files import whole_folder
+from foundation.plots import FAINT, INK, SERIES, svg_of
+
+FLOOR_DEG: Final = 0.01
+"""Smaller errors are drawn here: a logarithmic axis has no zero, and no ground truth is known as well."""
+
+_DECADE: Final = 10.0
+"""Points on the two axes stay apart by at least this factor, so that close errors do not fill the figure."""
+
+
+def error_scatter(
+    one: npt.NDArray[np.float64], other: npt.NDArray[np.float64], names: tuple[str, str], marked: dict[int, str]
+) -> bytes:
+    """Return a figure as SVG: the error of the other against that of the one, with the line where they are equal.
+
+    `one`, `other`: (N,) float64 each, degrees, in the same order of images.
+    """
+
+    def draw(figure: Any) -> None:
+        x, y = np.maximum(one, FLOOR_DEG), np.maximum(other, FLOOR_DEG)
+        low, high = float(min(x.min(), y.min())) / 1.15, float(max(x.max(), y.max())) * 1.15
+        middle = np.sqrt(low * high)
+        low, high = min(low, middle / _DECADE**0.5), max(high, middle * _DECADE**0.5)
+        axes = figure.add_subplot()
+        axes.plot([low, high], [low, high], color=FAINT, linewidth=1, zorder=1)
+        for colour, chosen in ((SERIES[0], one <= other), (SERIES[1], one > other)):
+            axes.scatter(x[chosen], y[chosen], s=14, color=colour, alpha=0.55, linewidths=0, zorder=2)
+        places = np.array(list(marked), dtype=np.int64)
+        axes.scatter(x[places], y[places], s=34, facecolors="none", edgecolors=INK, linewidths=0.8, zorder=3)
+        for place, name in marked.items():
+            left = x[place] > middle
+            axes.annotate(
+                name,
+                (x[place], y[place]),
+                xytext=(-5 if left else 5, 3),
+                textcoords="offset points",
+                ha="right" if left else "left",
+                fontsize=7,
+                color=INK,
+            )
+        axes.set(
+            xscale="log",
+            yscale="log",
+            xlim=(low, high),
+            ylim=(low, high),
+            aspect="equal",
+            xlabel=f"{names[0]}: error, degrees",
+            ylabel=f"{names[1]}: error, degrees",
+        )
+        axes.xaxis.set_major_formatter("{x:g}")
+        axes.yaxis.set_major_formatter("{x:g}")
+
+    return svg_of(draw, inches=(5.6, 5.4))
+
 
 _SAME_TRUTH_DEG: Final = 0.01
 """Truths that differ by less are the same light written with few digits; six decimals are good to .0001 degrees."""
@@ -205,3 +265,145 @@ def missing_images(matched: Matched) -> tuple[str, ...]:
 def _listed(names: Sequence[str]) -> str:
     rest = len(names) - _NAMED
     return ", ".join(names[:_NAMED]) + (f" and {rest} more" if rest > 0 else "")
+
+
+_HEADS = dict(zip(STATISTICS, PAPER_COLUMNS[1:], strict=True))
+"""Statistics as every other table heads them; files keep the short names."""
+
+_LABELLED = 5
+"""Images labelled in a scatter: more names would cover one another."""
+
+METHOD = (
+    "Wilcoxon signed-rank test, two-sided; equal errors are ranked and then left out (Pratt).",
+    "Effect: matched-pairs rank-biserial correlation, -1: the first errs less on every image; 1: more on every one.",
+)
+"""What the numbers of `tests_table` are."""
+
+
+def tests_table(comparisons: Sequence[Comparison]) -> Table:
+    """Return the signed-rank tests, a row a comparison."""
+    several = len(comparisons) > 1
+    notes = (*METHOD, *((f"p (Holm) is corrected for the {len(comparisons)} comparisons here.",) if several else ()))
+    return Table(
+        f"Paired {comparisons[0].matched.kind} errors",
+        ("First", "Second", "p", "p (Holm)", "Effect", "Images", "First better", "Second better", "Equal"),
+        tuple(
+            (
+                *made.matched.names,
+                f"{made.test.p:.2g}",
+                f"{made.p_holm:.2g}",
+                made.test.effect,
+                len(made.matched.images),
+                made.test.wins,
+                made.test.losses,
+                made.test.ties,
+            )
+            for made in comparisons
+        ),
+        notes=notes,
+    )
+
+
+def statistics_table(comparison: Comparison, level: float) -> Table:
+    """Return every statistic of one comparison, with difference and ratio."""
+    one, other = comparison.matched.names
+    images = counted(len(comparison.matched.images), "image")
+    return Table(
+        f"{one} against {other}: {comparison.matched.kind} errors of {images}, degrees",
+        ("Statistic", "First", "Second", "Difference", "from", "to", "Ratio", "ratio from", "ratio to"),
+        tuple(
+            (_HEADS[made.statistic], made.one, made.other, *made.difference, *(_known(number) for number in made.ratio))
+            for made in comparison.statistics
+        ),
+        digits=3,
+        notes=(f"Intervals of {level:.0%}: BCa bootstrap over images, 2000 resamples, the same for both.",),
+    )
+
+
+def images_table(comparison: Comparison, count: int = 10) -> Table:
+    """Return the images on which the two differ most."""
+    matched = comparison.matched
+    return Table(
+        f"{matched.names[0]} against {matched.names[1]}: the largest differences, degrees",
+        ("Image", "First", "Second", "Difference"),
+        tuple(
+            (matched.images[place], one, other, one - other)
+            for place in largest_differences(matched, count)
+            for one, other in [(float(matched.one[place]), float(matched.other[place]))]
+        ),
+    )
+
+
+def comparison_page(comparisons: Sequence[Comparison], notes: Sequence[str], level: float) -> str:
+    """Return the HTML page of comparisons."""
+    parts: list[Markup] = [*(pages.paragraph(note) for note in notes)]
+    parts += [pages.paragraph(verdict(made, level)) for made in comparisons]
+    parts.append(table_part(tests_table(comparisons)))
+    for made in comparisons:
+        matched = made.matched
+        marked = {place: matched.images[place] for place in largest_differences(matched, _LABELLED)}
+        picture = error_scatter(matched.one, matched.other, matched.names, marked)
+        caption = (
+            f"An image a point: above the line (blue) {matched.names[0]} errs less, below it (orange) more. The images "
+            f"with the largest differences are named. Errors below {FLOOR_DEG:g} degrees are drawn there."
+        )
+        parts += [
+            pages.heading(f"{matched.names[0]} against {matched.names[1]}"),
+            table_part(statistics_table(made, level)),
+            pages.row([pages.figure(picture, caption), table_part(images_table(made))]),
+        ]
+    return pages.page(_title(comparisons), parts)
+
+
+def write_comparisons(folder: Path, comparisons: Sequence[Comparison], notes: Sequence[str], level: float) -> None:
+    """Write a new folder: `tests.csv`, `statistics.csv`, `images.csv`, `tables.tex` and `report.html`."""
+    with whole_folder(folder, "the comparison") as place:
+        (place / "tests.csv").write_text(table_to_csv(tests_table(comparisons)), encoding="utf-8")
+        (place / "statistics.csv").write_text(_statistics_csv(comparisons), encoding="utf-8")
+        (place / "images.csv").write_text(_images_csv(comparisons), encoding="utf-8")
+        tables = [tests_table(comparisons)]
+        tables += [statistics_table(made, level) for made in comparisons]
+        text = "\n".join(tables_to_latex(table.title, [table]) for table in tables)
+        (place / "tables.tex").write_text(text, encoding="utf-8")
+        (place / "report.html").write_text(comparison_page(comparisons, notes, level), encoding="utf-8")
+
+
+def notes_of(comparisons: Sequence[Comparison]) -> tuple[str, ...]:
+    """Return the sentences on images that are missing, each once."""
+    return tuple(dict.fromkeys(note for made in comparisons for note in missing_images(made.matched)))
+
+
+def _title(comparisons: Sequence[Comparison]) -> str:
+    if len(comparisons) == 1:
+        return "{} against {}".format(*comparisons[0].matched.names)
+    return f"{len(comparisons)} comparisons of {comparisons[0].matched.kind} errors"
+
+
+def _known(number: float) -> float | None:
+    return None if number != number else number
+
+
+def _statistics_csv(comparisons: Sequence[Comparison]) -> str:
+    heads = ("difference", "difference_low", "difference_high", "ratio", "ratio_low", "ratio_high")
+    rows = tuple(
+        (
+            *made.matched.names,
+            compared.statistic,
+            compared.one,
+            compared.other,
+            *(_known(number) for number in (*compared.difference, *compared.ratio)),
+        )
+        for made in comparisons
+        for compared in made.statistics
+    )
+    return table_to_csv(Table("", ("first", "second", "statistic", "first_deg", "second_deg", *heads), rows))
+
+
+def _images_csv(comparisons: Sequence[Comparison]) -> str:
+    rows: list[tuple[str, ...]] = [("first", "second", "image", "first_deg", "second_deg", "difference_deg")]
+    for made in comparisons:
+        matched = made.matched
+        for image, one, other in zip(matched.images, matched.one, matched.other, strict=True):
+            numbers = (f"{number:.6f}" for number in (one, other, one - other))
+            rows.append((*matched.names, image, *numbers))
+    return csv_text(rows)

@@ -1,8 +1,14 @@
-"""Cross-validation: every image is estimated by a model that has not seen it."""
+"""Learned methods on parts of data sets: features extracted once, then any part to train on or to test.
+
+Cross-validation estimates every image by a model that has not seen it. Images may be made small first, so that
+training and test images are of one size, noise and fine detail averaged alike.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 import numpy.typing as npt
@@ -12,17 +18,169 @@ from evaluation.experiments.running import answer_scenes, fit_anew
 from evaluation.learning.feature_learner import (
     FeatureLearner,
     Features,
+    LearnedMethod,
     extract,
     fit_extracted,
     require_installed,
     truths_of,
 )
-from evaluation.methods.method import Learner
-from evaluation.methods.prepared import unit
-from evaluation.results.answers import NO_PIXEL, SceneAnswer, read_light, results_of
-from evaluation.results.result import Result
-from evaluation.scene import Scene
+from evaluation.methods.method import Learner, Method
+from evaluation.methods.prepared import shrink, unit
+from evaluation.results.result import NO_PIXEL, Result, SceneAnswer, read_light, results_of
+from evaluation.scene import Image, Scene
 from foundation.errors import InputError
+from foundation.processors import ordered_map
+
+_COVERED: Final = 1e-3
+"""Share of a pixel's area of which more must be usable; less is rounding of areas rather than a colour."""
+
+
+@dataclass(frozen=True, eq=False)
+class SmallScene:
+    """A scene made small, in memory.
+
+    - `name`: the image's name.
+    - `truth`: (3,) float64, linear camera RGB of the light, of any length.
+    - `image`: (H, W, 3) float32, linear camera RGB, in the unit of the image that it was.
+    - `mask`: (H, W) bool, True where no pixel was usable; None if every one was.
+    - `saturation`: none where clipped pixels were left out; that of the image where it was small already.
+    """
+
+    name: str
+    truth: npt.NDArray[np.float64]
+    image: Image
+    mask: npt.NDArray[np.bool_] | None
+    saturation: float | None
+
+    def read(self) -> tuple[Image, npt.NDArray[np.bool_] | None]:
+        """Return the image (H, W, 3) and its mask (H, W) bool."""
+        return self.image, self.mask
+
+
+def make_small(
+    scenes: Sequence[Scene], side: int, workers: int = 1, on_scene: Callable[[], None] | None = None
+) -> tuple[SmallScene, ...]:
+    """Return scenes of which no side is longer than `side`, px; see `shrink_image`.
+
+    `side`: longest side allowed, px.
+    """
+
+    def small(scene: Scene) -> SmallScene:
+        image, mask = scene.read()
+        if max(image.shape[:2]) <= side:
+            return SmallScene(scene.name, scene.truth, image, mask, scene.saturation)
+        return SmallScene(scene.name, scene.truth, *shrink_image(image, side, scene.saturation, mask), None)
+
+    made: list[SmallScene] = []
+    for scene in ordered_map(small, scenes, workers):
+        made.append(scene)
+        if on_scene:
+            on_scene()
+    return tuple(made)
+
+
+def shrink_image(
+    image: Image, side: int, saturation: float | None = None, mask: npt.NDArray[np.bool_] | None = None
+) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.bool_]]:
+    """Return an image made small by averaging areas, without clipped and masked pixels.
+
+    `image`: (H, W, 3) uint16, float32 or float64, linear camera RGB. `side`: longest side of the result, px.
+    `saturation`: value from which a channel is clipped; None if none is. `mask`: (H, W) bool, True where a pixel must
+    not be used, or None. Returns the image (h, w, 3) float32, and (h, w) bool, True where no pixel was usable; the
+    image is 0 there.
+
+    Examples
+    --------
+    >>> image = np.zeros((2, 4, 3), np.float32)
+    >>> image[:, 0], image[:, 1], image[0, 2] = 10, 30, 900
+    >>> small, mask = shrink_image(image, side=2, saturation=900)
+    >>> small[..., 0], mask
+    (array([[20.,  0.]], dtype=float32), array([[False, False]]))
+    """
+    usable = np.ones(image.shape[:2], dtype=bool)
+    if saturation is not None:
+        usable &= (image < saturation).all(axis=2)
+    if mask is not None:
+        usable &= ~mask
+    small, empty = shrink(image, usable, side, _COVERED)
+    small[empty] = 0
+    return small, empty
+
+
+Places = npt.NDArray[np.int64]
+"""(P,) int64: which scenes of a data set, from 0."""
+
+AnyLearner = Learner | FeatureLearner
+"""A learner of either kind: of scenes, or of features."""
+
+
+@dataclass(frozen=True, eq=False)
+class Material:
+    """Scenes with all that some learners take from them.
+
+    - `scenes`: N scenes.
+    - `truths`: (N, 3) float64, linear camera RGB of any length.
+    - `features`: for each learner its features of each scene, (...) of its own dtype or None where no pixel is usable;
+      None for a learner that reads the scenes itself.
+    """
+
+    scenes: tuple[Scene, ...]
+    truths: npt.NDArray[np.float64]
+    features: tuple[Sequence[Features | None] | None, ...]
+
+    @property
+    def everything(self) -> Places:
+        """All places, (N,) int64."""
+        return np.arange(len(self.scenes))
+
+
+def gather(
+    scenes: Sequence[Scene],
+    learners: Sequence[AnyLearner],
+    side: int | None = None,
+    workers: int = 1,
+    on_scene: Callable[[], None] | None = None,
+) -> Material:
+    """Return the material of scenes for learners; each image is read once for all that extract features.
+
+    `side`: longest side that images are made small to first, px, in memory; None leaves them as they are.
+    """
+    truths = truths_of(scenes)
+    if side is not None:
+        scenes, on_scene = make_small(scenes, side, workers, on_scene), None
+    extracting = [learner for learner in learners if isinstance(learner, FeatureLearner)]
+    given = iter(extract(scenes, extracting, workers, on_scene) if extracting else ())
+    features = tuple(next(given) if isinstance(learner, FeatureLearner) else None for learner in learners)
+    if on_scene and not extracting:
+        for _ in scenes:
+            on_scene()
+    return Material(tuple(scenes), truths, features)
+
+
+def fit_on(learner: AnyLearner, number: int, material: Material, places: Places, seed: int) -> Method:
+    """Return the learner fitted to the scenes at `places` (P,) int64; `number` is its place among the learners."""
+    features, chosen = material.features[number], [int(place) for place in places.tolist()]
+    if isinstance(learner, FeatureLearner) and features is not None:
+        return fit_extracted(learner, [features[place] for place in chosen], material.truths[places], seed)
+    return fit_anew(learner, [material.scenes[place] for place in chosen], seed)
+
+
+def estimate_on(method: Method, number: int, material: Material, places: Places) -> list[SceneAnswer]:
+    """Return what a fitted method answers for the scenes at `places` (P,) int64, P answers."""
+    features, chosen = material.features[number], [int(place) for place in places.tolist()]
+    if not isinstance(method, LearnedMethod) or features is None:
+        return [answer for (answer,) in answer_scenes([material.scenes[place] for place in chosen], [method])]
+    model = method.model
+    return [
+        SceneAnswer(None, NO_PIXEL) if given is None else read_light(unit(model.lights(given[None])[0]))
+        for given in (features[place] for place in chosen)
+    ]
+
+
+def result_of(name: str, answers: Sequence[SceneAnswer], truths: npt.NDArray[np.float64]) -> Result:
+    """Return the result that N answers make, held to truths (N, 3) float64."""
+    (result,) = results_of([name], truths, [[answer] for answer in answers])
+    return result
 
 
 def cross_validate(
@@ -40,51 +198,22 @@ def cross_validate(
 
     `folds`: (N,) int64, the fold of each image, of at least two kinds.
     """
-    truths = truths_of(scenes)
-    kinds = sorted(set(folds.tolist()))
-    if not learners or len(kinds) < 2:
-        raise InputError(f"{len(learners)} methods in {len(kinds)} folds: expected at least one method and two folds")
+    truths_of(scenes)
+    kinds = len(np.unique(folds))
+    if not learners or kinds < 2:
+        raise InputError(f"{len(learners)} methods in {kinds} folds: expected at least one method and two folds")
     for learner in learners:
         require_installed(learner)
     require_apart(scenes, folds)
-    extracting = [learner for learner in learners if isinstance(learner, FeatureLearner)]
-    features = iter(extract(scenes, extracting, workers, on_scene) if extracting else ())
-    answers = [
-        _by_features(learner, next(features), truths, folds, seed)
-        if isinstance(learner, FeatureLearner)
-        else _by_scenes(learner, scenes, folds, seed)
-        for learner in learners
-    ]
-    if on_scene and not extracting:
-        for _ in scenes:
-            on_scene()
-    return results_of([learner.name for learner in learners], truths, list(zip(*answers, strict=True)))
+    material = gather(scenes, learners, workers=workers, on_scene=on_scene)
+    return tuple(cross_fit(learner, number, material, folds, seed) for number, learner in enumerate(learners))
 
 
-def _by_features(
-    learner: FeatureLearner,
-    features: Sequence[Features | None],
-    truths: npt.NDArray[np.float64],
-    folds: npt.NDArray[np.int64],
-    seed: int,
-) -> list[SceneAnswer]:
-    answers = [SceneAnswer(None, NO_PIXEL)] * len(features)
-    for fold in sorted(set(folds.tolist())):
-        train = folds != fold
-        chosen = [given for given, taken in zip(features, train, strict=True) if taken]
-        model = fit_extracted(learner, chosen, truths[train], seed).model
-        for place, given in enumerate(features):
-            if not train[place] and given is not None:
-                answers[place] = read_light(unit(model.lights(given[None])[0]))
-    return answers
-
-
-def _by_scenes(learner: Learner, scenes: Sequence[Scene], folds: npt.NDArray[np.int64], seed: int) -> list[SceneAnswer]:
-    answers = [SceneAnswer(None, NO_PIXEL)] * len(scenes)
-    for fold in sorted(set(folds.tolist())):
-        train = [scene for scene, where in zip(scenes, folds, strict=True) if where != fold]
-        held = np.flatnonzero(folds == fold).tolist()
-        method = fit_anew(learner, train, seed)
-        for place, (answer,) in zip(held, answer_scenes([scenes[place] for place in held], [method]), strict=True):
-            answers[place] = answer
-    return answers
+def cross_fit(learner: AnyLearner, number: int, material: Material, folds: npt.NDArray[np.int64], seed: int) -> Result:
+    """Return what a learner makes of scenes, each estimated after a fit to those of the other folds, (N,) int64."""
+    answers: dict[int, SceneAnswer] = {}
+    for fold in np.unique(folds):
+        held = np.flatnonzero(folds == fold)
+        method = fit_on(learner, number, material, np.flatnonzero(folds != fold), seed)
+        answers |= zip(held.tolist(), estimate_on(method, number, material, held), strict=True)
+    return result_of(learner.name, [answers[place] for place in range(len(folds))], material.truths)

@@ -7,7 +7,6 @@ several lights, are always in the same fold: otherwise the method is tested on w
 from __future__ import annotations
 
 import csv
-import io
 import re
 from collections import Counter
 from collections.abc import Sequence
@@ -17,6 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from evaluation.datasets.identity import first_copies
+from evaluation.results.result import csv_text
 from evaluation.scene import Scene, SceneSet
 from foundation.errors import FormatError, InputError, counted, first_of
 from generator.named_numbers import is_number
@@ -151,11 +151,7 @@ def folds_to_csv(names: Sequence[str], folds: npt.NDArray[np.int64]) -> str:
     a.png,1
     b.png,0
     """
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(("image", "fold"))
-    writer.writerows(zip(names, map(int, folds), strict=True))
-    return text.getvalue()
+    return csv_text([("image", "fold"), *zip(names, map(int, folds), strict=True)])
 
 
 def require_apart(scenes: Sequence[Scene], folds: npt.NDArray[np.int64]) -> None:

@@ -3,46 +3,125 @@
 While methods run, `.RESULTS.partial` holds the answers for each image so far. A run of the same data set, methods,
 settings and software goes on there, wherever it was killed; its folder is the same to the last byte as that of a run
 that was left alone. When all images are done, the files are written there and the folder gets its name.
+
+The answers are a file that grows by one line an image. Each line is a checksum (CRC-32 of what follows, eight
+hexadecimal digits), the image's number, and its answers as JSON; the first says whose answers they are. A line that a
+kill or a crash left half, and all after it, are cut off.
 """
 
 from __future__ import annotations
 
 import json
 import shutil
+import zlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 import numpy.typing as npt
 
 from evaluation.datasets.identity import known_again, state_of
 from evaluation.experiments.folds import folds_to_csv
-from evaluation.experiments.running import SceneMethod, answer_scenes, truths_of
+from evaluation.experiments.running import SceneMethod, answer_scenes, require_truths
 from evaluation.experiments.suspicions import suspicions
-from evaluation.learning.model_files import StoredMethod, TrainingRecord
+from evaluation.learning.model_files import StoredMethod, TrainingRecord, scenes_sha256
 from evaluation.methods.method import Method
 from evaluation.metrics import ErrorKind
-from evaluation.reports.developed import developed
-from evaluation.reports.latex import table_to_latex
-from evaluation.reports.run_page import MOST_SHOWN, chosen_images, run_page
-from evaluation.results.answers import SceneAnswer, answer_to_json, results_of
-from evaluation.results.errors_file import ERRORS_FILE
-from evaluation.results.journal import JOURNAL_FILE, AnswerJournal, read_journal
+from evaluation.reports.run_page import MOST_SHOWN, chosen_images, developed, run_page
+from evaluation.reports.table_output import table_to_latex
+from evaluation.results.files import ERRORS_FILE, errors_csv, run_json, several_lights_csv
 from evaluation.results.method_records import describe_method
-from evaluation.results.result import Result
-from evaluation.results.run import Run
-from evaluation.results.run_files import errors_csv, run_json, several_lights_csv
-from evaluation.results.summary_tables import Subject, lights_tables, statistics_rows, summary_table
-from evaluation.results.tables import table_to_csv
+from evaluation.results.result import Result, Run, SceneAnswer, Subject, answer_from_json, answer_to_json, results_of
+from evaluation.results.tables import lights_tables, statistics_rows, summary_table, table_to_csv
 from evaluation.scene import MixedScene, Scene, SceneSet
 from foundation.errors import InputError, first_of
-from foundation.files import make_folder, partial_path, publish_folder, require_free, write_whole
-from foundation.hashing import sha256_of
-from foundation.held_folders import LOCK_FILE, held_folder
+from foundation.files import make_folder, partial_path, publish_folder, require_free, storage_error, write_whole
 from foundation.processors import ordered_map
 from foundation.version import software
+
+JOURNAL_FILE = "answers.jsonl"
+"""Its name in the hidden folder of a run."""
+
+
+def read_journal(path: Path, identity: dict[str, Any]) -> list[tuple[SceneAnswer, ...]]:
+    """Return the answers of the first images, and cut off what is not whole; begin the file where there is none."""
+    try:
+        content = path.read_bytes() if path.exists() else b""
+        whole, lines = _whole_lines(content)
+        head: dict[str, Any] = json.loads(lines[0]) if lines else {}
+        same = head == json.loads(json.dumps(identity))
+        if not same and len(lines) <= 1:
+            # Nothing was answered, so nothing is lost: a method that failed on the first image was corrected, say.
+            path.write_bytes(_line(identity))
+            return []
+        if not same:
+            raise InputError(
+                f"{path.parent} holds what another run has made so far: its {_difference(head, identity)} differ; go "
+                "on with that run by its own options, name another place, or remove that folder to begin anew"
+            )
+        answers: list[tuple[SceneAnswer, ...]] = []
+        kept = len(_line(identity))
+        for line in lines[1:]:
+            stored = json.loads(line)
+            if stored["image"] != len(answers):
+                break
+            answers.append(tuple(map(answer_from_json, stored["answers"])))
+            kept += len(line) + _OVERHEAD
+        kept = min(kept, whole)
+        if kept < len(content):
+            with path.open("r+b") as stream:
+                stream.truncate(kept)
+    except OSError as error:
+        raise storage_error(path, error) from error
+    return answers
+
+
+class AnswerJournal:
+    """The file, open to be continued."""
+
+    def __init__(self, stream: BinaryIO, count: int, folder: Path) -> None:
+        self._stream = stream
+        self._count = count
+        self._folder = folder
+
+    def append(self, answers: Sequence[SceneAnswer]) -> None:
+        """Add the answers for the next image."""
+        line = _line({"image": self._count, "answers": [answer_to_json(answer) for answer in answers]})
+        try:
+            self._stream.write(line)
+        except OSError as error:
+            raise storage_error(self._folder, error) from error
+        self._count += 1
+
+
+_OVERHEAD = len("00000000 \n")
+"""Bytes of a line beside its JSON: checksum, space, end."""
+
+
+def _line(content: dict[str, Any]) -> bytes:
+    text = json.dumps(content, separators=(",", ":")).encode()
+    return b"%08x %s\n" % (zlib.crc32(text), text)
+
+
+def _whole_lines(content: bytes) -> tuple[int, list[bytes]]:
+    """Return the length of the lines that are whole, and their JSON."""
+    lines: list[bytes] = []
+    place = 0
+    while (end := content.find(b"\n", place)) >= 0:
+        check, _, text = content[place:end].partition(b" ")
+        if check != b"%08x" % zlib.crc32(text):
+            break
+        lines.append(text)
+        place = end + 1
+    return place, lines
+
+
+def _difference(there: dict[str, Any], here: dict[str, Any]) -> str:
+    """Return the parts in which two identities differ."""
+    return " and ".join(name for name in {**there, **here} if there.get(name) != json.loads(json.dumps(here.get(name))))
+
 
 WHAT = "the results"
 """What the folder holds, for messages."""
@@ -66,7 +145,7 @@ def run_methods(
     twice = [name for number, name in enumerate(names) if name in names[:number]]
     if twice:
         raise InputError(f"two methods are called {twice[0]!r}; give one another name, or leave one out")
-    truths = truths_of(data.scenes, methods)
+    truths = require_truths(data.scenes, methods)
     # Methods are described before they run: what they keep or import while they do depends on where a run went on.
     run = _run_of(data, methods)
 
@@ -125,7 +204,7 @@ def describe_run(
         layout=data.layout,
         place=data.place,
         treatment=data.treatment,
-        data_sha256=_data_sha256(data.scenes),
+        data_sha256=scenes_sha256(data.scenes),
         truths=np.stack([scene.truth for scene in data.scenes]),
         results=results,
         methods=tuple(methods),
@@ -164,15 +243,6 @@ def _seen_before(name: str, record: TrainingRecord, data: SceneSet, sha256: str)
     if len(record.images):
         return f"{told}none of these has the name and light, or the source picture, of one of them"
     return f"{told}whether these are among them is not known"
-
-
-def _data_sha256(scenes: Sequence[Scene]) -> str:
-    """Return what `learning.model_files.scenes_sha256` returns, also of lights without a channel."""
-    shares = [scene.truth / scene.truth.sum() for scene in scenes]
-    lines = [
-        f"{scene.name}\t{' '.join(f'{part:.9f}' for part in row)}" for scene, row in zip(scenes, shares, strict=True)
-    ]
-    return sha256_of("\n".join(lines).encode())
 
 
 def _require_same(

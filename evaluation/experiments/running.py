@@ -22,8 +22,7 @@ import numpy.typing as npt
 from evaluation.methods.method import Learner, LocalMethod, Method
 from evaluation.methods.prepared import GREY, PreparedImage, PreparedMethod
 from evaluation.metrics import MapError, measure_map
-from evaluation.results.answers import SceneAnswer, read_light, results_of
-from evaluation.results.result import Result
+from evaluation.results.result import Result, SceneAnswer, read_light, results_of
 from evaluation.scene import MixedScene, Scene
 from foundation.errors import CropError, FormatError, InputError
 from foundation.processors import ordered_map
@@ -69,7 +68,7 @@ def evaluate(
     >>> f"{result.method}: {result.summary('reproduction').mean:.2f} degrees"
     'Gray-world: 0.00 degrees'
     """
-    truths = truths_of(scenes, methods)
+    truths = require_truths(scenes, methods)
     answers: list[tuple[SceneAnswer, ...]] = []
     for given in answer_scenes(scenes, methods, workers):
         answers.append(given)
@@ -78,7 +77,7 @@ def evaluate(
     return results_of([method.name for method in methods], truths, answers)
 
 
-def truths_of(scenes: Sequence[Scene], methods: Sequence[object]) -> npt.NDArray[np.float64]:
+def require_truths(scenes: Sequence[Scene], methods: Sequence[object]) -> npt.NDArray[np.float64]:
     """Return the ground truths (N, 3) float64 of scenes, camera RGB of any length."""
     if not scenes or not methods:
         raise InputError(f"{len(methods)} methods on {len(scenes)} images: name at least one of each")

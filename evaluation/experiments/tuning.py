@@ -13,7 +13,7 @@ from typing import cast
 import numpy as np
 import numpy.typing as npt
 
-from evaluation.experiments.running import truths_of
+from evaluation.experiments.running import require_truths
 from evaluation.methods.green_stability import choose, counted, family_names, lights_of, require_enough
 from evaluation.methods.method import Method
 from evaluation.methods.naming import find_method
@@ -96,7 +96,7 @@ def tune_family(
     errors: list[Summary | None] = [None] * len(methods)
     if kind is not None:
         which = counted(lights)
-        truths = truths_of(scenes, methods)[which]
+        truths = require_truths(scenes, methods)[which]
         measure = recovery_error if kind == "recovery" else reproduction_error
         errors = [summarise(measure(lights[which, place], truths)) for place in range(len(methods))]
     settings = [

@@ -17,7 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import numpy.typing as npt
@@ -51,15 +51,12 @@ class ColorBeaver(FeatureLearner):
     - `generations`: generations.
     """
 
+    key: ClassVar[str] = "color-beaver"
+
     norms: str = "1"
     corners: int = 3
     population: int = 80
     generations: int = 120
-
-    @property
-    def key(self) -> str:
-        """Its name on the command line and in model files."""
-        return "color-beaver"
 
     @property
     def name(self) -> str:

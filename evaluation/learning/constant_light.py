@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 import numpy.typing as npt
@@ -20,15 +21,8 @@ class ConstantLight(FeatureLearner):
     does not beat it has learned the distribution of the lights, and nothing of how they show in an image.
     """
 
-    @property
-    def key(self) -> str:
-        """Its name on the command line and in model files."""
-        return "constant-light"
-
-    @property
-    def name(self) -> str:
-        """Its name in tables."""
-        return "Constant light"
+    key: ClassVar[str] = "constant-light"
+    title: ClassVar[str] = "Constant light"
 
     def features(
         self, image: Image, saturation: float | None = None, mask: npt.NDArray[np.bool_] | None = None

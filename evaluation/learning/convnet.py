@@ -14,7 +14,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from types import ModuleType
+from typing import Any, ClassVar
 
 import numpy as np
 import numpy.typing as npt
@@ -23,9 +24,6 @@ from evaluation.learning.feature_learner import FeatureLearner, Features, requir
 from evaluation.learning.working_size import reduce
 from evaluation.scene import Image
 from foundation.errors import InputError
-
-if TYPE_CHECKING:
-    from types import ModuleType
 
 _KERNEL = 5
 """Side of the first convolution, px; the others have 3."""
@@ -48,25 +46,14 @@ class ConvNet(FeatureLearner):
     - `rate`: learning rate of Adam, which falls to zero along a cosine.
     """
 
+    key: ClassVar[str] = "convnet"
+    title: ClassVar[str] = "Convolutional network"
+    needs: ClassVar[tuple[str, str] | None] = "torch", "pip install torch"
+
     working_size: int = 64
     width: int = 16
     epochs: int = 60
     rate: float = 3e-3
-
-    @property
-    def key(self) -> str:
-        """Its name on the command line and in model files."""
-        return "convnet"
-
-    @property
-    def name(self) -> str:
-        """Its name in tables."""
-        return "Convolutional network"
-
-    @property
-    def needs(self) -> tuple[str, str]:
-        """What training needs: the module, and the command that installs it."""
-        return "torch", "pip install torch"
 
     def features(
         self, image: Image, saturation: float | None = None, mask: npt.NDArray[np.bool_] | None = None

@@ -11,7 +11,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib import import_module
-from typing import Any, Protocol
+from typing import Any, ClassVar, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -43,20 +43,19 @@ class LightModel(Protocol):
 class FeatureLearner(ABC):
     """A method yet to be fitted: a frozen dataclass whose fields, plain numbers and words, are its settings."""
 
-    @property
-    @abstractmethod
-    def key(self) -> str:
-        """Its name on the command line and in model files."""
+    key: ClassVar[str]
+    """Its name on the command line and in model files."""
+
+    title: ClassVar[str]
+    """Its name in tables, where that does not depend on its settings."""
+
+    needs: ClassVar[tuple[str, str] | None] = None
+    """What training needs beside NumPy and SciPy: the module, and the command that installs it; None if nothing."""
 
     @property
-    @abstractmethod
     def name(self) -> str:
         """Its name in tables."""
-
-    @property
-    def needs(self) -> tuple[str, str] | None:
-        """What training needs beside NumPy and SciPy: the module, and the command that installs it; None if nothing."""
-        return None
+        return self.title
 
     @abstractmethod
     def features(
@@ -166,10 +165,9 @@ def require_installed(learner: object) -> None:
 
 def what_is_missing(learner: object) -> str | None:
     """Return why a learner cannot be trained here, with the remedy; None if it can, or is not one of the house's."""
-    needs = learner.needs if isinstance(learner, FeatureLearner) else None
-    if not isinstance(learner, FeatureLearner) or needs is None:
+    if not isinstance(learner, FeatureLearner) or learner.needs is None:
         return None
-    module, remedy = needs
+    module, remedy = learner.needs
     try:
         import_module(module)
     except ImportError:

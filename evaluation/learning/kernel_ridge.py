@@ -16,7 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import numpy.typing as npt
@@ -41,6 +41,9 @@ class KernelRidge(FeatureLearner):
     - `penalty`: λ for 900 training images, above 0; it grows in proportion to their number.
     """
 
+    key: ClassVar[str] = "kernel-ridge"
+    title: ClassVar[str] = "Kernel ridge (chromaticity histograms)"
+
     working_size: int = 64
     penalty: float = 1.0
 
@@ -49,16 +52,6 @@ class KernelRidge(FeatureLearner):
             raise ValueError(f"a working size of {self.working_size} px; expected 1 to {_LARGEST}")
         if not self.penalty > 0:
             raise ValueError(f"a penalty of {self.penalty}; expected a number above 0")
-
-    @property
-    def key(self) -> str:
-        """Its name on the command line and in model files."""
-        return "kernel-ridge"
-
-    @property
-    def name(self) -> str:
-        """Its name in tables."""
-        return "Kernel ridge (chromaticity histograms)"
 
     def features(
         self, image: Image, saturation: float | None = None, mask: npt.NDArray[np.bool_] | None = None

@@ -20,7 +20,7 @@ import numpy as np
 import numpy.typing as npt
 
 from evaluation.datasets.identity import identities
-from evaluation.learning.feature_learner import FeatureLearner, LearnedMethod, truths_of
+from evaluation.learning.feature_learner import FeatureLearner, LearnedMethod
 from evaluation.learning.standard import standard_learners
 from evaluation.methods.method import Method
 from evaluation.scene import Scene, SceneSet
@@ -121,11 +121,9 @@ def scenes_sha256(scenes: Sequence[Scene]) -> str:
 
     Truths count as chromaticities to nine digits, so that their length does not matter.
     """
-    truths = truths_of(scenes)
-    shares = truths / truths.sum(axis=1, keepdims=True)
-    lines = [
-        f"{scene.name}\t{' '.join(f'{part:.9f}' for part in row)}" for scene, row in zip(scenes, shares, strict=True)
-    ]
+    truths = [np.asarray(scene.truth, dtype=np.float64) for scene in scenes]
+    shares = [" ".join(f"{part:.9f}" for part in truth / truth.sum()) for truth in truths]
+    lines = [f"{scene.name}\t{share}" for scene, share in zip(scenes, shares, strict=True)]
     return sha256_of("\n".join(lines).encode())
 
 

@@ -18,7 +18,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import numpy.typing as npt
@@ -50,6 +50,13 @@ class RegressionTrees(FeatureLearner):
     - `agreement`: distance in chromaticity within which features agree.
     """
 
+    key: ClassVar[str] = "regression-trees"
+    title: ClassVar[str] = "Regression trees (simple features)"
+    needs: ClassVar[tuple[str, str] | None] = (
+        "sklearn",
+        "pip install scikit-learn; a model that is trained already does without",
+    )
+
     working_size: int = 256
     bins: int = 64
     palette: int = 300
@@ -57,21 +64,6 @@ class RegressionTrees(FeatureLearner):
     windows: int = 20
     depth: int = 4
     agreement: float = 0.025
-
-    @property
-    def key(self) -> str:
-        """Its name on the command line and in model files."""
-        return "regression-trees"
-
-    @property
-    def name(self) -> str:
-        """Its name in tables."""
-        return "Regression trees (simple features)"
-
-    @property
-    def needs(self) -> tuple[str, str]:
-        """What training needs: the module, and the command that installs it."""
-        return "sklearn", "pip install scikit-learn; a model that is trained already does without"
 
     def features(
         self, image: Image, saturation: float | None = None, mask: npt.NDArray[np.bool_] | None = None

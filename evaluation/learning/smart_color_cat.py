@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import numpy.typing as npt
@@ -43,22 +43,15 @@ class SmartColorCat(FeatureLearner):
     - `bins`: bins of the histogram, one of `CHOICES`; 0 to choose by the training images.
     """
 
+    key: ClassVar[str] = "smart-color-cat"
+    title: ClassVar[str] = "Smart Color Cat"
+
     working_size: int = 256
     bins: int = 0
 
     def __post_init__(self) -> None:
         if self.bins not in (0, *CHOICES):
             raise ValueError(f"{self.bins} bins; expected 0 or one of {', '.join(map(str, CHOICES))}")
-
-    @property
-    def key(self) -> str:
-        """Its name on the command line and in model files."""
-        return "smart-color-cat"
-
-    @property
-    def name(self) -> str:
-        """Its name in tables."""
-        return "Smart Color Cat"
 
     def features(
         self, image: Image, saturation: float | None = None, mask: npt.NDArray[np.bool_] | None = None

@@ -1,23 +1,206 @@
-"""The report of a run: summary, how the data were treated, error curves, the chromaticity plane, and images."""
+"""The report of a run: summary, how the data were treated, error curves, the chromaticity plane, and images.
+
+Images are shown as recorded, corrected by the estimate, and by the truth: made small, white balanced, with the curve of
+sRGB. No colour matrix is applied, so the colours are the camera's own: less saturated than a photograph, but a cast
+shows as it would there. The exposure is the same for all pictures of an image.
+"""
 
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 from markupsafe import Markup
 
-from evaluation.metrics import ErrorKind
-from evaluation.reports.error_figures import error_curves, error_planes
-from evaluation.reports.page import table_part
-from evaluation.results.result import Result
-from evaluation.results.run import Run
-from evaluation.results.summary_tables import lights_tables, summary_table
-from evaluation.results.tables import Table
+from evaluation.metrics import ErrorKind, percentiles
+from evaluation.reports.table_output import table_part
+from evaluation.results.result import Result, Run
+from evaluation.results.tables import Table, lights_tables, summary_table
+from evaluation.scene import MixedScene, Scene
 from foundation import pages
+from foundation.colorimetry import srgb_codes
 from foundation.errors import counted
+from foundation.plots import FAINT, legend_label, series_style, svg_of
+
+_SHOWN_PERCENTILE = 98
+"""Percentile of all methods' errors at which the axis of errors ends: a few wild ones would squeeze the others."""
+
+_STEPS = 300
+"""Points of a curve: as many as a column of a page has pixels, whatever the number of images."""
+
+_PANELS = 12
+"""Methods that get a panel of their own: more are too small to be read."""
+
+_COLUMNS = 3
+"""Panels beside each other: what a page of 1100 px has room for."""
+
+_VECTORS = 3000
+"""Points that are drawn one by one; more become a picture, for a page of millions of circles opens slowly."""
+
+_BRIGHTEST_PERCENTILE = 95
+"""Percentile of all methods' errors at which the scale of colours ends."""
+
+
+def error_curves(results: Sequence[Result], kind: ErrorKind) -> bytes:
+    """Return the cumulative error curves of methods as SVG: the share of images up to each error."""
+    rows = math.ceil(len(results) / 2)
+    return svg_of(_draw_curves, results, kind, inches=(8.6, 3.9 + 0.19 * rows))
+
+
+def _draw_curves(figure: Any, results: Sequence[Result], kind: ErrorKind) -> None:
+    axes = figure.subplots()
+    every = np.concatenate([result.errors[kind] for result in results])
+    end = max(float(percentiles(every, (_SHOWN_PERCENTILE,))[0]), 1e-3)
+    for number, result in enumerate(results):
+        errors = np.sort(result.errors[kind])
+        shares = np.linspace(0, 100, min(len(errors), _STEPS) + 1)
+        # The k-th of n sorted errors is reached by k of n images.
+        places = np.ceil(shares / 100 * len(errors)).astype(int) - 1
+        reached = np.where(places < 0, 0.0, errors[np.maximum(places, 0)])
+        axes.plot(reached, shares, label=legend_label(result.method), linewidth=1.6, **series_style(number))
+    axes.set(xlim=(0, end), ylim=(0, 100), xlabel=f"{kind} angular error, degrees", ylabel="images up to it, %")
+    figure.legend(loc="outside lower left", ncols=2, handlelength=3)
+
+
+def error_planes(results: Sequence[Result], truths: npt.NDArray[np.float64], kind: ErrorKind) -> bytes:
+    """Return the errors over the chromaticity plane as SVG: a panel a method, the first twelve of them.
+
+    `truths`: (N, 3) float64, the true lights, camera RGB of any length.
+    """
+    shown = results[:_PANELS]
+    columns = _columns(len(shown))
+    wide, high = (4.6, 3.6) if len(shown) == 1 else (8.6, 0.7 + (7.8 / columns) * math.ceil(len(shown) / columns))
+    return svg_of(_draw_planes, shown, truths, kind, inches=(wide, high))
+
+
+def _columns(panels: int) -> int:
+    """Return how many panels stand beside each other: two pairs look better than three and one."""
+    return 2 if panels == 4 else min(_COLUMNS, panels)
+
+
+def _draw_planes(figure: Any, results: Sequence[Result], truths: npt.NDArray[np.float64], kind: ErrorKind) -> None:
+    from matplotlib import colormaps
+    from matplotlib.colors import ListedColormap
+
+    shares = truths / truths.sum(axis=1, keepdims=True)
+    every = np.concatenate([result.errors[kind] for result in results])
+    top = max(float(percentiles(every, (_BRIGHTEST_PERCENTILE,))[0]), 1e-3)
+    # Neither end of the scale may vanish, on a light page or on a dark one.
+    colours = ListedColormap(colormaps["viridis"](np.linspace(0.15, 0.92, 256)))
+    columns = _columns(len(results))
+    grid = figure.subplots(math.ceil(len(results) / columns), columns, squeeze=False, sharex=True, sharey=True)
+    drawn = None
+    for axes, result in zip(grid.flat, results, strict=False):
+        errors = result.errors[kind]
+        order = np.argsort(errors, kind="stable")  # The largest errors lie on top.
+        drawn = axes.scatter(
+            shares[order, 0],
+            shares[order, 2],
+            c=errors[order],
+            s=9,
+            cmap=colours,
+            vmin=0,
+            vmax=top,
+            linewidths=0,
+            rasterized=len(errors) * len(results) > _VECTORS,
+        )
+        axes.set_title(result.method, fontsize=8.5)
+    panels = list(grid.flat)
+    for axes in panels[len(results) :]:
+        axes.remove()
+    for axes in panels[max(0, len(results) - columns) : len(results)]:
+        # The lowest panel of each column has the labels, also above an empty place.
+        axes.tick_params(labelbottom=True)
+    figure.supxlabel("r = R / (R + G + B) of the true light", fontsize=9)
+    figure.supylabel("b = B / (R + G + B)", fontsize=9)
+    bar = figure.colorbar(drawn, ax=panels[: len(results)], extend="max", label=f"{kind} error, degrees", shrink=0.8)
+    bar.outline.set_edgecolor(FAINT)
+
+
+_HEIGHT = 170
+"""Pixels of a picture's height: three beside each other fill half a page."""
+
+_WIDEST = 300
+"""Pixels of a picture's width at most: a panorama would make the others tiny."""
+
+_WHITE_PERCENTILE = 98.0
+"""Percentile of the brightest channel, under the true light, that becomes white: what is above are highlights."""
+
+_GAP = 6
+"""Pixels between pictures, white on every screen."""
+
+_MASKED = 0.18
+"""Linear grey that stands for masked pixels: the middle of a display's range."""
+
+_HALF = 0.5
+"""Share of a small pixel that is masked above which it is drawn as masked."""
+
+_QUALITY = 88
+"""Of the JPEG files: traces of compression are not seen, and a page of a hundred pictures stays below 2 MB."""
+
+_LEAST_GAIN = 1e-6
+"""Share of the green channel that replaces a light's channel at zero, which cannot be divided by."""
+
+
+def developed(scene: Scene, estimates: Sequence[npt.NDArray[np.float64]]) -> list[bytes]:
+    """Return a JPEG file for each estimate: the scene as recorded, corrected by the estimate, and by the truth.
+
+    `estimates`: (3,) float64 each, camera RGB of any length.
+    """
+    image, mask = scene.read()
+    linear = image.astype(np.float32)
+    if mask is not None:
+        # What is masked must not shine into its neighbours when the image is resized, nor set the exposure.
+        linear[mask] = 0
+    small = _resized(linear)
+    truth: npt.NDArray[Any] = scene.truth
+    if isinstance(scene, MixedScene):
+        field = scene.read_truth_map()
+        truth = _resized(np.where(np.isfinite(field), field, np.float32(scene.truth / scene.truth.sum())))
+    covered = None if mask is None else _resized(mask.astype(np.float32)) > _HALF
+    free = small * _gains(truth)
+    free = free.reshape(-1, 3) if covered is None else free[~covered]
+    white = float(np.percentile(free.max(axis=1), _WHITE_PERCENTILE)) if len(free) else 0.0
+
+    def seen(light: npt.NDArray[Any]) -> npt.NDArray[np.uint8]:
+        lit = small * _gains(light) / np.float32(white or 1.0)
+        if covered is not None:
+            lit[covered] = _MASKED
+        return srgb_codes(lit)
+
+    raw, right = seen(np.ones(3)), seen(truth)
+    gap = np.full((len(small), _GAP, 3), 255, np.uint8)
+    return [_jpeg(np.hstack([raw, gap, seen(light), gap, right])) for light in estimates]
+
+
+def _jpeg(picture: npt.NDArray[np.uint8]) -> bytes:
+    import cv2
+
+    codes = np.ascontiguousarray(picture[..., ::-1])
+    _, encoded = cv2.imencode(".jpg", codes, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])
+    return encoded.tobytes()
+
+
+def _gains(light: npt.NDArray[Any]) -> npt.NDArray[np.float32]:
+    """Return what corrects for a light (..., 3) and leaves green as it is."""
+    given = np.asarray(light, dtype=np.float64)
+    floored = np.maximum(given, _LEAST_GAIN * given.max(axis=-1, keepdims=True))
+    return (floored[..., 1:2] / floored).astype(np.float32)
+
+
+def _resized(array: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
+    import cv2
+
+    height, width = array.shape[:2]
+    scale = min(_HEIGHT / height, _WIDEST / width)
+    size = (max(1, round(width * scale)), max(1, round(height * scale)))
+    way = cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR
+    return np.asarray(cv2.resize(array, size, interpolation=way), dtype=np.float32)
+
 
 WORST, MIDDLE = 3, 2
 """Images shown of each method: its largest errors, and those nearest to its median."""

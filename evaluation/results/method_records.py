@@ -18,7 +18,7 @@ from typing import Any, cast
 import numpy as np
 import numpy.typing as npt
 
-from evaluation.results.estimates import GivenEstimates
+from evaluation.results.files import GivenEstimates
 from foundation.hashing import file_sha256, sha256_of
 
 _DEEPEST = 6

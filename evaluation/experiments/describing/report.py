@@ -1,21 +1,238 @@
-"""A description's tables and page, alone or beside another's."""
+"""A description's tables and page, alone or beside another's: how real is what was generated.
+
+Images of the two have nothing to do with each other: each set is resampled by itself (`bootstrap.independent`). Two
+figures are called alike where the one lies within a quarter of the other: a ratio of 1/1.25 … 1.25, or, for figures
+with a sign, a difference within a quarter of the other's spread over its images. The quarter is a convention. Real
+photographs of two cameras by one group (Canon 600D and 1Ds Mark III of NUS) are alike by it in 18 of 21 figures.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Final, Literal
 
 import numpy as np
+import numpy.typing as npt
 from markupsafe import Markup
 
-from evaluation.experiments.describing.against import TOLERANCE, FigureCompared, compare_figures, sentence
-from evaluation.experiments.describing.description import DataDescription, figures, known_values
-from evaluation.experiments.describing.lights import energy_distance, light_distribution
-from evaluation.experiments.describing.quantities import QUANTITIES
-from evaluation.reports.description_figures import chroma_figure, lights_figure, luminance_figure, noise_figure
-from evaluation.reports.page import table_part
+from evaluation.experiments.bootstrap import independent
+from evaluation.experiments.describing.description import (
+    QUANTITIES,
+    DataDescription,
+    Quantity,
+    energy_distance,
+    figures,
+    known_values,
+    light_distribution,
+    summed,
+)
+from evaluation.reports.table_output import table_part
 from evaluation.results.tables import Table
 from foundation import pages
+from foundation.plots import FAINT, GRID, SERIES, legend_label, svg_of
 from generator.statistics import CHROMA_EDGES, LUMINANCE_EDGES, log_chroma
+
+TOLERANCE: Final = 0.25
+"""Share by which figures may differ and still be called alike: a convention."""
+
+_LEAST: Final = 3
+"""Images of which a figure must be known in each set: a quartile needs them."""
+
+Verdict = Literal["yes", "yes?", "no?", "no"]
+"""Whether a figure is within the tolerance; with a question mark where its interval reaches over the border."""
+
+
+@dataclass(frozen=True)
+class FigureCompared:
+    """A figure of a data set beside that of another.
+
+    - `change`: one / other, or one - other of a figure with a sign, and its interval of 95 %; NaN where `other` is 0.
+    - `scale`: what a difference is measured by: the other's spread over its images; 1 for a ratio.
+    - `distance`, `p`: two-sample Kolmogorov-Smirnov statistic of the images' numbers, 0 … 1, and the probability of
+      such a one where both sets are of one kind.
+    - `verdict`: whether the change is within `TOLERANCE`; None where it is not known.
+    """
+
+    quantity: Quantity
+    one: float
+    other: float
+    change: tuple[float, float, float]
+    scale: float
+    distance: float
+    p: float
+    verdict: Verdict | None
+
+
+def compare_figures(one: DataDescription, other: DataDescription, seed: int = 0) -> tuple[FigureCompared, ...]:
+    """Return every figure that is known of both sets, of at least three images each."""
+    compared: list[FigureCompared] = []
+    for quantity in QUANTITIES:
+        values = [known_values(described, quantity.value) for described in (one, other)]
+        if min(map(len, values)) >= _LEAST:
+            compared.append(_compared(quantity, values[0], values[1], seed))
+    return tuple(compared)
+
+
+def _compared(
+    quantity: Quantity, one: npt.NDArray[np.float64], other: npt.NDArray[np.float64], seed: int
+) -> FigureCompared:
+    from scipy.stats import ks_2samp
+
+    values = summed(one, quantity.summed), summed(other, quantity.summed)
+    scale = float(other.std()) if quantity.signed else 1.0
+    change = _change(quantity, one, other, seed)
+    test = ks_2samp(one, other)
+    return FigureCompared(
+        quantity, *values, change, scale, float(test.statistic), float(test.pvalue), _verdict(quantity, change, scale)
+    )
+
+
+def _change(
+    quantity: Quantity, one: npt.NDArray[np.float64], other: npt.NDArray[np.float64], seed: int
+) -> tuple[float, float, float]:
+    if quantity.summed == "spread":
+        # Deviations from the mean of the images themselves: the mean's own error is of second order.
+        squares = [np.square(values - values.mean()) for values in (one, other)]
+        ratio = independent(squares[0], squares[1], seed)[0].ratio
+        return ratio[0] ** 0.5, ratio[1] ** 0.5, ratio[2] ** 0.5
+    found = {compared.statistic: compared for compared in independent(one, other, seed)}[quantity.summed]
+    return found.difference if quantity.signed else found.ratio
+
+
+def _verdict(quantity: Quantity, change: tuple[float, float, float], scale: float) -> Verdict | None:
+    if not np.isfinite(change[0]):
+        return None
+    low, high = (-TOLERANCE * scale, TOLERANCE * scale) if quantity.signed else (1 / (1 + TOLERANCE), 1 + TOLERANCE)
+    within = low <= change[0] <= high
+    sure = low <= change[1] and change[2] <= high if within else change[2] < low or change[1] > high
+    return ("yes" if sure else "yes?") if within else ("no" if sure else "no?")
+
+
+def sentence(compared: FigureCompared, names: tuple[str, str]) -> str:
+    """Return in one sentence whether a figure of the one is what it is in the other."""
+    quantity, (value, low, high) = compared.quantity, compared.change
+    head = f"{quantity.title}: {compared.one:.3g} in {names[0]}, {compared.other:.3g} in {names[1]}"
+    if quantity.signed:
+        told = f"{value:+.3f} apart ({low:+.3f} to {high:+.3f}), {abs(value) / compared.scale:.0%} of its spread there"
+        told = told if compared.scale > 0 else f"{value:+.3f} apart ({low:+.3f} to {high:+.3f})"
+    else:
+        told = f"{value:.2f} times as much ({low:.2f} to {high:.2f})"
+    match compared.verdict:
+        case None:
+            return f"{head}: no ratio to a figure that is 0."
+        case "yes":
+            return f"{head}: {told}, within {TOLERANCE:.0%}."
+        case "yes?":
+            return f"{head}: {told}, within {TOLERANCE:.0%}, but other images might not be."
+        case "no?":
+            return f"{head}: {told}, not within {TOLERANCE:.0%}, but other images might be."
+        case "no":
+            return f"{head}: {told}, not within {TOLERANCE:.0%}."
+
+
+_FAINTEST: Final = 0.4
+"""Power of a share of cells at which it is drawn: rare colours stay visible beside frequent greys."""
+
+_POINTS: Final = 3000
+"""Lights drawn of a set at most: more make no other cloud, and a page too large to mail."""
+
+
+def luminance_figure(names: Sequence[str], shares: Sequence[npt.NDArray[np.float64]], edges: Sequence[float]) -> bytes:
+    """Return the distribution of luminance as SVG.
+
+    `shares`: for each (B,) float64, the share of cells in each bin. `edges`: (B + 1,) float, the bins' edges: decimal
+    logarithm of luminance over the 99th percentile.
+    """
+
+    def draw(figure: Any) -> None:
+        axes = figure.add_subplot()
+        for number, (name, share) in enumerate(zip(names, shares, strict=True)):
+            # The first bin holds all that is darker.
+            axes.stairs(
+                100 * share, np.power(10.0, edges), label=legend_label(name), color=SERIES[number], linewidth=1.5
+            )
+        axes.set(xscale="log", xlabel="luminance over its 99th percentile in the image", ylabel="cells, %")
+        axes.xaxis.set_major_formatter("{x:g}")
+        axes.set_ylim(bottom=0)
+        axes.legend(loc="upper left")
+
+    return svg_of(draw, inches=(7.2, 3.2))
+
+
+def chroma_figure(names: Sequence[str], shares: Sequence[npt.NDArray[np.float64]], edges: Sequence[float]) -> bytes:
+    """Return the histograms of chroma in the plane of ln(R/G) and ln(B/G) as SVG, side by side.
+
+    `shares`: for each (B, B) float64, the share of cells, by ln(R/G) and ln(B/G). `edges`: (B + 1,) float, the bins'
+    edges along both.
+    """
+
+    def draw(figure: Any) -> None:
+        from matplotlib.colors import LinearSegmentedColormap, to_rgba
+
+        top = max(float(share.max()) for share in shares) ** _FAINTEST
+        for number, (name, share) in enumerate(zip(names, shares, strict=True)):
+            axes = figure.add_subplot(1, len(shares), number + 1)
+            clear, full = (to_rgba(SERIES[number], alpha) for alpha in (0, 1))
+            axes.imshow(
+                share.T**_FAINTEST,
+                origin="lower",
+                extent=(edges[0], edges[-1], edges[0], edges[-1]),
+                cmap=LinearSegmentedColormap.from_list(f"set{number}", [clear, full]),
+                vmin=0,
+                vmax=top,
+                interpolation="nearest",
+            )
+            axes.axhline(0, color=FAINT, linewidth=0.6)
+            axes.axvline(0, color=FAINT, linewidth=0.6)
+            axes.set(title=name, xlabel="ln(R/G)", ylabel="ln(B/G)")
+
+    return svg_of(draw, inches=(3.8 * len(shares), 3.8))
+
+
+def lights_figure(names: Sequence[str], lights: Sequence[npt.NDArray[np.float64]]) -> bytes:
+    """Return the lights of sets in the plane of the chromaticities r and b as SVG.
+
+    `lights`: for each (L, 3) float64, linear camera RGB with r + g + b = 1.
+    """
+
+    def draw(figure: Any) -> None:
+        axes = figure.add_subplot()
+        for number, (name, given) in enumerate(zip(names, lights, strict=True)):
+            some = given[:: -(-len(given) // _POINTS)]
+            axes.scatter(
+                some[:, 0], some[:, 2], s=9, alpha=0.5, linewidths=0, color=SERIES[number], label=legend_label(name)
+            )
+        axes.set(xlabel="r = R / (R + G + B)", ylabel="b = B / (R + G + B)", aspect="equal")
+        axes.legend(loc="upper right")
+
+    return svg_of(draw, inches=(5.4, 4.6))
+
+
+def noise_figure(
+    names: Sequence[str],
+    measured: Sequence[npt.NDArray[np.float64]],
+    curves: Sequence[tuple[float, float] | None],
+    unit: str,
+) -> bytes:
+    """Return noise against signal as SVG, with the fitted photon-transfer curves.
+
+    `measured`: for each (N, 2) float64: signal and standard deviation of levels. `curves`: for each the read noise and
+    the gain of variance = read² + gain · signal, or None.
+    """
+
+    def draw(figure: Any) -> None:
+        axes = figure.add_subplot()
+        for number, (name, levels, curve) in enumerate(zip(names, measured, curves, strict=True)):
+            axes.plot(levels[:, 0], levels[:, 1], "o", markersize=4, color=SERIES[number], label=legend_label(name))
+            if curve is not None:
+                signal = np.exp(np.linspace(np.log(levels[0, 0]), np.log(levels[-1, 0]), 100, dtype=np.float64))
+                axes.plot(signal, np.sqrt(curve[0] ** 2 + curve[1] * signal), color=SERIES[number], linewidth=1)
+        axes.set(xscale="log", yscale="log", xlabel=f"signal, {unit} = 1", ylabel="standard deviation")
+        axes.grid(visible=True, which="major", color=GRID)
+        axes.legend(loc="upper left")
+
+    return svg_of(draw, inches=(5.4, 4.0))
 
 
 def figures_table(description: DataDescription) -> Table:

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
 import numpy.typing as npt
@@ -19,14 +19,12 @@ from evaluation.experiments.cross_validation import cross_validate
 from evaluation.experiments.paper.published import TABLE2
 from evaluation.experiments.paper.table1 import NUMBERS
 from evaluation.experiments.running import evaluate, fit_anew
+from evaluation.methods.method import Learner
 from evaluation.metrics import ErrorKind
+from evaluation.results.result import Result
 from evaluation.results.tables import Table
+from evaluation.scene import Scene
 from foundation.errors import InputError
-
-if TYPE_CHECKING:
-    from evaluation.methods.method import Learner
-    from evaluation.results.result import Result
-    from evaluation.scene import Scene
 
 LEARNERS: Final[Mapping[str, str]] = {
     "regression-trees": "Regression trees (simple features)",

@@ -1,38 +1,462 @@
-"""The result folder of a transfer: tables, every image's errors, folds, and how all was made."""
+"""What a transfer comes to: statistics with their intervals, ratios of rows, their tables, and the results folder.
+
+With several seeds a statistic is the mean of those of the seeds, not that of their errors together, and a resample is
+of images: one that is drawn counts in every seed. So the interval says what other test images would have given; how
+much another seed gives is stated apart.
+
+The paper's own ratios stand beside ours.
+"""
 
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
+from evaluation.experiments.bootstrap import STATISTICS, ErrorSample, bca, resamples
 from evaluation.experiments.folds import folds_to_csv
-from evaluation.experiments.transfer.figures import TransferFigures
+from evaluation.experiments.paper.published import TABLE2
 from evaluation.experiments.transfer.plan import TransferPlan, is_generated
-from evaluation.experiments.transfer.rows import TransferRow
-from evaluation.experiments.transfer.tables import (
-    errors_table,
-    intervals_table,
-    long_table,
-    naive_ratios_table,
-    paper_ratios_table,
-    real_ratios_table,
-)
-from evaluation.reports.latex import table_to_latex
-from evaluation.reports.page import table_part
+from evaluation.experiments.transfer.rows import NAIVE, TransferRow
+from evaluation.metrics import ErrorKind
+from evaluation.reports.table_output import table_part, table_to_latex
+from evaluation.results.files import errors_csv
 from evaluation.results.result import Result
-from evaluation.results.run_files import errors_csv
 from evaluation.results.tables import Table, table_to_csv
 from evaluation.scene import SceneSet
 from foundation import pages
+from foundation.errors import InputError
 from foundation.files import whole_folder, write_whole
 from foundation.plots import FAINT, INK, series_style, svg_of
 from foundation.version import software
+
+COUNT: Final = 2000
+"""Resamples: as many as `bootstrap.interval` takes by default."""
+LEVEL: Final = 0.95
+"""Confidence of an interval: the usual one."""
+
+Floats = npt.NDArray[np.float64]
+
+
+class BoundedFigure(NamedTuple):
+    """A number with the ends of its confidence interval; NaN where it is not known."""
+
+    value: float
+    low: float
+    high: float
+
+
+@dataclass(frozen=True)
+class RowFigures:
+    """What one row comes to.
+
+    - `statistics`: in the order of `bootstrap.STATISTICS`, degrees.
+    - `spread`: standard deviation of each statistic over the seeds, degrees; None with a single one.
+    """
+
+    row: TransferRow
+    statistics: tuple[BoundedFigure, ...]
+    spread: tuple[float, ...] | None
+
+
+@dataclass(frozen=True)
+class RowRatio:
+    """What a row comes to in parts of another with the same method, image by image on the same resamples.
+
+    - `row`, `base`: the row, and what it is held to.
+    - `ratios`: in the order of `bootstrap.STATISTICS`.
+    """
+
+    row: TransferRow
+    base: TransferRow
+    ratios: tuple[BoundedFigure, ...]
+
+
+@dataclass(frozen=True)
+class TransferFigures:
+    """All that is told of the rows.
+
+    - `error`: the kind of error.
+    - `rows`: every row with its statistics.
+    - `to_real`: every row that was trained elsewhere against the same method's real cross-validation.
+    - `to_naive`: every generated row against the naive rows of the same pictures and lights.
+    - `to_base`: every other row against those that were asked for, of the same method.
+    """
+
+    error: ErrorKind
+    rows: tuple[RowFigures, ...]
+    to_real: tuple[RowRatio, ...]
+    to_naive: tuple[RowRatio, ...]
+    to_base: tuple[RowRatio, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class _Replicates:
+    """Statistics of one row: of itself (6,), of resamples (B, 6), and without each image (N, 6); means over seeds."""
+
+    estimate: Floats
+    resampled: Floats
+    without: Floats
+
+
+def figures_of(
+    rows: Sequence[TransferRow], error: ErrorKind, seed: int = 0, base: str | None = None
+) -> TransferFigures:
+    """Return statistics, intervals and ratios of rows on the same test images.
+
+    `base`: `TransferRow.training` of rows that every other one is held to as well, with x for × and in any case; None
+    for no such ratios.
+    """
+    bases = _named(rows, base)
+    samples = [[ErrorSample.of(result.errors[error]) for result in row.results] for row in rows]
+    drawn: list[list[Floats]] = [[] for _ in rows]
+    for counts in resamples(len(samples[0][0].order), seed, COUNT):
+        for batches, several in zip(drawn, samples, strict=True):
+            batches.append(np.mean([one.statistics(counts) for one in several], axis=0))
+    known = [
+        _Replicates(
+            np.mean([one.estimate() for one in several], axis=0),
+            np.concatenate(batches),
+            np.mean([one.without_each() for one in several], axis=0),
+        )
+        for several, batches in zip(samples, drawn, strict=True)
+    ]
+    listed = tuple(
+        RowFigures(
+            row,
+            tuple(_figure(one.estimate[place], one.resampled[:, place], one.without[:, place]) for place in _PLACES),
+            _spread(several),
+        )
+        for row, one, several in zip(rows, known, samples, strict=True)
+    )
+
+    def ratio(number: int, base: int) -> RowRatio:
+        one, other = known[number], known[base]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            parts = [one.estimate / other.estimate, one.resampled / other.resampled, one.without / other.without]
+        ratios = tuple(_figure(parts[0][place], parts[1][:, place], parts[2][:, place]) for place in _PLACES)
+        return RowRatio(rows[number], rows[base], ratios)
+
+    to_real = [
+        ratio(number, base)
+        for number, row in enumerate(rows)
+        for base, other in enumerate(rows)
+        if other.kind == "cross-validation"
+        and other.method == row.method
+        and row.kind not in ("cross-validation", "none")
+    ]
+    to_naive = [
+        ratio(number, base)
+        for number, row in enumerate(rows)
+        for base, other in enumerate(rows)
+        if row.kind == "generated" and other.kind in NAIVE and (other.method, other.data) == (row.method, row.data)
+    ]
+    to_base = [
+        ratio(number, other)
+        for number, row in enumerate(rows)
+        for other in bases
+        if number not in bases and rows[other].method == row.method
+    ]
+    return TransferFigures(error, listed, tuple(to_real), tuple(to_naive), tuple(to_base))
+
+
+def _named(rows: Sequence[TransferRow], base: str | None) -> list[int]:
+    """Return the places of the rows that were trained in the way of that name."""
+    if base is None:
+        return []
+    trained = [(number, row) for number, row in enumerate(rows) if row.kind != "none"]
+    found = [number for number, row in trained if _plain(row.training) == _plain(base)]
+    if not found:
+        known = dict.fromkeys(row.training for _, row in trained)
+        raise InputError(f"no row was trained on {base!r}; expected one of: {'; '.join(known)}")
+    methods = {rows[number].method for number in found}
+    if not any(row.method in methods for number, row in trained if number not in found):
+        raise InputError(f"no method was trained on anything but {base!r}; add results to hold to it, or leave it out")
+    return found
+
+
+def _plain(training: str) -> str:
+    return " ".join(training.casefold().replace("×", " x ").split())
+
+
+_PLACES: Final = range(len(STATISTICS))
+"""Places of the statistics in arrays."""
+
+
+def _figure(value: float, replicates: Floats, without: Floats) -> BoundedFigure:
+    if not np.isfinite(value):
+        return BoundedFigure(np.nan, np.nan, np.nan)
+    return BoundedFigure(float(value), *bca(float(value), replicates, [without], LEVEL))
+
+
+def _spread(several: Sequence[ErrorSample]) -> tuple[float, ...] | None:
+    if len(several) < 2:
+        return None
+    deviations = np.std([one.estimate() for one in several], axis=0, ddof=1)
+    return tuple(float(part) for part in deviations)
+
+
+HEADS: Final = ("Mean", "Med.", "Tri.", "Best 25%", "Worst 25%", "Avg.")
+"""Heads of the statistics, in their order: all six stand in every table, since any one of them misleads alone."""
+
+SHOWN: Final = (1, 0, 4)
+"""Places in `bootstrap.STATISTICS` of what forest plots show: median, mean and worst quarter."""
+
+
+def errors_table(found: TransferFigures, name: str, images: int) -> Table:
+    """Return the statistics of every row; of several seeds their means."""
+    notes = [
+        f"{row.row.method}, {row.row.training}: no light in {guessed.sum()} images; grey stands in for it"
+        for row in found.rows
+        if (guessed := row.row.results[0].guessed).any()
+    ]
+    if any(row.spread for row in found.rows):
+        median = [row.spread[1] for row in found.rows if row.spread]
+        notes.append(
+            f"Means over seeds; the standard deviation of a median over seeds is up to {max(median):.2f} degrees."
+        )
+    return Table(
+        f"{name}: {found.error} angular error of {images} images, degrees",
+        ("Method", "Trained on", "Images", *HEADS),
+        tuple((*_heads(row.row), *(figure.value for figure in row.statistics)) for row in found.rows),
+        notes=tuple(notes),
+    )
+
+
+def intervals_table(found: TransferFigures, name: str) -> Table:
+    """Return the confidence intervals of every row's statistics."""
+    return Table(
+        f"{name}: {LEVEL * 100:.0f} % intervals of these errors, degrees",
+        ("Method", "Trained on", "Images", *HEADS),
+        tuple(
+            (*_heads(row.row), *(f"{figure.low:.2f} – {figure.high:.2f}" for figure in row.statistics))
+            for row in found.rows
+        ),
+        notes=("BCa bootstrap over the test images: what other images of the same kind would have given.",),
+    )
+
+
+def real_ratios_table(found: TransferFigures, name: str) -> Table:
+    """Return every row in parts of the same method's cross-validation on the test images, real ones or not."""
+    made = any(one.base.data for one in found.to_real)
+    base = f"cross-validation on {name} (generated)" if made else "real cross-validation"
+    good = "as good as images of the test set, which are generated, not real" if made else "as good as real images"
+    return _ratios_table(
+        f"{name}: errors in parts of the same method's {base}",
+        [(one, one.row.training) for one in found.to_real],
+        f"With {LEVEL * 100:.0f} % intervals, paired by test image. 1: {good}.",
+    )
+
+
+def naive_ratios_table(found: TransferFigures, name: str) -> Table | None:
+    """Return the generated rows in parts of the naive ones; None if there was no naive baseline."""
+    if not found.to_naive:
+        return None
+    return _ratios_table(
+        f"{name}: errors with generated images in parts of those with the same pictures and lights, but no table",
+        [(one, one.base.training) for one in found.to_naive],
+        "Paired by test image. Below 1: the table is worth something to this method.",
+        "In parts of",
+    )
+
+
+def base_ratios_table(found: TransferFigures, name: str) -> Table | None:
+    """Return every row in parts of the row that was asked for; None if none was."""
+    if not found.to_base:
+        return None
+    return _ratios_table(
+        f"{name}: errors in parts of those of the same method, trained on {found.to_base[0].base.training}",
+        [(one, one.row.training) for one in found.to_base],
+        "Paired by test image. Sets of other pictures or lights are held together with the choice of them.",
+    )
+
+
+def _ratios_table(
+    title: str, ratios: Sequence[tuple[RowRatio, str]], note: str, second_head: str = "Trained on"
+) -> Table:
+    """Return ratios with their intervals, each with what its second column says."""
+    rows = tuple(
+        (
+            one.row.method,
+            said,
+            *(
+                f"{figure.value:.2f} ({figure.low:.2f} – {figure.high:.2f})" if math.isfinite(figure.value) else "–"
+                for figure in one.ratios
+            ),
+        )
+        for one, said in ratios
+    )
+    return Table(title, ("Method", second_head, *HEADS), rows, notes=(note,))
+
+
+def paper_ratios_table() -> Table:
+    """Return the paper's ratios, of its table 2.
+
+    Examples
+    --------
+    >>> paper_ratios_table().texts()[2]
+    ('Color Beaver (using Gray-world)', '0.74 / 0.77', '1.16', '0.96', '0.99', '1.76', '1.21', '1.18')
+    """
+    rows: list[tuple[str | float, ...]] = []
+    for method, generated in TABLE2["generated"].items():
+        real = TABLE2["real"][method]
+        ratios = (one / other for one, other in zip(generated.as_tuple(), real.as_tuple(), strict=True))
+        rows.append((method, f"{generated.median:.2f} / {real.median:.2f}", *ratios))
+    return Table(
+        "The paper, Cube+: generated in parts of real cross-validation",
+        ("Method", "Medians, degrees", *HEADS),
+        tuple(rows),
+        notes=("Paper, table 2; Canon EOS 550D, Cube+ images as source pictures and as the test.",),
+    )
+
+
+def long_table(found: TransferFigures) -> Table:
+    """Return all numbers for other programs: a row for each method, training and statistic."""
+    to_real = {(one.row.method, one.row.training): one for one in found.to_real}
+    rows: list[tuple[str | float | None, ...]] = []
+    for row in found.rows:
+        ratio = to_real.get((row.row.method, row.row.training))
+        for place, statistic in enumerate(STATISTICS):
+            spread = row.spread[place] if row.spread else None
+            parts = _three(ratio.ratios[place]) if ratio else (None, None, None)
+            who = (row.row.method, row.row.kind, row.row.data, row.row.images, len(row.row.results))
+            rows.append((*who, found.error, statistic, *_three(row.statistics[place]), spread, *parts))
+    return Table("All numbers", _LONG, tuple(rows))
+
+
+_LONG: Final = (
+    *("method", "training", "data", "images", "seeds", "error", "statistic"),
+    *("degrees", "low", "high", "seed_sd", "ratio_to_real", "ratio_low", "ratio_high"),
+)
+"""Columns of the file for other programs; empty where a row has no such number."""
+
+
+def _heads(row: TransferRow) -> tuple[str, str, int | None]:
+    return row.method, row.training, row.images or None
+
+
+def _three(figure: BoundedFigure) -> tuple[float | None, ...]:
+    return tuple(number if math.isfinite(number) else None for number in figure)
+
+
+_LINE_INCHES: Final = 0.24
+"""Height of a line: a label of 9 points and some air."""
+
+_WIDEST: Final = 4.0
+"""An interval is drawn up to this factor beyond the outermost ratio, so that a wide one does not squeeze the others."""
+
+_NARROWEST: Final = 1.25
+"""The axis reaches from 1 over this to this at least: else differences that mean nothing would fill the figure."""
+
+_ROUND: Final = (1.0, 1.1, 1.25, 1.5, 2.0, 3.0, 5.0, 7.0, 8.0, 9.0)
+"""Round numbers of a decade: dense about 1 on both sides."""
+
+_MOST_TICKS: Final = 6
+"""Numbers on an axis at most: a panel is two inches wide."""
+
+
+@dataclass(frozen=True)
+class ForestLine:
+    """A line of a forest plot.
+
+    - `label`: what stands to the left.
+    - `ratios`: for each panel; none for a line that heads those below it.
+    - `series`: number of its colour, counted from 0; lines that belong together share one.
+    - `whole`: whether it is of the whole, and not of a part.
+    """
+
+    label: str
+    ratios: tuple[BoundedFigure, ...] = ()
+    series: int = 0
+    whole: bool = True
+
+
+def forest_plot(lines: Sequence[ForestLine], panels: Sequence[str]) -> bytes:
+    """Return a forest plot as SVG: ratios with their intervals, each on a line, of several statistics side by side.
+
+    The form is that of meta-analyses (S. Lewis and M. Clarke, "Forest plots: trying to see the wood and the trees", BMJ
+    322, 2001): a diamond for the whole, a square for each part of it, a line at 1, and a logarithmic axis, on which 2
+    and 1/2 are equally far from 1.
+    """
+    return svg_of(_draw, lines, panels, inches=(8.8, 0.9 + _LINE_INCHES * len(lines)))
+
+
+def _draw(figure: Any, lines: Sequence[ForestLine], panels: Sequence[str]) -> None:
+    grid = figure.subplots(1, len(panels), squeeze=False, sharey=True, sharex=True)[0]
+    low, high = _range(lines)
+    for number, (axes, title) in enumerate(zip(grid, panels, strict=True)):
+        axes.axvline(1, color=FAINT, linewidth=1, zorder=1)
+        for place, line in enumerate(lines):
+            if line.ratios:
+                _draw_ratio(axes, place, line, line.ratios[number])
+        axes.set(title=title, xscale="log", xlim=(low, high), xlabel="ratio")
+        ticks = round_numbers(low, high)
+        axes.set_xticks(ticks, [f"{tick:g}" for tick in ticks])
+        axes.minorticks_off()
+        axes.grid(visible=False, axis="y")
+        axes.tick_params(axis="y", length=0, labelcolor=INK)
+    grid[0].set_yticks(range(len(lines)), [line.label for line in lines])
+    for text, line in zip(grid[0].get_yticklabels(), lines, strict=True):
+        text.set(fontweight="normal" if line.ratios else "bold", color=INK if line.whole else FAINT)
+    grid[0].set_ylim(len(lines) - 0.5, -0.5)
+
+
+def _draw_ratio(axes: Any, place: int, line: ForestLine, ratio: BoundedFigure) -> None:
+    value, low, high = ratio
+    if not _positive(value):
+        return
+    colour = series_style(line.series)["color"]
+    if _positive(low) and _positive(high):
+        width, shown = (1.8, 1.0) if line.whole else (1.0, 0.7)
+        axes.plot([low, high], [place, place], color=colour, linewidth=width, alpha=shown, zorder=2)
+    marker, size = ("D", 6.5) if line.whole else ("s", 4)
+    axes.plot([value], [place], marker, color=colour, markersize=size, markeredgewidth=0, zorder=3)
+
+
+def _range(lines: Sequence[ForestLine]) -> tuple[float, float]:
+    """Return the ends of the axis: all ratios, and intervals as far as they leave those room."""
+    values = [ratio[0] for line in lines for ratio in line.ratios if _positive(ratio[0])]
+    ends = [end for line in lines for ratio in line.ratios for end in ratio[1:] if _positive(end)]
+    least, most = min([1 / _NARROWEST, *values]), max([_NARROWEST, *values])
+    low = max(min([least, *ends]), least / _WIDEST)
+    high = min(max([most, *ends]), most * _WIDEST)
+    return low / 1.03, high * 1.03
+
+
+def round_numbers(low: float, high: float) -> list[float]:
+    """Return round numbers from `low` to `high`, which 1 lies between, far enough apart to be read in a panel.
+
+    Examples
+    --------
+    >>> round_numbers(0.75, 1.3), round_numbers(0.6, 2.2)
+    ([0.8, 0.9, 1.0, 1.1, 1.25], [0.8, 1.0, 1.25, 2.0])
+    """
+    apart = (high / low) ** (1 / _MOST_TICKS)
+    powers = range(math.floor(math.log10(low)), math.ceil(math.log10(high)) + 1)
+    known = {round(part * 10.0**power, 12) for power in powers for part in _ROUND}
+    ticks = [1.0]
+    for tick in sorted(known):
+        if ticks[-1] * apart <= tick <= high:
+            ticks.append(tick)
+    for tick in sorted(known, reverse=True):
+        if low <= tick <= ticks[0] / apart:
+            ticks.insert(0, tick)
+    return ticks
+
+
+def _positive(number: float) -> bool:
+    return math.isfinite(number) and number > 0
+
+
+def shown_ratios(ratio: RowRatio) -> tuple[BoundedFigure, ...]:
+    """Return the ratios of the statistics that a forest plot shows."""
+    return tuple(ratio.ratios[place] for place in SHOWN)
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,11 +527,16 @@ def report_page(outcome: TransferOutcome) -> str:
         *(table_part(table) for table in outcome.tables()),
     ]
     if outcome.figures.to_real:
-        picture = svg_of(_draw_ratios, outcome.figures, inches=(8.5, 1 + 0.28 * len(outcome.figures.to_real)))
+        methods = list(dict.fromkeys(one.row.method for one in outcome.figures.to_real))
+        lines = [
+            ForestLine(f"{one.row.method}, {one.row.training}", shown_ratios(one), methods.index(one.row.method))
+            for one in outcome.figures.to_real
+        ]
+        picture = forest_plot(lines, [HEADS[place] for place in SHOWN])
         parts.append(
             pages.figure(
                 picture,
-                f"Median error in parts of the same method's cross-validation on {test.name}, with 95 % intervals; the "
+                f"Errors in parts of the same method's cross-validation on {test.name}, with 95 % intervals; the "
                 "vertical line is that cross-validation. Left of it a row's images train better than the test set's "
                 "own do.",
             )
@@ -124,22 +553,6 @@ def _training_sets(outcome: TransferOutcome) -> str:
     named = {some.data: some.kind for some in reversed(outcome.plan.training)}
     listed = [f"{name} ({'not generated' if named[name] == 'other' else 'generated'})" for name in sorted(named)]
     return ", ".join(listed)
-
-
-def _draw_ratios(figure: Any, found: TransferFigures) -> None:
-    axes = figure.subplots()
-    methods = list(dict.fromkeys(one.row.method for one in found.to_real))
-    for place, one in enumerate(found.to_real):
-        ratio = one.ratios[1]
-        look = {"color": series_style(methods.index(one.row.method))["color"]}
-        axes.plot([ratio.low, ratio.high], [place, place], **look)
-        axes.plot([ratio.value], [place], "o", **look)
-    axes.axvline(1, color=FAINT, linewidth=1)
-    axes.set_yticks(range(len(found.to_real)), [f"{one.row.method}, {one.row.training}" for one in found.to_real])
-    axes.tick_params(axis="y", labelcolor=INK)
-    axes.invert_yaxis()
-    axes.set_xscale("log")
-    axes.set_xlabel("ratio of medians")
 
 
 def _provenance(outcome: TransferOutcome) -> dict[str, Any]:

@@ -1,19 +1,393 @@
-"""What a transfer is to be: data sets opened, compared and cut to what may be trained on, before the work begins."""
+"""What a transfer is to be: data sets opened, compared and cut to what may be trained on, before the work begins.
+
+A method that has seen a test image, or its scene, is not tested. Generated images are compared by their source
+pictures: with another generated set by the hash of the file, with real images by the name, since a print of a
+photograph that is a test image shows the test image's scene. Real images are compared by name and by their pixels. A
+name is compared without folder and ending, capitals and case being one.
+
+The naive baseline is, for each image of a generated data set, a scene of the same picture under the same light, as
+bright and as finely quantised, without a print, a camera or noise: codes become linear light by the sRGB curve, colours
+those of the camera by its matrix if one is given, and each channel is multiplied by the light. What a learned method
+gains by training on the generated image instead is what the table is worth. Several lights share the pixels of the
+counterpart by the masks of the generated image, and light falls off as it does there. What `generate --exposure` and
+`--iso` did to the generated image is not done to its counterpart. Its pictures are found again by name and hash.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import os
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
+from functools import cached_property
+from pathlib import Path, PurePosixPath
+from typing import Any, Final, Literal
+
+import numpy as np
+import numpy.typing as npt
 
 from evaluation.datasets.generated import GeneratedScene
-from evaluation.experiments.transfer.naive import naive_scenes
-from evaluation.experiments.transfer.overlap import Shared, trainable_images
-from evaluation.experiments.transfer.pictures import find_sources
 from evaluation.experiments.transfer.rows import TrainingSet
 from evaluation.scene import Scene, SceneSet
-from foundation.errors import InputError, first_of
+from foundation.colorimetry import decode_srgb
+from foundation.errors import FormatError, InputError, first_of
+from foundation.hashing import file_sha256, sha256_of
+from generator.dataset.reader import Dataset
+from generator.lights.lighting import parse_mixture
+from generator.pictures.picture import Preparation, open_picture
+from generator.pictures.sources import PictureFile, RandomScene, find_pictures
 from generator.rendering.matrices import ColourMatrix, camera_matrix, choose_matrix
+from generator.variation.variation import Falloff, described_gradient
+
+Shared = Literal["refuse", "leave-out", "keep"]
+"""What to do about training images that show what test images show."""
+
+
+@dataclass(frozen=True)
+class SharedImage:
+    """A training image that shows what a test image shows.
+
+    - `position`: its place in the training set, from 0.
+    - `name`: its name there, or that of its source picture.
+    - `test`: the test image's name, or that of its source picture.
+    - `by`: how it was found out: by "name" or by "content".
+    """
+
+    position: int
+    name: str
+    test: str
+    by: str
+
+
+def shared_images(training: SceneSet, test: SceneSet) -> tuple[SharedImage, ...]:
+    """Return the training images that test images share a picture or a scene with.
+
+    Pixels are read where both sets are real ones.
+    """
+    if _place(training) == _place(test):
+        raise InputError(
+            f"{test.place} is both training and test; errors of a data set that is tested on itself are found by "
+            "cross-validation: evaluate cv"
+        )
+    made = [isinstance(some.scenes[0], GeneratedScene) for some in (training, test)]
+    how = _How(names=not all(made), pixels=not any(made))
+    tests = {key: name for name, keys in _keys(test, how) for key in keys}
+    shared: list[SharedImage] = []
+    for position, (name, keys) in enumerate(_keys(training, how)):
+        found = next(((tests[key], key[0]) for key in keys if key in tests), None)
+        if found:
+            shared.append(SharedImage(position, name, *found))
+    return tuple(shared)
+
+
+def trainable_images(
+    training: SceneSet, test: SceneSet, shared: Shared, called: str = "the test set", *, copies: bool = True
+) -> tuple[tuple[Scene, ...], str]:
+    """Return the images of a set that may be trained on, and in words what it shares with the test, "" for nothing."""
+    common = shared_images(training, test)
+    if not common:
+        return training.scenes, ""
+    told = (
+        f"{len(common)} of {len(training.scenes)} images of {training.name} are also in {called}, by {common[0].by}: "
+        f"{first_of([one.name for one in common], 3)}"
+    )
+    if shared == "keep" and not copies and any(one.by == "content" for one in common):
+        raise InputError(f"{told}; what is tested must be unseen: --shared leave-out trains without them")
+    if shared == "refuse":
+        raise InputError(
+            f"{told}; --shared leave-out trains without them, --shared keep with them (what was tested is then no "
+            "longer unseen)"
+        )
+    dropped = {one.position for one in common} if shared == "leave-out" else set[int]()
+    return tuple(scene for place, scene in enumerate(training.scenes) if place not in dropped), told
+
+
+_Key = tuple[str, str]
+"""How an image is known, "name" or "content", and by what."""
+
+
+@dataclass(frozen=True)
+class _How:
+    """By what images are compared besides the hashes of source pictures, which are always at hand."""
+
+    names: bool
+    pixels: bool
+
+
+def _keys(scenes: SceneSet, how: _How) -> list[tuple[str, tuple[_Key, ...]]]:
+    """Return the name of each image, or of its source, and the keys that it is known by."""
+    sources: dict[int, dict[str, _Key]] = {}
+    listed: list[tuple[str, tuple[_Key, ...]]] = []
+    for scene in scenes.scenes:
+        if not isinstance(scene, GeneratedScene):
+            content = (("content", _pixels(scene)),) if how.pixels else ()
+            listed.append((scene.name, content + _name_key(scene.name, how)))
+            continue
+        known = sources.setdefault(id(scene.dataset), _sources(scene))
+        source = scene.entry.source
+        listed.append((source, (known[source], *_name_key(source, how))))
+    return listed
+
+
+def _name_key(name: str, how: _How) -> tuple[_Key, ...]:
+    return (("name", PurePosixPath(name).stem.lower()),) if how.names else ()
+
+
+def _sources(scene: GeneratedScene) -> dict[str, _Key]:
+    """Return by what the source pictures of a generated set are known: the hash of the file, or how it was drawn."""
+    seed = scene.dataset.description.seed
+    return {
+        record.name: ("content", record.sha256 or f"{record.name} of seed {seed}") for record in scene.dataset.sources
+    }
+
+
+def _pixels(scene: Scene) -> str:
+    image, _ = scene.read()
+    return sha256_of(np.ascontiguousarray(image, dtype=np.float32))
+
+
+def _place(scenes: SceneSet) -> str:
+    return scenes.place.rstrip("/") if "://" in scenes.place else str(Path(scenes.place).resolve())
+
+
+@dataclass(frozen=True)
+class FoundPicture:
+    """A source picture of a data set that was found again.
+
+    - `name`: its name in the data set.
+    - `path`: its file; None for a picture of random colours, which is made again.
+    - `height`, `width`: its size in the data set, px.
+    - `preparation`: how it was prepared.
+    """
+
+    name: str
+    path: Path | None
+    height: int
+    width: int
+    preparation: Preparation
+
+    def codes(self, crop: int = 0) -> npt.NDArray[np.uint8]:
+        """Return the sRGB codes (H, W, 3) uint8 that images of the data set were made of: those of one of its crops."""
+        if self.path is None:
+            number = int(self.name.rpartition("-")[2])
+            return RandomScene(number, self.width, self.height, self.preparation.seed).read().picture
+        reading = open_picture(self.path, self.preparation, self.name)
+        picture = reading.cuts[crop].picture if reading.cuts else reading.picture
+        if picture.shape[:2] != (self.height, self.width):
+            raise FormatError(
+                f"{self.path} comes to {picture.shape[1]}x{picture.shape[0]} px where images of it are "
+                f"{self.width}x{self.height}; use the release that made the data set"
+            )
+        return picture
+
+
+def find_sources(dataset: Dataset, place: Path | str) -> tuple[Mapping[str, FoundPicture], tuple[str, ...]]:
+    """Return the source pictures of a data set that a folder holds, by name, and the names of those that it lacks.
+
+    A picture is the one that is meant if its bytes have the hash that the data set records; a file of that name is
+    tried first, then files of other names. Pictures of random colours need no file.
+    """
+    preparation = preparation_of(dataset)
+    # A set of random colours needs no folder, but one that is named must be there.
+    files = _Files({file.name: Path(file.location) for file in _listed(place)})
+    found: dict[str, FoundPicture] = {}
+    missing: list[str] = []
+    for record in dataset.sources:
+        path = None if record.sha256 is None else files.find(record.name, record.sha256)
+        if path is None and record.sha256 is not None:
+            missing.append(record.name)
+        else:
+            found[record.name] = FoundPicture(record.name, path, record.height, record.width, preparation)
+    return found, tuple(missing)
+
+
+def preparation_of(dataset: Dataset) -> Preparation:
+    """Return how the pictures of a data set were prepared, by its description."""
+    options: Mapping[str, Any] = dataset.description.options
+    crop = options.get("crop")
+    return Preparation(
+        max_side=options.get("max_side"),
+        crop=(int(crop[0]), int(crop[1])) if crop else None,
+        cover=bool(options.get("cover", False)),
+        crop_at=options.get("crop_at", "centre"),
+        profiles=options.get("profiles", "honour"),
+        # Scenes that another data set had first are cut where its seed said.
+        seed=options.get("lights_of", {}).get("pictures_seed", dataset.description.seed),
+        crops=int(options.get("crops", 1)),
+    )
+
+
+def _listed(place: Path | str) -> Sequence[PictureFile]:
+    if "://" in str(place):
+        raise InputError(f"{place} is no folder of this machine; copy the pictures to one")
+    return find_pictures(place)
+
+
+class _Files:
+    """Pictures by name and by hash; a hash is taken when it is asked for, once."""
+
+    def __init__(self, paths: Mapping[str, Path]) -> None:
+        self._paths = paths
+        self._hashes: dict[str, str] = {}
+        self._by_hash: dict[str, Path] | None = None
+
+    def find(self, name: str, sha256: str) -> Path | None:
+        """Return the file of that hash, one of that name first; None if there is none."""
+        if name in self._paths and self._hash(name) == sha256:
+            return self._paths[name]
+        if self._by_hash is None:
+            self._by_hash = {self._hash(other): path for other, path in self._paths.items()}
+        return self._by_hash.get(sha256)
+
+    def _hash(self, name: str) -> str:
+        if name not in self._hashes:
+            path = self._paths[name]
+            try:
+                self._hashes[name] = file_sha256(path)
+            except OSError as error:
+                raise InputError(f"cannot read {path}: {os.strerror(error.errno or 0)}; name another folder") from error
+        return self._hashes[name]
+
+
+_LINEAR: Final = decode_srgb(np.arange(256) / 255)
+"""Linear light 0 … 1 of each code."""
+
+
+def naive_image(
+    codes: npt.NDArray[np.uint8],
+    light: npt.NDArray[np.floating],
+    saturation: float,
+    matrix: npt.NDArray[np.float64] | None = None,
+) -> npt.NDArray[np.uint16]:
+    """Return the naive raw image of a picture under a light.
+
+    `codes`: (H, W, 3) uint8, sRGB codes. `light`: (3,) or (H, W, 3) float, linear camera RGB that code 255, 255, 255 is
+    to have, in counts. `matrix`: (3, 3) float64, linear sRGB to camera RGB with rows of sum 1; None leaves colours as
+    they are. Returns (H, W, 3) uint16, rounded to whole counts, 0 … `saturation`.
+
+    Examples
+    --------
+    >>> codes = np.array([[[255, 255, 255], [188, 0, 255]]], np.uint8)
+    >>> naive_image(codes, np.array([1000.0, 2000.0, 500.0]), saturation=1800)
+    array([[[1000, 1800,  500],
+            [ 503,    0,  500]]], dtype=uint16)
+    """
+    linear = _LINEAR[codes]
+    if matrix is not None:
+        # A colour outside of what the camera tells apart would be darker than black.
+        linear = np.maximum(linear @ matrix.T, 0)
+    return np.clip(np.rint(linear * light), 0, np.floor(saturation)).astype(np.uint16)
+
+
+@dataclass(frozen=True, eq=False)
+class NaiveScene:
+    """The naive counterpart of an image of a generated data set; made when it is read.
+
+    - `generated`: the image whose counterpart it is.
+    - `matrix`: the camera's colour matrix, or None.
+    """
+
+    generated: GeneratedScene
+    picture: FoundPicture
+    matrix: ColourMatrix | None = None
+
+    @property
+    def name(self) -> str:
+        """The name of the generated image."""
+        return self.generated.name
+
+    @property
+    def truth(self) -> npt.NDArray[np.float64]:
+        """The light (3,) float64 of the generated image, linear camera RGB, r + g + b = 1."""
+        return self.generated.truth
+
+    @property
+    def saturation(self) -> float:
+        """The white level of the generated image, counts."""
+        return self.generated.saturation
+
+    @cached_property
+    def whites(self) -> npt.NDArray[np.float64]:
+        """The lights (K, 3) float64 of the image, counts of the table's white reference."""
+        entry, description = self.generated.entry, self.generated.dataset.description
+        levels = {light.illumination: sum(light.white) for light in description.lights}
+        whites: list[npt.NDArray[np.float64]] = []
+        for label, truth in zip(entry.lights, entry.truths, strict=True):
+            mixture = parse_mixture(label)
+            if not levels.keys() >= set(mixture.lights):
+                raise FormatError(
+                    f"{entry.image} is under light {label}, which its data set does not list; make it again"
+                )
+            level = sum(weight * levels[light] for light, weight in zip(mixture.lights, mixture.weights, strict=True))
+            whites.append(np.array(truth) * level)
+        end = [float(self._details.get(f"end_{channel}", 1)) for channel in "rgb"]
+        if len(set(entry.lights)) == 1 and len(whites) == 2 and len(set(end)) > 1:
+            # One light that falls off with a tint: the second is what is left of the first at the far end.
+            whites[1] = whites[0] * end
+        return np.array(whites)
+
+    @cached_property
+    def _falloff(self) -> Falloff | None:
+        """How the image's light falls off without a tint, which is not among its lights; None if it does not."""
+        description = self.generated.dataset.description
+        variation: Any = description.options.get("variation", {})
+        try:
+            record = variation.get("gradient")
+            gradient = None if record is None else described_gradient(record)
+        except (InputError, AttributeError) as error:
+            raise FormatError(
+                f"the data set of {self.name} describes its variation as {variation}: {error}; make it again"
+            ) from error
+        if gradient is None or gradient.colour > 0:
+            return None
+        return gradient.of_image(description.seed, int(self.generated.entry.image.partition(".")[0]))
+
+    @property
+    def _details(self) -> Mapping[str, str]:
+        """What options did to the generated image, by column of `images.csv`."""
+        return self.generated.dataset.details.get(self.generated.entry.image, {})
+
+    def read(self) -> tuple[npt.NDArray[np.uint16], None]:
+        """Return the image (H, W, 3) uint16, counts, and no mask."""
+        light = self.whites[0]
+        if len(self.whites) > 1:
+            light = self.generated.dataset.read_weights(self.generated.entry) @ self.whites
+        matrix = None if self.matrix is None else self.matrix.rows
+        codes = self.picture.codes(int(self._details.get("crop", 0)))
+        if self._falloff is not None:
+            far = self._falloff.weights(*codes.shape[:2])[..., 1:]
+            light = light * (1 - far * (1 - self._falloff.end[1]))
+        return naive_image(codes, light, self.saturation, matrix), None
+
+
+@dataclass(frozen=True, eq=False)
+class NaiveMixedScene(NaiveScene):
+    """The naive counterpart of an image that several lights fall on."""
+
+    @property
+    def lights(self) -> npt.NDArray[np.float64]:
+        """The lights (K, 3) float64, linear camera RGB, r + g + b = 1."""
+        return np.array(self.generated.entry.truths)
+
+    def read_weights(self) -> npt.NDArray[np.float32]:
+        """Return the share of each light in each pixel: (H, W, K) float32, 0 … 1, sum 1."""
+        return self.generated.dataset.read_weights(self.generated.entry)
+
+    def read_truth_map(self) -> npt.NDArray[np.float32]:
+        """Return the light of each pixel: (H, W, 3) float32, r + g + b = 1."""
+        return self.generated.dataset.read_ground_truth_map(self.generated.entry)
+
+
+def naive_scenes(
+    scenes: Sequence[GeneratedScene], found: Mapping[str, FoundPicture], matrix: ColourMatrix | None = None
+) -> tuple[NaiveScene, ...]:
+    """Return the naive counterparts of generated images, in their order; images without a picture must be left out.
+
+    `matrix`: the camera's colour matrix, or None.
+    """
+    return tuple(
+        (NaiveScene if len(scene.entry.lights) == 1 else NaiveMixedScene)(scene, found[scene.entry.source], matrix)
+        for scene in scenes
+    )
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,20 +9,20 @@ from typing import Final, Literal
 import numpy as np
 import numpy.typing as npt
 
-from evaluation.experiments.folds import require_apart
-from evaluation.experiments.running import evaluate
-from evaluation.experiments.transfer.material import (
+from evaluation.experiments.cross_validation import (
     AnyLearner,
     Material,
     Places,
+    cross_fit,
     estimate_on,
     fit_on,
     gather,
     result_of,
 )
+from evaluation.experiments.folds import require_apart
+from evaluation.experiments.running import evaluate
 from evaluation.learning.constant_light import ConstantLight
 from evaluation.methods.method import Method
-from evaluation.results.answers import SceneAnswer
 from evaluation.results.result import Result
 from evaluation.scene import Scene
 from foundation.errors import InputError
@@ -145,7 +145,8 @@ def transfer(
     trials = gather(test, learners, side, workers, on_scene)
     parts = [
         TransferRow(
-            *(learner.name, "cross-validation", generated, _least(folds)), _crossed(learner, number, trials, folds)
+            *(learner.name, "cross-validation", generated, _least(folds)),
+            tuple(cross_fit(learner, number, trials, each, seed) for seed, each in enumerate(folds)),
         )
         for number, learner in enumerate(learners)
     ]
@@ -179,20 +180,6 @@ def _used(drawn: Sequence[Places]) -> Places:
 def _least(folds: Sequence[npt.NDArray[np.int64]]) -> int:
     """Return the images of the smallest part that is trained on."""
     return min(len(each) - int(np.bincount(each).max()) for each in folds)
-
-
-def _crossed(
-    learner: AnyLearner, number: int, trials: Material, folds: Sequence[npt.NDArray[np.int64]]
-) -> tuple[Result, ...]:
-    results: list[Result] = []
-    for seed, each in enumerate(folds):
-        answers: dict[int, SceneAnswer] = {}
-        for fold in np.unique(each):
-            inside = np.flatnonzero(each == fold)
-            method = fit_on(learner, number, trials, np.flatnonzero(each != fold), seed)
-            answers |= zip(inside.tolist(), estimate_on(method, number, trials, inside), strict=True)
-        results.append(result_of(learner.name, [answers[place] for place in range(len(each))], trials.truths))
-    return tuple(results)
 
 
 def _tested(learner: AnyLearner, number: int, lessons: Material, places: Places, trials: Material, seed: int) -> Result:

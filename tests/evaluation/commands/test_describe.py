@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from html import unescape
 from pathlib import Path
 
 import numpy as np
@@ -55,7 +56,7 @@ def test_two_sets(dataset: Path, thumbnails: str, capsys: pytest.CaptureFixture[
     assert len(lines) > 15
     text = page.read_text()
     assert text.count("<svg") == 4
-    assert "figures of made are within 25% of real [1]&#x27;s" in text
+    assert "figures of made are within 25% of real [1]'s" in unescape(text)
     assert "Definitions" in text
     for line in lines:
         assert line.replace("'", "&#x27;") in text

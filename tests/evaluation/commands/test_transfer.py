@@ -13,7 +13,7 @@ from evaluation.cli import main
 from evaluation.datasets.generated import open_generated
 from evaluation.experiments.transfer import rows as transfer_rows
 from evaluation.metrics import summarise
-from evaluation.results.errors_file import read_errors
+from evaluation.results.files import read_errors
 from tests.evaluation.experiments.transfer.conftest import Maker, save_pictures, write_table
 from tests.json_of import json_of
 

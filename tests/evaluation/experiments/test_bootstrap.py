@@ -9,14 +9,15 @@ from scipy import stats
 
 from evaluation.experiments.bootstrap import (
     STATISTICS,
+    ErrorSample,
     independent,
     interval,
     intervals,
     paired,
     paired_difference,
     paired_ratio,
+    resamples,
 )
-from evaluation.experiments.resampling import ErrorSample, resamples
 from evaluation.metrics import summarise
 from foundation.errors import InputError
 
@@ -134,7 +135,7 @@ def test_ends_are_the_same_every_time_and_at_any_piece_size(monkeypatch: pytest.
     first = intervals(errors, seed=4)
     assert intervals(errors, seed=4) == first
     assert intervals(errors, seed=5) != first
-    monkeypatch.setattr("evaluation.experiments.resampling._AT_ONCE", 1)
+    monkeypatch.setattr("evaluation.experiments.bootstrap._AT_ONCE", 1)
     assert intervals(errors, seed=4) == first
 
 

@@ -17,7 +17,7 @@ from evaluation.experiments.comparing import (
     signed_rank,
     verdict,
 )
-from evaluation.results.errors_file import MethodErrors
+from evaluation.results.files import MethodErrors
 from foundation.errors import InputError
 
 

@@ -9,8 +9,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from evaluation.learning.log_chroma import LogChroma, fold
-from evaluation.learning.log_chroma_training import BINS, crossentropy, likelihood, moments
+from evaluation.learning.log_chroma import BINS, LogChroma, crossentropy, fold, likelihood, moments
 from evaluation.metrics import recovery_error
 from foundation.errors import InputError
 from tests.evaluation.learning.made_up_world import world

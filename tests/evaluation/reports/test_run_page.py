@@ -1,9 +1,13 @@
-"""The report of a run: figures and pictures show what the numbers say."""
+"""The report of a run: figures and pictures show what the numbers say.
+
+Figures show names as they are written.
+"""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Sequence
+from html import unescape
 from typing import Any
 
 import cv2
@@ -11,16 +15,39 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
+from evaluation.experiments.comparing import error_scatter
 from evaluation.experiments.run_folder import describe_run
 from evaluation.experiments.running import evaluate
 from evaluation.methods import GrayEdge
-from evaluation.reports import error_figures
-from evaluation.reports.developed import developed
-from evaluation.reports.error_figures import error_curves, error_planes
-from evaluation.reports.run_page import chosen_images, run_page
+from evaluation.reports import run_page as error_figures
+from evaluation.reports.run_page import chosen_images, developed, error_curves, error_planes, run_page
 from evaluation.results.result import Result
 from tests.evaluation.made_up import MixedWall, Wall, as_set, walls
 from tests.foundation.test_pages import checked
+
+NAMES = ["a $\\bad{x$ b", "$y_1$", "_mine"]
+
+
+def texts(svg: bytes) -> list[str]:
+    """Return the texts of an SVG in their order."""
+    return [unescape(re.sub("<[^>]+>", "", each)).strip() for each in re.findall(r"(?s)<text.*?</text>", svg.decode())]
+
+
+@pytest.mark.filterwarnings("error")
+def test_names_are_neither_mathematics_nor_left_out() -> None:
+    random = np.random.default_rng(0)
+    results = [
+        Result(
+            name, np.ones((5, 3)), {"recovery": random.random(5), "reproduction": random.random(5)}, np.zeros(5, bool)
+        )
+        for name in NAMES
+    ]
+    curves = texts(error_curves(results, "recovery"))
+    planes = texts(error_planes(results, random.random((5, 3)) + 0.1, "recovery"))
+    scatter = texts(error_scatter(random.random(5), random.random(5), ("$a$", "_b"), {0: "im $x_1$"}))
+    assert all(name in curves and name in planes for name in NAMES)
+    assert {"im $x_1$", "$a$: error, degrees", "_b: error, degrees"} <= set(scatter)
+
 
 METHODS = [GrayEdge("Gray-world", 0, 1, 0, 0), GrayEdge("White <Patch>", 0, np.inf, 0, 0)]
 

@@ -1,12 +1,122 @@
-"""Tables as values and as CSV, which is read back by Python's own reader."""
+"""Tables as values and as CSV, which is read back by Python's own reader.
+
+Tables of results: one light and several are never mixed silently, and images without a light are named.
+"""
 
 from __future__ import annotations
 
 import csv
+from typing import Any
 
+import numpy as np
 import pytest
 
-from evaluation.results.tables import Table, table_to_csv
+from evaluation.experiments.running import evaluate
+from evaluation.metrics import recovery_error, summarise
+from evaluation.results.result import Subject
+from evaluation.results.tables import Table, lights_tables, statistics_rows, summary_table, table_to_csv
+from evaluation.scene import MixedScene, Scene
+from tests.evaluation.made_up import MixedWall, walls
+
+LIGHTS = np.array([[2.0, 1, 1], [1, 1, 1]])
+
+
+class White:
+    """Says white, and nothing at all on images that are named."""
+
+    name = "White"
+
+    def __init__(self, *values: object) -> None:
+        self.values = iter(values)
+
+    def estimate(self, image: Any, saturation: float | None = None, mask: Any = None) -> Any:
+        return next(self.values, (1, 1, 1))
+
+
+def subject_of(scenes: tuple[Scene, ...]) -> Subject:
+    mixed = tuple(isinstance(scene, MixedScene) for scene in scenes)
+    return Subject("Walls", tuple(scene.name for scene in scenes), mixed)
+
+
+def test_images_under_one_light_need_no_second_table() -> None:
+    scenes = walls(4)
+    results = evaluate(scenes, [White()])
+    table = summary_table(subject_of(scenes), results, "recovery")
+    assert table.title == "Walls: recovery angular error of 4 images, degrees"
+    assert table.rows == (("White", *results[0].summary("recovery").as_tuple()),)
+    assert table.notes == ()
+    assert lights_tables(subject_of(scenes), results, "recovery") == ()
+    further = summary_table(subject_of(scenes), results, "recovery", further=True)
+    summary = results[0].summary("recovery")
+    assert further.rows[0][-3:] == (summary.p95, summary.maximum, 100 * summary.below3)
+
+
+def test_several_lights_are_said_and_told_apart() -> None:
+    scenes: tuple[Scene, ...] = (*walls(3), MixedWall("mixed", LIGHTS), MixedWall("other", LIGHTS))
+    results = evaluate(scenes, [White()])
+    subject = subject_of(scenes)
+    title = summary_table(subject, results, "recovery").title
+    assert title.startswith("Walls: recovery angular error of 5 images (2 of them under several lights, held to")
+    several, one = lights_tables(subject, results, "recovery")
+    off = float(recovery_error(*LIGHTS))
+    row = dict(zip(several.columns[1::2], several.rows[0][1::2], strict=True))
+    assert row["MAE_illum"] == pytest.approx(off / 4, abs=1e-4)
+    assert row["By region"] == pytest.approx(off / 2, abs=1e-4)
+    assert row["Mean light"] == pytest.approx(float(recovery_error((1, 1, 1), scenes[3].truth)), abs=1e-4)
+    alone = recovery_error((1, 1, 1), np.stack([scene.truth for scene in scenes[:3]]))
+    assert one.rows[0][1:] == pytest.approx(summarise(alone).as_tuple())
+    everything = summary_table(subject_of(scenes[3:]), evaluate(scenes[3:], [White()]), "recovery").title
+    assert (
+        everything
+        == "Walls: recovery angular error of 2 images under several lights, held to the mean of these, degrees"
+    )
+
+
+def test_the_long_table_says_of_which_images_a_row_is() -> None:
+    scenes: tuple[Scene, ...] = (*walls(3), MixedWall("mixed", LIGHTS))
+    table = statistics_rows(subject_of(scenes), evaluate(scenes, [White((1, 1, 1), None)]))
+    counts = {(row[1], row[2]): (row[3], row[-1]) for row in table.rows}
+    assert counts == {
+        ("recovery", "all"): (4, 1),
+        ("reproduction", "all"): (4, 1),
+        ("recovery", "one"): (3, 1),
+        ("reproduction", "one"): (3, 1),
+        ("recovery", "several"): (1, 0),
+        ("reproduction", "several"): (1, 0),
+        ("pixel_recovery", "several"): (1, 0),
+        ("pixel_reproduction", "several"): (1, 0),
+        ("pixel_rgb", "several"): (1, 0),
+        ("region_recovery", "several"): (2, 0),
+        ("region_reproduction", "several"): (2, 0),
+    }
+
+
+def test_an_image_of_which_nothing_is_judged_is_left_out_and_counted(monkeypatch: pytest.MonkeyPatch) -> None:
+    scenes = (MixedWall("seen", LIGHTS), MixedWall("unseen", LIGHTS))
+    read = MixedWall.read
+
+    def covered(scene: MixedWall) -> Any:
+        image, _ = read(scene)
+        return image, np.full(image.shape[:2], scene.name == "unseen")
+
+    monkeypatch.setattr(MixedWall, "read", covered)
+    results = evaluate(scenes, [White()])
+    (several,) = lights_tables(subject_of(scenes), results, "recovery")
+    assert several.rows[0][1] == pytest.approx(float(recovery_error(*LIGHTS)) / 4, abs=1e-4)
+    assert any(note.startswith("1 images have no pixel whose light is known") for note in several.notes)
+    row = next(row for row in statistics_rows(subject_of(scenes), results).rows if row[1] == "pixel_rgb")
+    assert row[3] == 1
+
+
+def test_causes_are_named_few_at_a_time() -> None:
+    scenes = walls(6)
+    results = evaluate(scenes, [White(None, (0, 0, 0), (1, 1, 1), None, (1, np.nan, 1))])
+    (note,) = summary_table(subject_of(scenes), results, "recovery").notes
+    assert note == (
+        "White: no light for 4 of 6 images (wall 0.png returned None, wall 1.png returned 0 0 0, wall 3.png returned "
+        "None …); their light was taken to be grey"
+    )
+
 
 TABLE = Table(
     'Cube+, "all"',

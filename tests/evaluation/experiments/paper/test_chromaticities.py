@@ -5,8 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from evaluation.experiments.paper.chromaticities import chromaticity_rows, coverage_table, rb_of, table_lights
-from evaluation.experiments.paper.drawing import chromaticities_figure, standalone
+from evaluation.experiments.paper.reporting import (
+    chromaticities_figure,
+    chromaticity_rows,
+    coverage_table,
+    rb_of,
+    standalone,
+    table_lights,
+)
 from tests.evaluation.experiments.paper.conftest import LIGHTS, TableMaker
 
 

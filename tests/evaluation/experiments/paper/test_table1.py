@@ -1,4 +1,9 @@
-"""Plain methods on generated data sets: the eight of them, and worlds in which White-Patch is right or wrong."""
+"""Plain methods on generated data sets: the eight of them, and worlds in which White-Patch is right or wrong.
+
+Hot photosites in a table.
+
+What a table holds: its noise, and how grey its print is.
+"""
 
 from __future__ import annotations
 
@@ -9,23 +14,108 @@ import pytest
 
 from evaluation.experiments.paper.published import TABLE1
 from evaluation.experiments.paper.table1 import (
+    HotPhotosites,
+    HotScene,
     Setting,
     block_table,
+    hot_photosites,
+    hot_rows,
+    hot_table,
     joint_table,
+    noise_table,
+    print_colours,
+    print_table,
     sensor_of,
     settings,
     size_dependence,
     size_table,
     table1,
+    table_noise,
 )
 from evaluation.experiments.running import evaluate
 from evaluation.methods.standard import standard_methods
 from foundation.errors import InputError
 from generator.pictures.sources import SourcePicture, random_scenes
-from tests.evaluation.experiments.paper.conftest import TableMaker
+from tests.evaluation.experiments.paper.conftest import LIGHTS, TableMaker
+
+HOT_PICTURES = random_scenes(4, 24, 16, seed=8)
+TRUTHS = np.array([[2.0, 3.1, 1.0], [0.3, 0.7, 1.0]])
+
+
+def test_values_are_raised_and_cut(make_table: TableMaker) -> None:
+    del make_table
+    samples = np.array([[[10, 20, 30], [40, 50, 60]]], np.uint16)
+    hot = HotPhotosites(np.array([0, 5]), np.array([7.4, 1e5]))
+    np.testing.assert_array_equal(hot.raise_in(samples, 100), [[[17, 20, 30], [40, 50, 99]]])
+    np.testing.assert_array_equal(samples, [[[10, 20, 30], [40, 50, 60]]])
+
+
+def test_their_number_and_places(make_table: TableMaker) -> None:
+    lut = make_table("Test")
+    values = 512 * 25 * 3
+    hot = hot_photosites(lut, 1000, seed=4)
+    assert len(hot.places) == len(set(hot.places.tolist())) == round(values / 1000)
+    assert hot.places.max() < values
+    assert hot.signals.max() < 9000
+    np.testing.assert_array_equal(hot.places, hot_photosites(lut, 1000, seed=4).places)
+    assert set(hot.places.tolist()) != set(hot_photosites(lut, 1000, seed=5).places.tolist())
+    # More of them are the same ones and others.
+    assert set(hot.places.tolist()) < set(hot_photosites(lut, 2000, seed=4).places.tolist())
+
+
+def test_without_any_a_scene_is_itself(make_table: TableMaker) -> None:
+    lut = make_table("Test", noise=0.1)
+    (part, *_) = settings([lut], HOT_PICTURES, TRUTHS, side=40)
+    none = hot_photosites(lut, 0)
+    for scene in part.scenes:
+        np.testing.assert_array_equal(HotScene(scene, none).read()[0], scene.read()[0])
+    (row, *_) = hot_rows([part], [0])
+    (block,) = table1([part])
+    np.testing.assert_array_equal(row.result.errors["recovery"], block.results[0].errors["recovery"])
+
+
+def test_a_few_spoil_the_maximum(make_table: TableMaker) -> None:
+    part = settings([make_table("Canon EOS 550D", noise=0.02)], HOT_PICTURES, TRUTHS, side=96)[2]
+    rows = hot_rows([part], [0, 200])
+    errors = [row.result.summary("reproduction").median for row in rows]
+    assert errors[0] < 3
+    assert errors[1] > 3 * errors[0]
+    table = hot_table(rows, "reproduction")
+    assert table.rows[1][:4] == (
+        "Random scenes, 550D sensor, Given illuminations",
+        200,
+        8,
+        rows[1].result.summary("reproduction").mean,
+    )
+
+
+@pytest.mark.parametrize("share", [-1, 2e6])
+def test_a_share_of_all(make_table: TableMaker, share: float) -> None:
+    with pytest.raises(InputError, match="expected 0 to a million"):
+        hot_photosites(make_table("Test"), share)
+
+
+def test_noise_of_the_print_s_white(make_table: TableMaker) -> None:
+    noise = table_noise(make_table("Test", noise=0.05, samples=400))
+    # Of 400 samples the largest normal deviate is about three standard deviations up.
+    assert noise.spread == pytest.approx([0.05] * 3, rel=0.15)
+    assert noise.largest == pytest.approx([0.15] * 3, rel=0.4)
+    assert noise.level == pytest.approx(float(np.median(LIGHTS.max(axis=1))) / 9000, rel=0.02)
+    assert noise_table([noise]).rows[0][:2] == ("Test", len(LIGHTS))
+
+
+def test_a_print_that_reflects_as_its_code_is_grey(make_table: TableMaker) -> None:
+    colours = print_colours(make_table("Test"))
+    # Of the black bodies of 3002 and 3003 K the second is nearer to daylight. The codes are 0, 1/7 … 1.
+    assert colours.light == 3
+    assert colours.mean == pytest.approx([0.5] * 3, abs=1e-3)
+    assert colours.rms == pytest.approx([float(np.sqrt(np.mean((np.arange(8) / 7) ** 2)))] * 3, abs=1e-3)
+    table = print_table([colours])
+    assert [row[2] for row in table.rows] == ["mean", "root mean square"]
+    assert table.rows[0][6] == pytest.approx(0, abs=0.1)
+
 
 PICTURES = random_scenes(5, 24, 16, seed=8)
-TRUTHS = np.array([[2.0, 3.1, 1.0], [0.3, 0.7, 1.0]])
 SIX_D, FIVE_FIFTY_D = "Canon EOS 6D Mark II", "Canon EOS 550D"
 
 

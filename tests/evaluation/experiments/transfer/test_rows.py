@@ -11,7 +11,7 @@ import pytest
 
 from evaluation.experiments.cross_validation import cross_validate
 from evaluation.experiments.folds import draw_folds
-from evaluation.experiments.transfer.figures import TransferFigures, figures_of
+from evaluation.experiments.transfer.outcome import TransferFigures, figures_of
 from evaluation.experiments.transfer.rows import TrainingSet, TransferRow, draw_images, transfer
 from evaluation.learning.constant_light import ConstantLight
 from evaluation.methods.gray_edge import GrayEdge

@@ -50,13 +50,8 @@ def world(
 class MeanColour(FeatureLearner):
     """A straight map from the chromaticities of the mean colour to those of the light, by least squares."""
 
-    @property
-    def key(self) -> str:
-        return "mean-colour"
-
-    @property
-    def name(self) -> str:
-        return "Mean colour"
+    key = "mean-colour"
+    title = "Mean colour"
 
     def features(
         self, image: Image, saturation: float | None = None, mask: npt.NDArray[np.bool_] | None = None

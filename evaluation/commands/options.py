@@ -1,0 +1,323 @@
+"""What the commands share: options that several have, the data set that they read, and the methods that they name.
+
+A command has one parameter `reading: DataReading`, and `@with_data_options` puts the options in its place::
+
+    @with_data_options
+    def run(dataset: Annotated[str, typer.Argument()], *, reading: DataReading) -> None:
+        data = reading.open(dataset)
+
+The order in which a text is tried as a method: a file that ends in .npz is a model; a name of `standard_methods` or
+`standard_learners`; then module:Class or path/file.py:Class.
+"""
+
+from __future__ import annotations
+
+import functools
+import inspect
+import itertools
+from collections.abc import Callable, Generator, Iterable, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal, cast, get_type_hints
+
+import typer
+
+if TYPE_CHECKING:
+    from evaluation.datasets.options import DataOptions
+    from evaluation.methods.method import Learner, Method
+    from evaluation.results.files import GivenEstimates
+    from evaluation.scene import SceneSet
+
+
+def option(metavar: str, text: str, *names: str, **limits: Any) -> Any:
+    """Return a typer option whose help says its default, where there is one."""
+    return typer.Option(*names, metavar=metavar, help=text, show_default=False, **limits)
+
+
+def argument(metavar: str, text: str) -> Any:
+    """Return a typer argument."""
+    return typer.Argument(metavar=metavar, help=text, show_default=False)
+
+
+def thread_option(text: str = "") -> Any:
+    """Return the option --workers; `text` is what else its help says of the threads."""
+    return option("N", f"Threads{text}. \\[default: one a processor]", min=1)
+
+
+Data = Annotated[str, argument("DATA", "Folder or file of the data set, or its URL.")]
+
+AngularError = Literal["reproduction", "recovery"]
+
+PrintedError = Annotated[
+    AngularError, typer.Option(help="Angular error that is printed, and drawn in the report; files have both.")
+]
+
+PrintedStatistics = Annotated[
+    Literal["paper", "all"],
+    typer.Option(help="Print the paper's six statistics, or also 95th percentile, maximum and share below 3°."),
+]
+
+
+@contextmanager
+def image_steps(count: int) -> Generator[Callable[[], None]]:
+    """Show how many of `count` images are done, and yield what moves that on by one; Ctrl-C ends the block orderly."""
+    from foundation.console import orderly_end, progress
+
+    with orderly_end(), progress("images") as advance:
+        steps = itertools.count(1)
+        yield lambda: advance(next(steps), count)
+
+
+_PANEL = "Reading the data"
+
+
+@dataclass(frozen=True)
+class DataReading:
+    """How the data sets that a command is given are read; see `evaluation.datasets.options.DataOptions`.
+
+    - `layout`: A name of `evaluation.datasets.LAYOUTS`; None takes the one that a place looks like.
+    - `camera`, `subset`, `truth`: of a data set that has several.
+    - `black`, `saturation`: levels that replace those of the layout, in the units of the files.
+    - `partial`: whether missing images are left out and counted.
+    """
+
+    layout: str | None = None
+    camera: str | None = None
+    subset: str | None = None
+    truth: str | None = None
+    black: float | None = None
+    saturation: float | None = None
+    partial: bool = False
+
+    def open(self, place: str) -> SceneSet:
+        """Return the data set at a place; see `evaluation.datasets.opening.open_scenes`."""
+        from evaluation.datasets import open_scenes
+
+        return open_scenes(place, self.layout, self.options)
+
+    @property
+    def options(self) -> DataOptions:
+        """The options without the layout."""
+        from evaluation.datasets.options import DataOptions
+
+        return DataOptions(self.camera, self.subset, self.truth, self.black, self.saturation, self.partial)
+
+
+def _option(metavar: str | None, text: str, *names: str) -> Any:
+    return typer.Option(*names, metavar=metavar, help=text, show_default=False, rich_help_panel=_PANEL)
+
+
+_OPTIONS: dict[str, Any] = {
+    "layout": Annotated[
+        str | None,
+        _option(
+            "NAME",
+            "Layout of the data set: generated, thumbnails, cube-plus, cube++, simple-cube++, nus8, gehler-shi, "
+            "intel-tau, lsmi, ffcc or folder. \\[default: what it looks like]",
+            "--layout",
+        ),
+    ],
+    "camera": Annotated[
+        str | None,
+        _option("NAME", "One camera of nus8, gehler-shi (1D, 5D), intel-tau or lsmi. \\[default: all]", "--camera"),
+    ],
+    "subset": Annotated[
+        str | None,
+        _option(
+            "NAME",
+            "Part of the data set: train or test of simple-cube++; lab_printouts … of intel-tau; train, val, test, "
+            "single, mixed or test-mixed … of lsmi. \\[default: all]",
+            "--subset",
+        ),
+    ],
+    "truth": Annotated[
+        str | None,
+        _option(
+            "NAME",
+            "Ground truth where there are several: mean, left, right, left-white or right-white of cube++; own, left "
+            "or right of cube-plus; recommended or shi of gehler-shi. \\[default: the first of these]",
+            "--truth",
+        ),
+    ],
+    "black": Annotated[
+        float | None, _option("LEVEL", "Black level, in the units of the files. \\[default: the layout's]", "--black")
+    ],
+    "saturation": Annotated[
+        float | None,
+        _option(
+            "LEVEL",
+            "Value from which a pixel is clipped, in the units of the files. \\[default: the layout's]",
+            "--saturation",
+        ),
+    ],
+    "partial": Annotated[
+        bool, _option(None, "Take what is there of a copy that lacks images, and say how many it lacks.", "--partial")
+    ],
+}
+
+
+def with_data_options(command: Callable[..., None]) -> Callable[..., None]:
+    """Return a command whose parameter `reading` is replaced by the options of `DataReading`, for typer."""
+    signature = inspect.signature(command)
+    if "reading" not in signature.parameters:
+        raise ValueError(f"{command.__name__} has no parameter 'reading' to put the options in the place of")
+    fields = DataReading.__dataclass_fields__
+    options = [
+        inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=fields[name].default, annotation=kind)
+        for name, kind in _OPTIONS.items()
+    ]
+    hints = get_type_hints(command, localns={"SceneSet": Any}, include_extras=True)
+    others = [
+        parameter.replace(annotation=hints.get(name, Any))
+        for name, parameter in signature.parameters.items()
+        if name != "reading"
+    ]
+    first = [parameter for parameter in others if parameter.kind is not inspect.Parameter.KEYWORD_ONLY]
+    last = [parameter for parameter in others if parameter.kind is inspect.Parameter.KEYWORD_ONLY]
+
+    @functools.wraps(command)
+    def with_options(*arguments: Any, **given: Any) -> None:
+        reading = DataReading(**{name: given.pop(name) for name in _OPTIONS if name in given})
+        command(*arguments, **given, reading=reading)
+
+    with_options.__signature__ = signature.replace(parameters=[*first, *last, *options])  # type: ignore[attr-defined]
+    with_options.__annotations__ = {
+        **{parameter.name: parameter.annotation for parameter in (*first, *last, *options)},
+        "return": None,
+    }
+    return with_options
+
+
+METHOD_HELP = (
+    "Method: a name of --methods, also with parameters (shades-of-gray:p=4, gray-edge-1:p=4:sigma=2), a model file "
+    "(MODEL.npz of evaluate train), module:Class, or file.py:Class for a class of your own. Give it more than once for "
+    "several."
+)
+"""Help of the option --method."""
+
+
+def choose_methods(texts: Iterable[str]) -> list[Method]:
+    """Return the methods that texts name, each once, in their order.
+
+    `standard` are the seven of `STANDARD`, `all` every one of `standard_methods`.
+
+    Examples
+    --------
+    >>> [method.name for method in choose_methods(["gray-world", "white-patch", "gray-world"])]
+    ['Gray-world', 'White-Patch']
+    """
+    from evaluation.methods.standard import STANDARD, standard_methods
+
+    groups = {"standard": STANDARD, "all": tuple(standard_methods())}
+    wanted: list[str] = []
+    for text in texts:
+        wanted += groups.get(text.strip().lower(), (text.strip(),))
+    return [_method(text) for text in dict.fromkeys(wanted)]
+
+
+def choose_learners(texts: Iterable[str]) -> list[Learner]:
+    """Return the learners that texts name, each once, in their order; `all` are those of `standard_learners`.
+
+    Examples
+    --------
+    >>> [learner.name for learner in choose_learners(["regression-trees"])]
+    ['Regression trees (simple features)']
+    """
+    from evaluation.learning.standard import standard_learners
+
+    wanted: list[str] = []
+    for text in texts:
+        wanted += standard_learners() if text.strip().lower() == "all" else [text.strip()]
+    return [_learner(text) for text in dict.fromkeys(wanted)]
+
+
+def choose_beside_constant(text: str) -> tuple[list[Learner], list[str]]:
+    """Return the learners that a text names between commas, and why some of `all` are left out.
+
+    The constant light is not among them: it stands beside all others unasked.
+    """
+    from evaluation.learning.constant_light import ConstantLight
+    from evaluation.learning.feature_learner import what_is_missing
+
+    texts = [part.strip() for part in text.split(",")]
+    explicit = {learner.name for learner in choose_learners(part for part in texts if part.lower() != "all")}
+    named = [learner for learner in choose_learners(texts) if learner.name != ConstantLight().name]
+    missing = {learner.name: what_is_missing(learner) for learner in named if learner.name not in explicit}
+    left_out = [f"{name} is left out: {reason}" for name, reason in missing.items() if reason]
+    return [learner for learner in named if not missing.get(learner.name)], left_out
+
+
+def require_order(command: str, method: str, data: str) -> None:
+    """Refuse METHOD and DATA of `evaluate cv` and `evaluate train` in the wrong order.
+
+    Examples
+    --------
+    >>> require_order("cv", ".", "regression-trees")
+    Traceback (most recent call last):
+        ...
+    foundation.errors.InputError: . is a data set and regression-trees a method: the method comes first: evaluate cv \
+regression-trees .
+    """
+    from evaluation.learning.standard import standard_learners
+    from foundation.errors import InputError
+
+    names = {*standard_learners(), "all"}
+    is_method = all(part.strip() in names or ".py:" in part for part in data.split(","))
+    if is_method and not Path(data).exists() and (Path(method).exists() or "://" in method):
+        raise InputError(
+            f"{method} is a data set and {data} a method: the method comes first: evaluate {command} {data} {method}"
+        )
+
+
+def choose_estimates(texts: Sequence[str], images: Sequence[str]) -> list[GivenEstimates]:
+    """Return the files of estimates that texts name, as FILE.csv or NAME=FILE.csv, for the images of a data set."""
+    from evaluation.results.files import read_estimates
+
+    found: list[GivenEstimates] = []
+    for text in texts:
+        name, equals, path = text.partition("=")
+        named = bool(equals) and bool(name) and not Path(text).exists()
+        found.append(read_estimates(Path(path if named else text), images, name if named else None))
+    return found
+
+
+def _method(text: str) -> Method:
+    from evaluation.learning.standard import standard_learners
+    from foundation.errors import InputError
+
+    if text in standard_learners():
+        raise InputError(
+            f"{text} learns from images first: evaluate train {text} DATA --out MODEL.npz makes a method of it, and "
+            f"evaluate cv {text} DATA cross-validates it"
+        )
+    found = _found(text)
+    if not callable(getattr(found, "estimate", None)):
+        raise InputError(f"{text} has no estimate(image, saturation, mask): it learns first: give it to evaluate cv")
+    return cast("Method", found)
+
+
+def _learner(text: str) -> Learner:
+    from evaluation.learning.standard import standard_learners
+    from evaluation.methods.standard import standard_methods
+    from foundation.errors import InputError
+
+    known = standard_learners()
+    if text in known:
+        return known[text]
+    expected = f"expected {', '.join(known)}, module:Class or file.py:Class"
+    if text in standard_methods() or text.endswith(".npz"):
+        raise InputError(f"{text} has nothing to learn; {expected}")
+    if ":" not in text:
+        raise InputError(f"{text!r} is no method that learns; {expected}")
+    found = _found(text)
+    if not callable(getattr(found, "fit", None)):
+        raise InputError(f"{text} has no fit(scenes, seed); evaluate run takes methods that need not learn")
+    return cast("Learner", found)
+
+
+def _found(text: str) -> Method | Learner:
+    from evaluation.learning.model_files import load_model
+    from evaluation.methods.naming import find_method
+
+    return load_model(Path(text)) if text.endswith(".npz") else find_method(text)

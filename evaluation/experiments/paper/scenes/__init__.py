@@ -1,1 +1,0 @@
-"""The scenes of the experiments: pictures from raw images, images generated in memory, ground truths of real data."""

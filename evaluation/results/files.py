@@ -1,0 +1,307 @@
+"""The files of a results folder that other programs read, and their estimates: `errors.csv`, `run.json`.
+
+A line of `errors.csv` has the columns `image`, `method`, the estimate, the truth (`truth_r`, `truth_g`, `truth_b`),
+`recovery` and `reproduction` in degrees, and `guessed`. Columns are found by their names, so others may stand between
+them. A file without the truth's columns, or without `guessed`, is read too: its truths are not known, and no image is
+guessed.
+
+Estimates that another program has made are `image,r,g,b`, one line an image of the data set, with a head or without;
+commas, semicolons or tabs separate. An image is named as the data set names it, or without its extension. Every image
+of the data set has one line and no other image has any: a file of another part of the data set is refused rather than
+judged on what both happen to have.
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from evaluation.metrics import ErrorKind
+from evaluation.results.result import Result, csv_text
+from evaluation.scene import Scene
+from foundation.errors import FormatError, InputError, counted, first_of
+from foundation.hashing import sha256_of
+from generator.named_numbers import is_number
+
+ERRORS_FILE = "errors.csv"
+"""Its name in a results folder."""
+
+_KINDS: tuple[ErrorKind, ...] = ("recovery", "reproduction")
+_TRUTH = ("truth_r", "truth_g", "truth_b")
+_ESTIMATE = ("r", "g", "b")
+_GUESSED = {"": False, "0": False, "no": False, "false": False, "1": True, "yes": True, "true": True}
+
+
+@dataclass(frozen=True, eq=False)
+class MethodErrors:
+    """The errors of one method on the images of a data set.
+
+    - `method`: the method's name.
+    - `images`: the images' names, N of them, each once.
+    - `truths`: (N, 3) float64, linear camera RGB of any length; None where the file does not hold them.
+    - `errors`: kind of error to (N,) float64, degrees.
+    - `guessed`: (N,) bool, True where no pixel was usable and the estimate is therefore grey.
+    - `estimates`: (N, 3) float64, linear camera RGB of any length; None where the file does not hold them all.
+    """
+
+    method: str
+    images: tuple[str, ...]
+    truths: npt.NDArray[np.float64] | None
+    errors: Mapping[ErrorKind, npt.NDArray[np.float64]]
+    guessed: npt.NDArray[np.bool_]
+    estimates: npt.NDArray[np.float64] | None = None
+
+
+def read_errors(place: Path | str) -> dict[str, MethodErrors]:
+    """Return the errors of every method of a results folder, by the methods' names and in the file's order."""
+    path = Path(place)
+    if path.is_dir():
+        path = path / ERRORS_FILE
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except OSError as error:
+        raise InputError(
+            f"cannot read {path}: {error.strerror or error}; name a results folder of evaluate run, or the "
+            f"{ERRORS_FILE} in it"
+        ) from error
+    except UnicodeDecodeError as error:
+        raise FormatError(f"{path} is no CSV text in UTF-8: {error}") from error
+    rows = csv.DictReader(text.splitlines())
+    columns = rows.fieldnames or []
+    missing = [name for name in ("image", "method", *_KINDS) if name not in columns]
+    if missing:
+        raise FormatError(
+            f"{path} has the columns {', '.join(columns) or 'of an empty file'}; expected {', '.join(missing)} too, as "
+            "evaluate run writes them"
+        )
+    known = all(name in columns for name in _TRUTH)
+    found: dict[str, dict[str, tuple[list[float], bool, list[float]]]] = {}
+    for row in rows:
+        where = f"{path}, line {rows.line_num}"
+        wanted = (*_KINDS, *(_TRUTH if known else ()))
+        numbers = [_number(row[name], name, where) for name in wanted]
+        if min(numbers) < 0 or (known and not any(numbers[2:])):
+            raise FormatError(f"{where}: {row['image']} has {dict(zip(wanted, numbers, strict=True))}; none is below 0")
+        guessed = (row.get("guessed") or "").strip().lower()
+        if guessed not in _GUESSED:
+            raise FormatError(f"{where}: guessed is {guessed!r}; expected 0 or 1")
+        images = found.setdefault(row["method"] or "", {})
+        if row["image"] in images:
+            raise FormatError(f"{where}: {row['method']} on {row['image']} stands there a second time; remove one")
+        images[row["image"]] = numbers, _GUESSED[guessed], [_estimate(row.get(name)) for name in _ESTIMATE]
+    if not found:
+        raise FormatError(f"{path} has no line of errors below its head; run the methods again")
+    return {method: _errors_of(method, images, known) for method, images in found.items()}
+
+
+def _errors_of(method: str, images: Mapping[str, tuple[list[float], bool, list[float]]], known: bool) -> MethodErrors:
+    numbers = np.array([line for line, _, _ in images.values()])
+    estimates = np.array([estimate for _, _, estimate in images.values()])
+    return MethodErrors(
+        method=method,
+        images=tuple(images),
+        truths=numbers[:, 2:] if known else None,
+        errors={kind: numbers[:, place] for place, kind in enumerate(_KINDS)},
+        guessed=np.array([guessed for _, guessed, _ in images.values()]),
+        estimates=estimates if np.isfinite(estimates).all() else None,
+    )
+
+
+def _estimate(text: str | None) -> float:
+    """Return a part of an estimate; NaN where there is none: nothing here is computed from it."""
+    try:
+        return float(text or "")
+    except ValueError:
+        return math.nan
+
+
+def _number(text: str | None, name: str, where: str) -> float:
+    try:
+        value = float(text or "")
+    except ValueError:
+        value = math.nan
+    if not math.isfinite(value):
+        raise FormatError(f"{where}: {name} is {text!r}, expected a finite number")
+    return value
+
+
+RUN_FORMAT = "crop.run"
+"""What `run.json` says of itself."""
+
+
+def errors_csv(images: Sequence[str], truths: npt.NDArray[np.float64], results: Sequence[Result]) -> str:
+    """Return every estimate, truth and error as CSV text: `errors.csv`.
+
+    The columns are image, method, r, g, b, truth_r, truth_g, truth_b, recovery, reproduction, guessed, cause. Lights
+    have the sum 1, errors are degrees; `guessed` is 1 where the method gave no light and grey stands in for it, `cause`
+    says why.
+
+    `truths`: (N, 3) float64, camera RGB of any length.
+    """
+    shares = truths / truths.sum(axis=1, keepdims=True)
+    given = [result.estimates / result.estimates.sum(axis=1, keepdims=True) for result in results]
+    rows: list[tuple[object, ...]] = [("image", "method", *_ESTIMATE, *_TRUTH, *_KINDS, "guessed", "cause")]
+    for place, image in enumerate(images):
+        for result, estimates in zip(results, given, strict=True):
+            numbers = (*estimates[place], *shares[place])
+            errors = (result.errors[kind][place] for kind in _KINDS)
+            cause = (result.causes or {}).get(place, "")
+            rows.append(
+                (
+                    *(image, result.method),
+                    *(f"{part:.9f}" for part in numbers),
+                    *(f"{error:.6f}" for error in errors),
+                    *(int(result.guessed[place]), cause),
+                )
+            )
+    return csv_text(rows)
+
+
+def several_lights_csv(images: Sequence[str], results: Sequence[Result]) -> tuple[str, str]:
+    """Return the errors of images under several lights by pixel and by region as CSV text: `pixels.csv`, `regions.csv`.
+
+    The columns of the first are image, method, pixel_recovery (LSMI's MAE_illum), pixel_reproduction, pixel_rgb (its
+    MAE_rgb); of the second image, method, light (its number from 0), share (of the image's judged pixels), recovery,
+    reproduction. Degrees; empty where no pixel of an image is judged.
+    """
+    pixels: list[tuple[object, ...]] = [("image", "method", "pixel_recovery", "pixel_reproduction", "pixel_rgb")]
+    regions: list[tuple[object, ...]] = [("image", "method", "light", "share", "recovery", "reproduction")]
+    for result in results:
+        maps = result.maps
+        if maps is None:
+            continue
+        for place, number in enumerate(maps.images):
+            errors = (maps.pixel["recovery"][place], maps.pixel["reproduction"][place], maps.rgb[place])
+            pixels.append((images[number], result.method, *map(_degrees, errors)))
+        for place, number in enumerate(maps.region_images):
+            errors = (maps.region["recovery"][place], maps.region["reproduction"][place])
+            light, share = int(maps.region_lights[place]), f"{maps.region_shares[place]:.6f}"
+            regions.append((images[number], result.method, light, share, *map(_degrees, errors)))
+    return csv_text(pixels), csv_text(regions)
+
+
+def run_json(content: Mapping[str, Any]) -> str:
+    """Return the text of `run.json`."""
+    return json.dumps({"format": RUN_FORMAT, "version": 1, **content}, indent=2, ensure_ascii=False) + "\n"
+
+
+def _degrees(error: float) -> str:
+    return f"{error:.6f}" if np.isfinite(error) else ""
+
+
+_COLUMNS = ("image", "r", "g", "b")
+
+
+@dataclass(frozen=True, eq=False)
+class GivenEstimates:
+    """Estimates from a file, in place of a method.
+
+    - `name`: what stands in the tables.
+    - `file`: the file's name.
+    - `sha256`: of its bytes.
+    - `lights`: (3,) float64 of each image by its name, as the file has them: not checked to be lights.
+    """
+
+    name: str
+    file: str
+    sha256: str
+    lights: Mapping[str, npt.NDArray[np.float64]]
+
+    def estimate_scene(self, scene: Scene) -> npt.NDArray[np.float64]:
+        """Return the light (3,) float64 that the file has for a scene, camera RGB of any length."""
+        return self.lights[scene.name]
+
+
+def read_estimates(path: Path, images: Sequence[str], name: str | None = None) -> GivenEstimates:
+    """Return the estimates of a file for the images of a data set."""
+    try:
+        content = path.read_bytes()
+        text = content.decode("utf-8-sig")
+    except OSError as error:
+        raise InputError(f"cannot read {path}: {error.strerror or error}; name a CSV file of estimates") from error
+    except UnicodeDecodeError as error:
+        raise FormatError(f"{path} is no CSV text in UTF-8: {error}; expected {','.join(_COLUMNS)}") from error
+    by_stem = _by_stem(images)
+    known = set(images)
+    found: dict[str, npt.NDArray[np.float64]] = {}
+    unknown: list[str] = []
+    twice: list[str] = []
+    for given, light in _rows(path, text):
+        image = given if given in known else by_stem.get(given, by_stem.get(_stem(given)))
+        if image is None:
+            unknown.append(given)
+        elif image in found:
+            twice.append(given)
+        else:
+            found[image] = light
+    missing = [image for image in images if image not in found]
+    faults = [
+        f"{counted(len(those), one, several)} ({first_of(those)})"
+        for those, one, several in (
+            (missing, "image of the data set is missing", "images of the data set are missing"),
+            (unknown, "line is of no image of the data set", "lines are of no image of the data set"),
+            (twice, "image stands there twice", "images stand there twice"),
+        )
+        if those
+    ]
+    if faults:
+        raise InputError(f"{path}: {'; '.join(faults)}; expected one line for each of {counted(len(images), 'image')}")
+    return GivenEstimates(path.stem if name is None else name, path.name, sha256_of(content), found)
+
+
+def _by_stem(images: Sequence[str]) -> dict[str, str]:
+    """Return images by their names without extension, those left out of which two have the same."""
+    stems: defaultdict[str, list[str]] = defaultdict(list)
+    for image in images:
+        stems[_stem(image)].append(image)
+    return {stem: found[0] for stem, found in stems.items() if len(found) == 1}
+
+
+def _stem(image: str) -> str:
+    path = PurePosixPath(image)
+    return str(path.with_suffix("")) if path.name else image
+
+
+def _rows(path: Path, text: str) -> list[tuple[str, npt.NDArray[np.float64]]]:
+    lines = text.replace("\r\n", "\n").replace("\r", "\n").split("\n")
+    separator = max(",;\t", key=lines[0].count)
+    try:
+        rows = list(csv.reader(lines, delimiter=separator, strict=True))
+    except csv.Error as error:
+        raise FormatError(f"{path} is no CSV text: {error}; expected {','.join(_COLUMNS)}") from error
+    heads = [head.strip().lower() for head in rows[0]] if rows else []
+    headed = all(column in heads for column in _COLUMNS)
+    if not headed and not (len(heads) == len(_COLUMNS) and all(map(is_number, heads[1:]))):
+        raise FormatError(
+            f"{path} begins with {lines[0][:80].strip()!r}; expected the columns {','.join(_COLUMNS)}, with or without "
+            "a head"
+        )
+    if headed and len(set(heads)) < len(heads):
+        raise FormatError(f"{path} has columns of the same name: {separator.join(rows[0])}; expected each once")
+    places = [heads.index(column) if headed else number for number, column in enumerate(_COLUMNS)]
+    found: list[tuple[str, npt.NDArray[np.float64]]] = []
+    for number, row in enumerate(rows, start=1):
+        if (headed and number == 1) or not any(field.strip() for field in row):
+            continue
+        if len(row) != len(heads):
+            raise FormatError(
+                f"{path}, line {number}: {len(row)} fields where the first line has {len(heads)}; expected as many, "
+                "and a point, not a comma, in numbers"
+            )
+        try:
+            image, *light = (row[place].strip() for place in places)
+            found.append((image, np.array([float(part) for part in light])))
+        except (IndexError, ValueError) as error:
+            raise FormatError(
+                f"{path}, line {number}: {separator.join(row)[:80]!r}; expected a name and three numbers"
+            ) from error
+    return found

@@ -1,0 +1,194 @@
+"""Pictures developed from raw images with their ground truths.
+
+Scenes in memory are those that `generate` writes.
+
+Ground truths from files and data sets.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+
+from evaluation.experiments.paper.material import (
+    DevelopedSource,
+    ScaledSource,
+    develop,
+    developed,
+    lights_at_random,
+    lights_like,
+    read_truths,
+    rendered,
+)
+from evaluation.scene import SceneSet
+from foundation.colorimetry import decode_srgb, srgb_codes
+from foundation.errors import FormatError, InputError
+from generator import DatasetOptions, generate_dataset
+from generator.lights.choices import RandomLights, nearest_lights
+from generator.pictures.sources import random_scenes
+from generator.rendering.matrices import camera_matrix
+from tests.evaluation.experiments.paper.conftest import LIGHTS, TableMaker
+
+
+@dataclass(frozen=True, eq=False)
+class Photo:
+    """A raw image in memory."""
+
+    image: npt.NDArray[np.float64]
+    mask: npt.NDArray[np.bool_] | None
+    truth: npt.NDArray[np.float64]
+    name: str = "photo"
+    saturation: float | None = None
+
+    def read(self) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.bool_] | None]:
+        return self.image, self.mask
+
+
+@pytest.mark.parametrize("camera", ["Canon EOS 550D", "Canon EOS-1Ds Mark III", "Canon EOS 600D"])
+def test_a_picture_photographed_and_developed_is_itself(camera: str) -> None:
+    matrix = camera_matrix(camera)
+    assert matrix is not None
+    rng = np.random.default_rng(7)
+    codes = rng.integers(20, 256, (30, 40, 3), dtype=np.uint8)
+    codes[:4] = 255  # more than one in a hundred pixels are white, so white is where it was
+    light = np.array([0.5, 1.0, 0.7]) * 3000
+    raw = decode_srgb(codes / 255) @ matrix.rows.T * light
+    assert np.abs(develop(raw, light * 17, matrix=matrix).astype(int) - codes).max() <= 1
+    assert np.abs(develop(raw, light, matrix=None).astype(int) - codes).max() > 10
+    # The wrong light leaves a cast.
+    assert np.abs(develop(raw, light[::-1].copy(), matrix=matrix).astype(int) - codes).max() > 10
+
+
+def test_one_in_a_hundred_is_clipped() -> None:
+    wedge = np.linspace(0, 1, 10000).reshape(100, 100, 1) * np.array([0.3, 1.0, 0.4])
+    picture = develop(wedge, np.array([0.3, 1.0, 0.4]))
+    assert 0.01 <= (picture == 255).all(axis=2).mean() < 0.015
+    # A masked highlight does not darken the picture.
+    bright = wedge.copy()
+    bright[:50] *= 40
+    mask = np.zeros((100, 100), np.bool_)
+    mask[:50] = True
+    alone = develop(bright[50:], np.array([0.3, 1.0, 0.4]))
+    np.testing.assert_array_equal(develop(bright, np.array([0.3, 1.0, 0.4]), mask)[50:], alone)
+    assert develop(bright, np.array([0.3, 1.0, 0.4]))[50:].max() < 128
+
+
+def test_a_clipped_sky_is_white() -> None:
+    light = np.array([0.5, 1.0, 0.7])
+    image = np.full((20, 20, 3), 200.0) * light
+    image[:10] = 1000.0  # all channels at saturation: under this light as red and blue as no sky is
+    pink, white = (develop(image, light, saturation=level)[0, 0].tolist() for level in (None, 1000.0))
+    assert pink == srgb_codes([1, 0.5, 0.5 / 0.7]).tolist()
+    assert white == [255, 255, 255]
+    np.testing.assert_array_equal(develop(image, light, saturation=5000.0), develop(image, light))
+
+
+def test_a_source_has_no_chart() -> None:
+    mask = np.zeros((8, 8), np.bool_)
+    mask[:3, :3] = True
+    scene = Photo(np.full((8, 8, 3), 500.0), mask, np.array([1.0, 1.0, 1.0]))
+    (source,) = developed(SceneSet("made up", "none", "here", (scene,)), camera_matrix("EOS 550D"))
+    picture = source.read().picture
+    assert not picture[mask].any()
+    assert (picture[~mask] == 255).all()
+    assert source.name == "photo"
+    assert source.to_json() == {"developed": "photo", "matrix": "Canon EOS 550D"}
+
+
+def test_black_stays_black() -> None:
+    assert not develop(np.zeros((4, 4, 3)), np.ones(3)).any()
+    assert not DevelopedSource(Photo(np.ones((2, 2, 3)), np.ones((2, 2), np.bool_), np.ones(3))).read().picture.any()
+
+
+@pytest.mark.parametrize("light", [[0.0, 1, 1], [np.nan, 1, 1]])
+def test_a_light_has_three_channels(light: list[float]) -> None:
+    with pytest.raises(InputError, match="cannot be balanced"):
+        develop(np.ones((2, 2, 3)), np.array(light))
+
+
+SOURCES = random_scenes(6, 40, 30, seed=3)
+TRUTHS = np.array([[2.0, 3.1, 1.0], [0.3, 0.7, 1.0], [1.5, 3.0, 2.4]])
+PLAIN = DatasetOptions(previews=False)
+
+
+def test_random_lights_are_those_of_the_command(make_table: TableMaker, tmp_path: Path) -> None:
+    lut = make_table("Test", noise=0.05)
+    scenes = rendered(lut, SOURCES, lights_at_random(lut, 6, seed=9), seed=9)
+    made = generate_dataset(lut, tmp_path / "made", SOURCES, RandomLights(1, len(LIGHTS), 9), seed=9, options=PLAIN)
+    assert len({scene.light for scene in scenes}) > 1
+    for scene, entry in zip(scenes, made.entries, strict=True):
+        np.testing.assert_array_equal(scene.read()[0], made.read_image(entry))
+        np.testing.assert_allclose(scene.truth, entry.truth, atol=1e-9)
+        assert Path(entry.image).stem == scene.name
+        assert scene.saturation == 9000
+
+
+def test_near_lights_are_those_of_the_command(make_table: TableMaker, tmp_path: Path) -> None:
+    lut = make_table("Test", noise=0.05)
+    chosen = lights_like(lut, TRUTHS, 6)
+    assert chosen.numbers == (0, 3, 1, 0, 3, 1)
+    assert chosen.how.startswith("nearest by angle to 3 ground truths, 3 different lights")
+    # The angles are those of the lights that images have.
+    few = lights_like(lut, TRUTHS, 1).how
+    assert few.startswith("nearest by angle to the first 1 of 3 ground truths, 1 different lights")
+    assert few.split("angle to them")[1] == lights_like(lut, TRUTHS[:1], 1).how.split("angle to them")[1]
+    scenes = rendered(lut, SOURCES, chosen, seed=2)
+    lights = nearest_lights(lut, TRUTHS)
+    made = generate_dataset(lut, tmp_path / "made", SOURCES, lights, seed=2, options=PLAIN)
+    for scene, entry in zip(scenes, made.entries, strict=True):
+        np.testing.assert_array_equal(scene.read()[0], made.read_image(entry))
+
+
+def test_pictures_are_scaled_both_ways() -> None:
+    (scene, *_) = SOURCES
+    small, large = ScaledSource(scene, 20), ScaledSource(scene, 80)
+    assert small.read().picture.shape == (15, 20, 3)
+    assert large.read().picture.shape == (60, 80, 3)
+    assert small.name == scene.name
+    assert large.to_json() == {**scene.to_json(), "side": 80}
+    np.testing.assert_array_equal(ScaledSource(scene, 40).read().picture, scene.read().picture)
+
+
+def test_every_picture_needs_a_light(make_table: TableMaker) -> None:
+    lut = make_table("Test")
+    with pytest.raises(InputError, match="6 pictures have 5 lights"):
+        rendered(lut, SOURCES, lights_at_random(lut, 5, seed=0))
+
+
+TEXT = "File,GT_R,GT_G,GT_B\nA/1.png,1,2,3\nB/1.png,4,5,6\n\nA/2.png,7,8,9\n"
+
+
+def test_rows_of_one_camera(tmp_path: Path) -> None:
+    path = tmp_path / "eight.csv"
+    path.write_text(TEXT)
+    everything = read_truths(str(path))
+    assert everything.name == "eight"
+    assert everything.lights.tolist() == [[1, 2, 3], [4, 5, 6], [7, 8, 9]]
+    one = read_truths(f"{path}#A/")
+    assert one.name == "A"
+    assert one.lights.tolist() == [[1, 2, 3], [7, 8, 9]]
+    assert one.images == ("A/1.png", "A/2.png")
+    assert everything.images == ("A/1.png", "B/1.png", "A/2.png")
+    with pytest.raises(InputError, match=r"no row of .* begins with 'C'; the first begins with 'A/1.png'"):
+        read_truths(f"{path}#C")
+
+
+def test_a_file_without_names(tmp_path: Path) -> None:
+    path = tmp_path / "plain.txt"
+    path.write_text("1 2 3\n4 5 6\n")
+    assert read_truths(str(path)).lights.tolist() == [[1, 2, 3], [4, 5, 6]]
+    with pytest.raises(FormatError, match="2 ground truths and 1 names"):
+        read_truths(f"{path}#1")
+
+
+def test_those_of_a_data_set(tmp_path: Path) -> None:
+    path = tmp_path / "set.npz"
+    lights = np.array([[1.0, 2, 1], [2, 2, 1]])
+    np.savez(path, images=np.ones((2, 4, 4, 3), np.float32), gt=lights, names=np.array(["a", "b"]))
+    found = read_truths(str(path))
+    assert found.name == "set"
+    assert found.lights.tolist() == lights.tolist()

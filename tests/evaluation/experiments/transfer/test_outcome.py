@@ -1,0 +1,263 @@
+"""The tables say what was found, and what it does not hold for.
+
+Statistics, intervals and ratios of rows.
+
+Forest plots: every ratio where it belongs, what is not known nowhere, and a wide interval squeezes no other.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from math import inf, nan
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+
+from evaluation.experiments.bootstrap import STATISTICS, intervals, paired
+from evaluation.experiments.transfer.outcome import (
+    HEADS,
+    Figure,
+    ForestLine,
+    errors_table,
+    figures_of,
+    forest_plot,
+    intervals_table,
+    long_table,
+    naive_ratios_table,
+    paper_ratios_table,
+    real_ratios_table,
+    round_numbers,
+)
+from evaluation.experiments.transfer.rows import Kind, TransferRow
+from evaluation.metrics import summarise
+from evaluation.results.result import Result
+from evaluation.results.tables import table_to_csv
+from foundation.errors import InputError
+
+ERRORS = np.arange(1.0, 41.0)
+
+
+def _plain_row(kind: Kind, *gains: float, guessed: int = 0, images: int = 9) -> TransferRow:
+    blind = np.arange(40) < guessed
+    results = tuple(
+        Result("Trees", np.ones((40, 3)), {"recovery": gain * ERRORS, "reproduction": ERRORS}, blind) for gain in gains
+    )
+    return TransferRow("Trees", kind, "" if kind in ("cross-validation", "none") else "made", images, results)
+
+
+def test_all_statistics_stand_in_every_table() -> None:
+    found = figures_of(
+        [_plain_row("cross-validation", 1.0), _plain_row("generated", 2.0), _plain_row("naive", 4.0)], "recovery"
+    )
+    naive = naive_ratios_table(found, "Real")
+    assert naive is not None
+    for table in (
+        errors_table(found, "Real", 40),
+        intervals_table(found, "Real"),
+        real_ratios_table(found, "Real"),
+        naive,
+    ):
+        assert table.columns[-6:] == HEADS
+    assert errors_table(found, "Real", 40).texts()[1][:5] == ("Trees", "made: generated", "9", "41.00", "41.00")
+    # Twice the errors on every image: the interval of the ratio has no width.
+    assert real_ratios_table(found, "Real").texts()[0][2:] == ("2.00 (2.00 – 2.00)",) * 6
+    assert naive.texts()[0][1:3] == ("made: linear sRGB × light", "0.50 (0.50 – 0.50)")
+    assert naive_ratios_table(figures_of([_plain_row("generated", 1.0)], "recovery"), "Real") is None
+
+
+def test_what_a_number_hides_is_noted() -> None:
+    found = figures_of(
+        [_plain_row("cross-validation", 1.0, 1.2), _plain_row("none", 1.0, guessed=3, images=0)], "recovery"
+    )
+    table = errors_table(found, "Real", 40)
+    assert table.notes == (
+        "Trees, none: no light in 3 images; grey stands in for it",
+        # Medians 20.5 and 24.6, whose standard deviation is 4.1 / sqrt 2.
+        "Means over seeds; the standard deviation of a median over seeds is up to 2.90 degrees.",
+    )
+    assert table.texts()[1][2] == "–"
+
+
+def test_all_numbers_for_other_programs() -> None:
+    found = figures_of([_plain_row("cross-validation", 1.0), _plain_row("generated", 2.0, 4.0)], "recovery")
+    lines = table_to_csv(long_table(found)).splitlines()
+    assert lines[0].split(",") == [
+        *("method", "training", "data", "images", "seeds", "error", "statistic", "degrees", "low", "high"),
+        *("seed_sd", "ratio_to_real", "ratio_low", "ratio_high"),
+    ]
+    assert len(lines) == 13
+    fields = dict(zip(lines[0].split(","), lines[8].split(","), strict=True))
+    assert (fields["statistic"], fields["training"], fields["seeds"]) == ("median", "generated", "2")
+    assert float(fields["degrees"]) == pytest.approx(61.5)
+    assert float(fields["ratio_to_real"]) == pytest.approx(3)
+    assert lines[1].endswith(",,,,")
+
+
+def test_the_papers_ratios_by_hand() -> None:
+    medians = {row[0]: row[3] for row in paper_ratios_table().rows}
+    assert medians == pytest.approx(
+        {
+            "Regression trees (simple features)": 1.66 / 0.89,
+            "Smart Color Cat": 1.43 / 1.35,
+            "Color Beaver (using Gray-world)": 0.74 / 0.77,
+        }
+    )
+
+
+RANDOM = np.random.default_rng(3)
+REAL, OTHER, THIRD = (np.abs(RANDOM.normal(2, 1, 90)) for _ in range(3))
+
+
+def _row(kind: Kind, *errors: npt.NDArray[np.float64], method: str = "Trees") -> TransferRow:
+    results = tuple(
+        Result(method, np.ones((90, 3)), {"recovery": each, "reproduction": 2 * each}, np.zeros(90, bool))
+        for each in errors
+    )
+    return TransferRow(method, kind, "" if kind == "cross-validation" else "made", 9, results)
+
+
+def test_one_seed_is_what_the_bootstrap_gives() -> None:
+    rows = [_row("cross-validation", REAL), _row("generated", OTHER), _row("naive", THIRD)]
+    found = figures_of(rows, "recovery")
+    for row, errors in zip(found.rows, (REAL, OTHER, THIRD), strict=True):
+        np.testing.assert_allclose([figure.value for figure in row.statistics], summarise(errors).as_tuple()[:6])
+        expected = intervals(errors)
+        for statistic, figure in zip(STATISTICS, row.statistics, strict=True):
+            assert (figure.low, figure.high) == pytest.approx(expected[statistic])
+    for ratios, base in ((found.to_real[0], REAL), (found.to_naive[0], THIRD)):
+        for compared, figure in zip(paired(OTHER, base), ratios.ratios, strict=True):
+            assert (figure.value, figure.low, figure.high) == pytest.approx(compared.ratio)
+    assert [(one.row.kind, one.base.kind) for one in found.to_real] == [
+        ("generated", "cross-validation"),
+        ("naive", "cross-validation"),
+    ]
+    assert [row.spread for row in found.rows] == [None] * 3
+
+
+def test_several_seeds_are_the_mean_of_their_statistics() -> None:
+    found = figures_of([_row("cross-validation", REAL), _row("generated", OTHER, THIRD)], "reproduction")
+    both = np.array([summarise(2 * errors).as_tuple() for errors in (OTHER, THIRD)])
+    row = found.rows[1]
+    np.testing.assert_allclose([figure.value for figure in row.statistics], both.mean(axis=0))
+    assert row.spread is not None
+    np.testing.assert_allclose(row.spread, np.abs(both[0] - both[1]) / np.sqrt(2))
+    expected = both.mean(axis=0) / summarise(2 * REAL).as_tuple()
+    np.testing.assert_allclose([figure.value for figure in found.to_real[0].ratios], expected)
+    # The same errors twice know no more than once.
+    once, twice = (figures_of([_row("generated", *several)], "recovery") for several in ([REAL], [REAL, REAL]))
+    assert once.rows[0].statistics == twice.rows[0].statistics
+
+
+def test_methods_are_held_to_themselves_only() -> None:
+    rows = [
+        _row("cross-validation", REAL),
+        _row("cross-validation", OTHER, method="Cat"),
+        _row("generated", OTHER, method="Cat"),
+        _row("none", THIRD, method="Gray-world"),
+    ]
+    found = figures_of(rows, "recovery")
+    assert [(one.row.method, one.base.method) for one in found.to_real] == [("Cat", "Cat")]
+    assert [figure.value for figure in found.to_real[0].ratios] == [1.0] * 6
+    assert not found.to_naive
+
+
+def test_rows_are_held_to_one_that_is_asked_for_whatever_its_pictures() -> None:
+    chosen = replace(_row("generated", OTHER), data="chosen")
+    rows = [
+        _row("cross-validation", REAL),
+        chosen,
+        _row("naive with matrix", THIRD),
+        _row("naive with matrix", REAL, method="Cat"),
+        _row("none", REAL, method="Gray-world"),
+    ]
+    found = figures_of(rows, "recovery", base="Made:  matrix x linear sRGB x light")
+    assert [(one.row, one.base) for one in found.to_base] == [(rows[0], rows[2]), (chosen, rows[2])]
+    for compared, figure in zip(paired(OTHER, THIRD), found.to_base[1].ratios, strict=True):
+        assert (figure.value, figure.low, figure.high) == pytest.approx(compared.ratio)
+    assert not found.to_naive
+    assert not figures_of(rows, "recovery").to_base
+
+
+def test_a_base_that_is_not_there_is_told_with_those_that_are() -> None:
+    with pytest.raises(InputError, match=r"'naive'; expected one of: real, cross-validated; made: generated$"):
+        figures_of([_row("cross-validation", REAL), _row("generated", OTHER)], "recovery", base="naive")
+
+
+@pytest.mark.parametrize("base", ["none", " NONE"])
+def test_what_learns_nothing_is_no_base(base: str) -> None:
+    with pytest.raises(InputError, match=r"expected one of: real, cross-validated$"):
+        figures_of([_row("cross-validation", REAL), _row("none", THIRD, method="Gray-world")], "recovery", base=base)
+
+
+def test_a_base_with_nothing_to_hold_to_it_is_told() -> None:
+    rows = [_row("cross-validation", REAL), _row("generated", OTHER, method="Cat")]
+    with pytest.raises(InputError, match=r"no method was trained on anything but 'made: generated'; add results"):
+        figures_of(rows, "recovery", base="made: generated")
+
+
+def test_a_faultless_base_has_no_ratio() -> None:
+    found = figures_of([_row("cross-validation", np.zeros(90)), _row("generated", OTHER)], "recovery")
+    assert all(np.isnan(figure.value) and np.isnan(figure.low) for figure in found.to_real[0].ratios)
+
+
+PANELS = ("Med.", "Mean")
+
+
+def markers(svg: bytes) -> list[tuple[float, float]]:
+    """Return where markers stand: x, y in points from the top left."""
+    uses = re.findall(r'<use xlink:href="#\w+" x="([\d.]+)" y="([\d.]+)" style="fill: #', svg.decode())
+    return [(float(x), float(y)) for x, y in uses]
+
+
+def line(label: str, *ratios: tuple[float, float, float], whole: bool = True) -> ForestLine:
+    return ForestLine(label, tuple(Figure(*ratio) for ratio in ratios), whole=whole)
+
+
+def test_ratios_stand_on_a_logarithmic_axis_from_top_to_bottom() -> None:
+    lines = [
+        line("half", (0.5, 0.4, 0.6), (1, 0.9, 1.1)),
+        line("one", (1, 0.9, 1.1), (2, 1.9, 2.2), whole=False),
+        line("two", (2, 1.8, 2.5), (0.5, 0.4, 0.6)),
+    ]
+    first, second = markers(forest_plot(lines, PANELS))[:3], markers(forest_plot(lines, PANELS))[3:]
+    assert len(first) == len(second) == 3
+    (half, one, two), ys = zip(*first, strict=True)
+    assert one - half == pytest.approx(two - one, abs=0.01) != 0
+    assert half < one < two
+    assert ys == tuple(sorted(ys))
+    # The panels share their scale.
+    assert second[1][0] - second[0][0] == pytest.approx(two - one, abs=0.01)
+
+
+def test_what_is_not_known_is_not_drawn() -> None:
+    known = line("known", (1.2, 1, 1.4), (0.9, nan, nan))
+    unknown = line("unknown", (nan, nan, nan), (inf, nan, nan))
+    assert len(markers(forest_plot([ForestLine("Method"), known, unknown], PANELS))) == 2
+    assert not markers(forest_plot([ForestLine("Method"), unknown], PANELS))
+
+
+def test_a_wide_interval_does_not_squeeze_the_others() -> None:
+    def distance(end: float) -> float:
+        lines = [line("a", (1.0, 0.9, end), (1, 1, 1)), line("b", (1.2, 1.1, 1.3), (1, 1, 1))]
+        (a, b), _ = zip(*markers(forest_plot(lines, PANELS))[:2], strict=True)
+        return b - a
+
+    assert distance(1000) > 0.1 * distance(1.3)
+    assert distance(1000) == distance(10000)
+
+
+def test_names_stand_as_they_are() -> None:
+    svg = forest_plot([ForestLine("Trees <$x_1$>"), line("_mine", (1, 1, 1), (1, 1, 1))], PANELS).decode()
+    for text in ("Trees &lt;$x_1$&gt;", "_mine", *PANELS):
+        assert f">{text}</text>" in svg
+
+
+@pytest.mark.parametrize(("low", "high"), [(0.79, 1.26), (0.2, 1.3), (0.5, 40), (0.01, 900)])
+def test_numbers_of_an_axis_are_few_and_within_it(low: float, high: float) -> None:
+    numbers = round_numbers(low, high)
+    assert 1 in numbers
+    assert numbers == sorted(numbers)
+    assert 3 <= len(numbers) <= 7
+    assert low <= numbers[0] < numbers[-1] <= high

@@ -1,0 +1,83 @@
+"""Tables on terminals of every width.
+
+LaTeX tables: every row has as many cells as the preamble has columns, and no character is a command by accident.
+"""
+
+from __future__ import annotations
+
+import re
+
+import pytest
+
+from evaluation.reports.table_output import escape_latex, print_table, table_to_latex, tables_to_latex
+from evaluation.results.tables import Table
+
+TABLE = Table(
+    "A [bold]title[/]",
+    ("Algorithm", "Mean", "Worst 25%"),
+    (("Shades-of-Gray [p=2] of many words", 123.456, 7.0),),
+    notes=("[a] note",),
+)
+
+
+def test_square_brackets_are_no_markup(capsys: pytest.CaptureFixture[str]) -> None:
+    print_table(TABLE)
+    title, *rest, note = capsys.readouterr().out.splitlines()
+    assert title == TABLE.title
+    assert note == "[a] note"
+    assert "Shades-of-Gray [p=2] of many words" in "\n".join(rest)
+
+
+def test_a_narrow_terminal_folds_names_and_cuts_no_number(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("FORCE_COLOR", "1")  # By which rich takes any output for a terminal.
+    monkeypatch.setenv("COLUMNS", "45")
+    print_table(TABLE)
+    text = re.sub(r"\x1b\[[\d;]*m", "", capsys.readouterr().out)
+    assert max(map(len, text.splitlines())) <= 45
+    for word in ("123.46", "7.00", "Shades-of-Gray", "Worst 25%"):
+        assert word in text
+
+
+HEADS = ("Algorithm", "Mean", "Best 25%")
+
+
+def rows_of(text: str) -> list[str]:
+    body = text.partition("\\hline")[2].partition("\\end{tabular}")[0]
+    return [line for line in body.splitlines() if line and line != "\\hline"]
+
+
+def test_rows_have_the_columns_of_the_preamble() -> None:
+    table = Table("50 % of A&B_c", HEADS, (("Shades & {p=2} \\ #1", 1.234, None), ("σ = 1°", 2.0, 3.0)), notes=("n_1",))
+    text = table_to_latex(table)
+    found = re.search(r"\\begin\{tabular\}\{\|([lr|]+)\|\}", text)
+    assert found is not None
+    assert found[1].replace("|", "") == "lrr"
+    for row in rows_of(text):
+        assert row.endswith("\\\\")
+        assert len(re.findall(r"(?<!\\)&", row)) == 2
+    assert "1.23 & --" in text
+    assert "\\footnotesize n\\_1" in text
+
+
+def test_braces_match() -> None:
+    text = re.sub(r"\\[{}\\]", "", table_to_latex(Table("{", HEADS, (("}", 1.0, 2.0),))))
+    assert text.count("{") == text.count("}")
+
+
+def test_a_stack_has_one_preamble_and_every_title() -> None:
+    tables = [Table(f"Set {number}", HEADS, (("Gray-world", 1.0, 2.0),)) for number in range(3)]
+    text = tables_to_latex("All of them", tables)
+    assert text.count("\\begin{tabular}") == 1
+    assert [f"\\multicolumn{{3}}{{|c|}}{{Set {number}}}\\\\" in text for number in range(3)] == [True] * 3
+    with pytest.raises(ValueError, match="expected at least one"):
+        tables_to_latex("None", [])
+    with pytest.raises(ValueError, match="the same columns in each"):
+        tables_to_latex("Two kinds", [tables[0], Table("Narrow", ("a",), ())])
+
+
+@pytest.mark.parametrize("mark", list("\\&%$#_{}~^<>|"))
+def test_special_characters_are_escaped(mark: str) -> None:
+    # Not alone after the escape as a character that TeX acts on: preceded by a backslash, within $…$, or by its name.
+    assert escape_latex(mark) in (f"\\{mark}", f"${mark}$") or escape_latex(mark).startswith("\\text")

@@ -1,0 +1,159 @@
+"""`errors.csv` is read by the names of its columns, and what is wrong in it is named.
+
+Estimates of other programs: which names are taken for the same image, and what is refused.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from evaluation.results.files import read_errors, read_estimates
+from foundation.errors import FormatError, InputError
+
+HEAD = "image,method,estimate_r,estimate_g,estimate_b,truth_r,truth_g,truth_b,recovery,reproduction,guessed"
+
+
+def written(folder: Path, *lines: str, head: str = HEAD) -> Path:
+    path = folder / "errors.csv"
+    path.write_text("\n".join([head, *lines]) + "\n")
+    return path
+
+
+def test_a_folder_and_its_file(tmp_path: Path) -> None:
+    path = written(
+        tmp_path,
+        "b.png,Gray-world,.3,.4,.3,1,2,1,1.5,2.5,0",
+        '"a, 1.png",Gray-world,.3,.4,.3,2,2,1,0.5,0.25,1',
+        "b.png,Mine,.3,.4,.3,1,2,1,3,4,0",
+    )
+    run = read_errors(tmp_path)
+    assert list(run) == ["Gray-world", "Mine"]
+    grey = run["Gray-world"]
+    assert grey.images == ("b.png", "a, 1.png")
+    assert grey.truths is not None
+    assert grey.truths.tolist() == [[1, 2, 1], [2, 2, 1]]
+    assert grey.errors["recovery"].tolist() == [1.5, 0.5]
+    assert grey.errors["reproduction"].tolist() == [2.5, 0.25]
+    assert grey.guessed.tolist() == [False, True]
+    assert read_errors(path)["Mine"].errors["reproduction"].tolist() == [4]
+
+
+def test_columns_in_another_order_and_without_truths(tmp_path: Path) -> None:
+    path = written(tmp_path, "7,a.png,Mine,2", head="reproduction,image,method,recovery")
+    mine = read_errors(path)["Mine"]
+    assert mine.truths is None
+    assert (mine.errors["recovery"][0], mine.errors["reproduction"][0]) == (2, 7)
+    assert not mine.guessed.any()
+    assert mine.estimates is None
+
+
+@pytest.mark.parametrize(("second", "whole"), [("1,2,3", True), ("1,,3", False), ("1,nan,3", False)])
+def test_estimates_are_there_where_all_are(tmp_path: Path, second: str, whole: bool) -> None:
+    lines = ("a,Mine,3,4,5,1,2", f"b,Mine,{second},1,2")
+    mine = read_errors(written(tmp_path, *lines, head="image,method,r,g,b,recovery,reproduction"))["Mine"]
+    assert (None if mine.estimates is None else mine.estimates.tolist()) == ([[3, 4, 5], [1, 2, 3]] if whole else None)
+
+
+@pytest.mark.parametrize(
+    ("line", "says"),
+    [
+        ("a,Mine,1,1,1,1,1,1,x,2,0", "line 2: recovery is 'x'"),
+        ("a,Mine,1,1,1,1,1,1,nan,2,0", "line 2: recovery is 'nan'"),
+        ("a,Mine,1,1,1,1,1", "line 2: recovery is None"),
+        ("a,Mine,1,1,1,1,1,1,-1,2,0", "line 2: a has .*none is below 0"),
+        ("a,Mine,1,1,1,0,0,0,1,2,0", "line 2: a has"),
+        ("a,Mine,1,1,1,1,1,1,1,2,maybe", "guessed is 'maybe'"),
+        ("a,Mine,1,1,1,1,1,1,1,2,0\na,Mine,1,1,1,1,1,1,1,2,0", "line 3: Mine on a stands there a second time"),
+        ("", "no line of errors"),
+    ],
+)
+def test_faults_are_named(tmp_path: Path, line: str, says: str) -> None:
+    with pytest.raises(FormatError, match=says):
+        read_errors(written(tmp_path, line))
+
+
+def test_other_files(tmp_path: Path) -> None:
+    with pytest.raises(FormatError, match="has the columns image, method; expected recovery, reproduction too"):
+        read_errors(written(tmp_path, head="image,method").rename(tmp_path / "x.csv"))
+    with pytest.raises(InputError, match=r"cannot read .*errors.csv.*name a results folder"):
+        read_errors(tmp_path)
+    (tmp_path / "errors.csv").write_bytes(b"\xff\xfe\x80")
+    with pytest.raises(FormatError, match="no CSV text in UTF-8"):
+        read_errors(tmp_path)
+
+
+IMAGES = ["a/one.png", "a/two.png", "three.v1.png"]
+
+
+def given(tmp_path: Path, text: str) -> Path:
+    path = tmp_path / "other.csv"
+    path.write_bytes(text.encode())
+    return path
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "image,r,g,b\na/two.png,4,5,6\na/one.png,1,2,3\nthree.v1.png,7,8,9\n",
+        "a/one,1,2,3\na/two,4,5,6\nthree.v1,7,8,9",
+        "\ufeffB;Image;note;R;G\r\n3;a/one.tiff;x;1;2\r\n6;a/two.tiff;;4;5\r\n\r\n9;three.v1.tiff;;7;8\r\n",
+        "image,r,g,b\ra/two.png,4,5,6\ra/one.png,1,2,3\rthree.v1.png,7,8,9\r",
+        'image\tr\tg\tb\n"a/one.png"\t1e0\t2\t3.0\na/two.png\t4\t5\t6\nthree.v1.png\t7\t8\t9\n',
+    ],
+)
+def test_names_with_and_without_extension(tmp_path: Path, text: str) -> None:
+    found = read_estimates(given(tmp_path, text), IMAGES)
+    assert found.name == "other"
+    assert {image: light.tolist() for image, light in found.lights.items()} == {
+        "a/one.png": [1, 2, 3],
+        "a/two.png": [4, 5, 6],
+        "three.v1.png": [7, 8, 9],
+    }
+
+
+def test_what_is_no_light_is_kept_as_it_is(tmp_path: Path) -> None:
+    found = read_estimates(given(tmp_path, "a/one,nan,1,1\na/two,0,0,0\nthree.v1,-1,1,1\n"), IMAGES)
+    np.testing.assert_array_equal(found.lights["a/one.png"], [np.nan, 1, 1])
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("image,r,g,b\na/one,1,1,1\n", r"2 images of the data set are missing \(a/two\.png, three\.v1\.png\)"),
+        ("a/one,1,1,1\na/one.png,1,1,1\na/two,1,1,1\nthree.v1,1,1,1", r"1 image stands there twice \(a/one\.png\)"),
+        ("a/one,1,1,1\na/two,1,1,1\nthree.v1,1,1,1\nfour,1,1,1", r"1 line is of no image of the data set \(four\)"),
+    ],
+)
+def test_missing_unknown_and_double_images_are_named(tmp_path: Path, text: str, message: str) -> None:
+    with pytest.raises(InputError, match=f"{message}; expected one line for each of 3 images"):
+        read_estimates(given(tmp_path, text), IMAGES)
+
+
+def test_a_name_without_extension_that_two_images_have_is_neither(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"2 images of the data set are missing .* no image of the data set \(one\)"):
+        read_estimates(given(tmp_path, "one,1,1,1\n"), ["one.png", "one.tiff"])
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "begins with ''; expected the columns image,r,g,b"),
+        ("name,red,green,blue\na,1,1,1", "begins with 'name,red,green,blue'"),
+        ("image,r,g,b\na/one,1,1\n", "line 2: 3 fields where the first line has 4"),
+        ("image,r,g,b\na/one,1,one,1\n", "line 2"),
+        ("image,r,g,b\na/one,0,68,0,85,0,22\n", "line 2: 7 fields where the first line has 4"),
+        ("image,r,g,b,r,g,b\na/one,1,1,1,2,2,2\n", "columns of the same name"),
+        ('image,r,g,b\n"a/one,1,2,3\n', "is no CSV text"),
+    ],
+)
+def test_what_is_no_table_is_refused(tmp_path: Path, text: str, message: str) -> None:
+    with pytest.raises(FormatError, match=message):
+        read_estimates(given(tmp_path, text), IMAGES)
+
+
+def test_a_file_that_is_not_there(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"cannot read .*none\.csv: No such file"):
+        read_estimates(tmp_path / "none.csv", IMAGES)
