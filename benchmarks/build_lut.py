@@ -48,6 +48,7 @@ from experiment.framing.planes import frame_black
 from experiment.lights import plan_illuminations
 from experiment.session.folder import ReceivedFile, Session
 from experiment.session.plan import plan_steps
+from experiment.session.records import Judgement
 from sim.camera.film import write_dng
 from sim.optics import MILD_SHOULDERS
 from sim.world.rendering import Print

@@ -26,9 +26,9 @@ from typing import Any
 
 import numpy as np
 
-from acquisition.monitor.view import AttemptView, Head, SessionEvent, SessionView, read_session
+from acquisition.monitor.view import AttemptView, Head, SessionView, read_session
 from experiment.session.journal import JOURNAL_FILE
-from experiment.session.records import Check, preview_path
+from experiment.session.records import Check, SessionEvent, preview_path
 from foundation.colorimetry import decode_srgb
 from foundation.errors import CropError
 

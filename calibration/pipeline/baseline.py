@@ -39,7 +39,8 @@ from calibration.spread.correction import (
 )
 from calibration.spread.fitting import LEAST_COUNTS, LOOSE_UNEVENNESS, USUAL_UNEVENNESS
 from calibration.spread.surroundings import FrameLevels, photosite_offsets_px, printed_grid, unsuitable
-from drivers.raw.rawfile import Area, Mosaic
+from drivers.raw.plain_dng import Area
+from drivers.raw.rawfile import Mosaic
 from experiment.chart.model import Chart
 from experiment.config import CitationSettings
 from experiment.framing.field import Corners

@@ -10,7 +10,8 @@ import numpy.typing as npt
 
 from evaluation.scene import SceneSet
 from foundation.secret_texts import masked
-from generator.dataset.reader import Dataset, Entry, open_dataset
+from generator.dataset.reader import Dataset, open_dataset
+from generator.dataset.records import Entry
 
 
 @dataclass(frozen=True)

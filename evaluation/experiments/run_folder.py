@@ -38,6 +38,7 @@ from evaluation.results.tables import lights_tables, statistics_rows, summary_ta
 from evaluation.scene import MixedScene, Scene, SceneSet
 from foundation.errors import InputError, first_of
 from foundation.files import make_folder, partial_path, publish_folder, require_free, storage_error, write_whole
+from foundation.held_folders import LOCK_FILE, held_folder
 from foundation.processors import ordered_map
 from foundation.version import software
 

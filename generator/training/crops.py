@@ -38,6 +38,7 @@ from generator.kernels.planar import draw_batch
 from generator.lights.lighting import Lighting, Mixture
 from generator.rendering import Rendering
 from generator.rendering.black_points import KEEP, BlackPoint, veil_of
+from generator.variation.exposing import add_noise
 from generator.variation.iso_speed import IsoSpeed
 from generator.variation.sensor_noise import SensorNoise
 

@@ -23,6 +23,7 @@ from experiment.lights import (
     shown_colour,
     uniform_lights,
 )
+from foundation.colorimetry import decode_srgb
 from foundation.errors import FormatError, InputError
 
 HEADER = "index,kind,cct_k,red,green,blue\n"

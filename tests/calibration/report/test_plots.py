@@ -8,7 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from calibration.report.plots import half_size
-from drivers.raw.rawfile import Area, Mosaic
+from drivers.raw.plain_dng import Area
+from drivers.raw.rawfile import Mosaic
 
 
 def mosaic_of(

@@ -12,8 +12,8 @@ import pytest
 from calibration.causes.gathering import PrintPlace
 from calibration.figures.all_figures import FIGURES
 from calibration.pipeline.build import build
-from calibration.report.plots import draw_places, draw_reference_residuals, reference_residuals
-from calibration.report.report import half_size, write_report
+from calibration.report.plots import draw_places, draw_reference_residuals, half_size, reference_residuals
+from calibration.report.report import write_report
 from drivers.raw.rawfile import read_raw
 from foundation.plots import png_of
 from tests.calibration.causes.rooms import HAND, nth_white, taken

@@ -22,7 +22,8 @@ from drivers import tiff
 from drivers.camera import ExposureSettings
 from drivers.raw import plain_dng as dng_reading
 from drivers.raw import rawfile
-from drivers.raw.rawfile import Area, FrameOrigin, Mosaic, body_and_lens, read_raw
+from drivers.raw.plain_dng import Area
+from drivers.raw.rawfile import FrameOrigin, Mosaic, body_and_lens, read_raw
 from drivers.tiff import read_directories
 from foundation.errors import FormatError
 from sim.camera.film import write_dng as write_simulated_dng

@@ -12,7 +12,8 @@ from matplotlib import text
 
 from generator.dataset.contact_sheet import contact_sheet
 from generator.dataset.making import DatasetOptions, generate_dataset
-from generator.dataset.reader import Dataset, Entry
+from generator.dataset.reader import Dataset
+from generator.dataset.records import Entry
 from generator.lights.choices import RandomLights
 from generator.pictures.sources import random_scenes
 

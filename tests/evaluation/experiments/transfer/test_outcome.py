@@ -18,7 +18,6 @@ import pytest
 from evaluation.experiments.bootstrap import STATISTICS, intervals, paired
 from evaluation.experiments.transfer.outcome import (
     HEADS,
-    Figure,
     ForestLine,
     errors_table,
     figures_of,
@@ -212,7 +211,7 @@ def markers(svg: bytes) -> list[tuple[float, float]]:
 
 
 def line(label: str, *ratios: tuple[float, float, float], whole: bool = True) -> ForestLine:
-    return ForestLine(label, tuple(Figure(*ratio) for ratio in ratios), whole=whole)
+    return ForestLine(label, tuple(BoundedFigure(*ratio) for ratio in ratios), whole=whole)
 
 
 def test_ratios_stand_on_a_logarithmic_axis_from_top_to_bottom() -> None:
