@@ -18,6 +18,7 @@ import pytest
 from evaluation.experiments.bootstrap import STATISTICS, intervals, paired
 from evaluation.experiments.transfer.outcome import (
     HEADS,
+    BoundedFigure,
     ForestLine,
     errors_table,
     figures_of,
