@@ -11,6 +11,7 @@ import os
 import re
 import shutil
 import signal
+import socket
 import subprocess
 import sys
 import threading
@@ -157,6 +158,14 @@ def _split(command: str) -> list[str]:
     return shlex.split(command)
 
 
+def _press_freeze(port: int, frozen: bool) -> None:
+    """Freeze the projector's picture, or let it go on, as its remote control would (PJLink class 2, 5.3)."""
+    with socket.create_connection(("127.0.0.1", port), timeout=10.0) as line:
+        assert line.recv(64) == b"PJLINK 0\r"
+        line.sendall(b"%%2FREZ %d\r" % frozen)
+        assert line.recv(64) == b"%2FREZ=OK\r"
+
+
 def _end(process: subprocess.Popen[Any]) -> None:
     process.send_signal(signal.SIGCONT)
     process.terminate()
@@ -233,9 +242,9 @@ def test_what_the_how_to_says_is_what_happens(rehearsal: Rehearsal) -> None:
     _end(pop_up.process)
     after_exposures(1)
     projector = PjLinkProjector(lambda: TcpLink.connect("127.0.0.1", port, 10.0), timeout=10.0)
-    projector.set_frozen(True)
+    _press_freeze(port, True)
     session.hears("paused: .*frozen")
-    projector.set_frozen(False)
+    _press_freeze(port, False)
     after_exposures(1)
     projector.set_muted(True)
     session.hears("paused: .*muted")
