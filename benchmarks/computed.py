@@ -29,7 +29,7 @@ from experiment.config import LabSettings, SimulatedSettings
 from experiment.lights import plan_illuminations, save_illuminations
 from experiment.session.folder import Session
 from sim.world.sensors import find_body
-from synthesis.cli import TableSettings, room_of
+from synthesis.settings import TableSettings, room_of
 from synthesis.table import TableTask, compute_table
 
 LEAST_COUNTS = 30.0

@@ -119,9 +119,9 @@ _LEVEL: Final = 1
 """Level of ISA-L's compression, of 0 to 3, for maps and for what OpenEXR's prediction leaves: both are smooth."""
 _UP: Final = 2
 """The filter type Up (clause 9.2)."""
+# Colour types (clause 11.2.2).
 _GREY: Final = 0
 _RGB: Final = 2
-"""Colour types (clause 11.2.2)."""
 
 
 def encode_png(image: Image, metadata: ImageMetadata) -> bytes:

@@ -240,12 +240,12 @@ class Accumulator:
         }
 
     def to_arrays(self) -> _Arrays:
-        """Return what a checkpoint stores as arrays: all arrays and counts of this value and its parts, by name."""
+        """Return what a checkpoint stores as arrays, (...) of any dtype, by name: those of this value and its parts."""
         parts = {"": self, "estimate.": self.estimate, "hot.": self.hot, "dark.": self.dark}
         return {prefix + name: each for prefix, part in parts.items() for name, each in _arrays_of(part).items()}
 
     def restored(self, values: Mapping[str, Any], arrays: _Arrays) -> Accumulator:
-        """Return what was stored, by `to_json` and `to_arrays`, of a build of the same frames; this one is empty."""
+        """Return what was stored of a build of the same frames, `arrays` (...) of any dtype; this one is empty."""
         page_mm = self.baseline.chart.page_mm
         figures = tuple(
             replace(from_plain(DarkFrameFigures, stored, record.file, _BEGIN_ANEW), record=record)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 ROOT = Path(__file__).parents[2]
-PACKAGES = ("foundation", "drivers", "sim", "acquisition", "calibration", "synthesis")
+PACKAGES = ("foundation", "drivers", "sim", "experiment", "acquisition", "calibration", "synthesis")
 MODULES = sorted(
     ".".join(path.relative_to(ROOT).with_suffix("").parts)
     for package in PACKAGES

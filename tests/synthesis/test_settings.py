@@ -9,7 +9,7 @@ import pytest
 
 from foundation.errors import ConfigurationError
 from sim.world.sensors import BODIES, FACTS, find_body
-from synthesis.cli import TableSettings, load_settings, parse_settings, room_of
+from synthesis.settings import TableSettings, load_settings, parse_settings, room_of
 
 FILE = """
 seed = 3

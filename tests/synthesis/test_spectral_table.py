@@ -18,8 +18,8 @@ from foundation.errors import FormatError, InputError
 from generator.cli import main as generate
 from generator.lights.choices import parse_light
 from sim.world.room import print_reflectance, printed_reflectance, sensitivities
-from synthesis.cli import parse_settings, table_task
 from synthesis.lamps import LightSpectra, read_lights
+from synthesis.settings import parse_settings, table_task
 from synthesis.table import compute_table
 
 pytestmark = pytest.mark.slow

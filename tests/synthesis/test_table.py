@@ -20,7 +20,7 @@ from experiment.lights import plan_illuminations
 from foundation.errors import InputError, QualityError, StorageError
 from sim.world.room import Room
 from sim.world.sensors import BODIES
-from synthesis.cli import TableSettings, parse_settings, table_task
+from synthesis.settings import TableSettings, parse_settings, table_task
 from synthesis.table import TableTask, compute_table
 from tests.calibration.lab import LIGHTS, SETTINGS, designed, hang, take
 

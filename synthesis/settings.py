@@ -1,0 +1,179 @@
+"""What a settings file of `sim table` may say, everything with a default, and the table that it comes to.
+
+One TOML file becomes frozen values at the door; unknown keys are errors.
+"""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Sequence
+from dataclasses import asdict, fields, replace
+from pathlib import Path
+from typing import Annotated, Any, Final
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
+
+from calibration.citation import OriginRecord, with_changes
+from calibration.sampling import WINDOW, WINDOWS
+from drivers.camera import ExposureSettings
+from experiment.chart.layout import design_chart
+from experiment.config import CitationSettings, unknown_key
+from experiment.lights import plan_illuminations
+from foundation.errors import ConfigurationError
+from sim.spectral import describe_sensitivities, read_sensitivities
+from sim.world.room import Room
+from sim.world.sensors import find_body
+from synthesis.lamps import LightSpectra, illuminations_of
+from synthesis.table import TableTask
+
+NOT_COMPUTED: Final = (
+    "blur_px", "fold_mm", "lamp_drift_per_hour", "shutter_jitter_s", "stain_depth", "stain_mm", "wheel_hz",
+)  # fmt: skip
+"""What a photographed room may have and a computed table has not: its frames know neither neighbours nor time."""
+
+
+class _Settings(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+class ComputedExposure(_Settings):
+    """The exposure of every frame, as `[camera]` of LAB.toml has it.
+
+    Spectra are exposed each by itself (`synthesis.lamps.SpectralLamp`): of theirs only the ISO speed counts, and for
+    hot photosites the time.
+    """
+
+    iso: Annotated[int, Field(ge=50, le=25600)] = 100
+    """ISO speed."""
+    aperture: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 8.0
+    """f-number."""
+    shutter_s: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 0.5
+    """Shutter time, s."""
+
+
+class ComputedChart(_Settings):
+    """The chart, as `acquire chart` designs it."""
+
+    bits: Annotated[int, Field(ge=1, le=5)] = 5
+    """Bits kept of each channel."""
+    page: str | None = None
+    """Paper: A0 … A8, or the smallest that fits."""
+    seed: Annotated[int, Field(ge=0)] = 1
+    """Seed of the order of the colours."""
+
+
+class TableSettings(_Settings):
+    """Everything that a settings file of `sim table` says."""
+
+    seed: Annotated[int, Field(ge=0)] = 1
+    """Seed of everything that chance decides: the photosites' response, noise."""
+    window: int = WINDOW
+    """Half-size pixels along the side of a cell's window: 3, 5, 7 or 9."""
+    camera: dict[str, Any] = {}
+    """Facts of the body that differ; see `sim.world.sensors.find_body`."""
+    exposure: ComputedExposure = ComputedExposure()
+    room: dict[str, bool | int | float | str] = {}
+    """Parameters of the room that differ; see `sim.world.room.Room`."""
+    chart: ComputedChart = ComputedChart()
+
+    def changed(self, seed: int | None, room: dict[str, str | float]) -> TableSettings:
+        """Return the settings with another seed, where one is given, and changes of the room that come before its."""
+        return self.model_copy(update={"room": {**self.room, **room}} | ({} if seed is None else {"seed": seed}))
+
+    @property
+    def exposed(self) -> ExposureSettings:
+        """The exposure as the simulated room takes it."""
+        return ExposureSettings(self.exposure.iso, self.exposure.aperture, self.exposure.shutter_s)
+
+
+def load_settings(path: Path | None) -> TableSettings:
+    """Return what a settings file says; the defaults where none is given."""
+    if path is None:
+        return TableSettings()
+    try:
+        document = tomllib.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ConfigurationError(f"cannot read settings {path}: {error.strerror}; name a TOML file") from error
+    except UnicodeDecodeError as error:
+        raise ConfigurationError(f"{path} is no text in UTF-8: {error}; save it as such") from error
+    except tomllib.TOMLDecodeError as error:
+        raise ConfigurationError(f"{path} is not TOML: {error}") from error
+    return parse_settings(document, str(path))
+
+
+def parse_settings(document: dict[str, Any], where: str) -> TableSettings:
+    """Return the settings in a TOML document; `where` names it in errors."""
+    try:
+        settings = TableSettings.model_validate(document)
+    except ValidationError as error:
+        first = error.errors()[0]
+        key = ".".join(map(str, first["loc"]))
+        if first["type"] == "extra_forbidden":
+            models: dict[str, type[BaseModel]] = {"exposure": ComputedExposure, "chart": ComputedChart}
+            model = models.get(str(first["loc"][0]), TableSettings) if len(first["loc"]) > 1 else TableSettings
+            raise unknown_key(key, model.model_fields, where) from error
+        raise ConfigurationError(f"{where}: {key} = {first['input']!r}: {first['msg']}") from error
+    if settings.window not in WINDOWS:
+        raise ConfigurationError(f"{where}: window = {settings.window}: {', '.join(map(str, WINDOWS))} expected")
+    return settings
+
+
+def room_of(settings: TableSettings, where: str) -> Room:
+    """Return the default room with the seed and the changes of the settings; its lamp does not age."""
+    known = [field.name for field in fields(Room) if field.name not in ("seed", *NOT_COMPUTED)]
+    for key in settings.room:
+        if key in NOT_COMPUTED:
+            raise ConfigurationError(
+                f"{where}: room.{key} has no effect on a computed table, whose frames know neither neighbours nor "
+                "time; leave it out, or photograph in the simulated lab with acquire run"
+            )
+        if key not in known:
+            raise unknown_key(f"room.{key}", known, where)
+    try:
+        return TypeAdapter(Room).validate_python({**settings.room, "seed": settings.seed, "lamp_drift_per_hour": 0.0})
+    except ValidationError as error:
+        first = error.errors()[0]
+        key = ".".join(["room", *(str(part) for part in first["loc"][:1])])
+        raise ConfigurationError(f"{where}: {key}: {first['msg']}, got {first['input']!r}") from error
+
+
+def table_task(camera: str, settings: TableSettings, where: str, lights: LightSpectra | None = None) -> TableTask:
+    """Return the table of a camera under lights.
+
+    `lights`: spectra; None for the 707 lights of the simulated projector.
+    """
+    body = find_body(camera, settings.camera, where)
+    room = room_of(settings, where)
+    chart = design_chart(settings.chart.bits, settings.chart.page, settings.chart.seed)
+    seen = read_sensitivities(body.sensitivities)
+    record: dict[str, Any] = {
+        "by": "sim table",
+        "how": "no frame was taken: counts of the photosites under each cell were computed from spectra and a model of "
+        "the sensor, and sampled as those of a frame",
+        "sensitivities": describe_sensitivities(seen),
+        "lights": {"from": "simulated projector"} if lights is None else lights.source,
+        # By name: where a file of sensitivities lies is no property of the table.
+        "body": asdict(replace(body, sensitivities=seen.name)),
+        "exposure": settings.exposure.model_dump(mode="json"),
+        "room": {name: value for name, value in asdict(room).items() if name not in (*NOT_COMPUTED, "seed")},
+        "chart": settings.chart.model_dump(mode="json"),
+        "window": settings.window,
+        "seed": settings.seed,
+    }
+    planned = plan_illuminations() if lights is None else illuminations_of(lights.lights)
+    powers = None if lights is None else np.array([light.power for light in lights.lights])
+    record["lights"] |= {"count": len(planned)}
+    return TableTask(chart, body, room, settings.exposed, planned, powers, settings.window, record)
+
+
+def stated_by_hand(note: str | None, licence: str | None, authors: Sequence[str]) -> OriginRecord | None:
+    """Return what is said of a computed table by whoever computes it; None where nothing is.
+
+    `licence`: an SPDX expression (SPDX specification 2.3, annex D).
+    """
+    given = {"note": note, "licence": licence, "authors": tuple(authors) or None}
+    stated = with_changes(CitationSettings(), {name: value for name, value in given.items() if value is not None})
+    if stated == CitationSettings():
+        return None
+    return OriginRecord(authors=list(stated.authors), note=stated.note or None, licence=stated.licence or None)
