@@ -79,7 +79,7 @@ class TestWholeFile:
         assert path.read_text() == "new"
 
     def test_a_folder_that_is_gone_is_not_made_anew_where_it_must_be_there(self, tmp_path: Path) -> None:
-        with pytest.raises(StorageError, match=r"its folder is gone: connect and mount"):  # noqa: SIM117
+        with pytest.raises(StorageError, match="mount"):  # noqa: SIM117
             with whole_file(tmp_path / "disk" / "frame", make=False) as stream:
                 stream.write(b"raw")
         assert names(tmp_path) == []
@@ -99,7 +99,7 @@ class TestWholeFile:
     def test_a_disk_that_takes_no_more_is_one_sentence_and_leaves_nothing(self, tmp_path: Path) -> None:
         path = tmp_path / "big.dng"
         with (
-            pytest.raises(StorageError, match=r"cannot write .*big\.dng: .*no file may be so large"),
+            pytest.raises(StorageError, match=r"big\.dng: .*so large"),
             small_disk(10_000),
             whole_file(path) as stream,
         ):
@@ -128,25 +128,25 @@ class TestWholeFile:
 
     def test_a_link_to_nowhere_is_told(self, tmp_path: Path) -> None:
         (tmp_path / "link").symlink_to(tmp_path / "gone" / "a.csv")
-        with pytest.raises(InputError, match=r"link: .*it is a link to a place that is not there"):
+        with pytest.raises(InputError, match=r"link: .*a link to"):
             make_folder(tmp_path / "link")
 
     @pytest.mark.skipif(not Path("/proc/self").exists(), reason="this system has no /proc")
     def test_a_file_system_that_takes_no_files_is_told_from_a_disk_that_is_gone(self) -> None:
-        with pytest.raises(InputError, match=r"cannot write /proc/crop: .*name a place on an ordinary disk"):
+        with pytest.raises(InputError, match=r"/proc/crop: .*ordinary disk"):
             write_whole(Path("/proc/crop"), "x")
-        with pytest.raises(InputError, match=r"cannot write /proc/crop: .*name a place on an ordinary disk"):
+        with pytest.raises(InputError, match=r"/proc/crop: .*ordinary disk"):
             make_folder(Path("/proc/crop"))
 
     def test_a_disk_that_was_taken_away_is_not_taken_for_one_that_takes_no_files(self, tmp_path: Path) -> None:
         """The empty folder it was mounted on is there; what was written is not."""
-        with pytest.raises(StorageError, match="connect and mount the disk"), whole_file(tmp_path / "a.csv"):
+        with pytest.raises(StorageError, match="mount"), whole_file(tmp_path / "a.csv"):
             (tmp_path / ".a.csv.partial").unlink()
 
     def test_a_name_below_a_file_is_told(self, tmp_path: Path) -> None:
         write_whole(tmp_path / "file", "x")
         for path in (tmp_path / "file" / "a", tmp_path / "file" / "deeper" / "a"):
-            with pytest.raises(InputError, match=r"cannot write .* a part of that path is a file"):
+            with pytest.raises(InputError, match="part of"):
                 write_whole(path, "x")
         assert (tmp_path / "file").read_text() == "x"
 
@@ -195,7 +195,7 @@ class TestWholeFile:
             monkeypatch.setattr(storage.os, "fsync", fsync)
 
         fail(errno.EIO)
-        with pytest.raises(StorageError, match="Input/output error; the disk fails"):
+        with pytest.raises(StorageError, match="the disk fails"):
             storage.sync_folder(tmp_path)
         fail(errno.EINVAL)
         storage.sync_folder(tmp_path)
@@ -326,7 +326,7 @@ def test_an_empty_folder_is_no_free_file(tmp_path: Path) -> None:
     require_free_file(tmp_path / "new", "the lights")
     (tmp_path / "link").symlink_to(tmp_path / "nowhere")
     for path in (tmp_path, tmp_path / "link"):
-        with pytest.raises(InputError, match="already exists; name another place for the lights"):
+        with pytest.raises(InputError, match="for the lights"):
             require_free_file(path, "the lights")
 
 
@@ -368,5 +368,5 @@ def test_a_folder_that_is_there_and_not_there_is_not_waited_for(
         raise FileExistsError(errno.EEXIST, "File exists")
 
     monkeypatch.setattr(Path, "mkdir", mkdir)
-    with pytest.raises(StorageError, match="its folder is there and not there; name a place on an ordinary disk"):
+    with pytest.raises(StorageError, match="ordinary disk"):
         storage.make_folder(tmp_path / "x")

@@ -222,7 +222,7 @@ def test_messages_name_what_is_made_there_rather_than_the_hidden_folder(tmp_path
     table = tmp_path / "file" / "table"
     table.parent.touch()
     with (
-        pytest.raises(InputError, match=f"cannot write {table}: a part of that path is a file"),
+        pytest.raises(InputError, match=f"{table}: a part of"),
         held_folder(table.with_name(".table.partial"), BUSY, of=table),
     ):
         pytest.fail("held")
@@ -236,7 +236,7 @@ def test_a_folder_that_is_made_and_never_there_is_not_waited_for(
 
     monkeypatch.setattr("foundation.held_folders.make_folder", make_nothing)
     with (
-        pytest.raises(StorageError, match="its folder is made and not there; name a place on an ordinary disk"),
+        pytest.raises(StorageError, match="ordinary disk"),
         held_folder(tmp_path / "x", "busy"),
     ):
         pass

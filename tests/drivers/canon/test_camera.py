@@ -217,7 +217,7 @@ def test_what_would_spoil_a_series_is_refused_with_its_remedy(
 
 
 def test_a_low_battery_is_refused() -> None:
-    with pytest.raises(DeviceRefused, match="the battery is low"):
+    with pytest.raises(DeviceRefused, match="battery"):
         Lab(battery=0.05).camera.configure(SETTINGS)
 
 
@@ -239,7 +239,7 @@ def test_raw_beside_jpeg_is_not_offered_as_raw_alone() -> None:
         replace(spec, value=both.encode(), formats=(both,)) if spec.code == Property.EOS_IMAGE_FORMAT else spec
         for spec in EOS_550D.properties
     )
-    with pytest.raises(DeviceRefused, match=r"image format RAW alone is not offered; with raw are: RAW \+ JPEG L fine"):
+    with pytest.raises(DeviceRefused, match=r"RAW \+ JPEG L fine"):
         Lab(replace(EOS_550D, properties=properties)).camera.configure(SETTINGS)
 
 
@@ -251,25 +251,32 @@ def test_the_body_is_given_back_as_it_was(lab: Lab) -> None:
     assert lab.waiting() == 0
 
 
-def heard(lab: Lab) -> list[tuple[int, ...]]:
-    """Return the list of (offset, size) of the pieces that will be asked of the body, and answered."""
-    pieces: list[tuple[int, ...]] = []
+class Listening(faults.TroubledResponder):
+    """Notes what the body is asked."""
 
-    class Listening(faults.TroubledResponder):
-        def answer(self, request: PtpRequest, data: bytes | None) -> Answer:
-            if request.code == Operation.EOS_GET_PARTIAL_OBJECT:
-                pieces.append(request.parameters[1:])
-            return super().answer(request, data)
+    def __init__(self, good: Responder) -> None:
+        super().__init__(good)
+        self.asked: list[PtpRequest] = []
 
-    lab.device = Listening(lab.device)
-    return pieces
+    def answer(self, request: PtpRequest, data: bytes | None) -> Answer:
+        self.asked.append(request)
+        return super().answer(request, data)
+
+    def parameters(self, code: int) -> list[tuple[int, ...]]:
+        return [request.parameters for request in self.asked if request.code == code]
+
+
+def listen(lab: Lab) -> Listening:
+    lab.device = listening = Listening(lab.device)
+    return listening
 
 
 def test_a_large_frame_comes_in_pieces_of_a_mebibyte() -> None:
     lab = Lab(film_bytes=2_500_000)
-    pieces = heard(lab)
+    listening = listen(lab)
     lab.camera.configure(SETTINGS)
     size = lab.take().size
+    pieces = [parameters[1:] for parameters in listening.parameters(Operation.EOS_GET_PARTIAL_OBJECT)]
     assert pieces == [(0, 1 << 20), (1 << 20, 1 << 20), (2 << 20, size - (2 << 20))]
     assert lab.waiting() == 0
 
@@ -490,22 +497,16 @@ def test_an_object_that_is_announced_for_ever_and_never_there(lab: Lab) -> None:
 
 def test_an_announcement_that_comes_after_the_next_release_is_not_taken_for_its_frame(lab: Lab) -> None:
     held: list[Record] = []
-    released: list[int] = []
 
     def hold_first(records: tuple[Record, ...]) -> tuple[Record, ...]:
-        if released:
+        if listening.parameters(Operation.EOS_REMOTE_RELEASE_ON):
             late, held[:] = tuple(held), []
             return records + late
         held.extend(filter(is_frame, records))
         return tuple(record for record in records if not is_frame(record))
 
-    class Listening(faults.TroubledResponder):
-        def answer(self, request: PtpRequest, data: bytes | None) -> Answer:
-            if request.code == Operation.EOS_REMOTE_RELEASE_ON:
-                released.append(1)
-            return super().answer(request, data)
-
-    lab.device = Listening(Announcing(lab.eos, hold_first))
+    lab.device = Announcing(lab.eos, hold_first)
+    listening = listen(lab)
     lab.camera.configure(replace(SETTINGS, shutter_s=1.0))
     lab.press()
     lab.camera.idle()
@@ -517,11 +518,12 @@ def test_an_announcement_that_comes_after_the_next_release_is_not_taken_for_its_
 
 def test_a_transfer_goes_on_where_it_broke_off() -> None:
     lab = Lab(film_bytes=2_500_000)
-    pieces = heard(lab)
+    listening = listen(lab)
     lab.device = faults.Hanging(lab.device, Occasion({Operation.EOS_GET_PARTIAL_OBJECT}, after=1))
     lab.camera.configure(SETTINGS)
     lab.take(attempts=1)
-    assert [offset for offset, _ in pieces] == [0, 1 << 20, 2 << 20]
+    asked = listening.parameters(Operation.EOS_GET_PARTIAL_OBJECT)
+    assert [offset for _, offset, _ in asked] == [0, 1 << 20, 2 << 20]
     assert lab.openings == 2
 
 
@@ -625,16 +627,10 @@ def test_a_jpeg_beside_the_raw_is_freed(lab: Lab) -> None:
         jpeg = TransferRequest(0x78, 0x3801, 10, "IMG_0001.JPG")
         return tuple(item for record in records for item in ((record, jpeg) if is_frame(record) else (record,)))
 
-    freed: list[int] = []
-
-    class Listening(faults.TroubledResponder):
-        def answer(self, request: PtpRequest, data: bytes | None) -> Answer:
-            if request.code == Operation.EOS_TRANSFER_COMPLETE:
-                freed.append(request.parameters[0])
-            return super().answer(request, data)
-
-    lab.device = Listening(Announcing(lab.eos, add_jpeg))
+    lab.device = Announcing(lab.eos, add_jpeg)
+    listening = listen(lab)
     goes_on(lab, 2)
+    freed = [parameters[0] for parameters in listening.parameters(Operation.EOS_TRANSFER_COMPLETE)]
     assert freed.count(0x78) == 2
 
 
@@ -771,9 +767,9 @@ def test_a_body_that_forgets_its_frames_says_so_once(lab: Lab) -> None:
     lab.camera.configure(SETTINGS)
     lab.camera.expose()
     lab.pull()
-    with pytest.raises(DeviceError, match="holds none in its memory; take it again"):
+    with pytest.raises(DeviceError, match="take it again"):
         lab.camera.download(io.BytesIO())
-    with pytest.raises(DeviceError, match="no exposed frame waits"):
+    with pytest.raises(DeviceError, match="no exposed frame"):
         lab.camera.download(io.BytesIO())
     lab.take(attempts=1)
 
@@ -792,7 +788,7 @@ def test_configuring_drops_a_frame_that_was_not_downloaded(lab: Lab) -> None:
     lab.camera.expose()
     lab.camera.configure(SETTINGS)
     assert lab.waiting() == 0
-    with pytest.raises(DeviceError, match="no exposed frame waits"):
+    with pytest.raises(DeviceError, match="no exposed frame"):
         lab.camera.download(io.BytesIO())
 
 
@@ -813,12 +809,6 @@ OPTIONAL = (
 @pytest.mark.parametrize("code", OPTIONAL, ids=[code.name for code in OPTIONAL])
 def test_an_optional_operation_that_a_body_lists_and_has_not_got(code: Operation, answer: int) -> None:
     lab = Lab()
-    asked: list[int] = []
-
-    class Listening(faults.TroubledResponder):
-        def answer(self, request: PtpRequest, data: bytes | None) -> Answer:
-            asked.append(request.code)
-            return super().answer(request, data)
 
     class Rooming(faults.TroubledResponder):
         """Has room for frames, and does not know how to be told of it."""
@@ -829,11 +819,12 @@ def test_an_optional_operation_that_a_body_lists_and_has_not_got(code: Operation
                 return answered
             return Answer(PtpResponse(answer, request.transaction))
 
-    lab.device = Listening(
+    lab.device = (
         Rooming(lab.eos)
         if code == Operation.EOS_PC_HDD_CAPACITY
         else faults.Declining(lab.eos, answer, Occasion({code}, times=None))
     )
+    listening = listen(lab)
     lab.camera.configure(SETTINGS)
     for _ in range(3):
         lab.take(attempts=1)
@@ -843,7 +834,7 @@ def test_an_optional_operation_that_a_body_lists_and_has_not_got(code: Operation
     assert lab.openings == 1
     assert lab.waiting() == 0
     if code not in (Operation.EOS_KEEP_DEVICE_ON, Operation.EOS_REMOTE_RELEASE_OFF):
-        assert asked.count(code) <= 1, "it is not asked again"
+        assert len(listening.parameters(code)) <= 1, "it is not asked again"
     lab.camera.close()
 
 
@@ -908,7 +899,7 @@ def test_a_camera_that_never_was_is_told_at_once() -> None:
     def absent() -> Transport:
         raise LinkClosed("no camera on USB")
 
-    with pytest.raises(LinkClosed, match="no camera on USB"):
+    with pytest.raises(LinkClosed, match="on USB"):
         CanonEos(absent, clock).identity()
     assert clock.monotonic() == 0
 
@@ -917,13 +908,13 @@ def test_another_body_in_its_place_is_refused(lab: Lab) -> None:
     lab.camera.configure(SETTINGS)
     lab.device = SimulatedEos(EOS_550D, lab.film, lab.clock, serial="0000000002", auto_power_off_s=0)
     lab.pull()
-    with pytest.raises(DeviceRefused, match="serial number 0000000001 there is now a Canon EOS 550D with 0000000002"):
+    with pytest.raises(DeviceRefused, match=r"0000000001 .* 0000000002"):
         lab.take()
 
 
 def test_another_makers_camera_is_refused(lab: Lab) -> None:
     body = replace(EOS_550D, info=replace(EOS_550D.info, manufacturer="Nikon Corporation", model="D90"))
-    with pytest.raises(DeviceRefused, match="is a Nikon Corporation D90, which does not speak as a Canon EOS does"):
+    with pytest.raises(DeviceRefused, match="Nikon Corporation D90"):
         Lab(body).camera.identity()
 
 
@@ -994,7 +985,7 @@ def test_what_a_body_reports_is_kept_as_it_came_last(changes: list[tuple[int, by
 def test_an_answer_of_gigabytes_is_refused_before_it_is_read(length: int) -> None:
     # 32 bits of a container say at most 4 GiB, or that the end is not known; PTP/IP has 64.
     reception = Reception(PtpRequest(Operation.EOS_GET_EVENT, 7), None, "the camera")
-    with pytest.raises(ProtocolError, match="at most 4194304 were expected"):
+    with pytest.raises(ProtocolError, match="4194304"):
         reception.start(7, length)
 
 
@@ -1003,7 +994,7 @@ def test_an_answer_without_end_is_refused_at_its_bound() -> None:
     reception.start(7, None)
     for _ in range(64):
         reception.take(bytes(1 << 16))
-    with pytest.raises(ProtocolError, match="at most 4194304 were expected"):
+    with pytest.raises(ProtocolError, match="4194304"):
         reception.take(b"x")
 
 

@@ -176,7 +176,7 @@ def test_a_body_that_stands_at_raw_and_cannot_be_set_is_good() -> None:
 def test_an_aperture_ring_that_stands_right_is_good() -> None:
     ring = BodySetting("f-number", "f/8", ("f/8", "f/11"), fixed=True)
     assert plan((NIKON_Z7 | {"f-number": ring}).get, SETTINGS)["f-number"] == "f/8"
-    with pytest.raises(DeviceRefused, match="f-number 11 is not offered"):
+    with pytest.raises(DeviceRefused, match="f-number 11"):
         plan((NIKON_Z7 | {"f-number": ring}).get, replace(SETTINGS, aperture=11))
 
 
@@ -246,7 +246,7 @@ def test_a_picture_in_place_of_a_raw_file_is_refused(monkeypatch: pytest.MonkeyP
     with pytest.raises(DeviceRefused, match=r"capt0000\..* no raw file, though it was asked for one"):
         fake.camera.expose()
     assert fake.body.files == {}, "it does not stay in the camera's memory"
-    with pytest.raises(DeviceError, match="no exposed frame waits"):
+    with pytest.raises(DeviceError, match="no exposed frame"):
         fake.camera.download(io.BytesIO())
 
 
@@ -282,7 +282,7 @@ def test_a_fault_of_the_download_says_that_the_frame_is_lost(fake: Fake) -> None
     fake.body.fails.append(-34)
     with pytest.raises(DeviceError, match="check the cable"):
         fake.camera.download(io.BytesIO())
-    with pytest.raises(DeviceError, match="no exposed frame waits in the camera to be downloaded; expose it again"):
+    with pytest.raises(DeviceError, match="expose it again"):
         fake.camera.download(io.BytesIO())
 
 

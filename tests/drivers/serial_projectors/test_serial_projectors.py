@@ -196,7 +196,7 @@ def test_epson_power(code: bytes, power: Power) -> None:
 
 def test_epson_abnormal_state_is_a_fault() -> None:
     projector, _ = epson_script((b"PWR?\r", b"PWR=05\r:"))
-    with pytest.raises(DeviceFault, match="look at its indicators"):
+    with pytest.raises(DeviceFault, match="indicators"):
         projector.power()
 
 
@@ -207,7 +207,7 @@ def test_epson_is_asked_nothing_until_it_has_switched_on() -> None:
     projector.switch_on()
     script.read(1, 0)  # the empty answer
     assert projector.power() is Power.WARMING
-    with pytest.raises(DeviceRefused, match="wait until that is done"):
+    with pytest.raises(DeviceRefused, match="until that"):
         projector.lamps()
     clock.sleep(40)
     script.more(b":")
@@ -238,7 +238,7 @@ def test_epson_that_is_on_and_does_not_know_a_question_cannot_tell() -> None:
     assert projector.muted() is None
     assert projector.lamps() == ()
     for ask in (projector.muted, projector.lamps, projector.faults):
-        with pytest.raises(DeviceRefused, match="wait until its power is on"):
+        with pytest.raises(DeviceRefused, match="power is on"):
             ask()
     assert script.ended()
 
@@ -248,7 +248,7 @@ def test_epson_busy_for_an_earlier_program_says_how_long_to_wait() -> None:
     peer = EpsonPeer(SimulatedProjector(clock))
     EpsonProjector(lambda: SerialPeerLink(peer), clock=clock).switch_on()
     later = EpsonProjector(lambda: SerialPeerLink(peer), clock=clock)
-    with pytest.raises(LinkTimeout, match="for an earlier program: wait 130 s"):
+    with pytest.raises(LinkTimeout, match="wait 130 s"):
         later.power()
     clock.sleep(30)
     assert later.power() is Power.ON
@@ -358,16 +358,18 @@ def test_benq_power_with_and_without_echo_and_prompt(said: bytes, power: Power) 
     assert projector.power() is power
 
 
-def test_benq_answer_that_looks_like_its_echo() -> None:
-    projector, _ = benq_script((b"\r*pow=?#\r", b">*pow=?#\r\n*POW=OFF#\r\n>"), (b"\r*pow=on#\r", b">*pow=on#\r\n>"))
+@pytest.mark.parametrize(
+    ("state", "answer"),
+    [
+        (b">*pow=?#\r\n*POW=OFF#\r\n>", b">*pow=on#\r\n>"),
+        (b"*pow=?#\r\n*POW=OFF#\r\n", b"*pow=on#\r\n*pow=on#\r\n"),
+    ],
+    ids=["with a prompt", "without"],
+)
+def test_benq_answer_that_looks_like_its_echo(state: bytes, answer: bytes) -> None:
+    projector, script = benq_script((b"\r*pow=?#\r", state), (b"\r*pow=on#\r", answer))
     projector.switch_on()
-
-
-def test_benq_answer_like_its_echo_without_a_prompt() -> None:
-    projector, _ = benq_script(
-        (b"\r*pow=?#\r", b"*pow=?#\r\n*POW=OFF#\r\n"), (b"\r*pow=on#\r", b"*pow=on#\r\n*pow=on#\r\n")
-    )
-    projector.switch_on()
+    assert script.ended()
 
 
 def test_benq_on_the_way_is_known_by_where_it_was() -> None:
@@ -406,7 +408,7 @@ def test_benq_names_lamps_and_refusals() -> None:
     assert projector.lamps() == (Lamp(432, lit=True),)
     assert projector.lamps() == ()
     projector.set_muted(True)
-    with pytest.raises(DeviceRefused, match="wait until its power is on"):
+    with pytest.raises(DeviceRefused, match="power is on"):
         projector.muted()
 
 
@@ -589,7 +591,7 @@ def test_nec_error_bits() -> None:
 
 def test_nec_wrong_sum_and_wrong_answer() -> None:
     projector, _ = nec_script((RUNNING, running("00 00 01 00 00 04", "FA")))
-    with pytest.raises(ProtocolError, match="its sum is 0xfb"):
+    with pytest.raises(ProtocolError, match="0xfb"):
         projector.power()
     projector, _ = nec_script((RUNNING, "22 00 01 40 00 63"))
     with pytest.raises(ProtocolError, match="02h 00h"):
@@ -621,7 +623,7 @@ def test_half_an_answer_is_no_answer(name: str, data: st.DataObject) -> None:
     end = answer.index(b"#\r\n>") if name == "benq" else len(answer) - 1
     half = answer[: data.draw(st.integers(0, end))]
     script = Script(*((said, b":") for said in before), (question, (half,) if half else ()))
-    with pytest.raises(LinkTimeout, match="has not answered within 5 s"):
+    with pytest.raises(LinkTimeout, match="within 5 s"):
         driver(lambda: script).power()
 
 
