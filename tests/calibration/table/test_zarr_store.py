@@ -60,9 +60,9 @@ def test_there_and_back(lut: Lut, tmp_path: Path, place: str) -> None:
     assert files(tmp_path / "back") == files(lut.folder)
     assert back.sha256 == lut.sha256
     np.testing.assert_array_equal(back.samples, lut.samples)
-    with pytest.raises(InputError, match="already holds a table; name another place"):
+    with pytest.raises(InputError, match="already holds a table"):
         publish(lut, url)
-    with pytest.raises(InputError, match="back already exists; name another place for the table"):
+    with pytest.raises(InputError, match="back already exists"):
         fetch(url, tmp_path / "back")
 
 
@@ -92,7 +92,7 @@ def test_what_was_never_finished_is_published_anew(lut: Lut, tmp_path: Path, mon
 
     with pytest.raises(KeyboardInterrupt):
         publish(lut, url, stop)
-    with pytest.raises(FormatError, match="holds no table, or one that was never finished"):
+    with pytest.raises(FormatError, match="never finished"):
         fetch(url, tmp_path / "back")
     assert not (tmp_path / "back").exists()
     publish(lut, url)
@@ -102,7 +102,7 @@ def test_what_was_never_finished_is_published_anew(lut: Lut, tmp_path: Path, mon
 def test_nothing_else_is_overwritten(lut: Lut, tmp_path: Path) -> None:
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "notes.txt").write_text("mine")
-    with pytest.raises(InputError, match="mine already holds something else; name another place"):
+    with pytest.raises(InputError, match="mine already holds"):
         publish(lut, str(tmp_path / "mine"))
     assert (tmp_path / "mine" / "notes.txt").read_text() == "mine"
 
@@ -112,7 +112,7 @@ def test_what_changed_on_the_way_is_refused(lut: Lut, tmp_path: Path) -> None:
     publish(lut, url)
     array = import_module("zarr").open_array(url, mode="r+")
     array[7, 5, 4, 1] = 12345
-    with pytest.raises(FormatError, match=r"the samples of light 7 from .* are not those that were measured"):
+    with pytest.raises(FormatError, match="light 7"):
         fetch(url, tmp_path / "back")
     (shard,) = (path for path in (tmp_path / "published" / "c" / "1").rglob("*") if path.is_file())
     data = bytearray(shard.read_bytes())
@@ -135,7 +135,7 @@ def test_what_is_not_there_or_not_installed(lut: Lut, tmp_path: Path, monkeypatc
         del name
 
     monkeypatch.setattr("calibration.table.zarr_store.find_spec", find_spec)
-    with pytest.raises(InputError, match=r"need zarr; install it with: pip install zarr"):
+    with pytest.raises(InputError, match="pip install zarr"):
         publish(lut, str(tmp_path / "published"))
 
 
@@ -171,7 +171,7 @@ def retell_everything(described: dict[str, Any]) -> None:
 def test_a_published_truth_that_was_edited_is_refused(lut: Lut, tmp_path: Path) -> None:
     publish(lut, str(tmp_path / "published"))
     edit(tmp_path / "published", brighten_the_truth)
-    with pytest.raises(FormatError, match=r"illuminations\.csv is not as it was built: lights or ground truth"):
+    with pytest.raises(FormatError, match=r"illuminations\.csv"):
         fetch(str(tmp_path / "published"), tmp_path / "back")
     assert not (tmp_path / "back").exists()
 
@@ -256,7 +256,7 @@ def test_claimed_lights_do_not_fill_the_disk(lut: Lut, tmp_path: Path, monkeypat
         return SimpleNamespace(free=lut.samples.nbytes)
 
     monkeypatch.setattr("calibration.table.zarr_store.shutil.disk_usage", nearly_full)
-    with pytest.raises(StorageError, match=r"0\.0 GB are free at .*; free space or choose another disk"):
+    with pytest.raises(StorageError, match=r"0\.0 GB"):
         fetch(str(tmp_path / "published"), tmp_path / "back")
 
 
@@ -277,7 +277,7 @@ def test_damaged_samples_are_not_published(lut: Lut, tmp_path: Path) -> None:
     with (lut.folder / "samples.npy").open("r+b") as stream:
         stream.seek(-1, 2)
         stream.write(b"\x7f")
-    with pytest.raises(FormatError, match=f"the samples of light {LIGHTS - 1} are not those that were measured"):
+    with pytest.raises(FormatError, match=f"light {LIGHTS - 1} "):
         publish(open_lut(lut.folder), str(tmp_path / "published"))
     with pytest.raises(FormatError, match="never finished"):
         fetch(str(tmp_path / "published"), tmp_path / "back")
