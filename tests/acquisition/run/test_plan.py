@@ -130,7 +130,7 @@ class TestDisk:
             return os.statvfs_result((0,) * 8 + (os.ST_RDONLY, 255))
 
         monkeypatch.setattr(os, "statvfs", read_only)
-        with pytest.raises(StorageError, match=r"night: Read-only file system; .* mount it for writing"):
+        with pytest.raises(StorageError, match="night: Read-only file system"):
             free_bytes_at(tmp_path / "night")
 
     def test_a_disk_that_fails(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -33,7 +33,7 @@ def test_a_disk_that_forgets_is_noticed(tmp_path: Path) -> None:
     flip("samples.npy", -1)(tmp_path / "lut")
     assert writer.damaged() == [0]
     known = Provenance(camera="T", bits=1, white_level=1, session_sha256="", chart_sha256="", software="")
-    with pytest.raises(StorageError, match="lights 0 read back are not those written"):
+    with pytest.raises(StorageError, match="lights 0 "):
         writer.finish(LIGHTS[:1], np.ones((1, 3)), known)
     assert not (tmp_path / "lut" / "lut.json").exists()
 
@@ -79,5 +79,5 @@ def test_samples_that_have_changed_are_not_used(tmp_path: Path) -> None:
 def test_a_table_in_the_making_is_not_read(tmp_path: Path) -> None:
     (tmp_path / ".lut.partial").mkdir()
     LutWriter(tmp_path / ".lut.partial", 1, 8, 25)
-    with pytest.raises(FormatError, match="is a table in the making; finish it with build-lut"):
+    with pytest.raises(FormatError, match=r"in the making.*build-lut"):
         open_lut(tmp_path / "lut")

@@ -127,15 +127,15 @@ def test_an_older_table_is_held_against_what_it_recorded(tmp_path: Path) -> None
     flip("frames.csv", -3)(lut.folder)
     assert find_faults(open_lut(lut.folder)) == ["frames.csv does not list the frames that lut.json was made of"]
     flip("illuminations.csv", -3)(lut.folder)
-    with pytest.raises(FormatError, match=r"illuminations\.csv is not as it was built: lights or ground truth"):
+    with pytest.raises(FormatError, match=r"illuminations\.csv is not"):
         open_lut(lut.folder)
 
 
 @pytest.mark.parametrize(
     ("key", "value", "fault"),
     [
-        ("unfit", [{"colour": 8, "cause": "x"}], "unfit: colour 8 is none of the 8"),
-        ("lights_sha256", ["00" * 32], "has hashes of 1 lights, the table has 5 lights"),
+        ("unfit", [{"colour": 8, "cause": "x"}], "colour 8 "),
+        ("lights_sha256", ["00" * 32], "1 lights.* 5 lights"),
         ("lights_sha256", ["x"] * 5, "lights_sha256.0"),
         ("files_sha256", {"../frames.csv": "00" * 32}, "files_sha256"),
         ("bits", 2, r"expected uint16 \(5, 64, samples, 3\)"),
@@ -194,7 +194,7 @@ def test_a_file_of_absurd_size_is_not_read(tmp_path: Path) -> None:
     lut = write(tmp_path / "lut")
     with (lut.folder / "lut.json").open("r+b") as stream:
         stream.truncate(1 << 40)
-    with pytest.raises(FormatError, match=r"lut.json has 1099511627776 bytes, at most"):
+    with pytest.raises(FormatError, match="1099511627776 bytes"):
         open_lut(lut.folder)
 
 
