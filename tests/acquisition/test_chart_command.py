@@ -83,13 +83,9 @@ def test_the_paper_s_arrangement(chart: Run, capsys: pytest.CaptureFixture[str])
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (("--page", "A5"), "too small for the 32768 colours"),
-        (("--page", "A1", "--cell-mm", "5.29"), "3.60 mm fit"),
-        (("--cell-mm", "0.5"), "cannot be printed evenly"),
-        (("--arrangement", "paper", "--cell-mm", "3"), "leave --cell-mm out"),
-        (("--arrangement", "paper", "--page", "A6"), "256 × 128 cells"),
-        (("--page", "letter"), "is not known"),
-        (("--page", "1e9x1e9"), "larger than any print, 10000 mm a side"),
+        (("--page", "A5"), "32768"),
+        (("--arrangement", "paper", "--cell-mm", "3"), "--cell-mm"),
+        (("--page", "1e9x1e9"), "10000 mm"),
     ],
 )
 def test_what_cannot_be_printed_is_refused_in_one_line(

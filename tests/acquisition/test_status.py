@@ -103,4 +103,4 @@ def test_status_changes_nothing(folder: Path, capsys: pytest.CaptureFixture[str]
 
 def test_what_is_no_session(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["status", str(tmp_path)]) == 2
-    assert "is no session: it holds no journal.sqlite" in capsys.readouterr().err
+    assert "journal.sqlite" in capsys.readouterr().err

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import re
 from dataclasses import replace
-from datetime import UTC, datetime, timedelta, timezone
+from datetime import datetime, timedelta, timezone
 from pathlib import Path
 
 import pytest
@@ -168,12 +168,6 @@ def test_an_origin_is_carried_by_the_file_unchanged() -> None:
     known = parse_provenance(text.encode(), Path("lut.json"))
     assert known.origin == origin
     assert parse_provenance(known.to_json().encode(), Path("lut.json")).origin == origin
-
-
-def test_dates_are_in_utc() -> None:
-    found = origin_record(stated(), RECORDS, [BODY])
-    assert found.last_frame is not None
-    assert datetime.fromisoformat(found.last_frame).tzinfo == UTC
 
 
 def test_an_address_ends_no_entry() -> None:

@@ -93,9 +93,9 @@ def test_temperatures_are_read() -> None:
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("10000:2000:200", "steps of 200 K do not lead from 10000 to 2000 K"),
-        ("2000:10000:0", "steps of 0 K do not lead"),
-        ("2000:10000:nan", "steps of nan K do not lead"),
+        ("10000:2000:200", "200 K .*10000 to 2000 K"),
+        ("2000:10000:0", "steps of 0 K"),
+        ("2000:10000:nan", "steps of nan K"),
         ("2000:10000:1e-6", "in at most 10000 temperatures"),
         ("1:1e12:1", "1 K is not within 1000"),
         ("2000:inf:200", "inf K is not within"),
@@ -111,7 +111,7 @@ def test_temperatures_that_are_none_are_refused(text: str, said: str) -> None:
 
 def test_lights_do_not_overwrite_their_plot(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["illuminations", str(tmp_path / "a.png"), "--grid", "1"]) == 2
-    assert "a.png is where the plot of the lights goes; name the lights" in capsys.readouterr().err
+    assert "a.png" in capsys.readouterr().err
     assert not list(tmp_path.iterdir())
 
 
@@ -169,18 +169,17 @@ def test_a_file_of_other_hands(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("", "expected lights under the columns"),
-        (HEADER, "expected lights under the columns"),
-        (HEADER.replace(",", ";") + "0;uniform;;1;2;3\n", "expected lights under the columns"),
-        ("index,kind,red,green,blue\n0,uniform,1,2,3\n", "expected lights under the columns"),
-        (HEADER + "0,uniform,,1,2\n", "light 0: blue is missing, expected a whole number"),
-        (HEADER + "0,uniform,,1,2,\n", "light 0: blue is missing"),
-        (HEADER + "0,uniform,,1.5,2,3\n", "light 0: red is 1.5, expected a whole number"),
+        ("", "lights under the columns"),
+        (HEADER, "lights under the columns"),
+        (HEADER.replace(",", ";") + "0;uniform;;1;2;3\n", "lights under the columns"),
+        ("index,kind,red,green,blue\n0,uniform,1,2,3\n", "lights under the columns"),
+        (HEADER + "0,uniform,,1,2\n", "light 0: blue is missing"),
+        (HEADER + "0,uniform,,1.5,2,3\n", "light 0: red is 1.5"),
+        (HEADER + "0,uniform,,-1,2,3\n", "light 0: red is -1"),
         (HEADER + "0,uniform,,1,256,3\n", "light 0: green is 256; a code is 0 … 255"),
-        (HEADER + "0,uniform,,-1,2,3\n", "light 0: red is -1; a code"),
-        (HEADER + "0,sun,,1,2,3\n", "light 0: kind is 'sun', expected uniform or blackbody"),
+        (HEADER + "0,sun,,1,2,3\n", "light 0: kind is 'sun'"),
         (HEADER + "0,uniform,,1,2,3\n2,uniform,,1,2,3\n", "light 1: index is 2, expected 1"),
-        (HEADER + "0,blackbody,,1,2,3\n", "light 0: cct_k is missing, expected kelvin above 0"),
+        (HEADER + "0,blackbody,,1,2,3\n", "light 0: cct_k is missing"),
         (HEADER + "0,blackbody,warm,1,2,3\n", "light 0: cct_k is warm"),
         (HEADER + "0,blackbody,-5,1,2,3\n", "light 0: cct_k is -5"),
         (HEADER + "0,blackbody,inf,1,2,3\n", "light 0: cct_k is inf"),
@@ -201,7 +200,7 @@ def test_what_is_missing_or_no_text_is_refused(tmp_path: Path) -> None:
     binary = tmp_path / "picture.csv"
     binary.write_bytes(b"\x89PNG\xff\xfe")
     for path in (tmp_path / "none.csv", tmp_path, binary):
-        with pytest.raises(FormatError, match=r"cannot read illuminations .*make one with: acquire illuminations"):
+        with pytest.raises(FormatError, match="acquire illuminations"):
             load_illuminations(path)
 
 
@@ -228,5 +227,5 @@ def test_figures_of_other_kinds(tmp_path: Path) -> None:
         plot_illuminations(few, tmp_path / name)
         assert (tmp_path / name).read_bytes().startswith(head)
     plot_illuminations((), tmp_path / "none.png")
-    with pytest.raises(InputError, match=r"end its name with \.png, \.pdf, \.svg"):
+    with pytest.raises(InputError, match=r"\.png, \.pdf, \.svg"):
         plot_illuminations(few, tmp_path / "lights.txt")

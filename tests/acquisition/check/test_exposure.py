@@ -98,25 +98,7 @@ def test_white_is_judged_at_the_settings_time(level: float, grade: str) -> None:
         assert found.details["proposed_shutter_s"] in TIMES
 
 
-def test_a_room_in_which_every_time_saturates_is_told() -> None:
-    found = judge_exposure(tried(1e4, 0.5, TIMES), Saturation(13584, True, 15831), TIMES, PERIOD_S, recorded=False)
-    assert found.grade == "fault"
-    assert "even the shortest, 0.01667 s, saturates: set a higher f-number" in found.remedy
-
-
-def test_a_dim_room_asks_for_more_light() -> None:
-    found = judge_exposure(tried(0.01, 0.5, TIMES), Saturation(15831, False, 15831), TIMES, PERIOD_S, recorded=False)
-    assert found.grade == "remark"
-    assert "set a lower f-number or a higher ISO speed" in found.remedy
-
-
 def test_a_share_of_a_stated_saturation_is_not_called_good() -> None:
     found = judge_exposure(tried(1.4, 0.5, TIMES), Saturation(15831, False, 15831), TIMES, PERIOD_S, recorded=False)
     assert found.grade == "remark"
     assert "as the file states, not measured" in found.said
-
-
-def test_a_recording_is_judged_and_not_exposed_anew() -> None:
-    found = judge_exposure(tried(0.04, 0.5, [])[:1], Saturation(13584, True, 15831), [], PERIOD_S, recorded=True)
-    assert found.grade == "remark"
-    assert "cannot be exposed anew" in found.remedy

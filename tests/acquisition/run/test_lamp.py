@@ -236,12 +236,6 @@ def test_a_cold_lamp_is_lit_and_given_its_minutes() -> None:
     assert clock.monotonic() >= 600 + projector.traits.warm_up_s
 
 
-def test_a_warm_lamp_is_not_waited_for() -> None:
-    clock = SimulatedClock()
-    make_ready(SimulatedProjector(clock, power=Power.ON), SEQUENCE, no_time(clock))
-    assert clock.monotonic() == 0
-
-
 def test_a_warm_lamp_is_not_waited_for_though_the_answer_takes_its_time() -> None:
     class Slow(SimulatedProjector):
         def power(self) -> Power:
@@ -387,14 +381,6 @@ def test_a_projector_unreachable_at_the_start_is_waited_for() -> None:
     room.at(100, lambda: room.pull(False))
     make_ready(room.projector, SEQUENCE, room.retry)
     assert room.words == ["retry", "paused", "resumed"]
-
-
-def test_a_picture_muted_for_good_ends_the_run_with_its_cause() -> None:
-    room = Room()
-    room.device.set_muted(True)
-    with pytest.raises(DeviceFault, match=r"muted; .*; the run waited 10 min 00 s"):
-        await_health(room.projector, SEQUENCE, room.retry)
-    assert room.clock.monotonic() == pytest.approx(600)
 
 
 class Slow:

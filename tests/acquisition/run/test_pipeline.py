@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 from collections.abc import Callable, Iterable
 from datetime import timedelta
 from itertools import pairwise
@@ -177,7 +176,10 @@ class TestRefusals:
         lab = Lab(folder, lights=FOUR, reference_every=2)
         # w0 d1 l2 l3 w4: the picture has been stuck since light 2.
         judge = ScriptedJudge({4: refused("the picture is stuck", voids=True)})
-        assert run(lab, judge).complete
+        left: list[int] = []
+        assert run(lab, judge, observe=lambda taken: left.append(taken.left)).complete
+        assert left[:5] == [9, 8, 7, 6, 8], "what was voided is left again"
+        assert left[-1] == 0
         assert [step for step, _ in lab.taken()] == [
             *("w0", "d1", "l2", "l3", "w4", "d5"),
             *("w4", "l2", "l3", "d5", "l6", "l7", "w8", "d9"),
@@ -507,33 +509,3 @@ class TestEnding:
                 ending.ask()
 
         assert run(lab, ending=ending, observe=ask).complete
-
-
-def test_the_number_left_counts_what_was_voided(folder: Path) -> None:
-    lab = Lab(folder, lights=FOUR, reference_every=2)
-    left: list[int] = []
-    judge = ScriptedJudge({4: refused("the picture is stuck", voids=True)})
-
-    def count(taken: Taken) -> None:
-        left.append(taken.left)
-
-    assert run(lab, judge, observe=count).complete
-    assert left[:5] == [9, 8, 7, 6, 8]
-    assert left[-1] == 0
-
-
-def test_errno_of_a_disk_is_ours(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    import os
-
-    lab = Lab(folder)
-    real, calls = os.fsync, 0
-
-    def full(handle: int) -> None:
-        nonlocal calls
-        calls += 1
-        if 4 <= calls < 7:
-            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-        real(handle)
-
-    monkeypatch.setattr(os, "fsync", full)
-    assert run(lab).complete

@@ -83,19 +83,17 @@ class TestDisk:
         assert planned(enough).faults == ()
         (fault,) = planned(enough - 3.25 * GB).faults
         assert isinstance(fault, StorageError)
-        assert "3.3 GB are missing; free them, or name a session folder on another disk" in str(fault)
-        with pytest.raises(StorageError, match=r"3\.3 GB are missing"):
+        assert "3.3 GB" in str(fault)
+        with pytest.raises(StorageError, match=r"3\.3 GB"):
             planned(enough - 3.25 * GB).require()
+        (fault,) = planned(enough - 1).faults
+        assert "0.1 MB" in str(fault), "a little too small is never nothing"
 
     def test_there_is_room_for_what_is_taken_again_and_a_reserve(self) -> None:
         plan = planned()
         assert plan.work.left == 110
         assert plan.needed_bytes - SPARE_BYTES >= 1.1 * 110 * plan.frame_bytes.value
         assert needed_bytes(0, 1e6) == 0
-
-    def test_a_little_too_small_is_never_nothing(self) -> None:
-        (fault,) = planned(planned().needed_bytes - 1).faults
-        assert "0.1 MB are missing" in str(fault)
 
     def test_frames_of_the_session_tell_their_size(self) -> None:
         plan = planned(work=work_of(done=50, frame_bytes=25_000_000))
@@ -132,7 +130,7 @@ class TestDisk:
             return os.statvfs_result((0,) * 8 + (os.ST_RDONLY, 255))
 
         monkeypatch.setattr(os, "statvfs", read_only)
-        with pytest.raises(StorageError, match=r"night: Read-only file system; .* mount it for writing"):
+        with pytest.raises(StorageError, match="night: Read-only file system"):
             free_bytes_at(tmp_path / "night")
 
     def test_a_disk_that_fails(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -364,6 +362,16 @@ def contents(folder: Path) -> dict[str, tuple[int, bytes]]:
     }
 
 
+@pytest.fixture
+def small_disk(lab: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    usage = shutil.disk_usage(lab.parent)._replace(free=10**8)
+
+    def small(path: Path) -> object:
+        return usage
+
+    monkeypatch.setattr(shutil, "disk_usage", small)
+
+
 class TestDryRun:
     def test_a_new_session_is_printed_and_not_made(self, lab: Path, capsys: pytest.CaptureFixture[str]) -> None:
         before = contents(lab.parent)
@@ -391,19 +399,20 @@ class TestDryRun:
         assert "the largest of the session so far" in text
         assert "median of the session so far" in text
 
-    def test_a_full_disk_is_printed_and_is_the_exit_code(
-        self, lab: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    @pytest.mark.parametrize("dry", [["--dry-run"], []])
+    def test_nothing_is_taken_again_of_a_session_that_was_not_begun(
+        self, lab: Path, capsys: pytest.CaptureFixture[str], dry: list[str]
     ) -> None:
-        usage = shutil.disk_usage(lab.parent)._replace(free=10**8)
+        assert main(["run", str(lab), str(lab.parent / "night"), "--retake", "1", *dry]) == 2
+        assert "--retake" in capsys.readouterr().err
+        assert not (lab.parent / "night").exists()
 
-        def small(path: Path) -> object:
-            return usage
-
-        monkeypatch.setattr(shutil, "disk_usage", small)
+    @pytest.mark.usefixtures("small_disk")
+    def test_a_full_disk_is_printed_and_is_the_exit_code(self, lab: Path, capsys: pytest.CaptureFixture[str]) -> None:
         assert main(["run", str(lab), str(lab.parent / "night"), "--dry-run"]) == 5
         said = capsys.readouterr()
         assert "fault       the disk of" in said.out
-        assert "are missing; free them" in said.err
+        assert "are missing" in said.err
         found = json_of(main, ["run", lab, lab.parent / "night", "--dry-run"], capsys, code=5)
         assert (found["command"], found["frames"]) == ("acquire run", 8)
         assert found["needed_bytes"] > found["free_bytes"] == 10**8
@@ -424,10 +433,6 @@ class TestDryRun:
         assert plan.work.left == 8
         with pytest.raises(ConfigurationError, match="known are"):
             plan.require()
-
-    def test_it_takes_nothing_again(self, lab: Path, capsys: pytest.CaptureFixture[str]) -> None:
-        assert main(["run", str(lab), str(lab.parent / "night"), "--dry-run", "--retake", "1"]) == 2
-        assert "leave --retake out" in capsys.readouterr().err
 
 
 def test_the_first_fault_is_raised_and_the_others_named() -> None:
@@ -451,22 +456,9 @@ def test_the_times_of_a_session_are_those_between_its_frames(tmp_path: Path, lab
     assert timedelta(seconds=frame_s) == gaps[len(gaps) // 2]
 
 
-def test_a_run_checks_its_plan_before_anything_moves(
-    lab: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    usage = shutil.disk_usage(lab.parent)._replace(free=10**8)
-
-    def small(path: Path) -> object:
-        return usage
-
-    monkeypatch.setattr(shutil, "disk_usage", small)
+@pytest.mark.usefixtures("small_disk")
+def test_a_run_checks_its_plan_before_anything_moves(lab: Path, capsys: pytest.CaptureFixture[str]) -> None:
     before = contents(lab.parent)
     assert main(["run", str(lab), str(lab.parent / "night")]) == 5
-    assert "are missing; free them" in capsys.readouterr().err
+    assert "are missing" in capsys.readouterr().err
     assert contents(lab.parent) == before
-
-
-def test_nothing_is_taken_again_of_a_session_that_was_not_begun(lab: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["run", str(lab), str(lab.parent / "night"), "--retake", "1"]) == 2
-    assert "leave --retake out" in capsys.readouterr().err
-    assert not (lab.parent / "night").exists()

@@ -121,7 +121,7 @@ def test_a_cable_that_is_not_named_is_said(text: str, expected: str, monkeypatch
 
 
 def test_an_unknown_language_is_named_with_the_known_ones() -> None:
-    with pytest.raises(ConfigurationError, match="'pjlink', 'epson', 'benq', 'optoma' or 'nec'"):
+    with pytest.raises(ConfigurationError, match=r"'pjlink', .*'nec'"):
         parse_lab(HEAD + '[lab.projector]\ncontrol = "klingon"\n', "LAB.toml")
 
 

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from acquisition.run.devices import Devices
-from acquisition.run.lamp import RELIGHT_S
 from acquisition.run.pipeline import Taken
 from acquisition.run.retry import PAUSE_S
 from acquisition.run.sequencer import take_session
@@ -108,41 +107,9 @@ def test_a_pulled_cable_pauses_the_run_until_it_is_back(folder: Path) -> None:
     assert disturbed.lab.verdicts() == ONE_AGAIN
 
 
-def test_a_projector_that_lost_its_power_gets_its_minutes_again(folder: Path) -> None:
-    disturbed = Disturbed(folder)
-
-    def power_cut() -> None:
-        disturbed.beamer = SimulatedProjector(disturbed.clock)
-        disturbed.pull()
-        disturbed.clock.calls[PAUSE_S] = power_back
-
-    def power_back() -> None:
-        disturbed.pull(False)
-        disturbed.clock.calls[PAUSE_S] = disturbed.beamer.switch_on
-
-    disturbed.run(power_cut)
-    assert disturbed.words == ["refused", "retry", "paused", "still paused", "still paused", "warming up", "resumed"]
-    assert disturbed.clock.monotonic() > SETTINGS.sequence.warm_up_s
-    assert disturbed.lab.verdicts() == ONE_AGAIN
-
-
-def test_a_projector_long_out_of_reach_may_have_lost_its_power(folder: Path) -> None:
-    disturbed = Disturbed(folder)
-
-    def wait_on() -> None:
-        if disturbed.clock.slept.count(PAUSE_S) * PAUSE_S > RELIGHT_S:
-            disturbed.pull(False)
-        else:
-            disturbed.clock.calls[PAUSE_S] = wait_on
-
-    disturbed.clock.calls[PAUSE_S] = wait_on
-    disturbed.run(disturbed.pull)
-    assert disturbed.words == ["refused", "retry", "paused", "warming up", "resumed"]
-
-
 def test_a_lost_cable_ends_the_run_when_patience_does(folder: Path) -> None:
     disturbed = Disturbed(folder)
-    with pytest.raises(LinkClosed, match=r"nothing listens at .*; the run waited 10 min 00 s for that and ended:"):
+    with pytest.raises(LinkClosed, match=r"waited 10 min 00 s"):
         disturbed.run(disturbed.pull)
     assert disturbed.lab.verdicts() == ONE_AGAIN[:3]
     disturbed.pull(False)

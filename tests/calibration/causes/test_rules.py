@@ -82,7 +82,6 @@ CASES: list[tuple[Subject, Evidence, Cause]] = [
     # Between a stain and a shadow: both are possible.
     ("spot", replace(PRINT, deviation=-0.05, tint=0.3, added=0, kept=0.95), UNKNOWN),
     ("spot", replace(PRINT, deviation=0.1, tint=0.2, added=0.03, kept=0.97), REFLECTION),
-    ("spot", replace(PRINT, deviation=0.1, tint=0.2, added=0.03, kept=0.97), REFLECTION),
     # Brighter in proportion: the print is worn, the light uneven.
     ("spot", replace(PRINT, deviation=0.05, tint=0.1, added=0, kept=1.05), UNKNOWN),
     ("spot", replace(PRINT, showing=0.125, even_showing=0.33, deviation=-0.2, tint=0), OBJECT_IN_FRAME),

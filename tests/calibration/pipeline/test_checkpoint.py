@@ -183,7 +183,7 @@ def test_a_table_follows_its_session(session_under_way: Session, undisturbed: di
         with pytest.raises(FormatError, match="in the making"):
             open_lut(out)
     assert seen == [(0, 1), (3, 4), (3, 0), (lights - 1, every - 8)]
-    with pytest.raises(FormatError, match=r"1 of \d+ lights have no accepted frame.*--append"):
+    with pytest.raises(FormatError, match=r"1 of \d+ lights .*--append"):
         build(session, out)
     show(session, every)
     assert isinstance(append(session, out), BuildResult)
@@ -209,7 +209,7 @@ def test_a_light_taken_again_is_taken_in_again(
 
 
 def test_two_programs_do_not_make_one_table(session: Session, tmp_path: Path) -> None:
-    with unfinished_table(tmp_path / "lut"), pytest.raises(InputError, match="made by another program"):
+    with unfinished_table(tmp_path / "lut"), pytest.raises(InputError, match="another program"):
         build(session, tmp_path / "lut")
 
 
@@ -253,5 +253,5 @@ def test_the_frames_of_a_table_are_found_again(session: Session, session_under_w
     assert f"{first} cannot be read" in gone
     assert f"{second} has changed" in changed
     os.truncate(tmp_path / "lut" / "samples.npy", 1000)
-    with pytest.raises(FormatError, match=r"samples\.npy has 1000 bytes, 537728 expected"):
+    with pytest.raises(FormatError, match=r"1000 bytes, 537728"):
         open_lut(tmp_path / "lut")

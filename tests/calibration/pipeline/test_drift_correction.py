@@ -116,7 +116,7 @@ def test_the_verdict_judges_what_white_frames_leave_open(tables: tuple[Lut, Lut,
 
 def test_a_jump_between_white_frames_is_refused_and_names_the_remedy(lab: Lab, tmp_path: Path) -> None:
     with session_of(lab, tmp_path / "session", lambda number: 1.0 if number < 9 else 0.97) as session:
-        with pytest.raises(QualityError, match=r"Drift that white frames leave open.*without --correct-drift"):
+        with pytest.raises(QualityError, match=r"Drift .*--correct-drift"):
             build(session, tmp_path / "lut", options=CORRECTED)
         assert not (tmp_path / "lut").exists()
         assert build(session, tmp_path / "lut").verdict.outcome != "refuse"
@@ -128,7 +128,7 @@ def test_one_white_frame_is_refused_before_anything_is_read(lab: Lab, tmp_path: 
 
     with (
         take(lab, tmp_path / "session", LIGHTS[:2], verdict=verdict) as session,
-        pytest.raises(FormatError, match="1 accepted white frame, and --correct-drift"),
+        pytest.raises(FormatError, match=r"1 accepted white frame.*--correct-drift"),
     ):
         build(session, tmp_path / "lut", options=CORRECTED)
 

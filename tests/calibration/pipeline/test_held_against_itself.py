@@ -159,7 +159,7 @@ def test_lights_whose_files_state_another_exposure_are_refused(lab: Lab, tmp_pat
         return as_stated(lab, step, exposed if off else SETTINGS, stated if off else SETTINGS)
 
     said, report = refused(lab, tmp_path, frame)
-    assert "Exposure of a frame against that of most" in said
+    assert "Exposure of a frame" in said
     assert "instead of 0.5 s, ISO 100, f/8" in said
     assert report["retake"] == "4-5"
 
@@ -170,7 +170,7 @@ def test_white_frames_at_half_exposure_are_no_brilliant_colour(lab: Lab, tmp_pat
         tmp_path,
         lambda step: as_stated(lab, step, *((HALF, HALF) if step.kind == "white" else (SETTINGS, SETTINGS))),
     )
-    assert "Exposure of a frame against that of most" in said
+    assert "Exposure of a frame" in said
     assert "additivity" not in report["figures"]  # pyright: ignore[reportOperatorIssue]
 
 

@@ -155,13 +155,13 @@ def test_what_is_no_series_is_refused(
     with pytest.raises(InputError, match="No such file"):
         check(session, linearity=tmp_path / "nowhere")
     few = write_series(lab, tmp_path / "few", times=TIMES[:3])
-    with pytest.raises(InputError, match="holds 3 files, at least 4 raw files"):
+    with pytest.raises(InputError, match="3 files, at least 4"):
         check(session, linearity=few)
     one = write_series(lab, tmp_path / "one", times=(0.5,) * 4)
-    with pytest.raises(InputError, match="1 different exposure times"):
+    with pytest.raises(InputError, match="1 different"):
         check(session, linearity=one)
     (one / "3.dng").write_bytes(lab.dng(WHITE, 9, ExposureSettings(200, 8.0, 0.2)))
-    with pytest.raises(FormatError, match=r"3\.dng was taken with ISO 200"):
+    with pytest.raises(FormatError, match=r"3\.dng .*ISO 200"):
         check(session, linearity=one)
     (one / "0.dng").write_text("notes")
     assert main(["--check", "--linearity", str(one), str(session.folder)]) == 2
@@ -170,7 +170,7 @@ def test_what_is_no_series_is_refused(
 
 def test_a_chart_that_stands_elsewhere_is_refused(session: Session, tmp_path: Path) -> None:
     moved = hang(room=Room(waviness_mm=0.5, roll_deg=0.7, fill=0.935))
-    with pytest.raises(FormatError, match=r"0\.dng: the chart is not where the session has it"):
+    with pytest.raises(FormatError, match=r"0\.dng: the chart"):
         check(session, linearity=write_series(moved, tmp_path / "series"))
 
 
@@ -189,11 +189,3 @@ def test_references_are_under_the_table_s_hashes(copied: Path) -> None:
     assert find_faults(open_lut(copied, check=False)) == ["references.csv is not as it was built"]
     path.unlink()
     assert find_faults(open_lut(copied, check=False)) == ["references.csv is gone"]
-
-
-def test_a_dark_frame_is_under_the_table_s_hashes(copied: Path) -> None:
-    assert any(frame.kind == "dark" for frame in open_lut(copied).frames)
-    frames = copied / "frames.csv"
-    lines = frames.read_text().splitlines(keepends=True)
-    frames.write_text("".join(line for line in lines if not line.startswith("dark")))
-    assert find_faults(open_lut(copied, check=False)) == ["frames.csv is not as it was built"]

@@ -23,7 +23,7 @@ pytestmark = pytest.mark.slow
 
 @pytest.mark.parametrize("window", [1, 2, 4, 11, -5])
 def test_a_window_that_has_no_middle_or_no_place_is_refused(window: int) -> None:
-    with pytest.raises(InputError, match="3, 5, 7 or 9 expected"):
+    with pytest.raises(InputError, match="3, 5, 7 or 9"):
         BuildOptions(window)
 
 
@@ -62,10 +62,10 @@ def test_the_command_takes_a_window(session: Session, tmp_path: Path, capsys: py
 
     code, said = run("--window", 4, session.folder, tmp_path / "lut")
     assert code == 2
-    assert "a window of 4 pixels was asked for" in said
+    assert "4 pixels" in said
     code, said = run("--window", 3, "--info", tmp_path / "lut")
     assert code == 2
-    assert "--window is about how a table is made, and --info reads one" in said
+    assert "--info reads one" in said
 
 
 def test_dark_cells_that_the_lens_may_have_left_wrong_are_named_with_its_veil(built: BuildResult) -> None:

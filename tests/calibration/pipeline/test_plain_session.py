@@ -78,19 +78,6 @@ def test_a_bump_is_followed_and_reported(plain: Lab, tmp_path: Path, by: tuple[f
     assert ("moved_anew" in remarks) == bool(anew)
 
 
-def test_a_turn_is_registered_anew(plain: Lab, tmp_path: Path) -> None:
-    turned = moved_by(0.0, 0.0, roll_deg=0.7)
-    lights = renumbered(LIGHTS[4:7])
-
-    def frame(step: SessionStep) -> bytes:
-        return (turned if step.number >= 3 else plain).dng(step.colour, step.number)
-
-    with take(plain, tmp_path / "session", lights, frame=frame) as session:
-        result = build(session, tmp_path / "lut")
-    assert [figures.record.illumination for figures in result.figures.frames if figures.reregistered] == [1]
-    assert worst_error(plain, tmp_path / "lut") < 0.05
-
-
 def test_nothing_is_registered_anew_where_nothing_moves(plain: Lab, tmp_path: Path) -> None:
     lights = renumbered([*LIGHTS[::3], RED])
     with take(plain, tmp_path / "session", lights) as session:
@@ -132,20 +119,6 @@ def test_corners_by_hand_stand_in_for_light_that_shows_nothing(
     code, said = command(tmp_path / "session", tmp_path / "lut", "--corners", *corners)
     assert code == 0, said
     assert worst_error(plain, tmp_path / "lut") < 0.05
-
-
-def test_corners_that_cannot_be_are_refused_on_the_command_line(plain: Lab, tmp_path: Path, command: Command) -> None:
-    with take(plain, tmp_path / "session", renumbered(LIGHTS[4:6])):
-        pass
-    for corners, expected in (
-        (["0,0", "9000,0", "9000,6000", "0,6000"], "do not lie in the picture"),
-        (["1,1", "2,2", "x", "3,3"], "'x' is no corner"),
-        (["716,496", "68,494", "72,50", "722,60"], "give them in this order"),
-    ):
-        code, said = command(tmp_path / "session", tmp_path / "lut", "--corners", *corners)
-        assert code == 2
-        assert expected in said
-    assert not (tmp_path / "lut").exists()
 
 
 def test_a_check_that_fails_shows_what_was_looked_for(plain: Lab, tmp_path: Path, command: Command) -> None:

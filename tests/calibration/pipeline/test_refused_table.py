@@ -49,7 +49,7 @@ def test_a_table_carries_its_verdict(built: BuildResult) -> None:
 
 
 def test_a_refused_table_leaves_its_report_alone(short: Session, tmp_path: Path) -> None:
-    with pytest.raises(QualityError, match=r"no table is made\. Bare paper under the darkest .*expose longer"):
+    with pytest.raises(QualityError, match="Bare paper under the darkest"):
         build(short, tmp_path / "lut", report=write_report, judged_by=STRICT)
     assert list(tmp_path.iterdir()) == [tmp_path / "lut.refused"] == [refused_folder(tmp_path / "lut")]
     kept = sorted(path.name for path in (tmp_path / "lut.refused").iterdir())
@@ -67,7 +67,7 @@ def test_the_command_ends_with_the_exit_code_of_a_refusal(
 ) -> None:
     """A window of nine pixels does not fit into these cells."""
     assert main(["--check", "--window", "9", str(short.folder)]) == 4
-    assert "take a smaller window (build-lut --window)" in capsys.readouterr().err
+    assert "--window" in capsys.readouterr().err
     found = json_of(main, ["--window", "9", short.folder, tmp_path / "lut"], capsys, code=4)
     assert (found["command"], found["verdict"]) == ("build-lut", "refuse")
     assert found["figures"]

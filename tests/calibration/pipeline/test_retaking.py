@@ -79,7 +79,7 @@ def test_a_shadow_on_one_frame_costs_that_frame(
     folder, out = tmp_path / "session", tmp_path / "lut"
     with (
         doctored(lab, folder, kind, number, shadow) as session,
-        pytest.raises(QualityError, match=rf"no table is made\. .*, and take 1 frame again: {COMMAND}.*; see .*report"),
+        pytest.raises(QualityError, match=rf"take 1 frame again: {COMMAND}.*report"),
     ):
         build(session, out, report=write_report if kind == "light" else figures_alone)
     says = json.loads((tmp_path / "lut.refused" / "report.json").read_text())
@@ -92,7 +92,7 @@ def test_a_shadow_on_one_frame_costs_that_frame(
         build(session, out, report=figures_alone)
     says = json.loads((out / "report.json").read_text())
     assert (says["retake"], says["retake_sha256"]) == ("", [])
-    with pytest.raises(InputError, match="names no frame to be taken again"):
+    with pytest.raises(InputError, match="names no frame"):
         take_again(lab, folder)
 
 
@@ -100,7 +100,7 @@ def test_a_frame_that_ends_the_build_is_named_too(lab: Lab, tmp_path: Path) -> N
     folder, out = tmp_path / "session", tmp_path / "lut"
     with (
         doctored(lab, folder, "light", 2, nothing) as session,
-        pytest.raises(QualityError, match=rf"; or take frames/0004_light_002\.dng again: {COMMAND}"),
+        pytest.raises(QualityError, match=rf"frames/0004_light_002\.dng again: {COMMAND}"),
     ):
         build(session, out)
     assert take_again(lab, folder) == ["0004_light_002"]
@@ -114,7 +114,7 @@ def test_what_the_next_run_finds_by_itself_needs_no_option(lab: Lab, tmp_path: P
         data = bytearray(victim.read_bytes())
         data[-1] ^= 1
         victim.write_bytes(data)
-        with pytest.raises(FormatError, match="SESSION finds such frames by itself"):
+        with pytest.raises(FormatError, match="by itself"):
             build(session, tmp_path / "lut")
     with Session.open_for_run(tmp_path / "session") as session:
         (reason,) = session.verify()

@@ -165,16 +165,22 @@ def test_what_was_subtracted_is_recorded(room: Lab, session: Session, subtracted
     assert min(at_zero) < 0.001
 
 
-def test_a_growing_table_ends_in_the_same_bytes(session: Session, subtracted: BuildResult, tmp_path: Path) -> None:
-    """Interrupted between two checkpoints, and with another choice in between, which begins anew."""
-    assert subtracted.lut is not None
+def interrupted(session: Session, out: Path, options: BuildOptions) -> None:
+    """Build until the seventeenth frame."""
 
     def progress(done: int, total: int, what: str) -> None:
         if done == 17:
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        build(session, tmp_path / "lut", progress, options=SUBTRACTED)
+        build(session, out, progress, options=options)
+
+
+def test_a_growing_table_ends_in_the_same_bytes(session: Session, subtracted: BuildResult, tmp_path: Path) -> None:
+    """Interrupted between two checkpoints, and with another choice in between, which begins anew."""
+    assert subtracted.lut is not None
+
+    interrupted(session, tmp_path / "lut", SUBTRACTED)
     done: list[int] = []
     grown = append(session, tmp_path / "lut", lambda number, total, what: done.append(number), options=SUBTRACTED)
     assert not isinstance(grown, TableProgress)
@@ -184,14 +190,8 @@ def test_a_growing_table_ends_in_the_same_bytes(session: Session, subtracted: Bu
 
 
 def test_a_checkpoint_of_another_choice_is_not_gone_on_from(session: Session, tmp_path: Path) -> None:
-    def progress(done: int, total: int, what: str) -> None:
-        if done == 17:
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        build(session, tmp_path / "lut", progress, options=SUBTRACTED)
-    with pytest.raises(KeyboardInterrupt):
-        build(session, tmp_path / "lut", progress)
+    interrupted(session, tmp_path / "lut", SUBTRACTED)
+    interrupted(session, tmp_path / "lut", BuildOptions())
     done: list[int] = []
     build(session, tmp_path / "lut", lambda number, total, what: done.append(number), options=SUBTRACTED)
     assert done[:2] == [0, 1]
@@ -203,7 +203,7 @@ def test_without_dark_frames_it_is_refused(lab: Lab, tmp_path: Path, capsys: pyt
 
     with take(lab, tmp_path / "session", LIGHTS[:2], verdict=refuse_darks) as session:
         for make in (build, append):
-            with pytest.raises(FormatError, match=r"no accepted dark frame.*build the table without --subtract-dark"):
+            with pytest.raises(FormatError, match=r"dark frame.*--subtract-dark"):
                 make(session, tmp_path / "lut", options=SUBTRACTED)
         with pytest.raises(FormatError, match="no accepted dark frame"):
             check(session, SUBTRACTED)

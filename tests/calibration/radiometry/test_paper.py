@@ -71,7 +71,7 @@ def test_a_channel_without_light_has_the_shape_of_a_brighter_frame() -> None:
 
 
 def test_too_few_references_are_refused() -> None:
-    with pytest.raises(QualityError, match="5 white references can be used, at least 6 expected"):
+    with pytest.raises(QualityError, match=r"5 white references .*6 expected"):
         PaperReader(PLACES[:5], CENTRES, PAGE).read(np.ones((5, 3)))
 
 
@@ -92,11 +92,6 @@ def test_the_table_says_enough_to_undo_the_field() -> None:
                 order += 1
             product *= np.asarray(np.polynomial.legendre.legval2d(u, v, weights), dtype=np.float64)
         assert product == pytest.approx(field.at(CENTRES)[:, channel], rel=1e-5)
-
-
-def test_an_even_field_is_one() -> None:
-    assert FlatField.uniform(PAGE).at(CENTRES) == pytest.approx(1)
-    assert isinstance(FlatField.uniform(PAGE), FlatField)
 
 
 def test_a_stain_is_ignored_by_the_white_and_shown_by_the_spread() -> None:

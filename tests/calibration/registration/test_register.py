@@ -94,7 +94,7 @@ def test_shifted_moves_every_point(lab: Lab, tmp_path: Path) -> None:
 def test_another_order_of_colours_is_refused(lab: Lab, tmp_path: Path) -> None:
     other = design_chart(3, A_SERIES_MM["A5"], 2)
     assert [tag.id for tag in other.tags] == [tag.id for tag in lab.chart.tags]
-    with pytest.raises(RegistrationError, match=r"colours are not those of the chart: .* name the chart\.json"):
+    with pytest.raises(RegistrationError, match=r"chart\.json"):
         register(lab.mosaic(tmp_path), other)
 
 
@@ -153,7 +153,7 @@ def test_too_far_away_is_refused(tmp_path: Path) -> None:
 
 def test_a_real_photograph_without_the_chart_is_refused(lab: Lab) -> None:
     path = shipped("raw/canon_eos_550d_colorchart.dng")
-    with pytest.raises(RegistrationError, match="looked for, none found") as caught:
+    with pytest.raises(RegistrationError, match="none found") as caught:
         register(read_raw(path), lab.chart, path.name)
     assert "\n" not in str(caught.value)
 

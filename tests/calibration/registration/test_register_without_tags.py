@@ -136,7 +136,7 @@ def test_stated_corners_find_the_same_places(plain: Lab, tmp_path: Path) -> None
 
 def test_another_order_of_colours_is_refused(plain: Lab, tmp_path: Path) -> None:
     shuffled = replace(plain.chart, colours=np.random.default_rng(1).permutation(plain.chart.colours))
-    with pytest.raises(RegistrationError, match=r"name the chart\.json of this print"):
+    with pytest.raises(RegistrationError, match=r"chart\.json"):
         register(plain.mosaic(tmp_path), shuffled)
 
 
@@ -148,7 +148,7 @@ def test_a_field_displaced_by_one_cell_is_refused(plain: Lab, tmp_path: Path) ->
     columns = len(np.unique(plain.chart.centres_mm[:, 0].round(3)))
     grid = plain.chart.colours.reshape(-1, columns)
     other = replace(plain.chart, colours=np.roll(grid, 1, axis=1).reshape(-1))
-    with pytest.raises(RegistrationError, match="have the colours of the cells beside them"):
+    with pytest.raises(RegistrationError, match="cells beside them"):
         register(plain.mosaic(tmp_path), other)
 
 

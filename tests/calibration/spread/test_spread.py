@@ -27,7 +27,6 @@ from calibration.spread.surroundings import (
     FrameLevels,
     Surroundings,
     UsualLight,
-    far_taps,
     printed_grid,
     unsuitable,
 )
@@ -327,11 +326,6 @@ def test_the_mean_light_is_that_of_the_print_slot_by_slot(sharp: Photograph) -> 
     inks = around.inks(levels)
     slot_by_slot = around.image(levels, inks).mean(axis=(0, 1), dtype=np.float64)
     assert around.mean(levels, inks) == pytest.approx(slot_by_slot, rel=1e-6)
-
-
-def test_taps_of_a_far_kernel_add_up() -> None:
-    for scale in (0.3, 1.2, 9.6):
-        assert far_taps(scale).sum() == pytest.approx(1, abs=1e-6)
 
 
 def test_residuals_of_colour_are_blind_to_smooth_colours_and_linear() -> None:

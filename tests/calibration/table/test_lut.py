@@ -33,7 +33,7 @@ def test_a_disk_that_forgets_is_noticed(tmp_path: Path) -> None:
     flip("samples.npy", -1)(tmp_path / "lut")
     assert writer.damaged() == [0]
     known = Provenance(camera="T", bits=1, white_level=1, session_sha256="", chart_sha256="", software="")
-    with pytest.raises(StorageError, match="lights 0 read back are not those written"):
+    with pytest.raises(StorageError, match="lights 0 "):
         writer.finish(LIGHTS[:1], np.ones((1, 3)), known)
     assert not (tmp_path / "lut" / "lut.json").exists()
 
@@ -71,13 +71,13 @@ def test_samples_that_have_changed_are_not_used(tmp_path: Path) -> None:
     flip("samples.npy", 128 + 2 * 1200 + 7)(lut.folder)
     changed = open_lut(lut.folder)
     for light in (0, 1, 3):
-        changed.require_unchanged(light)
-    with pytest.raises(FormatError, match=r"samples\.npy: the samples of light 2 are not those .*build-lut --verify"):
-        changed.require_unchanged(2)
+        assert changed.light_samples(light).shape == (8, 25, 3)
+    with pytest.raises(FormatError, match=r"samples\.npy: .* light 2 .*build-lut --verify"):
+        changed.light_samples(2)
 
 
 def test_a_table_in_the_making_is_not_read(tmp_path: Path) -> None:
     (tmp_path / ".lut.partial").mkdir()
     LutWriter(tmp_path / ".lut.partial", 1, 8, 25)
-    with pytest.raises(FormatError, match="is a table in the making; finish it with build-lut"):
+    with pytest.raises(FormatError, match=r"in the making.*build-lut"):
         open_lut(tmp_path / "lut")

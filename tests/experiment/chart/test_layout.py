@@ -178,7 +178,7 @@ def test_a_page_can_be_larger_named_or_measured() -> None:
             5,
             "A5",
             1,
-            r"210 × 148 mm is too small for the 32768 colours .* even with cells of 1.06 mm.* A4 .* best .* A0",
+            r"210 × 148 mm .*32768 .*1\.06 mm.* A4 .* A0",
         ),
         (4, "A8", 1, r"A7 \(105 × 74 mm\).* A2"),
         (2, (18.0, 500.0), 1, "A8"),
@@ -233,12 +233,12 @@ def test_cells_shrink_to_whole_pixels_on_a_page_too_small(
 def test_the_cell_s_size_can_be_chosen() -> None:
     assert design_chart(2, "A4", cell_mm=7.0).cell_mm[0] == pytest.approx(165 * PX_MM)
     assert design_chart(2, cell_mm=2.54).page_mm == A_SERIES_MM["A8"]
-    with pytest.raises(InputError, match=r"in cells of 5\.29 mm; 3\.60 mm fit"):
+    with pytest.raises(InputError, match=r"5\.29 mm; 3\.60 mm"):
         design_chart(5, "A1", cell_mm=5.3)
     for wrong in (0.9, 0.0, -1.0, float("nan")):
         with pytest.raises(InputError, match=r"1\.06 mm"):
             design_chart(2, cell_mm=wrong)
-    with pytest.raises(InputError, match="no A page holds"):
+    with pytest.raises(InputError, match="no A page"):
         design_chart(5, cell_mm=20.0)
 
 

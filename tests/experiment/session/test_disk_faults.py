@@ -126,7 +126,7 @@ def test_a_journal_that_is_damaged_is_called_so(night: Night) -> None:
     data = bytearray(path.read_bytes())
     data[4096:] = bytes(len(data) - 4096)
     path.write_bytes(data)
-    with pytest.raises(FormatError, match=r"journal\.sqlite is damaged: .*; restore it from a copy"):
+    with pytest.raises(FormatError, match=r"journal\.sqlite is damaged"):
         night.run()
 
 
@@ -135,6 +135,6 @@ def test_a_disk_that_was_unmounted_is_not_written_below(night: Night) -> None:
     with Session.open_for_run(night.folder) as session:
         # What an unmounted disk leaves: the open journal, and nothing under the name.
         shutil.rmtree(session.frames_folder)
-        with pytest.raises(StorageError, match="its folder is gone: connect and mount the disk it was on"):
+        with pytest.raises(StorageError, match="mount the disk"):
             session.receive("0001_dark", capture(FRAMES[1]))
         assert not session.frames_folder.exists()

@@ -94,26 +94,26 @@ def test_no_session(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("lights", "said"),
     [
-        ((LIGHTS[0], replace(LIGHTS[1], colour=LIGHTS[2].colour), *LIGHTS[2:]), "planned as 255 1 0, the file says"),
-        (LIGHTS[:4], "light 4 was planned as 255 4 0, the file has no such light"),
+        ((LIGHTS[0], replace(LIGHTS[1], colour=LIGHTS[2].colour), *LIGHTS[2:]), "planned as 255 1 0"),
+        (LIGHTS[:4], "light 4 .* 255 4 0"),
     ],
 )
 def test_lights_edited_since_are_refused(session: Session, lights: tuple[Illumination, ...], said: str) -> None:
     session.close()
     save_illuminations(lights, session.folder / "illuminations.csv")
-    with pytest.raises(FormatError, match=rf"illuminations\.csv is not what .*{said}.*; restore it from a copy"):
+    with pytest.raises(FormatError, match=rf"illuminations\.csv .*{said}"):
         Session.open(session.folder)
 
 
 def test_a_session_without_its_settings(session: Session) -> None:
     (session.folder / "session.toml").unlink()
-    with pytest.raises(FormatError, match=r"the session.s settings .*session\.toml: No such file .*; restore it"):
+    with pytest.raises(FormatError, match=r"session\.toml: No such file"):
         session.settings_text()
 
 
 def test_a_session_without_its_frames(session: Session) -> None:
     session.frames_folder.rmdir()
-    with pytest.raises(FormatError, match=r"frames is missing, .*; restore it from a copy"):
+    with pytest.raises(FormatError, match="frames is missing"):
         session.set_aside_strays()
 
 
@@ -130,7 +130,7 @@ def test_a_disk_that_fails_is_no_traceback(session: Session, call: str, monkeypa
 
     with monkeypatch.context() as patched:
         patched.setattr(Path, call, fail)
-        with pytest.raises(StorageError, match=r"frames: Input/output error; .*run the same command again"):
+        with pytest.raises(StorageError, match="frames: Input/output error"):
             session.set_aside_strays()
     assert len(session.set_aside_strays()) == 1, "when the disk is back the same goes through"
 
@@ -140,7 +140,7 @@ def test_a_journal_that_cannot_be_looked_for_is_not_missing(session: Session, mo
         raise OSError(errno.EIO, "Input/output error", str(path))
 
     monkeypatch.setattr(Path, "stat", fail)
-    with pytest.raises(StorageError, match=r"cannot read .*journal\.sqlite: Input/output error; the disk fails"):
+    with pytest.raises(StorageError, match=r"journal\.sqlite: Input/output error"):
         session_exists(session.folder)
-    with pytest.raises(StorageError, match=r"cannot read .*journal\.sqlite: Input/output error; the disk fails"):
+    with pytest.raises(StorageError, match=r"journal\.sqlite: Input/output error"):
         Session.open(session.folder)

@@ -151,7 +151,7 @@ def test_patience_ends_with_a_sentence_and_nothing_is_lost(path: Path, monkeypat
     with closing(Journal.open_for_run(path, 0.05)) as journal:
         with (
             another_program(path, *WRITER),
-            pytest.raises(StorageError, match="is locked; end the other program that holds the session, then run"),
+            pytest.raises(StorageError, match="is locked"),
         ):
             journal.note(NOW, "not written")
         journal.note(NOW, "written")
@@ -290,7 +290,7 @@ def test_a_folder_that_may_not_be_written_is_read(public: Path, state: str) -> N
 def test_a_folder_that_may_not_be_written_is_not_taken(public: Path) -> None:
     with (
         nobody(public.parent),
-        pytest.raises(StorageError, match=r"cannot write .*journal\.sqlite: Permission denied; ask its owner"),
+        pytest.raises(StorageError, match=r"journal\.sqlite: Permission denied"),
     ):
         Journal.open_for_run(public)
 

@@ -49,6 +49,14 @@ def take_what_is_left(session: Session) -> list[int]:
     return [step.number for step in left]
 
 
+def take_again(session: Session, number: int) -> Path:
+    """Take one more accepted frame of a step; return its file."""
+    attempt = session.journal.begin(session.steps[number], "frames/again", NOW)
+    received = session.receive("again", lambda into: CapturedFrame("a.cr2", into.write(b"again"), NOW))
+    session.commit(attempt, received, Judgement(()), exposure_s=0.5, ended_at=NOW)
+    return received.path
+
+
 def verdicts(session: Session, number: int) -> list[str | None]:
     return [attempt.verdict for attempt in session.journal.attempts() if attempt.step == number]
 
@@ -88,10 +96,7 @@ def test_a_damaged_frame_is_voided_and_taken_again(session: Session, damage: str
 
 def test_two_accepted_frames_of_a_step_count_once(session: Session) -> None:
     """Older software retook a truncated frame and left both accepted."""
-    step = session.steps[3]
-    attempt = session.journal.begin(step, "frames/again", NOW)
-    received = session.receive("again", lambda into: CapturedFrame("a.cr2", into.write(b"again"), NOW))
-    session.commit(attempt, received, Judgement(()), exposure_s=0.5, ended_at=NOW)
+    take_again(session, 3)
     counted = [frame.file for frame in session.frames() if frame.illumination == 1 and frame.accepted]
     assert counted == ["frames/again.cr2"], "also where nobody has verified it"
     assert session.verify() == ("taken again since, as frames/again.cr2",)
@@ -100,11 +105,7 @@ def test_two_accepted_frames_of_a_step_count_once(session: Session) -> None:
 
 
 def test_the_newest_sound_frame_stays_where_a_newer_one_is_gone(session: Session) -> None:
-    step = session.steps[3]
-    attempt = session.journal.begin(step, "frames/again", NOW)
-    received = session.receive("again", lambda into: CapturedFrame("a.cr2", into.write(b"again"), NOW))
-    session.commit(attempt, received, Judgement(()), exposure_s=0.5, ended_at=NOW)
-    received.path.unlink()
+    take_again(session, 3).unlink()
     session.verify()
     assert verdicts(session, 3) == ["accepted", "voided"]
 
@@ -170,10 +171,7 @@ def test_lights_that_are_named_are_taken_again(session: Session) -> None:
 
 def test_the_same_command_after_an_interruption_takes_nothing_twice(session: Session) -> None:
     session.retake("1,2")
-    step = session.steps[3]
-    attempt = session.journal.begin(step, "frames/x", NOW)
-    received = session.receive("x", lambda into: CapturedFrame("a.cr2", into.write(b"x"), NOW))
-    session.commit(attempt, received, Judgement(()), exposure_s=0.5, ended_at=NOW)
+    take_again(session, 3)
     session.retake("1-2")
     assert take_what_is_left(session) == [4]
 
@@ -181,10 +179,10 @@ def test_the_same_command_after_an_interruption_takes_nothing_twice(session: Ses
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("900", r"the session has no light 900, its 5 lights are 0 … 4"),
+        ("900", "light 900.*0 … 4"),
         ("3-7", "no light 7"),
         ("4-2", r"4-2 runs backwards; name it 2-4"),
-        ("white", r"'white' is no light; name lights as 12,40-44, or bad for those that build-lut refused"),
+        ("white", "'white'"),
         ("1,,2", "'' is no light"),
         ("-1", "'-1' is no light"),
         ("²", "is no light"),
@@ -256,14 +254,14 @@ def test_between_reports_on_the_same_frames_the_one_written_last_counts(session:
 
 def test_without_a_report_on_this_session_nothing_is_bad(session: Session, tmp_path: Path) -> None:
     write_report(tmp_path / "of another session", "3", [b"frame 0005_light_003"], b"another", 300)
-    with pytest.raises(FormatError, match=r"no report of build-lut on .*/s lies beside it.*or name the lights"):
+    with pytest.raises(FormatError, match=r"build-lut on .*/s "):
         session.retake("bad")
 
 
 def test_a_report_that_refused_nothing_is_named(session: Session, tmp_path: Path) -> None:
     write_report(tmp_path / "lut.refused", "2", [b"frame 0004_light_002"], b"frame 0000_white", 100)
     write_report(tmp_path / "lut", "", [], b"frame 0000_white", 200)
-    with pytest.raises(InputError, match=r"lut/report.json, the newest report .* names no frame.*leave --retake out"):
+    with pytest.raises(InputError, match=r"lut/report\.json.*--retake"):
         session.retake("bad")
 
 
