@@ -177,7 +177,11 @@ class TestRefusals:
         # w0 d1 l2 l3 w4: the picture has been stuck since light 2.
         judge = ScriptedJudge({4: refused("the picture is stuck", voids=True)})
         left: list[int] = []
-        assert run(lab, judge, observe=lambda taken: left.append(taken.left)).complete
+
+        def count(taken: Taken) -> None:
+            left.append(taken.left)
+
+        assert run(lab, judge, observe=count).complete
         assert left[:5] == [9, 8, 7, 6, 8], "what was voided is left again"
         assert left[-1] == 0
         assert [step for step, _ in lab.taken()] == [
