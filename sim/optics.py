@@ -1,4 +1,4 @@
-"""What a photographic lens adds to a Gaussian blur: shoulders, veiling glare, lateral chromatic aberration.
+"""What lens and projector do to light beside a Gaussian blur: shoulders, veil, lateral colour, fall-off.
 
 **Point spread.** A share 1 − s of the light forms the core, a Gaussian of standard deviation σ, the photosite's
 aperture included; a share s is spread further, over the core convolved with the shoulder
@@ -11,23 +11,23 @@ whose standard deviation along each axis is √3 a, the shoulder's scale. Its tr
     MTF(f) = exp(−2π² σ² f²) · (1 − s + s · (1 + (2π a f)²)^(−3/2)).
 
 An exponential is chosen because measured wings of photographic lenses, of spherical aberration and of light scattered
-at glass and sensor, are straight lines on a logarithmic plot over some decades, and because it is no sum of Gaussians:
-what fits Gaussians to it has to show how well. `MILD_SHOULDERS` and `STRONG_SHOULDERS` are two such lenses.
+at glass and sensor, are straight lines on a logarithmic plot over some decades, and because it is no sum of
+Gaussians: what fits Gaussians to it has to show how well. `MILD_SHOULDERS` and `STRONG_SHOULDERS` are two such
+lenses.
 
 **Veiling glare** (ISO 9358:1994, ISO 18844:2017): a share v of the light of the whole frame, backdrop included, lies
 evenly on all of it, each camera channel by itself: (1 − v) · light + v · mean light. A uniform field keeps its light.
 
-**Lateral chromatic aberration**: red and blue are magnified otherwise than green. At ρ of the way from the axis to the
-frame's corner a channel's picture is shifted outwards against green's by d · ρ · (1 + ρ²) / 2, d at the corner: half of
-it the chromatic difference of magnification, which is linear in the field, half the chromatic difference of distortion,
-which is cubic (W. T. Welford, "Aberrations of Optical Systems", 1986, ch. 10). Half and half is chosen.
+**Lateral chromatic aberration**: red and blue are magnified otherwise than green. At ρ of the way from the axis to
+the frame's corner a channel's picture is shifted outwards against green's by d · ρ · (1 + ρ²) / 2, d at the corner:
+half of it the chromatic difference of magnification, which is linear in the field, half the chromatic difference of
+distortion, which is cubic (W. T. Welford, "Aberrations of Optical Systems", 1986, ch. 10). Half and half is chosen.
 
 Half-size pixels, centres at integers, x right, y down.
 
-How light falls off towards the edges: of the lens over the frame, of the projector over the page.
-
-Both as the constants that `sim.world.rendering.light` takes: 1 / (1 + c r²)² for the lens, which is cos⁴ of the angle
-to its axis, and g / (1 + c d²) for each primary of the projector.
+**Fall-off** of the lens over the frame and of the projector over the page, both as the constants that
+`sim.world.rendering.light` takes: 1 / (1 + c r²)² for the lens, which is cos⁴ of the angle to its axis, and g / (1 +
+c d²) for each primary of the projector.
 """
 
 from __future__ import annotations

@@ -1,20 +1,17 @@
-"""Spectral sensitivities of cameras, as ISO 17321-1 has them measured, read from files in the layout of rawtoaces.
+"""Measured spectra: sensitivities of cameras (ISO 17321-1), published lights, and how they come to one grid.
 
-The layout is that of AcademySoftwareFoundation/rawtoaces-data, schema 0.1.0: ``spectral_data.units`` is ``relative``,
+**Sensitivities** are read from files in the layout of rawtoaces. It is that of
+AcademySoftwareFoundation/rawtoaces-data, schema 0.1.0: ``spectral_data.units`` is ``relative``,
 ``spectral_data.index.main`` names the channels, and ``spectral_data.data.main`` has their responses to light of equal
 power by wavelength in nanometres. Only proportions matter: exposure is set elsewhere.
 
 Files of some cameras come with the suite (`sim.data`) and are known by name; any other is named by its path.
 
-Wavelength grids: what a measured spectrum must cover, and how it comes to another grid.
+**Grids.** What stands on a finer grid is not picked at the new grid's wavelengths but gathered: a line of a lamp that
+lies between two of them must not be lost. What stands on a coarser or the same grid is joined by straight lines.
 
-What stands on a finer grid is not picked at the new grid's wavelengths but gathered: a line of a lamp that lies between
-two of them must not be lost. What stands on a coarser or the same grid is joined by straight lines.
-
-Spectra of lights that the CIE and others have published, by their names.
-
-The tables are in `sim/data`, whose README says where they are from: the illuminants of CIE 15:2018 and ISO 7589, and
-measured light sources.
+**Published lights**, by their names. The tables are in `sim/data`, whose README says where they are from: the
+illuminants of CIE 15:2018 and ISO 7589, and measured light sources.
 """
 
 from __future__ import annotations

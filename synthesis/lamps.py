@@ -1,29 +1,25 @@
-"""What lights the chart: the simulated projector under its codes, or any spectra from one luminaire.
+"""What lights the chart (the projector under its codes, or any spectra), and the frames of patches that come of it.
 
 Light adds: a frame under a projector's light is the weighted sum of the same frame under each of its three primaries.
 A luminaire has one spectrum a light, and so one frame of its own for each.
 
-Lights by their spectra: from a CSV file, or the illuminants that the CIE and others have published.
+**Spectra.** A file has a column ``wavelength`` (nm) and one for each light, whose head is its name and no number; any
+even or uneven grid from 400 to 700 nm or beyond, in proportions that are each light's own. Published spectra are
+those of `sim.spectral`: CIE A to E, daylights D, fluorescent lamps FL1 to FL12 and FL3.1 to FL3.15, high-pressure
+lamps HP1 to HP5, LED-B1 to LED-V2, indoor daylights ID50 and ID65 (CIE 15:2018), the sources of ISO 7589, and
+measured light sources by their names there. ``5600K`` is a black body by Planck's law, ``daylight:6000`` the CIE
+daylight of a correlated colour temperature; ranges are ``FIRST:LAST:STEP`` with the ``K`` or the word ``daylight``
+before them.
 
-A file has a column ``wavelength`` (nm) and one for each light, whose head is its name and no number; any even or uneven
-grid from 400 to 700 nm or beyond, in proportions that are each light's own. Published spectra are those of
-`sim.spectral`: CIE A to E, daylights D, fluorescent lamps FL1 to FL12 and FL3.1 to FL3.15, high-pressure
-lamps HP1 to HP5, LED-B1 to LED-V2, indoor daylights ID50 and ID65 (CIE 15:2018), the sources of ISO 7589, and measured
-light sources by their names there.
-``5600K`` is a black body by Planck's law, ``daylight:6000`` the CIE daylight of a correlated colour temperature; ranges
-are ``FIRST:LAST:STEP`` with the ``K`` or the word ``daylight`` before them.
+**Frames** hold nothing but the middle of each patch. A frame of a session has some twenty million photosites, of
+which a table takes a sixth: the 10 by 10 photosites in the middle of each cell (25 half-size pixels), and those of
+the references. Here these alone exist, patch below patch in a frame as wide as one patch. Their light is what the
+simulated room would let fall on them without the lens's blur; their counts come from the simulated sensor itself
+(`sim.world.rendering.counts`), so that response, shot and read noise, rounding and saturation are those of a
+photographed frame, and calibration's own functions sample them as they do any other frame.
 
-Frames that hold nothing but the middle of each patch: what the simulated camera gives where a table is sampled.
-
-A frame of a session has some twenty million photosites, of which a table takes a sixth: the 10 by 10 photosites in the
-middle of each cell (25 half-size pixels), and those of the references. Here these alone exist, patch below patch in a
-frame as wide as one patch. Their light is what the simulated room would let fall on them without the lens's blur; their
-counts come from the simulated sensor itself (`sim.world.rendering.counts`), so that response, shot and read noise,
-rounding and saturation are those of a photographed frame, and calibration's own functions sample them as they do any
-other frame.
-
-What differs from a photographed frame: nothing is blurred, so no light leaks between neighbouring cells; all of a patch
-has the light of its middle; the chart lies exactly where it is looked for.
+What differs from a photographed frame: nothing is blurred, so no light leaks between neighbouring cells; all of a
+patch has the light of its middle; the chart lies exactly where it is looked for.
 """
 
 from __future__ import annotations

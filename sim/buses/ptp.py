@@ -1,8 +1,6 @@
-"""A PTP device without a cable: in memory, through the containers, without a bus, a thread or a wait.
+"""A PTP device without a USB cable: in memory, without a thread or a wait, or on a TCP port for any initiator (PTP/IP).
 
-A simulated device on the network: PTP/IP on a TCP port, for any initiator.
-
-Rules that hold inside:
+Rules of the network's device:
 
 - One initiator at a time, known by the number that joins its two connections; a second one hears that the device is
   busy.

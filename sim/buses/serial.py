@@ -1,14 +1,10 @@
-"""A pseudo-terminal: a serial port without hardware, on Linux and macOS, with a simulated device at its far end.
+"""Serial cables to a simulated device: a pseudo-terminal (Linux and macOS), one in memory, and one through TCP.
 
-Rules that hold inside:
+Rules of the pseudo-terminal:
 
 - One thread serves the device; it is joined when the terminal is closed.
 - To close it is to pull the cable out: whoever has the port open finds it gone.
 - What nobody reads is lost when the system's buffer is full, as on a cable without flow control.
-
-Cables to a peer that speaks when it has something to say: in the same thread, and over TCP.
-
-`sim.buses.serial` has the serial port of the system.
 """
 
 from __future__ import annotations

@@ -1,8 +1,6 @@
-"""A simulated USB bus for pyusb: the code that opens real cameras opens these, by the same calls.
+"""USB without hardware: a device as a pure machine, and a bus for pyusb that opens it by the calls for real ones.
 
-Hand a `SimulatedBus` to `drivers.links.usb` as its backend.
-
-Rules that hold inside:
+**The bus.** Hand a `SimulatedBus` to `drivers.links.usb` as its backend:
 
 - A device that is plugged in gets an address that none had before, as on a real bus; its port stays.
 - Nothing waits: a pipe that says nothing is a timeout at once.
@@ -10,17 +8,14 @@ Rules that hold inside:
 
 Sources: pyusb's `usb.backend`; libusb 1.0's error codes.
 
-The device's side of a USB cable as a pure machine: descriptors, control requests, and PTP on the bulk pipes.
-
-Rules that hold inside:
+**The device.** Descriptors, control requests, and PTP on the bulk pipes:
 
 - Packets count, as on a wire: a transfer from the host has ended only with a packet that is not full, and one to the
   host is closed by a zero-length packet when it fills its last one.
 - Nothing waits: a pipe without anything to say returns None, which on a bus is a NAK.
 - A transfer that is no PTP halts the bulk pipes, until the host clears them.
 
-`sim.buses.usb` puts it on a bus for pyusb, `sim.buses.usbip` on a network for USB/IP, `sim.buses.ptp` on no
-cable at all.
+`sim.buses.usbip` puts it on a network for USB/IP, `sim.buses.ptp` on no cable at all.
 
 Sources: USB 2.0, clauses 8.5 (transactions), 9.4 (standard requests) and 9.6 (descriptors); USB Still Image Capture
 Device Definition 1.0, clauses 5 to 7.

@@ -12,15 +12,14 @@ Rules that hold inside:
 
 Source: the Linux kernel's documentation, usb/usbip_protocol; URB semantics, driver-api/usb/URB.
 
-USB/IP as bytes: what a computer asks of another one that lends it a USB device, and the answers.
-
-A connection begins with one operation: to list the devices, or to import one. Once a device is imported, the same
-connection carries its transfers, each with a number under which its result comes back, in any order.
+**The wire.** A connection begins with one operation: to list the devices, or to import one. Once a device is
+imported, the same connection carries its transfers, each with a number under which its result comes back, in any
+order.
 
 Rules that hold inside:
 
-- `RequestReader` takes a stream in any pieces. Whatever arrives, the only error is `ProtocolError`; after it the stream
-  has lost its place.
+- `RequestReader` takes a stream in any pieces. Whatever arrives, the only error is `ProtocolError`; after it the
+  stream has lost its place.
 - Numbers are big-endian here, save the eight bytes of a control request, which are USB's own.
 
 Source: the Linux kernel's documentation, usb/usbip_protocol.

@@ -9,7 +9,7 @@ wire, so that much is borrowed from the one body that was recorded, an EOS 60D; 
 Sources: a recorded EOS 60D (firmware 1.1.0); the settings of an EOS 550D (firmware 1.0.9) and a 6D Mark II (1.0.2) as
 users of libgphoto2 have listed them; battery and burst figures of Canon's specifications.
 
-What a simulated EOS body is made of: the form of its table of facts, what all of them share, and Canon's structures.
+What all bodies share:
 
 - `OPERATIONS` are those that `sim.camera.eos` answers, in the 60D's order, and no others: a real body has more
   (uploads, live view, formatting).

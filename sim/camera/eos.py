@@ -1,7 +1,6 @@
 """The simulated EOS: a PTP responder that behaves as a Canon EOS body does, with a `Film` where the sensor would be.
 
-Here stand its two sides, the session, and its sleep. What it is stands in `sim.camera.eos`; what it does, in
-`sim.camera.eos`, `sim.camera.eos` and `sim.camera.eos`. The rules of all five:
+Rules that hold inside:
 
 - State moves with the time that is handed in, and only when somebody asks or touches the camera: what falls due in
   between happens then, in its order. With a `SimulatedClock` an initiator that waits must sleep by the same clock;
@@ -14,25 +13,6 @@ An initiator reaches it through `answer`; a hand on the camera through `turn_dia
 `insert_card`, `remove_card` and `wake`. Both may be used from several threads.
 
 Source: a recorded EOS 60D; ISO 15740:2013 for what is standard; libgphoto2 2.5.34 for what initiators expect.
-
-What a simulated EOS is at a moment, and what moves it: its time, its events, the values of its properties.
-
-The rules, and who joins all this to a camera, stand in `sim.camera.eos`. Everything that a body remembers is set here,
-so that the files above hold behaviour alone.
-
-Source: a recorded EOS 60D; libgphoto2 2.5.34 for what initiators expect.
-
-The simulated EOS's files: those on its card, and those in its memory that wait to be fetched.
-
-Source: a recorded EOS 60D; ISO 15740:2013 for what is standard.
-
-The simulated EOS's release: focus, the press, drive modes and brackets, and the frame until it is a file.
-
-The rules stand in `sim.camera.eos`.
-
-The simulated EOS's settings, as an initiator reaches them: Canon's own properties, and the standard's few.
-
-Source: a recorded EOS 60D; ISO 15740:2013 for the standard's properties.
 """
 
 from __future__ import annotations

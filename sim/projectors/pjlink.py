@@ -3,7 +3,7 @@
 Rules that hold inside: a peer deals with bytes alone; what they do happens in
 `sim.projectors.projector.SimulatedProjector`.
 
-What a simulated projector of PJLink class 2 says over UDP: answers to searches, and notices of its changes.
+Over UDP a projector of class 2 answers searches and gives notice of its changes.
 """
 
 from __future__ import annotations

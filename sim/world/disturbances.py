@@ -1,18 +1,16 @@
 """What goes wrong in the simulated lab while a session is taken: events as frozen values, by frame or by time.
 
 An event says from which frame to which it lasts, or from which second to which; both count since the session began,
-frames as the camera exposes them (from 0, retaken ones included), seconds by the lab's clock. It changes a frame in one
-of three places: what is shown, and the light, chart, lens and sensor (a `Situation`), or the counts
-that go into the file. All are functions of an event and a `Moment`, so that a frame comes out the same whoever asks and
-whatever was asked before.
+frames as the camera exposes them (from 0, retaken ones included), seconds by the lab's clock. It changes a frame in
+one of three places: what is shown, and the light, chart, lens and sensor (a `Situation`), or the counts that go into
+the file. All are functions of an event and a `Moment`, so that a frame comes out the same whoever asks and whatever
+was asked before.
 
 Sizes that are left out are chosen: large enough to be wrong, small enough to be overlooked.
 
-How one frame's circumstances differ from those of the undisturbed room: picture, light, chart, lens, sensor.
-
-Frozen values, and pure functions of places on the print. `sim.world.world.World.expose` takes a `Situation`;
-`sim.world.disturbances` makes one of what has gone wrong. Places are shares of the page unless said: (0, 0) is its
-top-left corner, (1, 1) its bottom-right one, and what reaches beyond lies off the page.
+**Situation.** How one frame's circumstances differ from those of the undisturbed room; `sim.world.world.World.expose`
+takes it. Places are shares of the page unless said: (0, 0) is its top-left corner, (1, 1) its bottom-right one, and
+what reaches beyond lies off the page.
 """
 
 from __future__ import annotations

@@ -1,23 +1,21 @@
-"""The two inner loops of the simulated room: from a drawing to the light on every photosite, and from light to counts.
+"""From a drawing on the print to the light on every photosite, and from light to counts.
 
-Compiled by numba on first use, single-threaded and without the interpreter's lock; `sim.world.world` calls them for
-blocks of rows from as many threads as there are processors. A row's result depends on its own arguments only, so
-neither blocks nor threads change a bit of it. Positions are photosites of the visible frame, centres at integers,
-unless said.
+**Loops.** Compiled by numba on first use, single-threaded and without the interpreter's lock; `sim.world.world` calls
+them for blocks of rows from as many threads as there are processors. A row's result depends on its own arguments
+only, so neither blocks nor threads change a bit of it. Positions are photosites of the visible frame, centres at
+integers, unless said.
 
-Where a point of the wavy print falls in the picture, and back.
-
-The print is a sheet held at its middle: a point (x, y) mm on it stands `height` mm out of the plane, towards the
-camera. The sheet is turned by roll, then tilt, then pan, and seen through a pinhole and Brown's lens distortion
-(D. C. Brown, "Close-range camera calibration", 1971; normalised coordinates and coefficient order as OpenCV has them).
-The paper does not stretch: its heights are so small against their wavelengths that a point keeps its x and y.
+**Geometry.** The print is a sheet held at its middle: a point (x, y) mm on it stands `height` mm out of the plane,
+towards the camera. The sheet is turned by roll, then tilt, then pan, and seen through a pinhole and Brown's lens
+distortion (D. C. Brown, "Close-range camera calibration", 1971; normalised coordinates and coefficient order as
+OpenCV has them). The paper does not stretch: its heights are so small against their wavelengths that a point keeps
+its x and y.
 
 Pixels are half-size, centres at integers, x right, y down; millimetres on the print, origin at its top-left corner.
 Pure functions of frozen values; light is not treated here.
 
-The print in front of the camera: rectangles of plain colour on paper, and the map of them that is rendered.
-
-Millimetres on the print, origin at its top-left corner, x right, y down.
+**The print** is rectangles of plain colour on paper, and a map of them that is rendered. Millimetres on the print,
+origin at its top-left corner, x right, y down.
 """
 
 from __future__ import annotations

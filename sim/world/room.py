@@ -1,53 +1,49 @@
 """The simulated lab around the camera: light, lens, print and what is wrong with them, as one frozen value.
 
-Light, ink and colour filters of the simulated room, as spectra from 380 to 780 nm in steps of 5 nm.
-
-Parametric models, each with its source; only the camera's sensitivities are measured data (`sim.data`). All spectra
-are relative: the exposure's scale is `sim.world.world`'s business. Pure functions, no state.
+**Spectra**, 380 to 780 nm in steps of 5 nm. Parametric models, each with its source; only the camera's sensitivities
+are measured data (`sim.data`). All spectra are relative: the exposure's scale is `sim.world.world`'s business. Pure
+functions, no state.
 
 Projector. ``uhp``: a short-arc mercury lamp of about 200 bar behind the dichroic red, green and blue segments of a
 colour wheel: a continuum, and the lines 405, 436, 546 and 577/579 nm broadened by pressure (Derra et al., "UHP lamp
 systems for projection applications", J. Phys. D 38 (2005) 2995, figure 4). ``led``: three light-emitting diodes, each
-an asymmetric Gaussian; peaks 633, 515 and 451 nm and full widths of 19, 34 and 22 nm, as three primaries of a measured
-LED projector have them (peaks 632, 516, 452 nm; widths at half maximum 19, 34, 21 nm).
+an asymmetric Gaussian; peaks 633, 515 and 451 nm and full widths of 19, 34 and 22 nm, as three primaries of a
+measured LED projector have them (peaks 632, 516, 452 nm; widths at half maximum 19, 34, 21 nm).
 
-Print. Yule-Nielsen spectral Neugebauer model (Yule and Nielsen 1951; Viggiano 1985): the sixteen
-overprints of cyan, magenta, yellow and black mixed by Demichel's weights in the power 1/n. A solid ink is a density
-band; peak wavelengths, widths and the secondary absorption follow measured ramps on photo paper (yellow: density 1.25
-below 480 nm, half at 490; magenta 1.17 at 540, 0.2 at 450; cyan 1.0 at three quarters at 600 nm, half of it left at
-700), which our solids match within about 0.1 in density. The surface's own reflection (matte paper) is added after.
-What a printer's profile makes of codes: `sim.world.room`.
+Print. Yule-Nielsen spectral Neugebauer model (Yule and Nielsen 1951; Viggiano 1985): the sixteen overprints of cyan,
+magenta, yellow and black mixed by Demichel's weights in the power 1/n. A solid ink is a density band; peak
+wavelengths, widths and the secondary absorption follow measured ramps on photo paper (yellow: density 1.25 below 480
+nm, half at 490; magenta 1.17 at 540, 0.2 at 450; cyan 1.0 at three quarters at 600 nm, half of it left at 700), which
+our solids match within about 0.1 in density. The surface's own reflection (matte paper) is added after.
 
-Papers. ``poster`` is what stands above. ``matt`` and ``glossy`` follow prints that an Epson XP-960 made without colour
-management, measured with a ColorMunki (olemagnp/print_profiles on GitHub, Argyll .ti3 files with spectra; none is
-copied): solid inks and their overprints, 400 to 730 nm, on PermaJet Matt Plus 240 and Ilford Galerie Smooth Pearl,
+Papers. ``poster`` is what stands above. ``matt`` and ``glossy`` follow prints that an Epson XP-960 made without
+colour management, measured with a ColorMunki (olemagnp/print_profiles on GitHub, Argyll .ti3 files with spectra; none
+is copied): solid inks and their overprints, 400 to 730 nm, on PermaJet Matt Plus 240 and Ilford Galerie Smooth Pearl,
 which one set of inks over two surfaces matches within 2.5 CIEDE2000 on average. Over that collection, and an Epson
-P800's glossy print (metebalci/profiling-an-epson-p800-printer), the density of black is 1.63 to 1.79 on four matt photo
-papers, 2.11 to 2.51 on ten from satin to glossy, 1.46 on an art and 1.28 on an office paper; the convex hulls of
-printed colours in CIELAB under D50 have 460 000 to 540 000, 580 000 to 790 000, 402 000 and 245 000 units. A review of
-many more papers has 1.6 to 1.7 and 2.0 to 2.2 (M. McNamee, "The whole range", swpp.co.uk, 2010). Ours have hulls of
-466 000 and 596 000: four inks, where such printers have six and more. Black is even over wavelength, as pigment blacks
-measure (P800, Canon Pro-300); the XP-960's dye black lets red beyond 680 nm through, which is left out.
+P800's glossy print (metebalci/profiling-an-epson-p800-printer), the density of black is 1.63 to 1.79 on four matt
+photo papers, 2.11 to 2.51 on ten from satin to glossy, 1.46 on an art and 1.28 on an office paper; the convex hulls
+of printed colours in CIELAB under D50 have 460 000 to 540 000, 580 000 to 790 000, 402 000 and 245 000 units. A
+review of many more papers has 1.6 to 1.7 and 2.0 to 2.2 (M. McNamee, "The whole range", swpp.co.uk, 2010). Ours have
+hulls of 466 000 and 596 000: four inks, where such printers have six and more. Black is even over wavelength, as
+pigment blacks measure (P800, Canon Pro-300); the XP-960's dye black lets red beyond 680 nm through, which is left
+out.
 
-A printer's profile: which ink codes print an sRGB file so that its greys are grey, and what the print reflects.
-
-``unmanaged`` sends the file's codes to the inks as they are, which is what the publication does: the grey axis then has
-the tint that equal codes of the inks give. ``managed`` is what a print shop's ICC profile does: sRGB (IEC 61966-2-1) →
-CIE XYZ of D50 (Bradford, as in ICC.1:2022 annex E) → relative colorimetric with black point compensation → ink codes
-of the paper. White is bare paper; black is the darkest neutral that the inks reach; in between, luminance over that
-of paper is linear between the two, as Adobe's black point compensation has it (ISO 18619). What no ink reaches goes to
-the nearest colour that one does, in CIELAB of the CIE 1931 observer under D50 relative to paper, differences of hue
-counted twice (chosen: profiles keep hue before chroma).
+**Profile.** Which ink codes print an sRGB file so that its greys are grey: ``unmanaged`` sends the file's codes to
+the inks as they are, which is what the publication does: the grey axis then has the tint that equal codes of the inks
+give. ``managed`` is what a print shop's ICC profile does: sRGB (IEC 61966-2-1) → CIE XYZ of D50 (Bradford, as in
+ICC.1:2022 annex E) → relative colorimetric with black point compensation → ink codes of the paper. White is bare
+paper; black is the darkest neutral that the inks reach; in between, luminance over that of paper is linear between
+the two, as Adobe's black point compensation has it (ISO 18619). What no ink reaches goes to the nearest colour that
+one does, in CIELAB of the CIE 1931 observer under D50 relative to paper, differences of hue counted twice (chosen:
+profiles keep hue before chroma).
 
 As in an ICC profile the table has 33 nodes a channel, is found by inverting the model of the print
-(`sim.world.room`; Levenberg-Marquardt from the nearest node of a coarse grid) and interpolated in tetrahedra, in
+(Levenberg-Marquardt from the nearest node of a coarse grid) and interpolated in tetrahedra, in
 which grey codes depend on grey nodes alone (Kasson and others, J. Electronic Imaging 4 (1995) 226).
 
-What handling does to a print: a stain, and a fold.
-
-A stain is a filter on the paper, of one colour, with a soft rim. A fold is a crease that does not lie flat: the sheet
-rises towards it on both sides, so that the crease stands off the plane, and either flank is turned a little towards
-the light or away from it. Pure functions of places on the print, millimetres from its top-left corner.
+**Handling.** A stain is a filter on the paper, of one colour, with a soft rim. A fold is a crease that does not lie
+flat: the sheet rises towards it on both sides, so that the crease stands off the plane, and either flank is turned a
+little towards the light or away from it. Pure functions of places on the print, millimetres from its top-left corner.
 """
 
 from __future__ import annotations

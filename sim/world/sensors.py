@@ -4,13 +4,12 @@ A body is a table of facts, without behaviour. Photosites count from the sensor'
 included, unless said; a count is what the raw file holds (DN).
 
 Sizes and margins: dcraw 9.28 (`adobe_coeff` and the Canon table in `identify`), masked rectangles: rawspeed's
-cameras.xml. Saturation: RawTherapee's camconst.json. Conversion gain and read noise: of the order that EMVA 1288 photon
-transfer gives for sensors of these generations; plausible, not measured on these bodies.
+cameras.xml. Saturation: RawTherapee's camconst.json. Conversion gain and read noise: of the order that EMVA 1288
+photon transfer gives for sensors of these generations; plausible, not measured on these bodies.
 
-Bodies for any sensitivities: known facts by name, plausible ones for the rest, and changes from a settings file.
-
-Sizes are the makers' numbers of recorded pixels. Borders, black, saturation, conversion gain and read noise are of the
-order that such sensors have: plausible, not measured on these bodies. Whoever knows better says so in a settings file.
+**Bodies for any sensitivities** have known facts by name and plausible ones for the rest. Sizes are the makers'
+numbers of recorded pixels. Borders, black, saturation, conversion gain and read noise are of the order that such
+sensors have: plausible, not measured on these bodies. Whoever knows better says so in a settings file.
 """
 
 from __future__ import annotations
