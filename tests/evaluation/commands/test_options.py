@@ -139,7 +139,6 @@ def test_defaults_are_whole_in_a_narrow_help(
     command: list[str], whole: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setenv("COLUMNS", "80")
-    monkeypatch.setenv("TERMINAL_WIDTH", "80")
     assert main([*command, "--help"]) == 0
     printed = " ".join(capsys.readouterr().out.replace("│", " ").split())
     assert whole in printed
