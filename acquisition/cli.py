@@ -125,7 +125,7 @@ def chart(
     from experiment.chart.layout import design_chart, paper_chart
     from experiment.chart.printing import save_pdf, save_preview, save_tiff
     from experiment.chart.proof import save_instructions, save_proof
-    from experiment.framing.sharpness import small_parts_warning
+    from experiment.framing.pictures import small_parts_warning
     from foundation.files import whole_folder
 
     if arrangement is Arrangement.PAPER:
@@ -327,8 +327,8 @@ def run(
     SESSION: session.toml, chart.json, illuminations.csv, frames/, previews/, journal.sqlite, frames.csv, report.html.
     Interrupt it as you like and run it again. Ends with 4 when frames were refused; the next run tries those again.
     """
+    from acquisition.run.notices import Terminal
     from acquisition.run.run import run_session
-    from acquisition.run.terminal import Terminal
     from experiment.config import load_lab
 
     settings = load_lab(lab)
@@ -459,7 +459,7 @@ def report(
 
     Reads SESSION, also while it is being taken. acquire run writes the same file when it ends.
     """
-    from acquisition.monitor.page import write_session_report
+    from acquisition.monitor.feed import write_session_report
 
     path = write_session_report(session, out)
     print(f"{path}: written")

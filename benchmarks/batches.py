@@ -17,7 +17,7 @@ import numpy.typing as npt
 
 from benchmarks.generator import natural_picture, nearby_cells, noisy_table, report
 from calibration.table.lut import Lut, open_lut
-from foundation.processors import processor_count
+from foundation.compiled import processor_count
 from generator.kernels.dithering import CellTable, checked_cells
 from generator.rendering.black_points import BlackPoint
 from generator.training.crops import Crops

@@ -35,9 +35,15 @@ import numpy as np
 import rawpy
 
 from calibration.checks.frame_consistency import ConsistencyCheck
-from calibration.pipeline.baseline import PAPER_OPTIONS, BuildOptions, baseline_of, with_lens
+from calibration.pipeline.baseline import (
+    PAPER_OPTIONS,
+    BuildOptions,
+    baseline_of,
+    decode_frame,
+    select_frames,
+    with_lens,
+)
 from calibration.pipeline.build import build, thread_count
-from calibration.pipeline.frames import decode_frame, select_frames
 from calibration.registration.register import register
 from calibration.sampling import gather_values, sites_at
 from drivers.camera import CapturedFrame
@@ -47,8 +53,7 @@ from experiment.chart.printing import drawing
 from experiment.framing.planes import frame_black
 from experiment.lights import plan_illuminations
 from experiment.session.folder import ReceivedFile, Session
-from experiment.session.plan import plan_steps
-from experiment.session.records import Judgement
+from experiment.session.records import Judgement, plan_steps
 from sim.camera.film import write_dng
 from sim.optics import MILD_SHOULDERS
 from sim.world.rendering import Print

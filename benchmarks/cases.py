@@ -45,7 +45,7 @@ from experiment.chart.layout import A_SERIES_MM, design_chart
 from experiment.chart.model import Chart
 from experiment.lights import Illumination
 from experiment.session.folder import Session
-from experiment.session.plan import SessionStep
+from experiment.session.records import SessionStep
 from foundation.errors import CropError
 from sim.optics import MILD_SHOULDERS, STRONG_SHOULDERS
 from sim.world.disturbances import Blob, Glare, Situation

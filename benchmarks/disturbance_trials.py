@@ -13,8 +13,7 @@ import numpy as np
 
 from benchmarks.judged_labs import Lab, cause
 from drivers.presenter import BLACK, WHITE, Colour
-from experiment.session.plan import SessionStep
-from experiment.session.records import Judgement
+from experiment.session.records import Judgement, SessionStep
 from sim.world.disturbances import (
     AmbientStep,
     AnyDisturbance,

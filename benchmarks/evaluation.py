@@ -141,7 +141,7 @@ def files_to_results() -> None:
     """Report how much of the time from files to results is decoding, by the wall clock of all processors."""
     from evaluation.datasets import open_scenes
     from evaluation.experiments.running import evaluate
-    from foundation.processors import processor_count
+    from foundation.compiled import processor_count
 
     chosen: Mapping[str, list[str]] = {
         "the paper's three": ["white-patch", "gray-world", "shades-of-gray"],

@@ -35,7 +35,7 @@ from isal import isal_zlib
 from benchmarks.encode import METADATA, at_once, photograph
 from benchmarks.generator import SAMPLES, noisy_table, report
 from calibration.table.lut import Lut, open_lut
-from foundation.processors import processor_count
+from foundation.compiled import processor_count
 from generator.dataset.making import DatasetOptions, generate_dataset
 from generator.files import encode_pieces
 from generator.pictures.sources import find_pictures

@@ -37,8 +37,7 @@ import numpy as np
 import numpy.typing as npt
 import skimage.data
 
-from calibration.table.lut import Lut, Provenance, open_lut
-from calibration.table.writer import LutWriter
+from calibration.table.lut import Lut, LutWriter, Provenance, open_lut
 from drivers.presenter import Colour
 from foundation.compiled import compiled
 from generator.kernels.choice import SCRATCH_BYTES, choose_group, row_keys

@@ -20,8 +20,7 @@ from experiment.chart.layout import design_chart
 from experiment.chart.model import Chart
 from experiment.config import LabSettings, parse_lab
 from experiment.lights import Illumination, plan_illuminations
-from experiment.session.plan import RESPONSE, SessionStep, plan_steps
-from experiment.session.records import Judgement
+from experiment.session.records import RESPONSE, Judgement, SessionStep, plan_steps
 from sim.camera.film import write_dng
 from sim.world.disturbances import CALM, AnyDisturbance, Disturbances, Moment
 from sim.world.room import Room

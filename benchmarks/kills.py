@@ -21,8 +21,7 @@ from pathlib import Path
 import numpy as np
 import psutil
 
-from calibration.table.lut import Lut, Provenance, open_lut
-from calibration.table.writer import LutWriter
+from calibration.table.lut import Lut, LutWriter, Provenance, open_lut
 from drivers.presenter import Colour
 from foundation.console import run
 from foundation.errors import DeviceError

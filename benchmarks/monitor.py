@@ -22,8 +22,7 @@ from typing import Any
 from acquisition.monitor.server import open_monitor
 from experiment.lights import plan_illuminations, save_illuminations
 from experiment.session.journal import JOURNAL_FILE, Journal
-from experiment.session.plan import RESPONSE, SessionStep, plan_steps
-from experiment.session.records import Check, Judgement
+from experiment.session.records import RESPONSE, Check, Judgement, SessionStep, plan_steps
 
 ATTEMPTS = 800
 """Attempts of a night: 707 lights, references, response frames, and some that were refused."""

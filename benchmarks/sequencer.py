@@ -37,11 +37,11 @@ from typing import BinaryIO
 
 import numpy as np
 
-from acquisition.judge.exposure import ExposureJudge
 from acquisition.judge.judge import LiveJudge
+from acquisition.judge.measure import ExposureJudge
 from acquisition.run.devices import Devices
 from acquisition.run.pipeline import Taken
-from acquisition.run.sequencer import take_session
+from acquisition.run.run import take_session
 from drivers.camera import CameraIdentity, CapturedFrame, ExposureSettings
 from drivers.presenter import BLACK, Colour
 from drivers.projector import Fault, Lamp, Power, ProjectorIdentity
@@ -50,8 +50,7 @@ from experiment.config import LabSettings, SequenceSettings
 from experiment.lights import Illumination, plan_illuminations
 from experiment.session.folder import Session
 from experiment.session.journal import Journal
-from experiment.session.plan import SessionStep, plan_steps
-from experiment.session.records import Judgement
+from experiment.session.records import Judgement, SessionStep, plan_steps
 from foundation.clock import Clock, SystemClock
 from sim.clock import OPENING, SimulatedClock
 from sim.world.sensors import BODIES

@@ -31,7 +31,7 @@ from typing import Any, BinaryIO
 
 from acquisition.run.devices import Devices
 from acquisition.run.queue import StepQueue
-from acquisition.run.sequencer import take_session
+from acquisition.run.run import take_session
 from drivers.camera import CameraIdentity, CapturedFrame, ExposureSettings
 from drivers.presenter import BLACK, Colour
 from experiment.chart.layout import design_chart
@@ -39,8 +39,7 @@ from experiment.config import LabSettings
 from experiment.lights import Illumination
 from experiment.session.folder import IncomingFile, Session
 from experiment.session.journal import Journal
-from experiment.session.plan import SessionStep, plan_steps
-from experiment.session.records import Judgement
+from experiment.session.records import Judgement, SessionStep, plan_steps
 from sim.clock import OPENING, SimulatedClock
 
 KILLS = 10_000

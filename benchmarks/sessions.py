@@ -37,8 +37,7 @@ from experiment.framing.movement import STILL_PX
 from experiment.framing.planes import CHANNELS
 from experiment.lights import Illumination
 from experiment.session.folder import ReceivedFile, Session
-from experiment.session.plan import SessionStep, plan_steps
-from experiment.session.records import Judgement
+from experiment.session.records import Judgement, SessionStep, plan_steps
 from foundation.colorimetry import angles_deg
 from sim.camera.film import write_dng
 from sim.world.disturbances import UNDISTURBED, Situation

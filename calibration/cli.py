@@ -353,7 +353,7 @@ def _verify_table(folder: Path, session: Path | None, output: JsonOutput) -> Non
     with _progress_bar("reading the samples") as progress:
         faults = find_faults(lut, lambda done, total: progress(done, total, "reading the samples"))
     if session is not None:
-        from calibration.pipeline.frames import frame_faults
+        from calibration.pipeline.baseline import frame_faults
         from experiment.session.folder import Session
 
         with Session.open(session) as opened, _progress_bar("reading the frames") as progress:
@@ -470,7 +470,7 @@ def _make(
 def _with_citation(options: BuildOptions, session: Session, changes: dict[str, Any]) -> BuildOptions:
     """Return the options with what was given of the table's origin in place of what the session's settings state."""
     from calibration.citation import with_changes
-    from calibration.pipeline.frames import stated_origin
+    from calibration.pipeline.baseline import stated_origin
 
     return replace(options, citation=with_changes(stated_origin(session).citation, changes)) if changes else options
 

@@ -14,15 +14,13 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from calibration.checks.frame_consistency import FrameConsistency
-from calibration.checks.frame_origins import OriginFigures
+from calibration.checks.frame_consistency import FrameConsistency, OriginFigures
 from calibration.checks.light_codes import CodeAgreement
 from calibration.checks.stray_light import StrayLight
 from calibration.citation import OriginRecord
 from calibration.radiometry.dark_frames import DarkSummary
 from calibration.radiometry.drift import DriftCorrection
-from calibration.radiometry.greys import tint_deg
-from calibration.radiometry.photon_transfer import PhotonTransfer
+from calibration.radiometry.greys import PhotonTransfer, tint_deg
 from calibration.radiometry.primaries import Primaries
 from calibration.registration.register import Registration
 from calibration.sampling import bleed

@@ -20,8 +20,8 @@ import numpy.typing as npt
 
 from calibration import kernels
 from drivers.raw.rawfile import Mosaic
+from experiment.framing.pictures import MAX_BLUR_PX
 from experiment.framing.planes import CHANNELS, phases
-from experiment.framing.sharpness import MAX_BLUR_PX
 
 UNEVEN_SHARE = 0.01
 """Difference of rim and middle, as a share of the patch, that matters (judgement)."""

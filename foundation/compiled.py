@@ -1,4 +1,4 @@
-"""Python functions compiled by numba: at their first call, for the processor at hand, and kept on disk.
+"""Python functions compiled by numba, kept on disk for the processor at hand; and work spread over its threads.
 
 A fresh machine needs no compiler: numba brings LLVM with it (`docs/decisions/0010-compiled-kernel.md`). numba itself is
 imported when a compiled function is first called, since that takes half a second
@@ -16,7 +16,8 @@ import os
 import pickle
 import re
 import sys
-from collections.abc import Callable
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
 from functools import cache, update_wrapper
 from pathlib import Path
@@ -220,3 +221,42 @@ def _checked_cache() -> Any:
             return hashlib.sha256(repr(self._index_key(sig, codegen)).encode() + code).digest()
 
     return CheckedCache
+
+
+_In = TypeVar("_In")
+_Out = TypeVar("_Out")
+
+
+def processor_count() -> int:
+    """Return the number of processors this process may run on, at least 1.
+
+    A scheduler or a container may bind a process to fewer than the machine has; where the system binds none, all are
+    counted. A container's share of processor time is not looked at.
+    """
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def ordered_map(function: Callable[[_In], _Out], things: Iterable[_In], workers: int) -> Iterator[_Out]:
+    """Yield the function's values in the order of the things; with one worker in the calling thread.
+
+    Examples
+    --------
+    >>> list(ordered_map(abs, [-3, 2, -1], workers=2))
+    [3, 2, 1]
+    """
+    from concurrent.futures import Future, ThreadPoolExecutor
+
+    if workers <= 1:
+        yield from map(function, things)
+        return
+    waiting: deque[Future[_Out]] = deque()
+    pool = ThreadPoolExecutor(workers)
+    try:
+        for thing in things:
+            waiting.append(pool.submit(function, thing))
+            if len(waiting) >= 2 * workers:
+                yield waiting.popleft().result()
+        while waiting:
+            yield waiting.popleft().result()
+    finally:
+        pool.shutdown(cancel_futures=True)

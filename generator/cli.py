@@ -9,11 +9,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
+from foundation.compiled import processor_count
 from foundation.console import EXIT_CODES, JsonOutput, json_output, loaded, new_app, run
 from foundation.errors import InputError
-from foundation.processors import processor_count
 from foundation.secret_texts import masked, printable
-from generator.command.demo_table import table_folder
 from generator.command.likeness_options import LikenessOptions, choose
 from generator.command.options import (
     CommonOptions,
@@ -26,7 +25,7 @@ from generator.command.options import (
     WorkOptions,
     grouped,
 )
-from generator.command.output import cells_sentences, matrix_sentence
+from generator.command.output import cells_sentences, matrix_sentence, table_folder
 
 if TYPE_CHECKING:
     from calibration.table.lut import Lut

@@ -31,7 +31,7 @@ import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from foundation.errors import FormatError, InputError
-from foundation.hashing import sha256_of
+from foundation.files import sha256_of
 
 NEEDED_NM: Final = (400.0, 700.0)
 """Wavelengths that must be covered: beyond them a camera with its infrared filter sees under 2 % of its light."""

@@ -91,7 +91,7 @@ def table(
     It is a table for generate like one that build-lut makes of a session in the simulated lab, in minutes. Options come
     before what the settings say.
     """
-    from foundation.processors import processor_count
+    from foundation.compiled import processor_count
     from synthesis.lamps import read_lights
     from synthesis.settings import load_settings, stated_by_hand, table_task
     from synthesis.table import compute_table

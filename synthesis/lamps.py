@@ -96,7 +96,7 @@ class LightSpectra:
 
 def read_lights(given: str) -> LightSpectra:
     """Return the lights that a text names: a CSV file's, or published ones."""
-    from foundation.hashing import sha256_of
+    from foundation.files import sha256_of
 
     path = Path(given)
     if path.is_file() or path.suffix.lower() == ".csv":

@@ -28,17 +28,16 @@ from calibration.radiometry.drift import corrections
 from calibration.radiometry.greys import references_csv
 from calibration.radiometry.primaries import Primaries
 from calibration.sampling import Sites, gather, gather_values, patch_means
-from calibration.table.lut import REFERENCES, Provenance, Unfit, frames_sha256
-from calibration.table.writer import LutWriter
+from calibration.table.lut import REFERENCES, LutWriter, Provenance, Unfit, frames_sha256
 from drivers.camera import ExposureSettings
 from experiment.chart.model import Chart
 from experiment.framing.planes import CLIPPING_SHARE
 from experiment.lights import Illumination
 from experiment.measures.paper import MAX_ORDER, MAX_ORDER_AROUND, MIN_REFERENCES, Paper, PaperReader
 from experiment.measures.sensor import saturation
+from foundation.compiled import ordered_map
 from foundation.errors import QualityError, StorageError
 from foundation.files import require_free, whole_folder
-from foundation.processors import ordered_map
 from foundation.version import software
 from sim.world.rendering import Print
 from sim.world.room import Room

@@ -26,8 +26,8 @@ from drivers.raw.rawfile import Mosaic
 from experiment.chart.model import Chart
 from experiment.framing.finding import MIN_MODULE_PX, Framing
 from experiment.framing.homography import project
+from experiment.framing.pictures import edge_blurs
 from experiment.framing.planes import CHANNELS, CLIPPING_SHARE, frame_black, phases
-from experiment.framing.sharpness import edge_blurs
 from experiment.measures.sensor import HIGHEST, LOWEST, deviations
 from foundation.errors import DeviceError, StorageError
 from foundation.robust import sigma_of

@@ -22,8 +22,7 @@ from acquisition.check.camera import BlurMap, Transfer, fit_transfer, measure_bl
 from acquisition.check.findings import LIMITS, Finding, Grade, amount, judged, percent
 from acquisition.check.light_and_print import PrintState, SmoothLight, measure_light, measure_print
 from acquisition.check.places import ChartMap, Levels, levels, place_chart, window_px
-from acquisition.run.devices import Devices
-from acquisition.run.shutter import holds_whole_turns
+from acquisition.run.devices import Devices, holds_whole_turns
 from drivers.camera import capture
 from drivers.presenter import BLACK, WHITE, Colour
 from drivers.raw.rawfile import Mosaic, read_raw

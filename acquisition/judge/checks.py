@@ -15,16 +15,14 @@ import numpy as np
 import numpy.typing as npt
 
 from acquisition.judge import limits
-from acquisition.judge.exposure import Exposure, disagreement, refusal
 from acquisition.judge.light import BLACK_DN
 from acquisition.judge.light_checks import same_light
-from acquisition.judge.measure import TILE_COLUMNS, TILE_ROWS, Anchor, Frame, Measured
+from acquisition.judge.measure import TILE_COLUMNS, TILE_ROWS, Anchor, Exposure, Frame, Measured, disagreement, refusal
 from acquisition.judge.state import JudgeState, is_brightest_grey
 from drivers.raw.rawfile import Mosaic
 from experiment.config import JudgeSettings, LabSettings
 from experiment.framing.planes import CHANNELS, Channel
-from experiment.session.plan import SessionStep
-from experiment.session.records import Check
+from experiment.session.records import Check, SessionStep
 
 
 def judge_file(

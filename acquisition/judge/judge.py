@@ -43,8 +43,7 @@ from experiment.config import LabSettings
 from experiment.framing.pictures import preview_jpeg
 from experiment.framing.planes import frame_black, phases
 from experiment.lights import Illumination
-from experiment.session.plan import REFERENCES, SessionStep
-from experiment.session.records import Check, Judgement
+from experiment.session.records import REFERENCES, Check, Judgement, SessionStep
 from foundation.errors import FormatError, RegistrationError
 
 _BESIDE = "it was under way when the frames before it were found to contradict each other; they are taken again first"

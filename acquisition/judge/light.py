@@ -27,7 +27,7 @@ import numpy as np
 import numpy.typing as npt
 
 from acquisition.judge.measure import SEGMENTS, Measured, Noise, strip_blocks
-from experiment.session.plan import TOP
+from experiment.session.records import TOP
 from foundation.robust import huber_weights, sigma_of
 
 _NODES = np.array([4, 8, 16, 24, 32, 44, 56, 72, 88, 104, 120, 136, 152, 168, 184, 200, 216, 232, 255.0])

@@ -19,8 +19,7 @@ from acquisition.judge import limits
 from acquisition.judge.light import Basis, Codes, Fit, FrameLight, Prediction, ProjectorModel, Residuals
 from acquisition.judge.measure import SEGMENTS, TILE_COLUMNS, TILE_ROWS, Measured
 from acquisition.judge.state import JudgeState, LampSeen, Leaning, Seen, combined
-from experiment.session.plan import SessionStep
-from experiment.session.records import Check
+from experiment.session.records import Check, SessionStep
 from foundation.colorimetry import angles_deg, decode_srgb
 from foundation.robust import sigma_of
 

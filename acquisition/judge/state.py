@@ -20,7 +20,7 @@ import numpy.typing as npt
 from acquisition.judge import limits
 from acquisition.judge.light import Basis, Codes, FrameLight, ProjectorModel
 from acquisition.judge.measure import Anchor, Frame, Measured
-from experiment.session.plan import PRIMARIES, REFERENCES, TOP, SessionStep
+from experiment.session.records import PRIMARIES, REFERENCES, TOP, SessionStep
 
 RECENT = 6
 """Frames whose noise is compared with the next one's: a camera's memory card hands out none older."""
@@ -109,7 +109,7 @@ class JudgeState:
     - `first`: the session's first accepted frame: camera, size, serial number.
     - `first_white`, `white`, `first_dark`, `dark`: accepted references.
     - `first_grey`: the first frame of the brightest grey, whose paper that of a run taken up again is held against.
-    - `primaries`: frames of the three primaries at `experiment.session.plan.TOP`.
+    - `primaries`: frames of the three primaries at `experiment.session.records.TOP`.
     - `basis`, `model`: how a frame is a sum of primaries, and which amounts codes give.
     - `moved_px`: (2,) where the chart lies at rest, from its place in the anchor: (0, 0), or where a bump has left it.
     - `recent`: the last frames, the newest last.
@@ -312,7 +312,7 @@ def is_brightest_grey(step: SessionStep) -> bool:
 
 
 def primary_codes(primary: int) -> Codes:
-    """Return the codes that show primary 0, 1 or 2 alone at `TOP` (`experiment.session.plan`)."""
+    """Return the codes that show primary 0, 1 or 2 alone at `TOP` (`experiment.session.records`)."""
     return PRIMARIES[primary].codes
 
 

@@ -28,8 +28,7 @@ from urllib.parse import parse_qs
 
 import numpy as np
 
-from acquisition.monitor.feed import SessionWatch, to_bytes
-from acquisition.monitor.page import live_page
+from acquisition.monitor.feed import SessionWatch, live_page, to_bytes
 from acquisition.monitor.view import read_session
 from experiment.session.journal import JOURNAL_FILE
 from foundation.errors import FormatError, InputError

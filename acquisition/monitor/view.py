@@ -19,7 +19,6 @@ from typing import Any
 from experiment.lights import Illumination, load_illuminations
 from experiment.session.heartbeat import AGAIN, Heartbeat, SessionPlace
 from experiment.session.journal import JOURNAL_FILE, Journal
-from experiment.session.plan import SessionStep
 from experiment.session.records import (
     ACCEPTED,
     FAILED,
@@ -30,6 +29,7 @@ from experiment.session.records import (
     AttemptDetails,
     Check,
     SessionEvent,
+    SessionStep,
     TimedAttempt,
     time_left,
 )

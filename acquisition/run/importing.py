@@ -15,18 +15,16 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import BinaryIO
 
-from acquisition.judge.exposure import judge_file
+from acquisition.judge.measure import judge_file
 from drivers.camera import CapturedFrame
 from drivers.presenter import BLACK, WHITE
 from experiment.chart.model import load_chart
 from experiment.config import LabSettings
 from experiment.lights import Illumination, load_illuminations
 from experiment.session.folder import FRAME_COLUMNS, Session
-from experiment.session.plan import FrameKind, SessionStep
-from experiment.session.records import ACCEPTED, REFUSED, Judgement
+from experiment.session.records import ACCEPTED, REFUSED, FrameKind, Judgement, SessionStep
 from foundation.errors import FormatError
-from foundation.files import require_free
-from foundation.hashing import file_sha256
+from foundation.files import file_sha256, require_free
 
 
 @dataclass(frozen=True)

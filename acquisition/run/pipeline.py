@@ -32,15 +32,22 @@ from datetime import datetime
 from functools import partial
 from typing import Self, TypeVar
 
-from acquisition.run.devices import Devices
-from acquisition.run.lamp import HealthWatch, await_health
+from acquisition.run.devices import Devices, HealthWatch, await_health
 from acquisition.run.queue import StepQueue, link_runs, step_name
 from acquisition.run.retry import Pause, RetryPolicy, is_curable
 from drivers.presenter import ReadsBack
 from experiment.config import JudgeSettings, LabSettings
 from experiment.session.folder import ReceivedFile, Session
-from experiment.session.plan import REFERENCES, SessionStep
-from experiment.session.records import ACCEPTED, Check, FrameJudge, Judgement, OutlastsPauses, preview_path
+from experiment.session.records import (
+    ACCEPTED,
+    REFERENCES,
+    Check,
+    FrameJudge,
+    Judgement,
+    OutlastsPauses,
+    SessionStep,
+    preview_path,
+)
 from foundation.console import Ending
 from foundation.errors import CropError, DeviceError, QualityError, StorageError, counted
 from foundation.files import write_whole

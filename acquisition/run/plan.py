@@ -22,10 +22,8 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any, Final, TypeVar
 
-from acquisition.run.devices import Devices
-from acquisition.run.lamp import reported_error
+from acquisition.run.devices import Devices, holds_whole_turns, period_s, reported_error, wheel_of
 from acquisition.run.rig.opening import known_frame_bytes, open_rig
-from acquisition.run.shutter import holds_whole_turns, period_s, wheel_of
 from drivers.camera import CameraIdentity, ReportsSupplies, Supplies
 from drivers.presenter import BLACK, ReportsWarnings
 from drivers.projector import Power, Projector
@@ -33,8 +31,7 @@ from experiment.chart.model import Chart, load_chart
 from experiment.config import LabSettings, parse_lab
 from experiment.lights import Illumination, load_illuminations
 from experiment.session.folder import Session, session_exists
-from experiment.session.plan import KINDS, RESPONSE, SessionStep, plan_steps
-from experiment.session.records import duration_text
+from experiment.session.records import KINDS, RESPONSE, SessionStep, duration_text, plan_steps
 from foundation.errors import (
     ConfigurationError,
     CropError,
@@ -45,8 +42,7 @@ from foundation.errors import (
     StorageError,
     counted,
 )
-from foundation.files import storage_error
-from foundation.hashing import file_sha256
+from foundation.files import file_sha256, storage_error
 from foundation.secret_texts import target_label
 
 FIXED: Final = (

@@ -20,8 +20,7 @@ from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Sequence
 
 from experiment.session.folder import Session
-from experiment.session.plan import REFERENCES, FrameKind, SessionStep, link_steps
-from experiment.session.records import ACCEPTED, Attempt
+from experiment.session.records import ACCEPTED, REFERENCES, Attempt, FrameKind, SessionStep, link_steps
 
 GIVEN_UP_IN_A_ROW = 3
 """Steps given up one after another after which going on makes no sense: something lasting is wrong. One may be chance,

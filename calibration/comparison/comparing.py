@@ -44,9 +44,9 @@ from experiment.measures.stains import STAINED
 from experiment.session.folder import Session
 from experiment.session.journal import JOURNAL_FILE
 from foundation.colorimetry import angles_deg
+from foundation.compiled import ordered_map, processor_count
 from foundation.errors import FormatError, counted, first_of
 from foundation.files import storage_error, write_whole
-from foundation.processors import ordered_map, processor_count
 
 _Array = npt.NDArray[np.float64]
 

@@ -33,7 +33,7 @@ from calibration.registration.register import (
 from calibration.sampling import SAFE_BLEED, bleed, largest_window
 from calibration.spread.fitting import MOST_MISFIT
 from experiment.framing.finding import MIN_TAG_SHARE
-from experiment.framing.sharpness import MIN_CELL_PX
+from experiment.framing.pictures import MIN_CELL_PX
 
 if TYPE_CHECKING:
     import numpy.typing as npt

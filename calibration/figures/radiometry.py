@@ -44,7 +44,7 @@ from experiment.measures.stains import added_light
 from foundation.errors import counted, first_of
 
 if TYPE_CHECKING:
-    from calibration.checks.frame_origins import ForeignFrame
+    from calibration.checks.frame_consistency import ForeignFrame
     from calibration.measurements import FrameMeasurements, TableMeasurements
     from experiment.chart.model import Chart
     from experiment.session.records import FrameRecord

@@ -23,8 +23,7 @@ import numpy.typing as npt
 from scipy.spatial import cKDTree
 
 from calibration.measurements import FrameMeasurements
-from calibration.pipeline.baseline import Baseline, RegisteredFrame
-from calibration.pipeline.frames import SelectedFrames, decode_frame
+from calibration.pipeline.baseline import Baseline, RegisteredFrame, SelectedFrames, decode_frame
 from calibration.pipeline.measuring import (
     MeasuredDarkFrame,
     MeasuredFrame,

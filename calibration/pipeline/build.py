@@ -37,16 +37,20 @@ from calibration.figures.all_figures import FIGURES
 from calibration.figures.figure import Figure
 from calibration.measurements import LinearityMeasurements, TableMeasurements
 from calibration.pipeline.accumulator import Accumulator, EarlyMeasurement
-from calibration.pipeline.baseline import PAPER_OPTIONS, BuildOptions, baseline_of, with_lens, with_primaries
-from calibration.pipeline.collecting import check_figures, table_figures
-from calibration.pipeline.frames import (
+from calibration.pipeline.baseline import (
+    PAPER_OPTIONS,
+    BuildOptions,
     ChangedFrame,
     ReportProgress,
     SelectedFrames,
+    baseline_of,
     decode_frame,
     select_frames,
     source_frames,
+    with_lens,
+    with_primaries,
 )
+from calibration.pipeline.collecting import check_figures, table_figures
 from calibration.pipeline.linearity import read_linearity
 from calibration.pipeline.measuring import (
     MeasuredFrame,
@@ -63,19 +67,19 @@ from calibration.table.lut import (
     REPORT_PAGE,
     REPORT_VERSION,
     SAMPLES,
+    LutWriter,
     Provenance,
     frames_sha256,
 )
-from calibration.table.writer import LutWriter
 from calibration.verdict import COMMAND, BuildResult, judge, judged_values, refusal, retake_json
 from experiment.framing.movement import Shift
 from experiment.framing.pictures import annotated_png
 from experiment.session.folder import Session
 from experiment.session.records import FrameRecord
+from foundation.compiled import processor_count
 from foundation.errors import FormatError, QualityError, RegistrationError, counted, first_of
 from foundation.files import partial_path, publish_folder, require_free, storage_error, sync_folder, write_whole
-from foundation.held_folders import LOCK_FILE, held_folder
-from foundation.processors import processor_count
+from foundation.folders import LOCK_FILE, held_folder
 from foundation.records import to_plain
 from foundation.version import software
 

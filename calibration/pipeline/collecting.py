@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import numpy.typing as npt
 
-from calibration.checks.frame_origins import origin_figures
+from calibration.checks.frame_consistency import origin_figures
 from calibration.checks.light_codes import CodeAgreement, code_agreement
 from calibration.checks.stray_light import StrayLight, stray_light
 from calibration.citation import origin_record, with_published_serials
@@ -23,8 +23,7 @@ from calibration.measurements import (
     TableMeasurements,
 )
 from calibration.pipeline.accumulator import Accumulator
-from calibration.pipeline.baseline import Baseline, lens_figures
-from calibration.pipeline.frames import stated_origin
+from calibration.pipeline.baseline import Baseline, lens_figures, stated_origin
 from calibration.radiometry.drift import drift_correction
 from calibration.radiometry.primaries import additivity, drift_gains, pure_lights
 from experiment.lights import Illumination

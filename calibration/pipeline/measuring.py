@@ -17,8 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from calibration.measurements import FrameMeasurements
-from calibration.pipeline.baseline import Baseline, RegisteredFrame, beyond_print, sites_of, usable_means
-from calibration.pipeline.frames import DecodedFrame
+from calibration.pipeline.baseline import Baseline, DecodedFrame, RegisteredFrame, beyond_print, sites_of, usable_means
 from calibration.radiometry.dark_frames import DarkFrameFigures, DarkLight, measure_dark_frame, winsorised_means
 from calibration.radiometry.primaries import Primaries
 from calibration.sampling import (

@@ -28,8 +28,8 @@ from experiment.chart.model import Chart
 from experiment.framing.field import SIDE_POINTS, FoundField, field_mm, refine_edges
 from experiment.framing.finding import Framing, find_chart
 from experiment.framing.homography import rms
+from experiment.framing.pictures import MIN_CELL_PX, blur_px
 from experiment.framing.planes import CHANNELS, Channel, Plane, frame_black, plane_of
-from experiment.framing.sharpness import MIN_CELL_PX, blur_px
 from foundation.errors import RegistrationError
 from foundation.robust import sigma_of
 

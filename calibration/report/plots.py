@@ -20,7 +20,7 @@ import numpy.typing as npt
 from calibration.causes.gathering import PrintPlace
 from calibration.checks.frame_consistency import has_enough_cells
 from calibration.measurements import FrameMeasurements, TableMeasurements
-from calibration.radiometry.photon_transfer import PhotonTransfer, noise_levels
+from calibration.radiometry.greys import PhotonTransfer, noise_levels
 from calibration.registration.register import Registration
 from calibration.sampling import rim_difference, sample_noise, sites_at
 from drivers.raw.rawfile import Mosaic

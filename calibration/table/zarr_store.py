@@ -54,9 +54,8 @@ from calibration.table.lut import (
 )
 from experiment.lights import load_illuminations
 from foundation.errors import CropError, FormatError, InputError, StorageError
-from foundation.files import require_free, storage_error, whole_folder, write_whole
-from foundation.foreign_folders import parse_json_object, require_plain_tree
-from foundation.hashing import file_sha256
+from foundation.files import file_sha256, require_free, storage_error, whole_folder, write_whole
+from foundation.folders import parse_json_object, require_plain_tree
 
 FORMAT: Final = "crop.lut.published"
 

@@ -27,9 +27,11 @@ from dataclasses import dataclass, field
 from typing import BinaryIO, TypeVar
 
 from drivers.camera import CameraIdentity, ExposureSettings, Supplies
-from drivers.canon.apex import APERTURE, ISO, SHUTTER, Scale
 from drivers.canon.records import (
+    APERTURE,
+    ISO,
     RAW_ONLY,
+    SHUTTER,
     AvailableFormats,
     AvailableValues,
     ImageFormat,
@@ -38,6 +40,7 @@ from drivers.canon.records import (
     PropertyChanged,
     PropertySetting,
     Record,
+    Scale,
     TransferRequest,
     decode_events,
     number_of,
@@ -59,8 +62,7 @@ from drivers.ptp.codes import (
     WhiteBalance,
 )
 from drivers.ptp.datasets import Cursor, DeviceInfo, StorageInfo, decode_u32_array
-from drivers.ptp.session import PASSING_LIMIT_S, START_TIMEOUT_S, OperationDeclined, PtpSession
-from drivers.ptp.transaction import Transport
+from drivers.ptp.session import PASSING_LIMIT_S, START_TIMEOUT_S, OperationDeclined, PtpSession, Transport
 from foundation.clock import Clock
 from foundation.errors import DeviceError, DeviceRefused, InputError, LinkTimeout, ProtocolError
 

@@ -25,8 +25,7 @@ from typing import BinaryIO, TypeVar
 from drivers.camera import CameraIdentity, CapturedFrame, ExposureSettings, Supplies
 from drivers.canon.body import EosBody, WaitingObject, plan, shutter_speeds
 from drivers.ptp.codes import ObjectFormat, ResponseCode
-from drivers.ptp.session import PASSING, OperationDeclined
-from drivers.ptp.transaction import Transport
+from drivers.ptp.session import PASSING, OperationDeclined, Transport
 from foundation.clock import Clock, SystemClock
 from foundation.errors import DeviceError, DeviceRefused, LinkClosed, LinkError, LinkTimeout, ProtocolError
 

@@ -23,8 +23,7 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Callable
 
-from drivers.links.exchange import Exchange, MessageParser
-from drivers.links.link import Link
+from drivers.links.link import Exchange, Link, MessageParser
 from drivers.presenter import BLACK, Colour
 from foundation.clock import Clock, SystemClock
 from foundation.errors import DeviceError, DeviceRefused, ProtocolError

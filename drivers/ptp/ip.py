@@ -30,7 +30,7 @@ from typing import Final, Self, cast
 from drivers.links.link import Link
 from drivers.links.network import TcpLink
 from drivers.ptp.datasets import U32, Cursor, PtpDataset, encode_integer
-from drivers.ptp.transaction import (
+from drivers.ptp.session import (
     MAX_PARAMETERS,
     CableTransport,
     PtpEvent,
@@ -625,7 +625,7 @@ _CALL_OFF_S: Final = 2.0
 
 
 class IpTransport(CableTransport):
-    """A `drivers.ptp.transaction.Transport` over two links.
+    """A `drivers.ptp.session.Transport` over two links.
 
     `open_command`, `open_event`: open the two connections; called again by `reset`. The second may raise `LinkClosed`
     for as long as the device has not opened its port: it is tried for 2 s. `guid`: 16 bytes by which a camera knows a

@@ -28,7 +28,7 @@ from enum import IntEnum
 from drivers.links.link import Pipe, PipeStalled, UsbPipes
 from drivers.ptp.codes import ResponseCode
 from drivers.ptp.datasets import Cursor, encode_integer
-from drivers.ptp.transaction import (
+from drivers.ptp.session import (
     MAX_PARAMETERS,
     CableTransport,
     PtpEvent,
@@ -302,7 +302,7 @@ _EMPTY_READS = 16
 
 
 class UsbTransport(CableTransport):
-    """A `drivers.ptp.transaction.Transport` over the pipes of a still image interface, which it closes in the end."""
+    """A `drivers.ptp.session.Transport` over the pipes of a still image interface, which it closes in the end."""
 
     def __init__(self, pipes: UsbPipes, clock: Clock) -> None:
         super().__init__()

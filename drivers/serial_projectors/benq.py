@@ -18,7 +18,7 @@ from __future__ import annotations
 import contextlib
 import re
 
-from drivers.links.exchange import MessageParser
+from drivers.links.link import MessageParser
 from drivers.projector import Fault, Power
 from drivers.serial_projectors.driver import CHECK_SPEED, SerialProjector, text_of
 from foundation.errors import DeviceRefused, ProtocolError

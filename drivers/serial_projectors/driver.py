@@ -4,7 +4,7 @@ Rules that hold inside:
 
 - A projector that cools down is not switched on, and one that warms up is not switched off; one that is there, or on
   the way, is sent nothing.
-- Every command may be repeated without harm (`drivers.links.exchange`).
+- Every command may be repeated without harm (`drivers.links.link`).
 """
 
 from __future__ import annotations
@@ -13,8 +13,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable
 from typing import ClassVar
 
-from drivers.links.exchange import Exchange, quoted
-from drivers.links.link import Link
+from drivers.links.link import Exchange, Link, quoted
 from drivers.projector import Fault, Lamp, Power, ProjectorIdentity
 from foundation.clock import Clock, SystemClock
 from foundation.errors import DeviceRefused, ProtocolError

@@ -19,7 +19,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 
-from drivers.links.exchange import Exchange, quoted
+from drivers.links.link import Exchange, quoted
 from drivers.projector import Fault, Power, Severity
 from drivers.serial_projectors.driver import CHECK_SPEED, SerialProjector, text_of
 from foundation.errors import DeviceFault, DeviceRefused, LinkTimeout, ProtocolError

@@ -18,7 +18,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
-from drivers.links.exchange import quoted
+from drivers.links.link import quoted
 from drivers.projector import Fault, Power, Severity
 from drivers.serial_projectors.driver import CHECK_SPEED, SerialProjector
 from foundation.errors import DeviceFault, DeviceRefused, ProtocolError

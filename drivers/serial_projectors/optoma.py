@@ -18,8 +18,7 @@ import re
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from drivers.links.exchange import quoted
-from drivers.links.link import Link
+from drivers.links.link import Link, quoted
 from drivers.projector import Fault, Power, Severity
 from drivers.serial_projectors.driver import CHECK_SPEED, DEFAULT_TIMEOUT_S, SYSTEM_CLOCK, SerialProjector, text_of
 from foundation.clock import Clock

@@ -77,9 +77,9 @@ def cv(
     from evaluation.reports.table_output import show_notes, show_tables
     from evaluation.results.method_records import describe_method
     from evaluation.results.tables import summary_table
+    from foundation.compiled import processor_count
     from foundation.console import orderly_end
     from foundation.files import require_free, require_free_file, write_whole
-    from foundation.processors import processor_count
 
     require_order("cv", method, data)
     others, left_out = choose_beside_constant(method)

@@ -56,9 +56,9 @@ def describe(
     from evaluation.experiments.describing.description import statistics_to_json
     from evaluation.experiments.describing.report import compare_figures, sentence
     from evaluation.reports.table_output import show_notes, show_tables
+    from foundation.compiled import processor_count
     from foundation.errors import InputError
     from foundation.files import require_free_file, write_whole
-    from foundation.processors import processor_count
 
     for path, what in ((out, "the statistics"), (report, "the page")):
         if path is not None:

@@ -112,7 +112,7 @@ def table1(
     from evaluation.experiments.paper.reporting import table1_report
     from evaluation.experiments.paper.table1 import hot_rows, settings, size_dependence
     from evaluation.experiments.paper.table1 import table1 as run
-    from foundation.processors import processor_count
+    from foundation.compiled import processor_count
 
     sides, shares = [int(side) for side in _numbers(sizes, "side of an image, px", 65535)], _numbers(hot, "share", 1e6)
     _require_free(out)
@@ -181,11 +181,11 @@ def table2(
     from evaluation.datasets import open_scenes
     from evaluation.experiments.folds import choose_folds
     from evaluation.experiments.paper.reporting import table2_report
-    from evaluation.experiments.paper.table2 import table2 as run
-    from evaluation.experiments.paper.table2 import table2_tables
+    from evaluation.experiments.paper.table1 import table2 as run
+    from evaluation.experiments.paper.table1 import table2_tables
     from evaluation.experiments.transfer.plan import trainable_images
     from evaluation.learning.standard import standard_learners
-    from foundation.processors import processor_count
+    from foundation.compiled import processor_count
 
     _require_free(out)
     asked = [name.strip() for name in methods.split(",") if name.strip()]
@@ -242,7 +242,7 @@ def bits(
     """Run methods on images whose colours were reduced."""
     from evaluation.experiments.paper.colour_reduction import bits_methods, bits_removed
     from evaluation.experiments.paper.reporting import bits_report
-    from foundation.processors import processor_count
+    from foundation.compiled import processor_count
 
     _require_free(out)
     opened = reading.open(data)
@@ -277,7 +277,7 @@ def flash(
 ) -> None:
     """Write tone-mapped codes of linear images."""
     from evaluation.experiments.paper.colour_reduction import write_codes
-    from foundation.processors import processor_count
+    from foundation.compiled import processor_count
 
     _require_free(out)
     opened = reading.open(data)
@@ -308,8 +308,8 @@ def flash_inverse(
 ) -> None:
     """Write the linear images of codes."""
     from evaluation.experiments.paper.colour_reduction import write_linear
+    from foundation.compiled import processor_count
     from foundation.console import progress
-    from foundation.processors import processor_count
 
     _require_free(out)
     with progress("images") as shown:

@@ -81,9 +81,9 @@ def run(
     """Evaluate methods on a data set."""
     from evaluation.experiments.run_folder import run_methods
     from evaluation.results.result import images_csv, table_csv
+    from foundation.compiled import processor_count
     from foundation.console import orderly_end, progress
     from foundation.files import write_whole
-    from foundation.processors import processor_count
 
     listed = [text.strip() for text in methods.split(",")] if methods is not None else []
     if methods is None and not method and not estimates:

@@ -53,9 +53,9 @@ def train(
     from evaluation.learning.model_files import provenance_of, save_model
     from evaluation.reports.table_output import show_notes
     from foundation.clock import SystemClock
+    from foundation.compiled import processor_count
     from foundation.errors import InputError
     from foundation.files import require_free_file
-    from foundation.processors import processor_count
 
     require_order("train", method, data)
     learners = choose_learners([method])

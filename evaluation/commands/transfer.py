@@ -121,8 +121,8 @@ def transfer(
     from evaluation.experiments.transfer.rows import transfer as run_transfer
     from evaluation.reports.table_output import show_notes, show_tables
     from evaluation.results.method_records import describe_method
+    from foundation.compiled import processor_count
     from foundation.files import require_free
-    from foundation.processors import processor_count
 
     if out is not None:
         require_free(out, "the results")

@@ -51,11 +51,11 @@ def tune(
     told: JsonOutput,
 ) -> None:
     """Choose a method's parameters on a data set."""
-    from evaluation.experiments.tuning import settings_of, tune_family, tuning_rows, tuning_table
+    from evaluation.experiments.cross_validation import settings_of, tune_family, tuning_rows, tuning_table
     from evaluation.reports.table_output import show_notes, show_tables
     from evaluation.results.tables import table_to_csv
+    from foundation.compiled import processor_count
     from foundation.files import require_free_file, write_whole
-    from foundation.processors import processor_count
 
     settings_of(family)  # A family that is none is told before a data set is opened.
     if out is not None:

@@ -23,7 +23,7 @@ from evaluation.datasets.generated import GeneratedScene
 from evaluation.datasets.thumbnails import Thumbnail
 from evaluation.scene import Scene
 from foundation.errors import CropError
-from foundation.hashing import sha256_of
+from foundation.files import sha256_of
 
 
 def identities(scenes: Sequence[Scene]) -> npt.NDArray[np.uint64]:

@@ -36,10 +36,10 @@ from evaluation.results.method_records import describe_method
 from evaluation.results.result import Result, Run, SceneAnswer, Subject, answer_from_json, answer_to_json, results_of
 from evaluation.results.tables import lights_tables, statistics_rows, summary_table, table_to_csv
 from evaluation.scene import MixedScene, Scene, SceneSet
+from foundation.compiled import ordered_map
 from foundation.errors import InputError, first_of
 from foundation.files import make_folder, partial_path, publish_folder, require_free, storage_error, write_whole
-from foundation.held_folders import LOCK_FILE, held_folder
-from foundation.processors import ordered_map
+from foundation.folders import LOCK_FILE, held_folder
 from foundation.version import software
 
 JOURNAL_FILE = "answers.jsonl"

@@ -24,8 +24,8 @@ from evaluation.methods.prepared import GREY, PreparedImage, PreparedMethod
 from evaluation.metrics import MapError, measure_map
 from evaluation.results.result import Result, SceneAnswer, read_light, results_of
 from evaluation.scene import MixedScene, Scene
+from foundation.compiled import ordered_map
 from foundation.errors import CropError, FormatError, InputError
-from foundation.processors import ordered_map
 
 _HOUSE = Path(__file__).parents[1]
 """This package's folder: what lies outside of it, and is no installed library, is the user's."""

@@ -18,8 +18,8 @@ import numpy.typing as npt
 
 from evaluation.methods.prepared import GREY, unit
 from evaluation.scene import Image, Scene
+from foundation.compiled import ordered_map
 from foundation.errors import InputError
-from foundation.processors import ordered_map
 
 Features = npt.NDArray[Any]
 """Features of one image (...) of any dtype; each learner says which shape and dtype its own have."""

@@ -26,8 +26,7 @@ from evaluation.methods.method import Method
 from evaluation.scene import Scene, SceneSet
 from foundation.clock import Clock
 from foundation.errors import FormatError, InputError
-from foundation.files import require_free_file, whole_file
-from foundation.hashing import sha256_of
+from foundation.files import require_free_file, sha256_of, whole_file
 from foundation.version import software
 
 _FORMAT = "croplab model 1"

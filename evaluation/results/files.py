@@ -29,7 +29,7 @@ from evaluation.metrics import ErrorKind
 from evaluation.results.result import Result, csv_text
 from evaluation.scene import Scene
 from foundation.errors import FormatError, InputError, counted, first_of
-from foundation.hashing import sha256_of
+from foundation.files import sha256_of
 from generator.named_numbers import is_number
 
 ERRORS_FILE = "errors.csv"

@@ -19,7 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from evaluation.results.files import GivenEstimates
-from foundation.hashing import file_sha256, sha256_of
+from foundation.files import file_sha256, sha256_of
 
 _DEEPEST = 6
 """Levels of values within values that are followed: settings are flat, and a graph of objects may have a circle."""

@@ -28,8 +28,7 @@ from experiment.chart.model import Chart, load_chart
 from experiment.lights import Illumination, load_illuminations, save_illuminations
 from experiment.session.journal import JOURNAL_FILE, PATIENCE_S, Journal, time_text
 from experiment.session.journal_file import MOST_BYTES
-from experiment.session.plan import SessionStep
-from experiment.session.records import FrameRecord, Judgement
+from experiment.session.records import FrameRecord, Judgement, SessionStep
 from experiment.session.repair import (
     BAD,
     lights_text,
@@ -44,13 +43,12 @@ from foundation.files import (
     reading_error,
     require_free,
     storage_error,
+    stream_sha256,
     whole_file,
     whole_folder,
     write_whole,
 )
-from foundation.foreign_folders import require_plain_folder
-from foundation.hashing import stream_sha256
-from foundation.held_folders import held_folder
+from foundation.folders import held_folder, require_plain_folder
 
 FRAME_COLUMNS = ("kind", "illumination", "file", "sha256", "taken_at", "exposure_s", "verdict")
 """Columns of `frames.csv` (docs/formats.md)."""

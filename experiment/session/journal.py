@@ -34,19 +34,21 @@ from experiment.session.journal_file import (
     reading_error,
     writing_error,
 )
-from experiment.session.plan import KINDS, FrameKind, SessionStep
 from experiment.session.records import (
     ACCEPTED,
     FAILED,
+    KINDS,
     REFUSED,
     VOIDED,
     AcceptedFile,
     Attempt,
     AttemptDetails,
     Check,
+    FrameKind,
     FrameRecord,
     Judgement,
     SessionEvent,
+    SessionStep,
 )
 from foundation.errors import FormatError, counted
 

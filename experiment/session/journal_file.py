@@ -33,7 +33,7 @@ from urllib.parse import quote
 from foundation.errors import FormatError, InputError, StorageError
 from foundation.files import disk_remedy_of, partial_path, storage_error, sync_folder
 from foundation.files import reading_error as file_reading_error
-from foundation.foreign_folders import is_inside_name, require_plain_folder
+from foundation.folders import is_inside_name, require_plain_folder
 
 _T = TypeVar("_T")
 _log = logging.getLogger(__name__)

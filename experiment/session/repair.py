@@ -25,11 +25,10 @@ from typing import Any, Final, cast
 import tomli_w
 
 from experiment.session.records import AcceptedFile
+from foundation.compiled import ordered_map, processor_count
 from foundation.errors import FormatError, InputError, StorageError
-from foundation.files import reading_error, storage_error, write_whole
-from foundation.foreign_folders import read_inside
-from foundation.hashing import file_sha256
-from foundation.processors import ordered_map, processor_count
+from foundation.files import file_sha256, reading_error, storage_error, write_whole
+from foundation.folders import read_inside
 from foundation.secret_texts import MASK, target_label
 
 SETTINGS_FILE: Final = "session.toml"

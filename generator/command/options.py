@@ -16,9 +16,9 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, get_type_hints
 
 import typer
 
+from foundation.compiled import processor_count
 from foundation.console import AsJson, Quiet, Verbose, Version
 from foundation.errors import InputError
-from foundation.processors import processor_count
 
 if TYPE_CHECKING:
     from calibration.table.lut import Lut

@@ -1,17 +1,23 @@
-"""What the command `generate` shows: progress on stderr, and what there is to say of rendering by colour."""
+"""What `generate` shows (progress, notes on rendering by colour), and the table of those who have none (`demo:`)."""
 
 from __future__ import annotations
 
+import subprocess
 import sys
 import time
 from collections.abc import Generator, Iterable
 from contextlib import ExitStack, contextmanager
 from datetime import timedelta
 from itertools import groupby
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Final
 
 from foundation.console import shows_progress
+from foundation.errors import InputError, StorageError
+from foundation.files import sha256_of
 from foundation.secret_texts import printable
+from foundation.version import software
 
 if TYPE_CHECKING:
     from rich.progress import Progress
@@ -19,6 +25,7 @@ if TYPE_CHECKING:
     from generator.dataset.plan import Plan
     from generator.dataset.shards import Callbacks
     from generator.rendering.matrices import ColourMatrix
+
 
 SOON_S: Final = 0.5
 """Work that is done within so many seconds gets no bar but its last line: what draws bars takes a tenth to load."""
@@ -157,3 +164,53 @@ def cells_sentences(plan: Plan, shards: Iterable[int]) -> tuple[str, ...]:
         f"finding the cells of {found} light{'' if found == 1 else 's'} on the way, once: they are kept for the next "
         "time; until then the time left is shown too long",
     )
+
+
+DEMO: Final = "demo:"
+"""What stands in place of a table's folder."""
+
+CAMERA: Final = "Canon_EOS_600D"
+LIGHTS: Final = "2856K,4000K,D55,D65,FL2,LED-B3,7500K,10000K"
+"""Incandescent lamp to blue sky, a fluorescent lamp and an LED between."""
+
+BITS: Final = 4
+"""Bits kept of each channel: 4096 colours, 5 MB."""
+
+
+def table_folder(given: Path, cache: Path | None = None) -> Path:
+    """Return the folder of a table: the one given, or that of the table to begin with, made if it is not there.
+
+    `cache`: where the table is kept; None for `generator.rendering.cell_mixtures.cache_folder`.
+    """
+    if str(given) != DEMO:
+        return given
+    from generator.rendering.cell_mixtures import cache_folder
+
+    cache = cache or cache_folder()
+    if cache is None:
+        raise InputError(
+            f"{DEMO} needs a place to keep its table, and there is no home folder; set XDG_CACHE_HOME, or make one "
+            "with sim table"
+        )
+    key = sha256_of(repr((software(), CAMERA, LIGHTS, BITS)).encode())[:12]
+    folder = cache / f"demo-{key}"
+    if not (folder / "lut.json").is_file():
+        _make(folder)
+    print(f"{DEMO} {folder}: a computed table of {CAMERA}, {8**BITS} colours under {LIGHTS}; see sim table --help")
+    return folder
+
+
+def _make(folder: Path) -> None:
+    """Have ``sim table`` make it, as a user would: this package knows tables and nothing that makes them."""
+    options = ["--camera", CAMERA, "--lights", LIGHTS, "--print", "managed", "--paper", "matt"]
+    with TemporaryDirectory() as place:
+        settings = Path(place) / "settings.toml"
+        settings.write_text(f"[chart]\nbits = {BITS}\n", encoding="utf-8")
+        words = [sys.executable, "-m", "synthesis.cli", "table", str(folder), *options, "--settings", str(settings)]
+        done = subprocess.run(words, stdout=subprocess.DEVNULL, check=False)
+    # Another program may have made it meanwhile, of the same bytes.
+    if done.returncode and not (folder / "lut.json").is_file():
+        raise StorageError(
+            f"the table for {DEMO} could not be made in {folder}: sim table ended with exit code {done.returncode}, "
+            "and says above why; mend that, or make a table elsewhere with sim table"
+        )

@@ -24,7 +24,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, get_args
 
 from foundation.errors import InputError
-from foundation.hashing import file_sha256
+from foundation.files import file_sha256
 from foundation.secret_texts import masked_values
 from foundation.version import software
 from generator.dataset.layouts import require_libraries

@@ -35,10 +35,10 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import ValidationError
 
+from foundation.compiled import ordered_map
 from foundation.errors import FormatError, InputError
-from foundation.foreign_folders import MOST_JSON_BYTES, bounded_lines, is_inside_name, parse_json_object
-from foundation.hashing import stream_sha256
-from foundation.processors import ordered_map
+from foundation.files import stream_sha256
+from foundation.folders import MOST_JSON_BYTES, bounded_lines, is_inside_name, parse_json_object
 from generator.dataset.layouts import member_name, read_member
 from generator.dataset.records import (
     COMPLETED_BY_HAND,

@@ -29,7 +29,7 @@ from pydantic import ValidationError
 
 from foundation.errors import FormatError, InputError
 from foundation.files import partial_path, publish_folder, require_free, storage_error
-from foundation.held_folders import LOCK_FILE, held_folder
+from foundation.folders import LOCK_FILE, held_folder
 from generator.dataset.records import ShardRecord, shard_key
 from generator.stores import DESCRIPTION, LocalStore, RemoteStore, Store, is_remote, local_path, open_store
 

@@ -16,8 +16,8 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 import numpy.typing as npt
 
+from foundation.compiled import ordered_map
 from foundation.errors import FormatError, InputError
-from foundation.processors import ordered_map
 from generator import philox
 from generator.likeness.balancing import LEAST_EFFECTIVE, balance, effective_size
 from generator.pictures.sources import Source, SourcePicture

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, Final, Protocol
 import numpy as np
 
 from foundation.errors import FormatError, InputError, StorageError
-from foundation.hashing import file_sha256, sha256_of, stream_sha256
+from foundation.files import file_sha256, sha256_of, stream_sha256
 from foundation.secret_texts import masked
 from generator import philox
 from generator.pictures.picture import LARGEST_SIDE, UNPREPARED, Cut, Picture, Preparation, open_picture

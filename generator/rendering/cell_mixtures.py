@@ -36,8 +36,7 @@ import numpy.typing as npt
 from foundation.colorimetry import angles_deg
 from foundation.compiled import compiled
 from foundation.errors import CropError
-from foundation.files import cache_folder, whole_file
-from foundation.hashing import sha256_of
+from foundation.files import cache_folder, sha256_of, whole_file
 from generator.rendering.print_profiles import PrintProfile
 
 SLOTS: Final = 16

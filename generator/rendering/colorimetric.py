@@ -37,7 +37,7 @@ from pathlib import Path
 
 from foundation.colorimetry import angles_deg
 from foundation.errors import QualityError
-from foundation.hashing import sha256_of
+from foundation.files import sha256_of
 from generator.lights.gamut import black_body
 from generator.lights.lighting import Lighting, Mixture, mixture_of, plain
 from generator.rendering import cell_mixtures, print_profiles

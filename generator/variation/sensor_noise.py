@@ -107,7 +107,7 @@ def measured_noise(lut: Lut) -> SensorNoise:
 
     Read from the cells under up to six of its lights, those that are brightest in their darkest channel, so that
     dark samples, which are cut at 0 and hence too quiet, are few; cells with such a sample, and unfit cells, are left
-    out. The curve is fitted by `calibration.radiometry.photon_transfer`. Numbers have six digits, so that they are the
+    out. The curve is fitted by `calibration.radiometry.greys`. Numbers have six digits, so that they are the
     same wherever a dataset is made.
 
     Raises
@@ -115,7 +115,7 @@ def measured_noise(lut: Lut) -> SensorNoise:
     InputError
         The samples do not follow the curve, or too few cells can be read.
     """
-    from calibration.radiometry.photon_transfer import photon_transfer
+    from calibration.radiometry.greys import photon_transfer
 
     count = lut.samples.shape[2]
     lights = np.argsort(-lut.white.min(axis=1), kind="stable")[:_LIGHTS]

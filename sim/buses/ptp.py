@@ -40,7 +40,7 @@ from drivers.ptp.ip import (
     encode,
     encode_data,
 )
-from drivers.ptp.transaction import PtpRequest, PtpResponse
+from drivers.ptp.session import PtpRequest, PtpResponse
 from drivers.ptp.usb import UsbTransport
 from foundation.errors import LinkClosed, LinkTimeout, ProtocolError
 from sim.buses.responder import Answer, NoAnswer, Responder
@@ -155,7 +155,7 @@ class MemoryPipes:
 
 
 class MemoryTransport(UsbTransport):
-    """A `drivers.ptp.transaction.Transport` straight to a responder."""
+    """A `drivers.ptp.session.Transport` straight to a responder."""
 
     def __init__(self, responder: Responder) -> None:
         self._memory = MemoryPipes(PtpUsbDevice(responder))

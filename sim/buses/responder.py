@@ -9,7 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Protocol
 
-from drivers.ptp.transaction import PtpEvent, PtpRequest, PtpResponse
+from drivers.ptp.session import PtpEvent, PtpRequest, PtpResponse
 
 
 @dataclass(frozen=True)

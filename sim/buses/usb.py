@@ -37,7 +37,7 @@ from usb.backend import IBackend
 
 from drivers.links.link import STILL_IMAGE_CLASS
 from drivers.ptp.codes import VENDOR_CANON_USB, ResponseCode
-from drivers.ptp.transaction import PtpRequest
+from drivers.ptp.session import PtpRequest
 from drivers.ptp.usb import (
     HIGH_SPEED_PACKET,
     ContainerReader,

@@ -30,7 +30,7 @@ from io import BytesIO
 from typing import NamedTuple
 
 from drivers.camera import ExposureSettings
-from drivers.canon import apex
+from drivers.canon import records
 from drivers.canon.records import (
     IMAGE_FORMAT_PROPERTIES,
     AvailableFormats,
@@ -76,7 +76,7 @@ from drivers.ptp.datasets import (
     encode_u32_array,
     encode_value,
 )
-from drivers.ptp.transaction import PtpEvent, PtpRequest, PtpResponse
+from drivers.ptp.session import PtpEvent, PtpRequest, PtpResponse
 from foundation.clock import Clock
 from foundation.errors import CropError, DeviceError, DeviceRefused, LinkClosed, ProtocolError
 from sim.buses.responder import Answer
@@ -665,11 +665,11 @@ class EosRelease(EosFiles):
         shutter = self._number_of(Property.EOS_SHUTTER_SPEED)
         mode = self._number_of(Property.EOS_AE_MODE)
         return ExposureSettings(
-            round(apex.ISO.value(iso)) if iso else _AUTO_ISO,
-            apex.APERTURE.value(aperture)
+            round(records.ISO.value(iso)) if iso else _AUTO_ISO,
+            records.APERTURE.value(aperture)
             if aperture and mode in (AeMode.MANUAL, AeMode.APERTURE_PRIORITY, AeMode.BULB)
             else _METERED_APERTURE,
-            apex.SHUTTER.value(shutter)
+            records.SHUTTER.value(shutter)
             if shutter and shutter != BULB and mode in (AeMode.MANUAL, AeMode.SHUTTER_PRIORITY)
             else _METERED_S,
         )

@@ -26,7 +26,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from drivers.camera import ExposureSettings
 from drivers.presenter import Colour
-from foundation.processors import processor_count
+from foundation.compiled import processor_count
 from sim.optics import APERTURE_VARIANCE, PhotographicLens, lens_falloff, projector_falloff
 from sim.world.disturbances import UNDISTURBED, Situation, moved, moved_back
 from sim.world.rendering import PAPER, Print, View, label_map, surface_of

@@ -25,8 +25,7 @@ from experiment.chart.model import Chart
 from experiment.chart.printing import drawing
 from experiment.lights import Illumination, plan_illuminations
 from experiment.session.folder import Session
-from experiment.session.plan import SessionStep
-from experiment.session.records import ACCEPTED
+from experiment.session.records import ACCEPTED, SessionStep
 from sim.camera.film import write_dng
 from sim.world.rendering import Print
 from sim.world.room import Room

@@ -12,7 +12,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from drivers.ptp.codes import ResponseCode
-from drivers.ptp.transaction import MAX_COLLECTED, PtpEvent, PtpRequest, PtpResponse, Transport
+from drivers.ptp.session import MAX_COLLECTED, PtpEvent, PtpRequest, PtpResponse, Transport
 from foundation.errors import LinkClosed, LinkTimeout, ProtocolError
 from sim.buses.responder import Answer, NoAnswer
 

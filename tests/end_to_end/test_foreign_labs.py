@@ -24,7 +24,7 @@ from benchmarks.sessions import (
 from calibration.pipeline.build import build
 from calibration.table.lut import open_lut
 from drivers.raw.rawfile import read_raw
-from experiment.session.plan import SessionStep
+from experiment.session.records import SessionStep
 from sim.world.disturbances import Blob, Glare, Situation
 from sim.world.room import Room
 from sim.world.sensors import BODIES

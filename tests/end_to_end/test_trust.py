@@ -22,7 +22,7 @@ from calibration.verdict import BuildResult
 from drivers.camera import ExposureSettings
 from drivers.presenter import WHITE, Colour
 from experiment.session.folder import Session
-from experiment.session.plan import SessionStep
+from experiment.session.records import SessionStep
 from foundation.colorimetry import angles_deg
 from foundation.errors import CropError, QualityError
 from sim.world.room import Room

@@ -8,8 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from calibration.table.lut import Provenance, open_lut
-from calibration.table.writer import LutWriter
+from calibration.table.lut import LutWriter, Provenance, open_lut
 from drivers.presenter import Colour
 from experiment.lights import Illumination
 from generator.dataset.making import DatasetOptions, generate_dataset

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from acquisition.run.shutter import require_whole_turns
+from acquisition.run.devices import require_whole_turns
 from experiment.config import LabSettings, load_lab, parse_lab
 from foundation.errors import ConfigurationError
 from foundation.secret_texts import target_label

@@ -13,7 +13,7 @@ import pytest
 
 from foundation.errors import StorageError
 from foundation.files import require_free, whole_folder, write_whole
-from foundation.held_folders import held_folder
+from foundation.folders import held_folder
 from tests.failing_calls import DISK_FAULTS, FailingCalls, Ran, failing_calls, why_not
 
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(why_not() != "", reason=why_not())]

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from foundation.hashing import HashingWriter, file_sha256, sha256_of, stream_sha256
+from foundation.files import HashingWriter, file_sha256, sha256_of, stream_sha256
 
 ABC = "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad"
 """Of the bytes abc (FIPS 180-4, NIST's example values)."""

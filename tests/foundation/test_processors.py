@@ -8,7 +8,7 @@ from threading import Event
 
 import pytest
 
-from foundation.processors import ordered_map, processor_count
+from foundation.compiled import ordered_map, processor_count
 
 
 @pytest.mark.skipif(not hasattr(os, "sched_getaffinity"), reason="this system binds no process to processors")

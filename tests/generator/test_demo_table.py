@@ -12,15 +12,15 @@ import pytest
 from calibration.table.lut import open_lut
 from foundation.errors import InputError
 from generator.cli import main
-from generator.command import demo_table
-from generator.command.demo_table import table_folder
+from generator.command import output
+from generator.command.output import table_folder
 
 
 @pytest.fixture(autouse=True)
 def small(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """Make it small, and keep it elsewhere than in the user's folder."""
-    monkeypatch.setattr(demo_table, "BITS", 1)
-    monkeypatch.setattr(demo_table, "LIGHTS", "D65,A")
+    monkeypatch.setattr(output, "BITS", 1)
+    monkeypatch.setattr(output, "LIGHTS", "D65,A")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
 
 

@@ -12,8 +12,7 @@ import usbip
 import usbip.host
 
 from drivers.links.network import TcpLink, TcpServer, UdpSocket
-from drivers.pjlink.projector import PjLinkProjector
-from drivers.pjlink.search import search
+from drivers.pjlink.projector import PjLinkProjector, search
 from drivers.pjlink.wire import LinkUp
 from drivers.projector import Power
 from sim.cli import main

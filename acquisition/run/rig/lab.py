@@ -8,8 +8,7 @@ from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import partial
 
-from acquisition.run.devices import Devices, ask_all
-from acquisition.run.shutter import require_whole_turns
+from acquisition.run.devices import Devices, ask_all, require_whole_turns
 from drivers.camera import Camera
 from drivers.canon.camera import CanonEos
 from drivers.display.fullscreen import FullScreen, identify_displays, list_displays
@@ -20,8 +19,7 @@ from drivers.gphoto2_camera import Gphoto2Camera
 from drivers.links.network import TcpLink
 from drivers.links.serial import SerialLink, list_serial_ports
 from drivers.links.usb import list_devices, open_usb
-from drivers.pjlink.projector import PjLinkProjector
-from drivers.pjlink.search import search
+from drivers.pjlink.projector import PjLinkProjector, search
 from drivers.pjlink.wire import PORT as PJLINK_PORT
 from drivers.presenter import Presenter
 from drivers.projector import Projector

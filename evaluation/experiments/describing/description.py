@@ -32,8 +32,8 @@ import numpy.typing as npt
 
 from evaluation.experiments.folds import group_of
 from evaluation.scene import Image, MixedScene, Scene, SceneSet
+from foundation.compiled import ordered_map
 from foundation.errors import FormatError, InputError
-from foundation.processors import ordered_map
 from foundation.version import software
 from generator.statistics import (
     CELLS,

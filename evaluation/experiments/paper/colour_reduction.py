@@ -37,10 +37,10 @@ from evaluation.metrics import ErrorKind
 from evaluation.results.result import Result, SceneAnswer, read_light, results_of
 from evaluation.results.tables import Table
 from evaluation.scene import Image, Scene, SceneSet
+from foundation.compiled import ordered_map
 from foundation.errors import FormatError, InputError
 from foundation.files import reading_error, whole_folder, write_whole
-from foundation.foreign_folders import is_inside_name, read_inside
-from foundation.processors import ordered_map
+from foundation.folders import is_inside_name, read_inside
 from generator.pictures.picture import clear_bits
 from generator.pictures.preview import Flash, fit_flash
 

@@ -1,4 +1,4 @@
-"""The paper's first table: plain methods on eight generated data sets (section 4.3).
+"""The paper's tables: plain methods on eight generated data sets (4.3), learned ones on real images (4.4).
 
 Two sets of scenes (pictures that are given, and pictures of random codes), two tables, two choices of lights (nearest
 to the ground truths of a real data set, and drawn from all of the table) make eight data sets. The paper names neither
@@ -26,6 +26,7 @@ from typing import TYPE_CHECKING, Final, TypeVar
 import numpy as np
 import numpy.typing as npt
 
+from evaluation.experiments.cross_validation import cross_validate
 from evaluation.experiments.paper.material import (
     ChosenLights,
     RenderedScene,
@@ -34,12 +35,14 @@ from evaluation.experiments.paper.material import (
     lights_like,
     rendered,
 )
-from evaluation.experiments.paper.published import TABLE1, Cell
-from evaluation.experiments.running import evaluate
+from evaluation.experiments.paper.published import TABLE1, TABLE2, Cell
+from evaluation.experiments.running import evaluate, fit_anew
+from evaluation.methods.method import Learner
 from evaluation.methods.standard import standard_methods
 from evaluation.metrics import ErrorKind
 from evaluation.results.result import Result
 from evaluation.results.tables import Table
+from evaluation.scene import Scene
 from foundation.colorimetry import angles_deg
 from foundation.errors import InputError, counted
 from generator.kernels.choice import replace_unfit_colours
@@ -48,6 +51,7 @@ from generator.pictures.sources import Source, random_scenes
 
 if TYPE_CHECKING:
     from generator import Lut
+
 
 DAYLIGHT_K: Final = 5600.0
 """The black body, kelvin, under which the print's colours are looked at: near what pictures are balanced for."""
@@ -452,4 +456,80 @@ def hot_table(rows: Sequence[HotRow], kind: ErrorKind) -> Table:
             "A model: dark signals drawn evenly up to saturation, at the same places under every light. The simulated "
             "sensors have none unless their room asks for some.",
         ),
+    )
+
+
+LEARNERS: Final[Mapping[str, str]] = {
+    "regression-trees": "Regression trees (simple features)",
+    "smart-color-cat": "Smart Color Cat",
+    "color-beaver": "Color Beaver (using Gray-world)",
+}
+"""The learners of the table: our short names, and the paper's names."""
+
+
+@dataclass(frozen=True, eq=False)
+class Trained:
+    """What one learner reaches, trained on real and on generated images.
+
+    `real`, `generated`: its results on the real images.
+    """
+
+    learner: str
+    real: Result
+    generated: Result
+
+
+def table2(
+    real: Sequence[Scene],
+    generated: Sequence[Scene],
+    learners: Mapping[str, Learner],
+    folds: npt.NDArray[np.int64],
+    seed: int = 0,
+    workers: int = 1,
+    on_scene: Callable[[], None] | None = None,
+) -> tuple[Trained, ...]:
+    """Return the results of each learner, trained on real and on generated images.
+
+    `folds`: (N,) int64, the fold of each real image.
+    """
+    if not generated or not learners:
+        raise InputError(f"{len(learners)} learners and {len(generated)} generated images: name at least one of each")
+    chosen = list(learners.values())
+    crossed = cross_validate(real, chosen, folds, seed, workers, on_scene)
+    fitted = [fit_anew(learner, generated, seed) for learner in chosen]
+    moved = evaluate(real, fitted, workers, on_scene)
+    return tuple(Trained(name, *both) for name, *both in zip(learners, crossed, moved, strict=True))
+
+
+def table2_tables(found: Sequence[Trained], kind: ErrorKind, name: str, with_published: bool = True) -> list[Table]:
+    """Return the two halves of the paper's table, and the ratios of their medians."""
+    heads: Mapping[str, str] = {
+        "real": f"Trained and tested on {name} (through cross-validation)",
+        "generated": f"Trained on the generated data set and tested on {name}",
+    }
+    tables: list[Table] = []
+    for training, title in heads.items():
+        rows: list[tuple[str | float | None, ...]] = []
+        published = TABLE2["real" if training == "real" else "generated"]
+        for trained in found:
+            result = trained.real if training == "real" else trained.generated
+            rows.append((result.method, *result.summary(kind).as_tuple()))
+            known = published.get(LEARNERS.get(trained.learner, ""))
+            if known and with_published:
+                rows.append(("paper", *known.as_tuple()))
+        tables.append(Table(title, ("Algorithm", *NUMBERS), tuple(rows)))
+    return [*tables, _ratios(found, kind, name)]
+
+
+def _ratios(found: Sequence[Trained], kind: ErrorKind, name: str) -> Table:
+    rows: list[tuple[str | float | None, ...]] = []
+    for trained in found:
+        ours = trained.generated.summary(kind).median / trained.real.summary(kind).median
+        paper = LEARNERS.get(trained.learner)
+        theirs = TABLE2["generated"][paper].median / TABLE2["real"][paper].median if paper else None
+        rows.append((trained.real.method, ours, theirs))
+    return Table(
+        f"Median trained on generated images over median trained on real ones, tested on {name}",
+        ("Algorithm", "Ratio", "In the paper, on Cube+"),
+        tuple(rows),
     )

@@ -30,7 +30,7 @@ from evaluation.experiments.transfer.rows import TrainingSet
 from evaluation.scene import Scene, SceneSet
 from foundation.colorimetry import decode_srgb
 from foundation.errors import FormatError, InputError, first_of
-from foundation.hashing import file_sha256, sha256_of
+from foundation.files import file_sha256, sha256_of
 from generator.dataset.reader import Dataset
 from generator.lights.lighting import parse_mixture
 from generator.pictures.picture import Preparation, open_picture

@@ -16,7 +16,7 @@ from acquisition.check.frames import (
     measure_saturation,
     search,
 )
-from acquisition.run.shutter import ENGRAVED_S
+from acquisition.run.devices import ENGRAVED_S
 from drivers.presenter import WHITE
 from drivers.raw.plain_dng import Area
 from drivers.raw.rawfile import Mosaic

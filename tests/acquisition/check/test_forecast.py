@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from acquisition.check.forecast import Forecast, darkest_counts, measure_table
+from acquisition.check.check import Forecast, darkest_counts, measure_table
 from acquisition.check.frames import PRIMARIES, PlacedChart, Shot
 from acquisition.check.places import place_chart, window_px
 from calibration.figures.figure import OUTCOMES
@@ -28,7 +28,7 @@ from experiment.framing.finding import find_chart
 from experiment.lights import plan_illuminations
 from experiment.measures.sensor import saturation
 from experiment.session.folder import Session
-from experiment.session.plan import SessionStep
+from experiment.session.records import SessionStep
 from foundation.errors import QualityError, RegistrationError
 from sim.world.room import Room
 from tests.calibration.lab import LIGHTS, SETTINGS, Lab, Paint, hang, hang_chart, take

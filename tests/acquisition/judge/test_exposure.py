@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from acquisition.judge.exposure import Exposure, disagreement, measure_exposure, refusal
+from acquisition.judge.measure import Exposure, disagreement, measure_exposure, refusal
 from drivers.camera import ExposureSettings
 from drivers.raw.rawfile import Mosaic, read_raw
 from experiment.config import LimitSettings

@@ -13,8 +13,7 @@ from acquisition.judge.light_checks import crept
 from acquisition.judge.state import Leaning
 from drivers.camera import ExposureSettings
 from drivers.presenter import BLACK, WHITE, Colour
-from experiment.session.plan import SessionStep, link_steps
-from experiment.session.records import Check, Judgement
+from experiment.session.records import Check, Judgement, SessionStep, link_steps
 from sim.world.disturbances import (
     AmbientStep,
     Bump,

@@ -15,8 +15,7 @@ import numpy.typing as npt
 from drivers.presenter import Colour
 from experiment.lights import Illumination, plan_illuminations, save_illuminations
 from experiment.session.journal import JOURNAL_FILE, Journal
-from experiment.session.plan import RESPONSE, SessionStep, plan_steps
-from experiment.session.records import Check, Judgement
+from experiment.session.records import RESPONSE, Check, Judgement, SessionStep, plan_steps
 from foundation.colorimetry import decode_srgb
 
 BEGUN = datetime(2026, 3, 1, 22, 0, tzinfo=UTC)

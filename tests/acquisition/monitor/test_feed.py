@@ -13,7 +13,7 @@ import pytest
 
 from acquisition.monitor.feed import SessionWatch, place_of, planned_places
 from experiment.session.journal import Journal
-from experiment.session.plan import link_steps
+from experiment.session.records import link_steps
 from tests.acquisition.monitor.made_up import LIGHTS, MadeUpRun
 
 

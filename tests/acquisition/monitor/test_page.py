@@ -15,7 +15,7 @@ from pathlib import Path
 
 import pytest
 
-from acquisition.monitor.page import write_session_report
+from acquisition.monitor.feed import write_session_report
 from acquisition.monitor.server import MonitorServer, open_monitor
 from experiment.lights import plan_illuminations
 from tests.acquisition.monitor.browser import Tab, browser_tab, needs_chromium

@@ -10,7 +10,7 @@ import pytest
 
 from acquisition.monitor.view import AttemptView, Head, SessionView, head_of, with_seconds
 from experiment.session.heartbeat import Heartbeat, Process, RunState, SessionPlace
-from experiment.session.plan import plan_steps
+from experiment.session.records import plan_steps
 from tests.acquisition.monitor.made_up import LIGHTS
 
 NOW = datetime(2026, 3, 1, 23, 0, tzinfo=UTC)

@@ -17,7 +17,7 @@ from typing import Any, BinaryIO
 from unittest.mock import patch
 
 from acquisition.run.devices import Devices
-from acquisition.run.sequencer import RunOutcome, take_session
+from acquisition.run.run import RunOutcome, take_session
 from drivers.camera import ExposureSettings
 from drivers.canon.camera import CanonEos
 from drivers.links.link import Link, Pipe, UsbPipes
@@ -25,15 +25,14 @@ from drivers.pjlink.projector import PjLinkProjector
 from drivers.presenter import BLACK, Colour
 from drivers.projector import Power, Severity
 from drivers.ptp.codes import ResponseCode
-from drivers.ptp.transaction import Transport
+from drivers.ptp.session import Transport
 from drivers.ptp.usb import UsbTransport
 from experiment.chart.layout import design_chart
 from experiment.config import LabSettings
 from experiment.lights import Illumination
 from experiment.session.folder import Session
 from experiment.session.journal import Journal
-from experiment.session.plan import SessionStep, plan_steps
-from experiment.session.records import Judgement
+from experiment.session.records import Judgement, SessionStep, plan_steps
 from foundation.errors import CropError, DeviceError, LinkClosed, StorageError
 from sim.buses.ptp import MemoryPipes
 from sim.buses.responder import Responder

@@ -19,7 +19,7 @@ from experiment.chart.layout import design_chart
 from experiment.config import LabSettings
 from experiment.lights import Illumination
 from experiment.session.folder import Session
-from experiment.session.plan import plan_steps
+from experiment.session.records import plan_steps
 from foundation.errors import DeviceError
 from sim.camera.film import write_dng
 from sim.clock import SimulatedClock

@@ -12,11 +12,11 @@ from typing import cast
 
 import pytest
 
-from acquisition.run.devices import Devices
-from acquisition.run.lamp import (
+from acquisition.run.devices import (
     OBEYS_S,
     POWER_LIMIT_S,
     RELIGHT_S,
+    Devices,
     HealthWatch,
     RunEnd,
     await_health,

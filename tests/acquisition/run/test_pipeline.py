@@ -12,13 +12,12 @@ import pytest
 
 from acquisition.run.pipeline import Taken
 from acquisition.run.retry import PAUSE_S
-from acquisition.run.sequencer import RunOutcome, take_session
+from acquisition.run.run import RunOutcome, take_session
 from drivers.presenter import BLACK, WHITE, Colour
 from drivers.projector import Power
 from experiment.lights import Illumination
 from experiment.session.folder import Session
-from experiment.session.plan import SessionStep, link_steps
-from experiment.session.records import Check, Judgement
+from experiment.session.records import Check, Judgement, SessionStep, link_steps
 from foundation.console import Ending
 from foundation.errors import DeviceError, DeviceFault, LinkTimeout, QualityError, StorageError
 from tests.acquisition.run.scripted import DOWNLOAD_S, EXPOSE_S, GLARE, LIGHTS, NIGHT, SETTINGS, TURNED, WELL, Lab

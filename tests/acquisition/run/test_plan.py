@@ -37,7 +37,7 @@ from experiment.chart.layout import design_chart
 from experiment.config import LabSettings, load_lab
 from experiment.lights import Illumination, save_illuminations
 from experiment.session.folder import Session
-from experiment.session.plan import plan_steps
+from experiment.session.records import plan_steps
 from foundation.errors import ConfigurationError, CropError, DeviceError, DeviceFault, DeviceRefused, StorageError
 from sim.clock import SimulatedClock
 from sim.projectors.projector import SimulatedProjector

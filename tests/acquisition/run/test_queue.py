@@ -10,7 +10,7 @@ import pytest
 from acquisition.run.queue import GIVEN_UP_IN_A_ROW, StepQueue, unclosed_kinds
 from drivers.presenter import BLACK, WHITE, Colour
 from experiment.lights import Illumination
-from experiment.session.plan import FrameKind, SessionStep, plan_steps
+from experiment.session.records import FrameKind, SessionStep, plan_steps
 
 STEPS = plan_steps([Illumination(n, "uniform", None, Colour(255, n, 0)) for n in range(4)], 2)
 """white 0, dark 1, light 2, 3, white 4, dark 5, light 6, 7, white 8, dark 9."""

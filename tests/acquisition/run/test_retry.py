@@ -23,7 +23,7 @@ from experiment.config import LabSettings
 from experiment.lights import Illumination
 from experiment.session.folder import Session
 from experiment.session.journal_file import HeldJournalError
-from experiment.session.plan import plan_steps
+from experiment.session.records import plan_steps
 from foundation.errors import (
     ConfigurationError,
     CropError,

@@ -10,8 +10,7 @@ import pytest
 
 from acquisition.run.queue import link_runs
 from acquisition.run.rig.lab import session_clock
-from acquisition.run.run import check_frames, clock_note, require_same_devices
-from acquisition.run.sequencer import take_session
+from acquisition.run.run import check_frames, clock_note, require_same_devices, take_session
 from drivers.camera import CameraIdentity, CapturedFrame
 from drivers.presenter import Colour
 from drivers.projector import ProjectorIdentity
@@ -19,8 +18,7 @@ from experiment.config import LabSettings
 from experiment.lights import Illumination
 from experiment.session.folder import Session
 from experiment.session.journal import Journal
-from experiment.session.plan import link_steps, plan_steps
-from experiment.session.records import Judgement
+from experiment.session.records import Judgement, link_steps, plan_steps
 from foundation.console import Ending
 from foundation.errors import DeviceRefused
 from tests.acquisition.run.scripted import LIGHTS, SETTINGS, Lab

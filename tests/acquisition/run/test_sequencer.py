@@ -11,7 +11,7 @@ import pytest
 from acquisition.run.devices import Devices
 from acquisition.run.pipeline import Taken
 from acquisition.run.retry import PAUSE_S
-from acquisition.run.sequencer import take_session
+from acquisition.run.run import take_session
 from drivers.links.link import Link
 from drivers.pjlink.projector import PjLinkProjector
 from drivers.projector import Power

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import pytest
 
-from acquisition.run.shutter import (
+from acquisition.run.devices import (
     ENGRAVED_S,
     holds_whole_turns,
     require_whole_turns,
 )
-from drivers.canon.apex import SHUTTER
+from drivers.canon.records import SHUTTER
 from experiment.config import CameraSettings, ProjectorCable
 from foundation.errors import ConfigurationError
 

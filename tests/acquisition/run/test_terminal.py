@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import pytest
 
+from acquisition.run.notices import Terminal, TimeLeft, verdict_line
 from acquisition.run.pipeline import Taken
-from acquisition.run.terminal import Terminal, TimeLeft, verdict_line
 from drivers.presenter import Colour
-from experiment.session.plan import SessionStep
-from experiment.session.records import Check, Judgement
+from experiment.session.records import Check, Judgement, SessionStep
 
 STEP = SessionStep(7, "light", 5, Colour(1, 2, 3))
 

@@ -14,7 +14,7 @@ from drivers.camera import ExposureSettings
 from drivers.presenter import Colour
 from experiment.lights import Illumination
 from experiment.session.folder import Session
-from experiment.session.plan import SessionStep
+from experiment.session.records import SessionStep
 from sim.camera.film import write_dng
 from sim.world.disturbances import UNDISTURBED, Blob, Situation
 from tests.calibration.lab import LIGHTS, SETTINGS, TAKEN_AT, Lab, renumbered, take

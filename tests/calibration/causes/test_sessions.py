@@ -27,7 +27,7 @@ from calibration.pipeline.build import build
 from calibration.verdict import BuildResult, ProbableCause, findings, remark, retaken_frames
 from drivers.presenter import Colour
 from experiment.session.folder import Session
-from experiment.session.plan import SessionStep
+from experiment.session.records import SessionStep
 from sim.world.disturbances import Blob, Situation
 from sim.world.room import Room
 from tests.calibration.causes.rooms import BRIGHT, HAND, Counts, glare, half, nth_white, taken

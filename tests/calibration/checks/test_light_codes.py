@@ -15,7 +15,7 @@ from calibration.figures.all_figures import FIGURES
 from calibration.pipeline.build import build
 from calibration.verdict import judge
 from experiment.lights import plan_illuminations
-from experiment.session.plan import SessionStep
+from experiment.session.records import SessionStep
 from foundation.colorimetry import angles_deg, decode_srgb
 from foundation.errors import FormatError
 from sim.world.room import Room, projector_primaries, sensitivities

@@ -26,7 +26,7 @@ from drivers.presenter import BLACK, WHITE
 from experiment.chart.model import Chart
 from experiment.measures.least_squares import order_of, page_polynomial
 from experiment.session.folder import Session
-from experiment.session.plan import SessionStep, plan_steps
+from experiment.session.records import SessionStep, plan_steps
 from foundation.errors import FormatError, InputError, QualityError
 from sim.camera.film import write_dng
 from sim.world.room import Room

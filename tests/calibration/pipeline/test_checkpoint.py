@@ -17,13 +17,13 @@ import numpy as np
 import pytest
 
 import calibration.pipeline.build as building
+from calibration.pipeline.baseline import frame_faults
 from calibration.pipeline.build import CHECKPOINT, Checkpoint, TableProgress, append, build, unfinished_table
-from calibration.pipeline.frames import frame_faults
 from calibration.table.lut import open_lut
 from calibration.table.verification import find_faults
 from calibration.verdict import BuildResult
 from experiment.session.folder import Session
-from experiment.session.plan import SessionStep
+from experiment.session.records import SessionStep
 from foundation.errors import FormatError, InputError
 from sim.world.room import Room
 from tests.calibration.lab import LIGHTS, Lab, hang, renumbered, take
@@ -32,16 +32,16 @@ pytestmark = pytest.mark.slow
 
 KILLER = """
 import os, signal, sys
-import calibration.pipeline.build, calibration.table.writer, calibration.report.report
+import calibration.pipeline.build, calibration.table.lut, calibration.report.report
 from calibration.cli import main
 
 place, count = sys.argv[1], int(sys.argv[2])
 calibration.pipeline.build.CHECKPOINT_EVERY = 3
 calibration.report.report.write_report = lambda *_: None
 owner, name = {
-    "putting": (calibration.table.writer.LutWriter, "put"),
+    "putting": (calibration.table.lut.LutWriter, "put"),
     "saving": (calibration.pipeline.build.UnfinishedTable, "save"),
-    "finishing": (calibration.table.writer, "write_whole"),
+    "finishing": (calibration.table.lut, "write_whole"),
     "publishing": (calibration.pipeline.build.Path, "replace"),
 }[place]
 real = getattr(owner, name)

@@ -18,7 +18,7 @@ from calibration.radiometry.drift import as_measured
 from calibration.table.lut import Lut, open_lut
 from calibration.table.verification import find_faults
 from experiment.session.folder import Session
-from experiment.session.plan import SessionStep
+from experiment.session.records import SessionStep
 from foundation.errors import FormatError, QualityError
 from sim.camera.film import write_dng
 from tests.calibration.lab import LIGHTS, SETTINGS, TAKEN_AT, Lab, figures_alone, take

@@ -10,14 +10,13 @@ from pathlib import Path
 
 import pytest
 
-from calibration.pipeline.frames import select_frames
+from calibration.pipeline.baseline import select_frames
 from drivers.camera import CapturedFrame
 from drivers.presenter import Colour
 from experiment.chart.layout import design_chart
 from experiment.lights import Illumination
 from experiment.session.folder import ReceivedFile, Session
-from experiment.session.plan import plan_steps
-from experiment.session.records import Judgement
+from experiment.session.records import Judgement, plan_steps
 
 AT = datetime(2024, 3, 1, 23, 0, tzinfo=UTC)
 LIGHTS = tuple(Illumination(n, "uniform", None, Colour(255, 20 * n, 255 - n)) for n in range(5))

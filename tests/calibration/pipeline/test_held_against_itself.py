@@ -18,7 +18,7 @@ from calibration.verdict import BuildResult
 from drivers.presenter import WHITE, Colour
 from experiment.lights import Illumination
 from experiment.session.folder import Session
-from experiment.session.plan import SessionStep
+from experiment.session.records import SessionStep
 from experiment.session.repair import lights_text
 from foundation.errors import QualityError
 from sim.camera.film import write_dng

@@ -17,8 +17,7 @@ from drivers.presenter import Colour
 from experiment.chart.layout import A_SERIES_MM, design_chart, paper_chart
 from experiment.framing.field import field_mm
 from experiment.lights import Illumination
-from experiment.session.plan import SessionStep
-from experiment.session.records import ACCEPTED
+from experiment.session.records import ACCEPTED, SessionStep
 from sim.world.room import Room
 from tests.calibration.lab import LIGHTS, SETTINGS, Lab, figures_alone, hang_chart, renumbered, take
 

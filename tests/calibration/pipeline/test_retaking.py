@@ -15,8 +15,7 @@ from calibration.pipeline.build import build
 from calibration.report.report import write_report
 from drivers.camera import CapturedFrame
 from experiment.session.folder import ReceivedFile, Session
-from experiment.session.plan import SessionStep, plan_steps
-from experiment.session.records import Judgement
+from experiment.session.records import Judgement, SessionStep, plan_steps
 from foundation.errors import FormatError, InputError, QualityError
 from tests.calibration.lab import LIGHTS, SETTINGS, TAKEN_AT, Lab, Paint, figures_alone, take
 

@@ -15,7 +15,7 @@ from calibration.pipeline.build import build
 from calibration.report.page import summary
 from calibration.verdict import BuildResult, judge, judged_values, remark
 from drivers.presenter import Colour
-from experiment.session.plan import SessionStep
+from experiment.session.records import SessionStep
 from sim.world.disturbances import Situation
 from sim.world.room import Room
 from sim.world.sensors import BODIES

@@ -20,7 +20,7 @@ from calibration.verdict import BuildResult
 from drivers.presenter import BLACK
 from experiment.measures.paper import FlatField, Paper
 from experiment.session.folder import Session
-from experiment.session.plan import SessionStep
+from experiment.session.records import SessionStep
 from foundation.errors import FormatError
 from sim.world.room import Room
 from tests.calibration.lab import LIGHTS, SETTINGS, Lab, hang, renumbered, take

@@ -9,9 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from calibration.table.lut import Provenance, open_lut
+from calibration.table.lut import LutWriter, Provenance, open_lut
 from calibration.table.verification import find_faults
-from calibration.table.writer import LutWriter
 from foundation.errors import FormatError, InputError, StorageError
 from tests.calibration.table.tables import FRAMES, LIGHTS, flip, write
 

@@ -9,7 +9,7 @@ from typing import Any
 from drivers.camera import CapturedFrame, capture
 from drivers.canon.camera import CanonEos
 from drivers.links.link import UsbPipes
-from drivers.ptp.transaction import Transport
+from drivers.ptp.session import Transport
 from drivers.ptp.usb import UsbTransport
 from foundation.errors import DeviceError, DeviceFault, DeviceRefused
 from sim.buses.ptp import MemoryPipes

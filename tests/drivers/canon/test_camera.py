@@ -42,7 +42,7 @@ from drivers.links.link import Pipe, UsbPipes
 from drivers.links.usb import open_usb
 from drivers.ptp.codes import AeMode, CaptureDestination, EosEvent, Operation, Property, ResponseCode
 from drivers.ptp.ip import IpTransport
-from drivers.ptp.transaction import PtpEvent, PtpRequest, PtpResponse, Reception, Transaction, Transport
+from drivers.ptp.session import PtpEvent, PtpRequest, PtpResponse, Reception, Transaction, Transport
 from drivers.ptp.usb import UsbTransport
 from foundation.errors import DeviceError, DeviceRefused, LinkClosed, ProtocolError, StorageError
 from sim.buses.ptp import serve_ptpip

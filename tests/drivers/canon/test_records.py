@@ -10,8 +10,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from drivers.canon import records as canon
-from drivers.canon.apex import APERTURE, ISO, SHUTTER, TOLERANCE, Scale
 from drivers.canon.records import (
+    APERTURE,
+    ISO,
+    SHUTTER,
+    TOLERANCE,
     AvailableFormats,
     AvailableValues,
     DeviceInfoEx,
@@ -24,6 +27,7 @@ from drivers.canon.records import (
     PropertyChanged,
     PropertySetting,
     Record,
+    Scale,
     TransferRequest,
 )
 from drivers.ptp.codes import CameraStatus, CaptureDestination, EosEvent, ObjectFormat, Property

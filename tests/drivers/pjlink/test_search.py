@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from drivers.links.network import Address, UdpSocket
 from drivers.pjlink import wire
-from drivers.pjlink.search import FoundProjector, search
+from drivers.pjlink.projector import FoundProjector, search
 from drivers.pjlink.wire import FaultsChanged, Found, InputChanged, LinkUp, PjLinkNotice, PowerChanged
 from drivers.projector import Fault, Power, Severity
 from foundation.errors import LinkClosed, LinkTimeout

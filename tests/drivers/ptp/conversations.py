@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TypedDict
 
 from drivers.ptp.codes import AeMode, DriveMode, Operation, Property
-from drivers.ptp.transaction import PtpRequest
+from drivers.ptp.session import PtpRequest
 from sim.camera.bodies import EOS_550D
 from sim.camera.eos import SimulatedEos
 from sim.clock import SimulatedClock

@@ -11,8 +11,16 @@ from dataclasses import dataclass
 
 from drivers.canon import records as canon
 from drivers.canon import records as values
-from drivers.canon.apex import APERTURE, ISO
-from drivers.canon.records import AvailableValues, DeviceInfoEx, ImageFormat, Notice, PropertyChanged, PropertySetting
+from drivers.canon.records import (
+    APERTURE,
+    ISO,
+    AvailableValues,
+    DeviceInfoEx,
+    ImageFormat,
+    Notice,
+    PropertyChanged,
+    PropertySetting,
+)
 from drivers.ptp import usb as container
 from drivers.ptp.codes import Operation, Property
 from drivers.ptp.datasets import (
@@ -24,7 +32,7 @@ from drivers.ptp.datasets import (
     encode_u32_array,
 )
 from drivers.ptp.ip import EndData, OperationRequest, PacketCutter, StartData, encode
-from drivers.ptp.transaction import PtpRequest, PtpResponse
+from drivers.ptp.session import PtpRequest, PtpResponse
 from drivers.ptp.usb import ContainerReader, DataPiece, DataStart
 from tests.drivers.ptp.conversations import EOS_60D_PROPERTIES, Recorded
 

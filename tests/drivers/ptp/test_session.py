@@ -7,8 +7,17 @@ from collections.abc import Callable
 import pytest
 
 from drivers.ptp.codes import Operation, ResponseCode
-from drivers.ptp.session import OPEN_TRIES, PASSING_LIMIT_S, OperationDeclined, PtpSession
-from drivers.ptp.transaction import LAST_TRANSACTION, PtpEvent, PtpRequest, PtpResponse, Transaction
+from drivers.ptp.session import (
+    LAST_TRANSACTION,
+    OPEN_TRIES,
+    PASSING_LIMIT_S,
+    OperationDeclined,
+    PtpEvent,
+    PtpRequest,
+    PtpResponse,
+    PtpSession,
+    Transaction,
+)
 from foundation.errors import DeviceRefused, LinkClosed, LinkTimeout, ProtocolError
 from sim.clock import SimulatedClock
 

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from drivers.links.link import Pipe, PipeStalled, UsbPipes
 from drivers.ptp import usb as container
 from drivers.ptp.codes import EventCode, Operation, ResponseCode
-from drivers.ptp.transaction import PtpEvent, PtpRequest, PtpResponse, next_transaction
+from drivers.ptp.session import PtpEvent, PtpRequest, PtpResponse, next_transaction
 from drivers.ptp.usb import ContainerReader, DataPiece, DataStart, DeviceStatus, Message, UsbTransport
 from foundation.errors import DeviceError, LinkClosed, LinkTimeout, ProtocolError
 from sim.buses.ptp import MemoryPipes

@@ -14,8 +14,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.links.exchange import MAX_MESSAGE
-from drivers.links.link import Link
+from drivers.links.link import MAX_MESSAGE, Link
 from drivers.projector import Fault, Lamp, Power, Projector, ProjectorIdentity, Severity
 from drivers.serial_projectors import LANGUAGES, benq, epson, language, nec, optoma
 from drivers.serial_projectors.benq import BenqProjector

@@ -8,8 +8,8 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
+from evaluation.experiments.cross_validation import tune_family, tuning_rows, tuning_table
 from evaluation.experiments.running import evaluate
-from evaluation.experiments.tuning import tune_family, tuning_rows, tuning_table
 from evaluation.methods.green_stability import family
 from evaluation.scene import Image
 from foundation.errors import InputError

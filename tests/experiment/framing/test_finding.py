@@ -14,8 +14,8 @@ from drivers.raw.rawfile import Mosaic, read_raw
 from experiment.chart.model import Chart
 from experiment.framing.finding import find_chart, find_tags
 from experiment.framing.movement import shift_between
+from experiment.framing.pictures import blur_px
 from experiment.framing.planes import CHANNELS, Plane, channel_offset_px, phases, plane_of, strongest_plane
-from experiment.framing.sharpness import blur_px
 from foundation.errors import RegistrationError
 from sim.world.room import Room
 from tests.calibration.lab import Lab, hang

@@ -6,7 +6,7 @@ import pytest
 
 from experiment.chart.layout import design_chart, paper_chart
 from experiment.chart.model import Chart
-from experiment.framing.sharpness import apparent_sizes, small_parts_warning
+from experiment.framing.pictures import apparent_sizes, small_parts_warning
 
 pytestmark = pytest.mark.slow
 

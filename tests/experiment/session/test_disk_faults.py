@@ -18,8 +18,7 @@ from drivers.presenter import Colour
 from experiment.chart.layout import design_chart
 from experiment.lights import Illumination
 from experiment.session.folder import Session
-from experiment.session.plan import plan_steps
-from experiment.session.records import Judgement
+from experiment.session.records import Judgement, plan_steps
 from foundation.errors import FormatError, StorageError
 from tests.failing_calls import DISK_FAULTS, FailingCalls, failing_calls, why_not
 

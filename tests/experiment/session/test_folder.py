@@ -15,8 +15,7 @@ from drivers.presenter import Colour
 from experiment.chart.layout import design_chart
 from experiment.lights import Illumination, save_illuminations
 from experiment.session.folder import Session, session_exists
-from experiment.session.plan import plan_steps
-from experiment.session.records import Judgement
+from experiment.session.records import Judgement, plan_steps
 from foundation.errors import FormatError, InputError, StorageError
 
 LIGHTS = tuple(Illumination(number, "uniform", None, Colour(255, number, 0)) for number in range(5))

@@ -18,8 +18,7 @@ from experiment.lights import Illumination
 from experiment.session import journal_file
 from experiment.session.journal import Journal, time_text
 from experiment.session.journal_file import JOURNAL_VERSION, create_file, require_sound_rows
-from experiment.session.plan import plan_steps
-from experiment.session.records import ACCEPTED, FAILED, AcceptedFile, Judgement, SessionEvent
+from experiment.session.records import ACCEPTED, FAILED, AcceptedFile, Judgement, SessionEvent, plan_steps
 from foundation.errors import FormatError, StorageError
 
 

@@ -21,7 +21,7 @@ from drivers.presenter import Colour
 from experiment.lights import Illumination
 from experiment.session import journal_file
 from experiment.session.journal import Journal
-from experiment.session.plan import plan_steps
+from experiment.session.records import plan_steps
 from foundation.errors import FormatError, StorageError
 
 pytestmark = pytest.mark.slow

@@ -21,8 +21,7 @@ from hypothesis import strategies as st
 from drivers.presenter import Colour
 from experiment.lights import Illumination
 from experiment.session.journal import Journal
-from experiment.session.plan import SessionStep, link_steps, plan_steps
-from experiment.session.records import AttemptDetails, Check, Judgement
+from experiment.session.records import AttemptDetails, Check, Judgement, SessionStep, link_steps, plan_steps
 
 pytestmark = pytest.mark.slow
 

@@ -9,8 +9,7 @@ import pytest
 
 from drivers.presenter import BLACK, WHITE, Colour
 from experiment.lights import Illumination
-from experiment.session.plan import RESPONSE, SessionStep, link_steps, plan_steps
-from experiment.session.records import duration_text
+from experiment.session.records import RESPONSE, SessionStep, duration_text, link_steps, plan_steps
 
 
 @pytest.mark.parametrize(

@@ -11,11 +11,11 @@ from typing import Any, BinaryIO, Literal
 
 import pytest
 
-from acquisition.judge.exposure import ExposureJudge
+from acquisition.judge.measure import ExposureJudge
 from acquisition.run.devices import Devices
 from acquisition.run.queue import StepQueue
 from acquisition.run.rig.opening import open_rig
-from acquisition.run.sequencer import take_session
+from acquisition.run.run import take_session
 from drivers.camera import Camera, CapturedFrame
 from drivers.presenter import BLACK, Colour, Presenter
 from experiment.chart.layout import design_chart
@@ -23,15 +23,16 @@ from experiment.config import LabSettings
 from experiment.lights import Illumination
 from experiment.session import records
 from experiment.session.folder import IncomingFile, ReceivedFile, Session
-from experiment.session.plan import (
+from experiment.session.records import (
     AHEAD,
     TRANSITIONS,
     UNDER_WAY,
+    Check,
+    Judgement,
     SessionStep,
     StepState,
     plan_steps,
 )
-from experiment.session.records import Check, Judgement
 from foundation.clock import Clock
 from foundation.errors import DeviceError, LinkTimeout, StorageError
 

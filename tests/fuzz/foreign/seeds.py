@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from calibration.table.lut import Lut, Provenance, SourceFrame, Unfit, frames_sha256, open_lut
-from calibration.table.writer import LutWriter
+from calibration.table.lut import Lut, LutWriter, Provenance, SourceFrame, Unfit, frames_sha256, open_lut
 from calibration.table.zarr_store import publish
 from drivers.camera import CapturedFrame
 from drivers.presenter import Colour
@@ -18,8 +17,7 @@ from experiment.chart.layout import design_chart
 from experiment.config import LabSettings
 from experiment.lights import Illumination
 from experiment.session.folder import Session
-from experiment.session.plan import plan_steps
-from experiment.session.records import Check, Judgement
+from experiment.session.records import Check, Judgement, plan_steps
 from generator.dataset.making import DatasetOptions, generate_dataset
 from generator.lights.choices import ListedLights, SimultaneousLights
 from generator.masks.making import parse_masks

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, get_args
 import pytest
 
 from calibration.citation import NOT_RECORDED, OriginRecord
-from generator.dataset.cards import CONFORMS_TO, OPEN, card, datasheet, kind_of, size_category
+from generator.dataset.layouts import CONFORMS_TO, OPEN, card, datasheet, kind_of, size_category
 from generator.dataset.making import DatasetOptions, generate_dataset
 from generator.dataset.records import Description, Layout, Split
 from generator.pictures.sources import random_scenes

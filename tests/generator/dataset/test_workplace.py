@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from foundation.errors import FormatError, InputError
-from foundation.held_folders import FolderLock, held_folder
+from foundation.folders import FolderLock, held_folder
 from generator.dataset import layouts as plain_files
 from generator.dataset.making import (
     DatasetOptions,

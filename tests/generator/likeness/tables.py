@@ -7,8 +7,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from calibration.table.lut import Lut, Provenance, open_lut
-from calibration.table.writer import LutWriter
+from calibration.table.lut import Lut, LutWriter, Provenance, open_lut
 from drivers.presenter import Colour
 from experiment.lights import Illumination
 

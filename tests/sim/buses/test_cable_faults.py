@@ -8,7 +8,7 @@ import pytest
 
 from drivers.links.usb import open_usb
 from drivers.ptp.codes import ResponseCode
-from drivers.ptp.transaction import PtpEvent, PtpRequest, Transport
+from drivers.ptp.session import PtpEvent, PtpRequest, Transport
 from drivers.ptp.usb import UsbTransport
 from foundation.errors import LinkClosed, LinkTimeout, ProtocolError
 from sim.buses.ptp import MemoryTransport

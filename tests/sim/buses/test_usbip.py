@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 from drivers.links.link import MemoryLink, Pipe, PipeStalled, memory_pair
 from drivers.links.network import TcpServer
 from drivers.ptp.datasets import DeviceInfo
-from drivers.ptp.transaction import PtpRequest, PtpResponse
+from drivers.ptp.session import PtpRequest, PtpResponse
 from drivers.ptp.usb import ContainerReader, DataPiece, DataStart, UsbTransport, encode
 from foundation.errors import LinkClosed, LinkTimeout, ProtocolError
 from sim.buses.usb import BULK_IN, BULK_OUT, INTERRUPT_IN, PtpUsbDevice, UsbIdentity

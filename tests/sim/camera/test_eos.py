@@ -15,7 +15,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from drivers.camera import ExposureSettings, capture
-from drivers.canon import apex
+from drivers.canon import records
 from drivers.canon.camera import CanonEos
 from drivers.canon.records import (
     RAW_ONLY,
@@ -56,7 +56,7 @@ from drivers.ptp.datasets import (
     decode_value,
     encode_string,
 )
-from drivers.ptp.transaction import PtpRequest
+from drivers.ptp.session import PtpRequest
 from foundation.errors import DeviceRefused, LinkClosed
 from sim.buses.ptp import MemoryTransport
 from sim.buses.responder import Answer
@@ -268,9 +268,9 @@ def test_a_550d_can_be_the_one_that_was_listed() -> None:
     host.ok(Operation.OPEN_SESSION, 1)
     host.ok(Operation.EOS_SET_EVENT_MODE, 1)
     offered = lists(host.events())
-    assert [apex.SHUTTER.label(code) for code in offered[Property.EOS_SHUTTER_SPEED]] == LISTED_SHUTTER_550D.split()
-    assert [apex.APERTURE.label(code) for code in offered[Property.EOS_APERTURE]] == LISTED_APERTURE_550D.split()
-    assert [apex.ISO.label(code) for code in offered[Property.EOS_ISO_SPEED]] == (
+    assert [records.SHUTTER.label(code) for code in offered[Property.EOS_SHUTTER_SPEED]] == LISTED_SHUTTER_550D.split()
+    assert [records.APERTURE.label(code) for code in offered[Property.EOS_APERTURE]] == LISTED_APERTURE_550D.split()
+    assert [records.ISO.label(code) for code in offered[Property.EOS_ISO_SPEED]] == (
         ["auto", "200", "400", "800", "1600", "3200", "6400"]
     )
 
@@ -281,10 +281,10 @@ def test_a_6d_mark_ii_is_the_one_that_was_listed() -> None:
     assert (info.manufacturer, info.model, info.device_version) == ("Canon.Inc", "Canon EOS 6D Mark II", "3-1.0.2")
     host.ok(Operation.OPEN_SESSION, 1)
     host.ok(Operation.EOS_SET_EVENT_MODE, 1)
-    records = host.events()
-    assert [apex.ISO.label(code) for code in lists(records)[Property.EOS_ISO_SPEED]] == LISTED_ISO_6D2.split()
+    reported = host.events()
+    assert [records.ISO.label(code) for code in lists(reported)[Property.EOS_ISO_SPEED]] == LISTED_ISO_6D2.split()
     formats = next(
-        r.formats for r in records if isinstance(r, AvailableFormats) and r.code == Property.EOS_IMAGE_FORMAT
+        r.formats for r in reported if isinstance(r, AvailableFormats) and r.code == Property.EOS_IMAGE_FORMAT
     )
     assert len(formats) == 31
     assert [str(formats[at]) for at in (0, 6, 7, 28, 29, 30)] == [

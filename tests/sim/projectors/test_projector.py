@@ -7,7 +7,7 @@ import hashlib
 import pytest
 
 from drivers.links.network import UdpSocket
-from drivers.pjlink.search import search
+from drivers.pjlink.projector import search
 from drivers.pjlink.wire import FaultsChanged, InputChanged, LinkUp, NoResolution, PowerChanged
 from drivers.projector import Fault, Power, Severity
 from foundation.errors import DeviceFault, LinkTimeout

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from evaluation.experiments.paper.table2 import LEARNERS, table2, table2_tables
+from evaluation.experiments.paper.table1 import LEARNERS, table2, table2_tables
 from evaluation.methods.prepared import unit
 from evaluation.metrics import recovery_error
 from evaluation.scene import Scene
