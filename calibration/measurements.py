@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from calibration.budget import Budget, budget_of
 from calibration.checks.frame_consistency import FrameConsistency, OriginFigures
 from calibration.checks.light_codes import CodeAgreement
 from calibration.checks.stray_light import StrayLight
@@ -22,6 +23,7 @@ from calibration.radiometry.dark_frames import DarkSummary
 from calibration.radiometry.drift import DriftCorrection
 from calibration.radiometry.greys import PhotonTransfer, tint_deg
 from calibration.radiometry.primaries import Primaries
+from calibration.radiometry.superposition import Superposition
 from calibration.registration.register import Registration
 from calibration.sampling import bleed
 from calibration.spread.correction import LensFigures
@@ -215,11 +217,6 @@ class LightMeasurements:
     drift: DriftCorrection | None = None
     stray: StrayLight | None = None
 
-    @cached_property
-    def white_error_deg(self) -> _Array:
-        """(L,) float64 degrees, standard error of each ground truth's direction."""
-        return direction_error_deg(self.white, self.white_error)
-
     @property
     def off_codes_deg(self) -> _Array | None:
         """(L,) float64 degrees, how far each white is off its codes for certain; None after a check.
@@ -233,6 +230,17 @@ class LightMeasurements:
             both = [light for light in (pair.one, pair.other) if light < len(off)]
             off[both] = np.maximum(off[both], pair.angle_deg)
         return off
+
+    def too_dark(self, dark: _Array) -> _Array:
+        """Return how much too much dark light (3,) float64 was perhaps subtracted, counts, of `dark` (3,) that was.
+
+        White then has twice as much beyond the sum of the primaries, each of which lacks it; a projector that adds
+        light of its own to white looks the same. Half of what is subtracted where no light shows it.
+        """
+        if self.additivity is None:
+            return dark / 2
+        beyond = -self.additivity * self.white[int(np.argmax(self.white.sum(axis=1)))]
+        return np.minimum(np.abs(beyond) / 2, dark)
 
     def lights_off_codes(self, accepted_deg: float) -> list[int]:
         """Return the lights further than `accepted_deg` from what their codes predict, the furthest first."""
@@ -275,6 +283,7 @@ class SensorMeasurements:
     - `noise`: (3,) float64, median standard deviation of one sample under white, relative to paper white.
     - `transfer`: photon-transfer curve of the frame that was registered first.
     - `linearity`: what a series of exposures shows; None where none was given.
+    - `superposition`: what lights of several primaries show of it beside the primaries alone.
     """
 
     saturation_counts: int
@@ -283,6 +292,7 @@ class SensorMeasurements:
     noise: _Array
     transfer: PhotonTransfer
     linearity: LinearityMeasurements | None
+    superposition: Superposition
 
 
 @dataclass(frozen=True, eq=False)
@@ -292,11 +302,13 @@ class CellMeasurements:
     - `window`: pixels along the side of a cell's window; S = window².
     - `unfit`: cells not to be used, each with its cause.
     - `stains`: where the print does not have its codes' colours, in the order of colour indices.
+    - `levels`: (C, 3) float64, of each cell in the frame that was registered first, bare paper 1.
     """
 
     window: int
     unfit: tuple[Unfit, ...]
     stains: Stains
+    levels: _Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -327,6 +339,11 @@ class TableMeasurements:
     lens: LensFigures
     point_spread: PointSpread | None
     origin: OriginRecord
+
+    @cached_property
+    def budget(self) -> Budget:
+        """What ground truth and cells may be off by, cause by cause."""
+        return budget_of(self)
 
     @property
     def white_frames(self) -> tuple[FrameMeasurements, ...]:
@@ -362,6 +379,15 @@ class TableMeasurements:
         return float((np.ptp(whites, axis=0) / whites.mean(axis=0)).max()) if len(whites) > 1 else 0.0
 
     @property
+    def white_scatter(self) -> float:
+        """Standard deviation of a white frame's brightness about its neighbours', a share; 0 of less than three."""
+        whites = np.array([frame.paper.white.sum() for frame in self.white_frames])
+        if len(whites) < 3:
+            return 0.0
+        off = whites[1:-1] - (whites[:-2] + whites[2:]) / 2
+        return float(np.sqrt((off**2).mean() / 1.5) / whites.mean())
+
+    @property
     def dark_share(self) -> float:
         """Light of bare paper while the projector shows black, of white, in the worst channel; NaN if not measured."""
         share = np.abs(self.dark_frames.light / self._full_white).max()
@@ -378,17 +404,3 @@ class TableMeasurements:
         """(3,) float64 counts of bare paper under white, or under the brightest light where no white was taken."""
         whites, lights = [frame.paper.white for frame in self.white_frames], self.lights.white
         return np.mean(whites, axis=0) if whites else lights[int(np.argmax(lights.sum(axis=1)))]
-
-
-def direction_error_deg(white: _Array, error: _Array) -> _Array:
-    """Return the standard error (L,) float64, degrees, of the direction of vectors with small independent errors.
-
-    The root of the mean square angle: of each component's error, the part across the vector counts (first-order
-    propagation of errors).
-
-    `white`, `error`: (L, 3) float64 and its standard errors, in one unit.
-    """
-    length = np.linalg.norm(white, axis=1, keepdims=True)
-    along = white / np.maximum(length, 1e-9)
-    across = np.sqrt((error**2 * (1 - along**2)).sum(axis=1))
-    return np.degrees(across / np.maximum(length[:, 0], 1e-9))

@@ -165,6 +165,18 @@ def bleed(cell_px: float, blur_px: float, window: int = WINDOW_PX) -> float:
     return float(ndtr(-(cell_px / 2 - window // 2 - MISPLACEMENT_PX) / max(blur_px, _LEAST_BLUR_PX)))
 
 
+def mean_bleed(cell_px: float, blur_px: float, window: int = WINDOW_PX) -> float:
+    """Return the share, 0 … 1, of the light of a window's mean that comes from beyond its cell, placed rightly.
+
+    Units and sources are those of `bleed`.
+    """
+    from scipy.special import ndtr
+
+    at = np.arange(-(window // 2), window // 2 + 1)
+    inside = 1 - 2 * ndtr(-(cell_px / 2 - at) / max(blur_px, _LEAST_BLUR_PX)).mean()
+    return float(1 - inside**2)
+
+
 def blur_of_bleed(cell_px: float, share: float, window: int = WINDOW_PX) -> float:
     """Return the σ of the blur, half-size px, at which `bleed` is `share` (0 … 0.5); 0 where it is at any blur."""
     from scipy.special import ndtri

@@ -34,6 +34,7 @@ from calibration.figures.figure import (
     SummaryRow,
     Worst,
 )
+from calibration.radiometry.superposition import NODES
 from foundation.colorimetry import angles_deg
 from foundation.errors import first_of
 
@@ -205,27 +206,102 @@ STRAY_SHARE = Figure(
 )  # fmt: skip
 
 
+def _bend(table: TableMeasurements) -> float | None:
+    """Return by how much superposition bends beyond two standard errors, over the levels of paper under the lights."""
+    found = table.sensor.superposition
+    if not found.measured or not _are_named_right(table):
+        return None
+    white = table.lights.white
+    level = np.geomspace(max(float(white.min()), found.full * NODES[1]), float(white.max()), 30)
+    errors = found.errors(level, np.full(len(level), level[-1]))
+    off, _ = found.relative(level)
+    bend = np.abs(off - off[-1])
+    return float(np.maximum(bend - 2 * np.sqrt(np.maximum(errors - bend**2, 0)), 0).max())
+
+
 def _linearity(table: TableMeasurements) -> float | None:
-    return None if table.sensor.linearity is None else table.sensor.linearity.worst
+    return _bend(table) if table.sensor.linearity is None else table.sensor.linearity.worst
 
 
 def _linearity_row(table: TableMeasurements) -> SummaryRow:
-    linearity = table.sensor.linearity
-    if linearity is None:
-        return SummaryRow("Linearity", "not measured", "give a series of exposures of the chart with --linearity")
-    low, high = linearity.range
-    note = f"{len(linearity.files)} exposures, {low:.0%} to {high:.0%} of saturation; 1 % is usual"
-    return SummaryRow("Linearity", f"{percent(linearity.worst)} from a straight line at most", note)
+    linearity, bend = table.sensor.linearity, _bend(table)
+    if linearity is not None:
+        low, high = linearity.range
+        note = f"{len(linearity.files)} exposures, {low:.0%} to {high:.0%} of saturation; 1 % is usual"
+        return SummaryRow("Linearity", f"{percent(linearity.worst)} from a straight line at most", note)
+    if bend is None:
+        note = "plan red, green and blue each alone, or give a series of exposures of the chart with --linearity"
+        return SummaryRow("Linearity", "not measured", note)
+    note = "for certain, over the levels of paper; red, green and blue alone against white, cell by cell"
+    return SummaryRow("Linearity", f"{percent(bend)} from proportion", note)
 
 
 LINEARITY = Figure(
-    "linearity", "Deviation from linearity, 5 to 95 % of saturation", "radiometry", "share", "at most", 0.01, 0.05,
+    "linearity", "Deviation from linearity", "radiometry", "share", "at most", 0.01, 0.05,
     why="counts are not proportional to light, so that chromaticities change with brightness",
-    source="EMVA 1288 asks for the range; 1 % is " + JUDGEMENT,
-    remedy="expose less, switch the camera's highlight priority off, and take the series in steady light",
+    source="EMVA 1288; 1 % is " + JUDGEMENT,
+    remedy="expose less, switch the camera's highlight priority and noise reduction off; a series of exposures of the "
+    "chart, given with --linearity, shows where counts bend",
     measure=_linearity, forecast=ONLY_OF_A_SESSION,
     worst=NO_PLACE, where=OF_ITS_CAUSE, retake=NO_FRAMES, cause=NO_CAUSE,
     drawing=NOT_DRAWN, lines=(Line(185, _linearity_row),),
+)  # fmt: skip
+
+
+def _linearity_known(table: TableMeasurements) -> float:
+    return float(table.sensor.linearity is not None or table.sensor.superposition.measured)
+
+
+LINEARITY_KNOWN = Figure(
+    "linearity_known", "Linearity measured", "radiometry", "", "at least", 1.0, None,
+    why="nothing shows whether counts are proportional to light; the uncertainty of the ground truth assumes what is "
+    "usual of cameras",
+    source="uncertainty budget",
+    remedy="plan red, green and blue each alone (acquire illuminations does), or give a series of exposures of the "
+    "chart with --linearity",
+    measure=_linearity_known, forecast=ONLY_OF_A_SESSION,
+    worst=NO_PLACE, where=OF_ITS_CAUSE, retake=NO_FRAMES, cause=NO_CAUSE,
+    drawing=NOT_DRAWN, lines=NO_LINES,
+)  # fmt: skip
+
+
+def _too_dark(table: TableMeasurements) -> float | None:
+    """Return how much too much dark light was subtracted for certain, of white, in the worst channel.
+
+    White has twice as much beyond the primaries' sum, in each channel as much as the dark frames' light allows; a
+    projector that adds light to white adds more, and of another colour.
+    """
+    lights, dark = table.lights, table.dark_frames.light
+    if lights.subtracted is None or lights.additivity is None or not _are_named_right(table):
+        return None
+    white = lights.white[int(np.argmax(lights.white.sum(axis=1)))]
+    beyond = -lights.additivity / 2
+    doubt = _UNSTEADY if len(table.white_frames) < _STEADY_FRAMES else table.white_scatter
+    certain = beyond - 2 * doubt
+    allowed = _DARK_ALLOWS * np.maximum(dark, 0) / white + doubt
+    return float(certain.max()) if (beyond > 0).all() and (beyond <= allowed).all() and (certain > 0).any() else 0.0
+
+
+_UNSTEADY = 0.001
+"""Standard deviation of a frame's brightness, a share, where white frames do not show it (judgement)."""
+
+_STEADY_FRAMES = 3
+"""White frames from which on they show it."""
+
+_DARK_ALLOWS = 1.25
+"""Over the dark frames' light, what may have been subtracted too much: all of it, and its error."""
+
+
+TOO_DARK = Figure(
+    "too_dark", "Dark light subtracted that lights do not have, of white", "light", "share", "at most", 0.0005, 0.002,
+    why="white has more than red, green and blue together, each of which lacks what was subtracted too much; deep "
+    "colours and dim lights are off by far more",
+    source="0.2 % of white puts a light of a tenth of white 1 degree off",
+    remedy="build the table without --subtract-dark; a lamp or a display was on while the dark frames were taken, or "
+    "the projector closes an iris for black: take the dark frames as the lights are taken",
+    measure=_too_dark, forecast=ONLY_OF_A_SESSION,
+    worst=NO_PLACE, where=OF_ITS_CAUSE, retake=NO_FRAMES, cause=NO_CAUSE,
+    drawing=NOT_DRAWN, lines=NO_LINES,
 )  # fmt: skip
 
 
@@ -234,7 +310,10 @@ def _beyond_sum(sign: int) -> Callable[[TableMeasurements], float | None]:
 
     def measure(table: TableMeasurements) -> float | None:
         off = table.lights.additivity
-        return max(float((sign * off).max()), 0.0) if off is not None and _are_named_right(table) else None
+        # What was subtracted too much is a figure of its own.
+        if off is None or not _are_named_right(table) or (sign < 0 and (_too_dark(table) or 0) > TOO_DARK.accept):
+            return None
+        return max(float((sign * off).max()), 0.0)
 
     return measure
 

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from calibration.budget import COVERAGE
 from calibration.causes.gathering import PrintPlace, noisy_evidence, reference_evidence
 from calibration.figures.figure import (
     JUDGEMENT,
@@ -130,32 +131,40 @@ REFERENCE_SPREAD = Figure(
 
 
 def _error_row(table: TableMeasurements) -> SummaryRow:
-    share = table.lights.white_error / np.maximum(table.lights.white, 1e-9)
-    value = f"{percent(float(np.median(share)))} of a channel, median"
-    note = "of the mean of the white references"
-    return SummaryRow("Standard error of the ground truth", value, note, brief=True)
+    error = table.budget.expanded_deg
+    value = f"{np.median(error):.2g}° median, {error.max():.2g}° worst light"
+    note = f"k = {COVERAGE:g}; of the worst most is by {table.budget.main_cause(int(np.argmax(error))).title}"
+    return SummaryRow("Uncertainty of the ground truth", value, note, brief=True)
 
+
+_BY_CAUSE = (
+    "see the largest of its causes: noise, expose longer or leave the darkest lights out; the lens, stop it down, clean "
+    "it and keep light from beside the print; darkness, darken the room; linearity, expose less"
+)
 
 TRUTH_MEDIAN_DEG = Figure(
-    "truth_median_deg", "Standard error of the ground truth, median light", "truth", "°", "at most", 0.1, 1.0,
+    "truth_median_deg", "Expanded uncertainty of the ground truth, median light", "truth", "°", "at most", 0.2, 1.0,
     why="a method's error cannot be measured finer than the ground truth is known",
-    source=JUDGEMENT + ": good methods are 1 to 2 degrees off", remedy="expose longer",
-    measure=lambda table: float(np.median(table.lights.white_error_deg)), forecast=ONLY_OF_A_SESSION,
+    source=JUDGEMENT + ": good methods are 1 to 2 degrees off; k = 2 (JCGM 100)", remedy=_BY_CAUSE,
+    measure=lambda table: float(np.median(table.budget.expanded_deg)), forecast=ONLY_OF_A_SESSION,
     worst=NO_PLACE, where=OF_ITS_CAUSE, retake=NO_FRAMES, cause=NO_CAUSE,
     drawing="lights", lines=(Line(190, _error_row),),
 )  # fmt: skip
 
 
 def _least_known(table: TableMeasurements, chart: Chart) -> Worst | None:
-    error = table.lights.white_error_deg
-    return worst_light(table, int(np.argmax(error)), f"{error.max():.2g}°") if len(error) > 1 else None
+    error = table.budget.expanded_deg
+    if len(error) < 2:
+        return None
+    light = int(np.argmax(error))
+    return worst_light(table, light, f"{error[light]:.2g}°, most by {table.budget.main_cause(light).title}")
 
 
 TRUTH_WORST_DEG = Figure(
-    "truth_worst_deg", "Standard error of the ground truth, worst light", "truth", "°", "at most", 0.5, 3.0,
-    why="under that light a method's error cannot be measured finer than the ground truth is known", source=JUDGEMENT,
-    remedy="expose longer, or leave the darkest lights out",
-    measure=lambda table: float(table.lights.white_error_deg.max()), forecast=ONLY_OF_A_SESSION,
+    "truth_worst_deg", "Expanded uncertainty of the ground truth, worst light", "truth", "°", "at most", 0.5, 3.0,
+    why="under that light a method's error cannot be measured finer than the ground truth is known",
+    source=JUDGEMENT + "; k = 2 (JCGM 100)", remedy=_BY_CAUSE,
+    measure=lambda table: float(table.budget.expanded_deg.max()), forecast=ONLY_OF_A_SESSION,
     worst=_least_known, where=OF_ITS_CAUSE, retake=NO_FRAMES, cause=NO_CAUSE,
     drawing="lights", lines=NO_LINES,
 )  # fmt: skip

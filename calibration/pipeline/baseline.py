@@ -34,6 +34,7 @@ from calibration.citation import Rig, StatedOrigin
 from calibration.radiometry.dark_frames import DarkLightEstimate, reflectances
 from calibration.radiometry.greys import GreyLevels, PhotonTransfer, photon_transfer
 from calibration.radiometry.primaries import Primaries, pure_lights
+from calibration.radiometry.superposition import Superposition, printed_predictors, superposition
 from calibration.registration.register import Registration, register
 from calibration.sampling import WINDOW, WINDOWS, Sites, gather, gather_means, sites_at
 from calibration.spread.correction import (
@@ -287,6 +288,8 @@ class Baseline:
     - `consistency_check`: compares other frames' cells with those of this one.
     - `primaries`: the primaries each alone; None where they were not given or cannot be used.
     - `lens`: what the lens spreads beside its sharp core, measured; None where it was not, or could not be.
+    - `superposition`: what the first frame and those of the primaries show of the sensor's linearity; None where one of
+      them is lacking, or the chart has moved in it.
     """
 
     chart: Chart
@@ -302,6 +305,13 @@ class Baseline:
     consistency_check: ConsistencyCheck
     primaries: Primaries | None = None
     lens: LensCorrection | None = None
+    superposition: Superposition | None = None
+
+    @property
+    def levels(self) -> _Array:
+        """(C, 3) float64, of each cell in the first frame, bare paper 1."""
+        paper, at_cells = self.paper.read(self.whites, self.first.file)
+        return self.means[: len(at_cells)] / (at_cells * np.maximum(paper.white, 1e-9))
 
     def require_layout(self, mosaic: Mosaic, what: str) -> None:
         """Refuse a frame, called `what`, whose sensor or setting is not that of the first."""
@@ -396,7 +406,7 @@ def with_lens(baseline: Baseline, first: DecodedFrame, primaries: Sequence[Decod
         return measured
     correction = FrameCorrection.of(lens.spread, view, around)
     corrected = _baseline(chart, points, baseline.options, first, replace(registered, lens=correction))
-    return replace(corrected, lens=lens)
+    return replace(corrected, lens=lens, superposition=baseline.superposition)
 
 
 def with_primaries(baseline: Baseline, primaries: Primaries | None) -> Baseline:
@@ -413,6 +423,28 @@ def with_primaries(baseline: Baseline, primaries: Primaries | None) -> Baseline:
         baseline.chart, baseline.points, evened, baseline.transfer, baseline.options, baseline.first
     )
     return replace(baseline, primaries=primaries, consistency_check=check)
+
+
+def with_superposition(baseline: Baseline, first: DecodedFrame, primaries: Sequence[DecodedFrame]) -> Baseline:
+    """Return the baseline with what the first frame shows of linearity beside the primaries; as it is without them."""
+    frames = [first, *primaries]
+    if not primaries or not all(_is_still(baseline, decoded) for decoded in frames):
+        return baseline
+    seen, peaks = zip(*(baseline.patches(one.mosaic, one.black) for one in frames), strict=True)
+    clipped = [peak >= CLIPPING_SHARE * one.saturation for peak, one in zip(peaks, frames, strict=True)]
+    usable = np.isfinite(seen).all(axis=(0, 2)) & ~np.any(clipped, axis=0)
+    chart, points = baseline.chart, baseline.points
+    usable[: chart.colour_count] &= _compared(chart, baseline.first)
+    printed = np.concatenate([np.zeros(len(points.whites_mm), dtype=np.int64), 1 + points.levels.level])
+    found = superposition(
+        seen[1:],
+        seen[0],
+        float(first.saturation - first.black.mean()),
+        usable,
+        printed_predictors(chart.rgb[chart.cell_of_colour], printed),
+        white=first.record.kind == "white",
+    )
+    return replace(baseline, superposition=found)
 
 
 def lens_figures(baseline: Baseline) -> LensFigures:
@@ -433,13 +465,18 @@ def beyond_print(decoded: DecodedFrame, beyond: Sites) -> _Array:
     return gather_means(decoded.mosaic, decoded.black, beyond).mean(axis=0)
 
 
+def _is_still(baseline: Baseline, decoded: DecodedFrame) -> bool:
+    """Return whether the chart lies in a frame where it was registered."""
+    shift = baseline.movement(decoded.mosaic, decoded.black, decoded.strongest, decoded.record.file)
+    return shift.gauges > 0 and shift.length_px <= STILL_PX and shift.largest_px <= 2 * STILL_PX
+
+
 def _spread_frame(baseline: Baseline, decoded: DecodedFrame, view: PrintView, mixed: bool) -> SpreadFrame | None:
     """Return a frame as the lens is measured on it; None where the chart has moved in it.
 
     `mixed` is whether several primaries light it.
     """
-    shift = baseline.movement(decoded.mosaic, decoded.black, decoded.strongest, decoded.record.file)
-    if shift.gauges == 0 or shift.length_px > STILL_PX or shift.largest_px > 2 * STILL_PX:
+    if not _is_still(baseline, decoded):
         return None
     means, highest = baseline.patches(decoded.mosaic, decoded.black)
     inside = np.isfinite(means).all(axis=1)

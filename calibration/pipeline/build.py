@@ -49,6 +49,7 @@ from calibration.pipeline.baseline import (
     source_frames,
     with_lens,
     with_primaries,
+    with_superposition,
 )
 from calibration.pipeline.collecting import check_figures, table_figures
 from calibration.pipeline.linearity import read_linearity
@@ -61,12 +62,14 @@ from calibration.pipeline.measuring import (
 from calibration.radiometry.drift import LEAST_WHITES, applied_drift, corrected, corrections
 from calibration.radiometry.greys import references_csv
 from calibration.table.lut import (
+    CELLS,
     REFERENCES,
     REPORT_FORMAT,
     REPORT_JSON,
     REPORT_PAGE,
     REPORT_VERSION,
     SAMPLES,
+    UNCERTAINTY,
     LutWriter,
     Provenance,
     frames_sha256,
@@ -273,7 +276,8 @@ def _begin(session: Session, selected: SelectedFrames, options: BuildOptions) ->
     """Register the chart, measure lens and primaries, and return what there is before any frame."""
     first = decode_frame(session, selected.registered)
     pure = [decode_frame(session, record) for record in selected.primaries]
-    baseline = with_lens(baseline_of(session.chart, first, options), first, pure)
+    plain = with_superposition(baseline_of(session.chart, first, options), first, pure)
+    baseline = with_lens(plain, first, pure)
     # The first frame's counts are not held any longer: it is read again in its turn.
     return Accumulator.empty(
         session, selected, with_primaries(baseline, measure_primaries(baseline, pure)), first.saturation
@@ -353,7 +357,9 @@ def _write_table(done: Accumulator, figures: TableMeasurements, writer: LutWrite
     references = references_csv(
         greys.names, lights.white / gain, lights.white_error / gain, greys.values / per_light, greys.errors / per_light
     )
-    files = {REFERENCES: references} if greys.names else {}
+    files = {UNCERTAINTY: figures.budget.lights_csv(), CELLS: figures.budget.cells_csv()}
+    if greys.names:
+        files[REFERENCES] = references
     writer.finish(session.illuminations, lights.white / gain, provenance, source_frames(records), files)
 
 

@@ -26,6 +26,7 @@ from calibration.pipeline.accumulator import Accumulator
 from calibration.pipeline.baseline import Baseline, lens_figures, stated_origin
 from calibration.radiometry.drift import drift_correction
 from calibration.radiometry.primaries import additivity, drift_gains, pure_lights
+from calibration.radiometry.superposition import Superposition
 from experiment.lights import Illumination
 from foundation.colorimetry import angles_deg
 
@@ -108,9 +109,10 @@ def _figures(
             noise=done.noise(),
             transfer=baseline.transfer,
             linearity=linearity,
+            superposition=baseline.superposition or Superposition.usual(float(saturation - even.black.mean())),
         ),
         dark_frames=dark,
-        cells=CellMeasurements(baseline.options.window, done.unfit(stains, frames), stains),
+        cells=CellMeasurements(baseline.options.window, done.unfit(stains, frames), stains, baseline.levels),
         origins=origin_figures(list(zip(done.records, published, strict=True))),
         origin=origin_record(stated, done.records, origins),
         primaries=baseline.primaries,

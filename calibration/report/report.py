@@ -72,6 +72,8 @@ def report_json(result: BuildResult) -> dict[str, Any]:
         "channels": _channels(table),
         "chart_places": _chart_places(table),
         "geometry": _geometry(table),
+        "uncertainty": table.budget.to_json(),
+        "superposition": table.sensor.superposition.to_json(),
         "lens": table.lens.to_json() | ({} if table.point_spread is None else table.point_spread.to_json()),
         "off_codes_deg": None if off_codes_deg is None else _short(off_codes_deg),
         "codes": None if table.lights.codes is None else _codes(table.lights.codes),

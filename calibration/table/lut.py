@@ -71,6 +71,12 @@ FRAMES: Final = "frames.csv"
 REFERENCES: Final = "references.csv"
 """The grey references under each light, where the chart has some."""
 
+UNCERTAINTY: Final = "uncertainty.csv"
+"""The expanded uncertainty of each light's ground truth, and its causes; absent in tables made before it was stated."""
+
+CELLS: Final = "cells.csv"
+"""The expanded relative uncertainty of each cell's mean; absent in tables made before it was stated."""
+
 REPORT_PAGE: Final = "report.html"
 """The report for people."""
 
@@ -90,6 +96,8 @@ MOST_BYTES: Final = {
     ILLUMINATIONS: 16 << 20,
     FRAMES: 16 << 20,
     REFERENCES: 64 << 20,
+    UNCERTAINTY: 16 << 20,
+    CELLS: 16 << 20,
     REPORT_JSON: 64 << 20,
     REPORT_PAGE: 256 << 20,
     SUMS: 64 << 10,
@@ -100,11 +108,17 @@ OPTIONAL: Final = frozenset({REPORT_PAGE})
 """Files that a table may do without: no number is read from them, and a table that was fetched has none."""
 
 _LINE = re.compile(r"([0-9a-f]{64})  ([A-Za-z0-9_][A-Za-z0-9_.-]{0,99})")
-_TEXTS: Final = (ILLUMINATIONS, FRAMES, REFERENCES, REPORT_JSON, REPORT_PAGE)
+_TEXTS: Final = (ILLUMINATIONS, FRAMES, REFERENCES, UNCERTAINTY, CELLS, REPORT_JSON, REPORT_PAGE)
 RESTORE: Final = "restore it from a copy, fetch the table again, or build it anew"
 
 WHITE_COLUMNS: Final = ("white_r", "white_g", "white_b")
 """Columns of `illuminations.csv` with the ground truth, after those of the lights."""
+
+EXPANDED: Final = "expanded_deg"
+"""Column of `uncertainty.csv` with a light's expanded uncertainty."""
+
+CELL_COLUMNS: Final = ("expanded_r", "expanded_g", "expanded_b")
+"""Columns of `cells.csv` after the colour's index."""
 
 MOST_WHITE: Final = 1_000_000
 """A ground truth is below this, in units of samples of 16 bits: what is larger was not measured, and its chromaticity
@@ -460,6 +474,31 @@ class Lut:
         return set()
 
     @cached_property
+    def truth_uncertainty_deg(self) -> npt.NDArray[np.float64] | None:
+        """(L,) float64 degrees, expanded uncertainty (k = 2) of the ground truth; None in tables that do not state it.
+
+        Raises
+        ------
+        FormatError
+            `uncertainty.csv` is damaged.
+        """
+        found = _load_numbers(self.folder / UNCERTAINTY, (EXPANDED,), len(self.illuminations))
+        return None if found is None else found[:, 0]
+
+    @cached_property
+    def cell_uncertainty(self) -> npt.NDArray[np.float64] | None:
+        """(8**bits, 3) float64, expanded relative uncertainty (k = 2) of each cell's mean in R, G and B, noise apart.
+
+        Under the light that the chart was registered in; None in tables that do not state it.
+
+        Raises
+        ------
+        FormatError
+            `cells.csv` is damaged.
+        """
+        return _load_numbers(self.folder / CELLS, CELL_COLUMNS, 8**self.provenance.bits)
+
+    @cached_property
     def frames(self) -> tuple[SourceFrame, ...]:
         """The frames the table was made from, in the order taken; empty in tables made before they were recorded.
 
@@ -516,6 +555,20 @@ def open_lut(folder: Path, *, check: bool = True) -> Lut:
     if check:
         require_listed(folder, provenance, len(lights))
     return Lut(folder, map_samples(folder / SAMPLES, len(lights), provenance.bits), lights, white, provenance)
+
+
+def _load_numbers(path: Path, columns: Sequence[str], count: int) -> npt.NDArray[np.float64] | None:
+    """Return columns (count, N) float64 of a table of numbers; None where there is no such file."""
+    if not path.is_file():
+        return None
+    try:
+        rows = list(csv.DictReader(io.StringIO(path.read_text(encoding="utf-8"))))
+        found = np.array([[float(row[column]) for column in columns] for row in rows]).reshape(len(rows), len(columns))
+    except (OSError, KeyError, TypeError, ValueError) as error:
+        raise FormatError(f"{path} is damaged: numbers under {','.join(columns)} expected; {RESTORE}") from error
+    if len(found) != count or not np.isfinite(found).all() or (found < 0).any():
+        raise FormatError(f"{path} has {len(found)} rows, {count} of finite numbers from 0 on expected; {RESTORE}")
+    return found
 
 
 def _load_white(path: Path) -> npt.NDArray[np.float64]:

@@ -39,7 +39,9 @@ from calibration.table.lut import (
     MOST_BYTES,
     MOST_SAMPLES,
     PROVENANCE,
+    CELLS,
     REFERENCES,
+    UNCERTAINTY,
     REPORT_JSON,
     SAMPLES,
     SUMS,
@@ -62,7 +64,7 @@ FORMAT: Final = "crop.lut.published"
 VERSION: Final = 1
 """The only version so far."""
 
-TEXTS: Final = (ILLUMINATIONS, FRAMES, REFERENCES, REPORT_JSON, SUMS, PROVENANCE)
+TEXTS: Final = (ILLUMINATIONS, FRAMES, REFERENCES, UNCERTAINTY, CELLS, REPORT_JSON, SUMS, PROVENANCE)
 """Files that go along where the table has them, the one that makes a folder a table last."""
 
 MOST_LIGHTS: Final = 65_536

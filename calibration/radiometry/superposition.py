@@ -1,0 +1,232 @@
+"""Linearity of the sensor by flux superposition: red, green and blue alone against a light that is made of them.
+
+Light adds: what a patch has under a light of several primaries is what it has under each alone, times how much of each
+there is. Counts that are proportional to light add up likewise; those of a sensor that compresses near saturation,
+loses counts near black or has its black elsewhere do not. The patches of a chart have all levels from black ink to bare
+paper, so that four frames show the whole curve. Neither print, lens nor the photosites' response matters, since the
+same photosites see all four; nor does a lamp that was brighter in one of the frames, since how much there is of each
+primary is fitted along. Detectors are calibrated so (superposition or flux-addition method: C. L. Sanders, Applied
+Optics 1, 1962).
+
+A factor common to all counts is not seen, and matters to no chromaticity.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from experiment.measures.least_squares import code_polynomial
+from foundation.robust import huber_weights, sigma_of
+
+NODES = (0.001, 0.003, 0.01, 0.03, 0.1, 0.25, 0.5, 0.75, 1.0)
+"""Shares of saturation between which the deviation is interpolated; it is 0 at black."""
+
+_USUAL_BEND = 0.01
+"""Standard deviation, before it is measured, of the relative deviation at saturation: EMVA 1288 linearity errors of
+cameras' raw files are below 1 %."""
+
+_USUAL_LOSS = 0.0005
+"""The same of what is lost or added near black, of saturation: some counts of 14 bits."""
+
+_LOSS_SCALES = (0.0005, 0.002)
+"""Shares of saturation within which that happens."""
+
+_USUAL_REST = 0.0003
+"""The same of what is neither, of each level."""
+
+_LEAST_PATCHES = 100
+"""Patches in a channel from which on something is said (judgement)."""
+
+_CODE_DEGREE = 4
+"""Of the polynomial in the codes that says what a patch has without its noise."""
+
+_LOOSE = 10.0
+"""Standard deviation of how much of a primary a light has, before it is fitted: nothing is known."""
+
+_FLICKER = 0.003
+"""The same beside what all primaries have in common, where the light is all of each: a lamp between two frames."""
+
+_OWN_SPECTRUM = 0.001
+"""The same of how it differs from channel to channel: a primary keeps its spectrum."""
+
+_ADDS = 0.02
+"""By how much amounts of primaries may differ from one another for their light to be theirs alone: a projector that
+brightens white adds light of another spectrum."""
+
+_GROUPS = 12
+"""Groups of like levels, in each of which the scatter is measured."""
+
+_ROUNDS = 3
+"""Solutions in a row, each weighted and linearised by the one before."""
+
+_AMOUNTS = 12
+"""Unknowns before the nodes': of each primary, and what each channel sees otherwise."""
+
+_Array = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Superposition:
+    """How counts deviate from proportion to light, and how well that is known.
+
+    - `full`: counts above black of saturation.
+    - `deviation`: (K,) float64 counts at `NODES`, what is measured less what a proportional sensor would have.
+    - `covariance`: (K, K) float64 counts².
+    - `measured`: whether frames show it; else it is what is usual of cameras.
+    """
+
+    full: float
+    deviation: _Array
+    covariance: _Array
+    measured: bool
+
+    @staticmethod
+    def usual(full: float) -> Superposition:
+        """Return what is usual of cameras, where a session shows nothing of it."""
+        return Superposition(full, np.zeros(len(NODES)), _usual(full), measured=False)
+
+    def relative(self, level: _Array) -> tuple[_Array, _Array]:
+        """Return the relative deviation (...) at levels (...), counts above black, and its weights (..., K)."""
+        weights = _hats(level / self.full) / np.maximum(level, 1e-9)[..., None]
+        return weights @ self.deviation, weights
+
+    def errors(self, level: _Array, reference: _Array) -> _Array:
+        """Return the mean square (...) of the relative error of levels (...) to references of any shape that fits.
+
+        What is measured is not taken out of the counts: it counts as an error of its full size.
+        """
+        (found, weights), (at_reference, of_reference) = self.relative(level), self.relative(reference)
+        weights = weights - of_reference
+        return (found - at_reference) ** 2 + np.einsum("...k,kl,...l->...", weights, self.covariance, weights)
+
+    def white_covariance(self, white: _Array) -> _Array:
+        """Return the mean square (L, 3, 3) float64 of the relative error that it leaves in whites (L, 3), counts."""
+        found, weights = self.relative(white)
+        off = found - found.mean(axis=1, keepdims=True)
+        return weights @ self.covariance @ np.swapaxes(weights, 1, 2) + off[:, :, None] * off[:, None, :]
+
+    def to_json(self) -> dict[str, Any]:
+        """Return it as `report.json` states it: shares of each node's level."""
+        level = np.array(NODES) * self.full
+        shares = {"deviation": self.deviation / level, "standard_error": np.sqrt(np.diag(self.covariance)) / level}
+        rounded = {name: [float(f"{value:.4g}") for value in found.tolist()] for name, found in shares.items()}
+        return {"measured": self.measured, "level_share": list(NODES), **rounded}
+
+
+def superposition(
+    alone: Sequence[_Array],
+    together: _Array,
+    full: float,
+    usable: npt.NDArray[np.bool_],
+    known: _Array,
+    white: bool,
+) -> Superposition:
+    """Return what a light of several primaries shows beside each alone; what is usual where that is too little.
+
+    `alone`: three (P, 3) float64 counts above black of patches under red, green and blue alone, nothing but black
+    subtracted. `together`: (P, 3) the same under the light. `full`: counts above black of saturation. `usable`: (P,)
+    bool, patches that are inside the frames, not clipped and not covered. `known`: (P, M) float64, what patches are
+    printed with, which predicts their levels without noise. `white`: whether the light is all of each primary.
+    """
+    if int(usable.sum()) < max(_LEAST_PATCHES, 2 * known.shape[1]):
+        return Superposition.usual(full)
+    seen, known = np.stack([together, *alone])[:, usable], known[usable]
+    hats, size = _hats(seen / full), _AMOUNTS + len(NODES)
+    prior = _prior(full, white and _adds(seen))
+    solution = np.concatenate([np.ones(3), np.zeros(size - 3)])
+    matrix, misfit = prior, 1.0
+    for _ in range(_ROUNDS):
+        matrix, right, misfit = prior.copy(), np.zeros(size), 1.0
+        for channel in range(3):
+            own = slice(3 + 3 * channel, 6 + 3 * channel)
+            amounts = solution[:3] + solution[own]
+            value, parts = seen[0, :, channel], seen[1:, :, channel].T
+            # What proportional counts would have: value - m(value) = sum of amount (part - m(part)).
+            bend = hats[0, :, channel] - np.einsum("k,kpn->pn", amounts, hats[1:, :, channel])
+            design = np.zeros((len(value), size))
+            design[:, :3], design[:, own], design[:, _AMOUNTS:] = parts, parts, bend
+            left = value - design @ solution
+            sigma = _scatter(left, value)
+            root = huber_weights(np.abs(left) / sigma, 1.0) / sigma
+            # The primaries' frames have noise, too; what the print gives of them has not (two-stage least squares).
+            rows, told = root[:, None] * known, root[:, None] * design
+            clean = rows @ np.linalg.lstsq(rows, told, rcond=None)[0]
+            matrix += clean.T @ clean
+            right += clean.T @ (root * value)
+            misfit = max(misfit, _misfit(rows, root * left))
+        solution = np.linalg.solve(matrix, right)
+    covariance = misfit * np.linalg.inv(matrix)
+    return Superposition(full, solution[_AMOUNTS:], covariance[_AMOUNTS:, _AMOUNTS:], measured=True)
+
+
+def printed_predictors(codes: npt.ArrayLike, references: npt.NDArray[np.integer]) -> _Array:
+    """Return what cells and references are printed with, (C + N, M) float64, as `superposition` asks for.
+
+    `codes`: (C, 3) int, 0 … 255. `references`: (N,) int, which of them have one colour, from 0.
+    """
+    cells = code_polynomial(codes, _CODE_DEGREE)
+    alike = np.eye(int(references.max(initial=-1)) + 1)[references]
+    corner = np.zeros((len(cells), alike.shape[1])), np.zeros((len(alike), cells.shape[1]))
+    return np.block([[cells, corner[0]], [corner[1], alike]])
+
+
+def _adds(seen: _Array) -> bool:
+    """Return whether the primaries make the light: amounts (3,) solved for in the brightest patches are alike."""
+    bright = seen[0].sum(axis=1) >= np.quantile(seen[0].sum(axis=1), 0.8)
+    together, *alone = seen[:, bright].mean(axis=1)
+    amounts = np.linalg.lstsq(np.array(alone).T, together, rcond=None)[0]
+    return bool(np.ptp(amounts) <= _ADDS and abs(float(amounts.mean()) - 1) <= 5 * _ADDS)
+
+
+def _prior(full: float, adds: bool) -> _Array:
+    """Return the inverse of the prior covariance of all unknowns."""
+    like, own = (_FLICKER, _OWN_SPECTRUM) if adds else (_LOOSE, _LOOSE)
+    prior = np.zeros((_AMOUNTS + len(NODES), _AMOUNTS + len(NODES)))
+    prior[:3, :3] = np.linalg.inv(_LOOSE**2 * np.ones((3, 3)) + like**2 * np.eye(3))
+    prior[3:_AMOUNTS, 3:_AMOUNTS] = np.eye(_AMOUNTS - 3) / own**2
+    prior[_AMOUNTS:, _AMOUNTS:] = np.linalg.inv(_usual(full))
+    return prior
+
+
+def _usual(full: float) -> _Array:
+    """Return the covariance (K, K) float64 counts² that is usual: bends of all counts, what is lost near black."""
+    level = np.array(NODES)
+    bends = [_USUAL_BEND * level**2, _USUAL_BEND * level**3]
+    losses = [_USUAL_LOSS * (1 - np.exp(-level / scale)) for scale in _LOSS_SCALES]
+    # The amounts of the primaries go along with any straight line: of all that fit as well, the one with none.
+    shapes = [shape - level * float((shape / level).mean()) for shape in (*bends, *losses)]
+    found: _Array = full**2 * (
+        np.sum([np.outer(one, one) for one in shapes], axis=0) + np.diag(_USUAL_REST * level) ** 2
+    )
+    return found
+
+
+def _hats(share: _Array) -> _Array:
+    """Return the weights (..., K) float64 of the nodes at shares (...) of saturation, linear between them."""
+    nodes = np.array([0.0, *NODES])
+    inside = np.clip(share, 0, nodes[-1])
+    right = np.clip(np.searchsorted(nodes, inside, side="right"), 1, len(nodes) - 1)
+    part = (inside - nodes[right - 1]) / (nodes[right] - nodes[right - 1])
+    weights = np.zeros((*share.shape, len(nodes)))
+    np.put_along_axis(weights, right[..., None], part[..., None], axis=-1)
+    np.put_along_axis(weights, right[..., None] - 1, 1 - part[..., None], axis=-1)
+    return weights[..., 1:]
+
+
+def _scatter(left: _Array, level: _Array) -> _Array:
+    """Return the usual scatter (P,) of what is left, by groups of like levels."""
+    found = np.empty(len(left))
+    for part in np.array_split(np.argsort(level, kind="stable"), _GROUPS):
+        found[part] = sigma_of(left[part]) + 1e-9
+    return found
+
+
+def _misfit(known: _Array, left: _Array) -> float:
+    """Return what the print explains of what is left, for each of its unknowns, over chance: at least 1."""
+    explained = known @ np.linalg.lstsq(known, left, rcond=None)[0]
+    return max(1.0, float(explained @ explained) / known.shape[1])
