@@ -45,6 +45,7 @@ from itertools import combinations
 
 import numpy as np
 import numpy.typing as npt
+from threadpoolctl import threadpool_limits
 
 from foundation.colorimetry import angles_deg
 
@@ -433,6 +434,8 @@ class CodeAgreement:
         )
 
 
+# Its matrices are small: threads of the linear algebra wait for each other longer than they work.
+@threadpool_limits.wrap(limits=1, user_api="blas")
 def code_agreement(
     codes: npt.NDArray[np.integer], white: _Array, error: _Array, *, dark_known: bool, drift_known: bool
 ) -> CodeAgreement:
