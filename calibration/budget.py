@@ -21,6 +21,7 @@ import numpy as np
 import numpy.typing as npt
 
 from calibration.sampling import mean_bleed
+from calibration.spread.added_light import LEAST_LEVEL
 from calibration.table.lut import CELL_COLUMNS, EXPANDED
 
 if TYPE_CHECKING:
@@ -42,9 +43,6 @@ half-second exposures; Heinz et al. 2018)."""
 
 _STRAY = 1e-4
 """Relative, independent in each channel: light from beside the print where no figure shows it (judgement)."""
-
-_LEAST_LEVEL = 1e-3
-"""Level of a cell, bare paper 1, below which its relative error is stated as if it had that."""
 
 _Array = npt.NDArray[np.float64]
 
@@ -157,7 +155,7 @@ def direction_deg(white: _Array, relative: _Array) -> _Array:
 def budget_of(table: TableMeasurements) -> Budget:
     """Return the budget of what was measured."""
     white = np.maximum(table.lights.white, 1e-9)
-    cells = np.maximum(table.cells.levels, _LEAST_LEVEL)
+    cells = np.maximum(table.cells.levels, LEAST_LEVEL)
     return Budget(
         (
             _noise(table, white, cells),
@@ -227,7 +225,7 @@ def _darkness(table: TableMeasurements, white: _Array, cells: _Array) -> Compone
 def _linearity(table: TableMeasurements, white: _Array, cells: _Array) -> Component:
     found = table.sensor.superposition
     paper = white[int(np.argmax(white.sum(axis=1)))]
-    level = np.maximum(cells, _LEAST_LEVEL) * paper
+    level = np.maximum(cells, LEAST_LEVEL) * paper
     source = (
         "red, green and blue alone against a light that is made of them"
         if found.measured
@@ -242,7 +240,7 @@ def _linearity(table: TableMeasurements, white: _Array, cells: _Array) -> Compon
 def _added_light(table: TableMeasurements, white: _Array, cells: _Array) -> Component:
     stray = _STRAY**2 if table.lights.stray is None else _STRAY**2 + table.lights.stray.share**2
     lights, _ = _even(stray, len(white), cells)
-    at_cells = stray / cells**2
+    at_cells = (stray + table.cells.added.mean_square) / cells**2
     return Component(
         "added light", "reflections and light of single frames", table.lights.stray is None,
         "light that lies on dark and bright cells alike; codes of 0, and white against the primaries", lights, at_cells,

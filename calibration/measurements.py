@@ -26,6 +26,7 @@ from calibration.radiometry.primaries import Primaries
 from calibration.radiometry.superposition import Superposition
 from calibration.registration.register import Registration
 from calibration.sampling import bleed
+from calibration.spread.added_light import AddedLight
 from calibration.spread.correction import LensFigures
 from calibration.spread.fitting import PointSpread
 from calibration.table.lut import Unfit
@@ -303,12 +304,14 @@ class CellMeasurements:
     - `unfit`: cells not to be used, each with its cause.
     - `stains`: where the print does not have its codes' colours, in the order of colour indices.
     - `levels`: (C, 3) float64, of each cell in the frame that was registered first, bare paper 1.
+    - `added`: light that lies on some of them whatever is printed there.
     """
 
     window: int
     unfit: tuple[Unfit, ...]
     stains: Stains
     levels: _Array
+    added: AddedLight
 
 
 @dataclass(frozen=True, eq=False)

@@ -61,6 +61,7 @@ _UNFIT_REMEDIES = {
     "disturbed": "see that nothing comes between lamp, print and camera",
     "unlike": "look at the cell in the frame of that light",
     "misplaced": "hang the print flatter",
+    "lit": "turn print or projector until no lamp, window or bright wall is mirrored on the print",
     "uneven": "focus on the print and keep the camera still",
 }
 """What helps against each cause of unfit cells (`calibration.pipeline.accumulator`)."""

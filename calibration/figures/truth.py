@@ -138,8 +138,8 @@ def _error_row(table: TableMeasurements) -> SummaryRow:
 
 
 _BY_CAUSE = (
-    "see the largest of its causes: noise, expose longer or leave the darkest lights out; the lens, stop it down, clean "
-    "it and keep light from beside the print; darkness, darken the room; linearity, expose less"
+    "see the largest of its causes: noise, expose longer or leave the darkest lights out; the lens, stop it down, "
+    "clean it and keep light from beside the print; darkness, darken the room; linearity, expose less"
 )
 
 TRUTH_MEDIAN_DEG = Figure(

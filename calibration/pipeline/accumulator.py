@@ -43,6 +43,7 @@ from calibration.radiometry.dark_frames import (
 )
 from calibration.registration.register import MAX_PLACE_ERROR_PX
 from calibration.sampling import has_dead_photosite, unevenness
+from calibration.spread.added_light import MOST_ADDED, AddedLight
 from calibration.table.lut import Unfit
 from experiment.framing.movement import Shift
 from experiment.framing.planes import CLIPPING_SHARE
@@ -292,8 +293,9 @@ class Accumulator:
         level = self.even_sum.mean(axis=1, dtype=np.float64) / max(self.even_frames, 1) / field
         return find_stains(level, cells_mm, self.baseline.chart.bits, ~(self.outside | self.covered))
 
-    def unfit(self, stains: Stains, frames: Sequence[FrameMeasurements]) -> tuple[Unfit, ...]:
+    def unfit(self, stains: Stains, frames: Sequence[FrameMeasurements], added: AddedLight) -> tuple[Unfit, ...]:
         """Return the cells not to be used, each with the first cause that applies; `frames`: what is said of them."""
+        lit_by_others = added.certain_share_of(self.baseline.levels).max(axis=1)
         disturbed = disturbed_cells(frames)
         lit = [(frame.consistency.alone, frame.record.illumination) for frame in frames]
         alone = {colour: light for cells, light in lit if light is not None for colour in cells}
@@ -317,6 +319,10 @@ class Accumulator:
                 cause = (
                     f"misplaced: its place is known to {self.place_error[colour]:.2f} px, {MAX_PLACE_ERROR_PX:g} px "
                     "allowed (three standard errors); the print waves there, or little of it is seen"
+                )
+            elif lit_by_others[colour] > MOST_ADDED:
+                cause = (
+                    f"lit: {lit_by_others[colour]:.1%} of its level is light that lies on the print there (reflection)"
                 )
             elif stains.stained[colour]:
                 deviation = stains.deviation_of(colour)

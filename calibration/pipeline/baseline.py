@@ -37,6 +37,7 @@ from calibration.radiometry.primaries import Primaries, pure_lights
 from calibration.radiometry.superposition import Superposition, printed_predictors, superposition
 from calibration.registration.register import Registration, register
 from calibration.sampling import WINDOW, WINDOWS, Sites, gather, gather_means, sites_at
+from calibration.spread.added_light import AddedLight, added_light
 from calibration.spread.correction import (
     FrameCorrection,
     LensCorrection,
@@ -83,6 +84,9 @@ _EVEN_COUNTS = 300.0
 
 _PAPER_WORTH = 10.0
 """Cells that a white reference counts for: its colour needs no polynomial."""
+
+_LEAST_BITS = 3
+"""Bits of a channel from which on neighbours in colour predict a cell."""
 
 _ROUNDS = 5
 """Reweighted solutions in a row; Huber's weights, squared, have settled by then."""
@@ -362,6 +366,17 @@ class Baseline:
             means.append(np.where(sites.inside[:, None], samples.mean(axis=1, dtype=np.float64), np.nan))
             peaks.append(highest)
         return np.concatenate(means), np.concatenate(peaks)
+
+    def added_light(self) -> AddedLight:
+        """Return the light that lies on parts of the print in the first frame, whatever is printed there."""
+        count = len(self.points.cells_mm)
+        if self.chart.bits < _LEAST_BITS:
+            return AddedLight.none(count)
+        paper, _ = self.paper.read(self.whites, self.first.file)
+        white = np.maximum(paper.white, 1e-9)
+        noise = self.transfer.variance(self.levels * white) / self.options.samples / white**2
+        usable = _compared(self.chart, self.first)
+        return added_light(self.levels, noise, usable, self.points.cells_mm, self.chart.page_mm, self.chart.bits)
 
     def dark_light_estimate(self) -> DarkLightEstimate:
         """Return the estimate of the dark light before any dark frame, with the reflectances of the first frame."""

@@ -89,6 +89,7 @@ def _figures(
     published = with_published_serials(origins, stated.citation.camera_serial)
     stains, dark = done.stains(_field_at_cells(baseline, even)), done.dark_summary()
     frames = _without_hot(done.frames, dark.hottest, stains.places_mm)
+    added = baseline.added_light()
     return TableMeasurements(
         session=SessionMeasurements(
             folder=session.folder,
@@ -112,7 +113,9 @@ def _figures(
             superposition=baseline.superposition or Superposition.usual(float(saturation - even.black.mean())),
         ),
         dark_frames=dark,
-        cells=CellMeasurements(baseline.options.window, done.unfit(stains, frames), stains, baseline.levels),
+        cells=CellMeasurements(
+            baseline.options.window, done.unfit(stains, frames, added), stains, baseline.levels, added
+        ),
         origins=origin_figures(list(zip(done.records, published, strict=True))),
         origin=origin_record(stated, done.records, origins),
         primaries=baseline.primaries,

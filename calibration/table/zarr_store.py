@@ -34,17 +34,17 @@ import numpy as np
 import numpy.typing as npt
 
 from calibration.table.lut import (
+    CELLS,
     FRAMES,
     ILLUMINATIONS,
     MOST_BYTES,
     MOST_SAMPLES,
     PROVENANCE,
-    CELLS,
     REFERENCES,
-    UNCERTAINTY,
     REPORT_JSON,
     SAMPLES,
     SUMS,
+    UNCERTAINTY,
     Lut,
     Provenance,
     known_sums,
