@@ -7,14 +7,13 @@ are above black unless called raw.
 from __future__ import annotations
 
 from dataclasses import asdict, astuple, dataclass
-from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from calibration.budget import Budget, budget_of
+from calibration.budget import Budget
 from calibration.checks.frame_consistency import FrameConsistency, OriginFigures
 from calibration.checks.light_codes import CodeAgreement
 from calibration.checks.stray_light import StrayLight
@@ -327,6 +326,7 @@ class TableMeasurements:
     - `lens`, `point_spread`: what the lens spreads beside its sharp core, and what of it was subtracted; None where it
       was not measured.
     - `origin`: with what, when and by whom the frames were taken.
+    - `budget`: what ground truth and cells may be off by, cause by cause.
     """
 
     session: SessionMeasurements
@@ -342,11 +342,7 @@ class TableMeasurements:
     lens: LensFigures
     point_spread: PointSpread | None
     origin: OriginRecord
-
-    @cached_property
-    def budget(self) -> Budget:
-        """What ground truth and cells may be off by, cause by cause."""
-        return budget_of(self)
+    budget: Budget
 
     @property
     def white_frames(self) -> tuple[FrameMeasurements, ...]:

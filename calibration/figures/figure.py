@@ -45,7 +45,7 @@ QUESTIONS: Final[dict[Group, str]] = {
 }
 
 Drawing = Literal[
-    "chart", "lights", "errors", "noise", "residuals", "worst", "field", "print", "course", "cells", "rest"
+    "chart", "lights", "budget", "errors", "noise", "residuals", "worst", "field", "print", "course", "cells", "rest"
 ]  # fmt: skip
 """Names of the report's pictures (`calibration.report.report`)."""
 

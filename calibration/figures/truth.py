@@ -148,7 +148,7 @@ TRUTH_MEDIAN_DEG = Figure(
     source=JUDGEMENT + ": good methods are 1 to 2 degrees off; k = 2 (JCGM 100)", remedy=_BY_CAUSE,
     measure=lambda table: float(np.median(table.budget.expanded_deg)), forecast=ONLY_OF_A_SESSION,
     worst=NO_PLACE, where=OF_ITS_CAUSE, retake=NO_FRAMES, cause=NO_CAUSE,
-    drawing="lights", lines=(Line(190, _error_row),),
+    drawing="budget", lines=(Line(190, _error_row),),
 )  # fmt: skip
 
 
@@ -166,7 +166,7 @@ TRUTH_WORST_DEG = Figure(
     source=JUDGEMENT + "; k = 2 (JCGM 100)", remedy=_BY_CAUSE,
     measure=lambda table: float(table.budget.expanded_deg.max()), forecast=ONLY_OF_A_SESSION,
     worst=_least_known, where=OF_ITS_CAUSE, retake=NO_FRAMES, cause=NO_CAUSE,
-    drawing="lights", lines=NO_LINES,
+    drawing="budget", lines=NO_LINES,
 )  # fmt: skip
 
 

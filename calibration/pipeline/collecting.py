@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import numpy.typing as npt
 
+from calibration.budget import Budget
 from calibration.checks.frame_consistency import origin_figures
 from calibration.checks.light_codes import CodeAgreement, code_agreement
 from calibration.checks.stray_light import StrayLight, stray_light
@@ -24,6 +25,7 @@ from calibration.measurements import (
 )
 from calibration.pipeline.accumulator import Accumulator
 from calibration.pipeline.baseline import Baseline, lens_figures, stated_origin
+from calibration.pipeline.components import budget_of
 from calibration.radiometry.drift import drift_correction
 from calibration.radiometry.primaries import additivity, drift_gains, pure_lights
 from calibration.radiometry.superposition import Superposition
@@ -90,7 +92,7 @@ def _figures(
     stains, dark = done.stains(_field_at_cells(baseline, even)), done.dark_summary()
     frames = _without_hot(done.frames, dark.hottest, stains.places_mm)
     added = baseline.added_light()
-    return TableMeasurements(
+    table = TableMeasurements(
         session=SessionMeasurements(
             folder=session.folder,
             camera=baseline.camera,
@@ -121,7 +123,9 @@ def _figures(
         primaries=baseline.primaries,
         lens=lens_figures(baseline),
         point_spread=None if baseline.lens is None else baseline.lens.spread,
+        budget=Budget.none(),
     )
+    return replace(table, budget=budget_of(table))
 
 
 def _field_at_cells(baseline: Baseline, even: FrameMeasurements) -> _Array:

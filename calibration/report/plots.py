@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from calibration.budget import Budget
 from calibration.causes.gathering import PrintPlace
 from calibration.checks.frame_consistency import has_enough_cells
 from calibration.measurements import FrameMeasurements, TableMeasurements
@@ -260,6 +261,48 @@ def draw_chromaticities(
             _ring(axes, float(share[0]), float(share[2]), f"light {worst}")
         axes.set(title=title, xlabel="r", aspect="equal", xlim=(-0.03, 1.03), ylim=(-0.03, 1.03))
     panels[0].set_ylabel("b")
+
+
+def draw_budget(figure: Any, budget: Budget, levels: _Array) -> None:
+    """Draw the expanded uncertainty of each light by cause, and that of each cell over its level.
+
+    `levels`: (C, 3) float64, bare paper 1.
+    """
+    figure.set_size_inches(10, 3.7)
+    lights, cells = figure.subplots(1, 2, width_ratios=(3, 2))
+    expanded = budget.expanded_deg
+    order = np.argsort(-expanded, kind="stable")
+    shared = expanded * budget.lights_deg**2 / np.maximum((budget.lights_deg**2).sum(axis=0), 1e-18)
+    at, base = np.arange(len(order)), np.zeros(len(order))
+    for number, (one, height) in enumerate(zip(budget.components, shared[:, order], strict=True)):
+        lights.bar(
+            at,
+            height,
+            1.0 if len(order) > _BARS_APART else 0.8,
+            bottom=base,
+            color=f"C{number}",
+            hatch="///" if one.assumed else None,
+            edgecolor="white" if one.assumed else "none",
+            linewidth=0,
+            label=f"{one.name} (assumed)" if one.assumed else one.name,
+        )
+        base += height
+    lights.set(title="ground truth", xlabel="lights, the worst first", ylabel="degrees, k = 2")
+    lights.set_xlim(-0.6, len(at) - 0.4)
+    lights.legend(frameon=False, fontsize=8)
+    if len(at) <= _BARS_APART:
+        lights.set_xticks(at, [str(light) for light in order])
+    else:
+        lights.set_xticks([])
+    for channel in range(3):
+        off = 100 * budget.expanded_cells[:, channel]
+        cells.plot(levels[:, channel], off, ".", color=CHANNEL_INK[channel], markersize=2, label="RGB"[channel])
+    cells.set(title="cells", xlabel="level, bare paper 1", ylabel="% of the level, k = 2", xscale="log", yscale="log")
+    cells.legend(frameon=False, fontsize=8)
+
+
+_BARS_APART = 40
+"""Lights up to which each has a bar of its own, and its number."""
 
 
 def _ring(axes: Any, x: float, y: float, text: str) -> None:

@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from calibration.budget import COVERAGE
 from calibration.checks.light_codes import CodeAgreement
 from calibration.figures.all_figures import BY_NAME, FIGURES
 from calibration.figures.figure import Worst
@@ -28,6 +29,7 @@ from calibration.report.plots import (
     WORST_CELLS,
     LabelledPlace,
     cell_noise,
+    draw_budget,
     draw_chromaticities,
     draw_course,
     draw_errors,
@@ -278,6 +280,15 @@ def _pictures(result: BuildResult, session: Session, worsts: Mapping[str, Worst]
             "cells",
         ),
         *_residual_picture(chart, table, frame),
+        Picture(
+            "What the ground truth may be off by",
+            f"Left: the expanded uncertainty (k = {COVERAGE:g}) of each light's direction, shared out among its causes "
+            "by their squares; lights in the order of it, the worst first. Right: that of each cell's mean by its "
+            "level, noise apart. " + "; ".join(f"{one.title}: {one.source}" for one in table.budget.components) + ".",
+            png_of(draw_budget, table.budget, table.cells.levels),
+            "truth",
+            "budget",
+        ),
     ]
 
 

@@ -5,12 +5,15 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Any
 
+import numpy as np
+
 from calibration.citation import bibtex, origin_lines
 from calibration.table.lut import (
     FRAMES,
     PROVENANCE,
     SAMPLES,
     SUMS,
+    UNCERTAINTY,
     Lut,
     Provenance,
     changed_files,
@@ -28,6 +31,17 @@ def _hashes(known: Provenance) -> str:
     if known.lights_sha256:
         return "ground truth and samples; the table is older than the list of every file"
     return "none: the table was made before they were recorded, so that changes are not noticed"
+
+
+def _uncertainty(lut: Lut) -> str:
+    """Return in words what the ground truth may be off by."""
+    expanded = lut.truth_uncertainty_deg
+    if expanded is None:
+        return "not stated: the table was computed, or made before it was"
+    return (
+        f"{np.median(expanded):.2g}° median, {expanded.max():.2g}° worst light ({int(np.argmax(expanded))}), k = 2; "
+        f"causes in {UNCERTAINTY}"
+    )
 
 
 def describe(lut: Lut) -> list[tuple[str, str]]:
@@ -68,6 +82,7 @@ def describe(lut: Lut) -> list[tuple[str, str]]:
             f"{brightest.min():.0f} to {brightest.max():.0f} in the brightest channel, saturation {known.white_level}",
         ),
         ("Chromaticities", chromaticities),
+        ("Uncertainty", _uncertainty(lut)),
         (
             "Cells unfit",
             f"{len(known.unfit)} of {8**known.bits}"
