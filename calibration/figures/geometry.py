@@ -31,7 +31,6 @@ from calibration.registration.register import (
     MIN_GOOD_BLOCKS,
 )
 from calibration.sampling import SAFE_BLEED, bleed, largest_window
-from calibration.spread.fitting import MOST_MISFIT
 from experiment.framing.finding import MIN_TAG_SHARE
 from experiment.framing.pictures import MIN_CELL_PX
 
@@ -146,10 +145,9 @@ BLEED = Figure(
 
 
 def _left_by_lens(table: TableMeasurements) -> float | None:
-    # Smooth light that is no lens's, as a reflection, has figures of its own; few cells cannot tell it from a veil.
-    spread, cells = table.point_spread, len(table.registration.mismatched_cells)
-    separable = spread is None or spread.misfit <= MOST_MISFIT or cells >= _LEAST_CELLS
-    return table.lens.left if table.lens.measured and separable else None
+    # What few cells cannot show of a lens is in the uncertainty of each light and cell; nothing can be done about it.
+    shown = len(table.registration.mismatched_cells) >= _LEAST_CELLS or table.lens.is_left_in
+    return table.lens.left if table.lens.measured and shown else None
 
 
 def _left_in_worst_cell(table: TableMeasurements) -> float | None:

@@ -298,6 +298,9 @@ def draw_budget(figure: Any, budget: Budget, levels: _Array) -> None:
         off = 100 * budget.expanded_cells[:, channel]
         cells.plot(levels[:, channel], off, ".", color=CHANNEL_INK[channel], markersize=2, label="RGB"[channel])
     cells.set(title="cells", xlabel="level, bare paper 1", ylabel="% of the level, k = 2", xscale="log", yscale="log")
+    for axis in (cells.xaxis, cells.yaxis):
+        axis.set_major_formatter("{x:g}")
+        axis.set_minor_formatter("")
     cells.legend(frameon=False, fontsize=8)
 
 

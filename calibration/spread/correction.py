@@ -221,6 +221,11 @@ class LensFigures:
         return max(self.left_in_worst, 0.0) if self.corrected else self.beyond_cell
 
     @property
+    def is_left_in(self) -> bool:
+        """Whether spread that the print shows is not corrected."""
+        return self.measured and not self.corrected and self.beyond_cell > 0
+
+    @property
     def left(self) -> float:
         """RMS error that the lens leaves in the means of cells, relative to paper."""
         return self._left(self.rms, self.residual)
