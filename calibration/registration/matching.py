@@ -286,6 +286,10 @@ class Anchors:
         """Return those chosen (N,)."""
         return Anchors(self.points_mm[chosen], self.places_px[:, chosen], self.information[:, chosen])
 
+    def known_to(self, factor: float) -> Anchors:
+        """Return them with standard errors a factor times as large."""
+        return Anchors(self.points_mm, self.places_px, self.information / factor**2)
+
     def pull(self, expected_px: _Array) -> _Array:
         """Return information times the distance (3, N, 2) float64 px⁻¹ from places (3, N, 2) expected."""
         return np.einsum("cnij,cnj->cni", self.information, self.places_px - expected_px)

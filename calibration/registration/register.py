@@ -69,6 +69,9 @@ at most: the map's own error. A curled rim comes last, when the RMS shows nothin
 _TAG_SIGMA_PX = 0.15
 """Standard error of a tag's corner: 0.085 px measured in white light, .20 in a weak one."""
 
+_LEAST_TAG_SIGMA_PX = 0.03
+"""The same at best: what the detector leaves in the sharpest frames."""
+
 _OUTLINE_SIGMA_PX = 0.1
 """Standard error of a point of the outline, across it (judgement)."""
 
@@ -202,6 +205,9 @@ def register(
             f"{what}: the {'tags' if chart.tags else 'edges of the field'} lie {lens_rms:.1f} px RMS off a plane seen "
             f"through a lens, {MAX_TAG_RESIDUAL_PX:g} allowed; hang the print flat, and see that it is this chart's"
         )
+    if chart.tags:
+        # Corners that the lens alone places better than usual are known as well as that; waves of a sheet hide it.
+        marks = marks.known_to(float(np.clip(2 * lens_rms, _LEAST_TAG_SIGMA_PX, _TAG_SIGMA_PX)) / _TAG_SIGMA_PX)
     cell_px = _cell_px(lens, chart)
     _require_size_and_focus(cell_px, blur, what)
     matcher = Matcher(chart, planes, lens, marks, lateral, blur, cell_px)
