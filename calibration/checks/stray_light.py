@@ -27,9 +27,10 @@ import numpy.typing as npt
 CERTAIN = 4.0
 """Standard errors that are taken off each amount, so that noise is not taken for light."""
 
-BOOSTED = 0.02
-"""Share by which white may exceed the primaries' sum for lights of several primaries to be judged: from there on the
-projector adds light of its own making where primaries overlap, which need not be a sum of theirs."""
+BOOST_ELSEWHERE = 0.25
+"""Share of what white has beyond the primaries' sum that lights of two primaries may have of the third: a projector that
+adds light where primaries overlap adds mostly theirs. What is wrong with the primaries' frames looks like such a boost,
+so that the check becomes less sharp by it, but never switches itself off (judgement)."""
 
 _LARGEST = 0.1
 """Amount beyond which it is no light of a room, but another light's frame or another exposure, which other figures
@@ -130,9 +131,9 @@ def stray_light(
     full = full_white @ inverse
     checked = np.ones(len(codes), dtype=np.bool_)
     checked[list(primaries)] = False
-    if len(full) and float(full.max()) > 1 + BOOSTED:
-        checked &= lights_of.sum(axis=1) <= 1
-    beyond = np.where(~lights_of & checked[:, None], np.maximum(np.abs(amounts) - CERTAIN * spread, 0), 0.0)
+    boost = max(float(full.max()) - 1, 0.0) if len(full) else 0.0
+    allowed = CERTAIN * spread + np.where(lights_of.sum(axis=1) > 1, BOOST_ELSEWHERE * boost, 0.0)[:, None]
+    beyond = np.where(~lights_of & checked[:, None], np.maximum(np.abs(amounts) - allowed, 0), 0.0)
     # All amounts of a light of another name or exposure are off, by far more.
     beyond[(beyond > _LARGEST).any(axis=1)] = 0
     zero = np.where(~lights_of & checked[:, None], np.abs(amounts), -1.0)

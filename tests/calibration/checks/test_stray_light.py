@@ -108,10 +108,17 @@ def test_lights_without_a_code_of_zero_are_not_checked() -> None:
     assert stray.to_json()["at_zero_codes"][WARM] is None
 
 
-def test_where_white_is_brightened_lights_of_one_primary_are_checked_still() -> None:
+def test_where_white_is_brightened_lights_with_a_code_of_zero_are_checked_still() -> None:
     stray = found(boost=0.3, stray={DIM: 0.01})
     assert stray.lights_beyond(0.004) == [DIM]
-    assert stray.checked.sum() == 1
+    assert stray.checked.sum() == 5
+
+
+def test_what_looks_like_a_boost_does_not_switch_the_check_off() -> None:
+    """Light in a primary's frame, the more of it the worse: never less is said of it."""
+    shares = [found(stray={0: amount}).share for amount in (0.005, 0.01, 0.02, 0.04)]
+    assert np.all(np.diff(shares) > 0)
+    assert shares[-1] > 0.01
 
 
 def test_what_cannot_be_known_is_not_said() -> None:
