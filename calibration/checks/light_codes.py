@@ -434,8 +434,6 @@ class CodeAgreement:
         )
 
 
-# Its matrices are small: threads of the linear algebra wait for each other longer than they work.
-@threadpool_limits.wrap(limits=1, user_api="blas")
 def code_agreement(
     codes: npt.NDArray[np.integer], white: _Array, error: _Array, *, dark_known: bool, drift_known: bool
 ) -> CodeAgreement:
@@ -445,7 +443,9 @@ def code_agreement(
     exposed alike, the lamp's drift and what is there at black taken off. `error`: (L, 3) float64 counts, standard
     errors.
     """
-    fit, swapped, misfit = _fitted(np.asarray(codes), white, error, dark_known=dark_known, drift_known=drift_known)
+    # Its matrices are small: threads of the linear algebra wait for each other longer than they work.
+    with threadpool_limits(limits=1, user_api="blas"):
+        fit, swapped, misfit = _fitted(np.asarray(codes), white, error, dark_known=dark_known, drift_known=drift_known)
     count = len(white)
     mean, spread = fit.predicted(np.arange(count)[:, None])
     angle, deviation, error_deg = _directions(mean, spread, white)

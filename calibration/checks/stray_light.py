@@ -28,9 +28,9 @@ CERTAIN = 4.0
 """Standard errors that are taken off each amount, so that noise is not taken for light."""
 
 BOOST_ELSEWHERE = 0.25
-"""Share of what white has beyond the primaries' sum that lights of two primaries may have of the third: a projector that
-adds light where primaries overlap adds mostly theirs. What is wrong with the primaries' frames looks like such a boost,
-so that the check becomes less sharp by it, but never switches itself off (judgement)."""
+"""Share of what white has beyond the primaries' sum that lights of two primaries may have of the third: a projector
+that adds light where primaries overlap adds mostly theirs. What is wrong with the primaries' frames looks like such a
+boost, so that the check becomes less sharp by it, but never switches itself off (judgement)."""
 
 _LARGEST = 0.1
 """Amount beyond which it is no light of a room, but another light's frame or another exposure, which other figures

@@ -201,7 +201,7 @@ def _adds(seen: _Array) -> bool:
     """Return whether the primaries make the light: amounts (3,) solved for in the brightest patches are alike."""
     bright = seen[0].sum(axis=1) >= np.quantile(seen[0].sum(axis=1), 0.8)
     together, *alone = seen[:, bright].mean(axis=1)
-    amounts = np.linalg.lstsq(np.array(alone).T, together, rcond=None)[0]
+    amounts: _Array = np.asarray(np.linalg.lstsq(np.array(alone).T, together, rcond=None)[0], dtype=np.float64)
     return bool(np.ptp(amounts) <= _ADDS and abs(float(amounts.mean()) - 1) <= 5 * _ADDS)
 
 

@@ -108,7 +108,7 @@ def _bumps(places_mm: _Array) -> _Array:
     """Return smooth bumps (C, K) all over the page, each as wide as they are apart."""
     low, high = places_mm.min(axis=0), places_mm.max(axis=0)
     apart = float((high - low).max()) / (_KNOTS - 1)
-    axes = [np.linspace(a, b, max(round((b - a) / apart), 1) + 1) for a, b in zip(low, high, strict=True)]
+    axes: list[_Array] = [np.linspace(a, b, max(round((b - a) / apart), 1) + 1) for a, b in zip(low, high, strict=True)]
     x, y = (np.exp(-0.5 * ((places_mm[:, n, None] - axes[n]) / apart) ** 2) for n in range(2))
     return (y[:, :, None] * x[:, None, :]).reshape(len(places_mm), -1)
 
@@ -116,17 +116,17 @@ def _bumps(places_mm: _Array) -> _Array:
 def _likeliest(value: _Array, design: _Array, bumps: int) -> tuple[_Array, _Array]:
     """Return the bumps' heights (K,) and their covariance for the size of added light that is likeliest."""
     normal, right = design.T @ design, design.T @ value
-    best = (-np.inf, np.zeros(0), np.zeros((0, 0)))
+    best, heights, spread = -np.inf, np.zeros(bumps), np.zeros((bumps, bumps))
     for size in _SIZES:
         prior = np.full(len(right), _USUAL_FACTOR**-2)
         prior[:bumps] = size**-2
         matrix = normal + np.diag(prior)
-        covariance = np.linalg.inv(matrix)
-        solution = covariance @ right
+        covariance: _Array = np.asarray(np.linalg.inv(matrix), dtype=np.float64)
+        solution: _Array = covariance @ right
         evidence = 0.5 * (float(right @ solution) - float(np.linalg.slogdet(matrix)[1]) + float(np.log(prior).sum()))
-        if evidence > best[0]:
-            best = evidence, solution[:bumps], covariance[:bumps, :bumps]
-    return best[1], best[2]
+        if evidence > best:
+            best, heights, spread = evidence, solution[:bumps], covariance[:bumps, :bumps]
+    return heights, spread
 
 
 def _scatter(left: _Array, level: _Array) -> _Array:
