@@ -202,6 +202,8 @@ class LightMeasurements:
       or of all. None without.
     - `drift`: how the lights are brought to one lamp in the table; None where that was not asked for. All else is as
       measured.
+    - `of_primaries`: (3,) float64, how much of red, green and blue alone full white has, 1 where it adds; None where a
+      frame that is needed is missing.
     - `stray`: light in frames that the dark ones do not show; None without the three primaries each alone or a dark
       frame.
     """
@@ -216,6 +218,7 @@ class LightMeasurements:
     white_frames: CodeAgreement | None
     drift: DriftCorrection | None = None
     stray: StrayLight | None = None
+    of_primaries: _Array | None = None
 
     @property
     def off_codes_deg(self) -> _Array | None:
@@ -343,6 +346,13 @@ class TableMeasurements:
     point_spread: PointSpread | None
     origin: OriginRecord
     budget: Budget
+
+    @property
+    def primary_lights(self) -> tuple[int, ...]:
+        """Lights of red, green and blue alone at their full, by their numbers; () where one is missing."""
+        found = {codes: light for light, codes in enumerate(self.session.codes)}
+        alone = ((255, 0, 0), (0, 255, 0), (0, 0, 255))
+        return tuple(found[codes] for codes in alone) if found.keys() >= set(alone) else ()
 
     @property
     def white_frames(self) -> tuple[FrameMeasurements, ...]:

@@ -479,12 +479,43 @@ def light_evidence(table: TableMeasurements, limit: float) -> Gathered:
 def drift_evidence(table: TableMeasurements, limit: float) -> Gathered:
     """Return what is known of white frames that differ: their exposures, or what lies on the print in one."""
     light = light_evidence(table, limit)
+    scatter = _colour_scatter(table)
+    light = replace(light, evidence=replace(light.evidence, colour_scatter=scatter, cameras=1.0))
     worst = max(table.white_frames, key=lambda frame: frame.consistency.block, default=None)
     if worst is None or light.frames or not worst.consistency.block > _DISTURBED:
         return light
     block = _block_of(table, worst, _DISTURBED)
     known = block.evidence.known() | light.evidence.known() | {"frames": block.evidence.frames}
     return Gathered(Evidence(**known), block.frames, block.places)
+
+
+def sum_evidence(table: TableMeasurements, limit: float) -> Gathered:
+    """Return what is known of primaries that do not add up to white: whether it is one of them, and its frame."""
+    light, off = light_evidence(table, limit), table.lights.of_primaries
+    if light.frames or off is None:
+        return light
+    middle = float(np.median(off))
+    one = int(np.argmax(np.abs(off - middle)))
+    others = float(np.ptp(np.delete(off, one)))
+    lone = abs(float(off[one]) - middle)
+    if not lone > 3 * others:
+        return light
+    frames = tuple(frame.record for frame in table.frames if frame.record.illumination == table.primary_lights[one])
+    return Gathered(replace(light.evidence, lone_primary=lone), frames, ())
+
+
+def _colour_scatter(table: TableMeasurements) -> float:
+    """Return the scatter of white's colour from one white frame to the next, of three or more; else 0.
+
+    Nothing where it drifts rather: where it goes further than it scatters.
+    """
+    white = np.log([frame.paper.white for frame in table.white_frames]).reshape(-1, 3)
+    if len(white) < 3:
+        return 0.0
+    colour = white[:, [0, 2]] - white[:, [1]]
+    bends = colour[1:-1] - (colour[:-2] + colour[2:]) / 2
+    scatter = float(np.sqrt((bends**2).mean() / 1.5))
+    return scatter if scatter > np.abs(colour[-1] - colour[0]).max() / len(colour) else 0.0
 
 
 def name_evidence(table: TableMeasurements, limit: float) -> Gathered:

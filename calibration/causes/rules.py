@@ -135,13 +135,28 @@ ROOM_LIGHT = Cause(
     "darken the room, cover lamps and displays, keep daylight out",
     "session",
 )
+OTHER_BRIGHTNESS = Cause(
+    "one primary's frame",
+    "less or more light in the frame of one primary alone than in the others: a shadow, a hand at the projector, a "
+    "lamp that flickered, another exposure",
+    "take that frame again, and see that nobody stands in the projector's light",
+    "frames",
+)
+COLOUR_WHEEL = Cause(
+    "colour wheel",
+    "the projector's colour wheel: exposures end within a turn, so that frames hold more of one primary than of "
+    "another",
+    "expose whole turns of the wheel, half a second and more (camera.shutter_s a multiple of 1 / colour_wheel_hz), or "
+    "take a projector without a wheel",
+    "session",
+)
 UNKNOWN = Cause("unknown", "", "", "nothing")
 """What was measured does not decide; the remedy is then that of the limit."""
 
 CAUSES = (
     HOT_PHOTOSITES, OBJECT_IN_FRAME, REFLECTION, REFLECTION_IN_FRAME, STAIN, SHADOW, CURL, FALL_OFF, SPREAD, BUMP,
     DEFOCUS, ANOTHER_PRINT, WRONG_NAME,
-    OTHER_CAMERA, OTHER_EXPOSURE, ROOM_LIGHT, UNKNOWN,
+    OTHER_CAMERA, OTHER_EXPOSURE, ROOM_LIGHT, OTHER_BRIGHTNESS, COLOUR_WHEEL, UNKNOWN,
 )  # fmt: skip
 """All of them."""
 
@@ -184,6 +199,8 @@ class Evidence:
     - `room_change`: change of it between dark frames, of white.
     - `stray`: light of a primary under a code of 0 that no dark frame shows, of that primary, the worst light.
     - `stray_primaries`: light of the primaries' frames together beyond white's, alike in each, of white.
+    - `lone_primary`: how differently much of one primary white has than of the other two, which are alike, relative.
+    - `colour_scatter`: scatter of white's colour from one white frame to the next, relative, over what its drift makes.
     - `other_iso`: frames of another ISO speed than most, by their files.
     - `misplaced`: share of the unfit cells whose place is not known well enough.
     - `uneven`: share of the unfit cells whose rim and middle differ.
@@ -220,6 +237,8 @@ class Evidence:
     room_change: float = NAN
     stray: float = NAN
     stray_primaries: float = NAN
+    lone_primary: float = NAN
+    colour_scatter: float = NAN
     other_iso: float = NAN
     misplaced: float = NAN
     uneven: float = NAN
@@ -332,6 +351,18 @@ RULES: tuple[Rule, ...] = (
         _about("iso"),
         (Condition("other_iso", 1, _FAR),),
         "the file states another ISO speed than the others'",
+    ),
+    Rule(
+        COLOUR_WHEEL,
+        DRIFT,
+        (Condition("colour_scatter", 0.002, _FAR), Condition("cameras", 1, 1)),
+        "white's colour goes to and fro from one white frame to the next, as no lamp drifts",
+    ),
+    Rule(
+        OTHER_BRIGHTNESS,
+        _about("sum"),
+        (Condition("lone_primary", 0.01, _FAR),),
+        "white has more or less of one primary than of the other two",
     ),
     Rule(
         WRONG_NAME,

@@ -16,6 +16,7 @@ from calibration.causes.gathering import (
     light_evidence,
     name_evidence,
     stray_evidence,
+    sum_evidence,
 )
 from calibration.checks.stray_light import CERTAIN
 from calibration.figures.figure import (
@@ -81,12 +82,42 @@ def _are_named_right(table: TableMeasurements) -> bool:
     return named and _are_alike(table)
 
 
+def _has_drift(table: TableMeasurements) -> bool:
+    """Return whether two white frames were taken, and not one file twice."""
+    return len({frame.record.sha256 for frame in table.white_frames}) > 1
+
+
+def _repeated(table: TableMeasurements) -> float:
+    files = [frame.record.sha256 for frame in table.frames]
+    return float(len(files) - len(set(files)))
+
+
+def _repeated_files(table: TableMeasurements, accepted: float) -> str:
+    seen: dict[str, str] = {}
+    again = [
+        f"{frame.record.file} is {seen[frame.record.sha256]}"
+        for frame in table.frames
+        if seen.setdefault(frame.record.sha256, frame.record.file) != frame.record.file
+    ]
+    return first_of(again)
+
+
+REPEATED_FILES = Figure(
+    "repeated_files", "Frames whose file is that of another frame", "light", "", "at most", 0.0, None,
+    why="one photograph stands for several: what changed between them, as the lamp's drift, was not seen",
+    source="no two exposures have the same bytes", remedy="correct the list of frames that was imported",
+    measure=_repeated, forecast=ONLY_OF_A_SESSION,
+    worst=NO_PLACE, where=_repeated_files, retake=NO_FRAMES, cause=NO_CAUSE,
+    drawing=NOT_DRAWN, lines=NO_LINES,
+)  # fmt: skip
+
+
 def _white_drift(table: TableMeasurements) -> float | None:
-    return table.white_drift if len(table.white_frames) > 1 and table.lights.drift is None else None
+    return table.white_drift if _has_drift(table) and table.lights.drift is None else None
 
 
 def _drift_row(table: TableMeasurements) -> SummaryRow | None:
-    if len(table.white_frames) < 2:
+    if not _has_drift(table):
         return None
     return SummaryRow("Drift of white", percent(table.white_drift), "between white frames; 1 % is usual", brief=True)
 
@@ -122,7 +153,7 @@ DRIFT_LEFT = Figure(
 
 def _white_drift_deg(table: TableMeasurements) -> float | None:
     white = np.array([frame.paper.white for frame in table.white_frames])
-    return float(angles_deg(white, np.broadcast_to(white[0], white.shape)).max()) if len(white) > 1 else None
+    return float(angles_deg(white, np.broadcast_to(white[0], white.shape)).max()) if _has_drift(table) else None
 
 
 WHITE_DRIFT_DEG = Figure(
@@ -319,7 +350,7 @@ def _beyond_sum(sign: int) -> Callable[[TableMeasurements], float | None]:
 
 
 def _sum_evidence(table: TableMeasurements, limit: float) -> Gathered:
-    light = light_evidence(table, limit)
+    light = sum_evidence(table, limit)
     return light if light.frames else name_evidence(table, OFF_CODES_DEG.accept)
 
 

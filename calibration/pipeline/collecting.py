@@ -161,13 +161,15 @@ def _light_figures(done: Accumulator, by_light: Sequence[FrameMeasurements]) -> 
     agreement = _code_agreement(
         illuminations, by_light, compared, dark, gains if len(compared) < 2 else np.ones_like(gains)
     )
+    added = additivity(illuminations, white, full_white, dark, gains)
     return LightMeasurements(
         white=white,
         white_error=error,
         gains=gains,
         subtracted=np.array([frame.dark for frame in by_light]) if options.subtract_dark else None,
         share_at_zero=np.array([frame.share_at_zero for frame in by_light]),
-        additivity=additivity(illuminations, white, full_white, dark, gains),
+        additivity=None if added is None else added[0],
+        of_primaries=None if added is None else added[1],
         codes=agreement.rows(slice(len(by_light))),
         white_frames=agreement.rows(slice(len(by_light), None)) if whites else None,
         stray=_stray_light(illuminations, by_light, whites, dark, gains),

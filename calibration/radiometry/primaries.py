@@ -33,8 +33,8 @@ _LARGEST = 0.2
 
 def additivity(
     lights: Sequence[Illumination], white: _Array, full_white: _Array | None, dark: _Array, gains: _Array
-) -> _Array | None:
-    """Return by how much the primaries together differ from white, per channel, relative to white.
+) -> tuple[_Array, _Array] | None:
+    """Return by how much the primaries together differ from white, relative to white, and how much of each it has.
 
     red + green + blue − 2 black = white where light adds: each of the three brings the projector's black along. A
     projector with a white segment on its wheel, or one that processes colours, gives more or less. It harms no table,
@@ -43,7 +43,8 @@ def additivity(
     `lights`: L lights; used are the three with one full primary, and full white if `full_white` is None. `white`: (L,
     3) their ground truths. `full_white`: (3,) paper under full white from the white frames, None without. `dark`: (3,)
     paper in the dark frames; zeros where already subtracted. `gains`: (L, 3) the lamp's drift at each light, of which
-    white frames are free; `drift_gains`. Returns (3,) float64; None when a primary or white is missing.
+    white frames are free; `drift_gains`. Returns (3,) float64 by channel, and (3,) by primary, 1 where white adds; None
+    when a primary or white is missing.
     """
     found: dict[tuple[int, int, int], _Array] = {}
     for light in lights:
@@ -53,7 +54,9 @@ def additivity(
     red, green, blue = primaries
     if total is None or red is None or green is None or blue is None or not np.isfinite(dark).all():
         return None
-    return (red + green + blue - 2 * dark) / total - 1
+    alone = np.stack([red, green, blue]) - dark
+    amounts = np.linalg.lstsq(alone.T, total - dark, rcond=None)[0]
+    return (red + green + blue - 2 * dark) / total - 1, np.asarray(amounts, dtype=np.float64)
 
 
 def drift_gains(at_s: _Array, white_at_s: _Array, white: _Array) -> _Array:

@@ -20,6 +20,8 @@ from tests.calibration.lab import SETTINGS, hang, renumbered, take
 
 PRIMARIES = ((255, 0, 0), (0, 255, 0), (0, 0, 255))
 
+_Array = npt.NDArray[np.float64]
+
 
 def lights(codes: tuple[tuple[int, int, int], ...]) -> list[Illumination]:
     return [Illumination(number, "uniform", None, Colour(*code)) for number, code in enumerate(codes)]
@@ -29,12 +31,20 @@ def test_light_adds_but_for_the_black_that_each_brings_along() -> None:
     black, parts = np.array([3.0, 5.0, 4.0]), np.array([[3000.0, 700, 90], [400, 6000, 500], [80, 900, 4000]])
     white = black + parts.sum(axis=0)
     even = np.ones((3, 3))
-    found = additivity(lights(PRIMARIES), parts + black, white, black, even)
-    assert found == pytest.approx(np.zeros(3), abs=1e-9)
-    boosted = additivity(lights(PRIMARIES), parts + black, 1.25 * white, black, even)
-    assert boosted == pytest.approx(np.full(3, -0.2), abs=1e-3)
-    dimmed = additivity(lights(PRIMARIES), 0.9 * (parts + black), white, black, 0.9 * even)
-    assert dimmed == pytest.approx(np.zeros(3), abs=1e-9)
+
+    def told(seen: _Array, full_white: _Array, gains: _Array = even) -> tuple[_Array, _Array]:
+        found = additivity(lights(PRIMARIES), seen, full_white, black, gains)
+        assert found is not None
+        return found
+
+    beyond, amounts = told(parts + black, white)
+    assert beyond == pytest.approx(np.zeros(3), abs=1e-9)
+    assert amounts == pytest.approx(np.ones(3))
+    assert told(parts + black, 1.25 * white)[0] == pytest.approx(np.full(3, -0.2), abs=1e-3)
+    assert told(0.9 * (parts + black), white, 0.9 * even)[0] == pytest.approx(np.zeros(3), abs=1e-9)
+    # A shadow in the frame of green alone: white has more of green than that frame.
+    shadowed = parts * np.array([[1.0], [0.9], [1.0]]) + black
+    assert told(shadowed, white)[1] == pytest.approx([1, 1 / 0.9, 1])
 
 
 def test_a_missing_primary_leaves_it_untold() -> None:
