@@ -35,7 +35,7 @@ from foundation.errors import InputError, RegistrationError
 MIN_TAGS = 2
 """Tags without which no homography is looked for: two give eight points, twice as many as one needs."""
 
-MIN_TAG_SHARE = 0.8
+MIN_TAG_SHARE = 0.75
 """Share of the chart's tags that must be found; fewer mean that part of the chart is covered, dark or outside."""
 
 MIN_MODULE_PX = 3.0
