@@ -299,6 +299,15 @@ class ImageOptions:
         ),
     ] = "table"
     preview: Annotated[bool, option(None, "Write tone-mapped previews.", _IMAGES)] = True
+    uncertainty: Annotated[
+        bool,
+        option(
+            None,
+            "Add to ground_truth.csv what each light's direction may be off by, in degrees (k = 2), as the table "
+            "states it.",
+            _IMAGES,
+        ),
+    ] = False
     contact_sheet: Annotated[
         Path | None,
         option("PATH", "Write a page of previews to this PNG file; with --verify of a dataset that is there.", _IMAGES),
@@ -318,6 +327,7 @@ class ImageOptions:
             split_exact=self.exact_split,
             bits=self.bits,
             scale=self.scale,
+            uncertainty=self.uncertainty,
             shard_images=shard_images,
             variation=variation,
             crops=crops,

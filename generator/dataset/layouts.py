@@ -37,6 +37,7 @@ from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from pathlib import Path
+from statistics import median
 from string import Template
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, BinaryIO, Final, Protocol, Self, cast
@@ -762,6 +763,18 @@ OPEN: Final = "**TO BE ANSWERED BY THE LAB.**"
 """What stands where only the makers of a dataset know the answer."""
 
 
+def uncertainty_of(description: Description) -> str:
+    """Return in a sentence how well the lights are known."""
+    known = [light.uncertainty_deg for light in description.lights if light.uncertainty_deg is not None]
+    if not known:
+        return "The table does not state what its lights may be off by."
+    return (
+        f"By the table's uncertainty budget the directions of its lights are known to {median(known):.2g}° in the "
+        f"median and {max(known):.2g}° at worst (expanded uncertainty, k = 2, about 95 % of lights; `uncertainty_deg` "
+        "in `dataset.json`). Differences between methods below that are none."
+    )
+
+
 def datasheet(description: Description) -> str:
     """Return the text of DATASHEET.md."""
     template = Template((Path(__file__).parent / "datasheet.md").read_text("utf-8"))
@@ -800,6 +813,7 @@ def datasheet(description: Description) -> str:
         "table_name": table_name(description),
         "table_software": table.software,
         "truth": truth_of(description),
+        "uncertainty": uncertainty_of(description),
         "white_level": stored_white(description),
     }
     # The makers of the dataset are asked for whether or not those of the table are known.

@@ -42,6 +42,7 @@ from generator.dataset.records import (
     STRETCHED_VERSION,
     SUMS,
     TRUTHS,
+    UNCERTAINTY_COLUMN,
     VERSION,
     Description,
     Details,
@@ -548,7 +549,8 @@ def assemble(place: Workplace, identity: Mapping[str, Any]) -> None:
             if options["split"] is not None
         }
         sums = stack.enter_context(place.files.create(SUMS))
-        table.write(_row(GROUND_TRUTH_COLUMNS))
+        stated = bool(options.get("uncertainty"))
+        table.write(_row((*GROUND_TRUTH_COLUMNS, *([UNCERTAINTY_COLUMN] if stated else []))))
         listed.write(_row(SOURCE_COLUMNS))
         for record, fresh, left_out in _records(place, int(identity["shards"])):
             names = {source.position: source for source in record.sources}
@@ -558,10 +560,11 @@ def assemble(place: Workplace, identity: Mapping[str, Any]) -> None:
                 counts["pixels"] += source.width * source.height * int(options.get("crops", 1))
                 counts["replaced"] += source.replaced_pixels
             skipped += left_out
+            used.update((light.illumination, light) for light in record.lights)
             for image in record.images:
                 source = names[image.position]
                 name = f"{image_key(image.number)}{suffix}"
-                table.write(_image_rows(name, source.name, image))
+                table.write(_image_rows(name, source.name, image, used if stated else None))
                 truths.write("{:.9f} {:.9f} {:.9f}\n".format(*image.truth))
                 if image.details:
                     rendered.add(image.details, source.width * source.height)
@@ -575,7 +578,6 @@ def assemble(place: Workplace, identity: Mapping[str, Any]) -> None:
                 counts["images"] += 1
             for file in record.files:
                 sums.write(f"{file.sha256}  {file.name}\n".encode())
-            used.update((light.illumination, light) for light in record.lights)
         if not counts["images"]:
             raise NothingMadeError(
                 f"none of the {identity['sources']['count']} pictures can be used: all were "
@@ -662,7 +664,28 @@ def _source_row(source: SourceRecord) -> str:
     return _row((*known, source.split or "", source.profile or ""))
 
 
-def _image_rows(name: str, source: str, image: ImageRecord) -> str:
+def _image_rows(name: str, source: str, image: ImageRecord, stated: Mapping[int, Light] | None) -> str:
+    """Return the rows of an image's lights, with what each may be off by where the table's lights are given."""
     return "".join(
-        _row((name, source, light.illumination, *(f"{part:.9f}" for part in light.truth))) for light in image.lights
+        _row(
+            (
+                name,
+                source,
+                light.illumination,
+                *(f"{part:.9f}" for part in light.truth),
+                *([] if stated is None else [_uncertainty(light.illumination, stated)]),
+            )
+        )
+        for light in image.lights
     )
+
+
+def _uncertainty(label: str, lights: Mapping[int, Light]) -> str:
+    """Return the expanded uncertainty of a light by its label, degrees: of a mixture the largest of its parts'.
+
+    Errors of a table's lights have causes in common, so that they do not cancel in a mixture, and a mixture lies
+    between its parts. Nothing where the table does not state one.
+    """
+    parts = [lights[int(part.partition(":")[0])].uncertainty_deg for part in label.split("+")]
+    known = [part for part in parts if part is not None]
+    return f"{max(known):.4g}" if len(known) == len(parts) else ""

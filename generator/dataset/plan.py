@@ -95,6 +95,8 @@ class DatasetOptions:
         ``"table"`` stores counts as they are; ``"full"`` stretches them over 16 bits, see `generator.files`.
     split_exact
         Whether parts have exactly the sizes of `split`, and not on average.
+    uncertainty
+        Whether `ground_truth.csv` has what each light's direction may be off by, as the table states it.
 
     Raises
     ------
@@ -125,6 +127,7 @@ class DatasetOptions:
     bits: int | None = None
     scale: Scale = "table"
     split_exact: bool = False
+    uncertainty: bool = False
 
     @property
     def has_details(self) -> bool:
@@ -425,6 +428,8 @@ class Plan:
             recorded["scale"] = options.scale
         if options.split_exact:
             recorded["split_exact"] = True
+        if options.uncertainty:
+            recorded["uncertainty"] = True
         # A data set is published: addresses in it have no secrets.
         return json.loads(json.dumps(masked_values(recorded)))
 
@@ -491,7 +496,7 @@ def table_of(lut: Lut) -> TableRecord:
 
 def light_of(lut: Lut, light: int) -> Light:
     """Return the record of light number `light` of the table."""
-    shown = lut.illuminations[light]
+    shown, expanded = lut.illuminations[light], lut.truth_uncertainty_deg
     red, green, blue = (float(part) for part in lut.white[light])
     return Light(
         illumination=light,
@@ -500,4 +505,5 @@ def light_of(lut: Lut, light: int) -> Light:
         codes=shown.colour.codes,
         white=(red, green, blue),
         name=shown.name,
+        uncertainty_deg=None if expanded is None else float(f"{expanded[light]:.4g}"),
     )

@@ -23,6 +23,9 @@ take their images for more than six times as bright."""
 
 GROUND_TRUTH: Final = "ground_truth.csv"
 GROUND_TRUTH_COLUMNS: Final = ("image", "source", "illumination", "r", "g", "b")
+UNCERTAINTY_COLUMN: Final = "uncertainty_deg"
+"""Column of `ground_truth.csv` on request: what the light's direction may be off by, expanded (k = 2), degrees."""
+
 IMAGES: Final = "images.csv"
 SOURCES: Final = "sources.csv"
 SOURCE_COLUMNS: Final = ("position", "name", "sha256", "width", "height", "replaced_pixels", "split", "profile")
@@ -93,6 +96,7 @@ class Light(_RecordWithOptional):
     """A light of the table that was used; `codes` as projected, `white` the ground truth in linear camera RGB.
 
     Lights of a table that was computed under spectra of its own have a `name`, and codes that would show their colour.
+    `uncertainty_deg` is the expanded uncertainty (k = 2) of its direction, where the table states it.
     """
 
     illumination: int
@@ -101,6 +105,7 @@ class Light(_RecordWithOptional):
     codes: tuple[int, int, int]
     white: Triple
     name: str | None = None
+    uncertainty_deg: float | None = None
 
     @property
     def label(self) -> str:
