@@ -380,10 +380,14 @@ class Baseline:
 
     def dark_light_estimate(self) -> DarkLightEstimate:
         """Return the estimate of the dark light before any dark frame, with the reflectances of the first frame."""
+        inside = np.concatenate([self.first.cells.inside, self.first.references.inside])
+        return DarkLightEstimate.none(self.reflectances(), inside, self.options.samples)
+
+    def reflectances(self) -> _Array:
+        """Return the reflectance (C + W + N, 3) float64 of cells and references in the first frame, bare paper 1."""
         paper, shape = self.paper.read(self.whites, self.first.file)
         field = np.concatenate([shape, paper.field.at(self.points.references_mm)])
-        inside = np.concatenate([self.first.cells.inside, self.first.references.inside])
-        return DarkLightEstimate.none(reflectances(self.means, field, paper.white), inside, self.options.samples)
+        return reflectances(self.means, field, paper.white)
 
 
 def baseline_of(chart: Chart, first: DecodedFrame, options: BuildOptions = PAPER_OPTIONS) -> Baseline:
@@ -412,7 +416,8 @@ def with_lens(baseline: Baseline, first: DecodedFrame, primaries: Sequence[Decod
     frames = [frame for decoded in primaries if (frame := _spread_frame(baseline, decoded, view, False))]
     if not frames:
         frames = [frame for frame in (_spread_frame(baseline, first, view, True),) if frame]
-    found = measure_spread(frames, around, chart.page_mm, chart.bits, LEAST_COUNTS)
+    left_out = "" if baseline.options.lens_correction else "left out by --no-lens-correction"
+    found = measure_spread(frames, around, chart.page_mm, chart.bits, LEAST_COUNTS, left_out)
     if found is None:
         return baseline
     lens = LensCorrection(view, *found)
@@ -466,11 +471,8 @@ def lens_figures(baseline: Baseline) -> LensFigures:
     """Return what is said of the lens of a session, measured or not, corrected or not."""
     if baseline.lens is None:
         why = unsuitable(baseline.chart) or f"no channel of paper has {LEAST_COUNTS:g} counts in a frame to measure on"
-        return LensFigures.unknown(why)
-    figures = baseline.lens.figures
-    if not baseline.options.lens_correction and baseline.lens.spread.proven:
-        return replace(figures, corrected=False, why_not="left out by --no-lens-correction")
-    return figures
+        return LensFigures.unknown(why, baseline.reflectances()[: baseline.chart.colour_count])
+    return baseline.lens.figures
 
 
 def beyond_print(decoded: DecodedFrame, beyond: Sites) -> _Array:

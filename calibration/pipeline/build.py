@@ -92,7 +92,7 @@ REPORT_FILES = (REPORT_PAGE, REPORT_JSON)
 CHECKPOINT_EVERY = 16
 """Frames from one checkpoint to the next: what a build that is killed has to do again."""
 
-METHOD = 12
+METHOD = 13
 """Raised when samples, ground truth or unfit cells come out otherwise, so that no table is made by two methods."""
 
 CHECKPOINT_FORM = 2

@@ -22,10 +22,14 @@ from calibration.spread.fitting import (
     FAR_PX,
     NEAR_PX,
     PLACES,
+    TERMS,
+    USUAL_VEIL,
     VARYING_BITS,
     PointSpread,
     ReferenceData,
     SpreadData,
+    channels_alike,
+    far_groups,
     fit_spread,
     kernel_of_terms,
     place_terms,
@@ -54,6 +58,13 @@ _LEAST_REFERENCES = 3
 
 _FIELD_ORDER = 6
 """Highest order of the smooth change of white references by which a frame's field would change."""
+
+_LEAST_LEVEL = 1e-3
+"""Level, bare paper 1, below which a cell's relative error is that of such a cell."""
+
+_LOST = 0.5
+"""Standard deviation of the light that is lost beyond the frame, in parts of what the widest kernel has in it: r⁻² may
+have half as much again there, which darkens a channel and shows nowhere."""
 
 _Array = npt.NDArray[np.float64]
 
@@ -115,6 +126,7 @@ class PrintView:
             neighbours=self.neighbours,
             offset_px=np.ascontiguousarray(offset),
             pitch_px=pitch,
+            frame_slots=float(np.prod(self.frame_px) / pitch.prod(axis=1).mean()),
             places=place_terms(middle.astype(np.float64), self.frame_px),
             whites=self.whites,
             light=self.light,
@@ -127,21 +139,21 @@ class FrameCorrection:
 
     - `around`: the patches' surroundings.
     - `near`: weights of the near kernels.
-    - `far`, `veil`: shares of the far kernels (F,), and of the veil.
+    - `far`, `veil`: shares of the far kernels (3, F), and of the veil (3,), by channel.
     - `beyond`: places that show what lies behind the print.
     """
 
     around: Surroundings
     near: NearLight
     far: _Array
-    veil: float
+    veil: _Array
     beyond: Sites
 
     @staticmethod
     def of(spread: PointSpread, view: PrintView, around: Surroundings) -> FrameCorrection:
         """Return the correction for a point spread and the surroundings of a frame's patches."""
         amounts, near = spread.amounts(), len(NEAR_PX)
-        far, veil = amounts[0, 0, near:-1], float(amounts[0, 0, -1])
+        far, veil = amounts[0, :, near:-1], amounts[0, :, -1]
         return FrameCorrection(around, around.near(amounts[:, :, :near]), far, veil, view.beyond)
 
     def added(self, levels: FrameLevels) -> _Array:
@@ -150,10 +162,10 @@ class FrameCorrection:
         added = self.near.at(levels, inks) - self.near.total * levels.patches
         if self.far.any():
             image = around.image(levels, inks)
-            for share, scale in zip(self.far.tolist(), FAR_PX, strict=True):
-                if share:
+            for share, scale in zip(self.far.T, FAR_PX, strict=True):
+                if share.any():
                     added += share * (around.far(image, scale) - levels.patches)
-        if self.veil:
+        if self.veil.any():
             added += self.veil * (around.mean(levels, inks) - levels.patches)
         return added
 
@@ -179,7 +191,7 @@ class SpreadFrame:
     printed: npt.NDArray[np.int64] | None = None
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class LensFigures:
     """What the correction comes to under the light of the frames that it was measured on; cells above 300 counts.
 
@@ -188,10 +200,15 @@ class LensFigures:
       by the shares' standard errors, proven or not, and by what is likely of the veil but not subtracted.
     - `worst_level`: level of that cell, bare paper 1.
     - `veil`, `veil_error`: likeliest share of the frame's mean light that lies on all of it, subtracted or not, and its
-      standard error.
+      standard error, of the channel in which both may come to most.
     - `beyond_cell`: share of the light of a window's worst sample that the kernels bring from beyond its cell, channel
       by channel the largest.
     - `left_in_worst`: the same beyond that of the window's mean, which is what is corrected.
+    - `white_covariance`: (3, 3) float64, of the relative error that the lens leaves in the white of bare paper, the
+      ground truth, in R, G and B: by the shares' covariance, by all of what is likely but not subtracted, and by what
+      may be lost beyond the frame. An assumed one, of a usual veil, where the lens is not measured.
+    - `cells_error`: (C, 3) float64, relative standard error that it leaves in the means of cells, in the order of
+      colour indices, against that white, under the light that is brightest in the channel; by the same covariance.
     - `measured`, `corrected`: whether the lens could be measured on the print, and whether samples and ground truth are
       corrected by it.
     - `why_not`: why nothing was measured or nothing is corrected; "" where it is.
@@ -206,14 +223,35 @@ class LensFigures:
     veil_error: float
     beyond_cell: float
     left_in_worst: float
+    white_covariance: _Array
+    cells_error: _Array
     measured: bool = True
     corrected: bool = True
     why_not: str = ""
 
     @staticmethod
-    def unknown(why_not: str) -> LensFigures:
-        """Return the figures of a lens that could not be measured, and why."""
-        return LensFigures(*(0.0,) * 9, measured=False, corrected=False, why_not=why_not)
+    def unknown(why_not: str, levels: _Array) -> LensFigures:
+        """Return the figures of a lens that could not be measured, and why.
+
+        A veil of the usual size is assumed. `levels`: (C, 3) float64 of the cells, bare paper 1; NaN where not seen.
+        """
+        mean = np.nanmean(levels, axis=0)
+        levels = np.where(np.isfinite(levels), levels, mean)
+        white = USUAL_VEIL**2 * channels_alike() * np.outer(1 - mean, 1 - mean)
+        cells = USUAL_VEIL * mean * np.abs(1 / np.maximum(levels, _LEAST_LEVEL) - 1)
+        return LensFigures(
+            *(0.0,) * 9,
+            white_covariance=white,
+            cells_error=cells,
+            measured=False,
+            corrected=False,
+            why_not=why_not,
+        )
+
+    @property
+    def assumed(self) -> bool:
+        """Whether what is said of white and cells is of a usual lens, and not of this one."""
+        return not self.measured
 
     @property
     def uncorrected_in_worst(self) -> float:
@@ -247,6 +285,10 @@ class LensFigures:
         """Return the figures as `lut.json` and `report.json` state them."""
         shares = [one.name for one in fields(self) if isinstance(getattr(self, one.name), float)]
         found: dict[str, Any] = {name: float(f"{getattr(self, name):.4g}") for name in shares}
+        found |= {
+            "white_covariance": [[float(f"{value:.4g}") for value in row] for row in self.white_covariance.tolist()],
+            "assumed": self.assumed,
+        }
         return {"measured": self.measured, "corrected": self.corrected, "why_not": self.why_not, **found}
 
 
@@ -281,17 +323,24 @@ class LensCorrection:
 
 
 def measure_spread(
-    frames: list[SpreadFrame], around: Surroundings, page_mm: tuple[float, float], bits: int, least_counts: float
+    frames: list[SpreadFrame],
+    around: Surroundings,
+    page_mm: tuple[float, float],
+    bits: int,
+    least_counts: float,
+    left_out: str = "",
 ) -> tuple[PointSpread, LensFigures] | None:
     """Return the point spread that frames show, and its figures; None where no frame is bright enough.
 
     `least_counts`: counts of bare paper from which on a channel is used, and of a cell from which on figures count it.
+    `left_out`: why frames are not corrected by it though it is proven; "" where they are.
     """
     if not frames:
         return None
     count = 8**bits
     data: list[SpreadData] = []
     scales: list[_Array] = []
+    of_paper: dict[int, _Array] = {}
     references: list[ReferenceData] = []
     near = [around.near(_whole(kernel)) for kernel in range(len(NEAR_PX))]
     # Of each channel the frame in which it has most light.
@@ -303,7 +352,7 @@ def measure_spread(
         seen, inks = _seen(frame, around, near), around.inks(frame.levels)
         even = around.mean(frame.levels, inks)
         for channel in bright.tolist():
-            changes, gains = _changes(frame, around, seen, page_mm, bits, channel)
+            changes, gains, of_paper[channel] = _changes(frame, around, seen, page_mm, bits, channel)
             relative = frame.field[:count, channel] * frame.white[channel]
             level = frame.levels.patches[:count, channel] / relative
             usable = frame.usable[:count]
@@ -316,7 +365,9 @@ def measure_spread(
     if not data:
         return None
     spread = fit_spread(data, around.grid.points_mm[:count], page_mm, bits, references)
-    return None if spread is None else (spread, _figures(spread, data, scales, around, bits, least_counts))
+    if spread is None:
+        return None
+    return spread, _figures(spread, data, scales, of_paper, around, bits, least_counts, left_out)
 
 
 def _whole(kernel: int) -> _Array:
@@ -355,11 +406,12 @@ def _changes(
     page_mm: tuple[float, float],
     bits: int,
     channel: int,
-) -> tuple[_Array, _Array]:
-    """Return the change (T, P) of a channel's levels for a whole share of each unknown, and white's mean change (T,).
+) -> tuple[_Array, _Array, _Array]:
+    """Return what a whole share of each unknown changes in a channel.
 
-    What comes in, less what the white references get, since the field is fitted through them; their mean, by which
-    all levels change alike, is returned apart. `seen` is what `_seen` returns.
+    The change (T, P) of its levels: what comes in, less what the white references get, since the field is fitted
+    through them. Their mean (T,), by which all levels change alike. The relative change (T,) of white itself: that
+    mean, less what a patch loses. `seen` is what `_seen` returns.
     """
     count, points = 8**bits, around.grid.points_mm
     seen_levels = frame.levels.patches[:, channel]
@@ -374,11 +426,14 @@ def _changes(
     at_all = page_polynomial(points, page_mm, _white_order(len(whites)))
     terms = kernel_of_terms()
     coming, differs = np.empty((2, len(terms), len(points)))
+    lost = np.empty(len(terms))
     for term, (kernel, place) in enumerate(terms):
         light, own = (part[:, channel] for part in seen[kernel])
         np.divide(light - own * seen_levels, relative, out=coming[term])
         np.subtract(own, own[:count].mean(), out=differs[term])
+        lost[term] = 1 - own[:count].mean()
         if place is not None:
+            lost[term] *= around.places[whites, place].mean()
             coming[term] *= around.places[:, place]
             differs[term] *= around.places[:, place]
     of_white = (coming[:, whites] + differs[:, whites]).T
@@ -388,7 +443,7 @@ def _changes(
     differs -= smooth
     differs *= expected
     coming += differs
-    return coming, gains
+    return coming, gains, gains - lost
 
 
 def _seen(frame: SpreadFrame, around: Surroundings, near: list[NearLight]) -> list[tuple[_Array, _Array]]:
@@ -406,15 +461,19 @@ def _figures(
     spread: PointSpread,
     data: list[SpreadData],
     scales: list[_Array],
+    of_paper: dict[int, _Array],
     around: Surroundings,
     bits: int,
     least_counts: float,
+    left_out: str,
 ) -> LensFigures:
     amounts = spread.amounts()
     corrected: list[_Array] = []
     unknown: list[_Array] = []
     levels: list[_Array] = []
     mean_square = spread.unexplained
+    off_by = spread.off_by(np.zeros(TERMS)) if left_out else mean_square
+    cells: dict[int, _Array] = {}
     for one, scale in zip(data, scales, strict=True):
         expected = predicted_levels(one.level[:, None], bits)[:, 0]
         lit = one.usable & (one.level * scale[-1] > least_counts)
@@ -424,24 +483,43 @@ def _figures(
         corrected.append(change @ spread.shares[terms])
         unknown.append(((change @ mean_square[np.ix_(terms, terms)]) * change).sum(axis=1))
         levels.append(one.level[lit])
+        change = one.changes / np.maximum(one.level, _LEAST_LEVEL)[:, None] - scale[:-1]
+        cells[one.channel] = np.sqrt(((change @ off_by[np.ix_(terms, terms)]) * change).sum(axis=1))
     size, left, level = np.concatenate(corrected), np.concatenate(unknown), np.concatenate(levels)
     worst, mean = _beyond_cell(around)
     near = amounts[:, :, : len(NEAR_PX)]
     wide = amounts[:, :, len(NEAR_PX) :].sum(axis=2)
     nothing = len(size) == 0
+    subtracted = spread.proven and not left_out
+    veils = far_groups()[-1]
+    veil, veil_error = spread.likeliest[veils], np.sqrt(np.diag(spread.covariance)[veils])
+    largest = int(np.argmax(veil + 2 * veil_error))
+    # Of a channel that is too dark to measure on, what the brightest of the others has.
+    other = data[int(np.argmax([scale[-1] for scale in scales]))].channel
     return LensFigures(
         rms=0.0 if nothing else float(np.sqrt((size**2).mean())),
         worst=0.0 if nothing else float(np.abs(size).max()),
         residual=0.0 if nothing else float(np.sqrt(left.mean())),
         residual_worst=0.0 if nothing else float(np.sqrt(left.max())),
         worst_level=0.0 if nothing else float(level[np.argmax(left)]),
-        veil=float(spread.likeliest[-1]),
-        veil_error=float(spread.errors()[0, 0, -1]),
+        veil=float(veil[largest]),
+        veil_error=float(veil_error[largest]),
         beyond_cell=float((near @ worst + wide).max()),
         left_in_worst=float((near @ (worst - mean)).max()),
-        corrected=spread.proven,
-        why_not="" if spread.proven else "no spread beside the sharp core is proven",
+        white_covariance=_of_white(spread, off_by, [of_paper.get(channel, of_paper[other]) for channel in range(3)]),
+        cells_error=np.stack([cells.get(channel, cells[other]) for channel in range(3)], axis=1),
+        corrected=subtracted,
+        why_not="" if subtracted else left_out if spread.proven else "no spread beside the sharp core is proven",
     )
+
+
+def _of_white(spread: PointSpread, off_by: _Array, of_paper: list[_Array]) -> _Array:
+    """Return the covariance (3, 3) of paper white's relative errors, by its change (T,) for whole shares by channel."""
+    change = np.zeros((3, TERMS))
+    for channel in range(3):
+        change[channel, terms_of(channel)] = of_paper[channel]
+    lost = _LOST * spread.likeliest[far_groups()[-2]]
+    return change @ off_by @ change.T + np.outer(lost, lost)
 
 
 def _beyond_cell(around: Surroundings) -> tuple[_Array, _Array]:

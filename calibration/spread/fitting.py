@@ -13,17 +13,19 @@ Rules that hold inside:
 - Nothing that carries a cell's own noise is among the regressors: own levels are predicted ones there.
 - What the field's fit and the print's unevenness can be wrong by, smooth factors of a cell's level, is fitted along,
   and held near 0 by what is usual of them. Veil is told from it since it adds the same to dark and bright cells.
-- A far kernel's share is not below 0, and a kernel whose omission costs less than `LEAST_GAIN` is left out. The veil is
-  not: beside kernels that are proven it has its likeliest share, which `USUAL_VEIL` holds towards 0.
+- A far kernel's share is not below 0, and a kernel whose omission costs less than `LEAST_GAIN` is left out. What lies
+  far is not: beside kernels that are proven far ones and the veil have their likeliest shares, which what is usual of
+  lenses holds towards 0, and those of R, G and B towards each other.
 
 C cells in the order of colour indices; T unknowns of a channel.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
+from itertools import pairwise, product
 from typing import Any
 
 import numpy as np
@@ -36,8 +38,9 @@ NEAR_PX = (1.5, 3.0, 6.0)
 """σ of the near kernels, half-size px: from where a window of 25 pixels begins to see its neighbours to a slot's width;
 in steps of two, within which a smooth spread differs from their sum by less than what is measured."""
 
-FAR_PX = (12.0, 24.0, 96.0)
-"""σ of the far kernels: one slot, two, and a tenth of the chart's height. Wider ones are not told from the veil."""
+FAR_PX = (12.0, 24.0, 96.0, 384.0)
+"""σ of the far kernels: one slot, two, a tenth of a full chart's height, and the widest that it tells from a veil.
+Power laws, whose reach is all of the frame, are mixtures of them."""
 
 PLACES = 9
 """Terms of a near kernel's share over the frame: aberrations grow with the field angle, and a lens may be decentred, so
@@ -46,8 +49,10 @@ everywhere."""
 
 _NEAR_TERMS = PLACES * len(NEAR_PX)
 
-TERMS = 3 * _NEAR_TERMS + len(FAR_PX) + 1
-"""Unknowns: near kernels for each channel and term over the frame, far ones and the veil for all channels together."""
+_CHANNEL_TERMS = _NEAR_TERMS + len(FAR_PX) + 1
+
+TERMS = 3 * _CHANNEL_TERMS
+"""Unknowns: for each channel near kernels term by term over the frame, far ones, and the veil."""
 
 LEAST_GAIN = 16.0
 """By how much a kernel must lower the sum of squares, in units of its variance: a share of four standard errors. All
@@ -74,8 +79,9 @@ FOLDS = 4
 _PATCHWORK = 10
 """Parts of the page's width that belong to one fold each, so that every fold has cells all over the print."""
 
-_FACTOR_ORDER, _INK_ORDER = 4, 2
-"""Orders over the page of smooth factors of a level, and of a density of ink (its level times its logarithm)."""
+_SHAPE_ORDER, _FACTOR_ORDER, _INK_ORDER = 4, 6, 2
+"""Orders over the page of light that is no kernel's, of smooth factors of a level, as high as a field's, and of a
+density of ink (its level times its logarithm)."""
 
 _PRIOR_SHARE = 0.1
 """Standard deviation that a share is expected to have at most: keeps kernels solvable that the windows hardly see."""
@@ -83,6 +89,27 @@ _PRIOR_SHARE = 0.1
 USUAL_VEIL = 0.01
 """Standard deviation of the veil that lenses have before it is measured: 0.3 to 1.5 % by ISO 9358 and ISO 18844. Where
 a print is lit so evenly that it shows no veil, this is what is known of it."""
+
+_FAR_STEPS = (0.01, 0.01, 0.004, 0.003)
+"""Standard deviation of each far kernel's share before it is measured, beside what the one before lets expect."""
+
+_FAR_SIZES = (0.3, 1.0, 3.0)
+"""How much more than that lenses may have. Each is as likely beforehand, and is weighed by what the print shows."""
+
+_FAR_FALL = 0.5
+"""Part of a far kernel's share that the next is expected to have: of r⁻² all, of r⁻³ a quarter, of an exponential none.
+What is known of 24 px says something of 384 px, which charts of few colours do not show."""
+
+CHANNELS_APART = 1 / 3
+"""Standard deviation of a channel's far share against what R, G and B have in common, in parts of that: scatter and
+reflections at coated glass change that much over the visible spectrum (chosen)."""
+
+_APART = (0.03, CHANNELS_APART, 0.7)
+"""The same of lenses whose channels are alike, that differ, and whose coatings suit one channel."""
+
+_APART_ODDS = (0.5, 0.35, 0.15)
+"""How likely these are beforehand (chosen); weighed as `_FAR_SIZES` are, so that where the print shows no difference,
+hardly any is put into it."""
 
 MOST_VEIL = 0.02
 """Veil beyond which it is none where shares cannot change over the frame: the worst lens by ISO 9358, and half a
@@ -122,7 +149,7 @@ def kernel_names() -> list[str]:
     """Return the name of each kernel: σ in half-size px, and "veil".
 
     >>> kernel_names()
-    ['1.5', '3', '6', '12', '24', '96', 'veil']
+    ['1.5', '3', '6', '12', '24', '96', '384', 'veil']
     """
     return [*(f"{scale:g}" for scale in NEAR_PX + FAR_PX), "veil"]
 
@@ -139,7 +166,7 @@ def place_terms(places_px: npt.NDArray[np.floating], frame_px: tuple[int, int]) 
 
 def terms_of(channel: int) -> npt.NDArray[np.int64]:
     """Return which unknowns (T,) int64 hold in a channel: kernel by kernel, term by term, the veil last."""
-    return np.concatenate([np.arange(_NEAR_TERMS) + channel * _NEAR_TERMS, np.arange(3 * _NEAR_TERMS, TERMS)])
+    return np.arange(_CHANNEL_TERMS, dtype=np.int64) + channel * _CHANNEL_TERMS
 
 
 def kernel_of_terms() -> list[tuple[int, int | None]]:
@@ -157,13 +184,18 @@ def groups_of_terms() -> list[npt.NDArray[np.int64]]:
     found: list[npt.NDArray[np.int64]] = []
     for kernel, changing in sorted({(int(kernel), int(changing)) for kernel, changing in terms}):
         own = np.flatnonzero((terms[:, 0] == kernel) & (terms[:, 1] == changing))
-        found.append(np.unique(np.concatenate([terms_of(channel)[own] for channel in range(3)])))
+        found.append(np.concatenate([terms_of(channel)[own] for channel in range(3)]))
     return found
+
+
+def far_groups() -> list[npt.NDArray[np.int64]]:
+    """Return the unknowns (3,) int64 in R, G and B of each far kernel, and last of the veil."""
+    return groups_of_terms()[-len(FAR_PX) - 1 :]
 
 
 def free_terms() -> npt.NDArray[np.bool_]:
     """Return which unknowns, (n,) bool of all, may be of either sign: near kernels', which the print shows clearly."""
-    return np.arange(TERMS) < 3 * _NEAR_TERMS
+    return np.arange(TERMS) % _CHANNEL_TERMS < _NEAR_TERMS
 
 
 @dataclass(frozen=True, eq=False)
@@ -171,7 +203,8 @@ class PointSpread:
     """What a lens spreads beside its sharp core, as measured on the print.
 
     - `shares`: (TERMS,) float64, unknowns as `terms_of` has them, by which frames are corrected: 0 where a kernel is
-      not proven, all of them where none is. Every lens has a veil: beside a proven kernel it has its likeliest share.
+      not proven, all of them where none is. Every lens has far light: beside a proven kernel it has its likeliest
+      shares.
     - `covariance`: (TERMS, TERMS) float64, of all unknowns measured together, proven or not.
     - `gain`: by how much the kernels lower the sum of squares of what cells of known colour differ by, in units of its
       variance: what chance gives is one for each unknown; the proven ones'.
@@ -194,7 +227,11 @@ class PointSpread:
 
         Of what is likely but not subtracted the standard errors alone would say too little.
         """
-        left_out = self.likeliest - self.shares
+        return self.off_by(self.shares)
+
+    def off_by(self, subtracted: _Array) -> _Array:
+        """Return the same (T, T) float64 where other shares (T,) are subtracted."""
+        left_out = self.likeliest - subtracted
         return self.covariance + np.outer(left_out, left_out)
 
     @property
@@ -342,15 +379,15 @@ def fit_spread(
     if not data:
         return None
     rows = [_rows(one, number, cells_mm, page_mm, bits) for number, one in enumerate(data)]
-    shapes = len(page_powers(_FACTOR_ORDER)) - 1
+    shapes = len(page_powers(_SHAPE_ORDER)) - 1
     size = max(int(one.unknowns.max()) for one in rows) + 1
-    prior = np.full(size, 1 / _PRIOR_SHARE**2)
-    # The widest kernel is a veil to all but large charts.
-    prior[TERMS - 2 : TERMS] = 1 / USUAL_VEIL**2
-    if bits < VARYING_BITS:
-        prior[:TERMS][_varying_terms()] = 1 / _SMALL_SHARE**2
+    factors = np.full(size, 1 / _PRIOR_SHARE**2)
     for one, row in zip(data, rows, strict=True):
-        prior[row.unknowns[len(terms_of(0)) + shapes :]] = 1 / one.unevenness**2
+        factors[row.unknowns[len(terms_of(0)) + shapes :]] = 1 / one.unevenness**2
+    prior = np.diag(factors)
+    usually = _usual_shares(bits, 1.0, CHANNELS_APART, CHANNELS_APART)
+    usual = np.asarray(np.linalg.inv(usually), dtype=np.float64)
+    prior[:TERMS, :TERMS] = usual
     shape = np.arange(TERMS, TERMS + shapes)
     everything = np.delete(np.arange(size), shape)
     solution = np.zeros(size)
@@ -361,33 +398,112 @@ def fit_spread(
         solution[everything] = _solved(*_of(normal.sum(axis=0), right.sum(axis=0), prior, everything), np.arange(TERMS))
     misfit = _misfit(normal.sum(axis=0), right.sum(axis=0), prior, shapes)
     normal, right = normal[:, everything][:, :, everything], right[:, everything]
-    prior = prior[everything]
+    prior = prior[np.ix_(everything, everything)]
     matrix, vector = _without_factors(normal.sum(axis=0), right.sum(axis=0), prior)
     # What is known beforehand does not become less by what the print shows of other light.
     inflated = _without_factors(normal.sum(axis=0), right.sum(axis=0), misfit * prior)[0]
-    covariance: _Array = np.asarray(misfit * np.linalg.inv(inflated), dtype=np.float64)
+    lenses = _Lenses.of(matrix, vector, inflated, misfit, bits, usual)
+    matrix = lenses.matrices[int(np.argmax(lenses.weights))]
     candidates = groups_of_terms()
     if bits < VARYING_BITS:
         candidates = [group for group in candidates if len(group) <= _EVEN_TERMS]
-    even = float(_positive(matrix, vector, _terms(candidates))[0][-1])
-    veil = _terms(candidates[-1:])
-    if misfit > MOST_MISFIT or (bits < VARYING_BITS and even > MOST_VEIL):
+    far = far_groups()
+    veil = far[-1]
+    unknown = np.zeros((TERMS, TERMS))
+    even = _positive(matrix, vector, _terms(candidates))[0][veil]
+    if misfit > MOST_MISFIT or (bits < VARYING_BITS and even.mean() > MOST_VEIL):
         # Other light lies smoothly over the frame, or shares grow towards the corners where cells are too few to see
         # it; what an even veil would have been taken for is not known.
-        covariance[-1, -1] += even**2
+        unknown[np.ix_(veil, veil)] = np.outer(even, even)
         candidates.pop()
-        veil = veil[:0]
+        far.pop()
     kept = _selected(matrix, vector, misfit, candidates)
     _, gain = _positive(matrix, vector, kept)
-    # No lens is without a veil: to leave out one that is not certain is to be wrong by all of it.
-    likeliest = np.round(_positive(matrix, vector, np.union1d(kept, veil))[0] / _ROUNDING) * _ROUNDING
+    # No lens is without far light: to leave out what is not certain is to be wrong by all of it. But few cells show so
+    # little of it that what is taken for several kernels' is more than what there is: there it is the veil's alone.
+    likeliest, covariance = lenses.shares(vector, np.union1d(kept, _terms(far)))
+    covariance += unknown
+    shares = likeliest
+    if bits < VARYING_BITS:
+        shares, _ = lenses.shares(vector, np.union1d(kept, _terms(far[len(FAR_PX) :])))
     held_out = 0.0
     for fold in range(FOLDS):
         others = normal.sum(axis=0) - normal[fold], right.sum(axis=0) - right[fold]
         with_kernels, without = (_solved(*others, prior, chosen) for chosen in (kept, kept[:0]))
         held_out += _explained(normal[fold], right[fold], with_kernels) - _explained(normal[fold], right[fold], without)
-    found = PointSpread(likeliest, covariance, gain, held_out, misfit, likeliest)
+    found = PointSpread(shares, covariance, gain, held_out, misfit, likeliest)
     return found if found.proven else replace(found, shares=np.zeros(TERMS))
+
+
+@dataclass(frozen=True, eq=False)
+class _Lenses:
+    """The equations under each thing that is supposed of a lens: how much far light it has, how alike its channels are.
+
+    - `matrices`, `covariances`: (L, TERMS, TERMS), of the equations, and of all shares.
+    - `weights`: (L,), how likely each is by what the print shows, of sum 1.
+    """
+
+    matrices: _Array
+    covariances: _Array
+    weights: _Array
+
+    @staticmethod
+    def of(matrix: _Array, vector: _Array, inflated: _Array, misfit: float, bits: int, usual: _Array) -> _Lenses:
+        """Return what becomes of equations that have the `usual` inverse (TERMS, TERMS) of the shares' covariance.
+
+        `inflated` is as `matrix`, the inverse in it `misfit` times as large.
+        """
+        matrices: list[_Array] = []
+        covariances: list[_Array] = []
+        evidence: list[float] = []
+        apart = list(zip(_APART, _APART_ODDS, strict=True))
+        for size, (far_apart, far_odds), (veil_apart, veil_odds) in product(_FAR_SIZES, apart, apart):
+            prior = np.linalg.inv(_usual_shares(bits, size, far_apart, veil_apart))
+            covariance = np.asarray(misfit * np.linalg.inv(inflated + misfit * (prior - usual)), dtype=np.float64)
+            gain = float(vector @ covariance @ vector) / misfit**2
+            # The logarithm of the integral over all shares (D. MacKay, Bayesian interpolation, 1992).
+            fits = 0.5 * (gain + float(np.linalg.slogdet(covariance)[1]) + float(np.linalg.slogdet(prior)[1]))
+            evidence.append(fits + math.log(far_odds * veil_odds))
+            matrices.append(matrix + prior - usual)
+            covariances.append(covariance)
+        weights = np.exp(np.array(evidence) - max(evidence))
+        return _Lenses(np.array(matrices), np.array(covariances), weights / weights.sum())
+
+    def shares(self, vector: _Array, kept: npt.NDArray[np.int64]) -> tuple[_Array, _Array]:
+        """Return the mean shares (TERMS,), others than the kept ones 0, and the covariance about them."""
+        each = np.array([_positive(matrix, vector, kept)[0] for matrix in self.matrices])
+        mean = np.round(self.weights @ each / _ROUNDING) * _ROUNDING
+        apart = (each - mean) * np.sqrt(self.weights)[:, None]
+        return mean, np.tensordot(self.weights, self.covariances, axes=1) + apart.T @ apart
+
+
+def _usual_shares(bits: int, size: float, far_apart: float, veil_apart: float) -> _Array:
+    """Return the covariance (TERMS, TERMS) of shares before they are measured.
+
+    `size`: of far kernels over the usual one. `far_apart`, `veil_apart`: as `CHANNELS_APART`, since scatter and
+    reflections have little to do with each other.
+    """
+    usual = np.diag(np.full(TERMS, _PRIOR_SHARE**2))
+    if bits < VARYING_BITS:
+        varying = _varying_terms()
+        usual[varying, varying] = _SMALL_SHARE**2
+    handed_on = np.eye(len(FAR_PX) + 1)
+    # The first of them is as much a near one, and the veil is of other origin.
+    for kernel in range(2, len(FAR_PX)):
+        handed_on[kernel] += _FAR_FALL * handed_on[kernel - 1]
+    steps = np.array([*(size * step for step in _FAR_STEPS), USUAL_VEIL])
+    sizes = (handed_on * steps**2) @ handed_on.T
+    groups = far_groups()
+    for one, row in zip(groups, sizes, strict=True):
+        for other, both in zip(groups, row, strict=True):
+            usual[np.ix_(one, other)] = both * channels_alike(far_apart)
+    usual[np.ix_(groups[-1], groups[-1])] = USUAL_VEIL**2 * channels_alike(veil_apart)
+    return usual
+
+
+def channels_alike(apart: float = CHANNELS_APART) -> _Array:
+    """Return the correlation (3, 3) float64 of far shares of R, G and B before they are measured."""
+    return (1 - apart**2) + apart**2 * np.eye(3)
 
 
 def _varying_terms() -> npt.NDArray[np.int64]:
@@ -397,7 +513,7 @@ def _varying_terms() -> npt.NDArray[np.int64]:
 
 def _of(normal: _Array, right: _Array, prior: _Array, chosen: npt.NDArray[np.int64]) -> tuple[_Array, _Array, _Array]:
     """Return equations of some unknowns alone."""
-    return normal[np.ix_(chosen, chosen)], right[chosen], prior[chosen]
+    return normal[np.ix_(chosen, chosen)], right[chosen], prior[np.ix_(chosen, chosen)]
 
 
 def _misfit(normal: _Array, right: _Array, prior: _Array, shapes: int) -> float:
@@ -422,22 +538,23 @@ def _rows(one: SpreadData, number: int, cells_mm: _Array, page_mm: tuple[float, 
     level = np.where(one.usable, level, one.level[nearest])
     expected = predicted_levels(level[:, None], bits)[:, 0]
     factor = page_polynomial(cells_mm, page_mm, _FACTOR_ORDER)[:, 1:]
+    shape = page_polynomial(cells_mm, page_mm, _SHAPE_ORDER)[:, 1:]
     ink = factor[:, : len(page_powers(_INK_ORDER)) - 1]
     dense = expected * np.log(np.clip(expected, 0.01, None))
-    even = factor * one.even[:, None]
+    even = shape * one.even[:, None]
     columns = np.column_stack([level, one.changes, even, factor * expected[:, None], ink * dense[:, None]])
     residual, known = colour_residual(columns, bits)
     chosen, folds = _by_fold(np.flatnonzero(known & one.usable), cells_mm, page_mm)
     common = TERMS + even.shape[1]
     own = factor.shape[1] + ink.shape[1]
     smooth: npt.NDArray[np.int64] = np.arange(own, dtype=np.int64) + common + number * own
-    shape: npt.NDArray[np.int64] = np.arange(TERMS, common, dtype=np.int64)
+    shapes: npt.NDArray[np.int64] = np.arange(TERMS, common, dtype=np.int64)
     return _Rows(
         value=residual[chosen, 0],
         design=residual[chosen, 1:],
         level=expected[chosen],
         folds=folds,
-        unknowns=np.concatenate([terms_of(one.channel), shape, smooth]),
+        unknowns=np.concatenate([terms_of(one.channel), shapes, smooth]),
     )
 
 
@@ -494,7 +611,7 @@ def _normal_equations(rows: Sequence[_Rows], solution: _Array) -> tuple[_Array, 
 
 def _without_factors(normal: _Array, right: _Array, prior: _Array, kept: int = TERMS) -> tuple[_Array, _Array]:
     """Return the equations (kept, kept), (kept,) of the first unknowns alone: smooth factors eliminated (Schur)."""
-    full = normal + np.diag(prior)
+    full = normal + prior
     share = np.linalg.solve(full[kept:, kept:], full[kept:, :kept]).T
     matrix = full[:kept, :kept] - share @ full[kept:, :kept]
     return 0.5 * (matrix + matrix.T), right[:kept] - share @ right[kept:]
@@ -503,7 +620,7 @@ def _without_factors(normal: _Array, right: _Array, prior: _Array, kept: int = T
 def _solved(normal: _Array, right: _Array, prior: _Array, kept: npt.NDArray[np.int64]) -> _Array:
     """Return all unknowns (T,), shares other than the kept ones 0."""
     shares, _ = _positive(*_without_factors(normal, right, prior), kept)
-    full = normal + np.diag(prior)
+    full = normal + prior
     solution = np.empty(len(right))
     solution[:TERMS] = shares
     solution[TERMS:] = np.linalg.solve(full[TERMS:, TERMS:], right[TERMS:] - full[TERMS:, :TERMS] @ shares)

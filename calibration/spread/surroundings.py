@@ -168,8 +168,7 @@ class UsualLight:
     """The field of the session's first frame, by which the light of what is not measured is known in all of them.
 
     - `patches`, `slots`: (P, 3) and (R K, 3) float64, at patches and slots; beyond the outermost patches as at those.
-    - `elsewhere`: (3 kinds, 3) float64, bare paper, black ink and what lies behind, the last unlit, summed over all
-      slots.
+    - `elsewhere`: (2 kinds, 3) float64, bare paper and black ink, summed over all slots.
     """
 
     patches: _Array
@@ -180,8 +179,7 @@ class UsualLight:
     def of(grid: PrintedGrid, patches: _Array, slots: _Array) -> UsualLight:
         """Return the light of a grid, given the field at patches (P, 3) and slots (R K, 3)."""
         shares = grid.others.reshape(-1, 3).astype(np.float64)
-        lit = [(shares[:, kind, None] * slots).sum(axis=0) for kind in (0, 1)]
-        return UsualLight(patches, slots, np.stack([*lit, np.full(3, shares[:, 2].sum())]))
+        return UsualLight(patches, slots, shares[:, :2].T @ slots)
 
 
 @dataclass(frozen=True, eq=False)
@@ -193,6 +191,7 @@ class Surroundings:
     - `offset_px`: (P, 3, 2) float64, from each patch's centre to the middle of its window, along the print's axes, by
       channel.
     - `pitch_px`: (P, 2) float64, a slot's width and height.
+    - `frame_slots`: how many slots the frame would hold.
     - `places`: (P, 9) float64, the terms of a share over the frame at each patch (`place_terms`).
     - `whites`: places of the white references among the patches.
     - `light`: the usual light of the session.
@@ -203,6 +202,7 @@ class Surroundings:
     neighbours: npt.NDArray[np.int32]
     offset_px: _Array
     pitch_px: _Array
+    frame_slots: float
     places: _Array
     whites: slice
     light: UsualLight
@@ -234,9 +234,14 @@ class Surroundings:
         return np.stack([np.median(whites, axis=0), levels.patches[0] / self.light.patches[0], levels.beyond])
 
     def mean(self, levels: FrameLevels, inks: _Array) -> _Array:
-        """Return the mean light (3,) float64 counts of the print and what lies behind it; `inks` (3, 3) of `inks`."""
-        total = levels.patches.sum(axis=0) + (self.light.elsewhere * inks).sum(axis=0)
-        return total / self.grid.source.size
+        """Return the mean light (3,) float64 counts of the frame: the print, and beside it what lies behind.
+
+        `inks` (3, 3) are those of `inks`.
+        """
+        sheet = levels.patches.sum(axis=0) + (self.light.elsewhere * inks[:2]).sum(axis=0)
+        slots = len(levels.patches) + float(self.grid.others[..., :2].sum())
+        beside = max(self.frame_slots - slots, 0.0)
+        return (sheet + beside * inks[2]) / (slots + beside)
 
     def image(self, levels: FrameLevels, inks: _Array) -> _Float:
         """Return the print slot by slot, (R, K, 3) float32 counts; `inks` (3, 3) are those of `inks`."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import cast
+from typing import Any, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -21,7 +21,15 @@ from calibration.spread.correction import (
     SpreadFrame,
     measure_spread,
 )
-from calibration.spread.fitting import LEAST_COUNTS, MOST_VEIL, USUAL_UNEVENNESS, PointSpread, colour_residual
+from calibration.spread.fitting import (
+    LEAST_COUNTS,
+    MOST_VEIL,
+    TERMS,
+    USUAL_UNEVENNESS,
+    PointSpread,
+    colour_residual,
+    far_groups,
+)
 from calibration.spread.surroundings import (
     PAD,
     FrameLevels,
@@ -32,8 +40,8 @@ from calibration.spread.surroundings import (
 )
 from experiment.chart.layout import A_SERIES_MM, design_chart, paper_chart
 from experiment.chart.model import Chart
+from experiment.measures.least_squares import page_polynomial
 from experiment.measures.paper import FlatField
-from foundation.colorimetry import angles_deg
 
 pytestmark = pytest.mark.slow
 
@@ -77,15 +85,20 @@ class Photograph:
     true: _Array
     field: _Array
 
-    def measured(self) -> tuple[PointSpread, LensFigures]:
+    def measured(self, left_out: str = "") -> tuple[PointSpread, LensFigures]:
         """Return the spread that the photograph shows."""
         usable = np.ones(len(self.true), dtype=np.bool_)
         # Paper as it is seen, and its field: a veil lifts it too.
         white = np.median(self.seen.patches[self.view.whites] / self.field[self.view.whites], axis=0)
         frame = SpreadFrame(self.seen, self.field, white, usable, USUAL_UNEVENNESS, self.printed)
-        found = measure_spread([frame], self.around, self.chart.page_mm, self.chart.bits, LEAST_COUNTS)
+        found = measure_spread([frame], self.around, self.chart.page_mm, self.chart.bits, LEAST_COUNTS, left_out)
         assert found is not None
         return found
+
+    def white_error(self, spread: PointSpread) -> _Array:
+        """Return the relative error (3,) of white once the spread is corrected."""
+        levels = self.clean - FrameCorrection.of(spread, self.view, self.around).added(self.seen)
+        return (levels / self.true)[self.view.whites].mean(axis=0) - 1
 
     def error(self, levels: _Array) -> float:
         """Return the RMS relative error of cells above 300 counts, relative to paper."""
@@ -95,17 +108,38 @@ class Photograph:
         return float(np.sqrt((off[self.true[cells] > LEAST_COUNTS] ** 2).mean()))
 
 
+def white_angles(error: _Array, covariance: _Array) -> tuple[float, float]:
+    """Return by how many degrees relative errors (3,) turn white, and the standard deviation by their covariance."""
+    unit = PAPER / np.linalg.norm(PAPER)
+    across = (np.eye(3) - np.outer(unit, unit)) @ np.diag(unit)
+    return tuple(np.degrees([np.linalg.norm(across @ error), np.sqrt(np.trace(across @ covariance @ across.T))]))
+
+
+def power_law(light: _Array, exponent: float, core: float, beyond: float) -> _Array:
+    """Return light (rows, columns) spread as (r² + core²)^(−exponent / 2), half the frame's width around."""
+    rows, columns = (2 * n for n in light.shape)
+    y, x = np.arange(rows, dtype=np.float64), np.arange(columns, dtype=np.float64)
+    square = np.minimum(y, rows - y)[:, None] ** 2 + np.minimum(x, columns - x) ** 2
+    kernel = np.where(square < (max(light.shape) / 2) ** 2, (square + core**2) ** (-exponent / 2), 0.0)
+    scene = np.full((rows, columns), beyond)
+    scene[: light.shape[0], : light.shape[1]] = light
+    found = np.fft.irfft2(np.fft.rfft2(scene) * np.fft.rfft2(kernel / kernel.sum()), scene.shape)
+    return np.asarray(found[: light.shape[0], : light.shape[1]], dtype=np.float64)
+
+
 def photograph(
     shoulder: float = 0.0,
-    veil: float = 0.0,
+    veil: float | tuple[float, float, float] = 0.0,
     growing: bool = False,
     falloff: float = 0.35,
     seed: int = 0,
     chart: Chart = CHART,
     rough: float = 0.0,
+    tails: tuple[float, float, tuple[float, float, float]] | None = None,
 ) -> Photograph:
     """Return a photograph: exponential shoulders of 2.5 px, growing threefold to the corner if asked, and a veil.
 
+    `tails` are a power law's exponent, its core in pixels, and the shares of R, G and B that are in it.
     `rough` is by how much the print's colours differ from smooth ones, as inks do: standard deviation, a share.
     """
     grid = printed_grid(chart)
@@ -132,7 +166,7 @@ def photograph(
     radius2 = ((x - columns / 2) ** 2 + (y - rows / 2) ** 2) / ((columns / 2) ** 2 + (rows / 2) ** 2)
     light = 1.1 * (1 - falloff * radius2)
     scene = (colours[grid.parts[part[..., 1], part[..., 0]]] * light[..., None] * PAPER).astype(np.float64)
-    image = scene
+    image = scene.copy()
     if shoulder:
         away = np.hypot(
             *(
@@ -145,7 +179,12 @@ def photograph(
         spread = np.fft.irfft2(np.fft.rfft2(scene, axes=(0, 1)) * answer, shape, axes=(0, 1))
         share = shoulder * (0.5 + radius2 if growing else np.ones(shape))
         image = scene + share[..., None] * (spread - scene)
-    image = (1 - veil) * image + veil * image.mean(axis=(0, 1))
+    if tails is not None:
+        exponent, core, shares = tails
+        for channel, share in enumerate(shares):
+            spread = power_law(scene[..., channel], exponent, core, float(scene[0, 0, channel]))
+            image[..., channel] += share * (spread - scene[..., channel])
+    image = (1 - np.array(veil)) * image + np.array(veil) * image.mean(axis=(0, 1))
     sites = sites_at(where, shape)
     steps = np.arange(-2, 3)
     near_y, near_x = sites.rows[:, None, None] + steps[:, None], sites.columns[:, None, None] + steps
@@ -170,6 +209,11 @@ def photograph(
     levels = GreyLevels.of(greys).level
     printed = np.concatenate([np.full(cells, -1), np.zeros(len(whites), dtype=np.int64), 1 + levels])
     true = of_patches * field_at * PAPER
+    # The field as its fit through the white references has it, what the lens does to them included.
+    at_all = page_polynomial(grid.points_mm, chart.page_mm, 6 if len(whites) >= 84 else 2)
+    seen = noisy[view.whites] / field_at[view.whites] / PAPER
+    changed: _Array = np.asarray(at_all @ np.linalg.lstsq(at_all[view.whites], seen, rcond=None)[0], dtype=np.float64)
+    field_at = field_at * changed / changed[:cells].mean(axis=0)
     return Photograph(chart, printed, view, around, FrameLevels(noisy, beyond), clean, true, field_at)
 
 
@@ -184,7 +228,7 @@ def test_a_sharp_lens_is_left_alone(sharp: Photograph) -> None:
     assert not spread.proven
     assert not figures.corrected
     assert (figures.rms, figures.worst, figures.beyond_cell) == (0, 0, 0)
-    assert 0 < figures.residual < 0.009
+    assert 0 < figures.residual < 0.012
     added = FrameCorrection.of(spread, sharp.view, sharp.around).added(sharp.seen)
     assert not added.any()
 
@@ -220,17 +264,16 @@ def test_a_chart_of_few_colours_shows_the_lens_on_its_references(shoulder: float
     spread, figures = shot.measured()
     added = FrameCorrection.of(spread, shot.view, shot.around).added(shot.seen)
     before, after = shot.error(shot.clean), shot.error(shot.clean - added)
-    assert after < 0.004
+    assert after < 0.005
     # What is said to be left covers what is left, and is no less for not being known.
     assert 0.5 * after < figures.residual < 0.03
     if not shoulder:
         assert not added.any()
         assert figures.residual > before
         return
-    # White is not tinted by it.
-    whites = shot.view.whites
-    true, seen = (levels[whites].mean(axis=0) for levels in (shot.true, shot.clean - added))
-    assert float(angles_deg(seen[None], true[None])[0]) < 0.03
+    # White is hardly tinted by it.
+    tint, stated = white_angles(shot.white_error(spread), figures.white_covariance)
+    assert tint < min(0.05, 2 * stated)
 
 
 @pytest.mark.parametrize("seed", [0, 2])
@@ -280,12 +323,12 @@ def test_a_veil_that_is_not_certain_is_taken_out_beside_shoulders_that_are(seed:
     assert 0 < figures.veil < 4 * figures.veil_error
     assert figures.veil == pytest.approx(0.006, abs=2 * figures.veil_error)
     kernels = spread.shares.copy()
-    kernels[-1] = 0
+    kernels[far_groups()[-1]] = 0
     left, with_veil = (
         shot.error(shot.clean - FrameCorrection.of(one, shot.view, shot.around).added(shot.seen))
         for one in (spread, replace(spread, shares=kernels))
     )
-    assert left < 0.5 * with_veil
+    assert left < 0.7 * with_veil
     assert left < figures.residual
 
 
@@ -324,8 +367,89 @@ def test_light_of_the_surroundings_is_that_of_an_even_print_where_all_is_even(sh
 def test_the_mean_light_is_that_of_the_print_slot_by_slot(sharp: Photograph) -> None:
     around, levels = sharp.around, sharp.seen
     inks = around.inks(levels)
-    slot_by_slot = around.image(levels, inks).mean(axis=(0, 1), dtype=np.float64)
-    assert around.mean(levels, inks) == pytest.approx(slot_by_slot, rel=1e-6)
+    slots = around.image(levels, inks).reshape(-1, 3).astype(np.float64)
+    as_large = replace(around, frame_slots=float(len(slots)))
+    assert as_large.mean(levels, inks) == pytest.approx(slots.mean(axis=0), rel=1e-6)
+    # What lies behind fills the rest of the frame.
+    beside = (slots.sum(axis=0) + 1000 * levels.beyond) / (len(slots) + 1000)
+    larger = replace(around, frame_slots=float(len(slots) + 1000))
+    assert larger.mean(levels, inks) == pytest.approx(beside, rel=1e-6)
+    assert around.frame_slots > len(slots)
+
+
+_COLOURED = [
+    {"veil": (0.003, 0.005, 0.009)},
+    {"veil": (0.016, 0.008, 0.004)},
+    {"tails": (3.0, 2.0, (0.02, 0.03, 0.07))},
+    {"tails": (3.0, 4.0, (0.06, 0.04, 0.02))},
+    {"tails": (2.0, 2.0, (0.02, 0.03, 0.05))},
+    {"tails": (2.0, 1.0, (0.06, 0.07, 0.03))},
+    {"tails": (2.5, 2.0, (0.03, 0.05, 0.02))},
+    {"shoulder": 0.03, "veil": (0.003, 0.005, 0.009)},
+]
+"""Lenses whose channels differ, some of forms that are no sums of the kernels."""
+
+
+def test_what_a_lens_leaves_in_white_is_as_much_as_is_said() -> None:
+    """On a chart of 512 colours, which shows little of it: said is neither less nor several times as much."""
+    ratios: list[float] = []
+    for seed, lens in enumerate(_COLOURED):
+        shot = photograph(**lens, chart=SMALL, rough=0.03, seed=seed)  # pyright: ignore[reportArgumentType]
+        spread, figures = shot.measured()
+        tint, stated = white_angles(shot.white_error(spread), figures.white_covariance)
+        ratios.append(tint / stated)
+    assert np.mean(np.array(ratios) < 2) > 0.8
+    assert max(ratios) < 4
+    assert 0.2 < float(np.median(ratios)) < 1.5
+
+
+@pytest.mark.parametrize("lens", [_COLOURED[0], _COLOURED[2], _COLOURED[4]], ids=["veil", "r⁻³", "r⁻²"])
+def test_a_chart_of_many_colours_shows_the_lens_channel_by_channel(lens: dict[str, Any]) -> None:
+    shot = photograph(**lens)
+    spread, figures = shot.measured()
+    error = shot.white_error(spread)
+    before, _ = white_angles(shot.white_error(replace(spread, shares=np.zeros(TERMS))), figures.white_covariance)
+    tint, stated = white_angles(error, figures.white_covariance)
+    assert tint < 0.75 * before
+    assert tint < 2 * stated
+    off = shot.clean - FrameCorrection.of(spread, shot.view, shot.around).added(shot.seen)
+    cells = slice(0, shot.chart.colour_count)
+    relative = (off / shot.true)[cells] / (1 + error) - 1
+    seen = shot.true[cells] > LEAST_COUNTS
+    assert figures.cells_error.shape == seen.shape
+    assert np.mean(np.abs(relative)[seen] < 2 * figures.cells_error[seen]) > 0.95
+
+
+def test_what_is_left_in_on_purpose_counts_in_full() -> None:
+    shot = photograph(veil=(0.003, 0.005, 0.012), shoulder=0.02, chart=SMALL)
+    spread, with_it = shot.measured()
+    _, without = shot.measured("left out")
+    assert spread.proven
+    assert with_it.corrected
+    assert not without.corrected
+    assert without.why_not == "left out"
+    nothing = shot.white_error(replace(spread, shares=np.zeros(TERMS)))
+    tint, stated = white_angles(nothing, without.white_covariance)
+    assert tint < 2 * stated
+    assert (np.abs(nothing) < 2 * np.sqrt(np.diag(without.white_covariance))).all()
+    assert (np.diag(without.white_covariance) > np.diag(with_it.white_covariance)).all()
+    assert (without.cells_error > with_it.cells_error).mean() > 0.9
+
+
+def test_a_lens_that_is_not_measured_has_a_usual_veil(sharp: Photograph) -> None:
+    levels = (sharp.true / sharp.field / PAPER)[: sharp.chart.colour_count]
+    levels[7] = np.nan
+    figures = LensFigures.unknown("no tags", levels)
+    assert figures.assumed
+    assert figures.to_json()["assumed"] is True
+    assert not sharp.measured()[1].assumed
+    veiled = photograph(veil=(0.005, 0.008, 0.011))
+    nothing = PointSpread(np.zeros(TERMS), np.zeros((TERMS, TERMS)), 0, 0, 1, np.zeros(TERMS))
+    tint, stated = white_angles(veiled.white_error(nothing), figures.white_covariance)
+    assert 0.5 * tint < stated < 2 * tint
+    assert np.isfinite(figures.cells_error).all()
+    dark, bright = np.argmin(np.nan_to_num(levels, nan=1)[:, 1]), np.argmax(np.nan_to_num(levels)[:, 1])
+    assert figures.cells_error[dark, 1] > 0.02 > figures.cells_error[bright, 1]
 
 
 def test_residuals_of_colour_are_blind_to_smooth_colours_and_linear() -> None:
