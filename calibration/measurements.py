@@ -184,6 +184,10 @@ class SessionMeasurements:
     codes: tuple[tuple[int, int, int], ...]
 
 
+_USUAL_TOO_DARK = 0.2
+"""Share of the dark light by which dark frames differ from what is there in the lights' (judgement)."""
+
+
 @dataclass(frozen=True, eq=False)
 class LightMeasurements:
     """What was measured of the lights, light by light; a check has one row, of the frame that it read.
@@ -238,10 +242,10 @@ class LightMeasurements:
         """Return how much too much dark light (3,) float64 was perhaps subtracted, counts, of `dark` (3,) that was.
 
         White then has twice as much beyond the sum of the primaries, each of which lacks it; a projector that adds
-        light of its own to white looks the same. Half of what is subtracted where no light shows it.
+        light of its own to white looks the same. Where no light shows it, a usual share of what is subtracted.
         """
         if self.additivity is None:
-            return dark / 2
+            return _USUAL_TOO_DARK * dark
         beyond = -self.additivity * self.white[int(np.argmax(self.white.sum(axis=1)))]
         return np.minimum(np.abs(beyond) / 2, dark)
 

@@ -202,7 +202,11 @@ def unfit_evidence(table: TableMeasurements, limit: float) -> Gathered | None:
     if common == "disturbed" and (covered := _disturbed(table, 0.0)) is not None:
         return covered
     if common != "covered":
-        known = _lens(table) | {"misplaced": kinds.count("misplaced") / len(kinds), "hot": hot}
+        known = _lens(table) | {
+            "misplaced": kinds.count("misplaced") / len(kinds),
+            "hot": hot,
+            "lit": kinds.count("lit") / len(kinds),
+        }
         return Gathered(Evidence(**known), (), places)
     known, lying = _of_residuals(table, table.registered_frame)
     return Gathered(Evidence(**known | {"hot": hot}), (registered,) if known else (), lying or places)

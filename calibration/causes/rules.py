@@ -202,6 +202,7 @@ class Evidence:
     - `lone_primary`: how differently much of one primary white has than of the other two, which are alike, relative.
     - `colour_scatter`: scatter of white's colour from one white frame to the next, relative, over what its drift makes.
     - `other_iso`: frames of another ISO speed than most, by their files.
+    - `lit`: share of the unfit cells of whose level light that lies on the print there is too much.
     - `misplaced`: share of the unfit cells whose place is not known well enough.
     - `uneven`: share of the unfit cells whose rim and middle differ.
     - `waves_px`: how far tags lie from where a flat sheet would have them, RMS, half-size px of cells of 10 px.
@@ -240,6 +241,7 @@ class Evidence:
     lone_primary: float = NAN
     colour_scatter: float = NAN
     other_iso: float = NAN
+    lit: float = NAN
     misplaced: float = NAN
     uneven: float = NAN
     waves_px: float = NAN
@@ -547,6 +549,12 @@ RULES: tuple[Rule, ...] = (
             Condition("share", 0, 0.5),
         ),
         "a place is darker in all frames, in proportion to its light, in all colours alike",
+    ),
+    Rule(
+        REFLECTION,
+        _about("unfit cells"),
+        (Condition("lit", 0.5, 1),),
+        "most of the cells concerned are brighter by as much as their neighbours, whatever is printed there",
     ),
     Rule(
         CURL,

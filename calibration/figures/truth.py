@@ -143,9 +143,9 @@ _BY_CAUSE = (
 )
 
 TRUTH_MEDIAN_DEG = Figure(
-    "truth_median_deg", "Expanded uncertainty of the ground truth, median light", "truth", "°", "at most", 0.2, 1.0,
+    "truth_median_deg", "Expanded uncertainty of the ground truth, median light", "truth", "°", "at most", 0.4, 1.0,
     why="a method's error cannot be measured finer than the ground truth is known",
-    source=JUDGEMENT + ": good methods are 1 to 2 degrees off; k = 2 (JCGM 100)", remedy=_BY_CAUSE,
+    source=JUDGEMENT + ": a quarter of a good method's error; k = 2 (JCGM 100)", remedy=_BY_CAUSE,
     measure=lambda table: float(np.median(table.budget.expanded_deg)), forecast=ONLY_OF_A_SESSION,
     worst=NO_PLACE, where=OF_ITS_CAUSE, retake=NO_FRAMES, cause=NO_CAUSE,
     drawing="budget", lines=(Line(190, _error_row),),

@@ -18,6 +18,7 @@ import numpy.typing as npt
 
 from calibration.spread.fitting import colour_residual, predicted_levels
 from experiment.measures.least_squares import page_polynomial
+from foundation.robust import biweight, sigma_of
 
 _KNOTS = 9
 """Places along the page's longer side at which added light is known; between them it is smooth: a spot of an eighth of
@@ -95,9 +96,12 @@ def added_light(
         columns = np.column_stack([known, bumps, factor * expected[:, None]])
         residual, told = colour_residual(columns, bits)
         rows = told & usable
-        weight = 1 / np.sqrt(_scatter(residual[rows, 0], expected[rows]) ** 2 + variance[rows, channel])
-        value, design = residual[rows, 0] * weight, residual[rows, 1:] * weight[:, None]
+        sigma = np.sqrt(_scatter(residual[rows, 0], expected[rows]) ** 2 + variance[rows, channel])
+        value, design = residual[rows, 0] / sigma, residual[rows, 1:] / sigma[:, None]
         solution, covariance = _likeliest(value, design, bumps.shape[1])
+        # Dust, a fold or a clipped cell is no light that lies on the cells around it, too.
+        trust = biweight(np.abs(value - design[:, : bumps.shape[1]] @ solution), 1.0)
+        solution, covariance = _likeliest(value * trust, design * trust[:, None], bumps.shape[1])
         share = bumps @ solution
         found.share[:, channel] = share - np.quantile(share[usable], 0.05)
         found.error[:, channel] = np.sqrt(np.einsum("ck,kl,cl->c", bumps, covariance, bumps))
@@ -131,8 +135,6 @@ def _likeliest(value: _Array, design: _Array, bumps: int) -> tuple[_Array, _Arra
 
 def _scatter(left: _Array, level: _Array) -> _Array:
     """Return the usual size (N,) of what is left, by groups of like levels."""
-    from foundation.robust import sigma_of
-
     found = np.empty(len(left))
     for part in np.array_split(np.argsort(level, kind="stable"), max(min(20, len(left) // 20), 1)):
         found[part] = sigma_of(left[part])

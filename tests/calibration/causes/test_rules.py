@@ -117,6 +117,8 @@ CASES: list[tuple[Subject, Evidence, Cause]] = [
     ("drift", Evidence(frames=11, exposure=1, cameras=1, colour_scatter=0.01), COLOUR_WHEEL),
     ("drift", Evidence(frames=11, exposure=1, cameras=1, colour_scatter=0.0), UNKNOWN),
     ("unfit cells", Evidence(hot=0.2), UNKNOWN),
+    ("unfit cells", Evidence(hot=0, lit=0.8), REFLECTION),
+    ("unfit cells", Evidence(hot=0, lit=0.2), UNKNOWN),
     ("references", Evidence(frames=4, radial=0.8, rim=-0.02, rim_frames=1, white_residual=1), FALL_OFF),
     ("references", Evidence(frames=4, radial=0.8, rim=0.02, rim_frames=0, white_residual=1), UNKNOWN),
     (

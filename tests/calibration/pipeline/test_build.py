@@ -228,7 +228,7 @@ def test_a_lamp_that_fades_is_reported_and_not_corrected(lab: Lab, tmp_path: Pat
 def test_the_report_stands_alone(built: BuildResult) -> None:
     assert built.lut is not None
     page = (built.lut / "report.html").read_text()
-    assert page.count("data:image/png;base64,") == 11
+    assert page.count("data:image/png;base64,") == 12
     # Verdict, what to do, and the four pictures to look at first stand before everything that is folded.
     heads = re.findall(r"<h2>([^<]+)</h2>", page[: page.index("<details")])
     assert [head for head in heads if head not in ("Probable causes",) and not head.startswith("Where it is")] == [
@@ -246,7 +246,7 @@ def test_the_report_stands_alone(built: BuildResult) -> None:
     assert f"<th scope='row'>Exposure</th><td>{exposure}</td>" in html.unescape(page)
     # A figure leads to the picture that shows it.
     pictures = set(re.findall(r"<div id='(\w+)'", page))
-    assert pictures >= set(re.findall(r"href='#(\w+)'", page)) >= {"residuals", "course", "lights"}
+    assert pictures >= set(re.findall(r"href='#(\w+)'", page)) >= {"residuals", "course", "budget"}
 
 
 def test_the_worst_of_each_figure_is_somewhere(built: BuildResult, session: Session) -> None:
@@ -258,8 +258,7 @@ def test_the_worst_of_each_figure_is_somewhere(built: BuildResult, session: Sess
         if worst.place is not None:
             assert 0 <= worst.place.x_mm <= chart.page_mm[0]
             assert 0 <= worst.place.y_mm <= chart.page_mm[1]
-    errors = built.figures.lights.white_error_deg
-    assert found["truth_worst_deg"].light == int(np.argmax(errors))
+    assert found["truth_worst_deg"].light == int(np.argmax(built.figures.budget.expanded_deg))
     assert found["bleed"].place is not None
     smallest = cell_sides_px(built.figures, chart).min()
     assert smallest == pytest.approx(built.figures.registration.cell_px, rel=0.1)

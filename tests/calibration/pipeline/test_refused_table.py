@@ -38,9 +38,9 @@ def test_a_table_carries_its_verdict(built: BuildResult) -> None:
     assert report["verdict"] == built.verdict.outcome != "refuse"
     assert report["figures"].keys() == judged_values(built.figures).keys()
     assert {limit["name"] for limit in report["limits"]} == report["figures"].keys()
-    # No series of exposures was given, no drift was to be taken out, and the chart is so small that the mean of what
-    # the lens may leave is remarked on, which names the worst cells.
-    unknown = {"linearity", "drift_left", "correction_worst"}
+    # No drift was to be taken out, no dark light subtracted, and what so small a chart does not show of the lens is in
+    # the uncertainty.
+    unknown = {"too_dark", "drift_left", "correction_residual", "correction_worst"}
     assert report["figures"].keys() == {limit.name for limit in FIGURES} - unknown
     page = (built.lut / "report.html").read_text()
     assert "class='verdict " in page
