@@ -36,6 +36,9 @@ _SIZES = (1e-5, 1e-4, 2e-4, 4e-4, 8e-4, 1.6e-3, 3.2e-3, 6.4e-3, 0.013, 0.026, 0.
 MOST_ADDED = 0.05
 """Share of a cell's level that may have been added for the cell to be used (judgement)."""
 
+_CERTAIN = 4.0
+"""Standard errors that are taken off, so that of some thousand cells none is listed for its noise."""
+
 LEAST_LEVEL = 1e-3
 """Level of a cell below which a relative error is stated as if it had that."""
 
@@ -63,7 +66,7 @@ class AddedLight:
 
     def certain_share_of(self, level: _Array) -> _Array:
         """Return by how much cells are brighter for certain, (C, 3) float64, relative to their levels (C, 3)."""
-        return np.maximum(self.share - 2 * self.error, 0) / np.maximum(level, LEAST_LEVEL)
+        return np.maximum(self.share - _CERTAIN * self.error, 0) / np.maximum(level, LEAST_LEVEL)
 
     @property
     def mean_square(self) -> _Array:
