@@ -28,7 +28,6 @@ from datetime import UTC
 from functools import lru_cache
 from typing import Annotated, Any, Final, Literal
 
-import typer
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from drivers.raw.rawfile import FrameOrigin
@@ -57,14 +56,6 @@ Text = Annotated[str, Field(max_length=20_000)]
 
 _SERIAL = ", serial number "
 """What stands before the number in a journal's name of the camera."""
-
-Note = Annotated[str | None, typer.Option("--note", help="What readers of the table should know.", show_default=False)]
-Licence = Annotated[
-    str | None,
-    typer.Option(
-        "--licence", "--license", metavar="SPDX", help="Licence of the table, as CC-BY-4.0.", show_default=False
-    ),
-]
 
 KEY_DIGITS: Final = 8
 """Digits of the table's hash in the key of its entry: two tables of one lab never share them by chance."""

@@ -13,12 +13,13 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from calibration.citation import Licence, Note
 from foundation import console
 from foundation.console import (
     EXIT_CODES,
     AsJson,
     JsonOutput,
+    Licence,
+    Note,
     Quiet,
     Verbose,
     Version,

@@ -440,6 +440,17 @@ def shows_progress() -> bool:
 AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object, for programs; all else goes to stderr.")]
 """The option ``--json``."""
 
+Note = Annotated[str | None, typer.Option("--note", help="What readers of the table should know.", show_default=False)]
+"""The option ``--note`` of commands that make a table."""
+
+Licence = Annotated[
+    str | None,
+    typer.Option(
+        "--licence", "--license", metavar="SPDX", help="Licence of the table, as CC-BY-4.0.", show_default=False
+    ),
+]
+"""The option ``--licence`` of commands that make a table."""
+
 
 class JsonOutput:
     """Figures of a command, gathered for the object that is printed at its end."""

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from drivers.serial_projectors import LANGUAGES
 from foundation import console
 from foundation.console import EXIT_CODES, Quiet, Verbose, Version, common_first, new_app
 
@@ -53,7 +54,7 @@ def projector(
     notify: Annotated[
         str | None, typer.Option(metavar="HOST:PORT", help="Send PJLink status notices there, by UDP.")
     ] = None,
-    serial: Annotated[str | None, typer.Option(help="Language on a serial port: benq, epson, nec or optoma.")] = None,
+    serial: Annotated[str | None, typer.Option(help=f"Language on a serial port: {', '.join(LANGUAGES)}.")] = None,
     lit: Annotated[bool, typer.Option("--lit", help="Begin with the lamp burning, not in standby.")] = False,
     warm_up: Annotated[float, typer.Option(min=0, metavar="SECONDS", help="Time to warm up.")] = 30.0,
     cool_down: Annotated[float, typer.Option(min=0, metavar="SECONDS", help="Time to cool down.")] = 60.0,

@@ -13,8 +13,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from calibration.citation import Licence, Note
-from foundation.console import EXIT_CODES, JsonOutput, orderly_end, progress, with_json
+from foundation.console import EXIT_CODES, JsonOutput, Licence, Note, orderly_end, progress, with_json
 from sim import cli as devices
 from sim.cli import app
 

@@ -20,6 +20,12 @@ def collected() -> tuple[Figure, ...]:
             raise ValueError(f"{figure.name}: it follows {figure.cause.follows}, which are not all figures")
     if len(names) < len(found):
         raise ValueError(f"{len(found)} figures have {len(names)} names")
+    at: dict[int, str] = {}
+    for figure in found:
+        for line in figure.lines:
+            if line.place in at:
+                raise ValueError(f"{figure.name}: place {line.place} of the summary has a line of {at[line.place]}")
+            at[line.place] = figure.name
     return found
 
 

@@ -343,6 +343,12 @@ class Accumulator:
         return tuple(found)
 
 
+def stored_names() -> list[str]:
+    """Return the names that a checkpoint stores; a build does not go on from one that was made with others."""
+    parts = (Accumulator, FrameMeasurements, DarkFrameFigures, DarkLight, DarkLightEstimate, HotPixels)
+    return [f"{part.__name__}.{field.name}" for part in parts for field in fields(part)]
+
+
 def disturbed_cells(frames: Sequence[FrameMeasurements]) -> dict[int, list[tuple[int, float]]]:
     """Return the lights under which something covered cells, and how far these are off; by the cells' colours.
 

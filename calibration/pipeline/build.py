@@ -36,7 +36,7 @@ import numpy.typing as npt
 from calibration.figures.all_figures import FIGURES
 from calibration.figures.figure import Figure
 from calibration.measurements import LinearityMeasurements, TableMeasurements
-from calibration.pipeline.accumulator import Accumulator, EarlyMeasurement
+from calibration.pipeline.accumulator import Accumulator, EarlyMeasurement, stored_names
 from calibration.pipeline.baseline import (
     PAPER_OPTIONS,
     BuildOptions,
@@ -94,9 +94,6 @@ CHECKPOINT_EVERY = 16
 
 METHOD = 13
 """Raised when samples, ground truth or unfit cells come out otherwise, so that no table is made by two methods."""
-
-CHECKPOINT_FORM = 2
-"""Raised when a checkpoint stores other names, so that one of older software is not gone on from."""
 
 CHECKPOINT = "checkpoint.npz"
 """Name of the checkpoint in the hidden folder."""
@@ -415,7 +412,7 @@ def _identity(session: Session, selected: SelectedFrames, options: BuildOptions)
     return {
         "software": software(),
         "method": METHOD,
-        "form": CHECKPOINT_FORM,
+        "stored": stored_names(),
         # The drift is taken out of the finished samples, and no sample depends on the citation.
         "options": to_plain(replace(options, correct_drift=False, citation=None)),
         "chart": session.chart.sha256,

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from importlib import resources
 from typing import Any
 
 from calibration.citation import origin_lines
@@ -166,9 +165,3 @@ def _cause(found: ProbableCause) -> dict[str, Any]:
         "places": places_text(found),
         "evidence": ", ".join(f"{key} {value:.3g}" for key, value in found.evidence.known().items()),
     }
-
-
-STYLE = "".join(
-    (resources.files("foundation") / "templates" / name).read_text() for name in ("colours.css", "style.css")
-)
-"""The style sheet of a page that is not made from a template."""

@@ -17,7 +17,8 @@ import logging
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import Protocol
+from enum import IntEnum
+from typing import ClassVar, Protocol
 
 from drivers.ptp.codes import EventCode, Operation, ResponseCode, describe
 from foundation.clock import Clock
@@ -148,53 +149,49 @@ LAST_TRANSACTION = 0xFFFFFFFE
 
 
 @dataclass(frozen=True)
-class PtpRequest:
-    """An operation that the initiator asks for."""
+class _Coded:
+    """What request, response and event have: a number of `codes`, and parameters; in text ``NAME(0x1, 0x2)``."""
 
+    codes: ClassVar[type[IntEnum]]
     code: int
     transaction: int = 0
     parameters: tuple[int, ...] = ()
 
     def __str__(self) -> str:
-        return f"{describe(Operation, self.code)}{_listed(self.parameters)}"
+        listed = ", ".join(f"0x{parameter:x}" for parameter in self.parameters)
+        return describe(self.codes, self.code) + (f"({listed})" if listed else "")
 
 
 @dataclass(frozen=True)
-class PtpResponse:
+class PtpRequest(_Coded):
+    """An operation that the initiator asks for."""
+
+    codes = Operation
+
+
+@dataclass(frozen=True)
+class PtpResponse(_Coded):
     """How an operation ended; `transaction` is the request's."""
 
-    code: int
-    transaction: int = 0
-    parameters: tuple[int, ...] = ()
+    codes = ResponseCode
 
     @property
     def ok(self) -> bool:
         """Whether the operation was carried out."""
         return self.code == ResponseCode.OK
 
-    def __str__(self) -> str:
-        return f"{describe(ResponseCode, self.code)}{_listed(self.parameters)}"
-
 
 @dataclass(frozen=True)
-class PtpEvent:
+class PtpEvent(_Coded):
     """Something that happened in the device; `transaction` is 0xffffffff where it belongs to none."""
 
-    code: int
+    codes = EventCode
     transaction: int = 0xFFFFFFFF
-    parameters: tuple[int, ...] = ()
-
-    def __str__(self) -> str:
-        return f"{describe(EventCode, self.code)}{_listed(self.parameters)}"
 
 
 def next_transaction(transaction: int) -> int:
     """Return the number that follows `transaction`; OpenSession carries 0 and 0xffffffff means none."""
     return 1 if transaction >= LAST_TRANSACTION else transaction + 1
-
-
-def _listed(parameters: tuple[int, ...]) -> str:
-    return "(" + ", ".join(f"0x{parameter:x}" for parameter in parameters) + ")" if parameters else ""
 
 
 MAX_COLLECTED = 4 * 1024 * 1024

@@ -243,18 +243,8 @@ def down_curvature(
     """Write √(f_xx² + 4 f_xy² + f_yy²) from rows smoothed, derived once, and derived twice along x."""
     del typing, smooth, slope, curve, reach, even, odd, bend, target, pitch
 
-    def emit(
-        builder: Any,
-        smooth: Any,
-        slope: Any,
-        curve: Any,
-        reach: Any,
-        even: Any,
-        odd: Any,
-        bend: Any,
-        target: Any,
-        pitch: Any,
-    ) -> None:
+    def emit(builder: Any, *given: Any) -> None:
+        smooth, slope, curve, reach, even, odd, bend, target, pitch = given
         step = ir.Constant(I64, LINE)
         (xx,) = _emit(builder, curve, step, (even,), reach, (EVEN,))
         (xy,) = _emit(builder, slope, step, (odd,), reach, (ODD,))

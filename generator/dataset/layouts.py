@@ -40,7 +40,7 @@ from pathlib import Path
 from statistics import median
 from string import Template
 from types import TracebackType
-from typing import TYPE_CHECKING, Any, BinaryIO, Final, Protocol, Self, cast
+from typing import TYPE_CHECKING, Any, BinaryIO, Final, NamedTuple, Protocol, Self, cast
 
 from calibration.citation import bibtex, origin_lines, table_title
 from foundation.errors import CropError, FormatError, InputError
@@ -285,21 +285,17 @@ class _Tar:
         pass
 
 
-def _read_tar_member(store: Store, container: str, file: str) -> bytes:
-    """Return the bytes of the file called `file` in the tar file called `container`.
+def _read_tar(stream: BinaryIO, file: str) -> bytes | None:
+    """Return the bytes of a file in a tar file.
 
     Only members that are plain files are looked at: a tar file may also hold links and sparse files, and claim sizes
     that it does not have.
     """
-    with store.open(container) as stream:
-        try:
-            for name, offset, size in _members(stream):
-                if name == file:
-                    stream.seek(offset)
-                    return stream.read(size)
-        except (tarfile.TarError, ValueError, OSError) as error:
-            raise FormatError(f"{store.place}/{container} is damaged: {error}; make the dataset again") from error
-    raise FormatError(f"{store.place}/{container} holds no {file}; make the dataset again")
+    for name, offset, size in _members(stream):
+        if name == file:
+            stream.seek(offset)
+            return stream.read(size)
+    return None
 
 
 def _members(stream: BinaryIO) -> Iterator[tuple[str, int, int]]:
@@ -338,12 +334,6 @@ _FILE = {"decode": False, "_type": "Image"}
 _STRING = {"dtype": "string", "_type": "Value"}
 _INT = {"dtype": "int64", "_type": "Value"}
 _TRUTH = {"feature": {"dtype": "float64", "_type": "Value"}, "length": 3, "_type": "List"}
-
-
-def require_pyarrow() -> None:
-    """Refuse where pyarrow is not installed."""
-    if find_spec("pyarrow") is None:
-        raise InputError("the layout parquet needs pyarrow; install it with: pip install pyarrow")
 
 
 def schema(previews: bool, maps: bool, details: bool) -> pa.Schema:
@@ -432,63 +422,137 @@ def _cell_of(file: str) -> tuple[str, int | None]:
     return ("masks", int(place)) if several else (name, None)
 
 
-def _read_parquet_member(store: Store, container: str, file: str) -> bytes:
-    """Return the bytes of a file, named as in a tar file, of the Parquet file called `container`."""
-    require_pyarrow()
+def _read_parquet(stream: BinaryIO, file: str) -> bytes | None:
+    """Return the bytes of a file, named as in a tar file, in a Parquet file."""
     import pyarrow.parquet as pq
 
+    number = int(file.partition(".")[0])
+    column, place = _cell_of(file)
+    size = stream.seek(0, 2)
+    table = pq.ParquetFile(
+        stream, thrift_string_size_limit=_MOST_THRIFT_BYTES, thrift_container_size_limit=_MOST_THRIFT_ITEMS
+    )
+    for group in range(table.num_row_groups):
+        # Our writer compresses nothing: a group that claims more than the file has is none of ours.
+        known = table.metadata.row_group(group)
+        if not (0 <= known.num_rows <= _MOST_ROWS and 0 <= known.total_byte_size <= 2 * size + 65536):
+            raise ValueError(f"it claims {known.num_rows} rows of {known.total_byte_size} bytes in a group")
+        numbers = table.read_row_group(group, ["number"]).column("number").to_pylist()
+        if number in numbers:
+            cells = table.read_row_group(group, [column]).column(column).to_pylist()
+            cell = cells[numbers.index(number)]
+            data = (cell if place is None else cell[place])["bytes"]
+            if not isinstance(data, bytes):
+                raise ValueError(f"{file} is no file")
+            return data
+    return None
+
+
+class Beside(NamedTuple):
+    """What a dataset has beside images and their lights: previews, maps of several lights, what options did."""
+
+    previews: bool
+    maps: bool
+    details: bool
+
+
+@dataclass(frozen=True)
+class JoinedLayout:
+    """A layout in which the images of a shard lie in one file.
+
+    - `ending`, `media`: of such a file: its name's, and its media type.
+    - `begin`: begins one on a stream.
+    - `read`: returns the bytes of an image's file that lies in one, named by `member_name`; None where it has no such.
+      Whatever else it raises says that the file is damaged.
+    - `library`: by which it is written and read; "" where Python suffices.
+    - `is_of_the_hub`: whether Hugging Face's `load_dataset` finds the images in it; else it finds the table of lights.
+    - `reading`: for the dataset's card, how images are read without losing bits.
+    - `columns`: name, type and description of those that Croissant's loaders find in it.
+    """
+
+    ending: str
+    media: str
+    begin: Callable[[HashingWriter, Beside], _Container]
+    read: Callable[[BinaryIO, str], bytes | None]
+    library: str
+    is_of_the_hub: bool
+    reading: str
+    columns: tuple[tuple[str, str, str], ...]
+
+
+_HUB_READING: Final = (
+    "`load_dataset` finds the parts. Its decoder, Pillow, keeps 8 of 16 bits: decode the bytes with "
+    "`cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)` (then BGR), with "
+    '`.cast_column("png", Image(decode=False))` before it in WebDataset shards; or read with '
+    "`generator.open_dataset`."
+)
+
+JOINED: Final[Mapping[str, JoinedLayout]] = {
+    "webdataset": JoinedLayout(
+        ending="tar",
+        media="application/x-tar",
+        begin=lambda stream, _: _Tar(stream),
+        read=_read_tar,
+        library="",
+        is_of_the_hub=True,
+        reading=_HUB_READING,
+        # Members of archives that a pattern names cannot be told to loaders; WebDataset's own reader finds them.
+        columns=(),
+    ),
+    "parquet": JoinedLayout(
+        ending="parquet",
+        media="application/x-parquet",
+        begin=lambda stream, beside: _Parquet(stream, schema(*beside)),
+        read=_read_parquet,
+        library="pyarrow",
+        is_of_the_hub=True,
+        reading=_HUB_READING,
+        columns=(
+            ("number", "sc:Integer", "Number of the image."),
+            ("source", "sc:Text", "Name of the picture that it shows."),
+            ("width", "sc:Integer", "Width, px."),
+            ("height", "sc:Integer", "Height, px."),
+        ),
+    ),
+}
+"""By name all layouts but `folder`, in which each image is a file of its own."""
+
+
+def library_of(layout: str) -> str:
+    """Return the library by which a layout is written and read; "" where Python suffices."""
+    return JOINED[layout].library if layout in JOINED else ""
+
+
+def require_library(layout: str) -> None:
+    """Refuse a layout whose library is not installed."""
+    library = library_of(layout)
+    if library and find_spec(library) is None:
+        raise InputError(f"the layout {layout} needs {library}; install it with: pip install {library}")
+
+
+def open_writer(layout: Layout, store: Store, shard: int, beside: Beside) -> ShardWriter:
+    """Return the writer of a shard."""
+    if layout == "folder":
+        return FolderWriter(store)
+    joined = JOINED[layout]
+    return JoinedWriter(store, shard, joined.ending, lambda stream: joined.begin(stream, beside))
+
+
+def read_member(layout: str, store: Store, container: str, file: str) -> bytes:
+    """Return the bytes of a file of an image that lies with others in one file of a shard."""
+    require_library(layout)
     with store.open(container) as stream:
         try:
-            number = int(file.partition(".")[0])
-            column, place = _cell_of(file)
-            size = stream.seek(0, 2)
-            table = pq.ParquetFile(
-                stream, thrift_string_size_limit=_MOST_THRIFT_BYTES, thrift_container_size_limit=_MOST_THRIFT_ITEMS
-            )
-            for group in range(table.num_row_groups):
-                # Our writer compresses nothing: a group that claims more than the file has is none of ours.
-                known = table.metadata.row_group(group)
-                if not (0 <= known.num_rows <= _MOST_ROWS and 0 <= known.total_byte_size <= 2 * size + 65536):
-                    raise ValueError(f"it claims {known.num_rows} rows of {known.total_byte_size} bytes in a group")
-                numbers = table.read_row_group(group, ["number"]).column("number").to_pylist()
-                if number in numbers:
-                    cells = table.read_row_group(group, [column]).column(column).to_pylist()
-                    cell = cells[numbers.index(number)]
-                    data = (cell if place is None else cell[place])["bytes"]
-                    if not isinstance(data, bytes):
-                        raise ValueError(f"{file} is no file")
-                    return data
+            data = JOINED[layout].read(stream, file)
         except CropError:
             raise
         except Exception as error:
             # Whatever a foreign file makes of the library: its own errors, and those of values that are missing.
             reason = " ".join(f"{type(error).__name__}: {error}".split())
             raise FormatError(f"{store.place}/{container} is damaged: {reason}; make the dataset again") from error
-    raise FormatError(f"{store.place}/{container} holds no {file}; make the dataset again")
-
-
-def require_libraries(layout: Layout) -> None:
-    """Refuse a layout whose library is not installed."""
-    if layout == "parquet":
-        require_pyarrow()
-
-
-def open_writer(layout: Layout, store: Store, shard: int, *, previews: bool, maps: bool, details: bool) -> ShardWriter:
-    """Return the writer of a shard."""
-    match layout:
-        case "folder":
-            return FolderWriter(store)
-        case "webdataset":
-            return JoinedWriter(store, shard, "tar", _Tar)
-        case "parquet":
-            columns = schema(previews, maps, details)
-            return JoinedWriter(store, shard, "parquet", lambda stream: _Parquet(stream, columns))
-
-
-def read_member(layout: str, store: Store, container: str, file: str) -> bytes:
-    """Return the bytes of a file of an image that lies with others in one file of a shard."""
-    read = _read_tar_member if layout == "webdataset" else _read_parquet_member
-    return read(store, container, file)
+    if data is None:
+        raise FormatError(f"{store.place}/{container} holds no {file}; make the dataset again")
+    return data
 
 
 def name_of(description: Description) -> str:
@@ -681,14 +745,22 @@ def _table_file(name: str, sha256: str) -> dict[str, Any]:
 
 def _files_of_images(description: Description) -> list[dict[str, Any]]:
     """Return the set of files that holds the images: themselves, or the shards that they lie in."""
-    suffix, layout = suffix_of(option(description, "format")), option(description, "layout")
-    media = _MEDIA.get(str(option(description, "format")), "application/octet-stream")
-    if layout == "folder":
+    joined = _joined(description)
+    if joined is None:
+        suffix = suffix_of(option(description, "format"))
+        media = _MEDIA.get(str(option(description, "format")), "application/octet-stream")
         return [_file_set("image-files", [f"images/*{suffix}"], media)]
-    parts = [part for part, images in description.splits.items() if images] or ["data"]
-    if layout == "parquet":
-        return [_file_set("shards", [f"{part}/*.parquet" for part in parts], "application/x-parquet")]
-    return [_file_set("shards", [f"{part}/*.tar" for part in parts], "application/x-tar")]
+    return [_file_set("shards", [f"{part}/*.{joined.ending}" for part in _parts(description)], joined.media)]
+
+
+def _joined(description: Description) -> JoinedLayout | None:
+    """Return the layout of a dataset; None where each image is a file of its own."""
+    return JOINED.get(option(description, "layout"))
+
+
+def _parts(description: Description) -> list[str]:
+    """Return the folders in which a dataset's shards lie."""
+    return [part for part, images in description.splits.items() if images] or ["data"]
 
 
 def _file_set(name: str, includes: list[str], media: str) -> dict[str, Any]:
@@ -709,23 +781,15 @@ def _ground_truth() -> dict[str, Any]:
 
 
 def _images(description: Description) -> list[dict[str, Any]]:
-    """Return the records of images: their files, or the columns of their shards.
-
-    Members of several archives that a pattern names cannot be told to loaders; WebDataset's own reader finds them.
-    """
-    if option(description, "layout") == "webdataset":
-        return []
-    if option(description, "layout") == "parquet":
-        columns = (
-            ("number", "sc:Integer", "Number of the image."),
-            ("source", "sc:Text", "Name of the picture that it shows."),
-            ("width", "sc:Integer", "Width, px."),
-            ("height", "sc:Integer", "Height, px."),
-        )
+    """Return the records of images: their files, or the columns of their shards."""
+    joined = _joined(description)
+    if joined is not None:
         fields = [
             _field("images", name, kind, text, {"fileSet": {"@id": "shards"}, "extract": {"column": name}})
-            for name, kind, text in columns
+            for name, kind, text in joined.columns
         ]
+        if not fields:
+            return []
     else:
         fields = [
             _field(
@@ -878,32 +942,26 @@ def _front_matter(description: Description) -> str:
 
 def _configs(description: Description) -> str:
     """Return where the files of each part lie; of plain files the table of ground truths is what rows are read from."""
-    layout = option(description, "layout")
-    if layout == "folder":
+    joined = _joined(description)
+    if joined is None or not joined.is_of_the_hub:
         files = "  - split: train\n    path: ground_truth.csv\n"
     else:
-        ending = {"webdataset": "tar", "parquet": "parquet"}[str(layout)]
-        parts = [part for part, images in description.splits.items() if images] or ["data"]
         files = "".join(
-            f"  - split: {'train' if part == 'data' else part}\n    path: {part}/*.{ending}\n" for part in parts
+            f"  - split: {'train' if part == 'data' else part}\n    path: {part}/*.{joined.ending}\n"
+            for part in _parts(description)
         )
     return f"configs:\n- config_name: default\n  data_files:\n{files}"
 
 
 def _reading(description: Description) -> str:
     """Return how the images are read without losing bits."""
-    form = option(description, "format")
-    if option(description, "layout") == "folder":
-        return (
-            f"`images/NNNNNN.{form}` are linear, 16 bits where the format has them; `load_dataset` gives the rows of "
-            "`ground_truth.csv`, whose column `image` names the file. Pillow keeps 8 of 16 bits of a PNG: use "
-            "`cv2.imread(path, cv2.IMREAD_UNCHANGED)` (then BGR) or `generator.open_dataset`."
-        )
+    form, joined = option(description, "format"), _joined(description)
+    if joined is not None:
+        return joined.reading
     return (
-        "`load_dataset` finds the parts. Its decoder, Pillow, keeps 8 of 16 bits: decode the bytes with "
-        "`cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)` (then BGR), with "
-        '`.cast_column("png", Image(decode=False))` before it in WebDataset shards; or read with '
-        "`generator.open_dataset`."
+        f"`images/NNNNNN.{form}` are linear, 16 bits where the format has them; `load_dataset` gives the rows of "
+        "`ground_truth.csv`, whose column `image` names the file. Pillow keeps 8 of 16 bits of a PNG: use "
+        "`cv2.imread(path, cv2.IMREAD_UNCHANGED)` (then BGR) or `generator.open_dataset`."
     )
 
 

@@ -27,7 +27,7 @@ from foundation.errors import InputError
 from foundation.files import file_sha256
 from foundation.secret_texts import masked_values
 from foundation.version import software
-from generator.dataset.layouts import require_libraries
+from generator.dataset.layouts import library_of, require_library
 from generator.dataset.records import SPLITS, Layout, Light, Scale, Split, TableRecord
 from generator.files import FORMATS, Format, libraries_of
 from generator.pictures.sources import PictureFile
@@ -335,7 +335,7 @@ class Plan:
                 f"{kept} bits of each code were to be kept, where the table has {self.lut.provenance.bits}; ask for "
                 "fewer"
             )
-        require_libraries(self.options.layout)
+        require_library(self.options.layout)
 
     @cached_property
     def parts(self) -> tuple[Split, ...]:
@@ -473,9 +473,8 @@ def versions(form: Format, layout: Layout) -> dict[str, str]:
     Other versions may give other bytes.
     """
     names = {"isal", "numpy", "OpenImageIO", "opencv-contrib-python-headless", "pillow", "scipy", "simplejpeg"}
-    if layout == "parquet":
-        names.add("pyarrow")
-    return {name: importlib.metadata.version(name) for name in sorted(names | {*libraries_of(form)})}
+    needed = {*libraries_of(form), library_of(layout)} - {""}
+    return {name: importlib.metadata.version(name) for name in sorted(names | needed)}
 
 
 def table_of(lut: Lut) -> TableRecord:

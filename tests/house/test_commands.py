@@ -32,6 +32,15 @@ def call(module: str, *arguments: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
 
 
+def test_opening_a_table_or_a_dataset_loads_no_commands() -> None:
+    code = (
+        "import sys, calibration.table.lut, generator\n"
+        "generator.open_lut, generator.open_dataset, generator.render\n"
+        "print(*sorted({'typer', 'click', 'rich'} & sys.modules.keys()))"
+    )
+    assert subprocess.check_output([sys.executable, "-c", code], text=True) == "\n"
+
+
 def commands_of(command: Any) -> Iterator[tuple[tuple[str, ...], Any]]:
     """Yield a command, and what is below it, with the words that lead there."""
     yield (), command

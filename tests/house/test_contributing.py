@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import os
 import re
 import shlex
@@ -12,6 +13,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
+
+from tests.house.test_docstrings import constants, has_reason
 
 pytestmark = pytest.mark.slow
 
@@ -95,6 +98,18 @@ def test_a_worked_example_works(example: Example, tmp_path: Path) -> None:
     )
     said = run(tmp_path, example.command())
     assert re.search(r"\b[1-9]\d* passed", said), said
+
+
+def test_constants_of_the_examples_state_their_reason() -> None:
+    texts = {path: text for example in EXAMPLES for path, text in example.files().items() if path[:5] != "tests"}
+    without = [
+        f"{path} {name}"
+        for path, text in texts.items()
+        for name, node, after in constants(ast.parse(text))
+        if not has_reason(node, after, text.splitlines())
+    ]
+    assert texts
+    assert without == []
 
 
 def run(folder: Path, words: list[str]) -> str:

@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 
 import calibration.pipeline.build as building
+from calibration.pipeline.accumulator import stored_names
 from calibration.pipeline.baseline import frame_faults
 from calibration.pipeline.build import CHECKPOINT, Checkpoint, TableProgress, append, build, unfinished_table
 from calibration.table.lut import open_lut
@@ -183,6 +184,9 @@ def test_a_table_follows_its_session(session_under_way: Session, undisturbed: di
         with pytest.raises(FormatError, match="in the making"):
             open_lut(out)
     assert seen == [(0, 1), (3, 4), (3, 0), (lights - 1, every - 8)]
+    with np.load(tmp_path / ".lut.partial" / CHECKPOINT) as stored:
+        arrays = {name.rpartition(".")[2] for name in stored.files} - {"text"}
+    assert arrays <= {name.partition(".")[2] for name in stored_names()}, "a checkpoint with other names is not used"
     with pytest.raises(FormatError, match=r"1 of \d+ lights .*--append"):
         build(session, out)
     show(session, every)

@@ -8,7 +8,9 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Iterator
-from typing import Any
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, get_args
 
 import pytest
 from hypothesis import given
@@ -22,6 +24,7 @@ from drivers.serial_projectors.driver import take_line
 from drivers.serial_projectors.epson import EpsonOnNetwork, EpsonProjector
 from drivers.serial_projectors.nec import NecProjector
 from drivers.serial_projectors.optoma import OptomaProjector
+from experiment.config import ProjectorCable
 from foundation.errors import (
     ConfigurationError,
     DeviceError,
@@ -38,26 +41,57 @@ from sim.projectors.serial import PEERS, SERIAL_NUMBER, BenqPeer, EpsonPeer, Opt
 from tests.contracts.projector import Bench, ProjectorContract
 from tests.drivers.links.troubled_links import Deaf, Dribbling, DroppedAfter, Garbling
 
+ROOT = Path(__file__).parents[3]
 NAMES = sorted(LANGUAGES)
 on_posix = pytest.mark.skipif(sys.platform == "win32", reason="Windows has no pseudo-terminals")
 
-IDENTITIES = {
-    "benq": ProjectorIdentity("BenQ", "Simulated Projector", ""),
-    "epson": ProjectorIdentity("Epson", "", SERIAL_NUMBER),
-    "nec": ProjectorIdentity("NEC", "Simulated Projector", "dark room"),
-    "optoma": ProjectorIdentity("Optoma", "model 1", ""),
-}
+OPTOMA_STATE = bytes.fromhex("7E 30 30 31 32 34 20 31 0D")
+RUNNING = "00 85 00 00 01 01 87"
 
 
-def _errors(faults: frozenset[Fault]) -> frozenset[Fault]:
+def running(data: str, sum_: str) -> str:
+    """Return the running status as a projector 1 of model 40h sends it; the sums are worked out by hand."""
+    return f"20 85 01 40 10 {data}" + " 00" * 10 + sum_
+
+
+@dataclass(frozen=True)
+class Expected:
+    """What a language is held to.
+
+    - `identity`: of the simulated projector.
+    - `reported`: which of its faults the language can say.
+    - `question`, `answer`: the manual's bytes that ask for the power state, and those that say it is on.
+    - `before`: what is sent over a new connection before the first question; ``:`` answers it.
+    """
+
+    identity: ProjectorIdentity
+    reported: Callable[[frozenset[Fault]], frozenset[Fault]]
+    question: bytes
+    answer: bytes
+    before: tuple[bytes, ...] = ()
+
+
+def errors_of(faults: frozenset[Fault]) -> frozenset[Fault]:
     return frozenset(fault for fault in faults if fault.severity is Severity.ERROR)
 
 
-REPORTED: dict[str, Callable[[frozenset[Fault]], frozenset[Fault]]] = {
-    "benq": lambda faults: frozenset(),
-    "epson": _errors,
-    "nec": lambda faults: faults,
-    "optoma": _errors,
+EXPECTED: dict[str, Expected] = {
+    "benq": Expected(
+        ProjectorIdentity("BenQ", "Simulated Projector", ""),
+        lambda faults: frozenset(),
+        b"\r*pow=?#\r",
+        b"\r\n>*pow=?#\r\n*POW=ON#\r\n>",
+    ),
+    "epson": Expected(
+        ProjectorIdentity("Epson", "", SERIAL_NUMBER), errors_of, b"PWR?\r", b"PWR=01\r:", before=(b"\r",)
+    ),
+    "nec": Expected(
+        ProjectorIdentity("NEC", "Simulated Projector", "dark room"),
+        lambda faults: faults,
+        bytes.fromhex(RUNNING),
+        bytes.fromhex(running("00 00 01 00 00 04", "FB")),
+    ),
+    "optoma": Expected(ProjectorIdentity("Optoma", "model 1", ""), errors_of, OPTOMA_STATE, b"INFO3\rOK1\r"),
 }
 
 
@@ -81,9 +115,16 @@ def bench_of(name: str, device: SimulatedProjector, projector: Projector, catch_
             device.switch_on()
         catch_up()
 
-    traits = device.traits
+    traits, expected = device.traits, EXPECTED[name]
     return Bench(
-        projector, wait, break_part, repair, IDENTITIES[name], traits.warm_up_s, traits.cool_down_s, REPORTED[name]
+        projector,
+        wait,
+        break_part,
+        repair,
+        expected.identity,
+        traits.warm_up_s,
+        traits.cool_down_s,
+        expected.reported,
     )
 
 
@@ -425,10 +466,9 @@ def optoma_script(*turns: tuple[bytes, tuple[bytes, ...] | bytes]) -> tuple[Opto
 # "Power ON ~XX00 1: 7E 30 30 30 30 20 31 0D", HD50 manual.
 OPTOMA_ON = bytes.fromhex("7E 30 30 30 30 20 31 0D")
 OPTOMA_MUTE = bytes.fromhex("7E 30 30 30 32 20 31 0D")
+
+
 # "Power State ~XX124 1: 7E 30 30 31 32 34 20 31 0D", W351 manual.
-OPTOMA_STATE = bytes.fromhex("7E 30 30 31 32 34 20 31 0D")
-
-
 def test_optoma_switches_on_and_is_overheard() -> None:
     projector, script = optoma_script(
         (OPTOMA_STATE, b"OK0\r"),
@@ -483,14 +523,6 @@ def test_optoma_lamp_failure_is_overheard() -> None:
 def nec_script(*turns: tuple[str, str]) -> tuple[NecProjector, Script]:
     script = Script(*((bytes.fromhex(heard), bytes.fromhex(said)) for heard, said in turns))
     return NecProjector(lambda: script, clock=SimulatedClock()), script
-
-
-RUNNING = "00 85 00 00 01 01 87"
-
-
-def running(data: str, sum_: str) -> str:
-    """Return the running status as a projector 1 of model 40h sends it; the sums are worked out by hand."""
-    return f"20 85 01 40 10 {data}" + " 00" * 10 + sum_
 
 
 @pytest.mark.parametrize(
@@ -597,33 +629,25 @@ def test_nec_wrong_sum_and_wrong_answer() -> None:
         projector.power()
 
 
-GOLDEN: dict[str, tuple[Callable[[Callable[[], Link]], Projector], tuple[bytes, ...], bytes, bytes]] = {
-    "benq": (BenqProjector, (), b"\r*pow=?#\r", b"\r\n>*pow=?#\r\n*POW=ON#\r\n>"),
-    "epson": (EpsonProjector, (b"\r",), b"PWR?\r", b"PWR=01\r:"),
-    "nec": (NecProjector, (), bytes.fromhex(RUNNING), bytes.fromhex(running("00 00 01 00 00 04", "FB"))),
-    "optoma": (OptomaProjector, (), OPTOMA_STATE, b"INFO3\rOK1\r"),
-}
-
-
 @pytest.mark.parametrize("name", NAMES)
 @given(data=st.data())
 def test_any_split_gives_the_same_answer(name: str, data: st.DataObject) -> None:
-    driver, before, question, answer = GOLDEN[name]
+    expected, answer = EXPECTED[name], EXPECTED[name].answer
     cuts = sorted(data.draw(st.sets(st.integers(1, len(answer) - 1))))
     pieces = tuple(answer[start:end] for start, end in zip([0, *cuts], [*cuts, len(answer)], strict=True))
-    script = Script(*((said, b":") for said in before), (question, pieces))
-    assert driver(lambda: script).power() is Power.ON
+    script = Script(*((said, b":") for said in expected.before), (expected.question, pieces))
+    assert LANGUAGES[name].projector(lambda: script).power() is Power.ON
 
 
 @pytest.mark.parametrize("name", NAMES)
 @given(data=st.data())
 def test_half_an_answer_is_no_answer(name: str, data: st.DataObject) -> None:
-    driver, before, question, answer = GOLDEN[name]
+    expected, answer = EXPECTED[name], EXPECTED[name].answer
     end = answer.index(b"#\r\n>") if name == "benq" else len(answer) - 1
     half = answer[: data.draw(st.integers(0, end))]
-    script = Script(*((said, b":") for said in before), (question, (half,) if half else ()))
+    script = Script(*((said, b":") for said in expected.before), (expected.question, (half,) if half else ()))
     with pytest.raises(LinkTimeout, match="within 5 s"):
-        driver(lambda: script).power()
+        LANGUAGES[name].projector(lambda: script).power()
 
 
 TAKERS: list[Callable[[bytes], tuple[Any, int] | None]] = [
@@ -757,11 +781,19 @@ def test_a_cable_pulled_out_is_told(name: str) -> None:
 
 def test_languages_are_found_in_any_case_and_unknown_ones_are_told_the_known() -> None:
     assert language("Epson") is LANGUAGES["epson"]
-    assert {name: (spoken.baud, spoken.parity) for name, spoken in LANGUAGES.items()} == {
-        "benq": (115200, "N"),
-        "epson": (9600, "N"),
-        "nec": (38400, "N"),
-        "optoma": (9600, "N"),
-    }
-    with pytest.raises(ConfigurationError, match="benq, epson, nec, optoma"):
+    with pytest.raises(ConfigurationError, match=", ".join(LANGUAGES)):
         language("klingon")
+
+
+def test_users_are_told_of_every_language() -> None:
+    control = ProjectorCable.model_fields["control"].annotation
+    assert set(get_args(control)) == {"none", "pjlink", *LANGUAGES}, "experiment/config.py"
+    told_by = {"docs/devices.md": "`{}` | {} |", "docs/lab.md": '"{}"', "acquisition/data/lab.toml": '"{}"'}
+    texts = {page: (ROOT / page).read_text() for page in told_by}
+    assert [
+        (page, name)
+        for page, pattern in told_by.items()
+        for name, spoken in LANGUAGES.items()
+        if pattern.format(name, spoken.baud) not in texts[page]
+    ] == []
+    assert {spoken.parity for spoken in LANGUAGES.values()} == {"N"}, "docs/devices.md says so of all"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Literal
+from typing import get_args
 
 import numpy as np
 import pytest
@@ -13,6 +13,7 @@ from calibration.table.lut import open_lut
 from evaluation.datasets import open_scenes
 from evaluation.scene import MixedScene
 from generator.dataset.making import DatasetOptions, generate_dataset
+from generator.dataset.records import Layout
 from generator.lights.choices import ListedLights, SimultaneousLights
 from generator.masks.making import parse_masks
 from generator.pictures.sources import random_scenes
@@ -20,10 +21,8 @@ from tests.evaluation.datasets import contract
 
 pytestmark = pytest.mark.slow
 
-Layout = Literal["folder", "webdataset", "parquet"]
 
-
-@pytest.mark.parametrize("layout", ["folder", "webdataset", "parquet"])
+@pytest.mark.parametrize("layout", get_args(Layout))
 @pytest.mark.parametrize("together", [1, 2])
 def test_every_layout(made_lut: Path, tmp_path: Path, layout: Layout, together: int) -> None:
     listed = ListedLights((0, 1))

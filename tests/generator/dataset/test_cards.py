@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, get_args
 import pytest
 
 from calibration.citation import NOT_RECORDED, OriginRecord
-from generator.dataset.layouts import CONFORMS_TO, OPEN, card, datasheet, kind_of, size_category
+from generator.dataset.layouts import CONFORMS_TO, JOINED, OPEN, card, datasheet, kind_of, size_category
 from generator.dataset.making import DatasetOptions, generate_dataset
 from generator.dataset.records import Description, Layout, Split
 from generator.pictures.sources import random_scenes
@@ -84,8 +84,8 @@ def test_the_card_is_what_the_hub_reads(made: Dataset) -> None:
     files = [entry for config in read.data.to_dict()["configs"] for entry in config["data_files"]]
     splits = made.description.splits
     named: set[Split] = {part for part, images in splits.items() if images}  # pyright: ignore[reportAssignmentType]
-    folder = made.description.options["layout"] == "folder"
-    assert {entry["split"] for entry in files} == ({"train"} if folder else named)
+    layout = JOINED.get(made.layout)
+    assert {entry["split"] for entry in files} == (named if layout and layout.is_of_the_hub else {"train"})
     for entry in files:
         assert list(place_of(made).glob(entry["path"])), entry
 

@@ -13,7 +13,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, get_args, get_type_hints
 
 import cv2
 import numpy as np
@@ -21,6 +21,8 @@ import numpy.typing as npt
 import pytest
 
 from foundation.errors import FormatError, InputError, StorageError
+from generator.command.options import ImageOptions
+from generator.dataset.layouts import JOINED
 from generator.dataset.making import DatasetOptions, generate_dataset
 from generator.dataset.reader import Dataset, file_faults, open_dataset
 from generator.dataset.records import COMPLETED_BY_HAND, Layout
@@ -37,7 +39,7 @@ if TYPE_CHECKING:
     Make = Callable[..., Dataset]
 
 SCENES = random_scenes(9, 28, 24, 8)
-LAYOUTS: tuple[Layout, ...] = ("folder", "webdataset", "parquet")
+LAYOUTS: tuple[Layout, ...] = get_args(Layout)
 
 
 @pytest.fixture
@@ -63,15 +65,20 @@ def place_of(made: Dataset) -> Path:
     return Path(made.store.place)
 
 
+def test_every_layout_is_offered() -> None:
+    offered = get_type_hints(ImageOptions)["layout"]
+    assert LAYOUTS == get_args(offered) == ("folder", *JOINED)
+
+
 @pytest.mark.parametrize("form", ["png", "tiff", "exr", "jxl", "dng"])
 def test_every_format_is_the_same_image_in_every_layout(make: Make, form: str) -> None:
-    folder, tar, parquet = (make(layout, form=form) for layout in LAYOUTS)
-    assert folder.entries == tar.entries == parquet.entries
+    folder, *others = (make(layout, form=form) for layout in LAYOUTS)
+    assert [other.entries for other in others] == [folder.entries] * len(JOINED)
     assert [entry.image for entry in folder.entries] == [f"{number:06d}.{form}" for number in range(18)]
     for entry in folder.entries[::4]:
         image = folder.read_image(entry)
         assert image.shape == ((12, 14, 3) if form == "dng" else (24, 28, 3))
-        for other in (tar, parquet):
+        for other in others:
             np.testing.assert_array_equal(other.read_image(entry), image)
             assert other.read_preview(entry) == folder.read_preview(entry) != None  # noqa: E711
 
@@ -170,7 +177,7 @@ def test_a_shard_that_cannot_be_ended_is_given_up_quietly(
     assert capfd.readouterr() == ("", "")
 
 
-@pytest.mark.parametrize("layout", ["webdataset", "parquet"])
+@pytest.mark.parametrize("layout", [name for name, joined in JOINED.items() if joined.is_of_the_hub])
 def test_hugging_face_finds_the_parts_by_the_card(
     make: Make, hugging_face: Any, tmp_path: Path, layout: Layout
 ) -> None:
@@ -179,6 +186,26 @@ def test_hugging_face_finds_the_parts_by_the_card(
     assert {part: rows.num_rows for part, rows in loaded.items()} == {
         part: images for part, images in made.description.splits.items() if images
     }
+
+
+def maps_in_folder(place: Path) -> list[bytes]:
+    names = ("masks/000003_0.png", "masks/000003_1.png", "ground_truth/000003.png")
+    return [(place / name).read_bytes() for name in names]
+
+
+def maps_in_tar(place: Path) -> list[bytes]:
+    with tarfile.open(place / "data" / "000000.tar") as tar:
+        streams = [tar.extractfile(f"000003.{name}.png") for name in ("masks_0", "masks_1", "ground_truth")]
+        return [stream.read() for stream in streams if stream is not None]
+
+
+def maps_in_parquet(place: Path) -> list[bytes]:
+    row = import_module("pyarrow.parquet").read_table(place / "data" / "000000.parquet").to_pylist()[3]
+    return [file["bytes"] for file in (*row["masks"], row["ground_truth"])]
+
+
+MAPS_OF = {"folder": maps_in_folder, "webdataset": maps_in_tar, "parquet": maps_in_parquet}
+"""Both masks of the fourth image and its ground truth, by other readers than ours."""
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)
@@ -191,20 +218,9 @@ def test_several_lights_in_an_image(make: Make, make_lut: Callable[..., Lut], la
     assert np.sum(entry.truth) == pytest.approx(1)
     text = (place_of(made) / "ground_truth.csv").read_text().splitlines()
     assert [line.split(",")[0] for line in text[7:9]] == ["000003.png", "000003.png"]
-    if layout == "folder":
-        files = [(place_of(made) / "masks" / f"000003_{light}.png").read_bytes() for light in (0, 1)]
-        weights = np.stack([grey(file) for file in files], axis=-1) / 65535
-        truths = decoded((place_of(made) / "ground_truth" / "000003.png").read_bytes()) / 65535
-    elif layout == "webdataset":
-        with tarfile.open(place_of(made) / "data" / "000000.tar") as tar:
-            members = {member.name: tar.extractfile(member) for member in tar.getmembers()}
-            maps = {name: stream.read() for name, stream in members.items() if stream is not None}
-        weights = np.stack([grey(maps[f"000003.masks_{light}.png"]) for light in (0, 1)], axis=-1) / 65535
-        truths = decoded(maps["000003.ground_truth.png"]) / 65535
-    else:
-        table = import_module("pyarrow.parquet").read_table(place_of(made) / "data" / "000000.parquet").to_pylist()
-        weights = np.stack([grey(mask["bytes"]) for mask in table[3]["masks"]], axis=-1) / 65535
-        truths = decoded(table[3]["ground_truth"]["bytes"]) / 65535
+    first, second, truth = MAPS_OF[layout](place_of(made))
+    weights = np.stack([grey(first), grey(second)], axis=-1) / 65535
+    truths = decoded(truth) / 65535
     assert weights.shape == (24, 28, 2)
     np.testing.assert_allclose(weights.sum(axis=2), 1, atol=1e-6)
     np.testing.assert_allclose(made.read_weights(entry), weights, atol=1e-7)
@@ -236,7 +252,7 @@ def test_verifying_names_what_is_not_as_it_was_made(make: Make, layout: Layout) 
     names = {path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()}
     files = len(names - {"SHA256SUMS", *COMPLETED_BY_HAND})
     assert verified == [(done + 1, files) for done in range(files)]
-    victim = sorted(path for path in folder.rglob("00000*") if path.suffix in (".png", ".tar", ".parquet"))[0]
+    victim = sorted(path for path in folder.rglob("00000*") if path.suffix != ".jpg")[0]
     data = bytearray(victim.read_bytes())
     data[len(data) // 2] ^= 1
     victim.write_bytes(bytes(data))
@@ -255,7 +271,7 @@ def test_verifying_names_what_is_not_as_it_was_made(make: Make, layout: Layout) 
         list(file_faults(folder.parent))
 
 
-@pytest.mark.parametrize("layout", ["webdataset", "parquet"])
+@pytest.mark.parametrize("layout", JOINED)
 def test_damaged_shards_are_named(make: Make, layout: Layout) -> None:
     made = make(layout)
     (file,) = (place_of(made) / "data").glob("000002.*")

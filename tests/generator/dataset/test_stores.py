@@ -11,7 +11,7 @@ from collections.abc import Callable, Generator, Iterator
 from contextlib import nullcontext
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, get_args
 
 import cv2
 import fsspec
@@ -23,6 +23,7 @@ from fsspec.registry import register_implementation
 from foundation.errors import FormatError, InputError, StorageError
 from generator.dataset.making import DatasetOptions, Plan, finish_dataset, generate_dataset, make_dataset, make_share
 from generator.dataset.reader import file_faults, open_dataset
+from generator.dataset.records import Layout
 from generator.dataset.shards import make_elsewhere
 from generator.dataset.workplace import workplace
 from generator.lights.choices import ListedLights
@@ -180,7 +181,7 @@ def make(lut: Lut, out: str | Path, **options: Any) -> None:
     generate_dataset(lut, out, SCENES, [2, 0], **grouped(**wishes))
 
 
-@pytest.mark.parametrize("layout", ["folder", "webdataset", "parquet"])
+@pytest.mark.parametrize("layout", get_args(Layout))
 def test_a_dataset_in_a_store_is_the_one_on_the_disk(make_lut: Callable[..., Lut], tmp_path: Path, layout: str) -> None:
     lut = make_lut()
     make(lut, tmp_path / "out", layout=layout)

@@ -10,7 +10,7 @@ import signal
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, get_args
 
 import pytest
 
@@ -27,7 +27,7 @@ from generator.dataset.making import (
     make_share,
 )
 from generator.dataset.reader import Dataset
-from generator.dataset.records import ShardRecord
+from generator.dataset.records import Layout, ShardRecord
 from generator.dataset.workplace import Workplace, workplace
 from generator.lights.choices import ListedLights, RandomLights
 from generator.pictures.sources import random_scenes
@@ -69,7 +69,7 @@ def interrupt_after(images: int) -> Callable[[], None]:
     return on_image
 
 
-@pytest.mark.parametrize("layout", ["folder", "webdataset", "parquet"])
+@pytest.mark.parametrize("layout", get_args(Layout))
 @pytest.mark.parametrize("workers", [1, 3])
 def test_going_on_gives_the_same_bytes(make_lut: Callable[..., Lut], tmp_path: Path, layout: str, workers: int) -> None:
     lut = make_lut()
@@ -128,7 +128,7 @@ def test_a_kill_at_any_file_operation_is_gone_on_from(make_lut: Callable[..., Lu
     assert step > 40
 
 
-@pytest.mark.parametrize("layout", ["folder", "webdataset", "parquet"])
+@pytest.mark.parametrize("layout", get_args(Layout))
 def test_a_record_is_written_when_its_files_are_on_the_disk(
     make_lut: Callable[..., Lut], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, layout: str
 ) -> None:
