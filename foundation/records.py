@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import math
+from functools import cache
 from typing import Annotated, Any, TypeVar, cast
 
 import numpy as np
@@ -44,13 +45,17 @@ class Record(BaseModel):
     model_config = ConfigDict(frozen=True, extra="ignore", arbitrary_types_allowed=True, use_attribute_docstrings=True)
 
 
+@cache
+def _adapter(kind: Any) -> TypeAdapter[Any]:
+    return TypeAdapter(kind)
+
+
 def to_plain(record: Any, kind: Any = None) -> Any:
     """Return a record, or a dataclass with typed fields, as JSON's objects, lists and numbers.
 
     `kind` is its type, where it is not that of the object alone (`tuple[Frame, ...]`).
     """
-    adapter: TypeAdapter[Any] = TypeAdapter(cast("Any", type(record) if kind is None else kind))
-    return adapter.dump_python(record, mode="json")
+    return _adapter(kind or cast("Any", type(record))).dump_python(record, mode="json")
 
 
 def to_json(record: Any, kind: Any = None) -> str:
@@ -67,7 +72,7 @@ def from_plain(kind: type[T], value: Any, about: object, remedy: str) -> T:
         A key is missing or its value is none of its type; `about` is the file, `remedy` what helps.
     """
     try:
-        return TypeAdapter(kind).validate_python(value)
+        return _adapter(kind).validate_python(value)
     except ValidationError as error:
         raise damaged(error, about, remedy) from error
 
@@ -75,7 +80,7 @@ def from_plain(kind: type[T], value: Any, about: object, remedy: str) -> T:
 def from_json(kind: type[T], text: bytes | str, about: object, remedy: str) -> T:
     """Return the record of a type, or a dataclass, from the text of a JSON file; errors as of `from_plain`."""
     try:
-        return TypeAdapter(kind).validate_json(text)
+        return _adapter(kind).validate_json(text)
     except ValidationError as error:
         raise damaged(error, about, remedy) from error
 

@@ -33,8 +33,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import astuple, dataclass, replace
-from typing import Any
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -273,21 +272,6 @@ class FrameConsistency:
     disturbed: tuple[tuple[int, float], ...] = ()
     seeds: tuple[int, ...] = ()
     alone: tuple[int, ...] = ()
-
-    def to_json(self) -> list[Any]:
-        """Return the values as JSON can hold them; `from_json` restores them to the last bit."""
-        return list(astuple(self))
-
-    @staticmethod
-    def from_json(stored: list[Any]) -> FrameConsistency:
-        """Return the values of what `to_json` returned."""
-        *found, disturbed, seeds, alone = stored
-        scatter, block, (x_mm, y_mm), (red, green, blue), share, extent_mm, added, kept = found
-        cells = tuple((int(cell), float(off)) for cell, off in disturbed)
-        place, colour = (x_mm, y_mm), (red, green, blue)
-        return FrameConsistency(
-            scatter, block, place, colour, share, extent_mm, added, kept, cells, tuple(seeds), tuple(alone)
-        )
 
     def without_hot(self, hot: _Mask, cells_mm: _Array) -> FrameConsistency:
         """Return the same where cells that are off by their hot photosites are not taken for covered ones.

@@ -92,7 +92,7 @@ CHECKPOINT_EVERY = 16
 METHOD = 12
 """Raised when samples, ground truth or unfit cells come out otherwise, so that no table is made by two methods."""
 
-CHECKPOINT_FORM = 2
+CHECKPOINT_FORM = 3
 """Raised when a checkpoint stores other names, so that one of older software is not gone on from."""
 
 CHECKPOINT = "checkpoint.npz"
