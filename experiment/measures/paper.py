@@ -112,10 +112,6 @@ class FlatField:
                 shape[:, channel] *= product(page_polynomial(points, self.page_mm, order_of(len(factor))), factor)
         return np.maximum(shape, LEAST_FIELD)
 
-    def orders(self) -> tuple[int, ...]:
-        """Return the total order of each channel's last factor, which was fitted on the frame itself."""
-        return tuple(order_of(len(factors[-1])) if factors else 0 for factors in self.coefficients)
-
     def parameters(self) -> list[list[list[float]]]:
         """Return the coefficients for `lut.json`: [channel][factor][term], seven significant digits."""
         return [

@@ -42,11 +42,6 @@ class Balance:
     weights: _Array
     bound: float | None
 
-    @property
-    def effective(self) -> float:
-        """Kish's effective sample size, 1 … N."""
-        return effective_size(self.weights)
-
 
 def effective_size(weights: _Array) -> float:
     """Return Kish's effective sample size of weights (N,) float64 ≥ 0.
@@ -70,7 +65,7 @@ def balance(
     Examples
     --------
     >>> found = balance(np.arange(100.0)[:, None] / 100, np.array([0.6]), np.inf)
-    >>> round(float(found.weights @ np.arange(100.0)) / 100, 3), round(found.effective)
+    >>> round(float(found.weights @ np.arange(100.0)) / 100, 3), round(effective_size(found.weights))
     (0.6, 88)
     """
     aside = moments - wanted
