@@ -81,14 +81,12 @@ class LinearityMeasurements:
     """Deviation of counts from proportion to the light (EMVA 1288, release 4.0, linearity error).
 
     - `files`: the frames, by rising exposure.
-    - `exposure_s`: (K,) float64 s, as the files state them.
     - `level`: (B,) float64, shares of saturation, rising.
     - `deviation`: (3, B) float64, relative, of R, G and B from the straight line that fits best; NaN where no patch has
       data.
     """
 
     files: tuple[str, ...]
-    exposure_s: _Array
     level: _Array
     deviation: _Array
 

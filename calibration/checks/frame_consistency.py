@@ -546,14 +546,11 @@ class OriginFigures:
     - `other_lens`: frames through another lens.
     - `other_exposure`: frames exposed otherwise by a hundredth or more.
     - `other_iso`: frames of another ISO speed.
-    - `stating_camera`, `stating_exposure`: how many frames state them at all.
     """
 
     other_camera: tuple[ForeignFrame, ...] = ()
     other_lens: tuple[ForeignFrame, ...] = ()
     other_exposure: tuple[ForeignFrame, ...] = ()
-    stating_camera: int = 0
-    stating_exposure: int = 0
     other_iso: tuple[ForeignFrame, ...] = ()
 
     @property
@@ -574,8 +571,6 @@ def origin_figures(frames: Sequence[tuple[FrameRecord, FrameOrigin]]) -> OriginF
         other_camera=_others(_stated_alike(bodies)),
         other_lens=_others(lenses),
         other_exposure=_other_exposures(frames),
-        stating_camera=len(bodies),
-        stating_exposure=sum(origin.exposure > 0 for _, origin in frames),
         other_iso=_others([(record, f"ISO {origin.iso}") for record, origin in frames if origin.iso]),
     )
 
