@@ -20,6 +20,7 @@ from foundation.console import (
     Version,
     common_first,
     new_app,
+    option,
     orderly_end,
     with_json,
 )
@@ -246,10 +247,9 @@ def check(
     identify: Annotated[bool, typer.Option(help="First show on every display its number for ten seconds.")] = False,
     corners: Annotated[
         tuple[str, str, str, str] | None,
-        typer.Option(
-            metavar="X,Y X,Y X,Y X,Y",
-            help="As in build-lut: the corners of the field of a chart without tags that is not found automatically.",
-            show_default=False,
+        option(
+            "X,Y X,Y X,Y X,Y",
+            "As in build-lut: the corners of the field of a chart without tags that is not found automatically.",
         ),
     ] = None,
     linearity: Annotated[
@@ -304,9 +304,9 @@ def run(
     session: Annotated[Path, typer.Argument(help="Session folder: new, or one that was interrupted.")],
     retake: Annotated[
         str | None,
-        typer.Option(
-            metavar="LIGHTS",
-            help="Take lights again, as in 12,40-44; bad: the frames that build-lut refused, by the newest report "
+        option(
+            "LIGHTS",
+            "Take lights again, as in 12,40-44; bad: the frames that build-lut refused, by the newest report "
             "beside SESSION. What was taken of them before is kept and not used.",
         ),
     ] = None,
