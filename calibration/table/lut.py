@@ -36,7 +36,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 from calibration.citation import OriginRecord
 from experiment.lights import COLUMNS, NAME, Illumination, load_illuminations
 from foundation.errors import FormatError, StorageError
-from foundation.files import file_sha256, partial_path, reading_error, sha256_of, storage_error, write_whole
+from foundation.files import file_sha256, partial_path, read_text, reading_error, sha256_of, storage_error, write_whole
 from foundation.folders import require_plain_folder
 
 FORMAT: Final = "crop.lut"
@@ -339,12 +339,7 @@ def require_plain_table(folder: Path) -> None:
 def known_sums(folder: Path, provenance: Provenance) -> dict[str, str]:
     """Return the recorded hashes of a table's files by name, `samples.npy` included; of older tables what they have."""
     if provenance.has_sums:
-        path = folder / SUMS
-        try:
-            return parse_sums(path.read_text("utf-8"), path)
-        except (OSError, UnicodeDecodeError) as error:
-            reason = error.strerror if isinstance(error, OSError) else "it is no text"
-            raise FormatError(f"cannot read {path}: {reason}; {RESTORE}") from error
+        return parse_sums(read_text(folder / SUMS, RESTORE), folder / SUMS)
     if (folder / SUMS).exists():
         raise FormatError(
             f"{folder / PROVENANCE} does not know of {SUMS} beside it: one of them has changed; {RESTORE}"
