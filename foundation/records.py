@@ -13,7 +13,16 @@ from typing import Annotated, Any, TypeVar, cast
 
 import numpy as np
 import numpy.typing as npt
-from pydantic import BaseModel, ConfigDict, PlainSerializer, PlainValidator, TypeAdapter, ValidationError
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    PlainSerializer,
+    PlainValidator,
+    SerializerFunctionWrapHandler,
+    TypeAdapter,
+    ValidationError,
+    model_serializer,
+)
 
 from foundation.errors import FormatError
 
@@ -43,6 +52,15 @@ class Record(BaseModel):
     """A frozen record; a key that is not known is passed over, as later versions may have more."""
 
     model_config = ConfigDict(frozen=True, extra="ignore", arbitrary_types_allowed=True, use_attribute_docstrings=True)
+
+
+class SparseRecord(Record):
+    """A record of which keys that are None by default are left out while they are, so that files stay as they were."""
+
+    @model_serializer(mode="wrap")
+    def _without_none(self, serialise: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        left_out = {name for name, field in type(self).model_fields.items() if field.default is None}
+        return {key: value for key, value in serialise(self).items() if value is not None or key not in left_out}
 
 
 @cache

@@ -25,11 +25,10 @@ from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Any, Final, cast
 
-from pydantic import ValidationError
-
 from foundation.errors import FormatError, InputError
 from foundation.files import partial_path, publish_folder, require_free, storage_error
 from foundation.folders import LOCK_FILE, held_folder
+from foundation.records import from_json
 from generator.dataset.records import ShardRecord, shard_key
 from generator.stores import DESCRIPTION, LocalStore, RemoteStore, Store, is_remote, local_path, open_store
 
@@ -67,12 +66,8 @@ class Workplace:
     def load(self, shard: int) -> ShardRecord:
         """Return the record of a shard that is done."""
         name = self._record_name(shard)
-        try:
-            return ShardRecord.model_validate_json(self.notes.get(name))
-        except ValidationError as error:
-            raise FormatError(
-                f"{self.notes.place}/{name} is damaged; remove it and run the same command again, which makes it anew"
-            ) from error
+        remedy = "remove it and run the same command again, which makes it anew"
+        return from_json(ShardRecord, self.notes.get(name), f"{self.notes.place}/{name}", remedy)
 
     def commit(self, record: ShardRecord) -> None:
         """Bring the record of a shard to the disk whose files are there: from here on it is done."""
