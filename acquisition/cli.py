@@ -268,8 +268,6 @@ def check(
     Writes nothing unless asked with --picture. Ends with 4 when there is a fault. Devices that cannot be used are all
     named at once, each with its remedy, and end it with 3, or with 2 where LAB.toml alone is at fault.
     """
-    import json
-
     from acquisition.check.check import CheckOptions, check_lab
     from experiment.config import load_lab
 
@@ -287,7 +285,7 @@ def check(
     with orderly_end():
         report = check_lab(settings, options, lambda sentence: print(sentence, file=sys.stderr))
     if told.asked:
-        told.add(**json.loads(report.to_json()))
+        told.add(**report.values())
     else:
         for line in report.lines():
             print(line)

@@ -429,6 +429,11 @@ class CheckFrames:
     focal_px: float | None
 
     @property
+    def usable(self) -> bool:
+        """Whether white is not clipped in the frames that the verdicts rest on."""
+        return not next(trial for trial in self.trials if trial.shutter_s == self.used_s).clipped
+
+    @property
     def used_s(self) -> float:
         """The shutter time of the frames that the verdicts rest on."""
         return self.whites[0].shutter_s

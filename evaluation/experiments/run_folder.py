@@ -12,7 +12,6 @@ kill or a crash left half, and all after it, are cut off.
 from __future__ import annotations
 
 import json
-import shutil
 import zlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
@@ -39,7 +38,7 @@ from evaluation.scene import MixedScene, Scene, SceneSet
 from foundation.compiled import ordered_map
 from foundation.errors import InputError, first_of
 from foundation.files import make_folder, partial_path, publish_folder, require_free, storage_error, write_whole
-from foundation.folders import LOCK_FILE, held_folder
+from foundation.folders import clear_folder, held_folder
 from foundation.records import from_plain, to_plain
 from foundation.version import software
 
@@ -314,15 +313,9 @@ def _publish(run: Run, scenes: Sequence[Scene], folder: Path, kind: ErrorKind, w
     for name, text in _files(run, kind, pictures).items():
         write_whole(partial / name, text)
     (partial / JOURNAL_FILE).unlink(missing_ok=True)
-    _clear(partial, set(_files_of(run)))
+    # Writes that never finished left something.
+    clear_folder(partial, _files_of(run))
     publish_folder(partial, folder, WHAT)
-
-
-def _clear(folder: Path, kept: set[str]) -> None:
-    """Remove leftovers of writes that never finished."""
-    for path in folder.iterdir():
-        if path.name not in kept | {LOCK_FILE}:
-            shutil.rmtree(path) if path.is_dir() else path.unlink()
 
 
 def _files_of(run: Run) -> tuple[str, ...]:

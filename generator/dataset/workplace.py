@@ -27,7 +27,7 @@ from typing import Any, Final, cast
 
 from foundation.errors import FormatError, InputError
 from foundation.files import partial_path, publish_folder, require_free, storage_error
-from foundation.folders import LOCK_FILE, held_folder
+from foundation.folders import clear_folder, held_folder
 from foundation.records import from_json
 from generator.dataset.records import ShardRecord, shard_key
 from generator.stores import DESCRIPTION, LocalStore, RemoteStore, Store, is_remote, local_path, open_store
@@ -212,13 +212,7 @@ def _require_still_free(path: Path, folder: Path) -> None:
 def _begin(folder: Path, plan_id: str) -> None:
     """Make the folders inside; files that are there without a plan are left from before the plan was written."""
     try:
-        for path in folder.iterdir():
-            if path.name == LOCK_FILE:
-                continue
-            if path.is_dir() and not path.is_symlink():
-                shutil.rmtree(path)
-            else:
-                path.unlink()
+        clear_folder(folder)
         for inner in ("plan", f"dataset-{plan_id}"):
             (folder / inner).mkdir()
     except OSError as error:
