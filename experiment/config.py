@@ -5,7 +5,6 @@ Nothing here opens anything: paths are resolved against the file's folder, value
 
 from __future__ import annotations
 
-import difflib
 import math
 import os
 import shlex
@@ -21,6 +20,7 @@ from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Fie
 from drivers.camera import ExposureSettings
 from foundation.errors import ConfigurationError
 from foundation.files import read_text
+from foundation.records import unknown_key
 from foundation.secret_texts import MASK, is_webhook, target_label
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
@@ -319,14 +319,6 @@ class LabSettings(Settings):
         # A password is needed to take frames, and whoever does that has LAB.toml.
         values["lab"]["projector"].pop("password", None)
         return tomli_w.dumps(values)
-
-
-def unknown_key(key: str, known: Iterable[str], where: str) -> ConfigurationError:
-    """Return the error for an unknown key, naming the nearest one that is known."""
-    names = sorted(known)
-    near = difflib.get_close_matches(key.rsplit(".", 1)[-1], names, n=1, cutoff=0.5)
-    hint = f"did you mean {near[0]!r}?" if near else f"known are {', '.join(names)}"
-    return ConfigurationError(f"{where}: unknown key {key!r}; {hint}")
 
 
 def load_lab(path: Path) -> LabSettings:

@@ -6,8 +6,10 @@ added has a default. Arrays are lists in the file, numbers that are not finite a
 
 from __future__ import annotations
 
+import difflib
 import json
 import math
+from collections.abc import Collection, Iterable, Mapping
 from functools import cache
 from typing import Annotated, Any, TypeVar, cast
 
@@ -24,7 +26,7 @@ from pydantic import (
     model_serializer,
 )
 
-from foundation.errors import FormatError
+from foundation.errors import ConfigurationError, FormatError
 
 T = TypeVar("T")
 
@@ -115,3 +117,29 @@ def damaged(error: ValidationError, about: object, remedy: str) -> FormatError:
         value=first["input"],
         expected=reason,
     )
+
+
+def unknown_key(key: str, known: Iterable[str], where: str) -> ConfigurationError:
+    """Return the error for an unknown key, naming the nearest one that is known."""
+    names = sorted(known)
+    near = difflib.get_close_matches(key.rsplit(".", 1)[-1], names, n=1, cutoff=0.5)
+    hint = f"did you mean {near[0]!r}?" if near else f"known are {', '.join(names)}"
+    return ConfigurationError(f"{where}: unknown key {key!r}; {hint}")
+
+
+def from_settings(
+    kind: type[T], given: Mapping[str, Any], where: str, key: str, known: Collection[str], **fixed: Any
+) -> T:
+    """Return a dataclass of what a user gives for some of its fields; a ConfigurationError says what cannot be used.
+
+    `given`: by names that are `known`, of the table `key` of a file, or a command line, `where`. `fixed`: other fields.
+    """
+    for name in given:
+        if name not in known:
+            raise unknown_key(f"{key}.{name}", known, where)
+    try:
+        return _adapter(kind).validate_python({**fixed, **given})
+    except ValidationError as error:
+        first = error.errors()[0]
+        at = ".".join([key, *(str(part) for part in first["loc"][:1])])
+        raise ConfigurationError(f"{where}: {at}: {first['msg']}, got {first['input']!r}") from error

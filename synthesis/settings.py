@@ -11,15 +11,16 @@ from pathlib import Path
 from typing import Annotated, Any, Final
 
 import numpy as np
-from pydantic import Field, TypeAdapter, ValidationError
+from pydantic import Field
 
 from calibration.citation import OriginRecord, with_changes
 from calibration.sampling import WINDOW, WINDOWS
 from experiment.chart.layout import design_chart
-from experiment.config import CameraSettings, CitationSettings, Settings, checked, parse_toml, unknown_key
+from experiment.config import CameraSettings, CitationSettings, Settings, checked, parse_toml
 from experiment.lights import plan_illuminations
 from foundation.errors import ConfigurationError
 from foundation.files import read_text
+from foundation.records import from_settings
 from sim.spectral import describe_sensitivities, read_sensitivities
 from sim.world.room import Room
 from sim.world.sensors import find_body
@@ -91,21 +92,14 @@ def parse_settings(document: dict[str, Any], where: str) -> TableSettings:
 
 def room_of(settings: TableSettings, where: str) -> Room:
     """Return the default room with the seed and the changes of the settings; its lamp does not age."""
+    unused = [key for key in settings.room if key in NOT_COMPUTED]
+    if unused:
+        raise ConfigurationError(
+            f"{where}: room.{unused[0]} has no effect on a computed table, whose frames know neither neighbours nor "
+            "time; leave it out, or photograph in the simulated lab with acquire run"
+        )
     known = [field.name for field in fields(Room) if field.name not in ("seed", *NOT_COMPUTED)]
-    for key in settings.room:
-        if key in NOT_COMPUTED:
-            raise ConfigurationError(
-                f"{where}: room.{key} has no effect on a computed table, whose frames know neither neighbours nor "
-                "time; leave it out, or photograph in the simulated lab with acquire run"
-            )
-        if key not in known:
-            raise unknown_key(f"room.{key}", known, where)
-    try:
-        return TypeAdapter(Room).validate_python({**settings.room, "seed": settings.seed, "lamp_drift_per_hour": 0.0})
-    except ValidationError as error:
-        first = error.errors()[0]
-        key = ".".join(["room", *(str(part) for part in first["loc"][:1])])
-        raise ConfigurationError(f"{where}: {key}: {first['msg']}, got {first['input']!r}") from error
+    return from_settings(Room, settings.room, where, "room", known, seed=settings.seed, lamp_drift_per_hour=0.0)
 
 
 def table_task(camera: str, settings: TableSettings, where: str, lights: LightSpectra | None = None) -> TableTask:
