@@ -20,6 +20,7 @@ from foundation.console import (
     Version,
     common_first,
     new_app,
+    option,
     orderly_end,
     with_json,
 )
@@ -246,10 +247,9 @@ def check(
     identify: Annotated[bool, typer.Option(help="First show on every display its number for ten seconds.")] = False,
     corners: Annotated[
         tuple[str, str, str, str] | None,
-        typer.Option(
-            metavar="X,Y X,Y X,Y X,Y",
-            help="As in build-lut: the corners of the field of a chart without tags that is not found automatically.",
-            show_default=False,
+        option(
+            "X,Y X,Y X,Y X,Y",
+            "As in build-lut: the corners of the field of a chart without tags that is not found automatically.",
         ),
     ] = None,
     linearity: Annotated[
@@ -268,8 +268,6 @@ def check(
     Writes nothing unless asked with --picture. Ends with 4 when there is a fault. Devices that cannot be used are all
     named at once, each with its remedy, and end it with 3, or with 2 where LAB.toml alone is at fault.
     """
-    import json
-
     from acquisition.check.check import CheckOptions, check_lab
     from experiment.config import load_lab
 
@@ -287,7 +285,7 @@ def check(
     with orderly_end():
         report = check_lab(settings, options, lambda sentence: print(sentence, file=sys.stderr))
     if told.asked:
-        told.add(**json.loads(report.to_json()))
+        told.add(**report.values())
     else:
         for line in report.lines():
             print(line)
@@ -304,9 +302,9 @@ def run(
     session: Annotated[Path, typer.Argument(help="Session folder: new, or one that was interrupted.")],
     retake: Annotated[
         str | None,
-        typer.Option(
-            metavar="LIGHTS",
-            help="Take lights again, as in 12,40-44; bad: the frames that build-lut refused, by the newest report "
+        option(
+            "LIGHTS",
+            "Take lights again, as in 12,40-44; bad: the frames that build-lut refused, by the newest report "
             "beside SESSION. What was taken of them before is kept and not used.",
         ),
     ] = None,

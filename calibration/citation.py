@@ -28,12 +28,13 @@ from datetime import UTC
 from functools import lru_cache
 from typing import Annotated, Any, Final, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import Field, ValidationError
 
 from drivers.raw.rawfile import FrameOrigin
 from experiment.config import CameraSettings, CitationSettings
 from experiment.session.records import FrameRecord
 from foundation.errors import InputError
+from foundation.records import Record
 
 SerialForm = Literal["hash", "plain", "withheld"]
 """How the serial number of a body is published (`experiment.config.CitationSettings.camera_serial`)."""
@@ -97,7 +98,7 @@ def with_published_serials(origins: Sequence[FrameOrigin], form: SerialForm) -> 
     return [replace(one, serial=published[one.camera, one.serial]) if one.serial else one for one in origins]
 
 
-class OriginRecord(BaseModel):
+class OriginRecord(Record):
     """With what, when and by whom the frames of a table were taken.
 
     - `rig`: ``lab``, ``simulated``, ``replay`` or ``imported``; None where the session does not say.
@@ -116,8 +117,6 @@ class OriginRecord(BaseModel):
       specification 2.3, annex D).
     """
 
-    model_config = ConfigDict(frozen=True, extra="ignore")
-
     rig: Rig | None = None
     camera_serial: Line | None = None
     camera_serial_is: Literal["hash", "plain", "withheld", "not stated"] = "not stated"
@@ -133,7 +132,7 @@ class OriginRecord(BaseModel):
     screen: Line | None = None
     taken_by: Line | None = None
     title: Line | None = None
-    authors: list[Line] = []
+    authors: list[Line] = Field(default_factory=list[Line])
     note: Text | None = None
     licence: Line | None = None
     url: Line | None = None

@@ -25,6 +25,7 @@ from foundation.console import (
     Version,
     json_output,
     new_app,
+    option,
     shows_progress,
 )
 from foundation.errors import FormatError, InputError, QualityError
@@ -77,18 +78,11 @@ def build_lut(
     ] = False,
     picture: Annotated[
         Path | None,
-        typer.Option(
-            "--picture",
-            metavar="PNG",
-            help="With --check, save the frame with what of the chart was found on it, or was looked for.",
-            show_default=False,
-        ),
+        option("PNG", "With --check, save the frame with what of the chart was found on it, or was looked for."),
     ] = None,
     window: Annotated[
         int | None,
-        typer.Option(
-            "--window", metavar="N", help="Pixels along the side of a cell's window: 3, 5, 7 or 9. \\[default: 5]"
-        ),
+        option("N", "Pixels along the side of a cell's window: 3, 5, 7 or 9. \\[default: 5]"),
     ] = None,
     subtract_dark: Annotated[
         bool,
@@ -116,130 +110,93 @@ def build_lut(
     ] = False,
     corners: Annotated[
         tuple[str, str, str, str] | None,
-        typer.Option(
-            "--corners",
-            metavar="X,Y X,Y X,Y X,Y",
-            help="For a chart without tags that is not found by itself: the corners of its field of cells in the frame "
+        option(
+            "X,Y X,Y X,Y X,Y",
+            "For a chart without tags that is not found by itself: the corners of its field of cells in the frame "
             "that is registered, pixels of the raw file, clockwise from the printed top-left.",
-            show_default=False,
         ),
     ] = None,
     linearity: Annotated[
         Path | None,
-        typer.Option(
-            "--linearity",
-            metavar="FOLDER",
-            help="Judge the sensor's linearity by raw files of the chart in its place, under one light, with exposure "
+        option(
+            "FOLDER",
+            "Judge the sensor's linearity by raw files of the chart in its place, under one light, with exposure "
             "times from dim to nearly saturated.",
-            show_default=False,
         ),
     ] = None,
     note: Note = None,
     licence: Licence = None,
     author: Annotated[
         list[str] | None,
-        typer.Option(
-            "--author",
-            metavar='"FAMILY, GIVEN"',
-            help="Who made the table; several times for several. As --note, --licence and --serial in place of "
+        option(
+            '"FAMILY, GIVEN"',
+            "Who made the table; several times for several. As --note, --licence and --serial in place of "
             "\\[citation] in the session's LAB.toml.",
-            show_default=False,
         ),
     ] = None,
     serial: Annotated[
         str | None,
-        typer.Option(
-            "--serial",
-            metavar="hash|plain|withheld",
-            help="How the camera's serial number is told in the table. \\[default: hash]",
-            show_default=False,
-        ),
+        option("hash|plain|withheld", "How the camera's serial number is told in the table. \\[default: hash]"),
     ] = None,
     info: Annotated[
         Path | None,
-        typer.Option(
-            "--info", metavar="LUT", help="Print what a table is and what it was made of.", show_default=False
-        ),
+        option("LUT", "Print what a table is and what it was made of."),
     ] = None,
     cite: Annotated[
         Path | None,
-        typer.Option("--cite", metavar="LUT", help="Print a BibTeX entry of a table.", show_default=False),
+        option("LUT", "Print a BibTeX entry of a table."),
     ] = None,
     verify: Annotated[
         Path | None,
-        typer.Option(
-            "--verify",
-            metavar="LUT",
-            help="Hash every byte of a table again and name what has changed; with SESSION, its frames too.",
-            show_default=False,
-        ),
+        option("LUT", "Hash every byte of a table again and name what has changed; with SESSION, its frames too."),
     ] = None,
     match: Annotated[
         tuple[Path, Path] | None,
-        typer.Option(
-            "--match",
-            metavar="LUT LUT",
-            help="Check whether colours and lights of two tables, of two cameras perhaps, correspond number by number.",
-            show_default=False,
+        option(
+            "LUT LUT",
+            "Check whether colours and lights of two tables, of two cameras perhaps, correspond number by number.",
         ),
     ] = None,
     compare: Annotated[
         tuple[Path, Path] | None,
-        typer.Option(
-            "--compare",
-            metavar="A B",
-            help="Compare two tables, or sessions, of one chart: what differs, and whether noise alone explains it. A "
+        option(
+            "A B",
+            "Compare two tables, or sessions, of one chart: what differs, and whether noise alone explains it. A "
             "session's table is made for it and thrown away.",
-            show_default=False,
         ),
     ] = None,
     as_json: AsJson = False,
     out: Annotated[
         Path | None,
-        typer.Option(
-            "--out",
-            metavar="FOLDER",
-            help="With --compare, write report.html with its pictures, comparison.json, lights.csv and cells.csv into "
+        option(
+            "FOLDER",
+            "With --compare, write report.html with its pictures, comparison.json, lights.csv and cells.csv into "
             "a new folder.",
-            show_default=False,
         ),
     ] = None,
     chart: Annotated[
         Path | None,
-        typer.Option(
-            "--chart",
-            metavar="CHART.json",
-            help="With --compare of tables and --out, the chart.json of both, so that differences are drawn on the "
+        option(
+            "CHART.json",
+            "With --compare of tables and --out, the chart.json of both, so that differences are drawn on the "
             "print; sessions have it.",
-            show_default=False,
         ),
     ] = None,
     publish: Annotated[
         tuple[Path, str] | None,
-        typer.Option(
-            "--publish",
-            metavar="LUT URL",
-            help="Write a table as a sharded Zarr array to a folder or a store that fsspec knows, such as s3://….",
-            show_default=False,
+        option(
+            "LUT URL", "Write a table as a sharded Zarr array to a folder or a store that fsspec knows, such as s3://…."
         ),
     ] = None,
     fetch: Annotated[
         tuple[str, Path] | None,
-        typer.Option(
-            "--fetch",
-            metavar="URL LUT",
-            help="Copy a published table to a new folder, where it is used, and verify it.",
-            show_default=False,
-        ),
+        option("URL LUT", "Copy a published table to a new folder, where it is used, and verify it."),
     ] = None,
     expect: Annotated[
         str | None,
-        typer.Option(
-            "--expect",
-            metavar="SHA256",
-            help="With --fetch, the table's hash as --info prints it, told by somebody you trust; another table is "
-            "refused.",
-            show_default=False,
+        option(
+            "SHA256",
+            "With --fetch, the table's hash as --info prints it, told by somebody you trust; another table is refused.",
         ),
     ] = None,
     verbose: Verbose = 0,

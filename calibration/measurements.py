@@ -6,12 +6,13 @@ are above black unless called raw.
 
 from __future__ import annotations
 
-from dataclasses import asdict, astuple, dataclass
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated
 
 import numpy as np
 import numpy.typing as npt
+from pydantic import AfterValidator
 
 from calibration.budget import Budget
 from calibration.checks.frame_consistency import FrameConsistency, OriginFigures
@@ -32,12 +33,14 @@ from calibration.table.lut import Unfit
 from drivers.raw.rawfile import FrameOrigin
 from experiment.framing.movement import Shift
 from experiment.framing.planes import Channel
-from experiment.measures.paper import FieldResidual, FlatField, Paper
+from experiment.measures.paper import Paper
 from experiment.measures.sensor import black_drift
 from experiment.measures.stains import Stains
 from experiment.session.records import FrameRecord
+from foundation.records import FloatArray
 
 _Array = npt.NDArray[np.float64]
+_Levels = Annotated[FloatArray, AfterValidator(lambda values: values.reshape(-1, 3))]
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,71 +63,19 @@ class FrameMeasurements:
     """
 
     record: FrameRecord
-    black: _Array
+    black: FloatArray
     channel: Channel
     shift: Shift
     reregistered: bool
     paper: Paper
     consistency: FrameConsistency
-    greys: _Array
-    grey_errors: _Array
-    dark: _Array
+    greys: _Levels
+    grey_errors: _Levels
+    dark: FloatArray
     share_at_zero: float
     blur_px: float
     exposure: float
     origin: FrameOrigin
-
-    def to_json(self) -> dict[str, Any]:
-        """Return the figures, but for the record, as JSON can hold them; `from_json` restores them to the last bit."""
-        return {
-            "black": self.black.tolist(),
-            "channel": self.channel,
-            "shift": list(astuple(self.shift)),
-            "reregistered": self.reregistered,
-            "field": [[factor.tolist() for factor in factors] for factors in self.paper.field.coefficients],
-            "white": self.paper.white.tolist(),
-            "error": self.paper.error.tolist(),
-            "references": self.paper.references,
-            "spread": self.paper.spread.tolist(),
-            "left": self.paper.left.to_json(),
-            "consistency": self.consistency.to_json(),
-            "greys": self.greys.tolist(),
-            "grey_errors": self.grey_errors.tolist(),
-            "dark": self.dark.tolist(),
-            "share_at_zero": self.share_at_zero,
-            "blur_px": self.blur_px,
-            "exposure": self.exposure,
-            "origin": asdict(self.origin),
-        }
-
-    @staticmethod
-    def from_json(record: FrameRecord, page_mm: tuple[float, float], stored: dict[str, Any]) -> FrameMeasurements:
-        """Return the figures of a frame from what `to_json` returned; `page_mm` is the chart's width and height."""
-        red, green, blue = (tuple(np.array(factor) for factor in factors) for factors in stored["field"])
-        white, error, spread = (np.array(stored[name]) for name in ("white", "error", "spread"))
-        return FrameMeasurements(
-            record=record,
-            black=np.array(stored["black"]),
-            channel=stored["channel"],
-            shift=Shift(*stored["shift"]),
-            reregistered=stored["reregistered"],
-            paper=Paper(
-                FlatField(page_mm, (red, green, blue)),
-                white,
-                error,
-                stored["references"],
-                spread,
-                FieldResidual.from_json(stored["left"]),
-            ),
-            consistency=FrameConsistency.from_json(stored["consistency"]),
-            greys=np.array(stored["greys"]).reshape(-1, 3),
-            grey_errors=np.array(stored["grey_errors"]).reshape(-1, 3),
-            dark=np.array(stored["dark"]),
-            share_at_zero=stored["share_at_zero"],
-            blur_px=stored["blur_px"],
-            exposure=stored["exposure"],
-            origin=FrameOrigin(**stored["origin"]),
-        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,14 +83,12 @@ class LinearityMeasurements:
     """Deviation of counts from proportion to the light (EMVA 1288, release 4.0, linearity error).
 
     - `files`: the frames, by rising exposure.
-    - `exposure_s`: (K,) float64 s, as the files state them.
     - `level`: (B,) float64, shares of saturation, rising.
     - `deviation`: (3, B) float64, relative, of R, G and B from the straight line that fits best; NaN where no patch has
       data.
     """
 
     files: tuple[str, ...]
-    exposure_s: _Array
     level: _Array
     deviation: _Array
 

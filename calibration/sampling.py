@@ -177,13 +177,6 @@ def mean_bleed(cell_px: float, blur_px: float, window: int = WINDOW_PX) -> float
     return float(1 - inside**2)
 
 
-def blur_of_bleed(cell_px: float, share: float, window: int = WINDOW_PX) -> float:
-    """Return the σ of the blur, half-size px, at which `bleed` is `share` (0 … 0.5); 0 where it is at any blur."""
-    from scipy.special import ndtri
-
-    return max(cell_px / 2 - window // 2 - MISPLACEMENT_PX, 0.0) / -float(ndtri(share))
-
-
 def largest_blur_px(cell_px: float) -> float:
     """Return the σ of the blur, half-size px, up to which a chart with cells of so many px is registered.
 

@@ -5,14 +5,13 @@ Nothing here opens anything: paths are resolved against the file's folder, value
 
 from __future__ import annotations
 
-import difflib
 import math
 import os
 import shlex
 import tomllib
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Annotated, Any, Literal, cast
+from typing import Annotated, Any, Literal, TypeVar, cast
 from urllib.parse import urlsplit
 
 import tomli_w
@@ -20,6 +19,8 @@ from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Fie
 
 from drivers.camera import ExposureSettings
 from foundation.errors import ConfigurationError
+from foundation.files import read_text
+from foundation.records import unknown_key
 from foundation.secret_texts import MASK, is_webhook, target_label
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
@@ -73,11 +74,16 @@ def _endless(value: object) -> object:
     return math.inf if isinstance(value, str) and value.strip().lower() == "forever" else value
 
 
-class _Settings(BaseModel):
+class Settings(BaseModel):
+    """What a settings file may say: frozen, and a key that is not known is an error."""
+
     model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True)
 
 
-class CameraSettings(_Settings):
+_AnySettings = TypeVar("_AnySettings", bound=Settings)
+
+
+class CameraSettings(Settings):
     """How every frame of the session is exposed; the exposure is fixed for a session."""
 
     iso: Annotated[int, Field(gt=0)] = 100
@@ -93,7 +99,7 @@ class CameraSettings(_Settings):
         return ExposureSettings(self.iso, self.aperture, self.shutter_s)
 
 
-class SequenceSettings(_Settings):
+class SequenceSettings(Settings):
     """How the session is taken."""
 
     settle_s: NotNegative = 0.5
@@ -124,7 +130,7 @@ class SequenceSettings(_Settings):
     of messages and `session.toml`, but for the host or the program's name."""
 
 
-class LimitSettings(_Settings):
+class LimitSettings(Settings):
     """When a frame is refused."""
 
     clipped_percent: NotNegative = 0.1
@@ -135,7 +141,7 @@ class LimitSettings(_Settings):
     """A dark frame's brightest photosites may reach this share of saturation, per cent."""
 
 
-class JudgeSettings(_Settings):
+class JudgeSettings(Settings):
     """What every frame is measured for while the session is taken, and when it is refused.
 
     Pixels are those of the half-size picture, one for each 2×2 block of photosites. The limits are judgement where no
@@ -168,7 +174,7 @@ class JudgeSettings(_Settings):
     their neighbour."""
 
 
-class CitationSettings(_Settings):
+class CitationSettings(Settings):
     """What a table says of itself that no device tells; `build-lut` writes it into the table and its data sets."""
 
     title: Annotated[str, Field(max_length=500)] = ""
@@ -190,7 +196,7 @@ class CitationSettings(_Settings):
     itself, "withheld" nothing."""
 
 
-class SimulatedSettings(_Settings):
+class SimulatedSettings(Settings):
     """The simulated lab."""
 
     body: str = "EOS 550D"
@@ -205,14 +211,14 @@ class SimulatedSettings(_Settings):
     """What goes wrong, by frame or time; see sim.world.disturbances. May change within a session, as luck does."""
 
 
-class ReplaySettings(_Settings):
+class ReplaySettings(Settings):
     """A recorded session to be served again."""
 
     session: Path
     """Folder of the recorded session."""
 
 
-class CameraCable(_Settings):
+class CameraCable(Settings):
     """Where the camera of a real lab is found."""
 
     connection: Literal["usb", "ptpip", "gphoto2"] = "usb"
@@ -233,7 +239,7 @@ class CameraCable(_Settings):
     """libgphoto2's name of the model; found out if left out."""
 
 
-class ProjectorCable(_Settings):
+class ProjectorCable(Settings):
     """How the projector of a real lab is controlled, and what its light is like."""
 
     control: Literal["none", "pjlink", "epson", "benq", "optoma", "nec"] = "none"
@@ -254,7 +260,7 @@ class ProjectorCable(_Settings):
     """Turns of its colour wheel a second; 0: it has none (LCD, LCoS, LED)."""
 
 
-class LightSource(_Settings):
+class LightSource(Settings):
     """What fills the projector's picture with one plain colour."""
 
     shown_by: Literal["display", "lightcrafter", "jvc"] = "display"
@@ -267,7 +273,7 @@ class LightSource(_Settings):
     """JVC: TCP port."""
 
 
-class LabRig(_Settings):
+class LabRig(Settings):
     """The cables of a real lab."""
 
     camera: CameraCable = CameraCable()
@@ -275,7 +281,7 @@ class LabRig(_Settings):
     light: LightSource = LightSource()
 
 
-class LabSettings(_Settings):
+class LabSettings(Settings):
     """Everything that LAB.toml says."""
 
     rig: Literal["lab", "simulated", "replay", "imported"]
@@ -315,26 +321,10 @@ class LabSettings(_Settings):
         return tomli_w.dumps(values)
 
 
-def unknown_key(key: str, known: Iterable[str], where: str) -> ConfigurationError:
-    """Return the error for an unknown key, naming the nearest one that is known."""
-    names = sorted(known)
-    near = difflib.get_close_matches(key.rsplit(".", 1)[-1], names, n=1, cutoff=0.5)
-    hint = f"did you mean {near[0]!r}?" if near else f"known are {', '.join(names)}"
-    return ConfigurationError(f"{where}: unknown key {key!r}; {hint}")
-
-
 def load_lab(path: Path) -> LabSettings:
     """Read `LAB.toml`, every path resolved against its folder; a ConfigurationError names what cannot be used."""
-    try:
-        text = path.read_text(encoding="utf-8-sig")
-    except OSError as error:
-        raise ConfigurationError(
-            f"cannot read settings {path}: {error.strerror}; examples/ has a file to begin with"
-        ) from error
-    except UnicodeDecodeError as error:
-        raise ConfigurationError(f"{path} is no text in UTF-8: {error}; save it as such") from error
     folder = path.resolve().parent
-    settings = parse_lab(text, str(path), folder)
+    settings = parse_lab(read_text(path, "examples/ has a file to begin with", "settings"), str(path), folder)
     if settings.rig == "replay" and settings.replay is None:
         raise ConfigurationError(f"{path}: rig = 'replay' needs [replay] with session = 'FOLDER' of the recording")
     changes: dict[str, Any] = {"chart": folder / settings.chart, "illuminations": folder / settings.illuminations}
@@ -349,19 +339,29 @@ def parse_lab(text: str, where: str, folder: Path | None = None) -> LabSettings:
     `where`: names them in errors. `folder`: what files that hold secrets are relative to; None where secrets are not
     looked up: in a session's own settings there are none.
     """
-    try:
-        document = tomllib.loads(text)
-    except (ValueError, RecursionError) as error:
-        raise ConfigurationError(f"{where} is not TOML: {error}") from error
+    document = parse_toml(text, where)
     if folder is not None:
         _look_up_secrets(document, folder, where)
+    return checked(LabSettings, document, where).read_from(where)
+
+
+def parse_toml(text: str, where: str) -> dict[str, Any]:
+    """Return the tables of a TOML text; `where` names it in errors."""
     try:
-        settings = LabSettings.model_validate(document)
+        return tomllib.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise ConfigurationError(f"{where} is not TOML: {error}") from error
+
+
+def checked(kind: type[_AnySettings], document: dict[str, Any], where: str) -> _AnySettings:
+    """Return the settings in a document; a ConfigurationError names the first key that cannot be used, no secret."""
+    try:
+        return kind.model_validate(document)
     except ValidationError as error:
         first = error.errors()[0]
         key = ".".join(str(part) for part in first["loc"])
         if first["type"] == "extra_forbidden":
-            raise unknown_key(key, _known_keys(first["loc"][:-1]), where) from error
+            raise unknown_key(key, _known_keys(kind, first["loc"][:-1]), where) from error
         if first["type"] == "missing":
             raise ConfigurationError(f"{where}: {key} is missing; add it") from error
         # What is above a secret holds it, and so does what is below it.
@@ -370,7 +370,6 @@ def parse_lab(text: str, where: str, folder: Path | None = None) -> LabSettings:
         # The cause has the value, too.
         reason = first["msg"].removeprefix("Value error, ")
         raise ConfigurationError(f"{where}: {key} = {given}: {reason}") from (None if secret else error)
-    return settings.read_from(where)
 
 
 def _look_up_secrets(document: dict[str, Any], folder: Path, where: str) -> None:
@@ -425,8 +424,7 @@ def _found_secret(key: str, place: dict[str, Any], folder: Path, where: str) -> 
     return secret
 
 
-def _known_keys(location: tuple[int | str, ...]) -> Iterable[str]:
-    model: type[BaseModel] = LabSettings
+def _known_keys(model: type[BaseModel], location: tuple[int | str, ...]) -> Iterable[str]:
     for part in location:
         annotation = model.model_fields[str(part)].annotation
         options = [option for option in (annotation, *getattr(annotation, "__args__", ())) if isinstance(option, type)]

@@ -21,7 +21,7 @@ import numpy.typing as npt
 from drivers.presenter import Colour
 from foundation.colorimetry import decode_srgb, encode_srgb, linear_srgb, planck, xyz_of
 from foundation.errors import FormatError, InputError
-from foundation.files import reading_error, whole_file, write_whole
+from foundation.files import read_csv, whole_file, write_whole
 
 Kind = Literal["uniform", "blackbody", "spectrum"]
 COLUMNS = ("index", "kind", "cct_k", "red", "green", "blue")
@@ -121,13 +121,7 @@ def save_illuminations(illuminations: Sequence[Illumination], path: Path) -> Non
 
 def load_illuminations(path: Path, *, computed: bool = False) -> tuple[Illumination, ...]:
     """Read `illuminations.csv`; further columns are ignored."""
-    try:
-        text = path.read_text(encoding="utf-8-sig")
-        rows = list(csv.DictReader(io.StringIO(text)))
-    except OSError as error:
-        raise reading_error(path, error, "make one with: acquire illuminations", "illuminations") from error
-    except (UnicodeDecodeError, csv.Error) as error:
-        raise FormatError(f"cannot read illuminations {path}: {error}; make one with: acquire illuminations") from error
+    rows = read_csv(path, "make one with: acquire illuminations", "illuminations")[1]
     if not rows or any(column not in rows[0] for column in COLUMNS):
         raise FormatError(f"{path}: expected lights under the columns {','.join(COLUMNS)}")
     lights: list[Illumination] = []

@@ -496,34 +496,72 @@ def json_output(command: str, asked: bool) -> Generator[JsonOutput]:
     output.write(stdout)
 
 
+def option(metavar: str | None, text: str, *names: str, panel: str | None = None, **more: Any) -> Any:
+    """Return typer's option; `names` are its own where that of its parameter, or a --no- beside it, would not do."""
+    return typer.Option(*names, metavar=metavar, help=text, rich_help_panel=panel, **more)
+
+
+def grouped(function: Callable[..., None]) -> Callable[..., None]:
+    """Return a command for typer in which options stand in the place of each parameter that is a group of them.
+
+    A group is a frozen dataclass, whose fields are ``Annotated`` with typer's ``Option`` or ``Argument`` and have
+    defaults. No two of a command's groups share a field's name.
+    """
+    hints = get_type_hints(function, include_extras=True)
+    parameters: list[inspect.Parameter] = []
+    members: dict[str, list[str]] = {}
+    for name, parameter in inspect.signature(function).parameters.items():
+        group = hints[name]
+        if not dataclasses.is_dataclass(group):
+            parameters.append(parameter.replace(annotation=group))
+            continue
+        kinds = get_type_hints(group, include_extras=True)
+        members[name] = [field.name for field in dataclasses.fields(group)]
+        parameters += [
+            parameter.replace(name=field.name, default=field.default, annotation=kinds[field.name])
+            for field in dataclasses.fields(group)
+        ]
+
+    def command(*arguments: Any, **given: Any) -> None:
+        groups = {
+            name: hints[name](**{field: given.pop(field) for field in fields if field in given})
+            for name, fields in members.items()
+        }
+        function(*arguments, **given, **groups)
+
+    return _declared(command, function, parameters)
+
+
+def _declared(
+    command: Callable[..., None], function: Callable[..., None], parameters: Sequence[inspect.Parameter]
+) -> Callable[..., None]:
+    """Return a command that typer takes for a function with other parameters."""
+    functools.update_wrapper(command, function)
+    command.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
+    command.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters} | {"return": None}
+    return command
+
+
 def with_json(command: str) -> Callable[[Callable[..., None]], Callable[..., None]]:
     """Return a decorator of a typer command whose one parameter of type `JsonOutput` becomes the option ``--json``."""
 
     def decorate(function: Callable[..., None]) -> Callable[..., None]:
-        signature = inspect.signature(function)
-        given = getattr(function, "__annotations__", {})
-        hints = given if "__signature__" in vars(function) else get_type_hints(function, include_extras=True)
-        output_name = next((name for name in signature.parameters if hints.get(name) is JsonOutput), None)
+        hints = get_type_hints(function, include_extras=True)
+        output_name = next((name for name, kind in hints.items() if kind is JsonOutput), None)
         if output_name is None:
             raise ValueError(f"{command} has no parameter of type JsonOutput to put the option in the place of")
         option = inspect.Parameter("as_json", inspect.Parameter.KEYWORD_ONLY, default=False, annotation=AsJson)
         others = [
-            parameter.replace(annotation=hints.get(name, Any))
-            for name, parameter in signature.parameters.items()
+            parameter.replace(annotation=hints[name])
+            for name, parameter in inspect.signature(function).parameters.items()
             if name != output_name
         ]
 
-        @functools.wraps(function)
         def with_option(*arguments: Any, as_json: bool = False, **named: Any) -> None:
             with json_output(command, as_json) as output:
                 function(*arguments, **named, **{output_name: output})
 
-        with_option.__signature__ = signature.replace(parameters=[*others, option])  # type: ignore[attr-defined]
-        with_option.__annotations__ = {
-            **{parameter.name: parameter.annotation for parameter in (*others, option)},
-            "return": None,
-        }
-        return with_option
+        return _declared(with_option, function, [*others, option])
 
     return decorate
 

@@ -8,6 +8,7 @@ that the caller did not mean to replace.
 from __future__ import annotations
 
 import contextlib
+import csv
 import errno
 import hashlib
 import io
@@ -140,6 +141,28 @@ def reading_error(path: Path, error: OSError, remedy: str, what: str = "") -> Fo
     return (StorageError if of_disk else FormatError)(
         f"cannot read {named}: {error.strerror or error}; {of_disk or remedy}"
     )
+
+
+def read_text(path: Path, remedy: str, what: str = "") -> str:
+    """Return a file's text, UTF-8; else raise a FormatError, or a StorageError where the disk is to blame."""
+    try:
+        return path.read_text(encoding="utf-8-sig")
+    except OSError as error:
+        raise reading_error(path, error, remedy, what) from error
+    except UnicodeDecodeError as error:
+        raise FormatError(f"no text in UTF-8: {error}", about=path, remedy=remedy) from error
+
+
+def read_csv(path: Path, remedy: str, what: str = "") -> tuple[list[str], list[dict[str, str]]]:
+    """Return the columns that the first line of a CSV file names, and its rows by them; errors as of `read_text`.
+
+    Cells that a short line lacks are empty.
+    """
+    table = csv.DictReader(io.StringIO(read_text(path, remedy, what)), restval="")
+    try:
+        return list(table.fieldnames or ()), list(table)
+    except csv.Error as error:
+        raise FormatError(f"no CSV: {error}", about=path, remedy=remedy) from error
 
 
 def _is_ours(error: BaseException, path: Path) -> TypeGuard[OSError]:

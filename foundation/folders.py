@@ -20,8 +20,9 @@ import errno
 import fcntl
 import logging
 import os
+import shutil
 import stat
-from collections.abc import Callable, Generator, Iterator, Mapping
+from collections.abc import Callable, Collection, Generator, Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Any, BinaryIO, Final, cast
@@ -114,6 +115,17 @@ def _require_size(path: Path, most: int) -> None:
         raise FormatError(
             f"{path} has {found.st_size} bytes, at most {most} expected; it is not what it is called, or damaged"
         )
+
+
+def clear_folder(folder: Path, kept: Collection[str] = ()) -> None:
+    """Remove what lies in a folder that is held, but for its lock and the names in `kept`."""
+    for path in folder.iterdir():
+        if path.name == LOCK_FILE or path.name in kept:
+            continue
+        if path.is_dir() and not path.is_symlink():
+            shutil.rmtree(path)
+        else:
+            path.unlink()
 
 
 def require_plain_tree(folder: Path) -> None:

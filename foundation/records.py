@@ -6,15 +6,27 @@ added has a default. Arrays are lists in the file, numbers that are not finite a
 
 from __future__ import annotations
 
+import difflib
 import json
 import math
+from collections.abc import Collection, Iterable, Mapping
+from functools import cache
 from typing import Annotated, Any, TypeVar, cast
 
 import numpy as np
 import numpy.typing as npt
-from pydantic import BaseModel, ConfigDict, PlainSerializer, PlainValidator, TypeAdapter, ValidationError
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    PlainSerializer,
+    PlainValidator,
+    SerializerFunctionWrapHandler,
+    TypeAdapter,
+    ValidationError,
+    model_serializer,
+)
 
-from foundation.errors import FormatError
+from foundation.errors import ConfigurationError, FormatError
 
 T = TypeVar("T")
 
@@ -44,13 +56,26 @@ class Record(BaseModel):
     model_config = ConfigDict(frozen=True, extra="ignore", arbitrary_types_allowed=True, use_attribute_docstrings=True)
 
 
+class SparseRecord(Record):
+    """A record of which keys that are None by default are left out while they are, so that files stay as they were."""
+
+    @model_serializer(mode="wrap")
+    def _without_none(self, serialise: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        left_out = {name for name, field in type(self).model_fields.items() if field.default is None}
+        return {key: value for key, value in serialise(self).items() if value is not None or key not in left_out}
+
+
+@cache
+def _adapter(kind: Any) -> TypeAdapter[Any]:
+    return TypeAdapter(kind)
+
+
 def to_plain(record: Any, kind: Any = None) -> Any:
     """Return a record, or a dataclass with typed fields, as JSON's objects, lists and numbers.
 
     `kind` is its type, where it is not that of the object alone (`tuple[Frame, ...]`).
     """
-    adapter: TypeAdapter[Any] = TypeAdapter(cast("Any", type(record) if kind is None else kind))
-    return adapter.dump_python(record, mode="json")
+    return _adapter(kind or cast("Any", type(record))).dump_python(record, mode="json")
 
 
 def to_json(record: Any, kind: Any = None) -> str:
@@ -67,7 +92,7 @@ def from_plain(kind: type[T], value: Any, about: object, remedy: str) -> T:
         A key is missing or its value is none of its type; `about` is the file, `remedy` what helps.
     """
     try:
-        return TypeAdapter(kind).validate_python(value)
+        return _adapter(kind).validate_python(value)
     except ValidationError as error:
         raise damaged(error, about, remedy) from error
 
@@ -75,7 +100,7 @@ def from_plain(kind: type[T], value: Any, about: object, remedy: str) -> T:
 def from_json(kind: type[T], text: bytes | str, about: object, remedy: str) -> T:
     """Return the record of a type, or a dataclass, from the text of a JSON file; errors as of `from_plain`."""
     try:
-        return TypeAdapter(kind).validate_json(text)
+        return _adapter(kind).validate_json(text)
     except ValidationError as error:
         raise damaged(error, about, remedy) from error
 
@@ -92,3 +117,29 @@ def damaged(error: ValidationError, about: object, remedy: str) -> FormatError:
         value=first["input"],
         expected=reason,
     )
+
+
+def unknown_key(key: str, known: Iterable[str], where: str) -> ConfigurationError:
+    """Return the error for an unknown key, naming the nearest one that is known."""
+    names = sorted(known)
+    near = difflib.get_close_matches(key.rsplit(".", 1)[-1], names, n=1, cutoff=0.5)
+    hint = f"did you mean {near[0]!r}?" if near else f"known are {', '.join(names)}"
+    return ConfigurationError(f"{where}: unknown key {key!r}; {hint}")
+
+
+def from_settings(
+    kind: type[T], given: Mapping[str, Any], where: str, key: str, known: Collection[str], **fixed: Any
+) -> T:
+    """Return a dataclass of what a user gives for some of its fields; a ConfigurationError says what cannot be used.
+
+    `given`: by names that are `known`, of the table `key` of a file, or a command line, `where`. `fixed`: other fields.
+    """
+    for name in given:
+        if name not in known:
+            raise unknown_key(f"{key}.{name}", known, where)
+    try:
+        return _adapter(kind).validate_python({**fixed, **given})
+    except ValidationError as error:
+        first = error.errors()[0]
+        at = ".".join([key, *(str(part) for part in first["loc"][:1])])
+        raise ConfigurationError(f"{where}: {at}: {first['msg']}, got {first['input']!r}") from error

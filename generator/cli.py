@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from foundation.compiled import processor_count
-from foundation.console import EXIT_CODES, JsonOutput, json_output, loaded, new_app, run
+from foundation.console import EXIT_CODES, JsonOutput, grouped, json_output, loaded, new_app, run
 from foundation.errors import InputError
 from foundation.secret_texts import masked, printable
 from generator.command.likeness_options import LikenessOptions, choose
@@ -23,7 +23,6 @@ from generator.command.options import (
     RenderingOptions,
     VariationOptions,
     WorkOptions,
-    grouped,
 )
 from generator.command.output import cells_sentences, matrix_sentence, table_folder
 

@@ -13,7 +13,7 @@ import typer
 
 from drivers.serial_projectors import LANGUAGES
 from foundation import console
-from foundation.console import EXIT_CODES, Quiet, Verbose, Version, common_first, new_app
+from foundation.console import EXIT_CODES, Quiet, Verbose, Version, common_first, new_app, option
 
 if TYPE_CHECKING:
     import numpy as np
@@ -51,17 +51,15 @@ def projector(
     udp: Annotated[
         int | None, typer.Option(min=0, max=65535, help="UDP port where PJLink searches are answered; 0 picks one.")
     ] = None,
-    notify: Annotated[
-        str | None, typer.Option(metavar="HOST:PORT", help="Send PJLink status notices there, by UDP.")
-    ] = None,
+    notify: Annotated[str | None, option("HOST:PORT", "Send PJLink status notices there, by UDP.")] = None,
     serial: Annotated[str | None, typer.Option(help=f"Language on a serial port: {', '.join(LANGUAGES)}.")] = None,
     lit: Annotated[bool, typer.Option("--lit", help="Begin with the lamp burning, not in standby.")] = False,
-    warm_up: Annotated[float, typer.Option(min=0, metavar="SECONDS", help="Time to warm up.")] = 30.0,
-    cool_down: Annotated[float, typer.Option(min=0, metavar="SECONDS", help="Time to cool down.")] = 60.0,
+    warm_up: Annotated[float, option("SECONDS", "Time to warm up.", min=0)] = 30.0,
+    cool_down: Annotated[float, option("SECONDS", "Time to cool down.", min=0)] = 60.0,
     pjlink_class: Annotated[int, typer.Option("--class", min=1, max=2, help="Class of PJLink.")] = 2,
     answer_after: Annotated[
         float,
-        typer.Option(min=0, max=10, metavar="SECONDS", help="Time to answer by PJLink; of real ones .05 to 2."),
+        option("SECONDS", "Time to answer by PJLink; of real ones .05 to 2.", min=0, max=10),
     ] = 0.0,
 ) -> None:
     """Serve a simulated projector: standby, 30 s of warm-up, on, 60 s of cooling.
@@ -138,20 +136,20 @@ def camera(
     model: Annotated[str, typer.Option(help="EOS 550D, EOS 6D Mark II, or Test: a small frame.")] = "EOS 550D",
     chart: Annotated[Path | None, typer.Option(help="chart.json of the print before it; grey squares else.")] = None,
     room: Annotated[
-        list[str] | None, typer.Option(metavar="NAME=VALUE", help="What differs from the default room, as LAB.toml's.")
+        list[str] | None, option("NAME=VALUE", "What differs from the default room, as LAB.toml's.")
     ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Of everything that chance decides: paper, noise.")] = 1,
     watch_screen: Annotated[
         str | None,
-        typer.Option(metavar="SCREEN", help="X screen that lights the chart: :1, 640x360+0+0, or :1,640x360+0+0."),
+        option("SCREEN", "X screen that lights the chart: :1, 640x360+0+0, or :1,640x360+0+0."),
     ] = None,
     watch_projector: Annotated[
-        str | None, typer.Option(metavar="HOST:PORT", help="PJLink projector that throws it; a steady lamp else.")
+        str | None, option("HOST:PORT", "PJLink projector that throws it; a steady lamp else.")
     ] = None,
     projector_password: Annotated[str | None, typer.Option(help="Its PJLink password.")] = None,
     event: Annotated[
         list[str] | None,
-        typer.Option(metavar="TABLE", help="What goes wrong, as in LAB.toml: '{ what = \"bump\", px = 1.0 }'."),
+        option("TABLE", "What goes wrong, as in LAB.toml: '{ what = \"bump\", px = 1.0 }'."),
     ] = None,
 ) -> None:
     """Serve a simulated Canon EOS on a network or a USB cable: it photographs grey squares under white light.

@@ -28,10 +28,11 @@ from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import ValidationError
 
 from foundation.errors import FormatError, InputError
 from foundation.files import sha256_of
+from foundation.records import Record
 
 NEEDED_NM: Final = (400.0, 700.0)
 """Wavelengths that must be covered: beyond them a camera with its infrared filter sees under 2 % of its light."""
@@ -173,24 +174,18 @@ is taken to be blind (judgement): what is cut off there is below a hundredth of 
 _CHANNELS: Final = ("R", "G", "B")
 
 
-class _Header(BaseModel):
-    model_config = ConfigDict(extra="ignore")
-
+class _Header(Record):
     manufacturer: str = ""
     model: str = ""
 
 
-class _Spectra(BaseModel):
-    model_config = ConfigDict(extra="ignore")
-
+class _Spectra(Record):
     units: str = "relative"
     index: dict[str, list[str]]
     data: dict[str, dict[str, list[float]]]
 
 
-class _Document(BaseModel):
-    model_config = ConfigDict(extra="ignore")
-
+class _Document(Record):
     header: _Header = _Header()
     spectral_data: _Spectra
 

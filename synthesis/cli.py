@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from foundation.console import EXIT_CODES, JsonOutput, Licence, Note, orderly_end, progress, with_json
+from foundation.console import EXIT_CODES, JsonOutput, Licence, Note, option, orderly_end, progress, with_json
 from sim import cli as devices
 from sim.cli import app
 
@@ -73,12 +73,7 @@ def table(
     licence: Licence = None,
     author: Annotated[
         list[str] | None,
-        typer.Option(
-            "--author",
-            metavar='"FAMILY, GIVEN"',
-            help="Who made the table; several times for several.",
-            show_default=False,
-        ),
+        option('"FAMILY, GIVEN"', "Who made the table; several times for several."),
     ] = None,
     *,
     told: JsonOutput,

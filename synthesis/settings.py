@@ -5,22 +5,22 @@ One TOML file becomes frozen values at the door; unknown keys are errors.
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Sequence
 from dataclasses import asdict, fields, replace
 from pathlib import Path
 from typing import Annotated, Any, Final
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
+from pydantic import Field
 
 from calibration.citation import OriginRecord, with_changes
 from calibration.sampling import WINDOW, WINDOWS
-from drivers.camera import ExposureSettings
 from experiment.chart.layout import design_chart
-from experiment.config import CitationSettings, unknown_key
+from experiment.config import CameraSettings, CitationSettings, Settings, checked, parse_toml
 from experiment.lights import plan_illuminations
 from foundation.errors import ConfigurationError
+from foundation.files import read_text
+from foundation.records import from_settings
 from sim.spectral import describe_sensitivities, read_sensitivities
 from sim.world.room import Room
 from sim.world.sensors import find_body
@@ -33,11 +33,7 @@ NOT_COMPUTED: Final = (
 """What a photographed room may have and a computed table has not: its frames know neither neighbours nor time."""
 
 
-class _Settings(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-
-class ComputedExposure(_Settings):
+class ComputedExposure(CameraSettings):
     """The exposure of every frame, as `[camera]` of LAB.toml has it.
 
     Spectra are exposed each by itself (`synthesis.lamps.SpectralLamp`): of theirs only the ISO speed counts, and for
@@ -46,13 +42,9 @@ class ComputedExposure(_Settings):
 
     iso: Annotated[int, Field(ge=50, le=25600)] = 100
     """ISO speed."""
-    aperture: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 8.0
-    """f-number."""
-    shutter_s: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 0.5
-    """Shutter time, s."""
 
 
-class ComputedChart(_Settings):
+class ComputedChart(Settings):
     """The chart, as `acquire chart` designs it."""
 
     bits: Annotated[int, Field(ge=1, le=5)] = 5
@@ -63,17 +55,17 @@ class ComputedChart(_Settings):
     """Seed of the order of the colours."""
 
 
-class TableSettings(_Settings):
+class TableSettings(Settings):
     """Everything that a settings file of `sim table` says."""
 
     seed: Annotated[int, Field(ge=0)] = 1
     """Seed of everything that chance decides: the photosites' response, noise."""
     window: int = WINDOW
     """Half-size pixels along the side of a cell's window: 3, 5, 7 or 9."""
-    camera: dict[str, Any] = {}
+    camera: dict[str, Any] = Field(default_factory=dict[str, Any])
     """Facts of the body that differ; see `sim.world.sensors.find_body`."""
     exposure: ComputedExposure = ComputedExposure()
-    room: dict[str, bool | int | float | str] = {}
+    room: dict[str, bool | int | float | str] = Field(default_factory=dict[str, bool | int | float | str])
     """Parameters of the room that differ; see `sim.world.room.Room`."""
     chart: ComputedChart = ComputedChart()
 
@@ -81,39 +73,18 @@ class TableSettings(_Settings):
         """Return the settings with another seed, where one is given, and changes of the room that come before its."""
         return self.model_copy(update={"room": {**self.room, **room}} | ({} if seed is None else {"seed": seed}))
 
-    @property
-    def exposed(self) -> ExposureSettings:
-        """The exposure as the simulated room takes it."""
-        return ExposureSettings(self.exposure.iso, self.exposure.aperture, self.exposure.shutter_s)
-
 
 def load_settings(path: Path | None) -> TableSettings:
     """Return what a settings file says; the defaults where none is given."""
     if path is None:
         return TableSettings()
-    try:
-        document = tomllib.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise ConfigurationError(f"cannot read settings {path}: {error.strerror}; name a TOML file") from error
-    except UnicodeDecodeError as error:
-        raise ConfigurationError(f"{path} is no text in UTF-8: {error}; save it as such") from error
-    except tomllib.TOMLDecodeError as error:
-        raise ConfigurationError(f"{path} is not TOML: {error}") from error
-    return parse_settings(document, str(path))
+    text = read_text(path, "name a TOML file", "settings")
+    return parse_settings(parse_toml(text, str(path)), str(path))
 
 
 def parse_settings(document: dict[str, Any], where: str) -> TableSettings:
     """Return the settings in a TOML document; `where` names it in errors."""
-    try:
-        settings = TableSettings.model_validate(document)
-    except ValidationError as error:
-        first = error.errors()[0]
-        key = ".".join(map(str, first["loc"]))
-        if first["type"] == "extra_forbidden":
-            models: dict[str, type[BaseModel]] = {"exposure": ComputedExposure, "chart": ComputedChart}
-            model = models.get(str(first["loc"][0]), TableSettings) if len(first["loc"]) > 1 else TableSettings
-            raise unknown_key(key, model.model_fields, where) from error
-        raise ConfigurationError(f"{where}: {key} = {first['input']!r}: {first['msg']}") from error
+    settings = checked(TableSettings, document, where)
     if settings.window not in WINDOWS:
         raise ConfigurationError(f"{where}: window = {settings.window}: {', '.join(map(str, WINDOWS))} expected")
     return settings
@@ -121,21 +92,14 @@ def parse_settings(document: dict[str, Any], where: str) -> TableSettings:
 
 def room_of(settings: TableSettings, where: str) -> Room:
     """Return the default room with the seed and the changes of the settings; its lamp does not age."""
+    unused = [key for key in settings.room if key in NOT_COMPUTED]
+    if unused:
+        raise ConfigurationError(
+            f"{where}: room.{unused[0]} has no effect on a computed table, whose frames know neither neighbours nor "
+            "time; leave it out, or photograph in the simulated lab with acquire run"
+        )
     known = [field.name for field in fields(Room) if field.name not in ("seed", *NOT_COMPUTED)]
-    for key in settings.room:
-        if key in NOT_COMPUTED:
-            raise ConfigurationError(
-                f"{where}: room.{key} has no effect on a computed table, whose frames know neither neighbours nor "
-                "time; leave it out, or photograph in the simulated lab with acquire run"
-            )
-        if key not in known:
-            raise unknown_key(f"room.{key}", known, where)
-    try:
-        return TypeAdapter(Room).validate_python({**settings.room, "seed": settings.seed, "lamp_drift_per_hour": 0.0})
-    except ValidationError as error:
-        first = error.errors()[0]
-        key = ".".join(["room", *(str(part) for part in first["loc"][:1])])
-        raise ConfigurationError(f"{where}: {key}: {first['msg']}, got {first['input']!r}") from error
+    return from_settings(Room, settings.room, where, "room", known, seed=settings.seed, lamp_drift_per_hour=0.0)
 
 
 def table_task(camera: str, settings: TableSettings, where: str, lights: LightSpectra | None = None) -> TableTask:
@@ -164,7 +128,7 @@ def table_task(camera: str, settings: TableSettings, where: str, lights: LightSp
     planned = plan_illuminations() if lights is None else illuminations_of(lights.lights)
     powers = None if lights is None else np.array([light.power for light in lights.lights])
     record["lights"] |= {"count": len(planned)}
-    return TableTask(chart, body, room, settings.exposed, planned, powers, settings.window, record)
+    return TableTask(chart, body, room, settings.exposure.exposure, planned, powers, settings.window, record)
 
 
 def stated_by_hand(note: str | None, licence: str | None, authors: Sequence[str]) -> OriginRecord | None:

@@ -13,9 +13,8 @@ Rules that hold inside:
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterable, Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import Any, Literal
 
@@ -144,17 +143,15 @@ class CheckReport:
             f"            not known before the session: {names}",
         ]
 
-    def to_json(self) -> str:
-        """Return the report as JSON: `devices`, `faults` (their number), `findings` as `Finding` has them, `table`."""
-        document = {
-            "devices": list(self.devices),
+    def values(self) -> dict[str, Any]:
+        """Return the report for programs: `devices`, `faults` (their number), `findings`, `table`."""
+        table = {"outcome": self.forecast, "figures": self.figures, "not_known": self.not_known}
+        return {
+            "devices": self.devices,
             "faults": len(self.of("fault")),
-            "findings": [_plain(asdict(finding)) for finding in self.findings],
-            "table": None
-            if self.forecast is None
-            else {"outcome": self.forecast, "figures": _plain(dict(self.figures)), "not_known": list(self.not_known)},
+            "findings": self.findings,
+            "table": None if self.forecast is None else table,
         }
-        return json.dumps(document, indent=1, ensure_ascii=False, allow_nan=False)
 
 
 def judged(limit: Limit, value: float, said: str, remedy: str, details: Mapping[str, Any] | None = None) -> Finding:
@@ -217,17 +214,6 @@ def percent(share: float) -> str:
 def _within(value: float, bounds: Range) -> bool:
     low, high = bounds
     return value == value and (low is None or value >= low) and (high is None or value <= high)
-
-
-def _plain(value: Any) -> Any:
-    """Return a value that JSON can hold: a number that is none becomes null."""
-    if isinstance(value, dict):
-        return {key: _plain(each) for key, each in value.items()}  # pyright: ignore[reportUnknownVariableType]
-    if isinstance(value, list | tuple):
-        return [_plain(each) for each in value]  # pyright: ignore[reportUnknownVariableType]
-    if isinstance(value, float) and (value != value or value in (float("inf"), float("-inf"))):
-        return None
-    return value
 
 
 _VERDICT = "the limits of a table's verdict"

@@ -41,16 +41,12 @@ class Shot:
 
     `mosaic`: its counts.
 
-    - `colour`: what was shown.
     - `shutter_s`: the shutter time that was set, seconds.
-    - `took_s`: seconds from the release until the file was here, by the lab's clock.
     - `size`: bytes of its file.
     """
 
-    colour: Colour
     shutter_s: float
     mosaic: Mosaic
-    took_s: float
     size: int
 
     def brightest(self, percentile: float) -> npt.NDArray[np.float64]:
@@ -93,12 +89,11 @@ class Photographer:
         begun = devices.clock.monotonic()
         with self._file.open("wb") as stream:
             size = capture(devices.camera, stream).size
-        took = devices.clock.monotonic() - begun
-        self.timings.append((wanted, took))
+        self.timings.append((wanted, devices.clock.monotonic() - begun))
         mosaic = read_raw(self._file)
         self.focal_px = stated_focal_px(self._file, mosaic)
         self._file.unlink()
-        return Shot(colour, wanted, mosaic, took, size)
+        return Shot(wanted, mosaic, size)
 
     def restore(self) -> None:
         """Set the shutter time of the settings again."""

@@ -6,7 +6,6 @@ verdict. The result is a session like any other.
 
 from __future__ import annotations
 
-import csv
 import math
 import shutil
 from collections.abc import Callable, Mapping
@@ -24,7 +23,7 @@ from experiment.lights import Illumination, load_illuminations
 from experiment.session.folder import FRAME_COLUMNS, Session
 from experiment.session.records import ACCEPTED, REFUSED, FrameKind, Judgement, SessionStep
 from foundation.errors import FormatError
-from foundation.files import file_sha256, require_free
+from foundation.files import file_sha256, read_csv, require_free
 
 
 @dataclass(frozen=True)
@@ -58,12 +57,7 @@ def read_frame_list(path: Path) -> tuple[list[ListedFrame], tuple[Illumination, 
     Only `kind`, `illumination` and `file` must be filled. Rows of the kind ``response`` are passed over: they serve
     while a session is taken, and the list does not say which codes they show.
     """
-    try:
-        rows = list(csv.DictReader(path.read_text(encoding="utf-8-sig").splitlines()))
-    except OSError as error:
-        raise FormatError(f"cannot read the list of frames {path}: {error.strerror}; name a CSV file") from error
-    except (UnicodeDecodeError, csv.Error) as error:
-        raise FormatError(f"cannot read the list of frames {path}: {error}; save it as CSV in UTF-8") from error
+    rows = read_csv(path, "name a CSV file in UTF-8", "the list of frames")[1]
     if not rows or any(column not in rows[0] for column in FRAME_COLUMNS[:3]):
         raise FormatError(f"expected frames under the columns {','.join(FRAME_COLUMNS)}", about=path)
     lights = load_illuminations(path.parent / "illuminations.csv")

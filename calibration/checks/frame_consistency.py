@@ -33,8 +33,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import astuple, dataclass, replace
-from typing import Any
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -273,21 +272,6 @@ class FrameConsistency:
     disturbed: tuple[tuple[int, float], ...] = ()
     seeds: tuple[int, ...] = ()
     alone: tuple[int, ...] = ()
-
-    def to_json(self) -> list[Any]:
-        """Return the values as JSON can hold them; `from_json` restores them to the last bit."""
-        return list(astuple(self))
-
-    @staticmethod
-    def from_json(stored: list[Any]) -> FrameConsistency:
-        """Return the values of what `to_json` returned."""
-        *found, disturbed, seeds, alone = stored
-        scatter, block, (x_mm, y_mm), (red, green, blue), share, extent_mm, added, kept = found
-        cells = tuple((int(cell), float(off)) for cell, off in disturbed)
-        place, colour = (x_mm, y_mm), (red, green, blue)
-        return FrameConsistency(
-            scatter, block, place, colour, share, extent_mm, added, kept, cells, tuple(seeds), tuple(alone)
-        )
 
     def without_hot(self, hot: _Mask, cells_mm: _Array) -> FrameConsistency:
         """Return the same where cells that are off by their hot photosites are not taken for covered ones.
@@ -562,14 +546,11 @@ class OriginFigures:
     - `other_lens`: frames through another lens.
     - `other_exposure`: frames exposed otherwise by a hundredth or more.
     - `other_iso`: frames of another ISO speed.
-    - `stating_camera`, `stating_exposure`: how many frames state them at all.
     """
 
     other_camera: tuple[ForeignFrame, ...] = ()
     other_lens: tuple[ForeignFrame, ...] = ()
     other_exposure: tuple[ForeignFrame, ...] = ()
-    stating_camera: int = 0
-    stating_exposure: int = 0
     other_iso: tuple[ForeignFrame, ...] = ()
 
     @property
@@ -590,8 +571,6 @@ def origin_figures(frames: Sequence[tuple[FrameRecord, FrameOrigin]]) -> OriginF
         other_camera=_others(_stated_alike(bodies)),
         other_lens=_others(lenses),
         other_exposure=_other_exposures(frames),
-        stating_camera=len(bodies),
-        stating_exposure=sum(origin.exposure > 0 for _, origin in frames),
         other_iso=_others([(record, f"ISO {origin.iso}") for record, origin in frames if origin.iso]),
     )
 

@@ -60,6 +60,8 @@ _BEGIN_ANEW = "begin the build anew"
 _Array = npt.NDArray[np.float64]
 _Arrays = dict[str, npt.NDArray[Any]]
 
+_Figures = tuple[FrameMeasurements | DarkFrameFigures, ...]
+
 EarlyMeasurement = MeasuredFrame | MeasuredDarkFrame | None
 """A frame as measured before its turn; None where the chart has to be registered again in it."""
 
@@ -89,7 +91,7 @@ class Accumulator:
     session: Session
     selected: SelectedFrames
     baseline: Baseline
-    figures: tuple[FrameMeasurements | DarkFrameFigures, ...]
+    figures: _Figures
     saturation: int
     registered: RegisteredFrame
     dark: DarkLight | None
@@ -233,10 +235,7 @@ class Accumulator:
         """Return what a checkpoint stores as text; the rest is `to_arrays`."""
         return {
             "registered": self.registered.file,
-            "figures": [
-                figures.to_json() if isinstance(figures, FrameMeasurements) else to_plain(figures)
-                for figures in self.figures
-            ],
+            "figures": to_plain(self.figures, _Figures),
         }
 
     def to_arrays(self) -> _Arrays:
@@ -246,12 +245,9 @@ class Accumulator:
 
     def restored(self, values: Mapping[str, Any], arrays: _Arrays) -> Accumulator:
         """Return what was stored of a build of the same frames, `arrays` (...) of any dtype; this one is empty."""
-        page_mm = self.baseline.chart.page_mm
+        found = from_plain(_Figures, values["figures"], self.session.folder, _BEGIN_ANEW)
         figures = tuple(
-            replace(from_plain(DarkFrameFigures, stored, record.file, _BEGIN_ANEW), record=record)
-            if record.kind == "dark"
-            else FrameMeasurements.from_json(record, page_mm, stored)
-            for record, stored in zip(self.selected.records, values["figures"], strict=False)
+            replace(each, record=record) for each, record in zip(found, self.selected.records, strict=False)
         )
         registered = self.baseline.first
         if values["registered"] != registered.file:

@@ -82,7 +82,7 @@ from experiment.session.records import FrameRecord
 from foundation.compiled import processor_count
 from foundation.errors import FormatError, QualityError, RegistrationError, counted, first_of
 from foundation.files import partial_path, publish_folder, require_free, storage_error, sync_folder, write_whole
-from foundation.folders import LOCK_FILE, held_folder
+from foundation.folders import clear_folder, held_folder
 from foundation.records import to_plain
 from foundation.version import software
 
@@ -499,13 +499,7 @@ class UnfinishedTable:
 
     def begin_anew(self) -> None:
         """Empty the folder."""
-        for path in self.folder.iterdir():
-            if path.name == LOCK_FILE:
-                continue
-            if path.is_dir() and not path.is_symlink():
-                shutil.rmtree(path)
-            else:
-                path.unlink()
+        clear_folder(self.folder)
 
     def discard(self) -> None:
         """Leave nothing behind when the block ends, since going on would lead to the same end."""

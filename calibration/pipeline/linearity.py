@@ -78,9 +78,7 @@ def read_linearity(folder: Path, baseline: Baseline) -> LinearityMeasurements:
             f"{folder}: no patch is between {LOWEST:.0%} and {HIGHEST:.0%} of saturation in two frames; "
             "take the series with times less far apart, from dim to nearly saturated"
         )
-    return LinearityMeasurements(
-        tuple(paths[number].name for number in order), np.array(times)[order], level, deviation
-    )
+    return LinearityMeasurements(tuple(paths[number].name for number in order), level, deviation)
 
 
 def _exposure_s(mosaic: Mosaic, path: Path) -> float:

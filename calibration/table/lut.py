@@ -36,8 +36,9 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 from calibration.citation import OriginRecord
 from experiment.lights import COLUMNS, NAME, Illumination, load_illuminations
 from foundation.errors import FormatError, StorageError
-from foundation.files import file_sha256, partial_path, reading_error, sha256_of, storage_error, write_whole
+from foundation.files import file_sha256, partial_path, read_text, reading_error, sha256_of, storage_error, write_whole
 from foundation.folders import require_plain_folder
+from foundation.records import Record, from_json
 
 FORMAT: Final = "crop.lut"
 
@@ -139,7 +140,7 @@ class Unfit(BaseModel):
         return self.cause.split(":")[0]
 
 
-class Provenance(BaseModel):
+class Provenance(Record):
     """The content of `lut.json`.
 
     - `camera`: maker and model as the raw files name it.
@@ -161,22 +162,20 @@ class Provenance(BaseModel):
       in tables made before it was kept, and in computed ones of which nothing is stated.
     """
 
-    model_config = ConfigDict(frozen=True, extra="ignore")
-
     format: Literal["crop.lut"] = FORMAT
     version: Literal[1] = VERSION
     camera: str
     bits: int = Field(ge=1, le=5)
     white_level: int = Field(ge=1, le=65535)
-    corrections: list[dict[str, Any]] = []
+    corrections: list[dict[str, Any]] = Field(default_factory=list[dict[str, Any]])
     session_sha256: str
     chart_sha256: str
     software: str
-    unfit: list[Unfit] = []
+    unfit: list[Unfit] = Field(default_factory=list[Unfit])
     samples_sha256: Sha256 | None = None
     illuminations_sha256: Sha256 | None = None
-    lights_sha256: list[Sha256] = []
-    files_sha256: dict[FileName, Sha256] = {}
+    lights_sha256: list[Sha256] = Field(default_factory=list[Sha256])
+    files_sha256: dict[FileName, Sha256] = Field(default_factory=dict[FileName, Sha256])
     has_sums: bool = False
     computed: dict[str, Any] | None = None
     origin: OriginRecord | None = None
@@ -213,12 +212,7 @@ def parse_provenance(text: bytes, path: Path) -> Provenance:
             f"{path.parent} is a table of version {head.version!r}, this software reads version {VERSION}; "
             "build it again from its session with build-lut, or install the software that wrote it"
         )
-    try:
-        return Provenance.model_validate_json(text)
-    except ValidationError as error:
-        first = error.errors()[0]
-        where = "".join(f"{part}: " for part in (".".join(map(str, first["loc"])),) if part)
-        raise FormatError(f"{path} is damaged: {where}{first['msg']}; restore it from a copy") from error
+    return from_json(Provenance, text, path, "restore it from a copy")
 
 
 @dataclass(frozen=True)
@@ -353,12 +347,7 @@ def require_plain_table(folder: Path) -> None:
 def known_sums(folder: Path, provenance: Provenance) -> dict[str, str]:
     """Return the recorded hashes of a table's files by name, `samples.npy` included; of older tables what they have."""
     if provenance.has_sums:
-        path = folder / SUMS
-        try:
-            return parse_sums(path.read_text("utf-8"), path)
-        except (OSError, UnicodeDecodeError) as error:
-            reason = error.strerror if isinstance(error, OSError) else "it is no text"
-            raise FormatError(f"cannot read {path}: {reason}; {RESTORE}") from error
+        return parse_sums(read_text(folder / SUMS, RESTORE), folder / SUMS)
     if (folder / SUMS).exists():
         raise FormatError(
             f"{folder / PROVENANCE} does not know of {SUMS} beside it: one of them has changed; {RESTORE}"

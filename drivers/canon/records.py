@@ -582,10 +582,6 @@ class Scale:
         best = min(fitting, key=lambda step: (step.code % 8 == 4, abs(step.value / (number or 1) - 1), step.code))
         return best.code
 
-    def labels(self, codes: Iterable[int]) -> str:
-        """Return what the camera shows for `codes`, in their order, for a message."""
-        return ", ".join(self.label(code) for code in codes) or "nothing"
-
     def _step(self, code: int) -> DialPosition | None:
         return next((step for step in self.steps if step.code == code), None)
 

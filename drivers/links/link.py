@@ -5,15 +5,13 @@ Rules that hold inside:
 - An implementation translates the system's errors into `LinkTimeout`, `LinkClosed` and `PipeStalled` at this border and
   nowhere else.
 - What was sent before hanging up can still be read after it.
-- `memory_pair` may be used from two threads, one an end. `PeerLink` has no thread and never waits: its peer has
-  answered by the time `write` returns, so an empty read can only mean that nothing will come.
+- `PeerLink` has no thread and never waits: its peer has answered by the time `write` returns, so an empty read can only
+  mean that nothing will come.
 """
 
 from __future__ import annotations
 
 import logging
-import threading
-import time
 from collections.abc import Callable
 from enum import Enum
 from typing import Final, Protocol, TypeVar
@@ -152,73 +150,13 @@ class PeerLink:
             if self._peer.closed:
                 raise LinkClosed("the simulated device hung up; open a new connection")
             raise LinkTimeout(f"the simulated device has not answered within {timeout:g} s")
-        return _take(self._incoming, limit)
+        taken = bytes(self._incoming[:limit])
+        del self._incoming[:limit]
+        return taken
 
     def close(self) -> None:
         """Hang up."""
         self._open = False
-
-
-class MemoryLink:
-    """One of two joined ends; see `memory_pair`."""
-
-    def __init__(self, changed: threading.Condition, outgoing: _Pipe, incoming: _Pipe) -> None:
-        self._changed = changed
-        self._outgoing = outgoing
-        self._incoming = incoming
-        self._open = True
-
-    def write(self, data: bytes, timeout: float) -> None:
-        """Put `data` where the other end reads it; never waits."""
-        with self._changed:
-            if not self._open or self._incoming.closed:
-                raise LinkClosed("the joined end was closed; open a new connection")
-            self._outgoing.waiting += data
-            self._changed.notify_all()
-
-    def read(self, limit: int, timeout: float) -> bytes:
-        """Return up to `limit` bytes that the other end wrote, waiting at most `timeout` seconds for the first."""
-        deadline = time.monotonic() + timeout
-        with self._changed:
-            while True:
-                if not self._open:
-                    raise LinkClosed("this end was closed; open a new connection")
-                if self._incoming.waiting:
-                    return _take(self._incoming.waiting, limit)
-                if self._incoming.closed:
-                    raise LinkClosed("the joined end was closed; open a new connection")
-                remaining = deadline - time.monotonic()
-                if remaining <= 0:
-                    raise LinkTimeout(f"nothing came from the joined end within {timeout:g} s")
-                self._changed.wait(remaining)
-
-    def close(self) -> None:
-        """Hang up; a reader waiting at either end is woken."""
-        with self._changed:
-            self._open = False
-            self._outgoing.closed = True
-            self._changed.notify_all()
-
-
-class _Pipe:
-    """Bytes under way in one direction."""
-
-    def __init__(self) -> None:
-        self.waiting = bytearray()
-        self.closed = False
-
-
-def memory_pair() -> tuple[MemoryLink, MemoryLink]:
-    """Return two ends of one cable: what one writes, the other reads."""
-    changed = threading.Condition()
-    there, back = _Pipe(), _Pipe()
-    return MemoryLink(changed, there, back), MemoryLink(changed, back, there)
-
-
-def _take(waiting: bytearray, limit: int) -> bytes:
-    taken = bytes(waiting[:limit])
-    del waiting[:limit]
-    return taken
 
 
 _log = logging.getLogger(__name__)

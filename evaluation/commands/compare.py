@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from evaluation.commands.options import AngularError, argument, option
-from foundation.console import EXIT_CODES, JsonOutput, with_json
+from evaluation.commands.options import AngularError, argument
+from foundation.console import EXIT_CODES, JsonOutput, option, with_json
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence

@@ -5,8 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import typer
-
 from evaluation.commands.options import (
     Data,
     DataReading,
@@ -15,13 +13,11 @@ from evaluation.commands.options import (
     argument,
     choose_beside_constant,
     image_steps,
-    option,
     require_order,
     thread_option,
-    with_data_options,
 )
 from evaluation.commands.train import LEARNERS_HELP
-from foundation.console import EXIT_CODES, JsonOutput, with_json
+from foundation.console import EXIT_CODES, JsonOutput, grouped, option, with_json
 
 if TYPE_CHECKING:
     import numpy as np
@@ -46,7 +42,7 @@ the table of evaluate run; writes nothing unless asked: --out writes the results
 
 
 @with_json("evaluate cv")
-@with_data_options
+@grouped
 def cv(
     method: Annotated[str, argument("METHOD", f"{LEARNERS_HELP}, all, module:Class or file.py:Class.")],
     data: Data,
@@ -58,9 +54,7 @@ def cv(
             "Number of folds to draw, or a file with the columns image,fold. \\[default: the data's own, or 3]",
         ),
     ] = None,
-    seed: Annotated[
-        int, typer.Option(metavar="N", help="Of the folds and of all that is random in the training.", min=0)
-    ] = 0,
+    seed: Annotated[int, option("N", "Of the folds and of all that is random in the training.", min=0)] = 0,
     error: PrintedError = "reproduction",
     statistics: PrintedStatistics = "paper",
     out: Annotated[Path | None, option("RESULTS", "Write everything to this new folder.")] = None,

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from evaluation.commands.options import DataReading, argument, image_steps, option, thread_option, with_data_options
-from foundation.console import EXIT_CODES, JsonOutput, with_json
+from evaluation.commands.options import DataReading, argument, image_steps, thread_option
+from foundation.console import EXIT_CODES, JsonOutput, grouped, option, with_json
 
 if TYPE_CHECKING:
     from evaluation.experiments.describing import DataDescription
@@ -29,7 +29,7 @@ Prints tables, and with --against one sentence for each figure: within 25 % or n
 
 
 @with_json("evaluate describe")
-@with_data_options
+@grouped
 def describe(
     data: Annotated[str, argument("DATA", "Folder, file or URL of it, or a STATS.json.")],
     against: Annotated[str | None, option("DATA", "Data set, or STATS.json, to hold it beside.")] = None,

@@ -1,8 +1,8 @@
 """What the commands share: options that several have, the data set that they read, and the methods that they name.
 
-A command has one parameter `reading: DataReading`, and `@with_data_options` puts the options in its place::
+A command has one parameter `reading: DataReading`, and `@grouped` puts the options in its place::
 
-    @with_data_options
+    @grouped
     def run(dataset: Annotated[str, typer.Argument()], *, reading: DataReading) -> None:
         data = reading.open(dataset)
 
@@ -12,27 +12,23 @@ The order in which a text is tried as a method: a file that ends in .npz is a mo
 
 from __future__ import annotations
 
-import functools
-import inspect
 import itertools
 from collections.abc import Callable, Generator, Iterable, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, cast, get_type_hints
+from typing import TYPE_CHECKING, Annotated, Any, Literal, cast
 
 import typer
+
+from foundation.console import option
 
 if TYPE_CHECKING:
     from evaluation.datasets.options import DataOptions
     from evaluation.methods.method import Learner, Method
     from evaluation.results.files import GivenEstimates
     from evaluation.scene import SceneSet
-
-
-def option(metavar: str, text: str, *names: str, **limits: Any) -> Any:
-    """Return a typer option whose help says its default, where there is one."""
-    return typer.Option(*names, metavar=metavar, help=text, show_default=False, **limits)
 
 
 def argument(metavar: str, text: str) -> Any:
@@ -69,7 +65,7 @@ def image_steps(count: int) -> Generator[Callable[[], None]]:
         yield lambda: advance(next(steps), count)
 
 
-_PANEL = "Reading the data"
+_reading_option = partial(option, panel="Reading the data")
 
 
 @dataclass(frozen=True)
@@ -82,13 +78,50 @@ class DataReading:
     - `partial`: whether missing images are left out and counted.
     """
 
-    layout: str | None = None
-    camera: str | None = None
-    subset: str | None = None
-    truth: str | None = None
-    black: float | None = None
-    saturation: float | None = None
-    partial: bool = False
+    layout: Annotated[
+        str | None,
+        _reading_option(
+            "NAME",
+            "Layout of the data set: generated, thumbnails, cube-plus, cube++, simple-cube++, nus8, gehler-shi, "
+            "intel-tau, lsmi, ffcc or folder. \\[default: what it looks like]",
+        ),
+    ] = None
+    camera: Annotated[
+        str | None,
+        _reading_option("NAME", "One camera of nus8, gehler-shi (1D, 5D), intel-tau or lsmi. \\[default: all]"),
+    ] = None
+    subset: Annotated[
+        str | None,
+        _reading_option(
+            "NAME",
+            "Part of the data set: train or test of simple-cube++; lab_printouts … of intel-tau; train, val, test, "
+            "single, mixed or test-mixed … of lsmi. \\[default: all]",
+        ),
+    ] = None
+    truth: Annotated[
+        str | None,
+        _reading_option(
+            "NAME",
+            "Ground truth where there are several: mean, left, right, left-white or right-white of cube++; own, left "
+            "or right of cube-plus; recommended or shi of gehler-shi. \\[default: the first of these]",
+        ),
+    ] = None
+    black: Annotated[
+        float | None, _reading_option("LEVEL", "Black level, in the units of the files. \\[default: the layout's]")
+    ] = None
+    saturation: Annotated[
+        float | None,
+        _reading_option(
+            "LEVEL",
+            "Value from which a pixel is clipped, in the units of the files. \\[default: the layout's]",
+        ),
+    ] = None
+    partial: Annotated[
+        bool,
+        _reading_option(
+            None, "Take what is there of a copy that lacks images, and say how many it lacks.", "--partial"
+        ),
+    ] = False
 
     def open(self, place: str) -> SceneSet:
         """Return the data set at a place; see `evaluation.datasets.opening.open_scenes`."""
@@ -102,91 +135,6 @@ class DataReading:
         from evaluation.datasets.options import DataOptions
 
         return DataOptions(self.camera, self.subset, self.truth, self.black, self.saturation, self.partial)
-
-
-def _option(metavar: str | None, text: str, *names: str) -> Any:
-    return typer.Option(*names, metavar=metavar, help=text, show_default=False, rich_help_panel=_PANEL)
-
-
-_OPTIONS: dict[str, Any] = {
-    "layout": Annotated[
-        str | None,
-        _option(
-            "NAME",
-            "Layout of the data set: generated, thumbnails, cube-plus, cube++, simple-cube++, nus8, gehler-shi, "
-            "intel-tau, lsmi, ffcc or folder. \\[default: what it looks like]",
-            "--layout",
-        ),
-    ],
-    "camera": Annotated[
-        str | None,
-        _option("NAME", "One camera of nus8, gehler-shi (1D, 5D), intel-tau or lsmi. \\[default: all]", "--camera"),
-    ],
-    "subset": Annotated[
-        str | None,
-        _option(
-            "NAME",
-            "Part of the data set: train or test of simple-cube++; lab_printouts … of intel-tau; train, val, test, "
-            "single, mixed or test-mixed … of lsmi. \\[default: all]",
-            "--subset",
-        ),
-    ],
-    "truth": Annotated[
-        str | None,
-        _option(
-            "NAME",
-            "Ground truth where there are several: mean, left, right, left-white or right-white of cube++; own, left "
-            "or right of cube-plus; recommended or shi of gehler-shi. \\[default: the first of these]",
-            "--truth",
-        ),
-    ],
-    "black": Annotated[
-        float | None, _option("LEVEL", "Black level, in the units of the files. \\[default: the layout's]", "--black")
-    ],
-    "saturation": Annotated[
-        float | None,
-        _option(
-            "LEVEL",
-            "Value from which a pixel is clipped, in the units of the files. \\[default: the layout's]",
-            "--saturation",
-        ),
-    ],
-    "partial": Annotated[
-        bool, _option(None, "Take what is there of a copy that lacks images, and say how many it lacks.", "--partial")
-    ],
-}
-
-
-def with_data_options(command: Callable[..., None]) -> Callable[..., None]:
-    """Return a command whose parameter `reading` is replaced by the options of `DataReading`, for typer."""
-    signature = inspect.signature(command)
-    if "reading" not in signature.parameters:
-        raise ValueError(f"{command.__name__} has no parameter 'reading' to put the options in the place of")
-    fields = DataReading.__dataclass_fields__
-    options = [
-        inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=fields[name].default, annotation=kind)
-        for name, kind in _OPTIONS.items()
-    ]
-    hints = get_type_hints(command, localns={"SceneSet": Any}, include_extras=True)
-    others = [
-        parameter.replace(annotation=hints.get(name, Any))
-        for name, parameter in signature.parameters.items()
-        if name != "reading"
-    ]
-    first = [parameter for parameter in others if parameter.kind is not inspect.Parameter.KEYWORD_ONLY]
-    last = [parameter for parameter in others if parameter.kind is inspect.Parameter.KEYWORD_ONLY]
-
-    @functools.wraps(command)
-    def with_options(*arguments: Any, **given: Any) -> None:
-        reading = DataReading(**{name: given.pop(name) for name in _OPTIONS if name in given})
-        command(*arguments, **given, reading=reading)
-
-    with_options.__signature__ = signature.replace(parameters=[*first, *last, *options])  # type: ignore[attr-defined]
-    with_options.__annotations__ = {
-        **{parameter.name: parameter.annotation for parameter in (*first, *last, *options)},
-        "return": None,
-    }
-    return with_options
 
 
 METHOD_HELP = (

@@ -14,11 +14,9 @@ from evaluation.commands.options import (
     argument,
     choose_learners,
     image_steps,
-    option,
     thread_option,
-    with_data_options,
 )
-from foundation.console import EXIT_CODES, JsonOutput, new_app, with_json
+from foundation.console import EXIT_CODES, JsonOutput, grouped, new_app, option, with_json
 
 if TYPE_CHECKING:
     from evaluation.experiments.paper.reporting import PaperReport
@@ -81,21 +79,19 @@ def table1(
     ],
     matrix: Annotated[
         str,
-        typer.Option(
-            metavar="CAMERA|FILE|none",
-            help="Colour matrix by which a data set in --pictures is developed: a camera such as Canon EOS-1Ds Mark "
+        option(
+            "CAMERA|FILE|none",
+            "Colour matrix by which a data set in --pictures is developed: a camera such as Canon EOS-1Ds Mark "
             "III, or a file of 3 x 3 numbers, linear sRGB to camera RGB.",
         ),
     ] = "none",
-    side: Annotated[int, typer.Option(metavar="PX", help="Longest side of every image.", min=1, max=65535)] = 512,
-    sizes: Annotated[
-        str, typer.Option(metavar="LIST", help="Further sides, px, between commas, to show what they change.")
-    ] = "",
+    side: Annotated[int, option("PX", "Longest side of every image.", min=1, max=65535)] = 512,
+    sizes: Annotated[str, option("LIST", "Further sides, px, between commas, to show what they change.")] = "",
     hot: Annotated[
         str,
-        typer.Option(
-            metavar="LIST",
-            help="Hot photosites in a million that a table is taken to have, between commas, to show what they do to "
+        option(
+            "LIST",
+            "Hot photosites in a million that a table is taken to have, between commas, to show what they do to "
             "White-Patch.",
         ),
     ] = "",
@@ -152,7 +148,7 @@ the real one, and tests on the real one. The paper's numbers stand beside those 
 
 @app.command("table2", help=_TABLE2)
 @with_json("evaluate paper table2")
-@with_data_options
+@grouped
 def table2(
     data: Annotated[str, typer.Argument(metavar="DATA", help="Real data set; the paper's is Cube+.")],
     generated: Annotated[str, option("PLACE", "Data set made by generate, to train on.")],
@@ -162,9 +158,10 @@ def table2(
             "LIST",
             "Methods that learn, between commas: names, module:Class or file.py:Class. "
             "\\[default: smart-color-cat, regression-trees, color-beaver]",
+            show_default=False,
         ),
     ] = "smart-color-cat,regression-trees,color-beaver",
-    folds: Annotated[str, typer.Option(metavar="N|FILE", help="Folds of the cross-validation, or their file.")] = "3",
+    folds: Annotated[str, option("N|FILE", "Folds of the cross-validation, or their file.")] = "3",
     shared: Annotated[
         Literal["refuse", "leave-out", "keep"],
         typer.Option(help="Generated images that show a picture of the test; the paper's do."),
@@ -226,12 +223,10 @@ nothing unless asked with --out.
 
 @app.command("bits", help=_BITS)
 @with_json("evaluate paper bits")
-@with_data_options
+@grouped
 def bits(
     data: Annotated[str, typer.Argument(metavar="DATA", help="Real data set of linear images; the paper's is NUS C1.")],
-    sigma: Annotated[
-        float, typer.Option(metavar="PX", help="Scale of Gray-Edge; 6 is usual for images of full size.", min=0.1)
-    ] = 6.0,
+    sigma: Annotated[float, option("PX", "Scale of Gray-Edge; 6 is usual for images of full size.", min=0.1)] = 6.0,
     error: Kind = "reproduction",
     out: Out = None,
     workers: Workers = None,
@@ -265,11 +260,11 @@ images, also codes that another program has changed.
 
 @app.command("flash", help=_FLASH)
 @with_json("evaluate paper flash")
-@with_data_options
+@grouped
 def flash(
     data: Annotated[str, typer.Argument(metavar="DATA", help="Real data set of linear images.")],
     out: Annotated[Path, option("FOLDER", "New folder of codes.")],
-    clear: Annotated[int, typer.Option(metavar="N", help="Bits of each code set to zero.", min=0, max=8)] = 0,
+    clear: Annotated[int, option("N", "Bits of each code set to zero.", min=0, max=8)] = 0,
     workers: Workers = None,
     *,
     reading: DataReading,

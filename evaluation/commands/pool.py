@@ -7,8 +7,8 @@ from typing import Annotated
 
 import typer
 
-from evaluation.commands.options import AngularError, argument, option
-from foundation.console import EXIT_CODES, JsonOutput, with_json
+from evaluation.commands.options import AngularError, argument
+from foundation.console import EXIT_CODES, JsonOutput, option, with_json
 
 HELP = f"""Pool the results of several transfers, such as one for each of several cameras.
 

@@ -14,11 +14,9 @@ from evaluation.commands.options import (
     PrintedStatistics,
     choose_estimates,
     choose_methods,
-    option,
     thread_option,
-    with_data_options,
 )
-from foundation.console import EXIT_CODES, JsonOutput, with_json
+from foundation.console import EXIT_CODES, JsonOutput, grouped, option, with_json
 
 if TYPE_CHECKING:
     from evaluation.metrics import ErrorKind
@@ -39,7 +37,7 @@ A run with --out that was stopped goes on when the same command is given again.
 
 
 @with_json("evaluate run")
-@with_data_options
+@grouped
 def run(
     data: Data,
     method: Annotated[list[str] | None, option("METHOD", METHOD_HELP)] = None,

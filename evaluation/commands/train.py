@@ -5,20 +5,16 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated
 
-import typer
-
 from evaluation.commands.options import (
     Data,
     DataReading,
     argument,
     choose_learners,
     image_steps,
-    option,
     require_order,
     thread_option,
-    with_data_options,
 )
-from foundation.console import EXIT_CODES, JsonOutput, with_json
+from foundation.console import EXIT_CODES, JsonOutput, grouped, option, with_json
 
 LEARNERS_HELP = "regression-trees, smart-color-cat, color-beaver, log-chroma, kernel-ridge, convnet or constant-light"
 """The suite's own, for the help of commands."""
@@ -37,13 +33,13 @@ another; the tables say what it was trained on.
 
 
 @with_json("evaluate train")
-@with_data_options
+@grouped
 def train(
     method: Annotated[str, argument("METHOD", f"One of {LEARNERS_HELP}.")],
     data: Data,
     *,
     out: Annotated[Path, option("MODEL.npz", "The new file to write the model to.")],
-    seed: Annotated[int, typer.Option(metavar="N", help="Of all that is random in the training.", min=0)] = 0,
+    seed: Annotated[int, option("N", "Of all that is random in the training.", min=0)] = 0,
     workers: Annotated[int | None, thread_option(" that read images; the model does not depend on it")] = None,
     reading: DataReading,
     told: JsonOutput,

@@ -13,11 +13,9 @@ from evaluation.commands.options import (
     choose_beside_constant,
     choose_methods,
     image_steps,
-    option,
     thread_option,
-    with_data_options,
 )
-from foundation.console import EXIT_CODES, JsonOutput, with_json
+from foundation.console import EXIT_CODES, JsonOutput, grouped, option, with_json
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -49,17 +47,18 @@ report.html and run.json.
 
 
 @with_json("evaluate transfer")
-@with_data_options
+@grouped
 def transfer(
     train: Annotated[list[str], option("GENERATED", "Data set to train on; may be repeated.")],
     test: Annotated[str, option("REAL", "Data set to test on.")],
-    methods: Annotated[str, typer.Option(metavar="LIST", help="Learned methods between commas, or all.")] = "all",
+    methods: Annotated[str, option("LIST", "Learned methods between commas, or all.")] = "all",
     statistics: Annotated[
         str,
         option(
             "LIST",
             "Statistics methods for reference between commas, all or none. "
             "\\[default: gray-world, shades-of-gray, gray-edge-1]",
+            show_default=False,
         ),
     ] = "gray-world,shades-of-gray,gray-edge-1",
     folds: Annotated[
@@ -89,9 +88,7 @@ def transfer(
         int | None,
         option("N", "Training images of every generated and naive row. \\[default: all of the smallest set]", min=1),
     ] = None,
-    seeds: Annotated[
-        int, typer.Option(metavar="K", help="Seeds of learners, training images and drawn folds.", min=1)
-    ] = 1,
+    seeds: Annotated[int, option("K", "Seeds of learners, training images and drawn folds.", min=1)] = 1,
     side: Annotated[
         int | None,
         option(

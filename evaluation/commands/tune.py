@@ -12,11 +12,9 @@ from evaluation.commands.options import (
     Data,
     DataReading,
     image_steps,
-    option,
     thread_option,
-    with_data_options,
 )
-from foundation.console import EXIT_CODES, JsonOutput, with_json
+from foundation.console import EXIT_CODES, JsonOutput, grouped, option, with_json
 
 FAMILIES_HELP = "shades-of-gray, general-gray-world, gray-edge-1 or gray-edge-2"
 """The families, for the help."""
@@ -36,7 +34,7 @@ evaluate run DATA --method SETTING evaluates one. Writes nothing unless asked wi
 
 
 @with_json("evaluate tune")
-@with_data_options
+@grouped
 def tune(
     family: Annotated[str, typer.Argument(metavar="FAMILY", help=f"{FAMILIES_HELP}, or one of these with @PIXELS.")],
     data: Data,

@@ -22,6 +22,7 @@ import numpy as np
 import numpy.typing as npt
 
 from evaluation.scene import Image
+from foundation import files
 from foundation.errors import FormatError, first_of
 from generator.files import decode_array
 
@@ -180,12 +181,8 @@ def check_light(values: Sequence[float], where: str) -> Light:
 
 
 def read_text(path: Path | str) -> str:
-    """Return the content of a text file."""
-    try:
-        return Path(path).read_text(encoding="utf-8-sig")
-    except (OSError, UnicodeDecodeError) as error:
-        reason = (isinstance(error, OSError) and error.strerror) or str(error)
-        raise FormatError(f"{path} cannot be read: {reason}; restore it from the data set's archive") from error
+    """Return the content of a text file of a data set."""
+    return files.read_text(Path(path), "restore it from the data set's archive")
 
 
 def numbers_in(text: str, where: str) -> list[float]:

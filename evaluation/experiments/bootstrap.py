@@ -191,27 +191,20 @@ _LEVEL: Final = 0.95
 _Rule = Callable[[Floats, Floats], Floats]
 
 
-def interval(
-    errors: npt.ArrayLike, statistic: Statistic, seed: int = 0, count: int = _COUNT, level: float = _LEVEL
-) -> tuple[float, float]:
-    """Return the confidence interval of a statistic of errors.
+def intervals(
+    errors: npt.ArrayLike, seed: int = 0, count: int = _COUNT, level: float = _LEVEL
+) -> dict[Statistic, tuple[float, float]]:
+    """Return the confidence interval of every statistic of errors, from the same resamples.
 
     `errors`: (N,) float, N ≥ 1, finite: degrees, or any other number an image.
 
     Examples
     --------
     >>> errors = [1.2, 0.4, 3.1, 2.2, 0.9, 1.7, 5.0, 2.8]
-    >>> low, high = interval(errors, "mean")
+    >>> low, high = intervals(errors)["mean"]
     >>> low < sum(errors) / 8 < high
     True
     """
-    return intervals(errors, seed, count, level)[_known(statistic)]
-
-
-def intervals(
-    errors: npt.ArrayLike, seed: int = 0, count: int = _COUNT, level: float = _LEVEL
-) -> dict[Statistic, tuple[float, float]]:
-    """Return the interval of every statistic of errors (N,) float, from the same resamples; see `interval`."""
     sample = ErrorSample.of(errors)
     replicates = np.concatenate([sample.statistics(drawn) for drawn in resamples(len(sample.order), seed, count)])
     left_out = sample.without_each()
@@ -238,56 +231,12 @@ class Compared:
     ratio: tuple[float, float, float]
 
 
-def paired_difference(
-    errors_a: npt.ArrayLike,
-    errors_b: npt.ArrayLike,
-    statistic: Statistic,
-    seed: int = 0,
-    count: int = _COUNT,
-    level: float = _LEVEL,
-) -> tuple[float, float, float]:
-    """Return the difference a - b of a statistic of two methods' errors on the same images, and its interval.
-
-    The same images are drawn for both, so what makes an image hard for both methods does not widen the interval.
-
-    `errors_a`, `errors_b`: (N,) float each, N ≥ 1, finite, in the same order of images.
-
-    Examples
-    --------
-    >>> worse = np.arange(1.0, 41.0)
-    >>> [round(number, 6) for number in paired_difference(worse, worse - 0.5, "median")]
-    [0.5, 0.5, 0.5]
-    """
-    return _paired(errors_a, errors_b, _known(statistic), seed, count, level).difference
-
-
-def paired_ratio(
-    errors_a: npt.ArrayLike,
-    errors_b: npt.ArrayLike,
-    statistic: Statistic,
-    seed: int = 0,
-    count: int = _COUNT,
-    level: float = _LEVEL,
-) -> tuple[float, float, float]:
-    """Return the ratio a / b of a statistic of two methods' errors on the same images, and its interval.
-
-    `errors_a`, `errors_b`: (N,) float each, N ≥ 1, finite, in the same order of images. Returns ratio, lower end, upper
-    end; all NaN where the statistic of b is 0.
-
-    Examples
-    --------
-    >>> errors = np.arange(1.0, 41.0)
-    >>> [round(number, 6) for number in paired_ratio(1.2 * errors, errors, "worst25")]
-    [1.2, 1.2, 1.2]
-    """
-    return _paired(errors_a, errors_b, _known(statistic), seed, count, level).ratio
-
-
 def paired(
     errors_a: npt.ArrayLike, errors_b: npt.ArrayLike, seed: int = 0, count: int = _COUNT, level: float = _LEVEL
 ) -> tuple[Compared, ...]:
-    """Return difference and ratio of every statistic for two methods on the same images; see `paired_difference`.
+    """Return difference and ratio of every statistic for two methods on the same images.
 
+    The same images are drawn for both, so what makes an image hard for both methods does not widen the intervals.
     `errors_a`, `errors_b`: (N,) float each, N ≥ 1, finite, in the same order of images.
     """
     one, other = ErrorSample.of(errors_a), ErrorSample.of(errors_b)
@@ -354,18 +303,6 @@ def _compare(
     return tuple(compared)
 
 
-def _paired(
-    errors_a: npt.ArrayLike, errors_b: npt.ArrayLike, statistic: Statistic, seed: int, count: int, level: float
-) -> Compared:
-    return paired(errors_a, errors_b, seed, count, level)[STATISTICS.index(statistic)]
-
-
 def _divide(one: Floats, other: Floats) -> Floats:
     with np.errstate(divide="ignore", invalid="ignore"):
         return one / other
-
-
-def _known(statistic: Statistic) -> Statistic:
-    if statistic not in STATISTICS:
-        raise InputError(f"{statistic!r} is no statistic; the statistics are {', '.join(STATISTICS)}")
-    return statistic

@@ -6,7 +6,6 @@ several lights, are always in the same fold: otherwise the method is tested on w
 
 from __future__ import annotations
 
-import csv
 import re
 from collections import Counter
 from collections.abc import Sequence
@@ -19,6 +18,7 @@ from evaluation.datasets.identity import first_copies
 from evaluation.results.result import csv_text
 from evaluation.scene import Scene, SceneSet
 from foundation.errors import FormatError, InputError, counted, first_of
+from foundation.files import read_csv
 from generator.named_numbers import is_number
 
 FOLDS = 3
@@ -97,18 +97,11 @@ def read_folds(path: Path, names: Sequence[str]) -> npt.NDArray[np.int64]:
     Folds may be any words or numbers; they are counted in their sorted order. Images that the data set lacks are
     refused as well as images that the file lacks.
     """
-    try:
-        with path.open(newline="", encoding="utf-8-sig") as stream:
-            table = csv.DictReader(stream)
-            columns = list(table.fieldnames or ())
-            rows = [(row.get("image") or "", (row.get("fold") or "").strip()) for row in table]
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        reason = (isinstance(error, OSError) and error.strerror) or str(error)
-        raise FormatError(f"cannot read folds from {path}: {reason}; expected CSV, image,fold a line") from error
+    columns, table = read_csv(path, "expected CSV, image,fold a line", "folds from")
     if not {"image", "fold"} <= set(columns):
         raise FormatError(f"{path} has the columns {','.join(columns)}; expected image,fold; correct its first line")
-    given = dict(rows)
-    twice = [image for image, count in Counter(image for image, _ in rows).items() if count > 1]
+    given = {row["image"]: row["fold"].strip() for row in table}
+    twice = [image for image, count in Counter(row["image"] for row in table).items() if count > 1]
     missing = [name for name in names if not given.get(name)]
     strange = sorted(set(given) - set(names))
     for wrong, what in ((twice, "more than once"), (missing, "without a fold"), (strange, "which the data set lacks")):
@@ -122,23 +115,17 @@ def read_folds(path: Path, names: Sequence[str]) -> npt.NDArray[np.int64]:
 
 def read_names(path: Path, names: Sequence[str]) -> frozenset[str]:
     """Return the images of a data set that a CSV file names in its column `image`."""
-    try:
-        with path.open(newline="", encoding="utf-8-sig") as stream:
-            table = csv.DictReader(stream)
-            columns = list(table.fieldnames or ())
-            given = [row.get("image") or "" for row in table]
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        reason = (isinstance(error, OSError) and error.strerror) or str(error)
-        raise FormatError(f"cannot read images from {path}: {reason}; expected CSV with a column image") from error
+    columns, table = read_csv(path, "expected CSV with a column image", "images from")
     if "image" not in columns:
         raise FormatError(f"{path} has the columns {','.join(columns)}; expected image among them")
-    strange = sorted(set(given) - set(names))
+    given = frozenset(row["image"] for row in table)
+    strange = sorted(given - set(names))
     if strange or not given:
         raise FormatError(
             f"{path} names {first_of(strange) if strange else 'no image'}; expected images of the data set, such as "
             f"{names[0]}"
         )
-    return frozenset(given)
+    return given
 
 
 def folds_to_csv(names: Sequence[str], folds: npt.NDArray[np.int64]) -> str:

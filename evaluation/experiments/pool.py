@@ -11,7 +11,6 @@ plots of the ratios.
 
 from __future__ import annotations
 
-import csv
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -48,7 +47,7 @@ from evaluation.results.result import Result
 from evaluation.results.tables import Cell, Table, table_to_csv
 from foundation import pages
 from foundation.errors import FormatError, InputError, counted, first_of
-from foundation.files import whole_folder, write_whole
+from foundation.files import read_csv, whole_folder, write_whole
 from foundation.version import software
 
 _KINDS: tuple[Kind, ...] = get_args(Kind)
@@ -144,18 +143,13 @@ def _about(folder: Path) -> dict[str, Any]:
 
 def _listed(path: Path) -> list[tuple[TransferRow, int]]:
     """Return the rows that a results file lists, without results, and the number of their seeds."""
+    lines = read_csv(path, "name a folder that evaluate transfer --out has written")[1]
     try:
-        with path.open(newline="", encoding="utf-8") as stream:
-            lines = list(csv.DictReader(stream))
         found = {
             (line["method"], line["training"], line["data"]): (int(line["images"]), int(line["seeds"]))
             for line in lines
         }
-    except OSError as error:
-        raise InputError(
-            f"cannot read {path}: {error.strerror or error}; name a folder that evaluate transfer --out has written"
-        ) from error
-    except (KeyError, ValueError, TypeError, csv.Error) as error:
+    except (KeyError, ValueError) as error:
         raise FormatError(f"{path} is no table of a transfer: {error}; run the transfer again") from error
     strange = [kind for _, kind, _ in found if kind not in _KINDS]
     if strange:

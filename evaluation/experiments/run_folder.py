@@ -12,7 +12,6 @@ kill or a crash left half, and all after it, are cut off.
 from __future__ import annotations
 
 import json
-import shutil
 import zlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
@@ -33,17 +32,21 @@ from evaluation.reports.run_page import MOST_SHOWN, chosen_images, developed, ru
 from evaluation.reports.table_output import table_to_latex
 from evaluation.results.files import ERRORS_FILE, errors_csv, run_json, several_lights_csv
 from evaluation.results.method_records import describe_method
-from evaluation.results.result import Result, Run, SceneAnswer, Subject, answer_from_json, answer_to_json, results_of
+from evaluation.results.result import Result, Run, SceneAnswer, Subject, results_of
 from evaluation.results.tables import lights_tables, statistics_rows, summary_table, table_to_csv
 from evaluation.scene import MixedScene, Scene, SceneSet
 from foundation.compiled import ordered_map
 from foundation.errors import InputError, first_of
 from foundation.files import make_folder, partial_path, publish_folder, require_free, storage_error, write_whole
-from foundation.folders import LOCK_FILE, held_folder
+from foundation.folders import clear_folder, held_folder
+from foundation.records import from_plain, to_plain
 from foundation.version import software
 
 JOURNAL_FILE = "answers.jsonl"
 """Its name in the hidden folder of a run."""
+
+
+_Answers = tuple[SceneAnswer, ...]
 
 
 def read_journal(path: Path, identity: dict[str, Any]) -> list[tuple[SceneAnswer, ...]]:
@@ -68,7 +71,7 @@ def read_journal(path: Path, identity: dict[str, Any]) -> list[tuple[SceneAnswer
             stored = json.loads(line)
             if stored["image"] != len(answers):
                 break
-            answers.append(tuple(map(answer_from_json, stored["answers"])))
+            answers.append(from_plain(_Answers, stored["answers"], path, "remove it to begin anew"))
             kept += len(line) + _OVERHEAD
         kept = min(kept, whole)
         if kept < len(content):
@@ -89,7 +92,7 @@ class AnswerJournal:
 
     def append(self, answers: Sequence[SceneAnswer]) -> None:
         """Add the answers for the next image."""
-        line = _line({"image": self._count, "answers": [answer_to_json(answer) for answer in answers]})
+        line = _line({"image": self._count, "answers": to_plain(tuple(answers), _Answers)})
         try:
             self._stream.write(line)
         except OSError as error:
@@ -256,7 +259,7 @@ def _require_same(
     again = sorted({0, len(known) // 2, len(known) - 1})
     for number, answers in zip(again, answer_scenes([scenes[number] for number in again], methods), strict=True):
         for method, now, before in zip(methods, answers, known[number], strict=True):
-            if json.dumps(answer_to_json(now)) != json.dumps(answer_to_json(before)):
+            if json.dumps(to_plain(now)) != json.dumps(to_plain(before)):
                 raise InputError(
                     f"{method.name} answers otherwise for {scenes[number].name} than when the run was stopped: the "
                     "image, or a file that the method reads, has changed, or it answers by chance; remove "
@@ -310,15 +313,9 @@ def _publish(run: Run, scenes: Sequence[Scene], folder: Path, kind: ErrorKind, w
     for name, text in _files(run, kind, pictures).items():
         write_whole(partial / name, text)
     (partial / JOURNAL_FILE).unlink(missing_ok=True)
-    _clear(partial, set(_files_of(run)))
+    # Writes that never finished left something.
+    clear_folder(partial, _files_of(run))
     publish_folder(partial, folder, WHAT)
-
-
-def _clear(folder: Path, kept: set[str]) -> None:
-    """Remove leftovers of writes that never finished."""
-    for path in folder.iterdir():
-        if path.name not in kept | {LOCK_FILE}:
-            shutil.rmtree(path) if path.is_dir() else path.unlink()
 
 
 def _files_of(run: Run) -> tuple[str, ...]:

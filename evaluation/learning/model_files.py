@@ -12,12 +12,13 @@ import json
 import zipfile
 import zlib
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import numpy.typing as npt
+from pydantic import Field, PlainValidator
 
 from evaluation.datasets.identity import identities
 from evaluation.learning.feature_learner import FeatureLearner, LearnedMethod
@@ -27,15 +28,21 @@ from evaluation.scene import Scene, SceneSet
 from foundation.clock import Clock
 from foundation.errors import FormatError, InputError
 from foundation.files import require_free_file, sha256_of, whole_file
+from foundation.records import from_plain, to_plain
 from foundation.version import software
 
 _FORMAT = "croplab model 1"
 _ABOUT = "about"
 _TRAINED = "trained_on"
+_REMEDY = "name a file that evaluate train has made"
 
 
 def _unknown() -> npt.NDArray[np.uint64]:
     return np.empty((0, 2), np.uint64)
+
+
+_Images = Annotated[npt.NDArray[np.uint64], PlainValidator(np.asarray), Field(exclude=True)]
+"""An array beside the text, which says all else."""
 
 
 @dataclass(frozen=True)
@@ -75,7 +82,7 @@ class TrainingRecord:
     seed: int
     software: str
     date: str
-    images: npt.NDArray[np.uint64] = field(default_factory=_unknown, compare=False)
+    images: _Images = field(default_factory=_unknown, compare=False)
 
     def sentence(self) -> str:
         """Return in one line what the model was trained on."""
@@ -142,17 +149,15 @@ def save_model(path: Path, method: Method, provenance: TrainingRecord) -> None:
             "keeps what it has learned by its own means, and is trained and evaluated by evaluate cv"
         )
     require_free_file(path, "the model")
-    told = asdict(provenance)
-    trained = told.pop("images")
     about = {
         "format": _FORMAT,
         "method": method.learner.key,
         "settings": settings_of(method.learner),
-        "provenance": told,
+        "provenance": to_plain(provenance),
     }
     arrays: dict[str, Any] = {
         _ABOUT: np.array(json.dumps(about, indent=1, sort_keys=True)),
-        _TRAINED: trained,
+        _TRAINED: provenance.images,
         **method.model.arrays(),
     }
     with whole_file(path) as stream:
@@ -176,11 +181,16 @@ def load_model(path: Path) -> StoredMethod:
         if about["method"] not in known:
             raise ValueError(f"it holds {about['method']!r}; known are {', '.join(known)}")
         learner = _with_settings(known[about["method"]], about["settings"])
-        provenance = _provenance(about["provenance"], arrays.pop(_TRAINED, _unknown()))
+        images = arrays.pop(_TRAINED, _unknown())
+        provenance = from_plain(TrainingRecord, about["provenance"] | {"images": images}, path, _REMEDY)
+        if images.dtype != np.uint64 or images.shape not in ((0, 2), (provenance.scenes, 2)):
+            raise ValueError(
+                f"its {_TRAINED} is {images.dtype} of the shape {images.shape}, expected uint64, (images, 2)"
+            )
         model = learner.restore(arrays)
     except (FileNotFoundError, IsADirectoryError) as error:
         what = "a folder" if path.is_dir() else "not there"
-        raise FormatError(f"{path} is {what}, expected a model file; name one that evaluate train has made") from error
+        raise FormatError(f"{path} is {what}, expected a model file; {_REMEDY}") from error
     except KeyError as error:
         raise _refused(path, f"it lacks {error}") from error
     except (
@@ -197,7 +207,7 @@ def _reason(error: Exception) -> str:
 
 
 def _refused(path: Path, why: str) -> FormatError:
-    return FormatError(f"{path} is no whole model file: {why}; name a file that evaluate train has made")
+    return FormatError(f"{path} is no whole model file: {why}; {_REMEDY}")
 
 
 def _read_arrays(path: Path) -> dict[str, npt.NDArray[Any]]:
@@ -224,12 +234,3 @@ def _with_settings(learner: FeatureLearner, settings: Mapping[str, Any]) -> Feat
         if type(value) is not type(expected[name]):
             raise ValueError(f"the setting {name} is {value!r}, expected one such as {expected[name]!r}")
     return type(learner)(**settings)
-
-
-def _provenance(given: Mapping[str, Any], images: npt.NDArray[Any]) -> TrainingRecord:
-    expected = {each.name for each in dataclasses.fields(TrainingRecord)} - {"images"}
-    if set(given) != expected:
-        raise ValueError(f"its provenance has {', '.join(sorted(given))}; expected {', '.join(sorted(expected))}")
-    if images.dtype != np.uint64 or images.shape not in ((0, 2), (given["scenes"], 2)):
-        raise ValueError(f"its {_TRAINED} is {images.dtype} of the shape {images.shape}, expected uint64, (images, 2)")
-    return TrainingRecord(**given, images=images)

@@ -538,29 +538,6 @@ def gaussian_kernel(sigma: float, order: int) -> npt.NDArray[np.float64]:
     return bend / (0.5 * x**2 * bend).sum()
 
 
-def differentiate(image: Image, order: int, sigma: float) -> npt.NDArray[np.float32]:
-    """Return the size of an image's Gaussian derivative, (H, W, 3) float32, channel by channel.
-
-    Order 0 is the smoothed image, order 1 the gradient's length, order 2 √(f_xx² + 4 f_xy² + f_yy²).
-
-    `image`: (H, W, 3) uint16, float32 or float64, not below 0. `sigma`: scale of the Gaussian, px; 0 for none, which
-    only order 0 allows.
-
-    Examples
-    --------
-    >>> ramp = np.full((1, 40, 3), 2, np.float32).cumsum(axis=1)
-    >>> differentiate(ramp, order=1, sigma=1.0)[0, 20].round(3)
-    array([2., 2., 2.], dtype=float32)
-    """
-    if not sigma:
-        return np.asarray(image, dtype=np.float32)
-    height, width = image.shape[:2]
-    found = np.empty((height, width, 3), dtype=np.float32)
-    for top, left, rows in differentiated_tiles(image, order, sigma, 1.0):
-        put_tile(found, top, left, rows)
-    return found
-
-
 def put_tile(found: npt.NDArray[np.float32], top: int, left: int, tile: npt.NDArray[np.float32]) -> None:
     """Write a tile of `differentiated_tiles`, (rows, Q) float32, to its place in an image (H, W, 3) float32."""
     wide = min(tile.shape[1] // 3, found.shape[1] - left)

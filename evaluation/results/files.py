@@ -29,7 +29,7 @@ from evaluation.metrics import ErrorKind
 from evaluation.results.result import Result, csv_text
 from evaluation.scene import Scene
 from foundation.errors import FormatError, InputError, counted, first_of
-from foundation.files import sha256_of
+from foundation.files import file_sha256, read_text
 from generator.named_numbers import is_number
 
 ERRORS_FILE = "errors.csv"
@@ -66,15 +66,7 @@ def read_errors(place: Path | str) -> dict[str, MethodErrors]:
     path = Path(place)
     if path.is_dir():
         path = path / ERRORS_FILE
-    try:
-        text = path.read_text(encoding="utf-8-sig")
-    except OSError as error:
-        raise InputError(
-            f"cannot read {path}: {error.strerror or error}; name a results folder of evaluate run, or the "
-            f"{ERRORS_FILE} in it"
-        ) from error
-    except UnicodeDecodeError as error:
-        raise FormatError(f"{path} is no CSV text in UTF-8: {error}") from error
+    text = read_text(path, f"name a results folder of evaluate run, or the {ERRORS_FILE} in it")
     rows = csv.DictReader(text.splitlines())
     columns = rows.fieldnames or []
     missing = [name for name in ("image", "method", *_KINDS) if name not in columns]
@@ -223,13 +215,7 @@ class GivenEstimates:
 
 def read_estimates(path: Path, images: Sequence[str], name: str | None = None) -> GivenEstimates:
     """Return the estimates of a file for the images of a data set."""
-    try:
-        content = path.read_bytes()
-        text = content.decode("utf-8-sig")
-    except OSError as error:
-        raise InputError(f"cannot read {path}: {error.strerror or error}; name a CSV file of estimates") from error
-    except UnicodeDecodeError as error:
-        raise FormatError(f"{path} is no CSV text in UTF-8: {error}; expected {','.join(_COLUMNS)}") from error
+    text = read_text(path, f"name a CSV file of estimates, {','.join(_COLUMNS)}")
     by_stem = _by_stem(images)
     known = set(images)
     found: dict[str, npt.NDArray[np.float64]] = {}
@@ -255,7 +241,7 @@ def read_estimates(path: Path, images: Sequence[str], name: str | None = None) -
     ]
     if faults:
         raise InputError(f"{path}: {'; '.join(faults)}; expected one line for each of {counted(len(images), 'image')}")
-    return GivenEstimates(path.stem if name is None else name, path.name, sha256_of(content), found)
+    return GivenEstimates(path.stem if name is None else name, path.name, file_sha256(path), found)
 
 
 def _by_stem(images: Sequence[str]) -> dict[str, str]:

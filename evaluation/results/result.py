@@ -9,14 +9,14 @@ import csv
 import io
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from evaluation.methods.prepared import GREY
-from evaluation.metrics import ErrorKind, MapError, RegionError, Summary, recovery_error, reproduction_error, summarise
+from evaluation.metrics import ErrorKind, MapError, Summary, recovery_error, reproduction_error, summarise
 from evaluation.scene import Scene
 
 
@@ -140,7 +140,7 @@ class SceneAnswer:
     - `by_pixel`: the errors by pixel and region, where several lights fall on the image.
     """
 
-    light: tuple[float, float, float] | None
+    light: tuple[float, float, float] | None = None
     cause: str = ""
     by_pixel: MapError | None = None
 
@@ -220,30 +220,6 @@ def _maps(answers: Sequence[SceneAnswer]) -> MapErrors | None:
             "reproduction": np.array([region.reproduction for _, region in regions], dtype=np.float64),
         },
     )
-
-
-def answer_to_json(answer: SceneAnswer) -> dict[str, Any]:
-    """Return an answer as a JSON object, from which `answer_from_json` makes the same answer to the last bit."""
-    return {key: value for key, value in asdict(answer).items() if value not in (None, "")}
-
-
-def answer_from_json(stored: dict[str, Any]) -> SceneAnswer:
-    """Return the answer that a JSON object is.
-
-    Examples
-    --------
-    >>> answer = SceneAnswer((0.1, 0.2, 1 / 3), "", MapError(1.0, 2.0, 3.0, (RegionError(0, 0.5, 1.0, 2.0),)))
-    >>> answer_from_json(answer_to_json(answer)) == answer
-    True
-    """
-    light, by_pixel = stored.get("light"), stored.get("by_pixel")
-    if light is not None:
-        red, green, blue = map(float, light)
-        light = (red, green, blue)
-    if by_pixel is not None:
-        regions = tuple(RegionError(**region) for region in by_pixel["regions"])
-        by_pixel = MapError(**(by_pixel | {"regions": regions}))
-    return SceneAnswer(light, str(stored.get("cause", "")), by_pixel)
 
 
 @dataclass(frozen=True)

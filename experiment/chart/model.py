@@ -16,10 +16,11 @@ from typing import Annotated, Literal
 
 import numpy as np
 import numpy.typing as npt
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field
 
 from foundation.errors import FormatError
 from foundation.files import reading_error, write_whole
+from foundation.records import from_json
 
 FORMAT = "crop.chart"
 VERSION = 1
@@ -196,15 +197,9 @@ class _Document(_Strict):
 def load_chart(path: Path) -> Chart:
     """Read `chart.json`."""
     try:
-        document = _Document.model_validate_json(path.read_bytes())
+        document = from_json(_Document, path.read_bytes(), path, "restore it from a copy")
     except OSError as error:
         raise reading_error(path, error, "name the chart.json of the print", "chart") from error
-    except ValidationError as error:
-        first = error.errors()[0]
-        where = ".".join(str(part) for part in first["loc"]) or "the file"
-        raise FormatError(
-            f"{path} is no chart that this version reads: {where}: {first['msg']}; restore it from a copy"
-        ) from error
     count = 8**document.bits
     colours = np.asarray(document.cells.colour, dtype=np.int64)
     if len(document.cells.centre_mm) != len(colours) or not np.array_equal(

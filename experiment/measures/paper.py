@@ -15,8 +15,7 @@
 
 from __future__ import annotations
 
-from dataclasses import astuple, dataclass
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
@@ -32,6 +31,7 @@ from experiment.measures.least_squares import (
     robust_least_squares,
 )
 from foundation.errors import QualityError
+from foundation.records import FloatArray
 from foundation.robust import sigma_of
 
 LEAST_FIELD = 0.05
@@ -96,7 +96,7 @@ class FlatField:
     """
 
     page_mm: tuple[float, float]
-    coefficients: tuple[tuple[_Array, ...], tuple[_Array, ...], tuple[_Array, ...]]
+    coefficients: tuple[tuple[FloatArray, ...], tuple[FloatArray, ...], tuple[FloatArray, ...]]
 
     @classmethod
     def uniform(cls, page_mm: tuple[float, float]) -> FlatField:
@@ -111,10 +111,6 @@ class FlatField:
             for factor in factors:
                 shape[:, channel] *= product(page_polynomial(points, self.page_mm, order_of(len(factor))), factor)
         return np.maximum(shape, LEAST_FIELD)
-
-    def orders(self) -> tuple[int, ...]:
-        """Return the total order of each channel's last factor, which was fitted on the frame itself."""
-        return tuple(order_of(len(factors[-1])) if factors else 0 for factors in self.coefficients)
 
     def parameters(self) -> list[list[list[float]]]:
         """Return the coefficients for `lut.json`: [channel][factor][term], seven significant digits."""
@@ -142,16 +138,6 @@ class FieldResidual:
     rim: float = 0.0
     radial: float = 0.0
 
-    def to_json(self) -> list[Any]:
-        """Return the values as JSON can hold them; `from_json` restores them to the last bit."""
-        return list(astuple(self))
-
-    @staticmethod
-    def from_json(stored: list[Any]) -> FieldResidual:
-        """Return the values of what `to_json` returned."""
-        (x_mm, y_mm), (red, green, blue), share, rim, radial = stored
-        return FieldResidual((x_mm, y_mm), (red, green, blue), share, rim, radial)
-
 
 @dataclass(frozen=True, eq=False)
 class Paper:
@@ -166,10 +152,10 @@ class Paper:
     """
 
     field: FlatField
-    white: _Array
-    error: _Array
+    white: FloatArray
+    error: FloatArray
     references: int
-    spread: _Array
+    spread: FloatArray
     left: FieldResidual = FieldResidual()
 
 

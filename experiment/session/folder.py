@@ -40,6 +40,7 @@ from experiment.session.repair import (
 from foundation.errors import DeviceError, FormatError, InputError
 from foundation.files import (
     is_partial,
+    read_text,
     reading_error,
     require_free,
     storage_error,
@@ -156,15 +157,7 @@ class Session:
 
     def settings_text(self) -> str:
         """Return the text of `session.toml`."""
-        path = self.folder / "session.toml"
-        try:
-            return path.read_text(encoding="utf-8")
-        except OSError as error:
-            raise reading_error(path, error, "restore it from a copy", "the session's settings") from error
-        except UnicodeDecodeError as error:
-            raise FormatError(
-                f"cannot read {path}, the settings of the session: {error}; restore it from a copy"
-            ) from error
+        return read_text(self.folder / "session.toml", "restore it from a copy", "the session's settings")
 
     def receive(self, stem: str, fill: Callable[[BinaryIO], CapturedFrame]) -> ReceivedFile:
         """Let a raw file be written into `frames/`; it is complete and on the disk when this returns."""

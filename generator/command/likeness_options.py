@@ -8,8 +8,9 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final
 
+from foundation.console import option
 from foundation.errors import InputError
-from generator.command.options import LightOptions, PictureOptions, VariationOptions, option
+from generator.command.options import LightOptions, PictureOptions, VariationOptions
 
 if TYPE_CHECKING:
     import numpy as np
@@ -23,7 +24,7 @@ if TYPE_CHECKING:
     from generator.statistics import RealStatistics
     from generator.variation.variation import ExposureChoice
 
-_LIKENESS = "Likeness"
+_likeness_option = partial(option, panel="Likeness")
 
 PARTS: Final = ("lights", "pictures", "exposure", "size")
 """What of a real data set can be followed."""
@@ -35,34 +36,31 @@ class LikenessOptions:
 
     like: Annotated[
         Path | None,
-        option(
+        _likeness_option(
             "STATS.json",
             "Make the dataset like the real one that evaluate describe --out wrote this of: lights drawn from a "
             "density of its lights, pictures drawn by weights that bring luminance, chroma and grey-world offsets to "
             "its own, exposures drawn from its exposures, and images cut to its most frequent size. Prints how far "
             "that went.",
-            _LIKENESS,
         ),
     ] = None
     like_in: Annotated[
         str | None,
-        option(
+        _likeness_option(
             "LIST",
             "In which of lights,pictures,exposure,size. \\[default: in all that no other option says]",
-            _LIKENESS,
         ),
     ] = None
     draw: Annotated[
         int | None,
-        option("N", "Draw N pictures, some several times. \\[default: as many as are found]", _LIKENESS, min=1),
+        _likeness_option("N", "Draw N pictures, some several times. \\[default: as many as are found]", min=1),
     ] = None
     lights_of: Annotated[
         str | None,
-        option(
+        _likeness_option(
             "DATASET",
             "Make the scenes of this dataset under the same lights for another camera, whose table LUT has the same "
             "lights; --sources names the same pictures, which are prepared in the same way.",
-            _LIKENESS,
         ),
     ] = None
 

@@ -5,19 +5,17 @@ Libraries that take long to load are imported when a group makes something of it
 
 from __future__ import annotations
 
-import dataclasses
-import functools
-import inspect
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, get_type_hints
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
 from foundation.compiled import processor_count
-from foundation.console import AsJson, Quiet, Verbose, Version
+from foundation.console import AsJson, Quiet, Verbose, Version, option
 from foundation.errors import InputError
 
 if TYPE_CHECKING:
@@ -30,44 +28,11 @@ if TYPE_CHECKING:
     from generator.variation.variation import ExposureChoice, Variation
 
 
-def grouped(function: Callable[..., None]) -> Callable[..., None]:
-    """Return a command for typer with one parameter for each field of the groups that `function` takes.
-
-    `function`: each of its parameters is annotated with a frozen dataclass, whose fields are ``Annotated`` with typer's
-    ``Option`` or ``Argument`` and have defaults. No two groups share a field's name.
-    """
-    groups = {name: hint for name, hint in get_type_hints(function).items() if name != "return"}
-    parameters: dict[str, inspect.Parameter] = {}
-    members: dict[str, list[str]] = {}
-    for name, group in groups.items():
-        hints = get_type_hints(group, include_extras=True)
-        members[name] = [field.name for field in dataclasses.fields(group)]
-        for field in dataclasses.fields(group):
-            if field.name in parameters:
-                raise TypeError(f"two groups of options have a field {field.name}; rename one of them")
-            parameters[field.name] = inspect.Parameter(
-                field.name, inspect.Parameter.KEYWORD_ONLY, default=field.default, annotation=hints[field.name]
-            )
-
-    @functools.wraps(function)
-    def command(**options: Any) -> None:
-        function(**{name: groups[name](**{field: options[field] for field in members[name]}) for name in groups})
-
-    command.__signature__ = inspect.Signature(list(parameters.values()))  # type: ignore[attr-defined]
-    command.__annotations__ = {name: parameter.annotation for name, parameter in parameters.items()}
-    return command
-
-
-def option(metavar: str | None, text: str, panel: str, *names: str, **more: Any) -> Any:
-    """Return typer's option with its help; `names` are its own where those of its field, or a --no-, would not do."""
-    return typer.Option(*names, metavar=metavar, help=text, rich_help_panel=panel, **more)
-
-
-_SOURCES = "Source pictures"
-_LIGHT = "Light"
-_IMAGES = "Images"
-_VARIATION = "Variation"
-_WORK = "Work"
+_source_option = partial(option, panel="Source pictures")
+_light_option = partial(option, panel="Light")
+_image_option = partial(option, panel="Images")
+_variation_option = partial(option, panel="Variation")
+_work_option = partial(option, panel="Work")
 
 
 @dataclass(frozen=True)
@@ -91,44 +56,41 @@ class PictureOptions:
 
     sources: Annotated[
         list[str] | None,
-        option(
+        _source_option(
             "PLACE",
             "A picture, or a folder that is searched with those below it, or a URL of either on a store that fsspec "
             "knows; may be repeated.",
-            _SOURCES,
         ),
     ] = None
-    random_scenes: Annotated[int, option("N", "Add N pictures of uniformly random colours.", _SOURCES, min=0)] = 0
-    size: Annotated[str, option("WxH", "Size of the random pictures, px.", _SOURCES)] = "512x512"
-    max_side: Annotated[int | None, option("PX", "Make larger pictures this small first.", _SOURCES, min=1)] = None
-    crop: Annotated[str | None, option("WxH", "Cut pictures to this size; smaller ones are left out.", _SOURCES)] = None
+    random_scenes: Annotated[int, _source_option("N", "Add N pictures of uniformly random colours.", min=0)] = 0
+    size: Annotated[str, _source_option("WxH", "Size of the random pictures, px.")] = "512x512"
+    max_side: Annotated[int | None, _source_option("PX", "Make larger pictures this small first.", min=1)] = None
+    crop: Annotated[str | None, _source_option("WxH", "Cut pictures to this size; smaller ones are left out.")] = None
     cover: Annotated[
         bool,
-        option(None, "Make pictures as small as still covers the crop before they are cut.", _SOURCES, "--cover"),
+        _source_option(None, "Make pictures as small as still covers the crop before they are cut.", "--cover"),
     ] = False
     crop_at: Annotated[
         Literal["centre", "random"] | None,
-        option(
+        _source_option(
             None,
             "Where to cut; random is chosen by the seed. Of several crops the first. \\[default: centre; random with "
             "--crops]",
-            _SOURCES,
         ),
     ] = None
     crops: Annotated[
         int,
-        option(
+        _source_option(
             "N",
             "Cut N different crops of each picture, the first where --crop-at says, the others at random places far "
             "from it and from each other.",
-            _SOURCES,
             min=1,
         ),
     ] = 1
     profiles: Annotated[
         Literal["honour", "ignore"],
-        option(
-            None, "Convert pictures with another colour profile to sRGB, or take their codes as they stand.", _SOURCES
+        _source_option(
+            None, "Convert pictures with another colour profile to sRGB, or take their codes as they stand."
         ),
     ] = "honour"
 
@@ -163,71 +125,65 @@ class PictureOptions:
 class LightOptions:
     """Which lights fall on which picture, and where."""
 
-    illuminations: Annotated[
-        str | None, option("LIST", "These lights for every picture: 0,5,12-20 or all.", _LIGHT)
-    ] = None
+    illuminations: Annotated[str | None, _light_option("LIST", "These lights for every picture: 0,5,12-20 or all.")] = (
+        None
+    )
     light: Annotated[
         list[str] | None,
-        option(
+        _light_option(
             "LIGHT",
             "A light for every picture, mixed of the table's: 12, 12:0.25+40:0.75, 5600K, a name such as D65 where "
             "the table's lights have names, or a chromaticity r=.3,b=.25; may be repeated.",
-            _LIGHT,
         ),
     ] = None
     random: Annotated[
         int | None,
-        option(
+        _light_option(
             "K",
             "K images of each picture, under distinct random lights of the table, or under lights drawn from "
             "--distribution. \\[default: 1]",
-            _LIGHT,
         ),
     ] = None
     distribution: Annotated[
         str | None,
-        option(
+        _light_option(
             "NAME",
             "Draw chromaticities from uniform, gaussian:r=.3,b=.25,sd=.02 (or sd_r, sd_b and corr for sd), or a "
             "file of ground truths as of --nearest: the kernel density of its lights.",
-            _LIGHT,
         ),
     ] = None
     nearest: Annotated[
         Path | None,
-        option(
+        _light_option(
             "GT.csv",
             "For scene i, in the order of the pictures, the light nearest in angle to ground truth i of this file, "
             "which starts over when it ends (columns GT_R,GT_G,GT_B or r,g,b, or lines of three numbers).",
-            _LIGHT,
         ),
     ] = None
     match: Annotated[
-        Path | None, option("GT.csv", "The same with a mixture of lights that matches the ground truth.", _LIGHT)
+        Path | None, _light_option("GT.csv", "The same with a mixture of lights that matches the ground truth.")
     ] = None
     lights_by_name: Annotated[
         Path | None,
-        option(
+        _light_option(
             "FILE.csv",
             "For each picture the light that this file gives for its name (columns source or name, and r,g,b), matched "
             "by a mixture; several rows of a name are several images.",
-            _LIGHT,
         ),
     ] = None
     outside: Annotated[
-        Literal["refuse", "nearest"], option(None, "What to do about lights that the table cannot make.", _LIGHT)
+        Literal["refuse", "nearest"], _light_option(None, "What to do about lights that the table cannot make.")
     ] = "refuse"
     lights_per_image: Annotated[
-        int | None, option("K", "Let K lights fall on each image. \\[default: 1; 2 with --masks]", _LIGHT)
+        int | None, _light_option("K", "Let K lights fall on each image. \\[default: 1; 2 with --masks]")
     ] = None
     masks: Annotated[
         str | None,
-        option(
+        _light_option(
             "KIND",
             "Where each of several lights falls: half-plane or soft-edge (angle, width), spots (count, radius, "
             "softness), smooth (scale, contrast), window (columns, rows, softness), with numbers where wanted, as in "
             "spots:count=3,radius=.1; or a folder of masks. \\[default: smooth]",
-            _LIGHT,
         ),
     ] = None
 
@@ -243,74 +199,68 @@ class LightOptions:
 class ImageOptions:
     """What is written, and the seed of everything random."""
 
-    seed: Annotated[int, option(None, "Seed of everything random.", _IMAGES)] = 0
+    seed: Annotated[int, _image_option(None, "Seed of everything random.")] = 0
     format: Annotated[
         Literal["png", "tiff", "exr", "jxl", "dng"],
-        option(
-            None, "PNG; uncompressed TIFF, fast and large; OpenEXR; JPEG XL, small; or raw files, Bayer DNG.", _IMAGES
+        _image_option(
+            None, "PNG; uncompressed TIFF, fast and large; OpenEXR; JPEG XL, small; or raw files, Bayer DNG."
         ),
     ] = "png"
     layout: Annotated[
         Literal["folder", "webdataset", "parquet"],
-        option(
+        _image_option(
             None,
             "Each image in a file of its own, or those of a shard in a tar file (WebDataset) or in a Parquet file "
             "(Hugging Face datasets).",
-            _IMAGES,
         ),
     ] = "folder"
     split: Annotated[
         str | None,
-        option(
+        _image_option(
             "SHARES",
             "Divide by source into train, validation and test, such as 0.8,0.1,0.1; by a hash of each picture, so that "
             "parts have these sizes on average.",
-            _IMAGES,
         ),
     ] = None
     exact_split: Annotated[
         bool,
-        option(
+        _image_option(
             None,
             "With --split, parts of exactly these sizes, such as 700,200,100 of 1000 pictures; copies of a "
             "picture stay in one part.",
-            _IMAGES,
             "--exact-split",
         ),
     ] = False
     bits: Annotated[
         int | None,
-        option(
+        _image_option(
             "N",
             "Keep N bits of each code of the pictures and set the others to zero before they are printed. "
             "\\[default: those of the table]",
-            _IMAGES,
             min=1,
             max=8,
         ),
     ] = None
     scale: Annotated[
         Literal["table", "full"],
-        option(
+        _image_option(
             None,
             "Store the camera's counts, which most programs show nearly black; or stretch them over 16 bits, which our "
             "readers undo (PNG, TIFF and JPEG XL).",
-            _IMAGES,
         ),
     ] = "table"
-    preview: Annotated[bool, option(None, "Write tone-mapped previews.", _IMAGES)] = True
+    preview: Annotated[bool, _image_option(None, "Write tone-mapped previews.")] = True
     uncertainty: Annotated[
         bool,
-        option(
+        _image_option(
             None,
             "Add to ground_truth.csv what each light's direction may be off by, in degrees (k = 2), as the table "
             "states it.",
-            _IMAGES,
         ),
     ] = False
     contact_sheet: Annotated[
         Path | None,
-        option("PATH", "Write a page of previews to this PNG file; with --verify of a dataset that is there.", _IMAGES),
+        _image_option("PATH", "Write a page of previews to this PNG file; with --verify of a dataset that is there."),
     ] = None
 
     def dataset_options(
@@ -342,31 +292,28 @@ class RenderingOptions:
 
     rendering: Annotated[
         Literal["codes", "colorimetric"] | None,
-        option(
+        _image_option(
             None,
             "Take a picture's codes as those of the print, as the paper did; or let each pixel be a cell that looks "
             "to the camera as the picture's colour should. \\[default: codes]",
-            _IMAGES,
         ),
     ] = None
     matrix: Annotated[
         str | None,
-        option(
+        _image_option(
             "NAME",
             "For colorimetric rendering: linear sRGB to the camera's RGB, of a camera by its name, of a file of 3 x 3 "
             "numbers, table for the one fitted from the table, or none. \\[default: that of the table's camera, else "
             "table]",
-            _IMAGES,
         ),
     ] = None
     black_point: Annotated[
         str,
-        option(
+        _image_option(
             "WHAT",
             "The print's own black: keep it, compensate for it (take it out), take out a random share of it of each "
             "image, random or random:MAX, or, with --like, of each picture the share that makes shadows like the real "
             "ones, like. The ground truth stays.",
-            _IMAGES,
         ),
     ] = "keep"
 
@@ -388,32 +335,29 @@ class VariationOptions:
 
     exposure: Annotated[
         str | None,
-        option(
+        _variation_option(
             "KIND",
             "Expose images anew: a factor such as .5; stops:low=-2,high=1 or normal:mean=-1,sd=.5, drawn for each; "
             "clip:share=.01 clips that share of the pixels, level:share=.01,low=.3,high=.9 lets it reach a level over "
             "saturation (most=8 limits the factor). Noise is that of the light, counts are cut at saturation.",
-            _VARIATION,
         ),
     ] = None
     gradient: Annotated[
         str | None,
-        option(
+        _variation_option(
             "KIND",
             "Let the light fall off over the image by up to some stops: smooth, soft-edge, spots or window with the "
             "numbers of --masks and stops=1,least=0,colour=0; with a colour, ln(R/G) and ln(B/G) of the far end differ "
             "by up to that, and images have masks and maps of the ground truth.",
-            _VARIATION,
         ),
     ] = None
     iso: Annotated[
         str | None,
-        option(
+        _variation_option(
             "N/BASE",
             "Add the noise of ISO speed N to that of the table, which was photographed with speed BASE: 1600/100, or "
             "1600/100:read=2.5, electrons of read noise before the amplifier. Tables that say their ISO speed need no "
             "BASE.",
-            _VARIATION,
         ),
     ] = None
 
@@ -435,37 +379,32 @@ class WorkOptions:
     """Who does the work and which part of it."""
 
     workers: Annotated[
-        int | None, option("N", "Threads, or processes of the engine dask. \\[default: one a processor]", _WORK)
+        int | None, _work_option("N", "Threads, or processes of the engine dask. \\[default: one a processor]")
     ] = None
     engine: Annotated[
         str,
-        option(
+        _work_option(
             "NAME",
             "local, dask (a cluster on this machine), or dask://HOST:PORT of a scheduler; docs/clusters.md.",
-            _WORK,
         ),
     ] = "local"
-    shard_images: Annotated[int, option("N", "Images of a shard: what a kill may cost.", _WORK, min=1)] = 256
+    shard_images: Annotated[int, _work_option("N", "Images of a shard: what a kill may cost.", min=1)] = 256
     shard: Annotated[
         str | None,
-        option(
-            "I/N", "Make share I of N only, I from 0, beside other programs that make theirs; then --finish.", _WORK
-        ),
+        _work_option("I/N", "Make share I of N only, I from 0, beside other programs that make theirs; then --finish."),
     ] = None
     finish: Annotated[
         str | None,
-        option(
+        _work_option(
             "OUT",
             "Make the dataset OUT of its shards when all shares are done; no other argument is needed.",
-            _WORK,
         ),
     ] = None
     verify: Annotated[
         str | None,
-        option(
+        _work_option(
             "OUT",
             "Hash every file of the dataset OUT again and name those that have changed; no other argument is needed.",
-            _WORK,
         ),
     ] = None
 

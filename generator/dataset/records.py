@@ -9,9 +9,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any, Final, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, SerializerFunctionWrapHandler, model_serializer
+from pydantic import Field
 
 from calibration.citation import OriginRecord
+from foundation.records import Record, SparseRecord
 from generator.files import Format
 
 FORMAT: Final = "crop.dataset"
@@ -48,22 +49,7 @@ Split = Literal["train", "validation", "test"]
 SPLITS: Final[tuple[Split, ...]] = ("train", "validation", "test")
 
 
-class _Record(BaseModel):
-    """A frozen value that is stored as JSON; what a later version adds is ignored."""
-
-    model_config = ConfigDict(frozen=True, extra="ignore")
-
-
-class _RecordWithOptional(_Record):
-    """A record of which keys that are None are left out, so that records without them stay as they were."""
-
-    @model_serializer(mode="wrap")
-    def _without_none(self, serialise: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        left_out = {name for name, field in type(self).model_fields.items() if field.default is None}
-        return {key: value for key, value in serialise(self).items() if value is not None or key not in left_out}
-
-
-class ReadingOptions(_Record):
+class ReadingOptions(Record):
     """What of the options of a dataset its readers need; they refuse values that no dataset is made with."""
 
     format: Format
@@ -73,7 +59,7 @@ class ReadingOptions(_Record):
     scale: Scale = "table"
 
 
-class TableRecord(_RecordWithOptional):
+class TableRecord(SparseRecord):
     """The table a dataset was made from; `sha256` as `calibration.table.lut.Lut.sha256`.
 
     `computed` is what the table says of itself where nothing was photographed for it
@@ -92,7 +78,7 @@ class TableRecord(_RecordWithOptional):
     origin: OriginRecord | None = None
 
 
-class Light(_RecordWithOptional):
+class Light(SparseRecord):
     """A light of the table that was used; `codes` as projected, `white` the ground truth in linear camera RGB.
 
     Lights of a table that was computed under spectra of its own have a `name`, and codes that would show their colour.
@@ -115,7 +101,7 @@ class Light(_RecordWithOptional):
         return f"{self.cct_k:.0f} K" if self.cct_k is not None else "{} {} {}".format(*self.codes)
 
 
-class SourceRecord(_Record):
+class SourceRecord(Record):
     """A source picture that was used.
 
     - `position`: place in the list of sources, from 0; the choice of its lights depends on it.
@@ -139,38 +125,38 @@ class SourceRecord(_Record):
     weight: float | None = None
 
 
-class Skipped(_Record):
+class Skipped(Record):
     """A source picture that could not be read; its numbers are left free."""
 
     position: int
     name: str
 
 
-class LightRow(_Record):
+class LightRow(Record):
     """A light in an image: its number in the table, or what a mixture is called, and its ground truth of sum 1."""
 
     illumination: str
     truth: Triple
 
 
-class ImageRecord(_Record):
+class ImageRecord(Record):
     """An image that was made; `truth` is the mean of its lights over its pixels, of sum 1; `details` as `Details`."""
 
     number: int
     position: int
     truth: Triple
     lights: list[LightRow]
-    details: Details = {}
+    details: Details = Field(default_factory=dict[str, int | float | str])
 
 
-class FileSum(_Record):
+class FileSum(Record):
     """A file of the dataset and its SHA-256."""
 
     name: str
     sha256: str
 
 
-class RenderingSummary(_Record):
+class RenderingSummary(Record):
     """How the images of a dataset were rendered, where that is not by codes with the print's black kept.
 
     - `outside`, `distance`: means over all pixels of the columns of `images.csv`: the share of colours that the print
@@ -183,7 +169,7 @@ class RenderingSummary(_Record):
     black_taken: float = 0.0
 
 
-class ShardRecord(_Record):
+class ShardRecord(Record):
     """What a shard made; images and files in the order of their numbers, sources in that of their positions.
 
     `lights` are those of the table that were used, alone or mixed.
@@ -197,7 +183,7 @@ class ShardRecord(_Record):
     lights: list[Light]
 
 
-class Description(_Record):
+class Description(SparseRecord):
     """The content of `dataset.json`.
 
     - `seed`, `options`: what the dataset is; with the table and the sources, enough to make every byte again.
@@ -222,15 +208,10 @@ class Description(_Record):
     sources: int = Field(ge=0, le=1 << 32)
     pixels: int = Field(ge=0)
     replaced_pixels: int = Field(ge=0)
-    splits: dict[str, int] = {}
+    splits: dict[str, int] = Field(default_factory=dict[str, int])
     lights: list[Light]
     skipped: list[Skipped]
     rendering: RenderingSummary | None = None
-
-    @model_serializer(mode="wrap")
-    def _without_none(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        """Leave `rendering` out where there is none: datasets are then described as before it was known."""
-        return {key: value for key, value in handler(self).items() if key != "rendering" or value is not None}
 
 
 @dataclass(frozen=True, slots=True)

@@ -25,11 +25,10 @@ from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Any, Final, cast
 
-from pydantic import ValidationError
-
 from foundation.errors import FormatError, InputError
 from foundation.files import partial_path, publish_folder, require_free, storage_error
-from foundation.folders import LOCK_FILE, held_folder
+from foundation.folders import clear_folder, held_folder
+from foundation.records import from_json
 from generator.dataset.records import ShardRecord, shard_key
 from generator.stores import DESCRIPTION, LocalStore, RemoteStore, Store, is_remote, local_path, open_store
 
@@ -67,12 +66,8 @@ class Workplace:
     def load(self, shard: int) -> ShardRecord:
         """Return the record of a shard that is done."""
         name = self._record_name(shard)
-        try:
-            return ShardRecord.model_validate_json(self.notes.get(name))
-        except ValidationError as error:
-            raise FormatError(
-                f"{self.notes.place}/{name} is damaged; remove it and run the same command again, which makes it anew"
-            ) from error
+        remedy = "remove it and run the same command again, which makes it anew"
+        return from_json(ShardRecord, self.notes.get(name), f"{self.notes.place}/{name}", remedy)
 
     def commit(self, record: ShardRecord) -> None:
         """Bring the record of a shard to the disk whose files are there: from here on it is done."""
@@ -217,13 +212,7 @@ def _require_still_free(path: Path, folder: Path) -> None:
 def _begin(folder: Path, plan_id: str) -> None:
     """Make the folders inside; files that are there without a plan are left from before the plan was written."""
     try:
-        for path in folder.iterdir():
-            if path.name == LOCK_FILE:
-                continue
-            if path.is_dir() and not path.is_symlink():
-                shutil.rmtree(path)
-            else:
-                path.unlink()
+        clear_folder(folder)
         for inner in ("plan", f"dataset-{plan_id}"):
             (folder / inner).mkdir()
     except OSError as error:

@@ -22,6 +22,7 @@ import numpy as np
 import numpy.typing as npt
 
 from foundation.errors import FormatError, InputError
+from foundation.files import read_text
 from generator.lights.gamut import rb_of
 from generator.named_numbers import is_number, parse_numbers
 from generator.philox import Words, standard_normal
@@ -127,10 +128,7 @@ def load_ground_truths(path: Path) -> npt.NDArray[np.float64]:
     """
     if is_statistics(path):
         return read_lights(path)
-    try:
-        lines = path.read_text(encoding="utf-8-sig").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        raise FormatError(f"cannot read ground truths {path}: {error}; name a text file") from error
+    lines = read_text(path, "name a text file", "ground truths").splitlines()
     numbered = [(number, line.strip()) for number, line in enumerate(lines, start=1) if line.strip()]
     if not numbered:
         raise FormatError(f"{path} is empty; expected three numbers a line")

@@ -166,27 +166,6 @@ class Lighting:
         """Return the ground truth of each light, (lights, 3) float64, linear camera RGB, not normalised."""
         return np.array([mixture.white(lut) for mixture in self.mixtures])
 
-    def overall(self, lut: Lut, weights: npt.NDArray[np.float32]) -> npt.NDArray[np.float64]:
-        """Return the mean light of the picture, (3,) float64, linear camera RGB, not normalised.
-
-        The one ground truth of an image of several lights, for methods that estimate one.
-
-        `weights`: (H, W, lights) float32 ≥ 0, as `weights_of` returns them.
-        """
-        from generator.masks.maps import mean_weights
-
-        return np.asarray(mean_weights(weights) @ self.whites(lut))
-
-    def ground_truth_map(self, lut: Lut, weights: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
-        """Return the ground truth (H, W, 3) float32 of each pixel.
-
-        `weights`: (H, W, lights) float32 ≥ 0, as `weights_of` returns them. Returns (H, W, 3) float32, r + g + b = 1:
-        the chromaticity of the sum of the lights' whites, each times its weight in the pixel.
-        """
-        from generator.masks.maps import chromaticities
-
-        return chromaticities(weights, self.whites(lut))
-
 
 @runtime_checkable
 class LightChoice(Protocol):

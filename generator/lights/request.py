@@ -19,6 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from foundation.errors import FormatError, InputError, first_of
+from foundation.files import read_text
 from generator.lights.choices import (
     DrawnLights,
     ListedLights,
@@ -86,11 +87,7 @@ def load_named_truths(path: Path) -> dict[str, npt.NDArray[np.float64]]:
 
     Returns for each name (K, 3) float64 ≥ 0, linear camera RGB, not normalised, K ≥ 1.
     """
-    try:
-        text = path.read_text(encoding="utf-8-sig")
-    except (OSError, UnicodeDecodeError) as error:
-        raise FormatError(f"cannot read lights {path}: {error}; name a CSV file") from error
-    reader = csv.DictReader(io.StringIO(text))
+    reader = csv.DictReader(io.StringIO(read_text(path, "name a CSV file", "lights")))
     head = {field.strip().lower(): field for field in reader.fieldnames or ()}
     name = next((column for column in _NAMES if column in head), None)
     triple = next((names for names in TRIPLES if all(part in head for part in names)), None)

@@ -14,7 +14,6 @@ a bounded multiplier is a price by the missing share instead of a condition.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
@@ -31,23 +30,6 @@ _BOUNDS: Final = tuple(float(bound) for bound in np.geomspace(8, 0.01, 40))
 freely, down to 1 %, that is hardly."""
 
 
-@dataclass(frozen=True, eq=False)
-class Balance:
-    """Weights, and what they come to.
-
-    - `weights`: (N,) float64 above 0, sum 1.
-    - `bound`: bound of the multipliers; None where the floor of the effective sample size did not matter.
-    """
-
-    weights: _Array
-    bound: float | None
-
-    @property
-    def effective(self) -> float:
-        """Kish's effective sample size, 1 … N."""
-        return effective_size(self.weights)
-
-
 def effective_size(weights: _Array) -> float:
     """Return Kish's effective sample size of weights (N,) float64 ≥ 0.
 
@@ -61,32 +43,32 @@ def effective_size(weights: _Array) -> float:
 
 def balance(
     moments: _Array, wanted: _Array, real: float, least_effective: float = LEAST_EFFECTIVE, variants: int = 1
-) -> Balance:
-    """Return the weights of N images by which the means of their moments come near to the wanted ones.
+) -> _Array:
+    """Return the weights (N,) float64 of images, sum 1, by which their moments' means come near to the wanted ones.
 
     `moments`: (N, K) float64, the moments of each image. `wanted`: (K,) float64, their wanted means. `least_effective`:
     least effective sample size as a share of the images, 0 … 1.
 
     Examples
     --------
-    >>> found = balance(np.arange(100.0)[:, None] / 100, np.array([0.6]), np.inf)
-    >>> round(float(found.weights @ np.arange(100.0)) / 100, 3), round(found.effective)
+    >>> weights = balance(np.arange(100.0)[:, None] / 100, np.array([0.6]), np.inf)
+    >>> round(float(weights @ np.arange(100.0)) / 100, 3), round(effective_size(weights))
     (0.6, 88)
     """
     aside = moments - wanted
     penalty, least = 1 / real, least_effective * len(moments) / variants
 
-    def is_enough(found: Balance) -> bool:
-        return effective_size(found.weights.reshape(-1, variants).sum(axis=1)) >= least
+    def is_enough(weights: _Array) -> bool:
+        return effective_size(weights.reshape(-1, variants).sum(axis=1)) >= least
 
     free = _dual(aside, penalty, np.zeros(len(wanted)), None)
-    found = Balance(_weights(aside, free), None)
+    found = _weights(aside, free)
     if is_enough(found):
         return found
-    best, low, high = Balance(np.full(len(moments), 1 / len(moments)), 0.0), 0, len(_BOUNDS) - 1
+    best, low, high = np.full(len(moments), 1 / len(moments)), 0, len(_BOUNDS) - 1
     while low <= high:
         middle = (low + high) // 2
-        found = Balance(_weights(aside, _dual(aside, penalty, free, _BOUNDS[middle])), _BOUNDS[middle])
+        found = _weights(aside, _dual(aside, penalty, free, _BOUNDS[middle]))
         if is_enough(found):
             best, high = found, middle - 1
         else:

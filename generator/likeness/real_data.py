@@ -358,7 +358,7 @@ def _weights(
     columns = [_moments(name, pictures[name], real[name]) for name in pictures]
     moments = np.concatenate([column for column, _ in columns], axis=1)
     wanted = np.concatenate([column.mean(axis=0) for _, column in columns])
-    return balance(moments, wanted, min(map(len, real.values())), least_effective, variants).weights
+    return balance(moments, wanted, min(map(len, real.values())), least_effective, variants)
 
 
 def _moments(name: str, pictures: _Array, real: _Array) -> tuple[_Array, _Array]:

@@ -42,15 +42,6 @@ def _quantised(red: Any, green: Any, blue: Any, full: Any) -> Any:
 
 
 @compiled
-def _chromaticities(weights: Any, whites: Any, out: Any) -> None:
-    for y in range(weights.shape[0]):
-        for x in range(weights.shape[1]):
-            red, green, blue = _light_at(weights, whites, y, x)
-            total = red + green + blue
-            out[y, x, 0], out[y, x, 1], out[y, x, 2] = red / total, green / total, blue / total
-
-
-@compiled
 def _quantise_chromaticities(weights: Any, whites: Any, full: Any, out: Any) -> None:
     for y in range(weights.shape[0]):
         for x in range(weights.shape[1]):
@@ -89,32 +80,14 @@ def _sums(weights: Any, out: Any) -> None:
             out[light] += row
 
 
-def chromaticities(weights: npt.NDArray[np.float32], whites: npt.NDArray[np.float64]) -> npt.NDArray[np.float32]:
-    """Return the chromaticity of the sum of the lights' whites, each times its weight, in each pixel.
-
-    `weights`: (H, W, K) float32 ≥ 0, not all 0 in a pixel. `whites`: (K, 3) float64, linear camera RGB above 0. Returns
-    (H, W, 3) float32, r + g + b = 1, computed in float32, lights added up in their order.
-
-    Examples
-    --------
-    >>> whites = np.array([[400.0, 400.0, 200.0], [100.0, 400.0, 500.0]])
-    >>> chromaticities(np.array([[[1, 0], [0.5, 0.5]]], np.float32), whites)
-    array([[[0.4 , 0.4 , 0.2 ],
-            [0.25, 0.4 , 0.35]]], dtype=float32)
-    """
-    out = np.empty((*weights.shape[:2], 3), np.float32)
-    _chromaticities(weights, whites.astype(np.float32), out)
-    return out
-
-
 def quantised_chromaticities(
     weights: npt.NDArray[np.float32], whites: npt.NDArray[np.float64], full: int
 ) -> npt.NDArray[np.uint16]:
-    """Return `chromaticities` as whole parts of `full` ≤ 65535: (H, W, 3) uint16, of which each pixel sums to `full`.
+    """Return the chromaticity of the sum of the lights' whites, each times its weight, in each pixel.
 
-    Red and blue are rounded, green is the rest.
-
-    `weights`: (H, W, K) float32 ≥ 0, not all 0 in a pixel. `whites`: (K, 3) float64, linear camera RGB above 0.
+    `weights`: (H, W, K) float32 ≥ 0, not all 0 in a pixel. `whites`: (K, 3) float64, linear camera RGB above 0. Returns
+    whole parts of `full` ≤ 65535: (H, W, 3) uint16, of which each pixel sums to `full`, computed in float32, lights
+    added up in their order. Red and blue are rounded, green is the rest.
 
     Examples
     --------

@@ -14,10 +14,11 @@ from typing import Any, Final, Literal
 
 import numpy as np
 import numpy.typing as npt
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import ValidationError
 
 from foundation.errors import FormatError, InputError
 from foundation.files import storage_error, whole_folder, write_whole
+from foundation.records import Record
 from generator.pictures.picture import Picture
 from generator.pictures.sources import Source
 
@@ -26,18 +27,14 @@ VERSION: Final = 1
 """The only version so far."""
 
 
-class _Entry(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="ignore")
-
+class _Entry(Record):
     name: str
     sha256: str | None
     width: int
     height: int
 
 
-class _Head(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="ignore")
-
+class _Head(Record):
     format: Literal["crop.gallery"] = FORMAT
     version: Literal[1] = VERSION
     pictures: list[_Entry]

@@ -48,7 +48,6 @@ little towards the light or away from it. Pure functions of places on the print,
 
 from __future__ import annotations
 
-import difflib
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
@@ -57,11 +56,10 @@ from typing import Any, Final, Literal, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from pydantic import TypeAdapter, ValidationError
 
 from drivers.camera import ExposureSettings
 from foundation.colorimetry import decode_srgb, observer_cie_1931
-from foundation.errors import ConfigurationError
+from foundation.records import from_settings
 from sim.spectral import published_spectra, read_sensitivities
 
 WAVELENGTHS_NM: NDArray[np.float64] = np.arange(380.0, 781.0, 5.0)
@@ -564,18 +562,8 @@ class Room:
 
 def read_room(seed: int, changes: Mapping[str, Any], where: str, key: str) -> Room:
     """Return the default room with a seed and the changes of a settings file or a command line."""
-    known = sorted(field.name for field in fields(Room) if field.name != "seed")
-    for name in changes:
-        if name not in known:
-            near = difflib.get_close_matches(name, known, n=1, cutoff=0.5)
-            hint = f"did you mean {near[0]!r}?" if near else f"known are {', '.join(known)}"
-            raise ConfigurationError(f"{where}: unknown key '{key}.{name}'; {hint}")
-    try:
-        return TypeAdapter(Room).validate_python({"seed": seed, **changes})
-    except ValidationError as error:
-        first = error.errors()[0]
-        at = ".".join([key, *(str(part) for part in first["loc"][:1])])
-        raise ConfigurationError(f"{where}: {at}: {first['msg']}, got {first['input']!r}") from error
+    known = [field.name for field in fields(Room) if field.name != "seed"]
+    return from_settings(Room, changes, where, key, known, seed=seed)
 
 
 _SLANT: Final = 0.36

@@ -14,7 +14,6 @@ sensors have: plausible, not measured on these bodies. Whoever knows better says
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from types import MappingProxyType
@@ -25,6 +24,7 @@ from numpy.typing import NDArray
 from pydantic import TypeAdapter, ValidationError
 
 from foundation.errors import ConfigurationError
+from foundation.records import from_settings
 from sim.spectral import Sensitivities, read_sensitivities
 
 
@@ -257,23 +257,11 @@ def find_body(
     """Return the body that a name or a file of sensitivities stands for."""
     body = BODIES.get(camera) or _of_sensitivities(camera, read_sensitivities(camera))
     given = dict(changes)
-    known = [field.name for field in fields(Body)] + ["pixels"]
-    for name in given:
-        if name not in known:
-            near = difflib.get_close_matches(name, known, n=1, cutoff=0.5)
-            hint = f"did you mean {near[0]!r}?" if near else f"known are {', '.join(known)}"
-            raise ConfigurationError(f"{where}: unknown key '{key}.{name}'; {hint}")
     pixels = given.pop("pixels", None)
     if pixels is not None:
         given = _areas(pixels, where, key) | given
-    try:
-        changed = TypeAdapter(Body).validate_python(
-            {field.name: given.get(field.name, getattr(body, field.name)) for field in fields(Body)}
-        )
-    except ValidationError as error:
-        first = error.errors()[0]
-        at = ".".join([key, *(str(part) for part in first["loc"][:1])])
-        raise ConfigurationError(f"{where}: {at}: {first['msg']}, got {first['input']!r}") from error
+    facts = {field.name: getattr(body, field.name) for field in fields(Body)}
+    changed = from_settings(Body, given, where, key, [*facts, "pixels"], **facts)
     _require_sensor(changed, where, key)
     return changed
 

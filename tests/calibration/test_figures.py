@@ -14,7 +14,7 @@ from calibration.figures import all_figures, geometry, light, radiometry, truth
 from calibration.figures.all_figures import FIGURES
 from calibration.figures.figure import QUESTIONS, CheckMeasurements, Figure
 from calibration.figures.truth import DARKEST_COUNTS
-from calibration.sampling import bleed, blur_of_bleed, largest_blur_px
+from calibration.sampling import largest_blur_px
 
 ROOT = Path(__file__).parents[2]
 PACKAGES = ("foundation", "drivers", "sim", "experiment", "calibration", "acquisition", "benchmarks")
@@ -89,12 +89,6 @@ def test_some_figures_are_asked_more_than_others() -> None:
 def test_a_check_that_saw_nothing_forecasts_nothing() -> None:
     nothing = CheckMeasurements()
     assert [figure.name for figure in FIGURES if figure.forecast is not None and figure.forecast(nothing)] == []
-
-
-@pytest.mark.parametrize("share", [0.005, 0.03])
-@pytest.mark.parametrize("cell_px", [8.6, 10.2, 12.4])
-def test_the_blur_of_a_bleed_is_its_inverse(share: float, cell_px: float) -> None:
-    assert bleed(cell_px, blur_of_bleed(cell_px, share)) == pytest.approx(share, rel=1e-9)
 
 
 def test_larger_cells_may_be_softer() -> None:

@@ -11,7 +11,7 @@ import pytest
 
 from acquisition.run.devices import require_whole_turns
 from experiment.config import LabSettings, load_lab, parse_lab
-from foundation.errors import ConfigurationError
+from foundation.errors import ConfigurationError, FormatError
 from foundation.secret_texts import target_label
 
 MINIMAL = 'rig = "simulated"\nchart = "c/chart.json"\nilluminations = "lights.csv"\n'
@@ -170,7 +170,7 @@ def test_replay_needs_a_recording(tmp_path: Path) -> None:
 
 
 def test_a_missing_file_is_named(tmp_path: Path) -> None:
-    with pytest.raises(ConfigurationError, match=r"nowhere\.toml"):
+    with pytest.raises(FormatError, match=r"nowhere\.toml"):
         load_lab(tmp_path / "nowhere.toml")
 
 

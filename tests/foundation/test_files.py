@@ -15,11 +15,12 @@ from pathlib import Path
 import pytest
 
 from foundation import files as storage
-from foundation.errors import InputError, StorageError
+from foundation.errors import FormatError, InputError, StorageError
 from foundation.files import (
     is_partial,
     make_folder,
     partial_path,
+    read_csv,
     read_whole,
     require_free,
     require_free_file,
@@ -370,3 +371,23 @@ def test_a_folder_that_is_there_and_not_there_is_not_waited_for(
     monkeypatch.setattr(Path, "mkdir", mkdir)
     with pytest.raises(StorageError, match="ordinary disk"):
         storage.make_folder(tmp_path / "x")
+
+
+def test_a_table_is_read_whatever_its_mark_and_its_short_lines(tmp_path: Path) -> None:
+    path = tmp_path / "some.csv"
+    path.write_bytes(b'\xef\xbb\xbfimage,fold\r\n"a\nb",1\r\nc\r\n')
+    assert read_csv(path, "mend it") == (
+        ["image", "fold"],
+        [{"image": "a\nb", "fold": "1"}, {"image": "c", "fold": ""}],
+    )
+    path.write_bytes(b"")
+    assert read_csv(path, "mend it") == ([], [])
+
+
+@pytest.mark.parametrize("content", [b"image\n\xff\n", b"image\n" + b"a" * 200_000 + b"\n", None])
+def test_what_is_no_table_is_refused_with_what_helps(tmp_path: Path, content: bytes | None) -> None:
+    path = tmp_path / "some.csv"
+    if content is not None:
+        path.write_bytes(content)
+    with pytest.raises(FormatError, match=r"some\.csv: .*; mend it"):
+        read_csv(path, "mend it")

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from foundation.errors import ConfigurationError
+from foundation.errors import ConfigurationError, FormatError
 from sim.world.sensors import BODIES, FACTS, find_body
 from synthesis.settings import TableSettings, load_settings, parse_settings, room_of
 
@@ -33,7 +33,7 @@ def test_a_file_changes_what_it_names(tmp_path: Path) -> None:
     path = tmp_path / "table.toml"
     path.write_text(FILE)
     settings = load_settings(path)
-    assert (settings.seed, settings.window, settings.exposed.iso, settings.exposed.shutter_s) == (3, 7, 400, 0.5)
+    assert (settings.seed, settings.window, settings.exposure.iso, settings.exposure.shutter_s) == (3, 7, 400, 0.5)
     room = room_of(settings, "here")
     assert (room.seed, room.vignetting, room.profile, room.lamp_drift_per_hour) == (3, 0.1, "managed", 0)
     body = find_body("Canon_EOS_5DS", settings.camera, "here")
@@ -111,7 +111,7 @@ def test_what_no_sensor_has_is_refused(camera: dict[str, Any], message: str) -> 
 
 
 def test_a_file_that_cannot_be_read_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(ConfigurationError, match="cannot read settings"):
+    with pytest.raises(FormatError, match="cannot read settings"):
         load_settings(tmp_path / "none.toml")
     (tmp_path / "bad.toml").write_text("seed = \n")
     with pytest.raises(ConfigurationError, match="is not TOML"):

@@ -17,7 +17,6 @@ from acquisition.check.frames import (
     search,
 )
 from acquisition.run.devices import ENGRAVED_S
-from drivers.presenter import WHITE
 from drivers.raw.plain_dng import Area
 from drivers.raw.rawfile import Mosaic
 
@@ -37,7 +36,7 @@ def photographed(rate: float, shutter_s: float, full: int, spread: float = 0.0, 
     mosaic = Mosaic(
         counts, "RGGB", np.full((2, 2), float(BLACK)), stated, "a camera", counts, Area(0, 0, 80, 120), ()
     )  # fmt: skip
-    return Shot(WHITE, shutter_s, mosaic, shutter_s + 1, 1)
+    return Shot(shutter_s, mosaic, 1)
 
 
 @pytest.mark.parametrize("share", [0.01, 0.1, 0.7, 1.5, 40.0])

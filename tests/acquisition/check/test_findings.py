@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import pytest
 
 from acquisition.check.findings import LIMITS, CheckReport, Finding, Limit, amount, judged, not_checked, worst
+from foundation.console import plain
 
 LIMIT = Limit("thing", "A thing", "share", (0.2, 0.5), (0.1, None), "it breaks")
 
@@ -35,7 +35,7 @@ def test_faults_are_told_first_and_what_was_not_checked_is_never_good() -> None:
 
 def test_json_holds_every_finding_and_no_number_that_is_none() -> None:
     report = CheckReport((), (judged(LIMIT, float("nan"), "bad", "mend it", {"each": [1.0, float("inf")]}),))
-    document = json.loads(report.to_json())
+    document = plain(report.values())
     assert document["faults"] == 1
     (found,) = document["findings"]
     assert found["value"] is None

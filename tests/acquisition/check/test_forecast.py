@@ -142,9 +142,9 @@ def say(case: Case, folder: Path) -> Said:
     paint = None if case.paint is None else case.paint(lab.mosaic(folder, WHITE, 2), lab)
     white, dark = lab.dng(WHITE, 2, paint=paint), lab.dng(BLACK, 3)
     shots: list[Shot] = []
-    for name, colour, data in (("white", WHITE, white), ("dark", BLACK, dark)):
+    for name, data in (("white", white), ("dark", dark)):
         (folder / f"{name}.dng").write_bytes(data)
-        shots.append(Shot(colour, 0.5, read_raw(folder / f"{name}.dng"), 0.0, len(data)))
+        shots.append(Shot(0.5, read_raw(folder / f"{name}.dng"), len(data)))
     forecast = None
     try:
         framing = find_chart(shots[0].mosaic, lab.chart, "the white frame")

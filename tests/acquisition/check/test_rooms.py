@@ -16,6 +16,7 @@ from acquisition.cli import main
 from experiment.chart.layout import paper_chart
 from experiment.chart.model import load_chart
 from experiment.config import load_lab
+from foundation.console import plain
 from sim.world import world
 from sim.world.room import Room, Stain, worn
 from tests.acquisition.check.conftest import Check, lab_toml
@@ -85,7 +86,7 @@ def test_what_is_not_known_yet_is_named(check: Check) -> None:
     assert {"white_drift", "off_codes_deg", "agreement"} <= set(report.not_known)
     assert "not known before the session: " in report.lines()[-1]
     assert ", white drift, " in report.lines()[-1]
-    table = json.loads(report.to_json())["table"]
+    table = plain(report.values())["table"]
     assert table["outcome"] == "accept"
     assert table["figures"]["cell_px"] > 8.6
 

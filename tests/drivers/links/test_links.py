@@ -7,16 +7,10 @@ from collections.abc import Iterator
 
 import pytest
 
-from drivers.links.link import PeerLink, memory_pair
+from drivers.links.link import PeerLink
 from drivers.links.network import LOOPBACK, TcpLink, TcpServer
 from foundation.errors import LinkClosed, LinkTimeout
 from tests.contracts.link import PATIENCE_S, Ends, LinkContract, read_exactly
-
-
-class TestMemoryPair(LinkContract):
-    @pytest.fixture
-    def ends(self) -> Ends:
-        return memory_pair()
 
 
 class TestTcpClient(LinkContract):
@@ -54,27 +48,6 @@ class _tcp_ends:  # noqa: N801 – reads as the function it stands for
         self._taken.append(link)
         self._arrived.set()
         self._done.wait(PATIENCE_S)
-
-
-def test_a_reader_in_another_thread_is_woken_by_data_and_by_closing() -> None:
-    near, far = memory_pair()
-    heard: list[bytes] = []
-    closed = threading.Event()
-
-    def listen() -> None:
-        heard.append(near.read(10, PATIENCE_S))
-        try:
-            near.read(10, PATIENCE_S)
-        except LinkClosed:
-            closed.set()
-
-    thread = threading.Thread(target=listen)
-    thread.start()
-    far.write(b"awake", PATIENCE_S)
-    far.close()
-    thread.join(PATIENCE_S)
-    assert heard == [b"awake"]
-    assert closed.is_set()
 
 
 class _Echo:

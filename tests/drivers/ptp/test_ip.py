@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.links.link import Link, MemoryLink, memory_pair
+from drivers.links.link import Link
 from drivers.links.network import TcpServer
 from drivers.ptp import ip as ptpip
 from drivers.ptp.ip import (
@@ -39,6 +39,7 @@ from tests.contracts.link import read_exactly
 from tests.contracts.transport import PATIENCE_S, Bench, Echo, TransportContract
 from tests.drivers.links.troubled_links import Dribbling
 from tests.drivers.ptp import examples
+from tests.joined_links import JoinedLink, joined_links
 
 CONVERSATION: tuple[Packet, ...] = (
     InitCommandRequest(bytes(range(16)), "lab"),
@@ -223,11 +224,11 @@ class FarEnd:
     """Both connections of a device whose words are put into its mouth beforehand."""
 
     def __init__(self, command: bytes = ACK, event: bytes = EVENT_ACK) -> None:
-        near_command, self.command = memory_pair()
-        near_event, self.event = memory_pair()
+        near_command, self.command = joined_links()
+        near_event, self.event = joined_links()
         self.command.write(command, PATIENCE_S)
         self.event.write(event, PATIENCE_S)
-        self._near: list[MemoryLink] = [near_event, near_command]
+        self._near: list[JoinedLink] = [near_event, near_command]
         self.refusals = 0
 
     def open_command(self) -> Link:
@@ -244,7 +245,7 @@ class FarEnd:
             self.open_command, self.open_event, guid=GUID, name="Cr", clock=clock or SimulatedClock(), label="camera"
         )
 
-    def heard(self, link: MemoryLink) -> bytes:
+    def heard(self, link: JoinedLink) -> bytes:
         return link.read(1 << 20, 0)
 
 

@@ -19,12 +19,12 @@ from evaluation.commands.options import (
     choose_estimates,
     choose_learners,
     choose_methods,
-    with_data_options,
 )
 from evaluation.datasets import LAYOUTS, DataOptions
 from evaluation.learning.standard import standard_learners
 from evaluation.methods import standard_methods
 from evaluation.methods.standard import STANDARD
+from foundation.console import grouped
 from foundation.errors import FormatError, InputError
 from tests.evaluation.datasets.made_up import nus8
 
@@ -148,7 +148,7 @@ def app(seen: list[object]) -> typer.Typer:
     made = typer.Typer()
 
     @made.command()
-    @with_data_options
+    @grouped
     def read(place: Annotated[str, typer.Argument()], *, count: int = 3, reading: DataReading) -> None:
         seen.extend([place, count, reading])
 
@@ -194,12 +194,12 @@ def test_the_help_names_every_layout_and_option() -> None:
     assert "--reading" not in help_text
 
 
-def test_a_command_without_the_parameter_is_a_mistake() -> None:
-    def read(place: str) -> None:
-        del place
+def test_two_groups_with_an_option_of_one_name_are_a_mistake() -> None:
+    def read(one: DataReading, other: DataReading) -> None:
+        del one, other
 
-    with pytest.raises(ValueError, match="read has no parameter 'reading'"):
-        with_data_options(read)
+    with pytest.raises(ValueError, match="duplicate parameter name: 'layout'"):
+        grouped(read)
 
 
 def test_levels_that_are_none_are_refused() -> None:

@@ -9,13 +9,11 @@ from scipy import stats
 
 from evaluation.experiments.bootstrap import (
     STATISTICS,
+    Compared,
     ErrorSample,
     independent,
-    interval,
     intervals,
     paired,
-    paired_difference,
-    paired_ratio,
     resamples,
 )
 from evaluation.metrics import summarise
@@ -30,6 +28,11 @@ WORLDS = 250
 def skewed(random: np.random.Generator, count: int) -> npt.NDArray[np.float64]:
     """Return errors distributed as those of colour constancy: their mean is above their median."""
     return random.gamma(1.5, 2.0, count)
+
+
+def median(compared: tuple[Compared, ...]) -> Compared:
+    """Return what of two sets of errors their medians say."""
+    return compared[STATISTICS.index("median")]
 
 
 @pytest.mark.parametrize("count", [1, 2, 3, 4, 5, 17, 64])
@@ -57,7 +60,7 @@ def test_every_resample_has_as_many_images_and_every_image_the_same_chance() -> 
 def test_interval_is_that_of_scipy() -> None:
     errors = skewed(np.random.default_rng(5), 80)
     known = stats.bootstrap((errors,), np.mean, n_resamples=20_000, method="BCa", rng=1).confidence_interval
-    ours = interval(errors, "mean", count=20_000)
+    ours = intervals(errors, count=20_000)["mean"]
     np.testing.assert_allclose(ours, known, atol=0.02 * (known.high - known.low))
 
 
@@ -87,7 +90,7 @@ def test_lower_confidence_covers_less() -> None:
     random = np.random.default_rng(9)
     hits = [
         low <= 3 <= high
-        for low, high in (interval(skewed(random, 120), "mean", count=600, level=0.5) for _ in range(WORLDS))
+        for low, high in (intervals(skewed(random, 120), count=600, level=0.5)["mean"] for _ in range(WORLDS))
     ]
     assert 0.40 < np.mean(hits) < 0.60
 
@@ -113,21 +116,22 @@ def test_resampling_each_method_alone_would_not_do() -> None:
     # The world in which an interval of pairs is wrong: it is not narrower than that of strangers.
     random = np.random.default_rng(11)
     hard = skewed(random, 300)
-    low, high = paired_ratio(hard * 1.05, hard, "median")[1:]
+    low, high = median(paired(hard * 1.05, hard)).ratio[1:]
     assert low == pytest.approx(1.05)
     assert high == pytest.approx(1.05)
-    shuffled = paired_ratio(random.permutation(hard) * 1.05, hard, "median")
+    shuffled = median(paired(random.permutation(hard) * 1.05, hard)).ratio
     assert shuffled[2] - shuffled[1] > 0.1
 
 
 def test_order_of_images_and_methods() -> None:
     random = np.random.default_rng(12)
     one, other = skewed(random, 90), skewed(random, 90)
-    difference, low, high = paired_difference(one, other, "trimean")
-    back = paired_difference(other, one, "trimean")
-    assert (difference, low, high) == pytest.approx((-back[0], -back[2], -back[1]))
-    assert difference == pytest.approx(summarise(one).trimean - summarise(other).trimean)
-    assert paired_ratio(one, other, "best25")[0] == pytest.approx(summarise(one).best25 / summarise(other).best25)
+    for there, back in zip(paired(one, other), paired(other, one), strict=True):
+        difference, low, high = there.difference
+        assert (difference, low, high) == pytest.approx((-back.difference[0], -back.difference[2], -back.difference[1]))
+        ours, theirs = (getattr(summarise(errors), there.statistic) for errors in (one, other))
+        assert difference == pytest.approx(ours - theirs)
+        assert there.ratio[0] == pytest.approx(ours / theirs)
 
 
 def test_ends_are_the_same_every_time_and_at_any_piece_size(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -140,13 +144,12 @@ def test_ends_are_the_same_every_time_and_at_any_piece_size(monkeypatch: pytest.
 
 
 def test_no_spread() -> None:
-    assert interval([2.5], "worst25") == (2.5, 2.5)
-    assert interval([2.5] * 9, "avg") == pytest.approx((2.5, 2.5))
-    assert interval([0, 0, 0], "avg") == (0, 0)
-    ratio = paired_ratio([1, 2, 3], [0, 0, 0], "mean")
-    assert np.isnan(ratio).all()
+    assert intervals([2.5])["worst25"] == (2.5, 2.5)
+    assert intervals([2.5] * 9)["avg"] == pytest.approx((2.5, 2.5))
+    assert intervals([0, 0, 0])["avg"] == (0, 0)
+    assert all(np.isnan(compared.ratio).all() for compared in paired([1, 2, 3], [0, 0, 0]))
     # The best quarter of the other is 0 in some resamples: no upper end then, but a lower one.
-    value, low, high = paired_ratio(np.arange(1.0, 9), np.arange(8.0) * 0.1, "median")
+    value, low, high = median(paired(np.arange(1.0, 9), np.arange(8.0) * 0.1)).ratio
     assert np.isfinite([value, low]).all()
     assert high > value
 
@@ -156,15 +159,13 @@ def test_no_spread() -> None:
 )
 def test_refuses_what_has_no_statistic(errors: list[float], says: str) -> None:
     with pytest.raises(InputError, match=says):
-        interval(errors, "mean")
+        intervals(errors)
 
 
 def test_refuses_what_it_does_not_know() -> None:
-    with pytest.raises(InputError, match="'mode' is no statistic; the statistics are mean, median"):
-        interval([1, 2], "mode")  # pyright: ignore[reportArgumentType]
     with pytest.raises(InputError, match="3 errors of one method and 2 of the other"):
         paired([1, 2, 3], [1, 2])
     with pytest.raises(InputError, match="0 resamples"):
-        interval([1, 2], "mean", count=0)
+        intervals([1, 2], count=0)
     with pytest.raises(InputError, match="a confidence of 95"):
-        interval([1, 2], "mean", level=95)
+        intervals([1, 2], level=95)

@@ -134,7 +134,7 @@ def test_foreign_files_are_refused(tmp_path: Path, kind: str) -> None:
 
 def test_a_model_that_is_not_there_or_a_folder_is_told(tmp_path: Path) -> None:
     with pytest.raises(
-        FormatError, match=r"none\.npz is not there, expected a model file; name one that evaluate train"
+        FormatError, match=r"none\.npz is not there, expected a model file; name a file that evaluate train"
     ):
         load_model(tmp_path / "none.npz")
     (tmp_path / "some.npz").mkdir()
@@ -187,7 +187,7 @@ UNFIT: list[tuple[Change, str]] = [
     (tell(method="oracle"), "'oracle'; known are"),
     (tell(settings={"depth": 3}), "settings depth; expected"),
     (lambda _, about: about["settings"].update(depth="deep"), "depth is 'deep'"),
-    (lambda _, about: about["provenance"].pop("seed"), "provenance"),
+    (lambda _, about: about["provenance"].pop("seed"), "seed"),
     (lambda _, about: about.pop("method"), "lacks 'method'"),
 ]
 

@@ -239,7 +239,7 @@ def test_a_damaged_record_and_a_changed_source_are_reported(make_lut: Callable[.
     (record,) = (tmp_path / ".out.partial" / "plan" / "shards").glob("000001.*.json")
     text = record.read_text()
     record.write_text(text[:-9])
-    with pytest.raises(FormatError, match=r"000001\.\w+\.json is damaged; remove it and run the same command again"):
+    with pytest.raises(FormatError, match=r"000001\.\w+\.json: damaged: .*; remove it and run the same command again"):
         finish_dataset(out)
     record.write_text(text.replace('"width":24', '"width":25'))
     with pytest.raises(FormatError, match="random-000000"):

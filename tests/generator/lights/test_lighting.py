@@ -13,6 +13,8 @@ from hypothesis import strategies as st
 
 from foundation.errors import InputError
 from generator.lights.lighting import Lighting, Mixture, mixture_of, parse_mixture, plain
+from generator.masks.making import FULL
+from generator.masks.maps import quantised_chromaticities
 
 if TYPE_CHECKING:
     from calibration.table.lut import Lut
@@ -86,15 +88,14 @@ def test_ground_truth_of_every_pixel(make_lut: Callable[..., Lut]) -> None:
     lut = make_lut()
     lighting = Lighting((plain(0), Mixture((1, 2), (0.5, 0.5))), Halves())
     weights = lighting.weights_of(2, 4)
-    truth = lighting.ground_truth_map(lut, weights)
+    truth = quantised_chromaticities(weights, lighting.whites(lut), FULL) / FULL
     other = lut.white[1] / 2 + lut.white[2] / 2
-    np.testing.assert_allclose(truth[:, :2], np.broadcast_to(lut.ground_truth[0], (2, 2, 3)), rtol=1e-6)
-    np.testing.assert_allclose(truth[:, 2:], np.broadcast_to(other / other.sum(), (2, 2, 3)), rtol=1e-6)
-    overall = lighting.overall(lut, weights)
-    np.testing.assert_allclose(overall, (lut.white[0] + other) / 2, rtol=1e-6)
-    even = lighting.ground_truth_map(lut, np.full((1, 1, 2), 0.5, np.float32))[0, 0]
+    np.testing.assert_allclose(truth[:, :2], np.broadcast_to(lut.ground_truth[0], (2, 2, 3)), atol=1 / FULL)
+    np.testing.assert_allclose(truth[:, 2:], np.broadcast_to(other / other.sum(), (2, 2, 3)), atol=1 / FULL)
+    halves = np.full((1, 1, 2), 0.5, np.float32)
+    even = quantised_chromaticities(halves, lighting.whites(lut), FULL)[0, 0] / FULL
     both = lut.white[0] + other
-    np.testing.assert_allclose(even, both / both.sum(), rtol=1e-6)
+    np.testing.assert_allclose(even, both / both.sum(), atol=1 / FULL)
 
 
 def test_masks_stand_for_several_lights_only() -> None:

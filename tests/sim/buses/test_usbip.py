@@ -15,7 +15,7 @@ import usbip.host
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.links.link import MemoryLink, Pipe, PipeStalled, memory_pair
+from drivers.links.link import Pipe, PipeStalled
 from drivers.links.network import TcpServer
 from drivers.ptp.datasets import DeviceInfo
 from drivers.ptp.session import PtpRequest, PtpResponse
@@ -28,6 +28,7 @@ from sim.camera.eos import SimulatedEos
 from sim.clock import SimulatedClock
 from tests.contracts.camera import SeededFilm
 from tests.contracts.transport import GIVE, HANG, PATIENCE_S, RAISE, Bench, Echo, TransportContract, payload
+from tests.joined_links import JoinedLink, joined_links
 
 ADDRESSES = {Pipe.BULK_OUT: BULK_OUT, Pipe.BULK_IN: BULK_IN, Pipe.INTERRUPT_IN: INTERRUPT_IN}
 URB = struct.Struct(">IIIIIIiiii8s")
@@ -199,7 +200,7 @@ class Conversation:
     """A connection in this thread: the service runs until it has read all that was written."""
 
     def __init__(self, responder: Echo) -> None:
-        self._near, far = memory_pair()
+        self._near, far = joined_links()
         self._far = _Once(far)
         self._service = UsbIpService([PtpUsbDevice(responder)])
 
@@ -213,7 +214,7 @@ class Conversation:
 class _Once:
     """A link that is closed once nothing more waits to be read."""
 
-    def __init__(self, good: MemoryLink) -> None:
+    def __init__(self, good: JoinedLink) -> None:
         self._good = good
 
     def read(self, limit: int, timeout: float) -> bytes:

@@ -1,0 +1,51 @@
+"""Two ends of one cable: what one writes, the other reads, in the same thread or another."""
+
+from __future__ import annotations
+
+import threading
+from dataclasses import dataclass
+
+from foundation.errors import LinkClosed, LinkTimeout
+
+
+@dataclass
+class _Way:
+    """Bytes under way in one direction."""
+
+    waiting: bytes = b""
+    closed: bool = False
+
+
+class JoinedLink:
+    """One end; see `joined_links`."""
+
+    def __init__(self, changed: threading.Condition, outgoing: _Way, incoming: _Way) -> None:
+        self._changed, self._outgoing, self._incoming = changed, outgoing, incoming
+
+    def write(self, data: bytes, timeout: float) -> None:
+        with self._changed:
+            if self._outgoing.closed or self._incoming.closed:
+                raise LinkClosed("an end is closed")
+            self._outgoing.waiting += data
+            self._changed.notify_all()
+
+    def read(self, limit: int, timeout: float) -> bytes:
+        coming = self._incoming
+        with self._changed:
+            if not self._changed.wait_for(lambda: coming.waiting or coming.closed or self._outgoing.closed, timeout):
+                raise LinkTimeout("nothing came")
+            taken, coming.waiting = coming.waiting[:limit], coming.waiting[limit:]
+        if not taken or self._outgoing.closed:
+            raise LinkClosed("an end is closed")
+        return taken
+
+    def close(self) -> None:
+        with self._changed:
+            self._outgoing.closed = True
+            self._changed.notify_all()
+
+
+def joined_links() -> tuple[JoinedLink, JoinedLink]:
+    """Return both ends."""
+    changed, there, back = threading.Condition(), _Way(), _Way()
+    return JoinedLink(changed, there, back), JoinedLink(changed, back, there)
