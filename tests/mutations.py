@@ -42,7 +42,10 @@ PACKAGES: list[str] = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool
 ENDLESS_S = 90
 """Time after which a test is said not to end: half as long again as the slowest takes beside others."""
 
-STOPPED_AT = re.compile(r"^(tests/.*::.*?)(?: FAILED| ERROR| ?$)|^ERROR (tests/[^:\s]*)(?: |$)", re.MULTILINE)
+STOPPED_AT = re.compile(
+    r"^(tests/.*?::.*?)(?: <- \S+)?(?: (?:PASSED|SKIPPED|XFAIL|FAILED|ERROR)\b.*| ?)$|^ERROR (tests/[^:\s]*)(?: |$)",
+    re.MULTILINE,
+)
 """The test at which pytest stopped: it failed, it has no outcome, or its file cannot be imported."""
 
 OTHER: dict[type[ast.AST], type[ast.AST]] = {
