@@ -1,10 +1,12 @@
 """Draw mutations of the product at random and count those that no test notices.
 
-`python -m tests.mutations [--count 60] [--seed 1] [--jobs 2]` changes one place at a time in a copy of the repository
-(a comparison, an operator, a number), runs the tests near it, and prints one JSON object a mutation and one
-for the whole. Every place is as likely, so that packages have their share by size. A mutation is killed where a test
-fails or does not end in time. Tests are tried from near to far and the first failure ends a try: those that import the
-module, those of its package, whole commands and the packages above; what survives these is said to survive.
+`python -m tests.mutations [--count 60] [--seed 1] [--results FILE]` changes one place at a time in a copy of the
+repository (a comparison, an operator, a number), runs the tests that can reach it, and prints one JSON object
+a mutation and one for the whole. Every place is as likely, so that packages have their share by size. A mutation is
+killed where a test fails or does not end, and passes without it. Tests are tried from near to far, by the
+imports that lead from them to the module, quick ones first, until one fails or `--limit` seconds are over: what
+survives these is said to survive. `--results` keeps what was tried, so that a run that was stopped goes on;
+`--again` tries what survived there once more, wherever its line is now.
 
 Not drawn are annotations, messages, numbers that are an index, and what only type checkers read.
 """
@@ -16,32 +18,35 @@ import ast
 import json
 import os
 import random
+import re
 import shutil
+import signal
 import subprocess
 import sys
 import tempfile
+import time
 import tomllib
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from contextlib import suppress
+from dataclasses import asdict, dataclass
+from functools import cache
 from pathlib import Path
 from queue import Queue
+from typing import Any
+
+import grimp
 
 ROOT = Path(__file__).parents[1]
 PACKAGES: list[str] = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["importlinter"]["root_packages"]
-COPIED = (
-    *PACKAGES,
-    "tests",
-    "benchmarks",
-    "examples",
-    "docs",
-    "pyproject.toml",
-    "CONTRIBUTING.md",
-    "README.md",
-    "Makefile",
+ENDLESS_S = 90
+"""Time after which a test is said not to end: half as long again as the slowest takes beside others."""
+
+STOPPED_AT = re.compile(
+    r"^(tests/.*?::.*?)(?: <- \S+)?(?: (?:PASSED|SKIPPED|XFAIL|FAILED|ERROR)\b.*| ?)$|^ERROR (tests/[^:\s]*)(?: |$)",
+    re.MULTILINE,
 )
-LIMIT_S = 1200.0
-"""Time for the tests of one stage: ten times what the slowest take on two busy cores."""
+"""The test at which pytest stopped: it failed, it has no outcome, or its file cannot be imported."""
 
 OTHER: dict[type[ast.AST], type[ast.AST]] = {
     ast.Lt: ast.LtE, ast.LtE: ast.Lt, ast.Gt: ast.GtE, ast.GtE: ast.Gt, ast.Eq: ast.NotEq, ast.NotEq: ast.Eq,
@@ -60,18 +65,18 @@ class Mutation:
     before: str
     after: str
     column: int
-    end: tuple[int, int]
+    last_line: int
+    last_column: int
 
     def apply(self, folder: Path) -> str:
         """Change the place in a copy of the checkout and return the file's text as it was."""
         path = folder / self.file
         text = path.read_text(encoding="utf-8")
         lines = text.splitlines(keepends=True)
-        last, column = self.end
         # ast counts columns in bytes of UTF-8.
         head = lines[self.line - 1].encode()[: self.column].decode()
-        tail = lines[last - 1].encode()[column:].decode()
-        lines[self.line - 1 : last] = [f"{head}({self.after}){tail}"]
+        tail = lines[self.last_line - 1].encode()[self.last_column :].decode()
+        lines[self.line - 1 : self.last_line] = [f"{head}({self.after}){tail}"]
         path.write_text("".join(lines), encoding="utf-8")
         return text
 
@@ -111,7 +116,7 @@ def places(path: Path) -> Iterator[Mutation]:
                 skipped = [note]
             case ast.FunctionDef(returns=ast.expr() as note):
                 skipped = [note]
-            case ast.JoinedStr() | ast.Raise():
+            case ast.JoinedStr() | ast.Raise() | ast.MatchValue():
                 skipped = [node]
             case ast.If(test=ast.Name(id="TYPE_CHECKING")):
                 skipped = [node]
@@ -123,9 +128,15 @@ def places(path: Path) -> Iterator[Mutation]:
     for node in ast.walk(tree):
         if isinstance(node, ast.expr) and id(node) not in left_out:
             for after in mutated(node):
-                end = node.end_lineno or node.lineno, node.end_col_offset or 0
-                file = str(path.relative_to(ROOT))
-                yield Mutation(file, node.lineno, ast.unparse(node), ast.unparse(after), node.col_offset, end)
+                yield Mutation(
+                    str(path.relative_to(ROOT)),
+                    node.lineno,
+                    ast.unparse(node),
+                    ast.unparse(after),
+                    node.col_offset,
+                    node.end_lineno or node.lineno,
+                    node.end_col_offset or 0,
+                )
 
 
 def drawn(count: int, seed: int) -> list[Mutation]:
@@ -134,62 +145,137 @@ def drawn(count: int, seed: int) -> list[Mutation]:
     return random.Random(seed).sample(every, count)
 
 
-def stages(mutation: Mutation) -> list[list[str]]:
-    """Return the test files to try, from near to far."""
-    module = mutation.file.removesuffix(".py").removesuffix("/__init__").replace("/", ".")
-    package, _, name = module.rpartition(".")
-    files = sorted((ROOT / "tests").rglob("test_*.py"))
-    texts = {path: path.read_text(encoding="utf-8") for path in files}
-    direct = [path for path, text in texts.items() if module in text or f"from {package} import {name}" in text]
-    root = module.split(".")[0]
-    own = [path for path in files if path.is_relative_to(ROOT / "tests" / root)]
-    whole = [path for path in files if path.is_relative_to(ROOT / "tests" / "end_to_end")]
-    above = [path for path, text in texts.items() if f"from {root}" in text]
-    found: list[list[str]] = []
-    seen = set[Path]()
-    for stage in (direct, own, [*whole, *above]):
-        new = [path for path in stage if path not in seen]
-        seen |= set(new)
-        if new:
-            found.append([str(path.relative_to(ROOT)) for path in new])
+def survivors(results: Path) -> list[Mutation]:
+    """Return the mutations that survived by a file of results, at their places as of now; those that left are gone."""
+    latest = {tuple(row["mutation"].values()): row["killed by"] for row in _rows(results)}
+    found: list[Mutation] = []
+    for file, line, before, after, *_ in (key for key, by in latest.items() if not by):
+        alike = [one for one in places(ROOT / file) if (one.before, one.after) == (before, after)]
+        found += sorted(alike, key=lambda one: abs(one.line - line))[:1]
     return found
 
 
-def killed_by(mutation: Mutation, folder: Path) -> str:
-    """Return the first test that notices a mutation in a copy of the checkout; "" where none does."""
-    text = mutation.apply(folder)
-    settings = os.environ | {"PYTHONPATH": str(folder), "PYTHONDONTWRITEBYTECODE": "1"}
-    words = [sys.executable, "-m", "pytest", "-x", "-q", "-n0", "--no-header", "-p", "no:cacheprovider", "-rf"]
+def _rows(results: Path | None) -> list[dict[str, Any]]:
+    """Return what is in a file of results."""
+    text = results.read_text(encoding="utf-8") if results and results.exists() else ""
+    return [json.loads(line) for line in text.splitlines()]
+
+
+@cache
+def _imported_by_tests() -> dict[Path, dict[str, int]]:
+    """Return each test file with the names it imports (0), and those that helpers and conftest.py import for it (1)."""
+    tests = ROOT / "tests"
+    named = dict[Path, set[str]]()
+    for path in tests.rglob("*.py"):
+        nodes = list(ast.walk(ast.parse(path.read_text(encoding="utf-8"))))
+        froms = [one for one in nodes if isinstance(one, ast.ImportFrom) and one.module]
+        named[path] = {f"{one.module}.{alias.name}" for one in froms for alias in one.names}
+        named[path] |= {one.module for one in froms if one.module}
+        named[path] |= {alias.name for one in nodes if isinstance(one, ast.Import) for alias in one.names}
+    found = dict[Path, dict[str, int]]()
+    for path in sorted(one for one in named if one.name.startswith("test_")):
+        waiting = [path, *(folder / "conftest.py" for folder in path.parents if folder.is_relative_to(tests))]
+        for one in waiting:
+            helpers = {ROOT.joinpath(*name.split(".")).with_suffix(".py") for name in named.get(one, ())}
+            waiting += sorted((helpers & named.keys()) - {*waiting})
+        behind = set[str]().union(*(named.get(one, ()) for one in waiting))
+        found[path] = dict.fromkeys(behind, 1) | dict.fromkeys(named[path], 0)
+    return found
+
+
+@cache
+def _imports() -> grimp.ImportGraph:
+    return grimp.build_graph(PACKAGES[0], *PACKAGES[1:])
+
+
+def stages(mutation: Mutation) -> list[tuple[str, list[str]]]:
+    """Return the test files to try, each lot with the option that says which of its tests, from near to far."""
+    module = mutation.file.removesuffix(".py").removesuffix("/__init__").replace("/", ".")
+    room = ROOT / "tests" / Path(mutation.file).parent
+    distance = {module: 0}
+    waiting = [module]
+    for name in waiting:
+        nearer = _imports().find_modules_that_directly_import(name) - distance.keys()
+        distance |= dict.fromkeys(nearer, distance[name] + 1)
+        waiting += sorted(nearer)
+    lots: tuple[list[str], ...] = ([], [], [])
+    for path, names in _imported_by_tests().items():
+        steps = min((distance[name] + further for name, further in names.items() if name in distance), default=None)
+        in_room = path.is_relative_to(room)
+        if steps == 0 or (in_room and path.stem == f"test_{Path(mutation.file).stem}"):
+            lots[0].append(str(path.relative_to(ROOT)))
+        elif steps is not None or in_room:
+            lots[1 if in_room or steps == 1 else 2].append(str(path.relative_to(ROOT)))
+    for lot in lots:
+        lot.sort(key=lambda file: not (ROOT / file).is_relative_to(room))
+    order = (("not slow", 0), ("not slow", 1), ("slow", 0), ("not slow", 2), ("slow", 1), ("slow", 2))
+    return [(which, lots[near]) for which, near in order if lots[near]]
+
+
+def killed_by(mutation: Mutation, folder: Path, limit_s: float, left_out: tuple[str, ...] = ()) -> str:
+    """Return the first test that notices a mutation in a copy of the checkout; "" where none does in the time.
+
+    `left_out`: tests that are not asked, since they fail without it, too.
+    """
+    end_s = time.monotonic() + limit_s
+    known_text = mutation.apply(folder)
+    deselected = [f"--deselect={test}" for test in left_out]
     try:
-        for stage in stages(mutation):
-            try:
-                done = subprocess.run(
-                    [*words, *stage],
-                    cwd=folder,
-                    env=settings,
-                    capture_output=True,
-                    text=True,
-                    timeout=LIMIT_S,
-                    check=False,
-                )
-            except subprocess.TimeoutExpired:
-                return "no end"
-            if done.returncode not in (0, 5):
-                lines = [line for line in done.stdout.splitlines() if line.startswith(("FAILED", "ERROR"))]
-                return (lines or ["not imported"])[0].split(" - ")[0]
+        for which, files in stages(mutation):
+            code, failed = tested(folder, ["-m", which, *deselected, *files], end_s - time.monotonic())
+            if code == "no time":
+                return ""
+            if code not in (0, 5):
+                break
+        else:
+            return ""
     finally:
-        (folder / mutation.file).write_text(text, encoding="utf-8")
-    return ""
+        (folder / mutation.file).write_text(known_text, encoding="utf-8")
+    if not failed or failed in left_out:
+        raise RuntimeError(f"pytest ended with {code} and named no test: {mutation}")
+    if tested(folder, [failed], 2 * ENDLESS_S)[0] == 0:
+        return failed
+    print(f"{failed} fails in a copy of the repository, and is left out", file=sys.stderr)
+    return killed_by(mutation, folder, end_s - time.monotonic(), (*left_out, failed))
+
+
+def tested(folder: Path, words: list[str], limit_s: float) -> tuple[int | str, str]:
+    """Run tests in a copy of the checkout; return pytest's exit status or "no time", and the test that failed."""
+    endless = ("-o", f"faulthandler_timeout={ENDLESS_S}", "-o", "faulthandler_exit_on_timeout=true")
+    running = subprocess.Popen(
+        [sys.executable, "-m", "pytest", "-x", "-vv", "-rE", "--tb=no", "-p", "no:cacheprovider", *endless, *words],
+        cwd=folder,
+        env=os.environ
+        | {
+            "PYTHONPATH": str(folder),
+            "PYTHONDONTWRITEBYTECODE": "1",
+            "PYTHONUNBUFFERED": "1",
+            "NUMBA_CACHE_DIR": str(folder / ".compiled"),
+        },
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+        text=True,
+        start_new_session=True,
+    )
+    try:
+        said, _ = running.communicate(timeout=max(limit_s, 1.0))
+    except subprocess.TimeoutExpired:
+        return "no time", ""
+    finally:
+        with suppress(ProcessLookupError):
+            os.killpg(running.pid, signal.SIGKILL)
+        running.communicate()
+    # One line a test, with its outcome once it has ended; a file that cannot be imported stands in the summary alone.
+    about = STOPPED_AT.findall(said)
+    return running.returncode, "".join(about[-1]) if about else ""
 
 
 def copied(folder: Path) -> Path:
     """Return a copy of the checkout in a folder."""
-    for name in COPIED:
-        source = ROOT / name
-        if source.is_dir():
-            shutil.copytree(source, folder / name, ignore=shutil.ignore_patterns("__pycache__"))
-        else:
-            shutil.copy(source, folder / name)
+    listed = subprocess.run(["git", "ls-files", "-z"], cwd=ROOT, capture_output=True, text=True, check=True).stdout
+    for name in listed.split("\0")[:-1]:
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy(ROOT / name, folder / name)
     return folder
 
 
@@ -199,32 +285,43 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--count", type=int, default=60, help="mutations")
     parser.add_argument("--seed", type=int, default=1, help="of the draw")
     parser.add_argument("--jobs", type=int, default=2, help="mutations tried at a time")
+    parser.add_argument("--limit", type=float, default=300.0, help="seconds of tests for a mutation")
+    parser.add_argument("--results", type=Path, help="file of what was tried: not tried again, and added to")
+    parser.add_argument("--again", action="store_true", help="try what survived in the file of results")
     parser.add_argument("--list", action="store_true", help="print the draw and try nothing")
     given = parser.parse_args(argv)
-    mutations = drawn(given.count, given.seed)
+    if given.again and not given.results:
+        parser.error("--again needs --results")
+    mutations = survivors(given.results) if given.again else drawn(given.count, given.seed)
     if given.list:
         for one in mutations:
             print(f"{one.file}:{one.line}: {one.before}  ->  {one.after}")
         return 0
+    known = {} if given.again else {Mutation(**row["mutation"]): row["killed by"] for row in _rows(given.results)}
     with tempfile.TemporaryDirectory() as scratch:
         free: Queue[Path] = Queue()
         for number in range(given.jobs):
             free.put(copied(Path(scratch) / str(number)))
 
         def tried(mutation: Mutation) -> bool:
+            if mutation in known:
+                return bool(known[mutation])
             folder = free.get()
             try:
-                by = killed_by(mutation, folder)
+                by = killed_by(mutation, folder, given.limit)
             finally:
                 free.put(folder)
-            row = {"file": mutation.file, "line": mutation.line, "before": mutation.before, "after": mutation.after}
-            print(json.dumps(row | {"killed by": by or None}), flush=True)
+            row = json.dumps({"mutation": asdict(mutation), "killed by": by or None})
+            print(row, flush=True)
+            if given.results:
+                with given.results.open("a", encoding="utf-8") as file:
+                    file.write(f"{row}\n")
             return bool(by)
 
         with ThreadPoolExecutor(given.jobs) as pool:
             killed = sum(pool.map(tried, mutations))
-    print(json.dumps({"name": "mutations killed", "value": killed, "unit": "", "against": f"{given.count} drawn"}))
-    return 0 if killed >= 0.9 * given.count else 1
+    print(json.dumps({"name": "mutations killed", "value": killed, "unit": "", "against": f"{len(mutations)} tried"}))
+    return 0 if killed >= 0.9 * len(mutations) else 1
 
 
 if __name__ == "__main__":

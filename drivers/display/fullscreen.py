@@ -344,6 +344,7 @@ class FullScreen:
     def _open_window(self) -> Any:
         glfw, display = self._glfw, self.display
         on_x = glfw.get_platform() == glfw.PLATFORM_X11
+        # Which ask for 8 bits a channel, and for codes that are shown as they are: no blending of samples, no sRGB.
         glfw.default_window_hints()
         if on_x:
             glfw.window_hint(glfw.POSITION_X, display.x)
@@ -353,14 +354,9 @@ class FullScreen:
             (glfw.DECORATED, False),
             (glfw.AUTO_ICONIFY, False),  # or it goes away when the operator clicks on another display
             (glfw.CENTER_CURSOR, False),
-            (glfw.RED_BITS, 8),
-            (glfw.GREEN_BITS, 8),
-            (glfw.BLUE_BITS, 8),
             (glfw.ALPHA_BITS, 0),
             (glfw.DEPTH_BITS, 0),
             (glfw.STENCIL_BITS, 0),
-            (glfw.SAMPLES, 0),
-            (glfw.SRGB_CAPABLE, False),
             (glfw.REFRESH_RATE, display.refresh_hz),
         ):
             glfw.window_hint(hint, value)

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
 
-from evaluation.datasets.files import BesideTextScene, Folder, Mask, decode_image, subtract_black
+from evaluation.datasets.files import Folder, Mask, PaintedScene, decode_image, subtract_black
 from evaluation.datasets.options import DataOptions, stated
 from evaluation.scene import Image, SceneSet
 from foundation.errors import FormatError, first_of
@@ -25,7 +25,7 @@ _SAMPLE = 100
 
 
 @dataclass(frozen=True, slots=True)
-class ThumbnailScene(BesideTextScene):
+class ThumbnailScene(PaintedScene):
     """A linear thumbnail; `white` is None unless the user gives it."""
 
     def read(self) -> tuple[Image, Mask]:
@@ -60,14 +60,7 @@ def open_ffcc(place: str, options: DataOptions, listed: Folder | None = None) ->
         prefix = below.path.relative_to(folder.path).as_posix()
         prefix = "" if prefix == "." else f"{prefix}/"
         scenes.extend(
-            ThumbnailScene(
-                f"{prefix}{name}.png",
-                path,
-                (1.0, 1.0, 1.0),
-                black,
-                options.saturation,
-                f"{path[:-4]}.txt",
-            )
+            ThumbnailScene(f"{prefix}{name}.png", path, f"{path[:-4]}.txt", black, options.saturation)
             for name, path in images.items()
             if name in texts
         )

@@ -262,21 +262,21 @@ class RawScene:
     """An image in a file, with its levels; a layout with a mask has a subclass.
 
     - `name`: the image's name, unique in its data set.
-    - `light`: linear camera RGB of the light, of any length.
+    - `light`: linear camera RGB of the light, of any length; or the path of its text file, read when it is asked for.
     - `black`: black level, in the units of the file.
     - `white`: value from which a pixel is clipped, in the units of the file, black not subtracted; None if none is.
     """
 
     name: str
     path: str
-    light: Light
+    light: Light | str
     black: float
     white: float | None
 
     @property
     def truth(self) -> npt.NDArray[np.float64]:
         """The light (3,) float64, linear camera RGB of any length."""
-        return np.array(self.light)
+        return np.array(read_light(self.light) if isinstance(self.light, str) else self.light)
 
     @property
     def saturation(self) -> float | None:
@@ -295,18 +295,8 @@ class RawScene:
 
 
 @dataclass(frozen=True, slots=True)
-class BesideTextScene(RawScene):
-    """An image whose light stands in a text file of its own, read when it is asked for; `light` is not used.
-
-    Pixels that are zero in every channel are masked: in such data sets that is how charts and faces are painted over.
-    """
-
-    truth_path: str = ""
-
-    @property
-    def truth(self) -> npt.NDArray[np.float64]:
-        """The light (3,) float64, linear camera RGB of any length."""
-        return np.array(read_light(self.truth_path))
+class PaintedScene(RawScene):
+    """An image whose pixels that are zero in every channel are masked: so charts and faces are painted over."""
 
     def mask(self, image: Image) -> Mask:
         """Return (H, W) bool, True where every channel of the image (H, W, 3) is zero."""

@@ -84,6 +84,9 @@ class Shift:
         return float(np.hypot(self.dx, self.dy))
 
 
+_UNKNOWN = Shift(0.0, 0.0, 0.0, 0)
+
+
 def gauge_boxes(framing: Framing) -> list[tuple[int, int, int, int]]:
     """Return the parts of a plane that `shift_between` reads, in elements: left, top, right, bottom (exclusive)."""
     if framing.field is None:
@@ -121,7 +124,7 @@ def shift_between(reference: Plane, framing: Framing, plane: Plane) -> Shift:
         return _field_shift(reference, plane, framing.field)
     shifts = [shift for tag in _gauge_tags(framing) if (shift := _tag_shift(reference, plane, tag)) is not None]
     if not shifts:
-        return Shift(0.0, 0.0, 0.0, 0)
+        return _UNKNOWN
     table = np.array(shifts)
     median = np.median(table, axis=0)
     largest = float(np.linalg.norm(table[:, :2], axis=1).max())
@@ -197,7 +200,6 @@ def _strip_places(middles: _Points, normals: _Points) -> _Points:
 
 def _field_shift(reference: Plane, plane: Plane, field: FoundField) -> Shift:
     """Return the movement of the field, from how far strips of its outline moved across themselves."""
-    unknown = Shift(0.0, 0.0, 0.0, 0)
     middles, normals = _strips(field)
     height, width = reference.values.shape
     places = _strip_places(middles, normals) - reference.offset_px
@@ -206,7 +208,7 @@ def _field_shift(reference: Plane, plane: Plane, field: FoundField) -> Shift:
     inside = np.asarray(seen_whole.all(axis=(1, 2, 3)))
     middles, normals, places = middles[inside], normals[inside], places[inside]
     if len(middles) < _MIN_STRIPS:
-        return unknown
+        return _UNKNOWN
     before = _sampled(reference, places)
     slope = np.asarray(np.gradient(before, axis=2))
     # As for a tag, but blur along an edge shows nothing.
@@ -235,7 +237,7 @@ def _field_shift(reference: Plane, plane: Plane, field: FoundField) -> Shift:
     correlation = (centred[0] * centred[1]).sum(axis=1) / np.maximum(power, 1e-9)
     good = (correlation > _LEAST_CORRELATION) & (np.abs(moved) < MAX_SHIFT_PX)
     if good.sum() < max(_MIN_STRIPS, 0.5 * len(middles)):
-        return unknown
+        return _UNKNOWN
     left = now - np.einsum("kni,ki->kn", design, solution)
     known = 1 / np.asarray(np.linalg.inv(gram), dtype=np.float64)[:, 2, 2]
     weights = known * solution[:, 0] ** 2 / np.maximum((left**2).mean(axis=1), 1e-9)

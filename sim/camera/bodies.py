@@ -268,7 +268,11 @@ def _stops(scale: records.Scale, first: int, last: int, thirds: bool = True) -> 
 
 _WHEEL = tuple(range(2500, 10001, 100))
 _SHIFT = tuple(number & 0xFFFFFFFF for number in range(-9, 10))
-_COMPENSATIONS = tuple(code & 0xFF for code in range(-40, 41) if code % 8 in (0, 3, 5))
+
+
+def _thirds(least: int, most: int) -> tuple[int, ...]:
+    """Return the codes of corrections in thirds of a stop, an eighth of a stop a unit, between two numbers of stops."""
+    return tuple(code & 0xFF for code in range(8 * least, 8 * most + 1) if code % 8 in (0, 3, 5))
 
 
 def _jpegs(*sizes: tuple[int, bool]) -> tuple[ImageFile, ...]:
@@ -396,7 +400,7 @@ _CHOICES_550D = _Choices(
     white_balance=(WhiteBalance.AUTO, *_COMMON_WHITE),
     drive=(DriveMode.SINGLE, DriveMode.CONTINUOUS, DriveMode.TIMER_10_S, DriveMode.TIMER_2_S),
     picture_styles=_STYLES,
-    bracketing=(0x00, 0x03, 0x05, 0x08, 0x0B, 0x0D, 0x10),
+    bracketing=_thirds(0, 2),
     compensation=(),
     outputs=(1, 2),
     temperatures=(),
@@ -461,8 +465,8 @@ EOS_6D_MARK_II = EosModel(
                 DriveMode.TIMER_CONTINUOUS,
             ),
             picture_styles=(0x87, 0x81, 0x82, 0x83, 0x88, *_STYLES[3:]),
-            bracketing=(0x00, 0x03, 0x05, 0x08, 0x0B, 0x0D, 0x10, 0x13, 0x15, 0x18),
-            compensation=_COMPENSATIONS,
+            bracketing=_thirds(0, 3),
+            compensation=_thirds(-5, 5),
             outputs=tuple(range(12)),
             temperatures=_WHEEL,
             auto_power_off_s=60,

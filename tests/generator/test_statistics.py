@@ -105,6 +105,14 @@ def test_numbers_of_two_colours() -> None:
     assert chroma.sum() == pytest.approx(1)
 
 
+def test_a_cell_is_near_grey_up_to_three_degrees_from_white() -> None:
+    # Away from white across it, by the tangent of the angle.
+    across = np.array([1.0, -1.0, 0.0]) / np.sqrt(2)
+    tilted = [np.ones(3) / np.sqrt(3) + np.tan(np.radians(degrees)) * across for degrees in (0.0, 2.9, 3.1, 5.0)]
+    values, _, _ = numbers_of_cells(np.array(tilted).reshape(2, 2, 3))
+    assert values["near_grey"] == 0.5
+
+
 def test_an_image_without_colour_has_no_numbers() -> None:
     values, luminance, chroma = numbers_of_cells(np.full((4, 4, 3), np.nan))
     assert all(np.isnan(value) for value in values.values())

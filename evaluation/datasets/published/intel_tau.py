@@ -17,7 +17,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from evaluation.datasets.files import BesideTextScene, Folder, read_text
+from evaluation.datasets.files import Folder, PaintedScene, read_text
 from evaluation.datasets.options import DataOptions, choose, stated
 from evaluation.scene import SceneSet
 from foundation.errors import FormatError, first_of
@@ -49,7 +49,7 @@ def open_intel_tau(place: str, options: DataOptions, listed: Folder | None = Non
     subset = choose(options.subset, there, "subset", place)
     black = 0.0 if options.black is None else options.black
     white = float(WHITE) if options.saturation is None else options.saturation
-    scenes: list[BesideTextScene] = []
+    scenes: list[PaintedScene] = []
     counts: list[str] = []
     for name, known in cameras.items():
         if camera not in (None, name):
@@ -88,7 +88,7 @@ def _cameras(folder: Folder) -> dict[str, Folder]:
     return {name: below for name, below in folder.folders.items() if any(part in below.folders for part in SUBSETS)}
 
 
-def _scenes(folder: Folder, prefix: str, black: float, white: float, partial: bool) -> list[BesideTextScene]:
+def _scenes(folder: Folder, prefix: str, black: float, white: float, partial: bool) -> list[PaintedScene]:
     images = folder.images((".tiff", ".tif"))
     lights = {_unpadded(name[:-3]): name for name in folder.files if name.endswith(".wp")}
     known = {_unpadded(name): name for name in images}
@@ -105,9 +105,7 @@ def _scenes(folder: Folder, prefix: str, black: float, white: float, partial: bo
             "each; complete the copy, or take what is there with --partial"
         )
     return [
-        BesideTextScene(
-            f"{prefix}{name}.tiff", images[name], (1.0, 1.0, 1.0), black, white, str(folder.path / lights[key])
-        )
+        PaintedScene(f"{prefix}{name}.tiff", images[name], str(folder.path / lights[key]), black, white)
         for key, name in known.items()
     ]
 
@@ -118,7 +116,7 @@ def _unpadded(name: str) -> str:
     return f"{head}_{int(number)}" if number.isdecimal() else name
 
 
-def _folds(folder: Folder, scenes: Sequence[BesideTextScene]) -> tuple[int, ...] | None:
+def _folds(folder: Folder, scenes: Sequence[PaintedScene]) -> tuple[int, ...] | None:
     """Return the authors' fold of each scene, or None where their lists are not there or do not name every scene."""
     lists = folder.folders.get("splits")
     paths = (

@@ -141,6 +141,7 @@ def test_real_cross_validation_is_that_of_the_command_cv(place: Path) -> None:
     assert main([*BASIC, "--out", "out"]) == 0
     assert main(["cv", "own.py:Map", "real.npz", "--out", "cv"]) == 0
     assert (place / "out" / "folds_0.csv").read_text() == (place / "cv" / "folds.csv").read_text()
+    assert json.loads((place / "out" / "run.json").read_text())["settings"]["folds"] == "3"
     ours, theirs = read_errors(place / "out"), read_errors(place / "cv")
     for name in ("Map of the mean", "Constant light"):
         np.testing.assert_allclose(
@@ -152,6 +153,7 @@ def test_folds_are_read(place: Path, capsys: pytest.CaptureFixture[str]) -> None
     (place / "folds.csv").write_text("image,fold\n" + "".join(f"real_{n:02d},{n % 2}\n" for n in range(30)))
     assert main([*BASIC, "--folds", "folds.csv", "--out", "out", "--statistics", "none"]) == 0
     assert (place / "out" / "folds_0.csv").read_text() == (place / "folds.csv").read_text()
+    assert json.loads((place / "out" / "run.json").read_text())["settings"]["folds"] == "folds.csv"
     cross_validated = [line for line in capsys.readouterr().out.splitlines() if "cross-validated" in line]
     assert all(" 15 " in line for line in cross_validated[:2])
 

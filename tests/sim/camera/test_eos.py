@@ -275,6 +275,16 @@ def test_a_550d_can_be_the_one_that_was_listed() -> None:
     )
 
 
+@pytest.mark.parametrize(("body", "stops"), [(EOS_550D, 2), (EOS_6D_MARK_II, 3)], ids=["550D", "6D Mark II"])
+def test_a_bracket_is_listed_in_thirds_of_a_stop(body: EosModel, stops: int) -> None:
+    host = host_of(body)
+    host.ok(Operation.OPEN_SESSION, 1)
+    host.ok(Operation.EOS_SET_EVENT_MODE, 1)
+    codes = lists(host.events())[Property.EOS_AEB]
+    # A unit is an eighth of a stop; a third is the nearest number of them.
+    assert list(codes) == [round(8 * third / 3) for third in range(3 * stops + 1)]
+
+
 def test_a_6d_mark_ii_is_the_one_that_was_listed() -> None:
     host = host_of(EOS_6D_MARK_II)
     info = DeviceInfo.decode(host.ok(Operation.GET_DEVICE_INFO))
