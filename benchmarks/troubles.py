@@ -144,9 +144,9 @@ def _convolved(plane: _Array, power: float) -> _Array:
     """Return a plane spread by a power law of the distance, whose sum is 1; beyond the frame there is its rim."""
     rows, columns = plane.shape
     padded = np.pad(plane, ((0, rows), (0, columns)), mode="edge")
-    y = np.minimum(np.arange(2 * rows), np.arange(2 * rows, 0, -1))
-    x = np.minimum(np.arange(2 * columns), np.arange(2 * columns, 0, -1))
-    kernel: _Array = np.maximum(np.hypot(y[:, None], x), _CORE_PX) ** -power
+    y, x = (np.arange(count, dtype=np.float64) for count in (2 * rows, 2 * columns))
+    away = np.hypot(np.minimum(y, 2 * rows - y)[:, None], np.minimum(x, 2 * columns - x))
+    kernel: _Array = np.maximum(away, _CORE_PX) ** -power
     spread: _Array = np.fft.irfft2(np.fft.rfft2(padded) * np.fft.rfft2(kernel / kernel.sum()), padded.shape)
     return spread[:rows, :columns]
 
