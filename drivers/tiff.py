@@ -109,6 +109,9 @@ _MAX_DIRECTORIES: Final = 64
 _MAX_VALUES: Final = 1 << 20
 """Values of one tag: a linearisation table, the longest that is read, has at most 65 536."""
 
+_LARGEST: Final = 2.0**53
+"""Numbers of floating point that are believed: larger ones are not exact, and no place, size or level is one."""
+
 _TEXT: Final = 2
 """Type ASCII (TIFF 6.0, section 2)."""
 
@@ -253,11 +256,15 @@ def _read_value(order: str, data: bytes | memoryview, place: int, kind: int, len
     numbers = _unpack(order, one * length if len(one) == 2 else f"{length}{one}", data, place)
     if len(one) == 2:
         return tuple(top / bottom if bottom else 0.0 for top, bottom in zip(numbers[::2], numbers[1::2], strict=True))
+    if one in "fd" and not all(abs(number) <= _LARGEST for number in numbers):
+        raise TiffDamaged(f"a tag holds numbers beyond {_LARGEST:g}, or none")
     return tuple(numbers)
 
 
 def _unpack(order: str, layout: str, data: bytes | memoryview, offset: int) -> tuple[int, ...]:
     try:
+        if not 0 <= offset <= len(data):
+            raise struct.error
         return struct.unpack_from(order + layout, data, offset)
     except struct.error as error:
         raise TiffDamaged(f"it points to byte {offset}, and has only {len(data)}") from error
