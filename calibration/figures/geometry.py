@@ -187,8 +187,8 @@ CORRECTION_RESIDUAL = Figure(
     "correction_residual", "Light of surroundings that may be left in cells' means", "radiometry", "share", "at most",
     0.01, 0.03,
     why="what the lens spreads, or may spread as a veil that an evenly lit print cannot show, is in the samples",
-    source=SIMULATED + ": 0.1 to 0.2 % where light falls off towards the corners, and the means are as good; 1.4 % in "
-    "even light or on a chart of 512 colours, which do not show a veil of the usual 1 %",
+    source=SIMULATED + ": 0.3 to 0.5 % where light falls off towards the corners, and the means twice as good; 1.4 % "
+    "in even light or on a chart of 512 colours, which do not show a veil of the usual 1 %",
     remedy=_LESS_VEIL,
     measure=_left_by_lens, forecast=ONLY_OF_A_SESSION,
     worst=NO_PLACE, where=_veil, retake=NO_FRAMES, cause=NO_CAUSE,
