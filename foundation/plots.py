@@ -14,6 +14,9 @@ from importlib import resources
 from io import BytesIO
 from typing import Any
 
+import numpy as np
+import numpy.typing as npt
+
 INK, FAINT, GRID, PAPER = "#22262b", "#5b636d", "#e3e6ea", "#fdfdfe"
 """Colours of text, of axes and notes, of rules, and of the page itself; an SVG's are exchanged on a dark screen."""
 
@@ -142,6 +145,26 @@ def standalone(svg: bytes) -> bytes:
     colours = (resources.files("foundation") / "templates" / "colours.css").read_text(encoding="utf-8")
     style = f"<style>{colours}svg {{ background: var(--paper); font-family: system-ui, sans-serif }}</style>"
     return re.sub(rb"(<svg\b[^>]*>)", lambda found: found[1] + style.encode(), svg, count=1)
+
+
+def draw_squares(
+    axes: Any,
+    page_mm: tuple[float, float],
+    places_mm: npt.NDArray[np.float64],
+    side_mm: float,
+    values: npt.NDArray[np.float64],
+    inches: float,
+    **colours: Any,
+) -> Any:
+    """Draw values (N,) as squares where they lie on a page, (N, 2) mm from its top left; return them for a colour bar.
+
+    `inches`: width of the axes, about. `colours`: `cmap`, `vmin`, `vmax`.
+    """
+    width, height = page_mm
+    # A marker's size is an area in points, 72 to an inch.
+    points = max(72 * inches / width * side_mm, 1.2)
+    axes.set(xlabel="mm", xlim=(0, width), ylim=(height, 0), aspect="equal")
+    return axes.scatter(*places_mm.T, c=values, s=points**2, marker="s", linewidths=0, **colours)
 
 
 def _write_plain_numbers(figure: Any) -> None:

@@ -58,7 +58,10 @@ OTHER: dict[type[ast.AST], type[ast.AST]] = {
 
 @dataclass(frozen=True)
 class Mutation:
-    """One changed place: its file, relative to the checkout, line, old and new source of the expression."""
+    """One changed place: its file, relative to the checkout, line, old and new source of the expression.
+
+    `text`: the line as it stands, by which the place is found again where others have moved it.
+    """
 
     file: str
     line: int
@@ -67,6 +70,7 @@ class Mutation:
     column: int
     last_line: int
     last_column: int
+    text: str
 
     def apply(self, folder: Path) -> str:
         """Change the place in a copy of the checkout and return the file's text as it was."""
@@ -107,7 +111,8 @@ def _is_text(node: ast.BinOp) -> bool:
 
 def places(path: Path) -> Iterator[Mutation]:
     """Yield every mutation of a file."""
-    tree = ast.parse(path.read_text(encoding="utf-8"))
+    source = path.read_text(encoding="utf-8")
+    tree, lines = ast.parse(source), source.splitlines()
     left_out = set[int]()
     for node in ast.walk(tree):
         skipped: list[ast.AST] = []
@@ -136,6 +141,7 @@ def places(path: Path) -> Iterator[Mutation]:
                     node.col_offset,
                     node.end_lineno or node.lineno,
                     node.end_col_offset or 0,
+                    lines[node.lineno - 1].strip(),
                 )
 
 
@@ -146,12 +152,15 @@ def drawn(count: int, seed: int) -> list[Mutation]:
 
 
 def survivors(results: Path) -> list[Mutation]:
-    """Return the mutations that survived by a file of results, at their places as of now; those that left are gone."""
-    latest = {tuple(row["mutation"].values()): row["killed by"] for row in _rows(results)}
+    """Return the mutations that survived by a file of results, at their places as of now, where these still are."""
+    latest = {Mutation(**row["mutation"]): row["killed by"] for row in _rows(results)}
     found: list[Mutation] = []
-    for file, line, before, after, *_ in (key for key, by in latest.items() if not by):
-        alike = [one for one in places(ROOT / file) if (one.before, one.after) == (before, after)]
-        found += sorted(alike, key=lambda one: abs(one.line - line))[:1]
+    for old in (one for one, by in latest.items() if not by):
+        said = (old.before, old.after, old.text)
+        alike = [one for one in places(ROOT / old.file) if (one.before, one.after, one.text) == said]
+        if not alike:
+            print(f"{old.file}:{old.line}: {old.text!r} is not there any more", file=sys.stderr)
+        found += sorted(alike, key=lambda one: (abs(one.line - old.line), abs(one.column - old.column)))[:1]
     return found
 
 

@@ -453,9 +453,9 @@ def _textures(plane: Plane) -> Framing:
         for column in range(across):
             top, bottom = (max(margin, row * height // down), min(height - margin, (row + 1) * height // down))
             left, right = (max(margin, column * width // across), min(width - margin, (column + 1) * width // across))
-            if bottom <= top or right <= left:
-                continue
             part = energy[top:bottom, left:right]
+            if not part.size:
+                continue
             y, x = divmod(int(part.argmax()), part.shape[1])
             middle = np.array([left + x, top + y]) + plane.offset_px
             corners = np.array([(-half, -half), (half, -half), (half, half), (-half, half)])

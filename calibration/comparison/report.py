@@ -30,7 +30,7 @@ from experiment.chart.model import Chart
 from foundation.errors import first_of
 from foundation.files import whole_folder, write_whole
 from foundation.pages import figure, heading, note, page, table, verdict
-from foundation.plots import FAINT, INK, MARK, png_of
+from foundation.plots import FAINT, INK, MARK, draw_squares, png_of
 from foundation.records import to_plain
 
 FORMAT = "crop.comparison"
@@ -253,13 +253,9 @@ def draw_map(figure: Any, chart: Chart, cells: CellDifferences) -> None:
     filled = np.nan_to_num(cells.mean - cells.offset)
     largest = np.take_along_axis(filled, np.abs(filled).argmax(axis=1)[:, None], axis=1)[:, 0]
     reach = max(0.5, 100 * float(np.percentile(np.abs(largest), 99)))
-    # A marker's size is an area in points: of a cell, with the axes about 8.2 inches wide.
-    side = 72 * 8.2 / page_w * float(np.mean(chart.cell_mm))
-    image = axes.scatter(
-        *chart.centres_mm[chart.cell_of_colour].T, c=100 * largest, s=side**2, marker="s", linewidths=0, cmap="RdBu",
-        vmin=-reach, vmax=reach,
-    )  # fmt: skip
-    axes.set(xlabel="mm", ylabel="mm", xlim=(0, page_w), ylim=(page_h, 0), aspect="equal")
+    places, side_mm = chart.centres_mm[chart.cell_of_colour], float(np.mean(chart.cell_mm))
+    image = draw_squares(axes, chart.page_mm, places, side_mm, 100 * largest, 8.2, cmap="RdBu", vmin=-reach, vmax=reach)
+    axes.set_ylabel("mm")
     figure.colorbar(image, ax=axes, label="B over A, %", shrink=0.8, extend="both")
 
 

@@ -31,7 +31,7 @@ from experiment.framing.planes import CHANNELS, frame_black, phases
 from experiment.measures.paper import FlatField
 from experiment.measures.stains import Stains
 from foundation.colorimetry import decode_srgb
-from foundation.plots import CHANNEL_INK, FAINT, INK, MARK
+from foundation.plots import CHANNEL_INK, FAINT, INK, MARK, draw_squares
 
 WORST_CELLS = 20
 """Cells that are shown magnified: two rows of ten."""
@@ -211,13 +211,11 @@ def draw_print(figure: Any, chart: Chart, stains: Stains) -> None:
     figure.set_size_inches(10, 8.6 * page_h / page_w)
     axes = figure.subplots()
     places = chart.centres_mm[chart.cell_of_colour]
-    # A marker's size is an area in points: of a cell, with the axes about 8.2 inches wide.
-    side = 72 * 8.2 / page_w * float(np.mean(chart.cell_mm))
-    image = axes.scatter(
-        *places.T, c=100 * stains.largest_deviation(), s=side**2, marker="s", linewidths=0, cmap="RdBu", vmin=-3, vmax=3
-    )
+    deviation, side_mm = 100 * stains.largest_deviation(), float(np.mean(chart.cell_mm))
+    image = draw_squares(axes, chart.page_mm, places, side_mm, deviation, 8.2, cmap="RdBu", vmin=-3, vmax=3)
+    side = float(np.sqrt(image.get_sizes()[0]))
     axes.plot(*places[stains.stained].T, "x", color=INK, markersize=max(3.0, 0.5 * side), markeredgewidth=0.8)
-    axes.set(xlabel="mm", ylabel="mm", xlim=(0, page_w), ylim=(page_h, 0), aspect="equal")
+    axes.set_ylabel("mm")
     figure.colorbar(image, ax=axes, label="deviation, %; brighter is positive", shrink=0.8, extend="both")
 
 
@@ -435,24 +433,20 @@ def draw_errors(figure: Any, table: TableMeasurements, chart: Chart) -> None:
     page_w, page_h = chart.page_mm
     figure.set_size_inches(10, 0.2 + 4.6 * page_h / page_w)
     left, right = figure.subplots(1, 2)
-    side = 72 * 4.1 / page_w * float(np.mean(chart.cell_mm))
+    side_mm = float(np.mean(chart.cell_mm))
     stains = table.cells.stains
     if stains.known:
         off = 100 * stains.largest_deviation()
         places = chart.centres_mm[chart.cell_of_colour]
         limit = max(1.0, float(np.abs(off).max()))
-        image = left.scatter(
-            *places.T, c=off, s=max(side, 1.2) ** 2, marker="s", linewidths=0, cmap="RdBu", vmin=-limit, vmax=limit
-        )
+        image = draw_squares(left, chart.page_mm, places, side_mm, off, 4.1, cmap="RdBu", vmin=-limit, vmax=limit)
         figure.colorbar(image, ax=left, label="%, brighter is positive", shrink=0.8)
         _mark(left, places[int(np.argmax(np.abs(off)))])
     else:
         left.text(0.5, 0.5, "too few colours to compare", ha="center", va="center", transform=left.transAxes)
     error = table.registration.uncertainty_px(chart.centres_mm)
-    image = right.scatter(
-        *chart.centres_mm.T, c=error, s=max(side, 1.2) ** 2, marker="s", linewidths=0, cmap="cividis", vmin=0,
-        vmax=max(float(np.percentile(error, _SHOWN_PERCENTILE)), 1e-3),
-    )  # fmt: skip
+    most = max(float(np.percentile(error, _SHOWN_PERCENTILE)), 1e-3)
+    image = draw_squares(right, chart.page_mm, chart.centres_mm, side_mm, error, 4.1, cmap="cividis", vmin=0, vmax=most)
     figure.colorbar(image, ax=right, label="half-size px", shrink=0.8, extend="max")
     _mark(right, chart.centres_mm[int(np.argmax(error))])
     left.set(title="colour of cells against their codes", ylabel="mm")

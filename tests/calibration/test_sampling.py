@@ -154,4 +154,7 @@ def test_the_largest_windows_are_those_of_the_table_of_arrangements() -> None:
     assert largest_window(10.2, 0.7) == 5
     assert largest_window(12.4, 0.7) == 7
     assert largest_window(4.0, 0.7) == 0
+    # 0.3 % of a sample of 5×5 would come from beyond a cell of 9.35 px, 0.17 % beyond one of 9.6 px.
+    assert [bleed(cell_px, 0.7) for cell_px in (9.35, 9.6)] == pytest.approx([0.003, 0.0017], abs=1e-4)
+    assert [largest_window(cell_px, 0.7) for cell_px in (9.35, 9.6)] == [3, 5]
     assert [bleed(10.2, 0.7, window) for window in WINDOWS] == sorted(bleed(10.2, 0.7, window) for window in WINDOWS)

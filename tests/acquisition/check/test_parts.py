@@ -18,7 +18,7 @@ from acquisition.check.camera import (
     series_times,
     tilt_deg,
 )
-from acquisition.check.light_and_print import judge_flicker, judge_primaries, measure_light
+from acquisition.check.light_and_print import AREAS, area_name, areas_of, judge_flicker, judge_primaries, measure_light
 from acquisition.check.places import Levels
 from drivers.camera import CameraIdentity, CapturedFrame, ExposureSettings, Supplies
 from experiment.chart.layout import design_chart
@@ -173,3 +173,15 @@ def test_light_is_read_from_few_references_and_from_many(bits: int, few: bool) -
     assert np.abs(error).max() < (0.04 if few else 0.005)
     without = replace(chart, references=chart.references[:3])
     assert measure_light(without, Levels(seen[:3], np.zeros(3, dtype=np.bool_))) is None
+
+
+def test_areas_are_numbered_row_by_row_and_each_has_a_name_of_its_own() -> None:
+    chart = design_chart(3, "A7")
+    rows, columns = AREAS
+    down, across = np.divmod(np.arange(rows * columns), columns)
+    middles = np.stack([(across + 0.5) / columns, (down + 0.5) / rows], axis=-1) * chart.page_mm
+    assert areas_of(middles, chart).tolist() == list(range(rows * columns))
+    assert areas_of(np.array([(-1.0, -1.0), chart.page_mm]), chart).tolist() == [0, rows * columns - 1]
+    names = [area_name(number) for number in range(rows * columns)]
+    assert len(set(names)) == len(names)
+    assert [names[number] for number in (0, 7, 14)] == ["the top far left", "the middle", "the bottom far right"]

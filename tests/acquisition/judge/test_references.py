@@ -131,6 +131,16 @@ def test_a_dark_frame_with_the_light_of_the_frame_before_is_named_a_screen_that_
     assert "stand still" in same.reason
 
 
+def test_what_a_frame_leaves_is_told_of_all_that_is_expected_darkness_and_light() -> None:
+    dark, white = measured((500, 500, 500)), measured((1500, 1500, 1500))
+    tiles = white.tiles.copy()
+    tiles[7] *= 1.1
+    left = Basis.of_white(white, dark).light(measured(tiles)).tiles
+    assert left.relative[7] == pytest.approx(0.1, abs=1e-3)
+    assert left.signed[7] == pytest.approx(0.1, abs=1e-3)
+    assert np.delete(left.relative, 7).max() < 1e-3
+
+
 @pytest.mark.parametrize("sign", [1, -1])
 def test_paper_white_is_held_against_the_first_of_the_session(sign: int) -> None:
     paper = np.array([500.0, 1000.0, 700.0])

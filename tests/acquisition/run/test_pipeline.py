@@ -485,6 +485,7 @@ class TestEnding:
         with pytest.raises(KeyboardInterrupt):
             run(lab, ending=ending)
         assert lab.verdicts() == ["accepted", "accepted", None]
+        assert [event.what for event in lab.session.journal.events()][-1] == "interrupted"
         assert not [path for path in (folder / "frames").iterdir() if path.name.startswith(".")]
         assert run(lab).complete
 

@@ -10,10 +10,13 @@ import pytest
 
 from calibration.radiometry.dark_frames import (
     DarkFrameFigures,
+    DarkLight,
+    DarkLightEstimate,
     HotPixels,
     dark_summary,
     measure_dark_frame,
 )
+from experiment.measures.paper import FlatField, Paper
 from experiment.session.records import FrameRecord
 from foundation.records import from_plain, to_plain
 
@@ -48,6 +51,20 @@ def test_leak_and_hot_photosites_are_read() -> None:
     assert np.flatnonzero(dark.hottest).tolist() == [17]
     assert dark.hottest[17] == pytest.approx(200, abs=20)
     assert len(dark.blacks) == 3
+
+
+def test_the_dark_light_of_two_frames_is_their_mean() -> None:
+    paper = Paper(FlatField.uniform((1, 1)), np.array([4.0, 7.0, 5.0]), np.full(3, 0.1), 9, np.zeros(3))
+    beyond = np.random.default_rng(3).normal(0, 2, (50, 3))
+    estimate = DarkLightEstimate.none(np.full((50, 3), 0.5), np.ones(50, dtype=bool), 25)
+    found: list[DarkLight] = []
+    for times in (1.0, 3.0):
+        means = 0.5 * paper.white + times * beyond
+        estimate, light = estimate.with_frame(means, np.zeros(3), paper, np.ones((50, 3)))
+        found.append(light)
+    # Without noise all that lies beyond the prediction is believed.
+    np.testing.assert_allclose(found[0].patches, 0.5 * paper.white + beyond, rtol=1e-5)
+    np.testing.assert_allclose(found[1].patches, 0.5 * paper.white + 2 * beyond, rtol=1e-5)
 
 
 def test_a_hot_photosite_is_remembered_over_a_bump() -> None:

@@ -1,4 +1,4 @@
-"""Half-size linear RGB, of any Bayer phase and any size."""
+"""Half-size linear RGB, of any Bayer phase and any size; and what is drawn of cells and lights."""
 
 from __future__ import annotations
 
@@ -6,10 +6,15 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from matplotlib.figure import Figure
 
-from calibration.report.plots import half_size
+from calibration.comparison.comparing import CellDifferences
+from calibration.comparison.report import draw_map
+from calibration.report.plots import draw_chromaticities, draw_print, half_size
 from drivers.raw.plain_dng import Area
 from drivers.raw.rawfile import Mosaic
+from experiment.chart.layout import design_chart
+from experiment.measures.stains import Stains
 
 
 def mosaic_of(
@@ -52,3 +57,54 @@ def test_the_masked_border_overrules_the_metadata() -> None:
     counts[:, :20] = 128
     image = half_size(mosaic_of(counts, "RGGB", (Area(0, 0, 200, 20),)))
     assert image == pytest.approx(872)
+
+
+CHART = design_chart(3, "A7")
+CELLS = CHART.centres_mm[CHART.cell_of_colour]
+
+
+def test_what_a_print_is_off_by_is_drawn_in_per_cent_where_its_cells_lie() -> None:
+    deviation = np.linspace(-0.02, 0.03, len(CELLS))
+    off = np.stack([deviation, deviation / 2, 0 * deviation], axis=-1)
+    stained = np.arange(len(CELLS)) == 5
+    figure = Figure()
+    draw_print(figure, CHART, Stains(off, np.full_like(off, 1e-6), off, stained, np.ones_like(off), CELLS))
+    axes = figure.axes[0]
+    (squares,) = axes.collections
+    np.testing.assert_allclose(np.asarray(squares.get_offsets()), CELLS)
+    np.testing.assert_allclose(np.asarray(squares.get_array()), 100 * deviation)
+    np.testing.assert_allclose(np.asarray(axes.lines[0].get_xydata()), CELLS[5:6])
+    # The page's first row is at the top.
+    assert (axes.get_xlim(), axes.get_ylim()) == ((0, CHART.page_mm[0]), (CHART.page_mm[1], 0))
+
+
+def test_what_cells_of_two_tables_differ_by_is_drawn_in_the_channel_that_differs_most() -> None:
+    random = np.random.default_rng(1)
+    mean, none = random.normal(0, 0.01, (len(CELLS), 3)), np.zeros((len(CELLS), 3))
+    mean[7] = np.nan
+    offset = np.array([0.001, -0.002, 0.0])
+    count = np.ones((len(CELLS), 3), dtype=np.int64)
+    cells = CellDifferences(count, mean, none, none, none, count, none, (), (), 1.0, 0.0, 0.0, offset)
+    figure = Figure()
+    draw_map(figure, CHART, cells)
+    axes = figure.axes[0]
+    (squares,) = axes.collections
+    left = mean - offset
+    largest = [row[np.abs(row).argmax()] if np.isfinite(row).all() else 0.0 for row in left]
+    np.testing.assert_allclose(np.asarray(squares.get_offsets()), CELLS)
+    np.testing.assert_allclose(np.asarray(squares.get_array()), 100 * np.array(largest))
+    assert (axes.get_xlim(), axes.get_ylim()) == ((0, CHART.page_mm[0]), (CHART.page_mm[1], 0))
+
+
+def test_lights_are_drawn_at_their_chromaticities_in_the_triangle_of_all() -> None:
+    codes = np.array([[255.0, 0, 0], [255, 255, 255], [0, 0, 0], [0, 0, 255]])
+    white = np.array([[600.0, 300, 100], [200, 500, 300], [0, 0, 0], [100, 300, 600]])
+    figure = Figure()
+    draw_chromaticities(figure, codes, np.array([False, True, False, False]), white, "seen", worst=0)
+    for axes, places in zip(
+        figure.axes, [[(1, 0), (0, 1), (1 / 3, 1 / 3)], *[[(0.6, 0.1), (0.1, 0.6), (0.2, 0.3)]] * 2], strict=True
+    ):
+        assert np.unique(np.asarray(axes.lines[0].get_xydata()), axis=0).tolist() == [[0, 0], [0, 1], [1, 0]]
+        # Black bodies come second; a light without light has no chromaticity.
+        drawn = np.concatenate([np.asarray(dots.get_offsets()) for dots in axes.collections])
+        np.testing.assert_allclose(drawn, places, atol=1e-9)

@@ -135,6 +135,19 @@ def test_waits_until_the_mode_has_changed(table: Table) -> None:
     assert table.controller.read(LightCrafterCommand.DISPLAY_MODE) == b"\0"
 
 
+@pytest.mark.parametrize(("takes_s", "is_waited_for"), [(2.5, True), (4.0, False)])
+def test_a_mode_is_waited_for_ten_times_as_long_as_it_takes(table: Table, takes_s: float, is_waited_for: bool) -> None:
+    read = table.controller.read
+
+    def later(command: int) -> bytes | None:
+        early = table.clock.monotonic() < takes_s
+        return b"\1" if early and command == LightCrafterCommand.DISPLAY_MODE else read(command)
+
+    table.controller.read = later  # type: ignore[method-assign, assignment]
+    with contextlib.nullcontext() if is_waited_for else pytest.raises(DeviceError, match="display mode"):
+        table.presenter()
+
+
 @pytest.mark.parametrize(
     ("command", "value", "reason"),
     [

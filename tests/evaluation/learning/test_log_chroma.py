@@ -79,6 +79,11 @@ def test_lights_that_span_more_than_the_torus_get_wider_bins() -> None:
     method = LEARNER.fit(scenes[:80])
     errors = [float(recovery_error(method.estimate(scene.image), scene.truth)) for scene in scenes[80:]]
     assert np.median(errors) < 3
+    arrays = method.model.arrays()
+    again = replace(method, model=LEARNER.restore(arrays))
+    assert again.estimate(scenes[90].image) == pytest.approx(method.estimate(scenes[90].image))
+    with pytest.raises(ValueError, match="bins of"):
+        LEARNER.restore({**arrays, "grid": np.array([0.5, 0.1])})
     with pytest.raises(InputError, match=r"span 3\.\d\d natural logarithms .* tells 3"):
         LEARNER.fit(relit(100, np.exp(np.stack([logs * 1.5, -logs], axis=1))))
 

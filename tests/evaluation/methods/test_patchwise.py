@@ -8,6 +8,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
+from evaluation.methods import gray_pixels
 from evaluation.methods.gray_pixels import LocalGraynessIndex
 from evaluation.methods.method import LocalMethod
 from evaluation.methods.standard import local_methods, standard_methods
@@ -41,6 +42,18 @@ def test_each_side_gets_its_light(method: LocalMethod) -> None:
     assert recovery_error(lights[:, -8:].reshape(-1, 3), BLUE).max() < limit
     one = recovery_error(np.tile(method.estimate(two_lights()), (2, 1)), np.stack([RED, BLUE]))
     assert one.min() > 8
+
+
+@pytest.mark.parametrize("pixels", [1, 1000])
+@pytest.mark.parametrize("name", ["grayness-index", "mean-shifted-gray-pixel"])
+def test_gray_pixels_are_those_of_the_whole_whatever_the_strips(
+    name: str, pixels: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Strips of a thousandth of the image, and of a row where a row has more pixels than a strip is to have."""
+    image, method = two_lights(), standard_methods()[name]
+    whole = method.estimate(image)
+    monkeypatch.setattr(gray_pixels, "_STRIP", pixels)
+    np.testing.assert_allclose(method.estimate(image), whole, rtol=1e-5)
 
 
 @pytest.mark.parametrize("method", local_methods().values())

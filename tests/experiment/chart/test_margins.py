@@ -109,6 +109,9 @@ def test_bars_are_as_wide_as_their_gaps() -> None:
         width = group[0, 2] - group[0, 0]
         assert group[:, 2].tolist() == (group[:, 0] + width).tolist()
         assert np.diff(group[:, 0]).tolist() == [2 * width, 2 * width]
+    # As far from the next group as a bar is wide, and 12 px at least.
+    apart = bars[1:, 0, 0] - bars[:-1, -1, 2]
+    assert apart.tolist() == [max(int(group[0, 2] - group[0, 0]), 12) for group in bars[:-1]]
     assert [int(group[0, 2] - group[0, 0]) for group in bars] == [30, 20, 15, 12, 10, 8, 6, 5, 4, 3, 2, 1]
     # 12 px are 0.98 line pairs a millimetre, 6 px twice as many: what the proof page names.
     assert abs(600 / 25.4 / 24 - 0.98) < 0.01

@@ -20,6 +20,7 @@ from generator.masks.making import (
     HalfPlanes,
     MadeMaskPlan,
     MaskMaker,
+    RandomStreams,
     SmoothFields,
     Spots,
     Windows,
@@ -271,6 +272,22 @@ def test_smooth_fields_change_over_their_scale() -> None:
     field = weights("smooth:scale=.5", 400, 400)[..., 0].astype(np.float64)
     assert np.abs(np.diff(field, axis=1)).max() < 0.06
     assert np.abs(np.diff(field, n=2, axis=0)).max() < 0.006
+
+
+def test_a_window_lies_where_it_was_drawn() -> None:
+    drawn = np.full(64, 0.5)
+    # A small one, a tenth of the picture's width to the left and as far down.
+    half, drawn[[0, 2, 3]] = (0.5, 0.375), (0, 0.3, 0.5 + 0.1 / 0.375)
+
+    class Drawn(RandomStreams):
+        def uniform(self, stream: int, count: int = 64) -> npt.NDArray[np.float64]:
+            del stream
+            return drawn[:count]
+
+    u, v = np.linspace(-0.5, 0.5, 201)[None], np.linspace(-0.375, 0.375, 151)[:, None]
+    lit = Windows(1, 1, 0.02).shares(Drawn(0, 0), half, 2, 0.005, u)(v)[1] > 0.5
+    rows, columns = np.nonzero(lit)
+    assert (u[0, columns].mean(), v[rows, 0].mean()) == pytest.approx((-0.1, 0.1), abs=0.006)
 
 
 def test_windows_have_their_panes() -> None:
