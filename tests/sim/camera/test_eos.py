@@ -285,6 +285,14 @@ def test_a_bracket_is_listed_in_thirds_of_a_stop(body: EosModel, stops: int) -> 
     assert list(codes) == [round(8 * third / 3) for third in range(3 * stops + 1)]
 
 
+def test_a_compensation_is_listed_in_thirds_of_a_stop_to_either_side() -> None:
+    host = host_of(EOS_6D_MARK_II)
+    host.ok(Operation.OPEN_SESSION, 1)
+    host.ok(Operation.EOS_SET_EVENT_MODE, 1)
+    codes = lists(host.events())[Property.EOS_EXPOSURE_COMPENSATION]
+    assert [(code + 128) % 256 - 128 for code in codes] == [round(8 * third / 3) for third in range(-15, 16)]
+
+
 def test_a_6d_mark_ii_is_the_one_that_was_listed() -> None:
     host = host_of(EOS_6D_MARK_II)
     info = DeviceInfo.decode(host.ok(Operation.GET_DEVICE_INFO))
