@@ -15,10 +15,9 @@ from statistics import median
 import numpy as np
 import numpy.typing as npt
 
-from benchmarks.generator import natural_picture, nearby_cells, noisy_table, report
+from benchmarks.generator import natural_picture, noisy_table, report
 from calibration.table.lut import Lut, open_lut
 from foundation.compiled import processor_count
-from generator.kernels.dithering import CellTable, checked_cells
 from generator.rendering.black_points import BlackPoint
 from generator.training.crops import Crops
 from generator.training.gallery import Gallery, gallery_of
@@ -54,14 +53,17 @@ def rate(seconds: list[float], crops: int) -> float:
     return crops / median(seconds)
 
 
-def _by_colour(crops: Crops, cells: CellTable) -> Crops:
+def _by_colour(crops: Crops) -> Crops:
     """Return the same crops rendered by colour, a random share of the print's black taken out."""
-    black_point = BlackPoint("random")
-    rendered = Crops(
-        crops.lut, crops.gallery, crops.size, exposure=crops.exposure, threads=crops.threads, black_point=black_point
+    return Crops(
+        crops.lut,
+        crops.gallery,
+        crops.size,
+        exposure=crops.exposure,
+        threads=crops.threads,
+        rendering="colorimetric",
+        black_point=BlackPoint("random"),
     )
-    rendered.__dict__["_cells"] = [cells] * len(rendered.lights)
-    return rendered
 
 
 def measure(lut: Lut) -> None:
@@ -76,11 +78,9 @@ def measure(lut: Lut) -> None:
         threads: Crops(lut, gallery, (SIDE, SIDE), exposure=(0.5, 1.0), threads=threads)
         for threads in sorted({1, processor_count()})
     }
-    # Cells of one kind for all lights: what is asked is how fast they are drawn, not how they are found.
-    cells = checked_cells(nearby_cells(), lut.provenance.bits)
     coloured: dict[int, list[float]] = {threads: [] for threads in ours}
     spent: dict[int, list[float]] = {threads: [] for threads in ours}
-    by_colour = {threads: _by_colour(crops, cells) for threads, crops in ours.items()}
+    by_colour = {threads: _by_colour(crops) for threads, crops in ours.items()}
     peer: list[float] = []
     for turn in range(ROUNDS + 1):
         start = time.perf_counter()

@@ -7,14 +7,11 @@ clock's. So ratios hold on a machine with other work to do, the clock's less so.
 Two lights are mixed by random weights in each pixel, which is the most work, and by masks of two kinds. Their weights,
 8 bytes a pixel, are read beside what the copy reads and writes.
 
-By colour, each pixel takes one of 16 cells around its code, as colorimetric rendering does; the ratio is to the same
-kernel by codes, in the same turns. How cells lie around a code is made up here: what a table's profile gives, of a
-simulated print, needs a table of full size, lies closer together, and is rendered up to a fifth faster.
+By colour, each pixel is interpolated between four nodes and has a recorded deviation; the ratio is to the kernel by
+codes, in the same turns. Means and deviations are made up here, which takes as long.
 
 The bound of fetching is a compiled loop that does nothing but copy the samples which the kernel draws, their places
 being known, to one place in the nearest cache: what the caches allow, whoever chooses. Two lights have a sample each.
-By colour the loop fetches each pixel's cell before its sample; its ratio to the kernel by codes is the most that
-rendering by colour could reach if finding cells cost nothing.
 """
 
 from __future__ import annotations
@@ -32,7 +29,6 @@ from pathlib import Path
 from typing import Any
 
 import cv2
-import numba
 import numpy as np
 import numpy.typing as npt
 import skimage.data
@@ -41,11 +37,11 @@ from calibration.table.lut import Lut, LutWriter, Provenance, open_lut
 from drivers.presenter import Colour
 from foundation.compiled import compiled
 from generator.kernels.choice import SCRATCH_BYTES, choose_group, row_keys
-from generator.kernels.dithering import CellTable, checked_cells, dither_row, find_places_and_choose
 from generator.kernels.mixing import mix_samples
 from generator.kernels.planar import draw_planar
+from generator.kernels.printing import NODES, PrintedLight, draw_printed
 from generator.kernels.rendering import draw_mosaic, draw_samples
-from generator.kernels.vector import GROUP, LANES, LINE, SAMPLE_BYTES, copy8, offset_at, prefetch_once
+from generator.kernels.vector import GROUP, LINE, copy8, offset_at, prefetch_once
 from generator.masks.making import parse_masks
 from generator.rendering.black_points import Veil, without_veil
 
@@ -159,49 +155,13 @@ def fetching(tables: npt.NDArray[np.uint16], picture: npt.NDArray[np.uint8]) -> 
     )
 
 
-@compiled
-def _place_all(picture: int, width: int, height: int, count: Any, places: int, choices: int) -> None:
-    groups = width // GROUP
-    for y in range(height):
-        keys, inks = dither_row(0, y, 0, np.uint64(0))
-        for group in range(groups):
-            source, word = picture + 3 * (y * width + GROUP * group), numba.uint32(LANES * group)
-            at = 4 * GROUP * (y * groups + group)
-            find_places_and_choose(source, word, keys[0], keys[1], keys[2], inks[1], count, places + at, choices + at)
-
-
-@compiled
-def _fetch_by_colour(samples: int, cells: int, stride: int, places: int, choices: int, count: int, target: int) -> None:
-    for i in range(0, count, GROUP):
-        place, choice = places + 4 * i, choices + 4 * i
-        for line in range(0, 4 * GROUP, LINE):
-            prefetch_once(place + 2048 + line)
-            prefetch_once(choice + 2048 + line)
-        for k in range(GROUP):
-            cell = offset_at(cells + 2 * offset_at(place + 4 * k)) & 0xFFFF
-            copy8(samples + stride * cell + offset_at(choice + 4 * k), target + 8 * k)
-
-
-def fetching_by_colour(samples: npt.NDArray[np.uint16], picture: npt.NDArray[np.uint8], cells: CellTable) -> Call:
-    """Return a call that loads the cell and then the sample of each pixel; the width must be whole groups."""
-    height, width = picture.shape[:2]
-    places, choices = np.zeros((2, height, width), np.uint32)
-    scratch = np.empty(SCRATCH_BYTES, np.uint8)
-    at = places.ctypes.data, choices.ctypes.data
-    _place_all(picture.ctypes.data, width, height, np.uint32(SAMPLES), *at)
-    tables = samples.ctypes.data, cells.cells.ctypes.data, SAMPLE_BYTES * SAMPLES
-    return lambda: (_fetch_by_colour(*tables, *at, width * height, scratch.ctypes.data), places, choices)
-
-
-def nearby_cells() -> npt.NDArray[np.uint16]:
-    """Return 16 cells (32768, 16) uint16 for each source node, some six distinct ones within two codes of it."""
+def printed_by_chance() -> tuple[PrintedLight, npt.NDArray[np.uint32]]:
+    """Return what a light makes of a print, and the cells of its nodes: numbers as large as a table's, at random."""
     rng = np.random.default_rng(6)
-    node = np.arange(32768)
-    codes = np.stack([node >> 10, node >> 5 & 31, node & 31], axis=-1)
-    some = codes[:, None] + rng.integers(-2, 3, (32768, 6, 3))
-    taken = rng.choice(6, (32768, 16), p=(0.4, 0.25, 0.15, 0.1, 0.06, 0.04))
-    red, green, blue = np.clip(np.take_along_axis(some, taken[..., None], 1), 0, 31).transpose(2, 0, 1)
-    return (red << 10 | green << 5 | blue).astype(np.uint16)
+    means, bases = rng.uniform(500, 9000, (NODES, 4)), rng.uniform(500, 9000, (1, NODES, 2, 4))
+    factors = 1e-3 * bases.astype(np.float32)
+    light = PrintedLight(means.astype(np.float32), factors, np.zeros(1, np.int64), np.ones(1, np.float32))
+    return light, rng.integers(0, 32768, NODES).astype(np.uint32)
 
 
 def in_turns(calls: Mapping[str, Call], clock: Callable[[], float], repeats: int = REPEATS) -> dict[str, float]:
@@ -226,12 +186,12 @@ def measure_picture(name: str, picture: npt.NDArray[np.uint8], tables: npt.NDArr
     planes = np.empty((3, height, width), np.float32)
     weights = np.random.default_rng(4).random((height, width, 2), dtype=np.float32)
     masks = {kind: mask_weights(kind, height, width) for kind in ("soft-edge", "half-plane")}
-    cells = checked_cells(nearby_cells(), 5)
+    light, cells = printed_by_chance()
+    printed = partial(draw_printed, tables[:1], picture, [light], cells, out=out)
     calls: dict[str, Call] = {
-        "kernel by colour": lambda: draw_samples(samples, picture, cells=cells, out=out),
+        "kernel by colour": printed,
         "streaming copy": lambda: np.copyto(out, picture),
         "bound of fetching": fetching(tables[:1], picture),
-        "bound of fetching by colour": fetching_by_colour(samples, picture, cells),
         "bound of fetching for two lights": fetching(tables, picture),
         "kernel": lambda: draw_samples(samples, picture, out=out),
         "mosaic": lambda: draw_mosaic(samples, picture, out=sites),
@@ -250,10 +210,6 @@ def measure_picture(name: str, picture: npt.NDArray[np.uint8], tables: npt.NDArr
     report(f"kernel, {name}, one thread", seconds["numpy take"] / seconds["kernel"], "ratio", "numpy take")
     by_colour = seconds["kernel"] / seconds["kernel by colour"]
     report(f"kernel by colour, {name}, one thread", by_colour, "ratio", "kernel by codes")
-    bound = seconds["bound of fetching by colour"]
-    report(f"bound of fetching by colour, {name}, one thread", seconds["kernel"] / bound, "ratio", "kernel by codes")
-    share = bound / seconds["kernel by colour"]
-    report(f"kernel by colour, {name}, one thread", share, "ratio", "bound of fetching by colour")
 
     threads = os.cpu_count() or 1
     with ThreadPoolExecutor(threads) as pool:
@@ -271,7 +227,7 @@ def measure_picture(name: str, picture: npt.NDArray[np.uint8], tables: npt.NDArr
         together: dict[str, Call] = {
             "streaming copy": copy_together,
             "kernel": lambda: draw_samples(samples, picture, threads=threads, out=out),
-            "kernel by colour": lambda: draw_samples(samples, picture, cells=cells, threads=threads, out=out),
+            "kernel by colour": partial(printed, threads=threads),
             "two lights": partial(mix_together, weights),
             **{f"two lights, {kind}": partial(mix_together, mask) for kind, mask in masks.items()},
         }

@@ -2,11 +2,11 @@
 
     python examples/greys.py LUT [--lights 0,35,665 | --every 50] [--picture cat.jpg ...]
 
-For each light: the angle between the light and the source's 32 greys, in the mean and the worst, as the chart shows
-their codes, by a map made under 5600 K, and by that of the light itself; the share of chroma kept by the latter two, as
-slopes of ln R/G and ln B/G of what is seen against what is wanted; and the share of colours that the print cannot show.
-Chroma and shares are those of the pictures' colours, or of all source colours alike if none is given. What is seen is
-the mean of the table's own samples, so nothing here is random.
+For each light: the angle between the light and the source's 17 greys, in the mean and the worst, as the chart shows
+their codes and by colour; the share of chroma that is kept by colour, as slopes of ln R/G and ln B/G of what is seen,
+without the print's black, against what is wanted; and the share of colours that the print cannot show. Chroma and
+shares are those of the pictures' colours, or of all source colours alike if none is given. What is seen is the mean of
+the table's own samples, so nothing here is random.
 """
 
 from __future__ import annotations
@@ -18,20 +18,17 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from calibration.table.lut import Lut, open_lut
+from calibration.table.lut import open_lut
 from foundation.colorimetry import angles_deg
-from generator.kernels.dithering import nearest_nodes
+from generator.kernels.printing import NODES, SIDE, nearest_nodes
 from generator.lights.choices import parse_lights
+from generator.lights.lighting import plain
 from generator.pictures.picture import open_picture
-from generator.rendering.colorimetric import NODES, colorimetric_mixtures
-from generator.rendering.matrices import ColourMatrix, matrix_for
-from generator.rendering.print_profiles import profile_of
+from generator.rendering.colorimetric import ColorimetricRendering, source_colours
+from generator.rendering.matrices import matrix_for
 
-GREYS = np.arange(32) * (32 * 32 + 32 + 1)
-"""Source nodes of equal codes of red, green and blue."""
-
-MAP_K = 5600.0
-"""Light of the map that serves all lights."""
+GREYS = np.arange(SIDE) * (SIDE * SIDE + SIDE + 1)
+"""Nodes of equal codes of red, green and blue."""
 
 Array = npt.NDArray[np.float64]
 
@@ -46,23 +43,25 @@ def kept(seen: Array, wanted: Array, shares: Array) -> str:
     return "{:.2f} {:.2f}".format(*slopes)
 
 
-def row(lut: Lut, light: int, matrix: ColourMatrix, shares: Array) -> list[str]:
+def row(rendering: ColorimetricRendering, light: int, shares: Array) -> list[str]:
     """Return the figures of one light."""
-    profile, own = profile_of(lut, light), colorimetric_mixtures(lut, light, matrix)
-    wanted = own.wanted.astype(np.float64)
-    maps = [colorimetric_mixtures(lut, MAP_K, matrix), own]
-    seen = [profile.colours[mixtures.cells].mean(axis=1) for mixtures in maps]
+    lut, white = rendering.lut, rendering.lut.white[light]
+    wanted, seen = source_colours(rendering.matrix), rendering.seen(plain(light)) / white
+    black = seen[0]
+    bare = (seen - black) / (seen[-1] - black)
     side = 1 << lut.provenance.bits
-    printed = profile.colours[np.arange(32) * side // 32 * (side * side + side + 1)]
-    angles = [angles_deg(greys, np.ones(3)) for greys in (printed, *(colours[GREYS] for colours in seen))]
+    greys = np.arange(SIDE) * side // SIDE * (side * side + side + 1)
+    printed = lut.samples[light][greys].mean(axis=1) / white
+    angles = [angles_deg(colours, np.ones(3)) for colours in (printed, seen[GREYS])]
     plan = lut.illuminations[light]
     name = "{} {} {}".format(*plan.codes) if plan.cct_k is None else f"{plan.cct_k:g} K"
+    inside = shares * (wanted.min(axis=1) > 0.01) * (bare.min(axis=1) > 0.01)
     return [
         f"{light}",
         name,
         *(f"{angle.mean():.2f} {angle.max():.2f}" for angle in angles),
-        *(kept(colours, wanted, shares) for colours in seen),
-        f"{shares @ own.outside:.3f}",
+        kept(np.maximum(bare, 1e-6), np.maximum(wanted, 1e-6), inside / inside.sum()),
+        f"{shares @ rendering.map.outside:.3f}",
     ]
 
 
@@ -83,8 +82,9 @@ def main() -> int:
         shares = np.mean([count / count.sum() for count in counts], axis=0)
     matrix = matrix_for(lut)
     print(f"matrix of {matrix.name}: {matrix.source}")
-    head = ["light", "shown as", "greys: codes", "by 5600 K", "by its own", "chroma: 5600 K", "its own", "outside"]
-    for cells in (head, *(row(lut, light, matrix, shares) for light in lights if isinstance(light, int))):
+    rendering = ColorimetricRendering(lut, matrix)
+    head = ["light", "shown as", "greys: codes", "by colour", "chroma kept", "outside"]
+    for cells in (head, *(row(rendering, light, shares) for light in lights if isinstance(light, int))):
         print(" | ".join(f"{cell:>14}" for cell in cells))
     return 0
 

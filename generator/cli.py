@@ -24,7 +24,7 @@ from generator.command.options import (
     VariationOptions,
     WorkOptions,
 )
-from generator.command.output import cells_sentences, matrix_sentence, table_folder
+from generator.command.output import matrix_sentence, table_folder
 
 if TYPE_CHECKING:
     from calibration.table.lut import Lut
@@ -164,7 +164,6 @@ def _make_whole(plan: Plan, out: str, workers: Workers, output: JsonOutput) -> D
     from generator.command.output import shown_progress
     from generator.dataset.making import make_dataset
 
-    _print_cells(plan, range(plan.shards))
     with shown_progress(plan.total) as callbacks:
         dataset = make_dataset(plan, out, workers, callbacks)
     _print_summary(dataset, out, output)
@@ -177,19 +176,12 @@ def _make_share(plan: Plan, out: str, shard: str, workers: Workers, output: Json
 
     share = parse_share(shard)
     shards = range(share[0], plan.shards, share[1])
-    _print_cells(plan, shards)
     with shown_progress(sum(map(plan.images_of, shards))) as callbacks:
         done, every = make_share(plan, out, share, workers, callbacks)
     output.add(dataset=masked(out), shard=shard, shards_done=done, shards=every)
     finish = f"make a dataset of them with generate --finish {out}"
     left = finish if done == every else "others are still to be made"
     print(masked(f"{done} of {every} shards of {out} are done; {left}"))
-
-
-def _print_cells(plan: Plan, shards: range) -> None:
-    """Say that cells of lights are found first."""
-    for line in cells_sentences(plan, shards):
-        print(line, flush=True)
 
 
 def _print_summary(dataset: Dataset, out: str, output: JsonOutput, was_there: bool = False) -> None:

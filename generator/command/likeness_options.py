@@ -265,13 +265,13 @@ def _drawn(
 def _black_under(lut: Lut, light: int, rendered: DatasetOptions) -> BlackShares:
     """Return the print's black under a light of the table; a QualityError where it is as bright as half of white."""
     from generator.dataset.shards import rendering_of
-    from generator.lights.lighting import Lighting, plain
+    from generator.lights.lighting import plain
     from generator.likeness.real_data import BlackShares
     from generator.rendering.black_points import veil_of
 
     grey = None
     if rendered.rendering == "colorimetric":
-        grey = rendering_of(lut, rendered).mixtures_for(Lighting((plain(light),))).black
+        grey = rendering_of(lut, rendered).black(plain(light))
     red, green, blue = veil_of(lut, plain(light), 1.0, grey).taken.tolist()
     return BlackShares((red, green, blue))
 

@@ -5,10 +5,9 @@ from __future__ import annotations
 import subprocess
 import sys
 import time
-from collections.abc import Generator, Iterable
+from collections.abc import Generator
 from contextlib import ExitStack, contextmanager
 from datetime import timedelta
-from itertools import groupby
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Final
@@ -22,7 +21,6 @@ from foundation.version import software
 if TYPE_CHECKING:
     from rich.progress import Progress
 
-    from generator.dataset.plan import Plan
     from generator.dataset.shards import Callbacks
     from generator.rendering.matrices import ColourMatrix
 
@@ -141,31 +139,6 @@ def matrix_sentence(matrix: ColourMatrix, camera: str, *, chosen: bool) -> str:
     )
 
 
-def cells_sentences(plan: Plan, shards: Iterable[int]) -> tuple[str, ...]:
-    """Return a line about lights whose cells are yet to be found while some shards of a plan are made, if there are."""
-    if plan.options.rendering != "colorimetric":
-        return ()
-    from generator.dataset.shards import rendering_of
-    from generator.rendering.colorimetric import lights_to_find
-
-    size = plan.options.shard_images
-    images = (number for shard in shards for number in range(shard * size, shard * size + plan.images_of(shard)))
-    scenes = groupby(images, lambda image: image // plan.choice.lights_each)
-    lightings = (
-        lighting
-        for scene, shown in scenes
-        for lightings in (plan.choice.lightings_of(scene),)
-        for lighting in (lightings[image % plan.choice.lights_each] for image in shown)
-    )
-    found = len(lights_to_find(rendering_of(plan.lut, plan.options), lightings))
-    if not found:
-        return ()
-    return (
-        f"finding the cells of {found} light{'' if found == 1 else 's'} on the way, once: they are kept for the next "
-        "time; until then the time left is shown too long",
-    )
-
-
 DEMO: Final = "demo:"
 """What stands in place of a table's folder."""
 
@@ -180,11 +153,11 @@ BITS: Final = 4
 def table_folder(given: Path, cache: Path | None = None) -> Path:
     """Return the folder of a table: the one given, or that of the table to begin with, made if it is not there.
 
-    `cache`: where the table is kept; None for `generator.rendering.cell_mixtures.cache_folder`.
+    `cache`: where the table is kept; None for `foundation.files.cache_folder`.
     """
     if str(given) != DEMO:
         return given
-    from generator.rendering.cell_mixtures import cache_folder
+    from foundation.files import cache_folder
 
     cache = cache or cache_folder()
     if cache is None:

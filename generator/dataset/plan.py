@@ -51,10 +51,11 @@ RENDERING: Final[Rendering] = "codes"
 STRETCHED: Final[tuple[Format, ...]] = ("png", "tiff", "jxl")
 """Formats without a place for the white level that readers use, whose counts may be stretched over 16 bits."""
 
-RENDERING_VERSION: Final = 3
+RENDERING_VERSION: Final = 4
 """Of colorimetric rendering: rises when its rules change, so that other pixels come of the same options.
 1 took the grey in the print's black cell out where 2 takes the grey that black was mapped to; 3 tries more cells for
-greys that 2 left off by .2 degrees and more."""
+greys that 2 left off by .2 degrees and more; 4 prints through one map of the chart, interpolated between cells, where
+those before it mixed cells for each light."""
 
 
 @dataclass(frozen=True)

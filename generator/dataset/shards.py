@@ -14,7 +14,6 @@ masks and maps say how much of either reaches a pixel.
 
 from __future__ import annotations
 
-import hashlib
 import math
 import threading
 from collections import deque
@@ -42,8 +41,7 @@ from generator.variation.variation import Varied
 
 if TYPE_CHECKING:
     from calibration.table.lut import Lut
-    from generator.kernels.dithering import CellTable
-    from generator.rendering.cell_mixtures import CellMixtures
+    from generator.kernels.printing import PrintedLight
     from generator.rendering.colorimetric import ColorimetricRendering
 
 
@@ -67,51 +65,70 @@ def photograph(
     uint16, linear camera RGB; of several lights the weights (H, W, K) float32 of each in each pixel, else None; and
     what is recorded of the rendering.
     """
-    from generator.kernels.dithering import dither, nearest_nodes
     from generator.kernels.mixing import mix_samples
-    from generator.kernels.rendering import WHOLE_LIGHT_PIXELS, draw_samples
-    from generator.rendering.cell_mixtures import summarise
+    from generator.kernels.rendering import draw_samples
 
     # The hash of the table stands for its samples in the dataset's description.
     for mixture in lighting.mixtures:
         for light in mixture.lights:
             lut.require_unchanged(light)
     share = options.black_point.share(seed, number) if black_taken is None else black_taken
-    cells = grey = None
-    details: Details = {}
+    details: Details = {} if options.black_point.kind == "keep" else {"black_taken": share}
+    weights = None if lighting.masks is None else lighting.weights_of(*picture.shape[:2])
     if options.rendering == "colorimetric":
         rendering = rendering_of(lut, options)
-        for light in rendering.light_of(lighting).lights:
-            lut.require_unchanged(light)
-        mixtures = rendering.mixtures_for(lighting)
-        cells, name = _table(mixtures, lut.provenance.bits)
-        grey = mixtures.black
-        missed = summarise(mixtures, nearest_nodes(picture).astype(np.float64))
-        outside, distance = round(missed.outside, 6), round(missed.distance_deg, 6)
-        details |= {"cells": name, "outside": outside, "distance": distance}
-    if options.black_point.kind != "keep":
-        details["black_taken"] = share
-    alone = lighting.masks is None and len(lighting.mixtures[0].lights) == 1 and not share
-    if cells is not None and not (alone or (lighting.masks is None and picture.size >= 3 * WHOLE_LIGHT_PIXELS)):
-        # Which samples are to be mixed, or freed of black, is known by the cells.
-        picture, cells = dither(picture, cells, lut.provenance.bits, seed, number), None
-    drawn_dithered = cells is not None
-    tables = [_samples(lut, mixture, picture, share, seed, drawn_dithered, grey) for mixture in lighting.mixtures]
-    if lighting.masks is None:
+        most = lut.provenance.white_level if weights is None else white_level
+        image, seen = _printed(rendering, picture, lighting, weights, share, seed, number, most)
+        return image, weights, seen | details
+    tables = [_samples(lut, mixture, picture, share, seed) for mixture in lighting.mixtures]
+    if weights is None:
         out = _reused(picture.shape)
-        return draw_samples(tables[0], picture, seed=seed, image=number, cells=cells, out=out), None, details
-    weights = lighting.weights_of(*picture.shape[:2])
+        return draw_samples(tables[0], picture, seed=seed, image=number, out=out), None, details
     image = mix_samples(tables, picture, weights, white_level=white_level, seed=seed, image=number)
     return image, weights, details
 
 
-def _samples(
-    lut: Lut, mixture: Mixture, picture: Picture, share: float, seed: int, dithered: bool, grey: float | None
-) -> npt.NDArray[np.uint16]:
-    """Return the samples of a light without a share of the print's black, at least those of a picture's colours.
+def _printed(
+    rendering: ColorimetricRendering,
+    picture: Picture,
+    lighting: Lighting,
+    weights: npt.NDArray[np.float32] | None,
+    share: float,
+    seed: int,
+    number: int,
+    most: int,
+) -> tuple[npt.NDArray[np.uint16], Details]:
+    """Return the raw image (H, W, 3) of a picture (H, W, 3) by colour, and what is recorded of it."""
+    from generator.kernels.printing import draw_printed, nearest_nodes
+    from generator.rendering.black_points import veil_of
 
-    A picture that is `dithered` while it is drawn may show any. `grey` is as of `black_points.veil_of`.
-    """
+    lut = rendering.lut
+    lights: list[PrintedLight] = []
+    for mixture in lighting.mixtures:
+        taken = veil_of(lut, mixture, share, rendering.black(mixture)).taken if share else None
+        lights.append(rendering.printed(mixture, taken))
+    outside, distance = rendering.map.missed(nearest_nodes(picture))
+    details: Details = {
+        "cells": rendering.map.sha256[:16],
+        "outside": round(outside, 6),
+        "distance": round(distance, 6),
+    }
+    image = draw_printed(
+        lut.samples,
+        picture,
+        lights,
+        rendering.cells,
+        shares=weights,
+        most=most,
+        seed=seed,
+        image=number,
+        out=_reused(picture.shape),
+    )
+    return image, details
+
+
+def _samples(lut: Lut, mixture: Mixture, picture: Picture, share: float, seed: int) -> npt.NDArray[np.uint16]:
+    """Return the samples of a light without a share of the print's black, at least those of a picture's colours."""
     from generator.kernels.choice import colours_in
     from generator.kernels.rendering import WHOLE_LIGHT_PIXELS
     from generator.rendering.black_points import veil_of, without_veil
@@ -119,9 +136,8 @@ def _samples(
     samples = mixture.samples(lut, seed, picture)
     if not share:
         return samples
-    small = not dithered and picture.size < 3 * WHOLE_LIGHT_PIXELS
-    colours = colours_in(picture, lut.provenance.bits) if small else None
-    veil = veil_of(lut, mixture, share, grey)
+    colours = colours_in(picture, lut.provenance.bits) if picture.size < 3 * WHOLE_LIGHT_PIXELS else None
+    veil = veil_of(lut, mixture, share)
     return without_veil(samples, veil, lut.provenance.white_level, colours)
 
 
@@ -139,15 +155,6 @@ def rendering_of(lut: Lut, options: DatasetOptions) -> ColorimetricRendering:
 
     matrix = options.matrix or matrix_for(lut)
     return _rendering(lut, matrix.name, tuple(matrix.rows.ravel().tolist()), matrix.source)
-
-
-@lru_cache(maxsize=8)
-def _table(mixtures: CellMixtures, bits: int) -> tuple[CellTable, str]:
-    """Return the cells of mixtures to draw from, and what they are called: the first 16 digits of their SHA-256."""
-    from generator.kernels.dithering import checked_cells
-
-    digest = hashlib.sha256(mixtures.cells.astype("<u2").tobytes()).hexdigest()
-    return checked_cells(mixtures.cells, bits), digest[:16]
 
 
 def _reused(shape: tuple[int, ...]) -> npt.NDArray[np.uint16]:

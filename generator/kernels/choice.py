@@ -82,7 +82,7 @@ def philox4x32(c0: Any, c1: Any, c2: Any, c3: Any, seed: Any) -> Any:
 
 @inlined
 def row_words(y: Any, place: Any, image: Any, seed: Any) -> Any:
-    """Return the three keys (uint32) of row `y`, and the word that `dithering.py` has for its own; `seed` is uint64."""
+    """Return the three keys (uint32) of row `y`, and a fourth word of them; `seed` is uint64."""
     k0, k1, k2, k3 = philox4x32(uint32(y), uint32(place), uint32(image), _PURPOSE, seed)
     return (k0, k1, k2), k3
 

@@ -21,7 +21,6 @@ from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
-from numpy import uint32
 
 from foundation.compiled import compiled
 from foundation.errors import InputError
@@ -35,49 +34,16 @@ from generator.kernels.choice import (
     choose_group,
     packed_rows,
     readable,
+    row_keys,
     run_in_threads,
 )
-from generator.kernels.dithering import (
-    DITHER_BYTES,
-    Cells,
-    CellTable,
-    checked_cells,
-    dither_row,
-    locate,
-    offset_cells,
-)
-from generator.kernels.vector import EIGHT, GROUP, SAMPLE_BYTES, offset_at, plane1, planes8, planes8_mirrored, prefetch
+from generator.kernels.vector import EIGHT, GROUP, offset_at, plane1, planes8, planes8_mirrored, prefetch
 
 Window = tuple[int, int, int, int]
 """x and y of a window's first pixel in the picture, and its width and height, px."""
 
-_STEP: Final = 2
-"""Groups between the two steps of dithering: the processor computes while it waits for cells."""
 SCALES: Final = 7
 """Numbers of an item that `vector.planes8` takes: factors and summands of three channels, and a limit."""
-
-
-@compiled
-def _choose_dithered(
-    row: int,
-    width: int,
-    low: int,
-    high: int,
-    inks: Any,
-    keys: Any,
-    count: Any,
-    scratch: int,
-    memory: int,
-    target: int,
-) -> None:
-    """Do what `choice.choose_group` does for each of the groups `low` to `high`, for the cells."""
-    stride = uint32(SAMPLE_BYTES * count)
-    for step in range(low, high + 1 + _STEP):
-        if step <= high:
-            locate(row, width, step, inks, keys, count, scratch, memory)
-        if low <= step - _STEP:
-            group = step - _STEP
-            offset_cells(group, inks, stride, memory, target + OFFSETS_BYTES * (group - low))
 
 
 @compiled
@@ -107,22 +73,18 @@ def _crop(
     """
     row_bytes = OFFSETS_BYTES * (width // GROUP + 2)
     for item in range(first, end):
-        light, picture, pitch, picture_width, x0, y0, flip, image, lights, cells = plan[item]
+        light, picture, pitch, picture_width, x0, y0, flip, image, lights = plan[item]
         samples = last if light == lights - 1 else tables + light * light_bytes
         line = lines + 4 * SCALES * item
-        memory = scratch + EDGE_BYTES + 2 * row_bytes
         low, high = x0 // GROUP, (x0 + width - 1) // GROUP
         for y in range(height + 1):
             if y < height:
-                keys, inks = dither_row(cells, y0 + y, image, seeds[item])
+                keys = row_keys(y0 + y, 0, image, seeds[item])
                 row = picture + y * pitch
                 chosen = scratch + EDGE_BYTES + row_bytes * (y & 1)
-                if cells:
-                    _choose_dithered(row, picture_width, low, high, inks, keys, count, scratch, memory, chosen)
                 for group in range(low, high + 1):
                     to = chosen + OFFSETS_BYTES * (group - low)
-                    if not cells:
-                        choose_group(row, picture_width, group, keys, count, bits, scratch, to)
+                    choose_group(row, picture_width, group, keys, count, bits, scratch, to)
                     for i in range(GROUP):
                         prefetch(samples + offset_at(to + 4 * i))
             if y == 0:
@@ -251,7 +213,6 @@ def draw_batch(
     gains: npt.ArrayLike = 1.0,
     seeds: npt.ArrayLike = 0,
     images: npt.ArrayLike = 0,
-    cells: Sequence[Cells | CellTable] | None = None,
     taken: npt.ArrayLike | None = None,
     stretches: npt.ArrayLike = 1.0,
     threads: int = 1,
@@ -276,9 +237,6 @@ def draw_batch(
         As for `draw_planar`.
     flips, gains, seeds, images
         (N,) bool, float, int and int, or one for all, as for `draw_planar`.
-    cells
-        N tables of cells (32768, 16) uint16, by which the pictures are dithered as by `dithering.dither`; one may
-        serve many items, or what `checked_cells` made of them. None: the pictures are codes.
     taken
         (N, 3) float ≥ 0, counts that are taken out of the channels of each item's samples; None takes out nothing.
     stretches
@@ -341,15 +299,14 @@ def draw_batch(
     outside = (frames[:, :2] < 0).any(axis=1) | (frames[:, :2] + frames[:, 2:] > shown[:, 2:]).any(axis=1)
     for item in np.flatnonzero(outside | (min(width, height) < 1))[:1]:
         _checked_window(frames[item].tolist(), pictures[int(item)])
-    plan = np.zeros((count, 10), np.int64)
+    plan = np.zeros((count, 9), np.int64)
     plan[:, 0], plan[:, 1], plan[:, 2:4] = numbers, shown[:, 0] + frames[:, 1] * shown[:, 1], shown[:, 1:3]
     plan[:, 4:6], plan[:, 6] = frames[:, :2], np.broadcast_to(flips, count)
     plan[:, 7], plan[:, 8] = imaged, len(tables)
-    inks = _addresses(cells, count, bits, plan)
-    scales = _scales(gained, white_level, taken, stretches)
+    scales = scales_of(gained, white_level, taken, stretches)
 
     def fill(first: int, end: int) -> None:
-        scratch = np.empty(EDGE_BYTES + 2 * OFFSETS_BYTES * (width // GROUP + 2) + DITHER_BYTES, np.uint8)
+        scratch = np.empty(EDGE_BYTES + 2 * OFFSETS_BYTES * (width // GROUP + 2), np.uint8)
         _crop(
             plan,
             seeded,
@@ -370,30 +327,12 @@ def draw_batch(
         )
 
     run_in_threads(fill, count, threads)
-    del inks
     if work is not target:
         target[...] = work
     return target
 
 
-def _addresses(
-    cells: Sequence[Cells | CellTable] | None, count: int, bits: int, plan: npt.NDArray[np.int64]
-) -> dict[int, CellTable]:
-    """Write the address of each item's table of cells into the plan; return the tables, to be kept until they are used.
-
-    Most items of a batch share a table; each is checked once.
-    """
-    if cells is None:
-        return {}
-    if len(cells) != count:
-        raise InputError(f"{len(cells)} tables of cells were given for {count} items, expected one each")
-    checked = {id(table): table for table in cells}
-    inks = {identity: checked_cells(table, bits) for identity, table in checked.items()}
-    plan[:, 9] = [inks[id(table)].cells.ctypes.data for table in cells]
-    return inks
-
-
-def _scales(
+def scales_of(
     gains: npt.NDArray[np.float64], white_level: int, taken: npt.ArrayLike | None, stretches: npt.ArrayLike
 ) -> npt.NDArray[np.float32]:
     """Return (N, 7) float32: what `vector.planes8` takes of each item."""

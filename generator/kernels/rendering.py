@@ -41,16 +41,6 @@ from generator.kernels.choice import (
     run_in_threads,
     writable,
 )
-from generator.kernels.dithering import (
-    DITHER_BYTES,
-    LOCATE_LEAD,
-    Cells,
-    CellTable,
-    checked_cells,
-    dither_row,
-    locate,
-    offset_cells,
-)
 from generator.kernels.vector import (
     GROUP,
     LANES,
@@ -126,42 +116,6 @@ def draw_groups(
             done += 1
 
 
-@compiled
-def draw_dithered(
-    row: int,
-    width: int,
-    inks: Any,
-    keys: Any,
-    samples: int,
-    count: Any,
-    scratch: int,
-    begin: int,
-    end: int,
-    base: int,
-) -> None:
-    """Do what `draw_groups` does, for the cells that stand for a row's pixels; `inks` are the row's.
-
-    Nothing needs to be chosen before; segments of a row are to come in turn. A function of its own: within the loop of
-    rows it is a third slower, since it is more than the registers hold.
-    """
-    groups, stride, memory = (width + GROUP - 1) // GROUP, uint32(SAMPLE_BYTES * count), scratch + SCRATCH_BYTES
-    for step in range(-LOCATE_LEAD if begin == 0 else begin, end):
-        group = step + LOCATE_LEAD
-        if group < groups:
-            prefetch_group(row, group)
-            locate(row, width, group, inks, keys, count, scratch, memory)
-        group = step + LEAD
-        if 0 <= group < groups:
-            offset_cells(group, inks, stride, memory, offsets_slot(scratch, group))
-        if step >= 0:
-            offsets, at, pixels = offsets_slot(scratch, step), base + SAMPLE_BYTES * GROUP * step, width - GROUP * step
-            if pixels > GROUP:
-                _copy_group(samples, offsets, at)
-            else:
-                for i in range(pixels):
-                    copy6(samples + offset_at(offsets + 4 * i), at + SAMPLE_BYTES * i)
-
-
 @inlined
 def _prefetch_lines(prefetch_from: int, lines: int, group: int) -> None:
     for line in range(lines * group, lines * (group + 1)):
@@ -200,33 +154,26 @@ def _gather(
     target: int,
     target_pitch: int,
     streamed: bool,
-    cells: int,
     scratch: int,
 ) -> None:
     """Fill rows of 3-channel pixels; picture, samples, target and scratch are addresses, pitches bytes from row to row.
-
-    `cells` is the address of a table of cells by which the picture is dithered, or 0.
 
     Picture and image leave the caches to the samples: the picture is prefetched as data that are read once; the image,
     if `streamed`, is put together in scratch memory and written past the caches, a line at a time.
     """
     groups = (width + GROUP - 1) // GROUP
-    lines = first_line(scratch + SCRATCH_BYTES + DITHER_BYTES)
+    lines = first_line(scratch + SCRATCH_BYTES)
     for y in range(rows):
-        keys, inks = dither_row(cells, first_row + y, image, seed)
+        keys = row_keys(first_row + y, 0, image, seed)
         row, to = picture + y * pitch, target + y * target_pitch
         begin, held = to, to & (LINE - 1)
-        if not cells:
-            choose_first_groups(row, width, keys, count, bits, scratch, 0, groups)
+        choose_first_groups(row, width, keys, count, bits, scratch, 0, groups)
         done = 0
         while done < groups:
             end, base = groups, to
             if streamed:
                 end, base = min(done + _SEGMENT_GROUPS, groups), lines + held - SAMPLE_BYTES * GROUP * done
-            if cells:
-                draw_dithered(row, width, inks, keys, samples, count, scratch, done, end, base)
-            else:
-                draw_groups(row, width, keys, samples, count, bits, scratch, done, end, groups, 0, 0, base)
+            draw_groups(row, width, keys, samples, count, bits, scratch, done, end, groups, 0, 0, base)
             if streamed:
                 stop = to + SAMPLE_BYTES * min(GROUP * end, width)
                 held = stream_lines(lines, begin, stop, end == groups)
@@ -292,7 +239,6 @@ def draw_samples(
     image: int = 0,
     first_row: int = 0,
     threads: int = 1,
-    cells: Cells | CellTable | None = None,
     out: npt.NDArray[np.uint16] | None = None,
 ) -> npt.NDArray[np.uint16]:
     """Return the raw linear image of `picture` under one light; the rule stands at the head of this file.
@@ -311,8 +257,6 @@ def draw_samples(
         The row of the whole picture that `picture` begins with: a picture done in bands is the same picture.
     threads
         Threads that share the rows; no byte depends on it.
-    cells
-        (32768, 16) uint16, by which the picture is dithered first, as `dithering.dither` does; None: it is codes.
     out
         (H, W, 3) uint16 to fill instead of a new array.
 
@@ -342,8 +286,7 @@ def draw_samples(
     target = check_out(out, picture.shape, np.uint16)
     key = check_seed(seed, image)
     source, table, work = packed_rows(picture), readable(samples), writable(target)
-    inks = None if cells is None else checked_cells(cells, bits)
-    size = SCRATCH_BYTES + DITHER_BYTES + line_buffer_bytes(SAMPLE_BYTES * GROUP * _SEGMENT_GROUPS)
+    size = SCRATCH_BYTES + line_buffer_bytes(SAMPLE_BYTES * GROUP * _SEGMENT_GROUPS)
 
     def fill(top: int, bottom: int) -> None:
         scratch = np.empty(size, np.uint8)
@@ -361,7 +304,6 @@ def draw_samples(
             work[top:].ctypes.data,
             work.strides[0],
             work.nbytes >= streaming.STREAMED_BYTES,
-            0 if inks is None else inks.cells.ctypes.data,
             scratch.ctypes.data,
         )
 

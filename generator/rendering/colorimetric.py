@@ -1,90 +1,416 @@
-"""Rendering by colour: from a table, a light and a colour matrix to the cells that show the colours of a picture.
+"""Rendering by colour: a picture is printed through the chart's own profile, as a print shop prints through one.
 
 What the camera should see of a source colour is a = C · linear sRGB, C being the colour matrix of its body. The
 print's black is not black and its paper not white, so black goes to the print's black point b and white to its white
 point w, as black point compensation does between two media (ISO 18619:2015; there in XYZ, here in camera RGB): t = b +
 (w - b) a.
 
-Mixtures of cells are exact for the lights of a table one by one, which are made once and kept. A mixture of lights, or
-several lights on an image, are one light more with nearly every image. There the mixtures are those of the table's
-light that is nearest, but colours near grey, by which the eye and every estimator know a light, are mixed anew for the
-very light of the image.
+Once a table, for each of 17 x 17 x 17 source colours (`kernels.printing.NODE_CODES`) the place in the chart is found
+where the camera sees t under a reference light (`print_inverse`). That is what a printer's profile is: it does not
+depend on the light that will fall on the print. Under a light of the table a node is the mean of the cells around its
+place, interpolated; under lights together it is the sum of theirs, as light adds. So a light, or a mixture of lights,
+costs a few milliseconds and nothing is kept of it but in memory.
 
-Source colours are nodes: of each channel 32 sRGB codes 255 k / 31, k = 0 … 31. A picture's codes lie between nodes,
-and are shared out among them by dithering.
+A print's greys drift with the light, as real ones do, and by degrees where inks are not neutral. Estimators know a
+light by greys, and the eye does: so greys of a light are made neutral, each level by a factor for each channel that
+keeps its brightness, and colours share the factor of the grey that is as bright.
+
+The noise of a pixel is recorded: `kernels/printing.py` says how.
 """
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Final
+import contextlib
+import json
+import threading
+import uuid
+import zipfile
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+from importlib.metadata import version
+from io import BytesIO
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 import numpy.typing as npt
 
 from calibration.radiometry.greys import tint_deg
-from foundation.colorimetry import decode_srgb
-from generator.kernels.choice import channels_of
-from generator.rendering.matrices import ColourMatrix
+from calibration.radiometry.table_noise import noise_curve
+from foundation.colorimetry import angles_deg, decode_srgb
+from foundation.errors import CropError, InputError, QualityError
+from foundation.files import cache_folder, sha256_of, whole_file
+from generator.kernels.printing import NODE_CODES, NODES, SIDE, PrintedLight, means_at
+from generator.lights.lighting import Mixture
+from generator.rendering import print_inverse, print_profiles
+from generator.rendering.print_inverse import corners, invert, nearest_to
+from generator.rendering.print_profiles import PrintProfile, profile_of
 
 if TYPE_CHECKING:
     from calibration.table.lut import Lut
-import json
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass
-from functools import lru_cache
-from importlib.metadata import version
-from pathlib import Path
+    from generator.rendering.matrices import ColourMatrix
 
-from foundation.colorimetry import angles_deg
-from foundation.errors import QualityError
-from foundation.files import sha256_of
-from generator.lights.gamut import black_body
-from generator.lights.lighting import Lighting, Mixture, mixture_of, plain
-from generator.rendering import cell_mixtures, print_profiles
-from generator.rendering.cell_mixtures import (
-    CellMixtures,
-    are_kept,
-    keep_mixtures,
-    load_mixtures,
-    mix_cells,
-    mixtures_of,
-    near_grey,
-)
-from generator.rendering.matrices import matrix_for
-from generator.rendering.print_profiles import PrintProfile, mixed_profile, profile_of
+_Array = npt.NDArray[np.float64]
 
-NODE_BITS: Final = 5
-"""Bits of a channel of the source nodes: at 32 codes a channel, interpolating between nodes errs by less than the
-samples of a cell differ."""
+REFERENCE_K: Final = 5600.0
+"""Temperature of the light under which places are found, kelvin: about the middle of daylight. Maps of 5600 K trained
+estimators as well as maps of each light (docs/transfer.md)."""
 
-NODES: Final = 8**NODE_BITS
-"""Number of source nodes."""
+_LEAST_RATIO: Final = 0.2
+"""Least of a channel's white over the largest under which a light may be the reference: it must see all colours."""
+
+MET_WITHIN: Final = 0.02
+"""Largest relative difference in a channel of a place that shows the wanted colour: a fifth of what neighbouring
+cells of a chart of five bits differ."""
+
+BLACK_WITHIN_DEG: Final = 0.4
+"""Angle to grey of the black that is asked of a print, degrees: a little less than the half that greys may be off."""
+
+MOST_LIFT: Final = 1.25
+"""Black point over the darkest grey that the print makes at most. Simulated unmanaged prints need 1.0 to 1.2; a lift of
+1.25 makes the contrast of a print less by a hundredth of white."""
+
+MOST_TINT: Final = 1.5
+"""Largest factor by which a channel of greys is made neutral. Prints need up to 1.1; a channel in which a light has
+hardly any counts may ask for more, of noise."""
+
+MOST_SPREAD: Final = 2.0
+"""Largest factor by which recorded deviations are made as large as the noise is at their level: 25 of them have a
+spread of their own that is off by a seventh, and that of the nearest cell is of another level."""
+
+NOISE_ABOVE: Final = 1.5
+"""Standard deviations of noise that are left between a mean and 0 where black is taken out: what is cut off then lifts
+a mean by 2 %."""
+
+_GREYS: Final = np.arange(SIDE) * (SIDE * SIDE + SIDE + 1)
+"""Nodes of three equal codes."""
+
+_LIGHTS_AT_HAND: Final = 1024
+"""Lights of a table whose nodes are kept in memory, 200 kB each."""
 
 
-def node_codes() -> npt.NDArray[np.float64]:
-    """Return the sRGB codes 0 … 1 of the source nodes, (32768, 3) float64; node (r << 10) | (g << 5) | b.
+def source_colours(matrix: ColourMatrix) -> _Array:
+    """Return what the camera should see of each node, over white: clip(C · linear sRGB, 0, 1), (4913, 3) float64.
 
-    Examples
-    --------
-    >>> node_codes()[[0, 31, 32767]].tolist()
-    [[0.0, 0.0, 0.0], [0.0, 0.0, 1.0], [1.0, 1.0, 1.0]]
+    `matrix`: linear sRGB to camera RGB, rows of sum 1, so that a grey is a grey to the camera, too.
     """
-    return channels_of(np.arange(NODES), NODE_BITS) / (2.0**NODE_BITS - 1)
+    channel = decode_srgb(np.array(NODE_CODES) / 255)
+    linear = np.stack(np.meshgrid(channel, channel, channel, indexing="ij"), axis=-1).reshape(-1, 3)
+    return np.clip(linear @ matrix.rows.T, 0.0, 1.0)
 
 
-def source_colours(matrix: ColourMatrix) -> npt.NDArray[np.float64]:
-    """Return what the camera should see of each source node, over white: clip(C · linear sRGB, 0, 1).
+@dataclass(frozen=True, eq=False)
+class PrintMap:
+    """Where in a chart the nodes are, and what is known of it.
 
-    `matrix`: linear sRGB to camera RGB, rows of sum 1, so that a grey is a grey to the camera, too. Returns (32768, 3)
-    float64, 0 … 1.
-
-    Examples
-    --------
-    >>> from generator.rendering.matrices import camera_matrix
-    >>> source_colours(camera_matrix("550D"))[[0, 31, 32767]].round(3).tolist()
-    [[0.0, 0.0, 0.0], [0.079, 0.238, 0.748], [1.0, 1.0, 1.0]]
+    - `cells`: (U,) int64, the cells that nodes need.
+    - `around`: (4913, 8) int64, places in `cells` of those around each node; `weights`: (4913, 8) float64, sum 1.
+    - `nearest`: (4913,) int64, place in `cells` of the cell whose samples a node has.
+    - `levels`: (4913,) float64, 0 … 16: which grey is as bright as a node, counted in grey nodes.
+    - `distance`: (4913,) float64, angle between what the place shows and the wanted colour, degrees.
+    - `outside`: (4913,) bool, whether the print cannot show the colour: a channel is off by more than `MET_WITHIN`.
+    - `noise`: (3, 3) float64: what the variance of a sample is of 1, y and y² at y counts, a column a channel; 0 where
+      the table's noise cannot be measured.
     """
-    return np.clip(decode_srgb(node_codes()) @ matrix.rows.T, 0.0, 1.0)
+
+    cells: npt.NDArray[np.int64]
+    around: npt.NDArray[np.int64]
+    weights: _Array
+    nearest: npt.NDArray[np.int64]
+    levels: _Array
+    distance: _Array
+    outside: npt.NDArray[np.bool_]
+    noise: _Array
+
+    @cached_property
+    def sha256(self) -> str:
+        """Hash of what decides pixels."""
+        parts = self.cells.astype("<i8"), self.around.astype("<i8"), self.weights.astype("<f8")
+        parts = *parts, self.nearest.astype("<i8"), self.levels.astype("<f8"), self.noise.astype("<f8")
+        return sha256_of(b"".join(np.ascontiguousarray(part).tobytes() for part in parts))
+
+    def missed(self, counts: npt.NDArray[np.int64]) -> tuple[float, float]:
+        """Return what a print makes of a picture: share of pixels outside its gamut 0 … 1, and mean angle, degrees.
+
+        `counts`: (4913,) int64, how many pixels are nearest to each node, as from `printing.nearest_nodes`.
+        """
+        shares = counts / counts.sum()
+        return float(shares @ self.outside), float(shares @ self.distance)
+
+
+_finding: Final = threading.Lock()
+"""Held while a map is read or found, so that of several threads one does so."""
+
+_KEPT: Final = tuple(PrintMap.__dataclass_fields__)
+_SUFFIX: Final = ".print"
+
+
+def print_map(lut: Lut, matrix: ColourMatrix, folder: Path | None = None) -> PrintMap:
+    """Return the map of a table's print for a colour matrix; it is kept on disk for the next time.
+
+    A file that is damaged or unreadable is as good as none, and where nothing can be written nothing is kept: seconds
+    of work are no reason to fail.
+
+    `folder`: where maps are kept; None for `cache_folder`.
+    """
+    depends = {
+        "table": lut.sha256,
+        "matrix": [float(part).hex() for part in matrix.rows.ravel()],
+        "code": _code(),
+        "numpy": version("numpy"),
+    }
+    folder = folder or cache_folder()
+    path = None if folder is None else folder / f"{sha256_of(json.dumps(depends).encode())}{_SUFFIX}"
+    found = _load(path)
+    if found is None:
+        found = find_map(lut, matrix)
+        _keep(found, path)
+    return found
+
+
+def _load(path: Path | None) -> PrintMap | None:
+    if path is None:
+        return None
+    with contextlib.suppress(OSError, EOFError, ValueError, KeyError, zipfile.BadZipFile):
+        with np.load(BytesIO(path.read_bytes()), allow_pickle=False) as kept:
+            found = PrintMap(**{name: kept[name] for name in _KEPT})
+        if found.around.shape == found.weights.shape == (NODES, 8) and len(found.nearest) == NODES:
+            return found
+    return None
+
+
+def _keep(found: PrintMap, path: Path | None) -> None:
+    if path is None:
+        return
+    stream = BytesIO()
+    arrays: dict[str, Any] = {name: getattr(found, name) for name in _KEPT}
+    np.savez_compressed(stream, **arrays)
+    # Workers may come here at the same time: each writes a file of its own, and the last to finish names it.
+    own = path.with_name(f"{path.stem}-{uuid.uuid4().hex}")
+    with contextlib.suppress(CropError, OSError), whole_file(own, lambda: path) as file:
+        file.write(stream.getvalue())
+
+
+@lru_cache(maxsize=1)
+def _code() -> str:
+    """Return a hash of the code that finds maps, so that those of older code are not taken for its own."""
+    files = [Path(str(module.__file__)) for module in (print_profiles, print_inverse)] + [Path(__file__)]
+    return sha256_of(b"".join(file.read_bytes() for file in files))
+
+
+def reference_light(lut: Lut) -> int:
+    """Return the light under which places are found: the black body nearest to 5600 K.
+
+    Of a table without black bodies that see all colours, the light whose white is the most even.
+    """
+    ratio = lut.white.min(axis=1) / lut.white.max(axis=1)
+    bodies = [
+        (abs(1e6 / light.cct_k - 1e6 / REFERENCE_K), light.index)
+        for light in lut.illuminations
+        if light.cct_k is not None and ratio[light.index] >= _LEAST_RATIO
+    ]
+    return min(bodies)[1] if bodies else int(ratio.argmax())
+
+
+def find_map(lut: Lut, matrix: ColourMatrix) -> PrintMap:
+    """Return the map of a table's print for a colour matrix: it takes seconds.
+
+    Raises
+    ------
+    QualityError
+        No cell can be used, or the print has no contrast.
+    """
+    light, bits = reference_light(lut), lut.provenance.bits
+    profile = profile_of(lut, light)
+    _require_contrast(lut, light, profile.black, profile.white)
+    usable = profile.usable & _usable_elsewhere(lut, light)
+    if not usable.any():
+        usable = profile.usable
+    colours = _filled(profile.colours, usable, bits)
+    black = black_point(profile, colours, bits)
+    share = source_colours(matrix)
+    wanted = black + (profile.white - black) * share
+    places = invert(colours, wanted.mean(axis=1), wanted, bits)
+    around, weights = corners(places, bits)
+    weights = weights * usable[around]
+    sums = weights.sum(axis=1)
+    fit = np.flatnonzero(usable)
+    nearest = fit[_nearest(places, fit, bits)]
+    lost = sums < 1e-6
+    weights[lost], around[lost] = np.eye(8)[0], nearest[lost, None]
+    weights[~lost] /= sums[~lost, None]
+    seen = np.einsum("kc,kcx->kx", weights, profile.colours[around])
+    cells, places_of = np.unique(np.concatenate([around.ravel(), nearest]), return_inverse=True)
+    brightness = np.asarray(share.mean(axis=1), np.float64)
+    levels = np.asarray(np.interp(brightness, brightness[_GREYS], np.arange(SIDE)), np.float64)
+    return PrintMap(
+        cells,
+        places_of[: NODES * 8].reshape(NODES, 8),
+        weights,
+        places_of[NODES * 8 :],
+        levels,
+        angles_deg(seen, wanted),
+        np.asarray((np.abs(seen - wanted) > MET_WITHIN * wanted).any(axis=1)),
+        _noise_of(lut),
+    )
+
+
+def _require_contrast(lut: Lut, light: int | str, black: float, white: float) -> None:
+    if 2 * black >= white:
+        raise QualityError(
+            f"under light {light} the table {lut.folder} has a black as bright as {black:.2g} of white, "
+            "expected less than half of its paper: its cell is spoilt or the print has no contrast; leave the "
+            "light out, build the table again, or render by codes"
+        )
+
+
+def _usable_elsewhere(lut: Lut, reference: int) -> npt.NDArray[np.bool_]:
+    """Return which cells are usable under the lights that are darkest in a channel, where odd photosites show most."""
+    others = {int(light) for light in lut.white.argmin(axis=0)} - {reference}
+    usable = np.ones(8**lut.provenance.bits, bool)
+    for light in others:
+        with contextlib.suppress(QualityError):
+            usable &= profile_of(lut, light).usable
+    return usable
+
+
+def _filled(colours: _Array, usable: npt.NDArray[np.bool_], bits: int) -> _Array:
+    """Return colours (8**bits, 3) > 0 with those of cells that are not usable taken from the nearest that is."""
+    lost, fit = np.flatnonzero(~usable), np.flatnonzero(usable)
+    filled = colours.copy()
+    if len(lost):
+        shifts = np.array([2 * bits, bits, 0])
+        codes = (lost[:, None] >> shifts & (1 << bits) - 1).astype(np.float64)
+        filled[lost] = colours[fit[_nearest(codes, fit, bits)]]
+    return filled
+
+
+def _nearest(places: _Array, cells: npt.NDArray[np.int64], bits: int) -> npt.NDArray[np.int64]:
+    """Return for each place in the chart (K, 3) which of some cells (N,) is nearest to it, (K,) int64."""
+    from scipy.spatial import KDTree
+
+    shifts = np.array([2 * bits, bits, 0])
+    tree: Any = KDTree(cells[:, None] >> shifts & (1 << bits) - 1)
+    return np.asarray(tree.query(places)[1], np.int64)
+
+
+def black_point(profile: PrintProfile, colours: _Array, bits: int) -> float:
+    """Return what black is mapped to: the darkest grey that the print shows; 1 = ideal white.
+
+    The darkest is taken, of greys from the print's own black to one a quarter brighter, that is off by no more than
+    `BLACK_WITHIN_DEG`; if there is none, the print's own black.
+
+    `colours`: (8**bits, 3) float64, those of the profile without cells that are not usable.
+    """
+    levels = profile.black * np.linspace(1.0, MOST_LIFT, 26)
+    levels = levels[levels <= profile.white]
+    wanted = levels[:, None] * np.ones(3)
+    around, weights = corners(nearest_to(colours, wanted, np.full((len(levels), 3), 0.5), bits), bits)
+    met = angles_deg(np.einsum("kc,kcx->kx", weights, colours[around]), wanted) <= BLACK_WITHIN_DEG
+    return float(levels[int(met.argmax())])
+
+
+def _noise_of(lut: Lut) -> _Array:
+    """Return what variances are of 1, y and y² at y counts, (3, 3), a column a channel; 0 where that is not known."""
+    with contextlib.suppress(InputError):
+        curve = noise_curve(lut)
+        if curve is not None:
+            return np.stack([curve.read_noise**2, 1 / curve.gain_e, curve.response**2])
+    return np.zeros((3, 3))
+
+
+@dataclass(frozen=True, eq=False)
+class ColorimetricRendering:
+    """Rendering by colour with a table.
+
+    `matrix`: linear sRGB to the camera's RGB. `folder`: where the map of the print is kept; None for `cache_folder`.
+    """
+
+    lut: Lut
+    matrix: ColourMatrix
+    folder: Path | None = None
+
+    @cached_property
+    def map(self) -> PrintMap:
+        """Where in the chart source colours are."""
+        with _finding:
+            return print_map(self.lut, self.matrix, self.folder)
+
+    @cached_property
+    def cells(self) -> npt.NDArray[np.uint32]:
+        """(4913,) uint32, the cell whose samples each node has."""
+        return self.map.cells[self.map.nearest].astype(np.uint32)
+
+    @cached_property
+    def _lights(self) -> Any:
+        return lru_cache(maxsize=_LIGHTS_AT_HAND)(self._nodes_of)
+
+    def _nodes_of(self, light: int) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]:
+        """Return what the camera sees of nodes under a light of the table, (4913, 3) counts, and of their cells.
+
+        Of cells (4913, 2, 4): means, and what deviations are multiplied by to be as large as the table's noise is at
+        the node; the fourth is not used.
+        """
+        found, samples = self.map, self.lut.light_samples(light)
+        means, spreads, own = np.empty((NODES, 3)), np.empty((NODES, 3)), np.zeros((NODES, 2, 4), np.float32)
+        seen = np.empty((NODES, 3))
+        means_at(np.asarray(samples), found.around, found.weights, found.nearest, found.cells, means, seen, spreads)
+        own[:, 0, :3], own[:, 1, :3] = seen, 1.0
+        if found.noise.any():
+            factors = np.sqrt(self._variance(means) / np.maximum(spreads, 1e-6))
+            own[:, 1, :3] = np.where(spreads > 0, np.clip(factors, 1 / MOST_SPREAD, MOST_SPREAD), 0.0)
+        return means.astype(np.float32), own
+
+    def seen(self, light: Mixture) -> _Array:
+        """Return what the camera sees of each node under a light, (4913, 3) float64, counts; greys are neutral.
+
+        Raises
+        ------
+        QualityError
+            The print has no contrast under the light.
+        """
+        white = light.white(self.lut)
+        means = np.zeros((NODES, 3))
+        for number, weight in zip(light.lights, light.weights, strict=True):
+            means += weight * self._lights(number)[0]
+        over = means[_GREYS] / white
+        level = over.mean(axis=1, keepdims=True)
+        _require_contrast(self.lut, light.label, float(level[0, 0]), float(level[-1, 0]))
+        factors = np.clip(level / np.maximum(over, 1e-9), 1 / MOST_TINT, MOST_TINT)
+        low = np.minimum(self.map.levels.astype(np.int64), SIDE - 2)
+        part = (self.map.levels - low)[:, None]
+        return means * ((1 - part) * factors[low] + part * factors[low + 1])
+
+    def black(self, light: Mixture) -> float:
+        """Return what black is mapped to under a light, over its white."""
+        return float((self.seen(light)[0] / light.white(self.lut)).mean())
+
+    def printed(self, light: Mixture, taken: _Array | None = None) -> PrintedLight:
+        """Return what a light makes of the print, for `kernels.printing`.
+
+        `taken`: (3,) counts of the print's black that are taken out, the rest stretched so that white stays; noise that
+        would reach below 0 is made smaller. None: nothing.
+        """
+        seen = self.seen(light)
+        white = np.minimum(light.white(self.lut), self.lut.provenance.white_level)
+        cells = np.stack([self._lights(number)[1] for number in light.lights])
+        each = np.sqrt(self._variance(seen))
+        means = np.empty((NODES, 4), np.float32)
+        means[:, 3] = np.linalg.norm(each, axis=1)
+        cells[:, :, 1, :3] /= means[:, 3, None]
+        if taken is not None:
+            stretch = 1 / (1 - taken / white)
+            seen = np.maximum((seen - taken) * stretch, 0.0)
+            # Counts have no sign: noise that reached below 0 would be cut off there, and black be too bright.
+            cells[:, :, 1, :3] *= stretch * np.minimum(seen / (NOISE_ABOVE * each * stretch), 1.0)
+        means[:, :3] = seen
+        return PrintedLight(means, cells, np.array(light.lights, np.int64), np.sqrt(light.weights).astype(np.float32))
+
+    def _variance(self, counts: _Array) -> _Array:
+        """Return the variance of samples of so many counts (N, 3) in the mean; photon noise where it is not known."""
+        kept = np.maximum(counts, 0.0)
+        one, linear, square = self.map.noise if self.map.noise.any() else np.array([[0.0] * 3, [1.0] * 3, [0.0] * 3])
+        return np.maximum(one + linear * kept + square * kept**2, 1e-6)
 
 
 DARKEST: Final = 0.1
@@ -116,188 +442,3 @@ def grey_tint_deg(lut: Lut) -> tuple[float, int] | None:
     greys = lut.samples[light, cells].mean(axis=1, dtype=np.float64)
     greys = greys[(greys / white).min(axis=1) > DARKEST]
     return (float(tint_deg(white, greys).max()), light) if len(greys) else None
-
-
-BLACK_WITHIN_DEG: Final = 0.4
-"""Angle to grey of the black that is asked of a print, degrees: a little less than the half that greys may be off."""
-
-MOST_LIFT: Final = 1.25
-"""Black point over the darkest grey that cells make at most. Simulated unmanaged prints need 1.0 to 1.2; a lift of 1.25
-makes the contrast of a print less by a hundredth of white."""
-
-_MIXTURES_AT_HAND: Final = 16
-"""Lights whose mixtures are kept in memory, 3 MB each: pictures that follow each other share some."""
-
-_asked_for: Final[set[str]] = set()
-"""Keys of mixtures of lights that were found in this process. One that is found a second time is kept: pictures go
-through a list of lights that is longer than what is in memory. Of lights drawn at random each has one image, and to
-keep them would push out those of the table's own lights."""
-
-_PROFILES_AT_HAND: Final = 64
-"""Lights whose profiles are kept in memory, 1 MB each: mixtures of lights share their parts."""
-
-
-def wanted_colours(profile: PrintProfile, matrix: ColourMatrix) -> npt.NDArray[np.float64]:
-    """Return what the camera should see of each source node on a print, (32768, 3) float64 over the white of the light.
-
-    `matrix`: linear sRGB to the camera's RGB.
-    """
-    black = black_point(profile)
-    return black + (profile.white - black) * source_colours(matrix)
-
-
-def black_point(profile: PrintProfile) -> float:
-    """Return what black is mapped to: the darkest grey that cells near to it make; 1 = ideal white.
-
-    At the very edge of the gamut cells of unlike colours would have to be mixed. So the darkest is taken, of greys from
-    the print's own black to one a quarter brighter, that is off by no more than `BLACK_WITHIN_DEG`; if there is none,
-    as on charts of few cells, the print's own black.
-
-    Examples
-    --------
-    >>> ramp = np.linspace(0.04, 0.9, 8)[:, None] * np.ones(3)
-    >>> round(black_point(PrintProfile(ramp, np.ones(8, bool))), 6)
-    0.04
-    """
-    levels = profile.black * np.linspace(1.0, MOST_LIFT, 26)
-    levels = levels[levels <= profile.white]
-    met = mix_cells(profile, levels[:, None] * np.ones(3)).distance <= BLACK_WITHIN_DEG
-    return float(levels[int(met.argmax())])
-
-
-def colorimetric_mixtures(
-    lut: Lut, light: float | Mixture, matrix: ColourMatrix | None = None, folder: Path | None = None
-) -> CellMixtures:
-    """Return for each source node the cells of a table that show it under a light.
-
-    Those of a light of the table are kept on disk for the next time.
-
-    `light`: A light of the table by its number (int), a black body between those of the table by its temperature in
-    kelvin (float), or any mixture of lights. `matrix`: linear sRGB to the camera's RGB; None for what `matrix_for`
-    gives. `folder`: where mixtures are kept; None for `kept_mixtures.cache_folder`.
-    """
-    if not isinstance(light, Mixture):
-        light = black_body(lut, light) if isinstance(light, float) else plain(int(light))
-    light.white(lut)
-    matrix = matrix_for(lut) if matrix is None else matrix
-    return _mixtures(lut, light, tuple(matrix.rows.ravel().tolist()), folder)
-
-
-@dataclass(frozen=True, eq=False)
-class ColorimetricRendering:
-    """Rendering by colour with a table: which mixtures of cells an image is made of.
-
-    `matrix`: linear sRGB to the camera's RGB.
-    """
-
-    lut: Lut
-    matrix: ColourMatrix
-
-    def light_of(self, lighting: Lighting) -> Mixture:
-        """Return the light for which an image's cells are chosen.
-
-        Of several lights on an image it is their sum, each as bright as the others: all of them fall on the same print,
-        so it can be right for one colour of light only.
-        """
-        shares: dict[int, float] = {}
-        for mixture, white in zip(lighting.mixtures, lighting.whites(self.lut), strict=True):
-            for light, weight in zip(mixture.lights, mixture.weights, strict=True):
-                shares[light] = shares.get(light, 0.0) + weight / float(white.sum())
-        return mixture_of(shares)
-
-    def mixtures_for(self, lighting: Lighting) -> CellMixtures:
-        """Return the mixtures, 32768 of them, for an image."""
-        return colorimetric_mixtures(self.lut, self.light_of(lighting), self.matrix)
-
-
-def lights_to_find(
-    rendering: ColorimetricRendering, lightings: Iterable[Lighting], folder: Path | None = None
-) -> frozenset[int]:
-    """Return the lights of the table whose cells images need and that are not kept: each takes a second or more.
-
-    `folder`: where mixtures are kept; None for `kept_mixtures.cache_folder`.
-    """
-    lut, rows = rendering.lut, tuple(rendering.matrix.rows.ravel().tolist())
-    mixtures = {rendering.light_of(lighting) for lighting in lightings}
-    needed = {_kept_for(lut, light) for light in mixtures}
-    return frozenset(light for light in needed if not are_kept(_key(lut, plain(light), rows), folder))
-
-
-@lru_cache(maxsize=_MIXTURES_AT_HAND)
-def _mixtures(lut: Lut, light: Mixture, rows: tuple[float, ...], folder: Path | None) -> CellMixtures:
-    matrix = ColourMatrix("", np.array(rows).reshape(3, 3), "")
-    first, *others = light.lights
-    key = _key(lut, light, rows)
-    found = load_mixtures(key, NODES, folder)
-    if found is not None:
-        return found
-    if others:
-        found = _mixtures_near_grey(lut, light, matrix, folder)
-        if key in _asked_for:
-            keep_mixtures(key, found, folder)
-        _asked_for.add(key)
-    else:
-        profile = _profile(lut, first)
-        if 2 * profile.black >= profile.white:
-            raise QualityError(
-                f"under light {first} the table {lut.folder} has a black as bright as {profile.black:.2g} of white, "
-                "expected less than half of its paper: its cell is spoilt or the print has no contrast; leave the "
-                "light out, build the table again, or render by codes"
-            )
-        found = mix_cells(profile, wanted_colours(profile, matrix))
-        keep_mixtures(key, found, folder)
-    return found
-
-
-def _mixtures_near_grey(lut: Lut, light: Mixture, matrix: ColourMatrix, folder: Path | None) -> CellMixtures:
-    """Return the mixtures of the light of the table that is nearest to `light`, those near grey mixed for `light`."""
-    base = colorimetric_mixtures(lut, _kept_for(lut, light), matrix, folder)
-    profile = mixed_profile(
-        [_profile(lut, number) for number in light.lights],
-        np.array(light.weights)[:, None] * lut.white[list(light.lights)],
-    )
-    wanted = wanted_colours(profile, matrix)
-    # A cell that is odd or clipped under one of the lights of the mixture alone may be among those of the nearest.
-    anew = near_grey(wanted) | ~profile.usable[base.cells].all(axis=1)
-    again = mix_cells(profile, wanted[anew])
-    cells = base.cells.copy()
-    cells[anew] = again.cells
-    return mixtures_of(cells, profile, wanted)
-
-
-def _kept_for(lut: Lut, light: Mixture) -> int:
-    """Return the light of a table whose cells serve a light: itself, or the one whose white is nearest to a mixture."""
-    first, *others = light.lights
-    return int(angles_deg(lut.white, light.white(lut)).argmin()) if others else first
-
-
-@lru_cache(maxsize=_PROFILES_AT_HAND)
-def _profile(lut: Lut, light: int) -> PrintProfile:
-    return profile_of(lut, light)
-
-
-def _key(lut: Lut, light: Mixture, rows: tuple[float, ...]) -> str:
-    """Return what mixtures are kept under: a hash of all that they depend on."""
-    depends = {
-        "table": lut.sha256,
-        "light": light.label,
-        "matrix": [row.hex() for row in rows],
-        "code": _code(),
-        # Of cells that are equally good the last digits choose, and other versions may have others.
-        "libraries": _libraries(version),
-    }
-    return sha256_of(json.dumps(depends).encode())
-
-
-@lru_cache(maxsize=1)
-def _libraries(version_of: Callable[[str], str]) -> dict[str, str]:
-    """Return versions of libraries; a key is made of each light, and to read one takes milliseconds."""
-    return {name: version_of(name) for name in ("numpy", "scipy")}
-
-
-@lru_cache(maxsize=1)
-def _code() -> str:
-    """Return a hash of the code that computes mixtures, so that those of older code are not taken for its own."""
-    modules = (print_profiles, cell_mixtures)
-    files = [Path(str(module.__file__)) for module in modules] + [Path(__file__)]
-    return sha256_of(b"".join(file.read_bytes() for file in files))

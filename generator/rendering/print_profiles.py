@@ -13,7 +13,6 @@ light, and 1, 1, 1 is a grey that is as bright as can be. Rules that hold inside
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, Final
@@ -114,28 +113,6 @@ def profile_of(lut: Lut, light: int) -> PrintProfile:
             "as unfit, clipped, or dark; choose other lights, or build the table again from a shorter exposure"
         )
     return PrintProfile(means / white, usable)
-
-
-def mixed_profile(profiles: Sequence[PrintProfile], whites: _Array) -> PrintProfile:
-    """Return what the camera sees of each cell under several lights together: light adds, and so do means.
-
-    A cell is usable that is so under each of them; where none is, all that are so under one of them.
-
-    `whites`: (K, 3) float64 > 0, linear camera RGB of each light, as bright as it is in the mixture.
-
-    Examples
-    --------
-    >>> usable = np.ones(8, bool)
-    >>> one, other = PrintProfile(np.full((8, 3), 0.2), usable), PrintProfile(np.full((8, 3), 0.6), usable)
-    >>> mixed_profile([one, other], np.array([[1.0, 3.0, 2.0], [1.0, 1.0, 2.0]])).colours[0].round(3).tolist()
-    [0.4, 0.3, 0.4]
-    """
-    shares = whites / whites.sum(axis=0)
-    colours = np.sum([share * profile.colours for share, profile in zip(shares, profiles, strict=True)], axis=0)
-    usable = np.all([profile.usable for profile in profiles], axis=0)
-    if not usable.any():
-        usable = np.any([profile.usable for profile in profiles], axis=0)
-    return PrintProfile(colours, usable)
 
 
 def odd_cells(samples: npt.NDArray[np.uint16], means: _Array) -> npt.NDArray[np.bool_]:

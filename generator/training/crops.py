@@ -33,9 +33,9 @@ import numpy.typing as npt
 from foundation.errors import InputError
 from generator import philox
 from generator.kernels.choice import replace_unfit_colours
-from generator.kernels.dithering import CellTable, checked_cells
-from generator.kernels.planar import draw_batch
-from generator.lights.lighting import Lighting, Mixture
+from generator.kernels.planar import draw_batch, scales_of
+from generator.kernels.printing import PrintedLight, draw_printed_crops
+from generator.lights.lighting import Mixture
 from generator.rendering import Rendering
 from generator.rendering.black_points import KEEP, BlackPoint, veil_of
 from generator.variation.exposing import add_noise
@@ -163,10 +163,9 @@ class Crops:
     threads
         Threads that share a batch; no value depends on it.
     rendering
-        ``"codes"``: a picture's codes are those of the print; ``"colorimetric"``: each pixel is a cell that looks to
-        the camera as the picture's colour should. Which, is found when a light is first drawn: it takes about a second
-        a light the first time, later they lie in the user's cache folder; and 2 MB of memory for each. So name the
-        lights, rather than leave it at all of a large table.
+        ``"codes"``: a picture's codes are those of the print; ``"colorimetric"``: the print shows the picture's colours
+        to the camera. Where in the chart they are takes seconds a table, once: it lies in the user's cache folder then.
+        Each light takes half a megabyte of memory.
     matrix
         Linear sRGB to the camera's RGB, for colorimetric rendering; None for that of the table's camera.
     black_point
@@ -247,16 +246,16 @@ class Crops:
             raise InputError("the black point like is for generate --like; take keep, compensate or random for crops")
         self._memory = Recycled()
         self._truths = (whites / whites.sum(axis=1, keepdims=True)).astype(np.float32)
-        self._tables, self._rows = _tables_of(lut, self.lights, seed)
-        self._cells = _cells_of(lut, self.lights, rendering, matrix)
+        self._tables, self._rows = _tables_of(lut, self.lights if rendering == "codes" else (), seed)
+        self._prints = _prints_of(lut, self.lights, rendering, matrix)
         self._pictures = [
             gallery.picture(number)
-            if self._cells
+            if self._prints
             else replace_unfit_colours(gallery.picture(number), lut.provenance)[0]
             for number in range(len(gallery))
         ]
         self._blacks: list[npt.NDArray[np.float64]] = []
-        if black_point.kind != "keep" and not self._cells:
+        if black_point.kind != "keep" and not self._prints:
             self._blacks = [veil_of(lut, mixture, 1.0).taken for mixture in mixtures]
         self._whites = np.minimum(whites, lut.provenance.white_level)
 
@@ -326,21 +325,37 @@ class Crops:
         if self.black_point.kind != "keep":
             taken = shares[:, None] * np.stack([self._black_of(light) for light in map(int, lights)])
             stretches = 1 / (1 - taken / self._whites[lights])
-        images = draw_batch(
-            self._tables,
-            self._rows[lights],
-            [self._pictures[place] for place in map(int, pictures)],
-            windows,
-            white_level=self.lut.provenance.white_level,
-            flips=(mirror >> 31).astype(bool) & self.flip,
-            gains=gains,
-            seeds=seeds,
-            cells=[self._cells[light] for light in map(int, lights)] if self._cells else None,
-            taken=taken,
-            stretches=stretches,
-            threads=self.threads,
-            out=self._memory.array((numbers.size, 3, height, width)) if out is None else out,
-        )
+        flips = (mirror >> 31).astype(bool) & self.flip
+        shown = [self._pictures[place] for place in map(int, pictures)]
+        out = self._memory.array((numbers.size, 3, height, width)) if out is None else out
+        if self._prints:
+            images = draw_printed_crops(
+                self.lut.samples,
+                [self._prints[light] for light in map(int, lights)],
+                shown,
+                windows,
+                self._prints.cells,
+                scales=scales_of(gains, self.lut.provenance.white_level, taken, stretches),
+                flips=flips,
+                seeds=seeds,
+                threads=self.threads,
+                out=out,
+            )
+        else:
+            images = draw_batch(
+                self._tables,
+                self._rows[lights],
+                shown,
+                windows,
+                white_level=self.lut.provenance.white_level,
+                flips=flips,
+                gains=gains,
+                seeds=seeds,
+                taken=taken,
+                stretches=stretches,
+                threads=self.threads,
+                out=out,
+            )
         if self.noise is not None:
             ratio = 1.0 if self.iso is None else self.iso.ratio
             wanted = self.noise if self.iso is None else self.noise.at(ratio, self.iso.sensor_electrons)
@@ -360,7 +375,7 @@ class Crops:
 
     def _black_of(self, light: int) -> npt.NDArray[np.float64]:
         """Return what a black point takes of a light at most, (3,) counts."""
-        return self._cells.black(light) if self._cells else self._blacks[light]
+        return self._prints.black(light) if self._prints else self._blacks[light]
 
     def __getitem__(self, item: int) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]:
         """Return the image (3, height, width) float32 and the illuminant (3,) float32 of one item.
@@ -411,8 +426,8 @@ def _tables_of(lut: Lut, lights: Sequence[Mixture], seed: int) -> tuple[npt.NDAr
     return np.stack([mixture.samples(lut, seed) for mixture in lights]), np.arange(len(lights))
 
 
-class _Cells:
-    """For each light what stands for source colours under it, found when it is first asked for."""
+class _Prints:
+    """For each light what it makes of the print, found when it is first asked for."""
 
     def __init__(self, lut: Lut, lights: Sequence[Mixture], matrix: ColourMatrix | None) -> None:
         from generator.rendering.colorimetric import ColorimetricRendering
@@ -421,32 +436,36 @@ class _Cells:
         self._lut = lut
         self._lights = lights
         self._rendering = ColorimetricRendering(lut, matrix or matrix_for(lut))
-        self._found: dict[int, tuple[CellTable, float]] = {}
+        self._found: dict[int, PrintedLight] = {}
         self._blacks: dict[int, npt.NDArray[np.float64]] = {}
 
-    def __getitem__(self, light: int) -> CellTable:
-        """Return the cells of source colours under a light."""
-        return self._mixed(light)[0]
+    @property
+    def cells(self) -> npt.NDArray[np.uint32]:
+        """The cell whose samples each node has; see `kernels.printing`."""
+        return self._rendering.cells
+
+    def __getitem__(self, light: int) -> PrintedLight:
+        """Return what a light makes of the print."""
+        if light not in self._found:
+            self._found[light] = self._rendering.printed(self._lights[light])
+        return self._found[light]
 
     def black(self, light: int) -> npt.NDArray[np.float64]:
         """Return what black was mapped to under a light, (3,) counts; a QualityError where it is half as bright."""
         if light not in self._blacks:
-            self._blacks[light] = veil_of(self._lut, self._lights[light], 1.0, self._mixed(light)[1]).taken
+            mixture = self._lights[light]
+            self._blacks[light] = veil_of(self._lut, mixture, 1.0, self._rendering.black(mixture)).taken
         return self._blacks[light]
 
-    def _mixed(self, light: int) -> tuple[CellTable, float]:
-        if light not in self._found:
-            mixtures = self._rendering.mixtures_for(Lighting((self._lights[light],)))
-            self._found[light] = checked_cells(mixtures.cells, self._lut.provenance.bits), mixtures.black
-        return self._found[light]
 
-
-def _cells_of(lut: Lut, lights: Sequence[Mixture], rendering: Rendering, matrix: ColourMatrix | None) -> _Cells | None:
-    """Return the cells that stand for source colours; None where codes are those of the print."""
+def _prints_of(
+    lut: Lut, lights: Sequence[Mixture], rendering: Rendering, matrix: ColourMatrix | None
+) -> _Prints | None:
+    """Return what lights make of the print; None where codes are those of the print."""
     if rendering not in get_args(Rendering):
         raise InputError(f"{rendering!r} is no rendering; use one of {', '.join(get_args(Rendering))}")
     if rendering == "colorimetric":
-        return _Cells(lut, lights, matrix)
+        return _Prints(lut, lights, matrix)
     if matrix is not None:
         raise InputError("a colour matrix is for colorimetric rendering; choose that, or leave the matrix out")
     return None

@@ -100,20 +100,3 @@ def test_the_tables_own_camera_needs_no_advice() -> None:
     known = camera_matrix("Canon EOS 550D")
     assert known is not None
     assert matrix_sentence(known, "Canon EOS 550D", chosen=False) == f"colour matrix: Canon EOS 550D ({SOURCE})"
-
-
-def test_lights_whose_cells_are_to_be_found_are_told_once(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    wish = ("--random-scenes", "2", "--size", "24x20", "--no-preview", "--rendering", "colorimetric")
-
-    def told(*arguments: str, matrix: str = "none") -> str:
-        assert main(["lut", *arguments, *wish, "--matrix", matrix]) == 0
-        return capsys.readouterr().out
-
-    assert "finding the cells of 2 lights on the way" in told("first", "--illuminations", "1,2")
-    assert "finding the cells" not in told("again", "--illuminations", "1,2", "--seed", "3")
-    # A mixture takes the cells of the light nearest to it, light 2 here, whose white is that of the mixture nearly.
-    assert "finding the cells" not in told("mixed", "--light", "1:0.05+2:0.95")
-    assert "finding the cells of 1 light on" in told("more", "--illuminations", "1-3")
-    # Another matrix has other cells. The first share of two scenes under three lights, two images each, has two lights.
-    share = ("--illuminations", "0,1,2", "--shard-images", "2", "--shard", "0/3")
-    assert "finding the cells of 2 lights on" in told("share", *share, matrix="Canon EOS 600D")

@@ -1,7 +1,8 @@
-"""From a table to the mixtures of cells for an image: lights, matrices, and what is kept."""
+"""From a table to what its lights make of source colours: places in the chart, greys, noise, matrices, what is kept."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,26 +11,31 @@ import pytest
 
 from foundation.colorimetry import angles_deg
 from foundation.errors import InputError, QualityError
+from generator.dataset.plan import DatasetOptions
+from generator.dataset.shards import photograph
+from generator.kernels.printing import NODES, SIDE
 from generator.lights.lighting import Lighting, Mixture, plain
-from generator.masks.making import parse_masks
-from generator.rendering.cell_mixtures import CellMixtures, mix_cells
+from generator.rendering.black_points import BlackPoint
 from generator.rendering.colorimetric import (
     BLACK_WITHIN_DEG,
-    NODES,
     ColorimetricRendering,
-    black_point,
-    colorimetric_mixtures,
-    wanted_colours,
+    reference_light,
+    source_colours,
 )
 from generator.rendering.matrices import ColourMatrix, fitted_matrix, matrix_for
-from generator.rendering.print_profiles import PrintProfile, profile_of
+from generator.rendering.print_inverse import corners, nearest_to
+from generator.rendering.print_profiles import profile_of
 from tests.generator.rendering.conftest import MakeTable
 from tests.generator.rendering.prints import MATRIX
 
 pytestmark = pytest.mark.slow
 
-GREYS = np.arange(32) * 1057
+MINE = ColourMatrix("mine", MATRIX, "")
+GREYS = np.arange(SIDE) * (SIDE * SIDE + SIDE + 1)
 """Nodes of equal codes of red, green and blue."""
+
+RAMP = np.repeat(np.arange(256, dtype=np.uint8)[:, None, None], 3, axis=2).repeat(1024, axis=1)
+"""All greys, (256, 1024, 3)."""
 
 
 @pytest.fixture(autouse=True)
@@ -38,134 +44,146 @@ def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path / "cache" / "croplab"
 
 
-def test_greys_of_a_source_are_of_the_light(make_table: MakeTable) -> None:
-    lut = make_table(bits=4, tint=0.15)
-    samples = lut.samples[1].astype(np.float64)
-    own = samples[np.arange(16) * 273].mean(axis=1)
+@pytest.mark.parametrize("bits", [2, 4])
+def test_greys_are_of_the_light_with_the_noise_of_the_table_and_no_step(make_table: MakeTable, bits: int) -> None:
+    lut = make_table(bits=bits, tint=0.15)
+    own = lut.samples[1][np.arange(1 << bits) * (1 + (1 << bits) + (1 << 2 * bits))].mean(axis=1)
     assert angles_deg(own, lut.white[1]).max() > 4
-    mixtures = colorimetric_mixtures(lut, 1)
-    assert mixtures.cells.shape == (NODES, 16)
-    shown = samples[mixtures.cells[GREYS]].mean(axis=(1, 2))
-    assert angles_deg(shown, lut.white[1]).max() < 0.5
+    options = DatasetOptions(rendering="colorimetric", matrix=MINE)
+    for light in (plain(0), plain(1), Mixture((0, 2), (0.3, 0.7))):
+        image = photograph(lut, RAMP, Lighting((light,)), options, 3, 4, 11536)[0].astype(np.float64)
+        means, spreads = image.mean(axis=1), image.std(axis=1)
+        assert angles_deg(means, light.white(lut))[20:].max() < 0.4
+        # The table's noise is that of photons: a variance of a count for each count.
+        ratio = spreads[20:231] / np.sqrt(means[20:231])
+        # A chart of 64 colours knows its noise to some percent.
+        assert ratio.mean() == pytest.approx(1, abs=0.02 if bits > 2 else 0.04)
+        assert np.abs(ratio - 1).max() < (0.12 if bits > 2 else 0.2)
+        errors = spreads / np.sqrt(image.shape[1])
+        rises = np.diff(means, axis=0)
+        assert (rises / np.hypot(errors[1:], errors[:-1])).min() > -4
+        # Even rises: what one code adds is nearly what the next one does.
+        brightness = means.sum(axis=1)
+        error = np.sqrt((errors**2).sum(axis=1))[64:-2] * np.sqrt(6)
+        bends = np.abs(np.diff(brightness, 2)[64:] / error)
+        assert (bends > 3).mean() < 0.02
+        assert bends.max() < 5
 
 
-def test_a_warm_light_has_cells_of_its_own(make_table: MakeTable) -> None:
-    lut = make_table(bits=4, blue_of_green=0.5)
-    matrix = ColourMatrix("mine", MATRIX, "")
-    own, daylight = (colorimetric_mixtures(lut, light, matrix) for light in (0, 1))
-    seen = profile_of(lut, 0).colours
-    # What all of these want is well within what the print can show in daylight.
-    pale = np.flatnonzero((angles_deg(own.wanted, np.ones(3)) < 15) & (own.wanted.mean(axis=1) > 0.2))
+def test_a_print_of_known_colours_is_met_where_it_can_be(make_table: MakeTable) -> None:
+    lut = make_table(bits=4)
+    rendering = ColorimetricRendering(lut, MINE)
+    seen = rendering.seen(plain(1)) / lut.white[1]
+    inside = ~rendering.map.outside
+    # This print shows just what its codes say, so that all but its noise and the outermost colours are met.
+    assert inside.mean() > 0.8
+    wanted = source_colours(MINE)
+    shown = (seen - seen[0].mean()) / (seen[-1].mean() - seen[0].mean())
+    assert np.abs(shown - wanted)[inside].max() < 0.03
+    assert rendering.map.distance[inside].mean() < 0.2
 
-    def kept(mixtures: CellMixtures) -> float:
-        shown = seen[mixtures.cells[pale]].mean(axis=1)
-        x, y = (np.log(colours[:, 2] / colours[:, 1]) for colours in (own.wanted[pale], shown))
-        return float(np.polyfit(x, y, 1)[0])
 
-    # Half of green in blue leaves half of the chroma, but for cells that are bluer.
-    assert kept(daylight) < 0.65
-    assert kept(own) > 0.8
+def test_places_are_the_inverse_of_what_is_seen() -> None:
+    bits = 3
+    codes = np.stack([np.arange(512) >> 6, np.arange(512) >> 3 & 7, np.arange(512) & 7], axis=-1) / 7
+    colours = (0.05 + 0.9 * codes**2.2) @ np.array([[0.8, 0.1, 0.1], [0.2, 0.7, 0.1], [0.0, 0.2, 0.8]])
+    places = np.random.default_rng(4).uniform(0, 7, (200, 3))
+    around, weights = corners(places, bits)
+    wanted = np.einsum("kc,kcx->kx", weights, colours[around])
+    found = nearest_to(colours, wanted, np.clip(places + 0.7, 0, 7), bits)
+    np.testing.assert_allclose(found, places, atol=1e-3)
+    # What is out of reach ends on the surface, nearer than any cell.
+    beyond = wanted * [1.6, 0.7, 0.7]
+    found = nearest_to(colours, beyond, places, bits)
+    around, weights = corners(found, bits)
+    missed = angles_deg(np.einsum("kc,kcx->kx", weights, colours[around]), beyond)
+    assert np.median(missed) < 0.1 or ((found <= 0) | (found >= 7)).any(axis=1).mean() > 0.5
 
 
 def test_black_is_as_dark_as_it_can_be_grey(make_table: MakeTable) -> None:
     profile = profile_of(make_table(bits=4), 1)
-    assert black_point(profile) == pytest.approx(profile.black, rel=0.1)
-    tinted = PrintProfile(profile.colours * np.array([1.1, 1.0, 0.9]), profile.usable)
-    darker = tinted.colours[tinted.colours.mean(axis=1) < tinted.black]
+    lut = make_table(bits=4, name="again")
+    assert ColorimetricRendering(lut, MINE).black(plain(1)) == pytest.approx(profile.black, rel=0.1)
+
+    def redden(samples: npt.NDArray[np.uint16]) -> None:
+        samples[:] = np.rint(samples * [1.1, 1.0, 0.9])
+
+    tinted = make_table(bits=4, change=redden, name="tinted")
+    profile = profile_of(tinted, 1)
+    darker = profile.colours[profile.colours.mean(axis=1) < profile.black]
     assert angles_deg(darker, np.ones(3)).min() > BLACK_WITHIN_DEG
-    lifted = wanted_colours(tinted, ColourMatrix("mine", MATRIX, ""))[0]
-    assert mix_cells(tinted, lifted[None]).distance[0] <= BLACK_WITHIN_DEG
+    rendering = ColorimetricRendering(tinted, MINE)
+    assert rendering.map.distance[0] <= BLACK_WITHIN_DEG
+    assert rendering.black(plain(1)) == pytest.approx(profile.black, rel=0.26)
 
 
-def test_a_second_run_takes_what_the_first_kept(
+def test_a_map_is_found_once_for_a_table_and_a_matrix(
     make_table: MakeTable, cache: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    matrix = ColourMatrix("mine", MATRIX, "")
-    first = colorimetric_mixtures(make_table(bits=1), 0, matrix)
+    first = ColorimetricRendering(make_table(bits=1), MINE).map
     (path,) = cache.iterdir()
     content = path.read_bytes()
-    # The same table at another place is the same table; another light, matrix or table is not.
-    again = colorimetric_mixtures(make_table(bits=1, name="copy"), 0, matrix)
-    np.testing.assert_array_equal(first.cells, again.cells)
+    # The same table at another place is the same table; another matrix or table is not.
+    again = ColorimetricRendering(make_table(bits=1, name="copy"), MINE)
+    assert again.map.sha256 == first.sha256
     assert [file.name for file in cache.iterdir()] == [path.name]
     assert path.read_bytes() == content
-    colorimetric_mixtures(make_table(bits=1, name="other"), 1, matrix)
-    colorimetric_mixtures(make_table(bits=1, name="third"), 0, ColourMatrix("none", np.eye(3), ""))
-    colorimetric_mixtures(make_table(bits=1, tint=0.1, name="fourth"), 0, matrix)
-    assert len(list(cache.iterdir())) == 4
-    # Nor is what other libraries have computed.
+    ColorimetricRendering(make_table(bits=1, name="third"), ColourMatrix("none", np.eye(3), "")).map  # noqa: B018
+    ColorimetricRendering(make_table(bits=1, tint=0.1, name="fourth"), MINE).map  # noqa: B018
+    assert len(list(cache.iterdir())) == 3
+    # Nor is what another numpy has computed.
     monkeypatch.setattr("generator.rendering.colorimetric.version", "{} 0".format)
-    colorimetric_mixtures(make_table(bits=1, name="fifth"), 0, matrix)
-    assert len(list(cache.iterdir())) == 5
+    ColorimetricRendering(make_table(bits=1, name="fifth"), MINE).map  # noqa: B018
+    assert len(list(cache.iterdir())) == 4
 
 
-def test_a_mixture_of_lights_is_kept_when_it_comes_again(
-    make_table: MakeTable, cache: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Pictures go through a list of lights time and again; of lights drawn at random each comes once."""
-    lut, matrix = make_table(bits=1), ColourMatrix("mine", MATRIX, "")
-    # More than are in memory.
-    mixtures = [Mixture((0, 2), (part / 32, 1 - part / 32)) for part in range(1, 20)]
-    first = [colorimetric_mixtures(lut, mixture, matrix).cells for mixture in mixtures]
-    once = len(list(cache.iterdir()))
-    assert once <= 3, "lights of the table alone"
-    for mixture in mixtures:
-        colorimetric_mixtures(lut, mixture, matrix)
-    assert len(list(cache.iterdir())) == once + len(mixtures)
-    monkeypatch.setattr("generator.rendering.colorimetric.mix_cells", None)
-    for mixture, cells in zip(mixtures, first, strict=True):
-        np.testing.assert_array_equal(colorimetric_mixtures(lut, mixture, matrix).cells, cells)
-
-
-def test_lights_have_numbers_temperatures_and_mixtures(make_table: MakeTable) -> None:
+@pytest.mark.parametrize("length", [-9, 0, 400])
+def test_a_damaged_map_is_as_good_as_none(make_table: MakeTable, cache: Path, length: int) -> None:
     lut = make_table(bits=1)
-    by_number, by_kelvin = colorimetric_mixtures(lut, 1), colorimetric_mixtures(lut, 5600.0)
-    np.testing.assert_array_equal(by_number.cells, by_kelvin.cells)
-    # This print is the same under all lights, but for noise.
-    mixed = colorimetric_mixtures(lut, Mixture((0, 2), (0.5, 0.5)))
-    assert np.median(np.abs(mixed.colours - by_number.colours)) < 0.005
+    whole = ColorimetricRendering(lut, MINE).map.sha256
+    (path,) = cache.iterdir()
+    path.write_bytes(path.read_bytes()[:length])
+    assert ColorimetricRendering(lut, MINE).map.sha256 == whole
+
+
+def test_where_nothing_can_be_kept_nothing_is(make_table: MakeTable, tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    rendering = ColorimetricRendering(make_table(bits=1), MINE, tmp_path / "file" / "folder")
+    assert len(rendering.map.nearest) == NODES
+
+
+def test_light_adds_but_for_the_tint_of_greys(make_table: MakeTable) -> None:
+    lut = make_table(bits=3)
+    rendering = ColorimetricRendering(lut, MINE)
+    mixed = rendering.seen(Mixture((0, 2), (0.25, 0.75)))
+    sums = 0.25 * rendering.seen(plain(0)) + 0.75 * rendering.seen(plain(2))
+    np.testing.assert_allclose(mixed, sums, rtol=0.02, atol=2)
+    assert angles_deg(mixed[GREYS], Mixture((0, 2), (0.25, 0.75)).white(lut)).max() < 1e-4
     with pytest.raises(InputError, match="there is no light 9"):
-        colorimetric_mixtures(lut, 9)
-    with pytest.raises(InputError, match="1000 K is outside"):
-        colorimetric_mixtures(lut, 1000.0)
+        rendering.seen(plain(9))
 
 
-def test_greys_are_grey_under_mixtures_of_lights_and_several_lights(make_table: MakeTable) -> None:
-    lut = make_table(bits=4, tint=0.15)
-    rendering = ColorimetricRendering(lut, ColourMatrix("mine", MATRIX, ""))
-    mixture = Mixture((0, 2), (0.3, 0.7))
-    mixtures = rendering.mixtures_for(Lighting((mixture,)))
-    shown = mixture.samples(lut).astype(np.float64)[mixtures.cells[GREYS]].mean(axis=(1, 2))
-    assert angles_deg(shown, mixture.white(lut)).max() < 0.5
-    assert mixtures.distance[GREYS].max() < 0.5
-    # Two lights that are the same are one.
-    lighting = Lighting((mixture, mixture), parse_masks("half-plane", 2, 1).maker(0))
-    assert rendering.light_of(lighting).weights == pytest.approx(mixture.weights)
-    np.testing.assert_array_equal(rendering.mixtures_for(lighting).cells, mixtures.cells)
+def test_black_that_is_taken_out_leaves_means_and_white(make_table: MakeTable) -> None:
+    lut = make_table(bits=3)
+    options = DatasetOptions(rendering="colorimetric", matrix=MINE, black_point=BlackPoint("compensate"))
+    kept = photograph(lut, RAMP, Lighting((plain(1),)), replace(options, black_point=BlackPoint()), 3, 4, 11536)[0]
+    bare = photograph(lut, RAMP, Lighting((plain(1),)), options, 3, 4, 11536)[0]
+    black, white = kept[0].mean(axis=0), lut.white[1]
+    wanted = (kept.mean(axis=1) - black) / (1 - black / white)
+    # Cut off at 0, noise would lift black by .4 of it, 6 counts here.
+    np.testing.assert_allclose(bare.mean(axis=1), wanted, atol=2.5)
+    assert bare.mean(axis=1)[0].max() < 1
 
 
-def test_greys_are_mixed_anew_for_a_mixture_of_unlike_lights(make_table: MakeTable) -> None:
-    lut = make_table(bits=4, tint=0.15, blue_of_green=0.8)
-    matrix = ColourMatrix("mine", MATRIX, "")
-    mixture = Mixture((0, 2), (0.8, 0.2))
-    seen = mixture.samples(lut).mean(axis=1) / mixture.white(lut)
-    by_one = [colorimetric_mixtures(lut, light, matrix).cells[GREYS] for light in range(3)]
-    assert min(angles_deg(seen[cells].mean(axis=1), np.ones(3)).max() for cells in by_one) > 0.5
-    own = colorimetric_mixtures(lut, mixture, matrix).cells[GREYS]
-    assert angles_deg(seen[own].mean(axis=1), np.ones(3)).max() < 0.5
-
-
-def test_several_lights_count_alike_however_bright(make_table: MakeTable) -> None:
-    lut = make_table(bits=1)
-    rendering = ColorimetricRendering(lut, ColourMatrix("mine", MATRIX, ""))
-    light = rendering.light_of(Lighting((plain(0), plain(1)), parse_masks("half-plane", 2, 1).maker(0)))
-    parts = np.array(light.weights) * lut.white[list(light.lights)].sum(axis=1)
-    assert parts[0] == pytest.approx(parts[1])
+def test_the_reference_is_daylight_or_the_light_that_sees_most(make_table: MakeTable) -> None:
+    assert reference_light(make_table(bits=1)) == 1
+    assert reference_light(make_table(bits=1, lights=1, name="candle")) == 0
 
 
 def test_a_table_of_one_light(make_table: MakeTable) -> None:
-    rendering = ColorimetricRendering(make_table(bits=1, lights=1), ColourMatrix("mine", MATRIX, ""))
-    assert rendering.mixtures_for(Lighting((plain(0),))).cells.max() < 8
+    rendering = ColorimetricRendering(make_table(bits=1, lights=1), MINE)
+    assert rendering.cells.max() < 8
+    assert np.isfinite(rendering.seen(plain(0))).all()
 
 
 def test_the_matrix_is_that_of_the_camera_or_of_the_table(make_table: MakeTable) -> None:
@@ -202,8 +220,24 @@ def test_cells_that_clip_and_cells_with_hot_samples_are_not_used(make_table: Mak
     assert profile.usable.sum() > 300
     whole = profile_of(make_table(name="whole"), 1)
     assert profile.white < whole.white
-    shown = clipped.samples[1].astype(np.float64)[colorimetric_mixtures(clipped, 1).cells[GREYS]].mean(axis=(1, 2))
-    assert angles_deg(shown, clipped.white[1]).max() < 0.7
+    shown = ColorimetricRendering(clipped, MINE).seen(plain(1))[GREYS]
+    assert angles_deg(shown, clipped.white[1]).max() < 0.1
+    assert shown.max() < 5000
+
+
+def test_cells_that_are_not_usable_are_not_seen(make_table: MakeTable) -> None:
+    """An odd cell under any light that is dark in a channel, and its neighbours do without it."""
+
+    def spoil(samples: npt.NDArray[np.uint16]) -> None:
+        samples[146, 3] = 9000
+
+    spoilt, whole = make_table(change=spoil), make_table(name="whole")
+    rendering = ColorimetricRendering(spoilt, MINE)
+    seen, found = rendering.seen(plain(1)), rendering.map
+    assert 146 in ColorimetricRendering(whole, MINE).cells
+    assert 146 not in rendering.cells
+    assert not found.weights[found.cells[found.around] == 146].any()
+    np.testing.assert_allclose(seen, ColorimetricRendering(whole, MINE).seen(plain(1)), rtol=0.25)
 
 
 def test_a_black_that_is_spoilt_is_named_and_makes_no_flat_image(make_table: MakeTable) -> None:
@@ -211,4 +245,4 @@ def test_a_black_that_is_spoilt_is_named_and_makes_no_flat_image(make_table: Mak
         samples[0] = (samples[511] * 0.7).astype(np.uint16)
 
     with pytest.raises(QualityError, match=r"under light 1 the table .* has a black as bright as 0\.6\d* of white"):
-        colorimetric_mixtures(make_table(change=spoil), 1)
+        ColorimetricRendering(make_table(change=spoil), MINE).seen(plain(1))

@@ -20,7 +20,7 @@ from generator.lights.lighting import Mixture
 from generator.pictures.picture import Picture
 from generator.pictures.sources import random_scenes
 from generator.rendering.black_points import BlackPoint, veil_of
-from generator.rendering.colorimetric import colorimetric_mixtures
+from generator.rendering.colorimetric import ColorimetricRendering
 from generator.rendering.matrices import ColourMatrix
 from generator.training.crops import KEPT, Crops, Recycled
 from generator.training.gallery import Gallery, gallery_of, open_gallery, save_gallery
@@ -297,7 +297,7 @@ def test_crops_by_colour_are_windows_of_the_image_that_is_rendered_so(
     level = lut.provenance.white_level
     for image, before, light, share in zip(batch.images, kept.images, batch.lights, batch.black_taken, strict=True):
         mixture = crops.lights[int(light)]
-        grey = colorimetric_mixtures(lut, mixture, MATRIX).black
+        grey = ColorimetricRendering(lut, MATRIX).black(mixture)
         veil = veil_of(lut, mixture, float(share), grey)
         wanted = (before.astype(np.float64) * level - veil.taken[:, None, None]) * veil.stretch[:, None, None] / level
         np.testing.assert_allclose(image, wanted, atol=2e-6)
