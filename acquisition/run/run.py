@@ -19,7 +19,7 @@ from acquisition.judge.judge import LiveJudge
 from acquisition.judge.measure import ExposureJudge
 from acquisition.monitor.feed import write_session_report
 from acquisition.run.devices import Devices, RunEnd, leave_lab, make_ready
-from acquisition.run.notices import Notices
+from acquisition.run.notices import Notices, PauseNotices
 from acquisition.run.pipeline import Job, Pipeline, Saver, Taken
 from acquisition.run.plan import planned_steps, require_plan, require_same
 from acquisition.run.queue import StepQueue, link_runs, unclosed_kinds, white_first
@@ -187,10 +187,6 @@ def clock_note(session: Session, clock: Clock) -> str:
     )
 
 
-NOTIFIED = ("paused", "resumed")
-"""Words of a run's reports that are told to whoever is notified; its end is, in any case."""
-
-
 @dataclass(frozen=True)
 class RunOutcome:
     """Why a run ended.
@@ -314,26 +310,34 @@ class _Reports:
         self._announce = announce
         self._state = state
         self._notices = Notices(notify, session.folder.name, announce)
+        self._pauses = PauseNotices(self._notify, clock)
 
     def tell(self, what: str, sentence: str, /) -> None:
         """Tell what happens."""
         self._announce(f"{what}: {sentence}")
-        if what in NOTIFIED:
-            self._notices.tell(what, sentence, datetime.now(UTC))
+        if what == "paused":
+            self._pauses.paused(sentence)
+        elif what == "resumed":
+            self._pauses.resumed(sentence)
         if what != VOIDED:  # the journal notes that with the rows that it changes
             self._journal.note(self._clock.now(), what, sentence)
 
     def sign_of_life(self, what: str, sentence: str, within_s: float, /) -> None:
         """Say that the run waits, and for what."""
         doing: RunState = "paused" if what == "paused" else "waiting"
+        if doing == "paused":
+            self._pauses.paused(sentence)
         self._state(sentence)
         self._journal.beat(doing, sentence, datetime.now(UTC) + timedelta(seconds=within_s))
 
     def end(self, how: str, sentence: str) -> None:
         """Note why the run is over; a disk that cannot take that is told of already."""
-        self._notices.tell(how, sentence, datetime.now(UTC))
+        self._notify(how, sentence)
         with suppress(StorageError):
             self._journal.note(self._clock.now(), how, sentence)
+
+    def _notify(self, event: str, sentence: str) -> None:
+        self._notices.tell(event, sentence, datetime.now(UTC))
 
     def close(self) -> None:
         """Let the last notices be delivered."""

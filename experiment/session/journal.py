@@ -311,6 +311,11 @@ class Journal:
         )
         return [AcceptedFile(*row) for row in rows]
 
+    def unused_bytes(self, after: int) -> int:
+        """Return how many bytes the raw files of refused and voided attempts with numbers above `after` take."""
+        query = "SELECT COALESCE(SUM(size), 0) FROM attempts WHERE id > ? AND verdict IN (?, ?)"
+        return int(self._rows(query, (after, REFUSED, VOIDED))[0][0])
+
     def kept_files(self, step: SessionStep) -> int:
         """Return how many raw files, accepted or refused, `step` has already."""
         query = "SELECT COUNT(*) FROM attempts WHERE step=? AND sha256 IS NOT NULL"
