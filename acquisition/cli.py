@@ -414,6 +414,22 @@ def redact(session: Annotated[Path, typer.Argument(help="Session folder.")]) -> 
 
 
 @app.command(epilog=EXIT_CODES)
+def rebuild(session: Annotated[Path, typer.Argument(help="Session folder.")]) -> None:
+    """Make the journal of a session anew that was deleted, overwritten or damaged.
+
+    Reads SESSION/ledger.jsonl, where each run writes what the journal holds a second time. Writes
+    SESSION/journal.sqlite; what stands in its place is renamed, not deleted. Frames stay as they are.
+    """
+    from experiment.session.folder import busy_sentence, rebuild_journal
+    from experiment.session.journal import JOURNAL_FILE
+    from foundation.folders import held_folder
+
+    with held_folder(session, busy_sentence(session)):
+        attempts = rebuild_journal(session)
+    print(f"{session / JOURNAL_FILE}: made anew, {attempts} attempts; next: acquire status {session}")
+
+
+@app.command(epilog=EXIT_CODES)
 def monitor(
     session: Annotated[Path, typer.Argument(help="Session folder; one that is not there yet is waited for.")],
     port: Annotated[int, typer.Option(min=0, max=65535, help="Port; 0 takes a free one.")] = 8707,

@@ -49,7 +49,7 @@ from experiment.session.records import (
     preview_path,
 )
 from foundation.console import Ending
-from foundation.errors import CropError, DeviceError, QualityError, StorageError, counted
+from foundation.errors import CropError, DeviceError, QualityError, StorageError, counted, first_of
 from foundation.files import write_whole
 
 AHEAD = 1
@@ -177,7 +177,7 @@ class Pipeline:
             step = self._job.queue.next()
             if step is not None:
                 return self._job.retry.attempt(partial(self._show, step), _SCREEN)
-            if not self._under_way:
+            if not self._under_way and not self._verdicts.void_lost():
                 self._lasting.over()
                 return None
             self._collect(0)
@@ -338,6 +338,8 @@ class Pipeline:
             try:
                 self._collect(0)
             except CropError as further:
+                if str(further) == str(error):
+                    continue
                 error.add_note(f"then: {further}")
 
 
@@ -459,12 +461,24 @@ class Verdicts:
             self._lasting.accepted(step, frame.changed)
         else:
             self._refuse(step, judgement)
+        if judgement.accepted and step.kind == "white":
+            self.void_lost()
         if judgement.voids and step.kind in REFERENCES:
             self._void_since_reference(frame, judgement.reason, under_way)
         elif judgement.voids:
             self._void_first_frames(frame, judgement.reason, under_way)
         if voided or not judgement.accepted:
             self._unused_bytes = job.on_disk(lambda: job.session.journal.unused_bytes(self._last_before))
+
+    def void_lost(self) -> bool:
+        """Open the steps again whose files are gone or cut since they were taken; return whether there are any."""
+        queue, found = self._job.queue, self._job.on_disk(self._job.session.lost_files)
+        lost = [frame for frame in found if not queue.is_open(frame.step)]
+        if lost:
+            reason = f"{first_of([frame.file for frame in lost])}: gone or cut while the run was at work"
+            queue.void([frame.step for frame in lost], reason)
+            self._void([frame.attempt for frame in lost], reason)
+        return bool(lost)
 
     def _refuse(self, step: SessionStep, judgement: Judgement) -> None:
         queue = self._job.queue

@@ -41,7 +41,7 @@ from contextlib import AbstractContextManager, nullcontext, suppress
 from dataclasses import dataclass
 from typing import Final, Protocol, TypeVar
 
-from experiment.session.journal_file import HeldJournalError
+from experiment.session.journal_file import HeldJournalError, LostJournalError
 from experiment.session.records import duration_text
 from foundation import errors
 from foundation.clock import Clock
@@ -90,7 +90,7 @@ class WaitCallback(Protocol):
 
 def is_curable(fault: CropError) -> bool:
     """Return whether waiting may help: any fault of a device or of the disk, but nothing that the user gave."""
-    return isinstance(fault, DeviceError | StorageError) and not isinstance(fault, HeldJournalError)
+    return isinstance(fault, DeviceError | StorageError) and not isinstance(fault, HeldJournalError | LostJournalError)
 
 
 class RetryPolicy:

@@ -239,6 +239,7 @@ def take_session(
         job = Job(session, devices, settings, _open_steps(session, settings, first), retry)
         if len(job.queue):
             _take_open(job, judge or ExposureJudge(settings), observe, asked)
+        session.journal.require_whole()
         outcome = RunOutcome(len(session.steps), len(job.queue), job.queue.given_up)
         if asked.asked and not outcome.complete:
             raise KeyboardInterrupt
