@@ -66,11 +66,11 @@ class AttemptView(Attempt):
 class Head:
     """How a session stands.
 
-    - `state`: ``running``, ``waiting`` or ``paused`` as the run says it; ``late``: it runs, and a frame takes much longer
-      than those before; ``silent``: it is there, and the sign of life that it announced did not come; ``complete``;
-      ``incomplete``: it has ended and frames are left; ``stopped``: killed or power lost; ``copy``: the run's signs of
-      life are those of another folder; ``unknown``: the journal has no sign of life; ``absent``, ``gone``,
-      ``unreadable``: there is no journal to read, yet, or any more.
+    - `state`: ``running``, ``waiting`` or ``paused`` as the run says it; ``late``: it runs, and a frame takes much
+      longer than those before; ``silent``: it is there, and the sign of life that it announced did not come;
+      ``complete``; ``incomplete``: it has ended and frames are left; ``stopped``: killed or power lost; ``copy``: the
+      run's signs of life are those of another folder; ``unknown``: the journal has no sign of life; ``absent``,
+      ``gone``, ``unreadable``: there is no journal to read, yet, or any more.
     - `sentence`: the same in words, with the remedy behind a semicolon where there is one; empty while there is nothing
       to say.
     - `alive`: whether a run is at work.

@@ -19,6 +19,7 @@ from acquisition.judge.judge import LiveJudge
 from acquisition.judge.measure import ExposureJudge
 from acquisition.monitor.feed import write_session_report
 from acquisition.run.devices import Devices, RunEnd, leave_lab, make_ready
+from acquisition.run.life import Life
 from acquisition.run.notices import Notices, PauseNotices
 from acquisition.run.pipeline import Job, Pipeline, Saver, Taken
 from acquisition.run.plan import planned_steps, require_plan, require_same
@@ -223,7 +224,8 @@ def take_session(
     running frame; None for a run that nobody asks. `first`: numbers of steps that are taken before all others.
     """
     sequence = settings.sequence
-    reports = _Reports(session, devices.clock, announce, state, sequence.notify)
+    life = Life(settings.notify.alive, session.folder.name, announce, devices.clock)
+    reports = _Reports(session, devices.clock, announce, state, sequence.notify, life)
     asked = ending or Ending()
     retry = RetryPolicy(
         devices.clock,
@@ -233,12 +235,18 @@ def take_session(
         reports.sign_of_life,
         asked.at_once,
     )
+
+    def count(frame: Taken) -> None:
+        life.sign(f"{len(session.steps) - frame.left} of {len(session.steps)} frames")
+        observe(frame)
+
+    life.ready()
     try:
         for stray in session.set_aside_strays():
             reports.tell("stray", f"{stray.name}: complete, but not in the journal; kept, not used")
         job = Job(session, devices, settings, _open_steps(session, settings, first), retry)
         if len(job.queue):
-            _take_open(job, judge or ExposureJudge(settings), observe, asked)
+            _take_open(job, judge or ExposureJudge(settings), count, asked)
         session.journal.require_whole()
         outcome = RunOutcome(len(session.steps), len(job.queue), job.queue.given_up)
         if asked.asked and not outcome.complete:
@@ -305,12 +313,14 @@ class _Reports:
         announce: Callable[[str], object],
         state: Callable[[str], object],
         notify: str,
+        life: Life,
     ) -> None:
         self._journal = session.journal
         self._clock = clock
         self._announce = announce
         self._state = state
         self._notices = Notices(notify, session.folder.name, announce)
+        self._life = life
         self._pauses = PauseNotices(self._notify, clock)
 
     def tell(self, what: str, sentence: str, /) -> None:
@@ -329,11 +339,13 @@ class _Reports:
         if doing == "paused":
             self._pauses.paused(sentence)
         self._state(sentence)
+        self._life.sign(f"{doing}: {sentence}")
         self._journal.beat(doing, sentence, datetime.now(UTC) + timedelta(seconds=within_s))
 
     def end(self, how: str, sentence: str) -> None:
         """Note why the run is over; a disk that cannot take that is told of already."""
         self._notify(how, sentence)
+        self._life.end(how, sentence)
         with suppress(StorageError):
             self._journal.note(self._clock.now(), how, sentence)
 
@@ -343,3 +355,4 @@ class _Reports:
     def close(self) -> None:
         """Let the last notices be delivered."""
         self._notices.close()
+        self._life.close()
