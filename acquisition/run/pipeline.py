@@ -33,6 +33,7 @@ from functools import partial
 from typing import Self, TypeVar
 
 from acquisition.run.devices import Devices, HealthWatch, await_health
+from acquisition.run.gaps import GAP_S, GapWatch
 from acquisition.run.queue import StepQueue, link_runs, step_name
 from acquisition.run.retry import FRAMES, Pause, RetryPolicy, is_curable
 from drivers.presenter import Colour, ReadsBack
@@ -46,6 +47,7 @@ from experiment.session.records import (
     Judgement,
     OutlastsPauses,
     SessionStep,
+    duration_text,
     preview_path,
 )
 from foundation.console import Ending
@@ -76,6 +78,7 @@ class Job:
     settings: LabSettings
     queue: StepQueue
     retry: RetryPolicy
+    gaps: GapWatch
 
     def on_disk(self, action: Callable[[], _Result]) -> _Result:
         """Return what `action` returns; while the disk is full or gone, it is waited for."""
@@ -241,6 +244,7 @@ class Pipeline:
         stem = step.stem if kept == 0 else f"{step.stem}_try{kept + 1}"
         number = self._job.on_disk(lambda: journal.begin(step, f"frames/{stem}", light.shown_at))
         self._job.queue.begin(step)
+        self._note_gap()
         begun = clock.monotonic()
         changed = step.colour not in (light.replaced, self._exposed)
         self._exposed = step.colour
@@ -251,7 +255,25 @@ class Pipeline:
             self._pause_for(_CAMERA, error)
             return None
         timings = {"show": light.show_s, "settle": settling_s, "expose": clock.monotonic() - begun}
-        return Exposed(step, number, stem, clock.now(), self._screen_check(step), timings, changed)
+        checks = (*self._screen_check(step), *self._gap_check(step))
+        return Exposed(step, number, stem, clock.now(), checks, timings, changed)
+
+    def _note_gap(self) -> float:
+        """Tell of a time in which the program stood still; return how long that was, seconds."""
+        if gap_s := self._job.gaps.taken():
+            sentence = f"the run stood still for {duration_text(gap_s)}: the machine slept, or the process was stopped"
+            self._job.retry.report("gap", sentence)
+        return gap_s
+
+    def _gap_check(self, step: SessionStep) -> tuple[Check, ...]:
+        """Refuse a frame during which the program stood still: nobody knows what the screen showed meanwhile."""
+        if not (gap_s := self._note_gap()):
+            return ()
+        reason = (
+            f"the run stood still for {duration_text(gap_s)} while the frame was exposed; keep the machine from "
+            "sleeping; the frame is taken again"
+        )
+        return (Check("gap", gap_s, None, GAP_S, "s", reason),)
 
     def _screen_check(self, step: SessionStep) -> tuple[Check, ...]:
         """Ask the screen whether it still shows the light, before it may change."""

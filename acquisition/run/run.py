@@ -19,6 +19,7 @@ from acquisition.judge.judge import LiveJudge
 from acquisition.judge.measure import ExposureJudge
 from acquisition.monitor.feed import write_session_report
 from acquisition.run.devices import Devices, RunEnd, leave_lab, make_ready
+from acquisition.run.gaps import GapWatch
 from acquisition.run.life import Life
 from acquisition.run.notices import Notices, PauseNotices
 from acquisition.run.pipeline import Job, Pipeline, Saver, Taken
@@ -244,9 +245,10 @@ def take_session(
     try:
         for stray in session.set_aside_strays():
             reports.tell("stray", f"{stray.name}: complete, but not in the journal; kept, not used")
-        job = Job(session, devices, settings, _open_steps(session, settings, first), retry)
-        if len(job.queue):
-            _take_open(job, judge or ExposureJudge(settings), count, asked)
+        with GapWatch() as gaps:
+            job = Job(session, devices, settings, _open_steps(session, settings, first), retry, gaps)
+            if len(job.queue):
+                _take_open(job, judge or ExposureJudge(settings), count, asked)
         session.journal.require_whole()
         outcome = RunOutcome(len(session.steps), len(job.queue), job.queue.given_up)
         if asked.asked and not outcome.complete:
