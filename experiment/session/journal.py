@@ -30,7 +30,6 @@ from experiment.session.journal_file import (
     LockRetry,
     LostJournalError,
     close_after_run,
-    connect_to_read,
     create_file,
     open_for_run,
     open_to_read,
@@ -405,8 +404,8 @@ class Journal:
 
     def _append(self, ledger: Ledger, rows: Mapping[str, Sequence[Row]]) -> None:
         if not ledger.is_there():
-            with closing(connect_to_read(self._path)) as committed:
-                ledger.restore(rows_of(committed))
+            # Of the file that is open: that on the disk may be gone as well.
+            ledger.restore(rows_of(self._connection))
         ledger.append(rows)
 
 

@@ -87,7 +87,12 @@ def log_cut(folder: Path) -> None:
     os.truncate(folder / "journal.sqlite-wal", 40)
 
 
-MISHAPS = (deleted, cut, emptied, replaced, overwritten, overwritten_by_another, log_deleted, log_cut)
+def both_deleted(folder: Path) -> None:
+    ledger_path(folder).unlink()
+    deleted(folder)
+
+
+MISHAPS = (both_deleted, deleted, cut, emptied, replaced, overwritten, overwritten_by_another, log_deleted, log_cut)
 
 
 def facts(folder: Path) -> Rows:
