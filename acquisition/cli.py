@@ -24,7 +24,7 @@ from foundation.console import (
     orderly_end,
     with_json,
 )
-from foundation.errors import InputError, QualityError, first_of
+from foundation.errors import DeviceError, InputError, QualityError, first_of
 
 if TYPE_CHECKING:
     from experiment.config import LabSettings
@@ -377,7 +377,8 @@ def status(
 ) -> None:
     """Show how far a session is, how long it will take, what was measured last, and what was refused.
 
-    Reads SESSION, also while it is being taken; writes nothing. Says so when the run was killed.
+    Reads SESSION, also while it is being taken; writes nothing. Says so when the run was killed. Ends with 3 when it is
+    there, and a frame is late, or no sign of life came in its time.
     """
     from datetime import UTC, datetime
 
@@ -394,6 +395,9 @@ def status(
         print("\n".join(status_lines(view, now)))
     if warning := secrets_warning(session):
         print(f"warning: {warning}", file=sys.stderr)
+    head = view.head(now)
+    if head.state in ("late", "silent"):
+        raise DeviceError(head.sentence)
 
 
 @app.command(epilog=EXIT_CODES)
@@ -411,6 +415,22 @@ def redact(session: Annotated[Path, typer.Argument(help="Session folder.")]) -> 
         print(f"{session / SETTINGS_FILE}: {' and '.join(found)} taken out; change it where copies are about")
     else:
         print(f"{session / SETTINGS_FILE}: holds no secret")
+
+
+@app.command(epilog=EXIT_CODES)
+def rebuild(session: Annotated[Path, typer.Argument(help="Session folder.")]) -> None:
+    """Make the journal of a session anew that was deleted, overwritten or damaged.
+
+    Reads SESSION/ledger.jsonl, where each run writes what the journal holds a second time. Writes
+    SESSION/journal.sqlite; what stands in its place is renamed, not deleted. Frames stay as they are.
+    """
+    from experiment.session.folder import busy_sentence, rebuild_journal
+    from experiment.session.journal import JOURNAL_FILE
+    from foundation.folders import held_folder
+
+    with held_folder(session, busy_sentence(session)):
+        attempts = rebuild_journal(session)
+    print(f"{session / JOURNAL_FILE}: made anew, {attempts} attempts; next: acquire status {session}")
 
 
 @app.command(epilog=EXIT_CODES)

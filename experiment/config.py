@@ -26,7 +26,7 @@ from foundation.secret_texts import MASK, is_webhook, target_label
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 
-_SECRETS = ("sequence.notify", "lab.projector.password")
+_SECRETS = ("sequence.notify", "notify.alive", "lab.projector.password")
 """Keys whose values are in no message, nor in `session.toml`: a session is copied, shown and published."""
 
 _SECRET_BYTES = 4096
@@ -124,10 +124,21 @@ class SequenceSettings(Settings):
     lamp_if_unfinished: Literal["off", "on"] = "off"
     """What the lamp does when a run ends by itself before the session is complete: it goes out, for nobody may be
     there, or burns on, so that the next run needs no warm-up. After Ctrl-C it is left as it is."""
+    refused_gb: Annotated[float, Field(gt=0)] = 5.0
+    """Gigabytes that refused and voided frames of one run may take of the disk before it ends: two hundred frames of an
+    18-megapixel body, a quarter of a session's; ``inf``: as many as there is space for."""
     notify: Annotated[str, AfterValidator(_target_checked), Field(repr=False)] = ""
     """Who is told when a run pauses, goes on and ends: a URL that gets JSON by POST, or a command that gets the same on
     its standard input; empty: nobody. Or ``{ env = "NAME" }`` or ``{ file = "PATH" }``, where that is found. Kept out
     of messages and `session.toml`, but for the host or the program's name."""
+
+
+class NotifySettings(Settings):
+    """Who is told that a run lives."""
+
+    alive: Annotated[str, AfterValidator(_target_checked), Field(repr=False)] = ""
+    """A URL or a command that is told at most once a minute that the run is at work, and at its end how it ended, as
+    `sequence.notify` is told; what expects that, and pages somebody when it does not come, is a dead man's switch."""
 
 
 class LimitSettings(Settings):
@@ -293,6 +304,7 @@ class LabSettings(Settings):
     """illuminations.csv of the plan, relative to the settings file."""
     camera: CameraSettings = CameraSettings()
     sequence: SequenceSettings = SequenceSettings()
+    notify: NotifySettings = NotifySettings()
     limits: LimitSettings = LimitSettings()
     judge: JudgeSettings = JudgeSettings()
     simulated: SimulatedSettings = SimulatedSettings()
@@ -316,6 +328,7 @@ class LabSettings(Settings):
         """Return the settings, defaults included, as the text of `session.toml`; secrets are masked."""
         values = self.model_dump(mode="json", exclude_none=True)
         values["sequence"]["notify"] = target_label(self.sequence.notify)
+        values["notify"]["alive"] = target_label(self.notify.alive)
         # A password is needed to take frames, and whoever does that has LAB.toml.
         values["lab"]["projector"].pop("password", None)
         return tomli_w.dumps(values)

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from experiment.lights import Illumination, load_illuminations
-from experiment.session.heartbeat import AGAIN, Heartbeat, SessionPlace
+from experiment.session.heartbeat import AGAIN, BEAT_S, LATE_S, Heartbeat, SessionPlace
 from experiment.session.journal import JOURNAL_FILE, Journal
 from experiment.session.records import (
     ACCEPTED,
@@ -37,6 +37,12 @@ from foundation.errors import CropError
 
 RUN_STARTS = "start"
 """The event with which a run begins to take frames."""
+
+LATE_FRAMES = 3
+"""Times that frames lately took, after which one is late: a download that is tried again takes twice as long."""
+
+LOOK = "look at the camera, its cable and the machine"
+"""What helps where a run says nothing."""
 
 LAB_CLOCK_S = 600.0
 """How far the lab's clock may be from that of the wall for the end to be told as a time of day; a simulated lab's time
@@ -60,10 +66,11 @@ class AttemptView(Attempt):
 class Head:
     """How a session stands.
 
-    - `state`: ``running``, ``waiting`` or ``paused`` as the run says it; ``complete``; ``incomplete``: it has ended and
-      frames are left; ``stopped``: killed or power lost; ``copy``: the run's signs of life are those of another folder;
-      ``unknown``: the journal has no sign of life; ``absent``, ``gone``, ``unreadable``: there is no journal to read,
-      yet, or any more.
+    - `state`: ``running``, ``waiting`` or ``paused`` as the run says it; ``late``: it runs, and a frame takes much
+      longer than those before; ``silent``: it is there, and the sign of life that it announced did not come;
+      ``complete``; ``incomplete``: it has ended and frames are left; ``stopped``: killed or power lost; ``copy``: the
+      run's signs of life are those of another folder; ``unknown``: the journal has no sign of life; ``absent``,
+      ``gone``, ``unreadable``: there is no journal to read, yet, or any more.
     - `sentence`: the same in words, with the remedy behind a semicolon where there is one; empty while there is nothing
       to say.
     - `alive`: whether a run is at work.
@@ -207,8 +214,9 @@ def head_of(view: SessionView, now: datetime, process_alive: bool | None) -> Hea
     done = {one.step for one in attempts if one.verdict == ACCEPTED} & {step.number for step in steps}
     verdicts = [one.verdict for one in attempts]
     left = len(steps) - len(done)
-    state, sentence = _state_of(view, now, process_alive, left)
     intervals = [one.seconds for one in attempts[-RECENT:] if one.seconds is not None]
+    frame_s = statistics.median(intervals) if intervals else None
+    state, sentence = _state_of(view, now, process_alive, left, frame_s)
     judged = (one for one in attempts if one.verdict is not None)
     remaining = time_left((TimedAttempt(one.seconds, one.verdict in (ACCEPTED, VOIDED)) for one in judged), left)
     near = (
@@ -220,7 +228,7 @@ def head_of(view: SessionView, now: datetime, process_alive: bool | None) -> Hea
     return Head(
         state,
         sentence,
-        state in ("running", "waiting", "paused"),
+        state in ("running", "waiting", "paused", "late"),
         heartbeat.at if heartbeat else None,
         heartbeat.until if heartbeat else None,
         total=len(steps),
@@ -230,14 +238,16 @@ def head_of(view: SessionView, now: datetime, process_alive: bool | None) -> Hea
         refused=verdicts.count(REFUSED),
         failed=verdicts.count(FAILED),
         voided=verdicts.count(VOIDED),
-        seconds_per_frame=statistics.median(intervals) if intervals else None,
+        seconds_per_frame=frame_s,
         remaining_s=remaining,
         eta=now + timedelta(seconds=remaining) if near and remaining is not None else None,
         last=next((one.taken_at for one in reversed(attempts) if one.taken_at is not None), None),
     )
 
 
-def _state_of(view: SessionView, now: datetime, process_alive: bool | None, left: int) -> tuple[str, str]:
+def _state_of(
+    view: SessionView, now: datetime, process_alive: bool | None, left: int, frame_s: float | None
+) -> tuple[str, str]:
     heartbeat, here, total = view.heartbeat, view.place, len(view.steps)
     copied = heartbeat is not None and heartbeat.state != "ended" and heartbeat.is_of(here) is False
     over = heartbeat is None or heartbeat.state == "ended" or copied or heartbeat.is_dead(now, process_alive)
@@ -251,4 +261,12 @@ def _state_of(view: SessionView, now: datetime, process_alive: bool | None, left
         return "stopped", heartbeat.sentence_for(now, process_alive)
     if heartbeat.state == "ended":
         return "incomplete", heartbeat.sentence or f"ended with {left} of {total} frames left; {AGAIN}"
+    since = f"{heartbeat.at.astimezone():%Y-%m-%d %H:%M:%S}"
+    if now > heartbeat.until + timedelta(seconds=LATE_S):
+        doing = f"then: {heartbeat.sentence}"
+        return "silent", f"no sign since {since}, and its process is there: it hangs, or was stopped ({doing}); {LOOK}"
+    if heartbeat.state == "running" and frame_s is not None:
+        due_s = BEAT_S + LATE_FRAMES * frame_s + LATE_S
+        if (now - heartbeat.at).total_seconds() > due_s:
+            return "late", f"late since {since}: a frame takes {frame_s:.1f} s, and none came; {LOOK}"
     return heartbeat.state, heartbeat.sentence

@@ -20,6 +20,7 @@ from __future__ import annotations
 
 import base64
 import json
+import math
 import os
 import queue
 import shlex
@@ -39,13 +40,18 @@ from urllib.parse import unquote, urlsplit, urlunsplit
 
 from acquisition.run.pipeline import Taken
 from acquisition.run.queue import step_name
+from acquisition.run.retry import pause_cause
 from experiment.session.records import RECENT, Check, Judgement, TimedAttempt, duration_text, time_left
+from foundation.clock import Clock
 from foundation.secret_texts import is_webhook, target_label
 
 LIMIT_S: Final = 20.0
 """How long a receiver may take; a message to a telephone takes seconds."""
 ENDING_S: Final = 2.0
 """How much longer the end waits for the last one, so that a receiver that is too slow is named."""
+QUIET_S: Final = 3600.0
+"""Between two notices of a pause for the same cause: whoever was told once in the hour, and did not come, is not woken
+by each time that it comes and goes."""
 QUEUED: Final = 100
 """Notices that may wait for a slow receiver; more are dropped."""
 
@@ -173,6 +179,34 @@ def _post(url: str, body: bytes, headers: Mapping[str, str]) -> str:
         return getattr(error.reason, "strerror", None) or type(error.reason).__name__
     except (OSError, ValueError, http.client.HTTPException) as error:
         return getattr(error, "strerror", None) or type(error).__name__
+
+
+class PauseNotices:
+    """Tells of pauses: of one for the same cause once in `QUIET_S`, of the end of one that was told.
+
+    `tell`: takes an event and its sentence.
+    """
+
+    def __init__(self, tell: Callable[[str, str], object], clock: Clock) -> None:
+        self._tell, self._clock = tell, clock
+        self._told_at: dict[str, float] = {}
+        self._is_told = False
+
+    def paused(self, sentence: str) -> None:
+        """Note a pause as it begins, or as it lasts: one that began too early to be told is told later."""
+        if self._is_told:
+            return
+        cause, now = pause_cause(sentence), self._clock.monotonic()
+        if now - self._told_at.get(cause, -math.inf) >= QUIET_S:
+            self._told_at[cause] = now
+            self._is_told = True
+            self._tell("paused", sentence)
+
+    def resumed(self, sentence: str) -> None:
+        """Note that the pause is over."""
+        if self._is_told:
+            self._is_told = False
+            self._tell("resumed", sentence)
 
 
 SHOWN = ("light", "movement", "blur", "white drift", "dark", "ambient", "exposure")

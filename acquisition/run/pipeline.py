@@ -33,9 +33,10 @@ from functools import partial
 from typing import Self, TypeVar
 
 from acquisition.run.devices import Devices, HealthWatch, await_health
+from acquisition.run.gaps import GAP_S, GapWatch
 from acquisition.run.queue import StepQueue, link_runs, step_name
-from acquisition.run.retry import Pause, RetryPolicy, is_curable
-from drivers.presenter import ReadsBack
+from acquisition.run.retry import FRAMES, Pause, RetryPolicy, is_curable
+from drivers.presenter import Colour, ReadsBack
 from experiment.config import JudgeSettings, LabSettings
 from experiment.session.folder import ReceivedFile, Session
 from experiment.session.records import (
@@ -46,10 +47,11 @@ from experiment.session.records import (
     Judgement,
     OutlastsPauses,
     SessionStep,
+    duration_text,
     preview_path,
 )
 from foundation.console import Ending
-from foundation.errors import CropError, DeviceError, QualityError, StorageError, counted
+from foundation.errors import CropError, DeviceError, QualityError, StorageError, counted, first_of
 from foundation.files import write_whole
 
 AHEAD = 1
@@ -58,13 +60,6 @@ come in, several times what judging takes; more would only be lost where one is 
 
 DOWNLOADS = 2
 """Tries at fetching a frame before it is exposed again: a driver has renewed its connection several times by then."""
-
-PROBE_S = 5.0
-"""Between the second and the third try at a frame that is refused for something lasting; the second comes at once, each
-later pause is twice the one before."""
-
-LONGEST_PROBE_S = 300.0
-"""Between two such tries at most: each leaves a refused file of 25 MB, and an operator can wait for five minutes."""
 
 PROMISE = "ending after this frame; press Ctrl-C again to end at once"
 """What somebody is told who asks a run to end."""
@@ -83,6 +78,7 @@ class Job:
     settings: LabSettings
     queue: StepQueue
     retry: RetryPolicy
+    gaps: GapWatch
 
     def on_disk(self, action: Callable[[], _Result]) -> _Result:
         """Return what `action` returns; while the disk is full or gone, it is waited for."""
@@ -100,19 +96,24 @@ class Taken:
 
 @dataclass(frozen=True)
 class ShownLight:
-    """A step whose light is on the screen since `since`, seconds of the clock; to show it took `show_s`."""
+    """A step whose light is on the screen since `since`, seconds of the clock; to show it took `show_s`.
+
+    `replaced`: the colour that was shown before; None for the first.
+    """
 
     step: SessionStep
     shown_at: datetime
     since: float
     show_s: float
+    replaced: Colour | None
 
 
 @dataclass(frozen=True)
 class Exposed:
     """A frame that is in the camera or beyond it; `checks` are what the devices say of it.
 
-    `number` is that of its attempt in the journal, `stem` its file's name without suffix.
+    `number` is that of its attempt in the journal, `stem` its file's name without suffix. `changed`: whether another
+    colour was shown, and exposed, before it, so that a picture that is late or stands still would be seen.
     """
 
     step: SessionStep
@@ -121,6 +122,7 @@ class Exposed:
     over_at: datetime
     checks: tuple[Check, ...]
     timings: Mapping[str, float]
+    changed: bool
 
 
 @dataclass(frozen=True)
@@ -149,6 +151,8 @@ class Pipeline:
         self._health = None if projector is None else HealthWatch(projector, job.devices.clock)
         self._under_way: deque[tuple[Exposed, Future[Saved]]] = deque()
         self._pauses: dict[str, Pause] = {}
+        self._shown: Colour | None = None
+        self._exposed: Colour | None = None
 
     def run(self) -> None:
         """Take frames until the queue is empty or the end was asked for.
@@ -167,13 +171,17 @@ class Pipeline:
     def _next_light(self) -> ShownLight | None:
         """Show the next light; wait for verdicts where it depends on them; None where nothing more is to be taken."""
         while not self._ending.asked:
+            if self._verdicts.is_spent:
+                self._collect(0)
+                self._verdicts.require_budget()
             if self._lasting.is_found:
                 self._collect(0)
                 self._lasting.wait()
             step = self._job.queue.next()
             if step is not None:
                 return self._job.retry.attempt(partial(self._show, step), _SCREEN)
-            if not self._under_way:
+            if not self._under_way and not self._verdicts.void_lost():
+                self._lasting.over()
                 return None
             self._collect(0)
         self._collect(0)
@@ -208,7 +216,8 @@ class Pipeline:
         shown_at, begun = clock.now(), clock.monotonic()
         self._job.devices.presenter.show(step.colour)
         since = clock.monotonic()
-        return ShownLight(step, shown_at, since, since - begun)
+        replaced, self._shown = self._shown, step.colour
+        return ShownLight(step, shown_at, since, since - begun, replaced)
 
     def _show_following(self) -> ShownLight | None:
         """Show the next light if it is known; a presenter that fails is met when no frame waits in the camera."""
@@ -235,7 +244,10 @@ class Pipeline:
         stem = step.stem if kept == 0 else f"{step.stem}_try{kept + 1}"
         number = self._job.on_disk(lambda: journal.begin(step, f"frames/{stem}", light.shown_at))
         self._job.queue.begin(step)
+        self._note_gap()
         begun = clock.monotonic()
+        changed = step.colour not in (light.replaced, self._exposed)
+        self._exposed = step.colour
         try:
             self._job.devices.camera.expose()
         except DeviceError as error:
@@ -243,7 +255,25 @@ class Pipeline:
             self._pause_for(_CAMERA, error)
             return None
         timings = {"show": light.show_s, "settle": settling_s, "expose": clock.monotonic() - begun}
-        return Exposed(step, number, stem, clock.now(), self._screen_check(step), timings)
+        checks = (*self._screen_check(step), *self._gap_check(step))
+        return Exposed(step, number, stem, clock.now(), checks, timings, changed)
+
+    def _note_gap(self) -> float:
+        """Tell of a time in which the program stood still; return how long that was, seconds."""
+        if gap_s := self._job.gaps.taken():
+            sentence = f"the run stood still for {duration_text(gap_s)}: the machine slept, or the process was stopped"
+            self._job.retry.report("gap", sentence)
+        return gap_s
+
+    def _gap_check(self, step: SessionStep) -> tuple[Check, ...]:
+        """Refuse a frame during which the program stood still: nobody knows what the screen showed meanwhile."""
+        if not (gap_s := self._note_gap()):
+            return ()
+        reason = (
+            f"the run stood still for {duration_text(gap_s)} while the frame was exposed; keep the machine from "
+            "sleeping; the frame is taken again"
+        )
+        return (Check("gap", gap_s, None, GAP_S, "s", reason),)
 
     def _screen_check(self, step: SessionStep) -> tuple[Check, ...]:
         """Ask the screen whether it still shows the light, before it may change."""
@@ -330,6 +360,8 @@ class Pipeline:
             try:
                 self._collect(0)
             except CropError as further:
+                if str(further) == str(error):
+                    continue
                 error.add_note(f"then: {further}")
 
 
@@ -402,6 +434,26 @@ class Verdicts:
         self._job, self._lasting = job, lasting
         self._voided_ahead: dict[int, str] = {}
         self._lacks_previews = False
+        self._last_before = lasting.last_before
+        self._unused_bytes = 0
+
+    @property
+    def _budget_bytes(self) -> float:
+        return self._job.settings.sequence.refused_gb * 1e9
+
+    @property
+    def is_spent(self) -> bool:
+        """Whether this run has filled the disk with more frames that are not used than it may."""
+        return self._unused_bytes > self._budget_bytes
+
+    def require_budget(self) -> None:
+        """Raise if `is_spent`: what refuses so many frames is not chance, and fills the disk."""
+        if self.is_spent:
+            raise QualityError(
+                f"refused and voided frames of this run take {self._unused_bytes / 1e9:.3g} GB of the disk, "
+                f"{self._budget_bytes / 1e9:g} allowed (sequence.refused_gb); acquire status names the causes: remove "
+                "them, then run the same command again; it has the same budget anew"
+            )
 
     def take_in(self, frame: Exposed, saved: Saved, under_way: Sequence[Exposed]) -> None:
         """Journal a verdict; `under_way`: the frames behind it, whose verdicts are not known."""
@@ -427,13 +479,28 @@ class Verdicts:
             job.queue.accept(step)
             for what, sentence in _followed_changes(step, judgement, job.session.steps, job.settings.judge):
                 job.retry.report(what, sentence)
-            self._lasting.accepted(step)
+            job.retry.accepted()
+            self._lasting.accepted(step, frame.changed)
         else:
             self._refuse(step, judgement)
+        if judgement.accepted and step.kind == "white":
+            self.void_lost()
         if judgement.voids and step.kind in REFERENCES:
             self._void_since_reference(frame, judgement.reason, under_way)
         elif judgement.voids:
             self._void_first_frames(frame, judgement.reason, under_way)
+        if voided or not judgement.accepted:
+            self._unused_bytes = job.on_disk(lambda: job.session.journal.unused_bytes(self._last_before))
+
+    def void_lost(self) -> bool:
+        """Open the steps again whose files are gone or cut since they were taken; return whether there are any."""
+        queue, found = self._job.queue, self._job.on_disk(self._job.session.lost_files)
+        lost = [frame for frame in found if not queue.is_open(frame.step)]
+        if lost:
+            reason = f"{first_of([frame.file for frame in lost])}: gone or cut while the run was at work"
+            queue.void([frame.step for frame in lost], reason)
+            self._void([frame.attempt for frame in lost], reason)
+        return bool(lost)
 
     def _refuse(self, step: SessionStep, judgement: Judgement) -> None:
         queue = self._job.queue
@@ -496,7 +563,10 @@ class Verdicts:
 
 
 class LastingCause:
-    """What would refuse every frame: waited for, and tried again at growing intervals until a frame shows it is over.
+    """What would refuse every frame: waited for, and tried again at growing intervals until it is seen to be over.
+
+    A picture that is always late shows the right light where a frame follows itself: that it is over is shown by a
+    light that another one was shown before, or by all frames that were to tell, of which one is such a frame.
 
     - `last_before`: the newest attempt from before the run, or from before its last pause for something lasting.
     """
@@ -506,7 +576,9 @@ class LastingCause:
         self.last_before = max((attempt.id for attempt in job.session.journal.attempts()), default=0)
         self._sentence = ""
         self._step: SessionStep | None = None
-        self._probing: tuple[Pause, float] | None = None
+        self._probing: Pause | None = None
+        self._to_show: set[int] = set()
+        self._is_changing = False
 
     @property
     def is_found(self) -> bool:
@@ -515,7 +587,7 @@ class LastingCause:
 
     @property
     def is_probed(self) -> bool:
-        """Whether it was waited for, and no frame has shown yet that it is over."""
+        """Whether it was waited for, and the frames have not shown yet that it is over."""
         return self._probing is not None
 
     def found(self, sentence: str, step: SessionStep | None) -> None:
@@ -525,30 +597,29 @@ class LastingCause:
     def wait(self) -> None:
         """Let time pass for somebody to remove the cause, then let the frames be tried again."""
         fault, self._sentence = QualityError(self._sentence), ""
-        pause, pause_s = self._probing or (self._job.retry.pause("the frames"), 0.0)
-        clock = self._job.devices.clock
-        until = clock.monotonic() + pause_s
-        pause.wait(fault)
-        while clock.monotonic() < until:
-            pause.wait(fault)
-        self._probing = pause, min(max(2 * pause_s, PROBE_S), LONGEST_PROBE_S)
+        self._probing = self._probing or self._job.retry.pause(FRAMES)
+        self._probing.back_off(fault)
         self._job.queue.retry()
-        if self._step is not None and self._step.kind != "dark":
-            self._link()
+        self._to_show, self._is_changing = set(), False
+        if self._step is not None:
+            self._to_show.add(self._step.number)
+            if self._step.kind != "dark":
+                self._link()
 
-    def accepted(self, step: SessionStep) -> None:
-        """Note an accepted frame, which may show that the cause is gone.
+    def accepted(self, step: SessionStep, changed: bool) -> None:
+        """Note an accepted frame, which may show that the cause is gone; `changed`: see `Exposed`.
 
-        What links runs is accepted at another level of the lamp, and a dark frame where no light reaches the chart.
+        A dark frame is accepted where no light reaches the chart, too.
         """
-        if self._probing is None:
-            return
-        if self._step is None:
-            is_over = step.kind != "dark"
-        else:
-            is_over = step.kind == "light" or step.number == self._step.number
-        if is_over:
-            self._probing[0].over()
+        self._to_show.discard(step.number)
+        self._is_changing |= changed and step.kind != "dark"
+        if self._is_changing and (step.kind == "light" or not self._to_show):
+            self.over()
+
+    def over(self) -> None:
+        """Let the run go on as before the cause was found."""
+        if self._probing is not None:
+            self._probing.over()
             self._probing = None
 
     def _link(self) -> None:
@@ -558,6 +629,7 @@ class LastingCause:
         if any(attempt.kind == "light" and attempt.verdict == ACCEPTED for attempt in attempts):
             numbers = job.on_disk(lambda: link_runs(job.session))
             job.queue.begin_with(step for step in job.session.steps if step.number in numbers)
+            self._to_show.update(numbers)
         self.last_before = attempts[-1].id
         self._saver.after_pause()
 

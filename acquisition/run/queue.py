@@ -84,6 +84,10 @@ class StepQueue:
             number = self._between(number)
         return None if number is None else self._steps[number]
 
+    def is_open(self, number: int) -> bool:
+        """Return whether a step is without an accepted frame."""
+        return number in self._open
+
     def begin(self, step: SessionStep) -> None:
         """Note that an attempt at `step` begins."""
         self._under_way.add(step.number)

@@ -25,6 +25,8 @@ Rules that hold inside:
   paused`); with other digits it is no other. `resumed` ends it.
 - Every few seconds of a pause come `on_wait`, with cause and countdown, and `idle`, for devices that are not at fault.
 - When the time is over, the error is of the first cause's class and names it first; what held at last is added.
+- What fails again before `RECURS_WITHIN` frames were accepted was not mended: its pauses count together, and share one
+  patience and one back-off. A cause that comes and goes ends a run as one does that stays.
 - Nothing that is told may end the run: a full disk, which cannot take the note of a pause, gets it when there is space.
 - What is no `CropError` passes through at once: Ctrl-C ends a pause; `on_wait` and `idle` may raise
   `KeyboardInterrupt`.
@@ -36,9 +38,10 @@ import math
 import re
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext, suppress
+from dataclasses import dataclass
 from typing import Final, Protocol, TypeVar
 
-from experiment.session.journal_file import HeldJournalError
+from experiment.session.journal_file import HeldJournalError, LostJournalError
 from experiment.session.records import duration_text
 from foundation import errors
 from foundation.clock import Clock
@@ -53,6 +56,16 @@ SLOW_S: Final = 10.0
 TRY_S: Final = 300.0
 """How long a try may go without a sign of life: a camera's driver waits 90 s for a frame of 30 s, then
 looks for it for 70 s more over a new connection, and a question may go without an answer for 20 s."""
+RECURS_WITHIN: Final = 10
+"""Frames that must be accepted after a pause for the next one to count anew: what works for half a minute between two
+faults lets a session get on, and what works for a frame or two does not."""
+BACK_OFF_S: Final = 5.0
+"""Between the second and the third try of what costs a refused file each; the second comes at once, each later pause is
+twice the one before."""
+LONGEST_BACK_OFF_S: Final = 300.0
+"""Between two such tries at most: an operator can wait for five minutes."""
+FRAMES: Final = "the frames"
+"""What is waited for where nothing fails but every frame is refused."""
 _INSTANT_S: Final = 1e-6
 """Resolution of simulated time: nothing shorter can be waited for."""
 
@@ -77,7 +90,7 @@ class WaitCallback(Protocol):
 
 def is_curable(fault: CropError) -> bool:
     """Return whether waiting may help: any fault of a device or of the disk, but nothing that the user gave."""
-    return isinstance(fault, DeviceError | StorageError) and not isinstance(fault, HeldJournalError)
+    return isinstance(fault, DeviceError | StorageError) and not isinstance(fault, HeldJournalError | LostJournalError)
 
 
 class RetryPolicy:
@@ -102,6 +115,14 @@ class RetryPolicy:
         self.breakable = breakable
         self._tell, self._idle, self._on_wait = report, idle, on_wait
         self._untold: list[tuple[str, str]] = []
+        self._histories: dict[str, _History] = {}
+
+    def accepted(self) -> None:
+        """Note an accepted frame: what was waited for before so many of them counts as mended."""
+        for name, history in list(self._histories.items()):
+            history.frames += 1
+            if history.frames >= RECURS_WITHIN:
+                del self._histories[name]
 
     def attempt(
         self,
@@ -126,7 +147,7 @@ class RetryPolicy:
 
     def pause(self, name: str, *, idle: bool = True) -> Pause:
         """Return what waits for `name`, and counts from its first failure; parameters as those of `attempt`."""
-        return Pause(self, name, idle)
+        return Pause(self, name, idle, self._histories.setdefault(name, _History()))
 
     def report(self, what: str, sentence: str) -> None:
         """Tell what happens; where the disk cannot take it, it is told again as soon as something else can be."""
@@ -152,11 +173,22 @@ class RetryPolicy:
             self._on_wait(state, sentence, within_s)
 
 
+@dataclass
+class _History:
+    """What was waited for a thing so far: `pauses` of `spent_s` together, and accepted `frames` since the last."""
+
+    pauses: int = 0
+    spent_s: float = 0.0
+    back_off_s: float = 0.0
+    frames: int = 0
+
+
 class Pause:
     """The wait for one thing that fails; given by `RetryPolicy.pause`."""
 
-    def __init__(self, policy: RetryPolicy, name: str, idle: bool) -> None:
+    def __init__(self, policy: RetryPolicy, name: str, idle: bool, history: _History) -> None:
         self._policy = policy
+        self._history = history
         self._name = name
         self._idle = idle
         self._begun_trying = policy.clock.monotonic()
@@ -169,6 +201,15 @@ class Pause:
         with self._policy.breakable():
             self._wait(fault)
 
+    def back_off(self, fault: CropError) -> None:
+        """Wait as `wait` does, longer each time, for a try that costs something."""
+        clock, history = self._policy.clock, self._history
+        until = clock.monotonic() + history.back_off_s
+        self.wait(fault)
+        while clock.monotonic() < until:
+            self.wait(fault)
+        history.back_off_s = min(max(2 * history.back_off_s, BACK_OFF_S), LONGEST_BACK_OFF_S)
+
     def _wait(self, fault: CropError) -> None:
         policy = self._policy
         now = policy.clock.monotonic()
@@ -176,7 +217,7 @@ class Pause:
         again = self._first is not None
         if not again:
             self._first, self._failed_at = fault, now
-        left = policy.limit_s - (now - self._failed_at)
+        left = self._left_s()
         if left < _INSTANT_S:
             raise self._ended(first, fault) from fault
         if not again and now - self._begun_trying < SLOW_S:
@@ -200,12 +241,19 @@ class Pause:
             are = "are" if self._name.endswith("s") else "is"
             lasted = duration_text(self._lasted_s())
             self._policy.report("resumed", f"{self._name} {are} ready again after a pause of {lasted}")
+            self._history.pauses += 1
+            self._history.frames = 0
+            self._history.spent_s += max(self._lasted_s(), PAUSE_S)
+            self._told = ""
+
+    def _left_s(self) -> float:
+        return self._policy.limit_s - self._history.spent_s - self._lasted_s()
 
     def _lasted_s(self) -> float:
         return self._policy.clock.monotonic() - self._failed_at
 
     def _countdown(self, fault: CropError) -> str:
-        left = self._policy.limit_s - self._lasted_s()
+        left = self._left_s()
         end = "waits for as long as it takes" if math.isinf(left) else f"ends in {duration_text(max(left, 0))}"
         return f"{_named(self._name, fault)} (paused for {duration_text(self._lasted_s())}; goes on by itself, {end})"
 
@@ -214,10 +262,18 @@ class Pause:
             return first
         at_last = "" if _kind(fault) == _kind(first) else f"; at last: {fault}"
         waited = duration_text(self._policy.limit_s)
+        if self._history.pauses:
+            waited += f", in {self._history.pauses + 1} pauses with few frames between them,"
         return _family(first)(
             f"{_named(self._name, first)}{at_last}",
             remedy=f"the run waited {waited} for that and ended: when it is mended run the same command again",
         )
+
+
+def pause_cause(sentence: str) -> str:
+    """Return what a pause is for, of the sentence that tells it: the same at each of its times, and for all frames."""
+    name, *_ = sentence.partition(": ")
+    return name if name == FRAMES else _kind(sentence.rpartition(" (")[0])
 
 
 def _named(name: str, fault: CropError) -> str:
@@ -225,7 +281,7 @@ def _named(name: str, fault: CropError) -> str:
     return str(fault) if str(fault).startswith(name) else f"{name}: {fault}"
 
 
-def _kind(fault: CropError) -> str:
+def _kind(fault: CropError | str) -> str:
     """Return a fault's words without its numbers, which may change from one try to the next."""
     return re.sub(r"\d+(?:[.,]\d+)*", "#", str(fault))
 

@@ -19,7 +19,9 @@ from acquisition.judge.judge import LiveJudge
 from acquisition.judge.measure import ExposureJudge
 from acquisition.monitor.feed import write_session_report
 from acquisition.run.devices import Devices, RunEnd, leave_lab, make_ready
-from acquisition.run.notices import Notices
+from acquisition.run.gaps import GapWatch
+from acquisition.run.life import Life
+from acquisition.run.notices import Notices, PauseNotices
 from acquisition.run.pipeline import Job, Pipeline, Saver, Taken
 from acquisition.run.plan import planned_steps, require_plan, require_same
 from acquisition.run.queue import StepQueue, link_runs, unclosed_kinds, white_first
@@ -187,10 +189,6 @@ def clock_note(session: Session, clock: Clock) -> str:
     )
 
 
-NOTIFIED = ("paused", "resumed")
-"""Words of a run's reports that are told to whoever is notified; its end is, in any case."""
-
-
 @dataclass(frozen=True)
 class RunOutcome:
     """Why a run ended.
@@ -227,7 +225,8 @@ def take_session(
     running frame; None for a run that nobody asks. `first`: numbers of steps that are taken before all others.
     """
     sequence = settings.sequence
-    reports = _Reports(session, devices.clock, announce, state, sequence.notify)
+    life = Life(settings.notify.alive, session.folder.name, announce, devices.clock)
+    reports = _Reports(session, devices.clock, announce, state, sequence.notify, life)
     asked = ending or Ending()
     retry = RetryPolicy(
         devices.clock,
@@ -237,12 +236,20 @@ def take_session(
         reports.sign_of_life,
         asked.at_once,
     )
+
+    def count(frame: Taken) -> None:
+        life.sign(f"{len(session.steps) - frame.left} of {len(session.steps)} frames")
+        observe(frame)
+
+    life.ready()
     try:
         for stray in session.set_aside_strays():
             reports.tell("stray", f"{stray.name}: complete, but not in the journal; kept, not used")
-        job = Job(session, devices, settings, _open_steps(session, settings, first), retry)
-        if len(job.queue):
-            _take_open(job, judge or ExposureJudge(settings), observe, asked)
+        with GapWatch() as gaps:
+            job = Job(session, devices, settings, _open_steps(session, settings, first), retry, gaps)
+            if len(job.queue):
+                _take_open(job, judge or ExposureJudge(settings), count, asked)
+        session.journal.require_whole()
         outcome = RunOutcome(len(session.steps), len(job.queue), job.queue.given_up)
         if asked.asked and not outcome.complete:
             raise KeyboardInterrupt
@@ -308,33 +315,46 @@ class _Reports:
         announce: Callable[[str], object],
         state: Callable[[str], object],
         notify: str,
+        life: Life,
     ) -> None:
         self._journal = session.journal
         self._clock = clock
         self._announce = announce
         self._state = state
         self._notices = Notices(notify, session.folder.name, announce)
+        self._life = life
+        self._pauses = PauseNotices(self._notify, clock)
 
     def tell(self, what: str, sentence: str, /) -> None:
         """Tell what happens."""
         self._announce(f"{what}: {sentence}")
-        if what in NOTIFIED:
-            self._notices.tell(what, sentence, datetime.now(UTC))
+        if what == "paused":
+            self._pauses.paused(sentence)
+        elif what == "resumed":
+            self._pauses.resumed(sentence)
         if what != VOIDED:  # the journal notes that with the rows that it changes
             self._journal.note(self._clock.now(), what, sentence)
 
     def sign_of_life(self, what: str, sentence: str, within_s: float, /) -> None:
         """Say that the run waits, and for what."""
         doing: RunState = "paused" if what == "paused" else "waiting"
+        if doing == "paused":
+            self._pauses.paused(sentence)
         self._state(sentence)
+        self._life.sign(f"{doing}: {sentence}")
         self._journal.beat(doing, sentence, datetime.now(UTC) + timedelta(seconds=within_s))
 
     def end(self, how: str, sentence: str) -> None:
         """Note why the run is over; a disk that cannot take that is told of already."""
-        self._notices.tell(how, sentence, datetime.now(UTC))
+        self._notify(how, sentence)
+        self._life.end(how, sentence)
         with suppress(StorageError):
             self._journal.note(self._clock.now(), how, sentence)
+
+    def _notify(self, event: str, sentence: str) -> None:
+        self._notices.tell(event, sentence, datetime.now(UTC))
 
     def close(self) -> None:
         """Let the last notices be delivered."""
         self._notices.close()
+        self._life.close()

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import csv
 import io
+import sqlite3
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
@@ -27,8 +28,9 @@ from drivers.presenter import Colour
 from experiment.chart.model import Chart, load_chart
 from experiment.lights import Illumination, load_illuminations, save_illuminations
 from experiment.session.journal import JOURNAL_FILE, PATIENCE_S, Journal, time_text
-from experiment.session.journal_file import MOST_BYTES
-from experiment.session.records import FrameRecord, Judgement, SessionStep
+from experiment.session.journal_file import MOST_BYTES, restoring
+from experiment.session.ledger import ledger_path, read_ledger
+from experiment.session.records import AcceptedFile, FrameRecord, Judgement, SessionStep
 from experiment.session.repair import (
     BAD,
     lights_text,
@@ -132,11 +134,17 @@ class Session:
 
         It is held until it is closed, and `frames.csv` is made anew.
         """
-        path = journal_path(folder)
+        path = folder / JOURNAL_FILE
+        if not _is_file(path) and not _is_file(ledger_path(folder)):
+            journal_path(folder)
         with ExitStack() as opened:
             opened.enter_context(held_folder(folder, busy_sentence(folder)))
+            if not _is_file(path):
+                rebuild_journal(folder)
+                announce(f"journal: {path} was gone, and was made anew from {ledger_path(folder)}")
             journal = Journal.open_for_run(path, patience_s, announce)
             opened.callback(journal.close)
+            journal.keep_twice(ledger_path(folder))
             session = cls(folder, journal, opened)
             session.write_frames_csv()
             session._hold = opened.pop_all()
@@ -250,6 +258,12 @@ class Session:
         """Return every frame that was taken and judged, in the order of the plan, refused ones included."""
         return self.journal.frames()
 
+    def lost_files(self) -> list[AcceptedFile]:
+        """Return the frames that count, one a step, whose files are not there in full size any more."""
+        require_frames_folder(self.folder)
+        newest = {frame.step: frame for frame in self.journal.accepted_files()}
+        return [frame for frame in newest.values() if not _has_size(self.folder / frame.file, frame.size)]
+
     def write_frames_csv(self) -> None:
         """Derive `frames.csv` anew from the journal."""
         text = io.StringIO()
@@ -357,8 +371,10 @@ class IncomingFile:
 
 def session_exists(folder: Path) -> bool:
     """Return whether `folder` is a session; refuse when it holds something else."""
-    if _is_file(folder / JOURNAL_FILE):
+    if _is_file(folder / JOURNAL_FILE) or _is_file(ledger_path(folder)):
         return True
+    if _is_file(folder / "session.toml") and (folder / "frames").is_dir():
+        raise FormatError(_without_journal(folder))
     require_free(folder, "the session")
     return False
 
@@ -372,10 +388,35 @@ def journal_path(folder: Path) -> Path:
     """Return the path of a session's journal."""
     path = folder / JOURNAL_FILE
     if not _is_file(path):
+        if _is_file(ledger_path(folder)) or (_is_file(folder / "session.toml") and (folder / "frames").is_dir()):
+            raise FormatError(_without_journal(folder))
         raise FormatError(
             f"{folder} is no session: it holds no {JOURNAL_FILE}; name a folder made by acquire run or import"
         )
     return path
+
+
+def _without_journal(folder: Path) -> str:
+    path = folder / JOURNAL_FILE
+    return f"{folder} holds the frames of a session, and its journal {path.name} is gone; {restoring(path)}"
+
+
+def rebuild_journal(folder: Path) -> int:
+    """Make a session's journal anew from its ledger; return how many attempts it holds.
+
+    The journal that is there keeps its bytes under another name.
+    """
+    ledger = ledger_path(folder)
+    rows = read_ledger(ledger)
+    if "plan" not in rows:
+        raise FormatError(f"{ledger} holds no plan; restore the session from a copy")
+    try:
+        Journal.rebuild(folder / JOURNAL_FILE, rows)
+    except OSError as error:
+        raise storage_error(folder / JOURNAL_FILE, error) from error
+    except sqlite3.Error as error:
+        raise FormatError(f"{ledger} is damaged: {error}; restore the session from a copy") from error
+    return len(rows.get("attempts", {}))
 
 
 def _is_file(path: Path) -> bool:

@@ -23,17 +23,21 @@ from pathlib import Path
 from typing import Any
 
 from drivers.presenter import Colour
+from experiment.session.guard import JournalGuard
 from experiment.session.heartbeat import Heartbeat, Process, RunState, SessionPlace
 from experiment.session.journal_file import (
     JOURNAL_VERSION,
     LockRetry,
+    LostJournalError,
     close_after_run,
     create_file,
     open_for_run,
     open_to_read,
     reading_error,
+    set_aside,
     writing_error,
 )
+from experiment.session.ledger import PLACE, Ledger, Row, Rows, insert_rows, rows_of
 from experiment.session.records import (
     ACCEPTED,
     FAILED,
@@ -51,15 +55,13 @@ from experiment.session.records import (
     SessionStep,
 )
 from foundation.errors import FormatError, counted
+from foundation.files import partial_path, sync_folder
 
 JOURNAL_FILE = "journal.sqlite"
 """Name of the journal in a session's folder."""
 
 _AMONG = "IN (SELECT value FROM json_each(?))"
 """Condition on numbers that are given as a JSON list, however many there are."""
-
-_PLACE = "place"
-"""Key of the record that says which folder the signs of life are given for."""
 
 PATIENCE_S = 600.0
 """How long a write waits for another program's unless the caller says otherwise: as long as a run waits for a device by
@@ -80,6 +82,8 @@ class Journal:
         self._version = version
         self._writes = retry is not None
         self._retry = retry or LockRetry(path, 0, lambda sentence: None)
+        self._ledger: Ledger | None = None
+        self._guard: JournalGuard | None = None
 
     @staticmethod
     def create(path: Path, steps: Sequence[SessionStep]) -> None:
@@ -104,8 +108,38 @@ class Journal:
         retry = LockRetry(path, patience_s, announce)
         return cls(path, open_for_run(path, retry), JOURNAL_VERSION, retry)
 
+    @staticmethod
+    def rebuild(path: Path, rows: Rows) -> None:
+        """Write a journal anew that holds these facts; what stands in its place keeps its bytes under another name."""
+        copy = partial_path(path)
+        copy.unlink(missing_ok=True)
+        with closing(create_file(copy)) as connection, connection:
+            connection.execute("BEGIN")
+            insert_rows(connection, rows)
+        Journal.open(copy).close()
+        set_aside(path)
+        copy.replace(path)
+        sync_folder(path.parent)
+
+    def keep_twice(self, ledger: Path) -> None:
+        """Keep all facts in a second place, too, and watch that the journal stays the one that is open."""
+        try:
+            rows = self._retry.run(lambda: rows_of(self._connection))
+        except sqlite3.DatabaseError as error:
+            raise reading_error(self._path, error) from error
+        self._ledger = Ledger(ledger, rows)
+        self._guard = JournalGuard(self._path, self._ledger)
+
+    def require_whole(self) -> None:
+        """Raise where the journal on the disk is not the one that is open, or does not hold what was written."""
+        if self._guard is not None:
+            self._guard.require_same()
+            self._guard.require_whole()
+
     def close(self) -> None:
         """Release the file; a second call does nothing."""
+        if self._ledger is not None:
+            self._ledger.close()
         if self._writes:
             close_after_run(self._connection)
         else:
@@ -129,21 +163,17 @@ class Journal:
 
     def add_steps(self, steps: Sequence[SessionStep]) -> None:
         """Put steps at the end of the plan; their numbers must be free."""
-        with self._writing():
-            self._connection.executemany(
-                "INSERT INTO plan VALUES (?, ?, ?, ?, ?, ?)",
-                [(step.number, step.kind, step.illumination, *step.colour.codes) for step in steps],
-            )
+        with self._writing() as change:
+            for step in steps:
+                red, green, blue = step.colour.codes
+                row = {"step": step.number, "kind": step.kind, "illumination": step.illumination}
+                change.put("plan", row | {"red": red, "green": green, "blue": blue})
 
     def begin(self, step: SessionStep, file: str, at: datetime) -> int:
         """Note that an attempt at `step` begins, to be saved as `file`; return the attempt's id."""
-        with self._writing():
-            cursor = self._connection.execute(
-                "INSERT INTO attempts (step, kind, illumination, file, started_at) VALUES (?, ?, ?, ?, ?)",
-                (step.number, step.kind, step.illumination, file, time_text(at)),
-            )
-        assert cursor.lastrowid is not None
-        return cursor.lastrowid
+        row = {"step": step.number, "kind": step.kind, "illumination": step.illumination}
+        with self._writing() as change:
+            return change.put_numbered("attempts", row | {"file": file, "started_at": time_text(at)})
 
     def commit(
         self,
@@ -164,62 +194,45 @@ class Journal:
         `exposure_s`: the exposure asked for, seconds.
         """
         verdict = ACCEPTED if judgement.accepted else REFUSED
-        row = (file, size, sha256, time_text(taken_at), exposure_s, time_text(ended_at), verdict, judgement.reason)
-        checks = [
-            (attempt, position, check.name, check.value, check.low, check.high, check.unit, check.reason)
-            for position, check in enumerate(judgement.checks)
-        ]
-        seen = judgement.seen or (None, None, None)
-        with self._writing():
-            self._connection.execute(
-                "UPDATE attempts SET file=?, size=?, sha256=?, taken_at=?, exposure_s=?, ended_at=?, verdict=?,"
-                " reason=? WHERE id=?",
-                (*row, attempt),
-            )
-            self._connection.executemany("INSERT INTO checks VALUES (?, ?, ?, ?, ?, ?, ?, ?)", checks)
-            self._connection.execute(
-                "INSERT INTO measurements VALUES (?, ?, ?, ?, ?, ?, ?)",
-                (attempt, *seen, judgement.measurement, judgement.voids, judgement.lasting),
-            )
-            self._connection.executemany(
-                "INSERT INTO timings VALUES (?, ?, ?)",
-                [(attempt, name, seconds) for name, seconds in (timings or {}).items()],
-            )
+        row = {"file": file, "size": size, "sha256": sha256, "taken_at": time_text(taken_at), "exposure_s": exposure_s}
+        row |= {"ended_at": time_text(ended_at), "verdict": verdict, "reason": judgement.reason}
+        red, green, blue = judgement.seen or (None, None, None)
+        measured = {"attempt": attempt, "red": red, "green": green, "blue": blue, "data": judgement.measurement}
+        with self._writing() as change:
+            change.set_attempt(attempt, row)
+            for position, check in enumerate(judgement.checks):
+                change.put("checks", {"attempt": attempt, "position": position, **vars(check)})
+            change.put("measurements", measured | {"voids": int(judgement.voids), "lasting": int(judgement.lasting)})
+            for name, seconds in (timings or {}).items():
+                change.put("timings", {"attempt": attempt, "name": name, "seconds": seconds})
 
     def fail(self, attempt: int, at: datetime, reason: str) -> None:
         """Note that an attempt gave no frame."""
-        with self._writing():
-            self._connection.execute(
-                "UPDATE attempts SET ended_at=?, verdict=?, reason=? WHERE id=?",
-                (time_text(at), FAILED, reason, attempt),
-            )
+        with self._writing() as change:
+            change.set_attempt(attempt, {"ended_at": time_text(at), "verdict": FAILED, "reason": reason})
 
     def void(self, attempts: Iterable[int], at: datetime, reason: str) -> None:
         """Note that frames that were accepted must not be used after all; their rows and files stay."""
-        with self._writing():
-            changed = self._connection.executemany(
-                "UPDATE attempts SET verdict=?, reason=? WHERE id=? AND verdict=?",
-                [(VOIDED, reason, attempt, ACCEPTED) for attempt in attempts],
-            ).rowcount
-            if changed > 0:
-                self._connection.execute(
-                    "INSERT INTO events (at, what, detail) VALUES (?, ?, ?)",
-                    (time_text(at), VOIDED, f"{counted(changed, 'frame')}: {reason}"),
-                )
+        accepted = {frame.attempt for frame in self.accepted_files()} & set(attempts)
+        if not accepted:
+            return
+        with self._writing() as change:
+            for attempt in sorted(accepted):
+                change.set_attempt(attempt, {"verdict": VOIDED, "reason": reason})
+            detail = f"{counted(len(accepted), 'frame')}: {reason}"
+            change.put_numbered("events", {"at": time_text(at), "what": VOIDED, "detail": detail})
 
     def note(self, at: datetime, what: str, detail: str = "") -> None:
         """Note an event."""
-        with self._writing():
-            self._connection.execute(
-                "INSERT INTO events (at, what, detail) VALUES (?, ?, ?)", (time_text(at), what, detail)
-            )
+        with self._writing() as change:
+            change.put_numbered("events", {"at": time_text(at), "what": what, "detail": detail})
 
     def beat(self, state: RunState, sentence: str, until: datetime) -> None:
         """Give a sign of life, in place of the one before."""
         own, at, place = Process.own(), datetime.now(UTC), SessionPlace.of(self._path)
         with self._writing():
             if place is not None:
-                self._connection.execute("INSERT OR REPLACE INTO records VALUES (?, ?)", (_PLACE, place.to_text()))
+                self._connection.execute("INSERT OR REPLACE INTO records VALUES (?, ?)", (PLACE, place.to_text()))
             self._connection.execute(
                 "INSERT OR REPLACE INTO heartbeat VALUES (1, ?, ?, ?, ?, ?, ?, ?, ?)",
                 (time_text(at), own.pid, own.started, own.host, own.boot, state, sentence, time_text(until)),
@@ -227,12 +240,12 @@ class Journal:
 
     def record(self, key: str, text: str) -> None:
         """Note what a session is taken with, such as a device's identity, in place of what stood under `key`."""
-        with self._writing():
-            self._connection.execute("INSERT OR REPLACE INTO records VALUES (?, ?)", (key, text))
+        with self._writing() as change:
+            change.put("records", {"key": key, "text": text})
 
     def records(self) -> dict[str, str]:
         """Return what the session was taken with, by key."""
-        return dict(self._newer_rows(f"SELECT key, text FROM records WHERE key <> '{_PLACE}' ORDER BY key"))
+        return dict(self._newer_rows(f"SELECT key, text FROM records WHERE key <> '{PLACE}' ORDER BY key"))
 
     def heartbeat(self) -> Heartbeat | None:
         """Return the newest sign of life; None if none was ever given."""
@@ -240,7 +253,7 @@ class Journal:
         if not rows:
             return None
         at, *process, state, sentence, until = rows[0]
-        said = self._newer_rows(f"SELECT text FROM records WHERE key = '{_PLACE}'")
+        said = self._newer_rows(f"SELECT text FROM records WHERE key = '{PLACE}'")
         place = SessionPlace.from_text(said[0][0]) if said else None
         begun, due = datetime.fromisoformat(at), datetime.fromisoformat(until)
         return Heartbeat(begun, Process(*process), state, sentence, due, place)
@@ -311,6 +324,11 @@ class Journal:
         )
         return [AcceptedFile(*row) for row in rows]
 
+    def unused_bytes(self, after: int) -> int:
+        """Return how many bytes the raw files of refused and voided attempts with numbers above `after` take."""
+        query = "SELECT COALESCE(SUM(size), 0) FROM attempts WHERE id > ? AND verdict IN (?, ?)"
+        return int(self._rows(query, (after, REFUSED, VOIDED))[0][0])
+
     def kept_files(self, step: SessionStep) -> int:
         """Return how many raw files, accepted or refused, `step` has already."""
         query = "SELECT COUNT(*) FROM attempts WHERE step=? AND sha256 IS NOT NULL"
@@ -355,18 +373,73 @@ class Journal:
             raise reading_error(self._path, error) from error
 
     @contextmanager
-    def _writing(self) -> Generator[None]:
-        """Make what is written inside one transaction, which is on the disk when the block ends."""
+    def _writing(self) -> Generator[_Change]:
+        """Make what is written inside one transaction, which is on the disk when the block ends.
+
+        What is lost with the journal stands in the ledger all the same.
+        """
         try:
             self._retry.run(lambda: self._connection.execute("BEGIN IMMEDIATE"))
-            yield
+            change = _Change(self._connection)
+            yield change
+            if self._ledger is not None and change.rows:
+                self._append(self._ledger, change.rows)
+            if self._guard is not None:
+                self._guard.require_same()
             self._retry.run(lambda: self._connection.execute("COMMIT"))
+            if self._guard is not None:
+                self._guard.wrote()
+            if self._ledger is not None:
+                self._ledger.keep()
+        except LostJournalError:
+            if self._ledger is not None:
+                self._ledger.keep()
+            raise
         except sqlite3.DatabaseError as error:
             raise writing_error(self._path, error) from error
         finally:
             with suppress(sqlite3.Error):
                 if self._connection.in_transaction:
                     self._connection.execute("ROLLBACK")
+
+    def _append(self, ledger: Ledger, rows: Mapping[str, Sequence[Row]]) -> None:
+        if not ledger.is_there():
+            # Of the file that is open: that on the disk may be gone as well.
+            ledger.restore(rows_of(self._connection))
+        ledger.append(rows)
+
+
+class _Change:
+    """A transaction: what is put into it is written, and remembered for the ledger."""
+
+    def __init__(self, connection: sqlite3.Connection) -> None:
+        self._connection = connection
+        self.rows: dict[str, list[Row]] = {}
+
+    def put(self, table: str, row: Row) -> int:
+        """Write a row, in place of one of the same key among the records; return its number."""
+        verb = "INSERT OR REPLACE" if table == "records" else "INSERT"
+        marks = ", ".join("?" * len(row))
+        cursor = self._connection.execute(
+            f"{verb} INTO {table} ({', '.join(row)}) VALUES ({marks})", tuple(row.values())
+        )
+        # SQLite keeps what is no number as NULL.
+        plain = {name: None if isinstance(value, float) and value != value else value for name, value in row.items()}
+        self.rows.setdefault(table, []).append(plain)
+        assert cursor.lastrowid is not None
+        return cursor.lastrowid
+
+    def put_numbered(self, table: str, row: Row) -> int:
+        """Write a row of a table that numbers its rows; return the number."""
+        number = self.put(table, row)
+        self.rows[table][-1] = {"id": number, **row}
+        return number
+
+    def set_attempt(self, attempt: int, row: Row) -> None:
+        """Change columns of an attempt."""
+        columns = ", ".join(f"{name}=?" for name in row)
+        self._connection.execute(f"UPDATE attempts SET {columns} WHERE id=?", (*row.values(), attempt))
+        self.rows.setdefault("attempts", []).append({"id": attempt, **row})
 
 
 def time_text(at: datetime) -> str:

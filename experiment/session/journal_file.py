@@ -20,6 +20,7 @@ import errno
 import fcntl
 import logging
 import os
+import shlex
 import shutil
 import sqlite3
 import tempfile
@@ -109,6 +110,9 @@ _NO_LOCKS = {errno.ENOLCK, errno.EINVAL, errno.ENOSYS, errno.EOPNOTSUPP, errno.E
 _READABLE_FAULTS = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EACCES, errno.EPERM}
 """Faults of a disk that can be read all the same."""
 
+_SIDE_FILES = ("-wal", "-shm", "-journal")
+"""What SQLite keeps beside a journal, by suffix."""
+
 _PROBE_BYTES = 65536
 """As much as a commit writes, with the pages of its log."""
 
@@ -116,8 +120,20 @@ _NETWORK = {"nfs", "nfs4", "cifs", "smb3", "smbfs", "fuse.sshfs", "9p", "afs", "
 """File systems on which several machines work and share no memory, as /proc/self/mounts names them."""
 
 
+def restoring(path: Path) -> str:
+    """Return what helps where a journal is damaged or gone."""
+    # A disk that does not tell has a fault of its own, which is said before this.
+    if os.path.isfile(path.with_name("ledger.jsonl")):  # noqa: PTH113 - it never raises
+        return f"acquire rebuild {shlex.quote(str(path.parent))} makes it anew from ledger.jsonl"
+    return "restore it from a copy"
+
+
 class HeldJournalError(StorageError):
     """Another program held the journal for as long as a write waits: waiting once more would only double that."""
+
+
+class LostJournalError(StorageError):
+    """The journal that a run has open is not the one on the disk any more: waiting does not bring it back."""
 
 
 class LockRetry:
@@ -157,12 +173,17 @@ def create_file(path: Path) -> sqlite3.Connection:
     return connection
 
 
+def connect_to_read(path: Path) -> sqlite3.Connection:
+    """Return a connection that cannot write to a journal that this program has open and trusts."""
+    return _connect(path, "ro")
+
+
 def open_to_read(path: Path) -> tuple[sqlite3.Connection, int]:
     """Return a connection that cannot write, and the journal's version."""
     require_plain_folder(path.parent, MOST_BYTES)
     try:
         # A run has all three; without the third nobody is at work, and reading in place would make it.
-        if _is_write_ahead(path) and not _beside(path, "-shm").exists():
+        if _is_write_ahead(path) and not beside(path, "-shm").exists():
             connection = _copied(path)
         else:
             connection = _opened_or_copied(path)
@@ -206,6 +227,16 @@ def close_after_run(connection: sqlite3.Connection) -> None:
         pass  # Somebody reads it, the disk is gone, or it is closed: the next run or reader copes with what is there.
     finally:
         connection.close()
+
+
+def set_aside(path: Path) -> None:
+    """Give a journal that is not to be used any more, and what SQLite keeps beside it, names that nothing reads."""
+    number = 1
+    while any(beside(path, f"{suffix}.{number}.lost").exists() for suffix in ("", *_SIDE_FILES)):
+        number += 1
+    for suffix in ("", *_SIDE_FILES):
+        with suppress(FileNotFoundError):
+            beside(path, suffix).rename(beside(path, f"{suffix}.{number}.lost"))
 
 
 def _connect(path: Path, mode: str) -> sqlite3.Connection:
@@ -269,8 +300,8 @@ def _copied(path: Path) -> sqlite3.Connection:
     with tempfile.TemporaryDirectory(prefix="crop-") as scratch:
         copy = Path(scratch) / path.name
         for suffix in ("", "-wal", "-journal"):
-            if (source := _beside(path, suffix)).exists() or not suffix:
-                shutil.copyfile(source, _beside(copy, suffix))
+            if (source := beside(path, suffix)).exists() or not suffix:
+                shutil.copyfile(source, beside(copy, suffix))
         with closing(_connect(copy, "rw")) as connection:
             connection.backup(memory)
     memory.execute("PRAGMA query_only = ON")
@@ -282,7 +313,7 @@ def _is_write_ahead(path: Path) -> bool:
 
     Only asked while no `-shm` is there: closing a file gives up all locks that the process has on it.
     """
-    if _beside(path, "-shm").exists():
+    if beside(path, "-shm").exists():
         return True
     with path.open("rb") as stream:
         return stream.read(20)[18:] == b"\x02\x02"
@@ -330,7 +361,8 @@ def file_system_of(path: Path) -> str:
     return max(holding, default=(0, ""))[1]
 
 
-def _beside(path: Path, suffix: str) -> Path:
+def beside(path: Path, suffix: str) -> Path:
+    """Return the file that SQLite keeps beside a journal under a suffix."""
     return path.with_name(path.name + suffix)
 
 
@@ -364,7 +396,7 @@ def _checked(path: Path, connection: sqlite3.Connection) -> int:
             )
         if lacking := set(_tables_of(version)) - tables:
             raise FormatError(
-                f"{path} is damaged: it lacks its table {' and '.join(sorted(lacking))}; restore it from a copy"
+                f"{path} is damaged: it lacks its table {' and '.join(sorted(lacking))}; {restoring(path)}"
             )
         require_sound_rows(path, connection, version)
     except BaseException:
@@ -397,7 +429,7 @@ def reading_error(path: Path, error: OSError | sqlite3.DatabaseError) -> FormatE
         )
     if not _is_damage(error):
         return FormatError(f"cannot read {path}: {error}; check its permissions and the disk")
-    return FormatError(f"{path} is damaged: {error}; restore it from a copy")
+    return FormatError(f"{path} is damaged: {error}; {restoring(path)}")
 
 
 def writing_error(path: Path, error: sqlite3.DatabaseError) -> FormatError | InputError | StorageError:
@@ -414,7 +446,7 @@ def writing_error(path: Path, error: sqlite3.DatabaseError) -> FormatError | Inp
     elif _primary_code(error) in (sqlite3.SQLITE_READONLY, sqlite3.SQLITE_PERM, sqlite3.SQLITE_CANTOPEN):
         remedy = "see that the folder may be written and the disk is there"
     elif _is_damage(error) and not _is_sound(path):
-        return FormatError(f"{path} is damaged: {error}; restore it from a copy")
+        return FormatError(f"{path} is damaged: {error}; {restoring(path)}")
     else:
         remedy = "check the disk and its cable"
     return StorageError(f"cannot write {path}: {error}; {remedy}, then run the same command again")
@@ -449,7 +481,7 @@ def _primary_code(error: sqlite3.DatabaseError) -> int:
     return getattr(error, "sqlite_errorcode", 0) & 0xFF
 
 
-_DAMAGED: Final = "it is damaged, or not to be trusted; restore it from a copy"
+_DAMAGED: Final = "it is damaged, or not to be trusted"
 
 _WHOLE = "typeof({0}) = 'integer' AND {0} BETWEEN 0 AND 1000000000"
 _MAYBE_WHOLE = "({0} IS NULL OR " + _WHOLE + ")"
@@ -550,7 +582,9 @@ def _require_plain_schema(path: Path, connection: sqlite3.Connection) -> None:
         plain = kind == "table" and not str(sql or "").lstrip().upper().startswith("CREATE VIRTUAL")
         # SQLite makes an index of each primary key, without a text.
         if not (plain or (kind == "index" and sql is None)):
-            raise FormatError(f"{path} holds the {kind} {str(name)[:80]!r}, which no journal has; {_DAMAGED}")
+            raise FormatError(
+                f"{path} holds the {kind} {str(name)[:80]!r}, which no journal has; {_DAMAGED}; {restoring(path)}"
+            )
 
 
 def require_sound_rows(path: Path, connection: sqlite3.Connection, version: int) -> None:
@@ -559,12 +593,18 @@ def require_sound_rows(path: Path, connection: sqlite3.Connection, version: int)
         columns = {row[1]: row[6] for row in connection.execute(f"PRAGMA table_xinfo({table})")}
         lacking = _COLUMNS[table].keys() - columns.keys()
         if lacking or any(columns.values()):
-            raise FormatError(f"{path}: the columns of {table} are not those of a journal; {_DAMAGED}")
+            raise FormatError(
+                f"{path}: the columns of {table} are not those of a journal; {_DAMAGED}; {restoring(path)}"
+            )
         sound = " AND ".join([f"({form.format(column)})" for column, form in _COLUMNS[table].items()])
         together = _TOGETHER.get(table, "1")
         query = f"SELECT COUNT(*) FROM {table} WHERE ({sound} AND {together}) IS NOT TRUE"
         if found := connection.execute(query).fetchone()[0]:
-            raise FormatError(f"{path}: {found} rows of {table} hold values that no run writes; {_DAMAGED}")
+            raise FormatError(
+                f"{path}: {found} rows of {table} hold values that no run writes; {_DAMAGED}; {restoring(path)}"
+            )
     for (file,) in connection.execute("SELECT DISTINCT file FROM attempts"):
         if not is_inside_name(file):
-            raise FormatError(f"{path} names the file {file[:200]!r}, which is none of the session; {_DAMAGED}")
+            raise FormatError(
+                f"{path} names the file {file[:200]!r}, which is none of the session; {_DAMAGED}; {restoring(path)}"
+            )

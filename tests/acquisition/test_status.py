@@ -6,11 +6,14 @@ import json
 import shutil
 import subprocess
 import sys
+from contextlib import closing
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import pytest
 
 from acquisition.cli import main
+from experiment.session.journal import Journal
 from experiment.session.records import Check
 from tests.acquisition.monitor.made_up import MadeUpRun
 
@@ -58,6 +61,15 @@ def test_a_run_at_work(folder: Path, capsys: pytest.CaptureFixture[str]) -> None
     assert "frames/0004_light" in told.split("without an accepted frame:")[1].split("last events:")[0]
     assert "refused: the light is 8.2 % off" in told.split("last verdicts:")[1]
     assert "8.2 %" not in told.split("without an accepted frame:")[1], "that light was taken again"
+
+
+def test_a_run_that_hangs_is_no_success(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with closing(Journal.open_for_run(folder / "journal.sqlite")) as journal:
+        journal.beat("running", "frames are taken", datetime.now(UTC) - timedelta(minutes=5))
+    assert main(["status", str(folder)]) == 3
+    said = capsys.readouterr()
+    assert "state   silent: no sign since" in said.out
+    assert "then: frames are taken" in said.err
 
 
 def test_a_killed_run_has_no_time_left(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:

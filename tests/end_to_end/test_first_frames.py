@@ -83,6 +83,15 @@ def again(folder: Path) -> Run:
         return Run(tuple(said), end, tuple(session.journal.attempts()))
 
 
+def test_a_picture_that_stays_one_frame_late_ends_the_run(tmp_path: Path) -> None:
+    late = {"what": "half-changed", "place": [-9, -9, 9, 9], "from_frame": 28, "to_frame": 10_000}
+    taken = run(tmp_path, late, lights=12)
+    assert "when it is mended run the same command again" in taken.end
+    assert taken.verdicts["refused"] < 20
+    assert len(of(taken.said, "paused")) == 1
+    assert not of(taken.said, "resumed")
+
+
 def of(said: Sequence[str], word: str) -> list[str]:
     return [sentence for sentence in said if sentence.startswith(f"{word}: ")]
 

@@ -289,7 +289,7 @@ def test_a_full_disk_costs_nothing_taken(
     def fail(handle: int) -> None:
         nonlocal calls
         calls += 1
-        if calls > 20:
+        if calls > 40:
             raise OSError(28, "No space left on device")
         real(handle)
 

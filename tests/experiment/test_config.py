@@ -135,6 +135,7 @@ def test_no_secret_gets_into_the_session(target: str, label: str) -> None:
             "chart": "c",
             "illuminations": "i",
             "sequence": {"notify": target},
+            "notify": {"alive": target},
             "lab": {"projector": {"control": "pjlink", "host": "h", "password": "s3cret"}},
         }
     )

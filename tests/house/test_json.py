@@ -21,7 +21,15 @@ from foundation.errors import QualityError
 from tests.house_commands import COMMANDS
 from tests.json_of import json_of
 
-WITHOUT_FIGURES = {"acquire init", "acquire redact", "acquire monitor", "acquire report", "sim projector", "sim camera"}
+WITHOUT_FIGURES = {
+    "acquire init",
+    "acquire redact",
+    "acquire rebuild",
+    "acquire monitor",
+    "acquire report",
+    "sim projector",
+    "sim camera",
+}
 """Commands that write or serve something and have no figure to tell."""
 
 REFERENCE = Path(__file__).parents[2] / "docs/reference/json.md"

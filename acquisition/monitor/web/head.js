@@ -45,7 +45,7 @@ function drawBanner() {
   const banner = $("banner");
   const quiet = head.state === "running" || !head.sentence;
   banner.hidden = quiet;
-  banner.className = ["stopped", "incomplete", "gone", "unreadable"].includes(head.state)
+  banner.className = ["stopped", "silent", "incomplete", "gone", "unreadable"].includes(head.state)
     ? "bad"
     : head.state === "complete"
       ? "good"
@@ -86,7 +86,7 @@ function drawClock() {
 
 /** Draw the tab's icon: a ring that fills, in the colour of the state. */
 function drawIcon(share) {
-  const colours = { running: "#2f8fd0", complete: "#2f8fd0", waiting: "#e0a000", paused: "#e0a000" };
+  const colours = { running: "#2f8fd0", complete: "#2f8fd0", waiting: "#e0a000", paused: "#e0a000", late: "#e0a000" };
   const colour = colours[model.head.state] ?? "#d9541e";
   const round = 2 * Math.PI * 11;
   const circle = (stroke, more) =>

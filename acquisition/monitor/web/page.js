@@ -15,6 +15,8 @@ const STATES = {
   paused: ["‖", "paused"],
   complete: ["■", "complete"],
   incomplete: ["■", "ended, incomplete"],
+  late: ["‖", "late"],
+  silent: ["✕", "no sign"],
   stopped: ["✕", "stopped"],
   copy: ["⧉", "a copy"],
   gone: ["✕", "no session"],
@@ -22,7 +24,7 @@ const STATES = {
   absent: ["…", "not begun"],
   unknown: ["?", "no sign of life known"],
 };
-const LOUD = new Set(["paused", "incomplete", "stopped", "complete"]);
+const LOUD = new Set(["paused", "late", "silent", "incomplete", "stopped", "complete"]);
 const WHITE = "white, red ─ green ╌ blue ┈";
 const BLACK = "black, red ─ green ╌ blue ┈";
 const PACE = "seconds a frame";

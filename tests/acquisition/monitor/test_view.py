@@ -65,6 +65,26 @@ def test_where_the_labs_time_is_another_no_time_of_day_is_told() -> None:
     assert stands.eta is None
 
 
+@pytest.mark.parametrize(
+    ("ago", "state"), [(0.0, "running"), (49.0, "running"), (51.0, "late"), (329.0, "late"), (331.0, "silent")]
+)
+def test_a_run_that_hangs_is_late_and_then_silent(ago: float, state: str) -> None:
+    """Frames of five seconds: three of them, the five of a sign of life, and thirty; the sign was due within 300 s."""
+    beat = heartbeat("running", ago=ago, within=300.0)
+    stands = head(attempts(3), beat)
+    assert stands.state == state
+    assert stands.alive == (state != "silent")
+    if state != "running":
+        since = "late since" if state == "late" else "no sign since"
+        assert stands.sentence.startswith(f"{since} {beat.at.astimezone():%Y-%m-%d %H:%M:%S}")
+        assert stands.eta is None, "no time of arrival rolls on"
+
+
+def test_a_pause_is_silent_only_after_the_sign_that_it_announced() -> None:
+    assert head(attempts(3), heartbeat("paused", ago=339.0, within=310.0)).state == "paused"
+    assert head(attempts(3), heartbeat("paused", ago=341.0, within=310.0)).state == "silent"
+
+
 def test_a_killed_run_is_told_at_once_where_it_ran() -> None:
     stands = head(attempts(3), heartbeat("running", ago=1.0), alive=False)
     assert stands.state == "stopped"

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from acquisition.run.retry import PAUSE_S, RETRY_S, RetryPolicy
+from acquisition.run.retry import BACK_OFF_S, LONGEST_BACK_OFF_S, PAUSE_S, RECURS_WITHIN, RETRY_S, RetryPolicy
 from acquisition.run.rig.opening import open_rig
 from drivers.camera import keep_awake
 from drivers.presenter import WHITE
@@ -260,13 +260,49 @@ def test_a_full_disk_takes_the_notes_of_its_pause_when_there_is_space() -> None:
     assert room.words == ["retry", "paused", "resumed"]
 
 
-def test_two_pauses_have_each_their_time() -> None:
+def outlast(room: Room, retry: RetryPolicy, name: str = "the screen") -> None:
+    begun = room.clock.monotonic()
+    assert retry.attempt(room.broken(until(begun + 50, DeviceError("covered"))), name) == "done"
+
+
+def test_pauses_with_many_frames_between_them_have_each_their_time() -> None:
     room = Room(60.0)
     retry = room.retry
     for _ in range(3):
-        begun = room.clock.monotonic()
-        assert retry.attempt(room.broken(until(begun + 50, DeviceError("covered"))), "the screen") == "done"
+        outlast(room, retry)
+        for _ in range(RECURS_WITHIN):
+            retry.accepted()
     assert room.words == ["retry", "paused", "resumed"] * 3
+
+
+def test_what_fails_again_after_a_few_frames_has_one_patience() -> None:
+    room = Room(60.0)
+    retry = room.retry
+    outlast(room, retry)
+    for _ in range(RECURS_WITHIN - 1):
+        retry.accepted()
+    outlast(room, retry, "the camera")
+    begun = room.clock.monotonic()
+    with pytest.raises(DeviceError, match="in 2 pauses"):
+        outlast(room, retry)
+    assert room.clock.monotonic() - begun == pytest.approx(10, abs=PAUSE_S + RETRY_S), "fifty of sixty are spent"
+
+
+def test_one_back_off_holds_across_pauses() -> None:
+    room = Room(math.inf)
+    retry = room.retry
+    waited: list[float] = []
+    for _ in range(9):
+        pause = retry.pause("the frames")
+        begun = room.clock.monotonic()
+        pause.back_off(DeviceError("refused"))
+        pause.wait(DeviceError("refused"))
+        waited.append(room.clock.monotonic() - begun)
+        pause.over()
+        retry.accepted()
+    assert all(earlier <= later for earlier, later in pairwise(waited))
+    assert waited[0] < BACK_OFF_S + 2 * PAUSE_S
+    assert waited[-1] >= LONGEST_BACK_OFF_S
 
 
 def test_a_full_disk_never_loses_the_frame_in_the_camera(tmp_path: Path) -> None:
