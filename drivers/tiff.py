@@ -85,6 +85,9 @@ class TiffTag(IntEnum):
     ACTIVE_AREA = 50829
     MASKED_AREAS = 50830
 
+    # Panasonic RW2: the byte from which on the pixels lie
+    RW2_PIXELS = 280
+
     # Canon CR2: widths of the vertical slices in which the raw pixels are stored
     CR2_SLICES = 50752
 
@@ -167,6 +170,7 @@ _DECODED: Final = frozenset(
         TiffTag.BLACK_LEVEL_DELTA_V,
         TiffTag.WHITE_LEVEL,
         TiffTag.CR2_SLICES,
+        TiffTag.RW2_PIXELS,
         TiffTag.ACTIVE_AREA,
         TiffTag.MASKED_AREAS,
     }

@@ -43,6 +43,7 @@ from drivers.raw.plain_dng import (
     stated_areas,
     stated_black,
 )
+from drivers.raw.wholeness import extents_fault, filled_fault, size_fault
 from drivers.tiff import CFA, Directory, Tags, TiffDamaged, TiffTag, ValueType, head, is_tiff, read_directories, text
 from foundation.errors import FormatError
 from foundation.files import read_whole
@@ -360,6 +361,14 @@ def decode_raw(data: bytes | memoryview, path: Path) -> Mosaic:
     """Return the mosaic of a raw file's bytes, for those who have read them already; `path` names it in messages."""
     if not data:
         raise _unreadable(path, "it is empty")
+    mosaic = _decode(data, path)
+    fault = filled_fault(mosaic.counts, mosaic.black)
+    if fault is not None:
+        raise _unreadable(path, fault)
+    return mosaic
+
+
+def _decode(data: bytes | memoryview, path: Path) -> Mosaic:
     cr3 = _check_cr3(path, data)
     directories = _check_structure(path, data)
     plain = read_plainly(data, directories)
@@ -404,6 +413,9 @@ def _mosaic(path: Path, raw: RawPy, data: bytes | memoryview, directories: list[
     if raw.raw_type is not rawpy.RawType.Flat or pattern is None or pattern.shape != (2, 2):
         raise _not_bayer(path, "its pixels do not follow a 2×2 pattern of colour filters")
     sizes = raw.sizes
+    fault = size_fault(data, directories, sizes.raw_height * sizes.raw_width)
+    if fault is not None:
+        raise _unreadable(path, fault)
     sensor = raw.raw_image
     # A view that kept LibRaw's object alive no longer would show freed memory.
     if sensor.base is not raw or sensor.dtype != np.uint16:
@@ -480,9 +492,9 @@ def _check_structure(path: Path, data: bytes | memoryview) -> list[Directory]:
         raise _unreadable(path, str(error)) from error
     pixels = raw_pixels(directories)
     if pixels is not None:
-        for offset, size in pixels.extents():
-            if offset + size > len(data):
-                raise _unreadable(path, f"its pixels reach to byte {offset + size}, and it has only {len(data)}")
+        fault = extents_fault(data, pixels, dng=any(one.integers(TiffTag.DNG_VERSION) for one in directories))
+        if fault is not None:
+            raise _unreadable(path, fault)
     return directories
 
 
