@@ -6,8 +6,8 @@ Rules that hold inside:
 - LibRaw reads behind a file's end as zeros or ones without a word. So what a file says of itself is held against its
   bytes first, and what came out against its black level.
 
-Sources: TIFF 6.0 (strips), TIFF technical note 1 and DNG 1.7.1 (tiles); ISO/IEC 14496-12, 8.7 (CR3). Where the pixels
-of an RW2 lie is known from LibRaw 0.22 (src/metadata/tiff.cpp, tag 0x118), of a RAF from src/metadata/identify.cpp.
+Sources: TIFF 6.0 (strips), TIFF technical note 1 and DNG 1.7.1 (tiles). Where the pixels of an RW2 (tag 0x118) and of a
+RAF (byte 100) begin is as ExifTool's tables of tags describe it (RawDataOffset; the header of RAF files).
 """
 
 from __future__ import annotations
@@ -22,7 +22,8 @@ from numpy.typing import NDArray
 from drivers.tiff import Directory, TiffTag
 
 _LEAST_BITS = 0.25
-"""Bits for each photosite below which no codec of a maker's puts a frame: noise alone takes two or more."""
+"""Bits for each photosite below which no codec of a maker's puts a frame: lossless JPEG spends one on each at least
+(ITU-T T.81, annex H), and noise takes several. Chosen."""
 
 _UNCOMPRESSED, _DEFLATE = 1, (8, 32946)
 """Compression (TIFF 6.0; DNG 1.7.1, chapter 3; 32946: Adobe's number of old)."""
