@@ -38,6 +38,7 @@ from acquisition.judge.light_checks import judge_evenness, judge_light
 from acquisition.judge.measure import Anchor, Frame, measure
 from acquisition.judge.state import Examined, JudgeState, LampSeen, is_brightest_grey, primary_of
 from drivers.raw.rawfile import Mosaic, read_raw
+from drivers.raw.wholeness import filled_fault
 from experiment.chart.model import Chart
 from experiment.config import LabSettings
 from experiment.framing.pictures import preview_jpeg
@@ -106,6 +107,9 @@ class LiveJudge:
             mosaic = read_raw(file)
         except FormatError as error:
             return Judgement.of_reason("file", str(error))
+        fault = filled_fault(mosaic.counts, mosaic.black)
+        if fault is not None:
+            return Judgement.of_reason("data", f"{file}: {fault}")
         before, black = self._state, frame_black(mosaic)
         found = self._look(mosaic, black, step)
         checks = named_once(found.checks)

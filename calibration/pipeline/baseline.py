@@ -51,6 +51,7 @@ from calibration.spread.surroundings import FrameLevels, photosite_offsets_px, p
 from calibration.table.lut import Lut, SourceFrame
 from drivers.raw.plain_dng import Area
 from drivers.raw.rawfile import Mosaic, decode_raw
+from drivers.raw.wholeness import filled_fault
 from experiment.chart.model import Chart
 from experiment.config import CameraSettings, CitationSettings
 from experiment.framing.field import Corners
@@ -733,6 +734,12 @@ def decode_frame(session: Session, record: FrameRecord) -> DecodedFrame:
             f"{record.sha256[:16]}…; restore the file from a copy, {_TAKEN_AGAIN}"
         )
     mosaic = decode_raw(data, path)
+    fault = filled_fault(mosaic.counts, mosaic.black)
+    if fault is not None:
+        raise FormatError(
+            f"{path} is no whole frame: {fault}; restore the file from a copy, or take it again: acquire run LAB.toml "
+            "SESSION --retake with the number of its light"
+        )
     black = frame_black(mosaic)
     return DecodedFrame(record, mosaic, black, strongest_channel(mosaic, black), saturation(mosaic))
 

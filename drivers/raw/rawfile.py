@@ -43,7 +43,7 @@ from drivers.raw.plain_dng import (
     stated_areas,
     stated_black,
 )
-from drivers.raw.wholeness import extents_fault, filled_fault, size_fault
+from drivers.raw.wholeness import extents_fault, size_fault
 from drivers.tiff import CFA, Directory, Tags, TiffDamaged, TiffTag, ValueType, head, is_tiff, read_directories, text
 from foundation.errors import FormatError
 from foundation.files import read_whole
@@ -361,14 +361,6 @@ def decode_raw(data: bytes | memoryview, path: Path) -> Mosaic:
     """Return the mosaic of a raw file's bytes, for those who have read them already; `path` names it in messages."""
     if not data:
         raise _unreadable(path, "it is empty")
-    mosaic = _decode(data, path)
-    fault = filled_fault(mosaic.counts, mosaic.black)
-    if fault is not None:
-        raise _unreadable(path, fault)
-    return mosaic
-
-
-def _decode(data: bytes | memoryview, path: Path) -> Mosaic:
     cr3 = _check_cr3(path, data)
     directories = _check_structure(path, data)
     plain = read_plainly(data, directories)
