@@ -203,8 +203,8 @@ def illuminations(
     lights = plan_illuminations(grid, parse_ccts(blackbodies))
     if not lights:
         raise InputError("no light is left: grid is 0 and there are no black bodies; name some")
-    plot_illuminations(lights, plot)
     save_illuminations(lights, out)
+    plot_illuminations(lights, plot)
     told.add(file=out, plot=plot, lights=len(lights), kinds=Counter(light.kind for light in lights))
     print(f"{out}: {len(lights)} lights; plot in {plot}")
 

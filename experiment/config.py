@@ -337,7 +337,11 @@ class LabSettings(Settings):
 def load_lab(path: Path) -> LabSettings:
     """Read `LAB.toml`, every path resolved against its folder; a ConfigurationError names what cannot be used."""
     folder = path.resolve().parent
-    settings = parse_lab(read_text(path, "examples/ has a file to begin with", "settings"), str(path), folder)
+    settings = parse_lab(
+        read_text(path, "acquire init writes one to begin with; it comes before the session", "settings"),
+        str(path),
+        folder,
+    )
     if settings.rig == "replay" and settings.replay is None:
         raise ConfigurationError(f"{path}: rig = 'replay' needs [replay] with session = 'FOLDER' of the recording")
     changes: dict[str, Any] = {"chart": folder / settings.chart, "illuminations": folder / settings.illuminations}

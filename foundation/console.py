@@ -28,6 +28,7 @@ import sys
 import threading
 from collections.abc import Callable, Generator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, redirect_stdout, suppress
+from io import TextIOWrapper
 from typing import Annotated, Any, TextIO, cast, get_type_hints
 
 import typer
@@ -58,6 +59,7 @@ def say_error(message: str) -> None:
 
 def run(command: Callable[[], object], *, keeps: bool = True, loads: bool = False) -> int:
     """Call `command` and return the exit code; a foreseeable fault is one line on stderr, no traceback."""
+    _make_printable()
     collects = gc.isenabled()
     if loads:
         gc.disable()
@@ -77,6 +79,17 @@ def run(command: Callable[[], object], *, keeps: bool = True, loads: bool = Fals
         _abandon_stdout()
         return code or StorageError.exit_code
     return code
+
+
+def _make_printable() -> None:
+    """Have output say what it can: closed streams take it silently, and what their encoding lacks becomes a mark."""
+    for name in ("stdout", "stderr"):
+        stream = getattr(sys, name)
+        if stream is None:
+            # The interpreter found the descriptor closed; what is opened now lives as long as the process.
+            setattr(sys, name, os.fdopen(os.open(os.devnull, os.O_WRONLY), "w", encoding="utf-8"))
+        elif isinstance(stream, TextIOWrapper) and stream.errors == "strict":
+            stream.reconfigure(errors="replace")
 
 
 def loaded() -> None:
@@ -571,7 +584,8 @@ def plain(value: Any) -> Any:
 
     Examples
     --------
-    >>> from pathlib import Path
+    >>> from io import TextIOWrapper
+    from pathlib import Path
     >>> plain({"place": Path("lut"), "angles": (0.5, float("nan"))})
     {'place': 'lut', 'angles': [0.5, None]}
     """

@@ -45,6 +45,7 @@ from evaluation.methods.green_stability import FAMILIES
 from evaluation.methods.standard import local_methods, standard_methods
 from evaluation.methods.wrapped import PATCHES, PatchwiseMethod, ResizedMethod
 from foundation.errors import InputError
+from foundation.packages import require_own_packages
 
 if TYPE_CHECKING:
     from evaluation.methods.method import Learner, Method
@@ -193,6 +194,7 @@ def _module_of_file(path: Path) -> ModuleType:
     module = importlib.util.module_from_spec(spec)
     # Data classes and pickles look their module up by its name.
     sys.modules[name] = module
+    require_own_packages()
     if str(whole.parent) not in sys.path:
         sys.path.append(str(whole.parent))
     try:
@@ -204,6 +206,7 @@ def _module_of_file(path: Path) -> ModuleType:
 
 
 def _module_by_name(name: str) -> ModuleType:
+    require_own_packages()
     if str(Path.cwd()) not in sys.path:
         sys.path.append(str(Path.cwd()))
     try:

@@ -458,3 +458,22 @@ def test_the_short_form_of_evaluate_takes_them_first(tmp_path: Path, capsys: pyt
 
     assert main(["-q", str(tmp_path / "none")]) == 2
     assert str(tmp_path / "none") in capsys.readouterr().err
+
+
+PRINTING = "from foundation.console import run; import sys; sys.exit(run(lambda: print('30 \u00b0 \u2026')))"
+
+
+@pytest.mark.parametrize("encoding", ["ascii", "latin-1", "utf-8"])
+def test_a_terminal_gets_what_it_can_show(encoding: str) -> None:
+    environment = {**os.environ, "PYTHONIOENCODING": encoding}
+    done = subprocess.run([sys.executable, "-c", PRINTING], capture_output=True, check=False, env=environment)
+    assert (done.returncode, done.stderr) == (0, b"")
+    assert done.stdout.startswith(b"30 ")
+
+
+@pytest.mark.parametrize("closed", ["1", "2"])
+def test_closed_streams_are_no_fault(closed: str) -> None:
+    words = ["sh", "-c", f'exec "$0" -c "$1" {closed}>&-', sys.executable, PRINTING]
+    done = subprocess.run(words, capture_output=True, check=False)
+    assert done.returncode == 0
+    assert b"Traceback" not in done.stderr

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.metadata
+import inspect
 import re
 import subprocess
 import sys
@@ -56,7 +57,9 @@ def paths_of(module: str) -> list[tuple[str, ...]]:
 @pytest.mark.parametrize("command", COMMANDS)
 def test_the_command_is_installed(command: str) -> None:
     entries = importlib.metadata.entry_points(group="console_scripts", name=command)
-    assert {entry.value for entry in entries} == {f"{COMMANDS[command]}:main"}
+    (entry,) = set(entries)
+    assert entry.value == f"croplab:{command.replace('-', '_')}"
+    assert f'_run("{COMMANDS[command]}")' in inspect.getsource(entry.load())
 
 
 @pytest.mark.parametrize("module", COMMANDS.values())

@@ -462,3 +462,9 @@ def test_a_run_checks_its_plan_before_anything_moves(lab: Path, capsys: pytest.C
     assert main(["run", str(lab), str(lab.parent / "night")]) == 5
     assert "are missing" in capsys.readouterr().err
     assert contents(lab.parent) == before
+
+
+def test_a_folder_in_place_of_the_lights_leaves_nothing_beside_it(tmp_path: Path) -> None:
+    (tmp_path / "lights").mkdir()
+    assert main(["illuminations", str(tmp_path / "lights")]) != 0
+    assert [path.name for path in tmp_path.iterdir()] == ["lights"]

@@ -1,0 +1,99 @@
+"""CroP under one name of its own: `import croplab`, then `croplab.open_lut`, `croplab.render` and the rest.
+
+The names are those of `generator` and `evaluation` that docs/library.md is about, loaded when they are first used. The
+packages have short names, so a file `generator.py` in a user's folder would hide one: here, and at the start of each
+command, that is told by the name of the file.
+"""
+
+from __future__ import annotations
+
+import sys
+from importlib import import_module
+from pathlib import Path
+
+_HOMES = {
+    "open_lut": "generator",
+    "read_picture": "generator",
+    "render": "generator",
+    "find_pictures": "generator",
+    "generate_dataset": "generator",
+    "DatasetOptions": "generator",
+    "Workers": "generator",
+    "Callbacks": "generator",
+    "open_dataset": "generator",
+    "draw_samples": "generator",
+    "draw_mosaic": "generator",
+    "draw_planar": "generator",
+    "draw_batch": "generator",
+    "mix_samples": "generator",
+    "mixed_table": "generator",
+    "flash": "generator",
+    "Crops": "generator.training",
+    "gallery_of": "generator.training",
+    "open_gallery": "generator.training",
+    "recovery_error": "evaluation.metrics",
+    "reproduction_error": "evaluation.metrics",
+    "summarise": "evaluation.metrics",
+}
+
+__all__ = list(_HOMES)  # pyright: ignore[reportUnsupportedDunderAll] - names are loaded when used
+
+
+def __getattr__(name: str) -> object:
+    if name not in _HOMES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    _require_own_packages()
+    return getattr(import_module(_HOMES[name]), name)
+
+
+def __dir__() -> list[str]:
+    return [*globals(), *__all__]
+
+
+def _require_own_packages() -> None:
+    """Raise an ImportError that names the file by which one of the packages is hidden."""
+    # The lowest package, which has the check, may be the hidden one.
+    lowest = import_module("foundation")
+    if Path(lowest.__file__ or "").resolve().parent != Path(__file__).resolve().parent / "foundation":
+        raise ImportError(f"{lowest.__file__} hides the package foundation of CroP; rename it")
+    from foundation.errors import InputError
+    from foundation.packages import require_own_packages
+
+    try:
+        require_own_packages()
+    except InputError as error:
+        raise ImportError(str(error)) from error
+
+
+def _run(module: str) -> int:
+    try:
+        _require_own_packages()
+    except ImportError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    return int(import_module(module).main())
+
+
+def acquire() -> int:
+    """Run the command `acquire`."""
+    return _run("acquisition.cli")
+
+
+def build_lut() -> int:
+    """Run the command `build-lut`."""
+    return _run("calibration.cli")
+
+
+def generate() -> int:
+    """Run the command `generate`."""
+    return _run("generator.cli")
+
+
+def evaluate() -> int:
+    """Run the command `evaluate`."""
+    return _run("evaluation.cli")
+
+
+def sim() -> int:
+    """Run the command `sim`."""
+    return _run("synthesis.cli")

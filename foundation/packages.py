@@ -1,0 +1,45 @@
+"""The packages of this software by name, and whether a user's file hides one of them.
+
+Their names are short and common: a file `generator.py` beside a user's program is imported in place of the package.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from pathlib import Path
+from typing import Final
+
+from foundation.errors import InputError
+
+PACKAGES: Final = (
+    "foundation",
+    "drivers",
+    "sim",
+    "experiment",
+    "calibration",
+    "acquisition",
+    "synthesis",
+    "generator",
+    "evaluation",
+)
+"""From the lowest to the highest."""
+
+_ROOT: Final = Path(__file__).resolve().parents[1]
+
+
+def require_own_packages() -> None:
+    """Import each package, so that no file that is found later can hide it.
+
+    Raises
+    ------
+    InputError
+        Another file or folder was found by the name of one.
+    """
+    for name in PACKAGES:
+        module = import_module(name)
+        found = module.__file__ or next(iter(getattr(module, "__path__", [])), "something without a file")
+        if Path(found).resolve().parent != _ROOT / name:
+            raise InputError(
+                f"{found} hides the package {name} of CroP, expected {_ROOT / name}; rename it, or start from another "
+                "folder"
+            )

@@ -1,0 +1,66 @@
+"""Files of users that have a name of one of our packages."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+
+
+def run(code: str, folder: Path) -> subprocess.CompletedProcess[str]:
+    """Run code as a program in a folder that comes before all others."""
+    environment = {**os.environ, "PYTHONPATH": f"{folder}{os.pathsep}{ROOT}"}
+    program = [sys.executable, "-c", code]
+    return subprocess.run(program, capture_output=True, text=True, check=False, env=environment, cwd=folder)
+
+
+@pytest.mark.parametrize("hidden", ["generator", "evaluation", "foundation"])
+def test_a_file_that_hides_a_package_is_named(tmp_path: Path, hidden: str) -> None:
+    (tmp_path / f"{hidden}.py").write_text("x = 1\n")
+    done = run("import croplab; croplab.open_lut", tmp_path)
+    assert f"{tmp_path / hidden}.py hides the package {hidden} of CroP" in done.stderr.splitlines()[-1]
+    done = run("import croplab, sys; sys.argv = ['generate', '--help']; sys.exit(croplab.generate())", tmp_path)
+    assert done.returncode == 2
+    assert done.stderr.startswith(f"error: {tmp_path / hidden}.py hides the package {hidden}")
+
+
+def test_the_name_of_its_own_has_what_the_packages_have_and_loads_late(tmp_path: Path) -> None:
+    code = """
+import sys, croplab
+assert not {"numpy", "typer", "generator"} & sys.modules.keys()
+assert croplab.open_lut is __import__("generator").open_lut
+for name in croplab.__all__:
+    assert callable(getattr(croplab, name)), name
+try:
+    croplab.nothing
+except AttributeError:
+    print("done")
+"""
+    done = run(code, tmp_path)
+    assert done.stdout == "done\n", done.stderr
+
+
+def test_a_method_beside_such_a_file_is_loaded_and_hides_nothing(tmp_path: Path) -> None:
+    (tmp_path / "generator.py").write_text("raise SystemExit('hidden')\n")
+    method = tmp_path / "mine.py"
+    lines = (
+        "class Mine:",
+        "    name = 'mine'",
+        "    def estimate(self, image, saturation, mask=None):",
+        "        return (1, 1, 1)",
+    )
+    method.write_text("\n".join(lines))
+    code = f"""
+from evaluation.methods.naming import find_method
+print(find_method({str(method)!r} + ":Mine").name)
+import generator
+print(generator.open_lut.__module__)
+"""
+    (tmp_path / "elsewhere").mkdir()
+    done = run(code, tmp_path / "elsewhere")
+    assert done.stdout.splitlines() == ["mine", "generator"], done.stderr
