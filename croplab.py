@@ -11,6 +11,15 @@ import sys
 from importlib import import_module
 from pathlib import Path
 
+COMMANDS = {
+    "acquire": "acquisition.cli",
+    "build-lut": "calibration.cli",
+    "generate": "generator.cli",
+    "evaluate": "evaluation.cli",
+    "sim": "synthesis.cli",
+}
+"""The commands, and the module of each."""
+
 _HOMES = {
     "open_lut": "generator",
     "read_picture": "generator",
@@ -65,35 +74,35 @@ def _require_own_packages() -> None:
         raise ImportError(str(error)) from error
 
 
-def _run(module: str) -> int:
+def _run(command: str) -> int:
     try:
         _require_own_packages()
     except ImportError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
-    return int(import_module(module).main())
+    return int(import_module(COMMANDS[command]).main())
 
 
 def acquire() -> int:
     """Run the command `acquire`."""
-    return _run("acquisition.cli")
+    return _run("acquire")
 
 
 def build_lut() -> int:
     """Run the command `build-lut`."""
-    return _run("calibration.cli")
+    return _run("build-lut")
 
 
 def generate() -> int:
     """Run the command `generate`."""
-    return _run("generator.cli")
+    return _run("generate")
 
 
 def evaluate() -> int:
     """Run the command `evaluate`."""
-    return _run("evaluation.cli")
+    return _run("evaluate")
 
 
 def sim() -> int:
     """Run the command `sim`."""
-    return _run("synthesis.cli")
+    return _run("sim")

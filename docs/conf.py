@@ -19,10 +19,11 @@ from sphinx.application import Sphinx
 from sphinx.domains.python import PyXRefRole
 from typer.main import get_command
 
+from croplab import COMMANDS
+
 ROOT = Path(__file__).resolve().parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
 PACKAGES = PROJECT["tool"]["importlinter"]["root_packages"]
-COMMANDS = PROJECT["project"]["scripts"]
 
 project = "CroP"
 version = release = PROJECT["project"]["version"]
@@ -85,9 +86,7 @@ def write_commands(app: Sphinx) -> None:
     """Write the pages of the commands: the help of each and of all below it."""
     folder = Path(app.srcdir) / "reference" / "commands"
     folder.mkdir(parents=True, exist_ok=True)
-    sys.path.insert(0, str(ROOT))
-    for command, place in COMMANDS.items():
-        module = place.split(":")[0]
+    for command, module in COMMANDS.items():
         parts: list[str] = []
         for words in words_of(command, get_command(import_module(module).app)):
             text = help_of(module, [*words, "--help"])

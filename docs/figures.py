@@ -17,6 +17,8 @@ from typing import Any
 
 import grimp
 
+from croplab import COMMANDS
+
 ROOT = Path(__file__).resolve().parents[1]
 IMAGES = ROOT / "docs" / "images"
 
@@ -92,7 +94,7 @@ def read_plan() -> Plan:
             module = ignored.split(" -> ")[0].removesuffix(".**")
             excepted[module.split(".")[0]].add(module)
     commands: dict[str, list[str]] = {package: [] for package in roots}
-    for command, place in project["project"]["scripts"].items():
+    for command, place in COMMANDS.items():
         commands[place.split(".")[0]].append(command)
     graph = grimp.build_graph(*roots, cache_dir=None)
     imports: dict[str, set[str]] = {}

@@ -15,6 +15,8 @@ from typing import Any
 
 from typer.main import get_command
 
+from croplab import COMMANDS
+
 ROOT = Path(__file__).resolve().parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
 FOLDER = ROOT / "docs" / "man"
@@ -25,7 +27,7 @@ _COMPLETION = ("install_completion", "show_completion")
 def pages() -> dict[Path, str]:
     """Return every page by the file that it belongs into."""
     scripts: dict[str, str] = PROJECT["scripts"]
-    return {FOLDER / f"{name}.1": page(name, _command_of(place), sorted(scripts)) for name, place in scripts.items()}
+    return {FOLDER / f"{name}.1": page(name, _command_of(name), sorted(scripts)) for name in scripts}
 
 
 def page(name: str, command: Any, names: list[str]) -> str:
@@ -58,8 +60,8 @@ def page(name: str, command: Any, names: list[str]) -> str:
     return "".join(parts).replace(",\n.BR", "\n.BR") + "\n"
 
 
-def _command_of(place: str) -> Any:
-    return get_command(import_module(place.split(":")[0]).app)
+def _command_of(name: str) -> Any:
+    return get_command(import_module(COMMANDS[name]).app)
 
 
 def _below(words: tuple[str, ...], command: Any) -> Iterator[tuple[tuple[str, ...], Any]]:

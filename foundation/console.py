@@ -584,8 +584,7 @@ def plain(value: Any) -> Any:
 
     Examples
     --------
-    >>> from io import TextIOWrapper
-    from pathlib import Path
+    >>> from pathlib import Path
     >>> plain({"place": Path("lut"), "angles": (0.5, float("nan"))})
     {'place': 'lut', 'angles': [0.5, None]}
     """

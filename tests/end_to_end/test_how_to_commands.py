@@ -17,8 +17,8 @@ import cv2
 import numpy as np
 import pytest
 
+from croplab import COMMANDS
 from tests.house.test_documented_commands import FOUND
-from tests.house_commands import COMMANDS
 
 pytestmark = pytest.mark.slow
 

@@ -19,9 +19,9 @@ import pytest
 from typer.main import get_command
 
 from acquisition.run.plan import planned_steps
+from croplab import COMMANDS
 from experiment.config import load_lab
 from experiment.lights import plan_illuminations
-from tests.house_commands import COMMANDS
 
 ROOT = Path(__file__).parents[2]
 MADE = ("docs/reference/commands/", "docs/reference/api/")

@@ -16,9 +16,9 @@ import numpy as np
 import pytest
 from typer.main import get_command
 
+from croplab import COMMANDS
 from foundation.console import JsonOutput, json_output, plain, with_json
 from foundation.errors import QualityError
-from tests.house_commands import COMMANDS
 from tests.json_of import json_of
 
 WITHOUT_FIGURES = {

@@ -12,6 +12,7 @@ from typing import Any
 import pytest
 from typer.main import get_command
 
+from croplab import COMMANDS
 from docs.manpages import FOLDER, PROJECT, ROOT, pages
 
 PAGES = pages()
@@ -36,7 +37,7 @@ def every(command: Any) -> Iterator[Any]:
 @pytest.mark.parametrize("name", PROJECT["scripts"])
 def test_every_option_stands_on_its_page(name: str) -> None:
     text = PAGES[FOLDER / f"{name}.1"].replace("\\-", "-").replace("\\fB", "").replace("\\fR", "").replace("\\fI", "")
-    for command in every(get_command(import_module(PROJECT["scripts"][name].split(":")[0]).app)):
+    for command in every(get_command(import_module(COMMANDS[name]).app)):
         for option in command.params:
             for word in option.opts if option.param_type_name == "option" else ():
                 assert f"\n{word}" in text or f", {word}" in text, word
