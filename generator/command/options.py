@@ -203,7 +203,9 @@ class ImageOptions:
     format: Annotated[
         Literal["png", "tiff", "exr", "jxl", "dng"],
         _image_option(
-            None, "PNG; uncompressed TIFF, fast and large; OpenEXR; JPEG XL, small; or raw files, Bayer DNG."
+            None,
+            "PNG of 16 bits, of which Pillow and imageio keep 8 (read with cv2.IMREAD_UNCHANGED or open_dataset); "
+            "uncompressed TIFF, fast and large; OpenEXR; JPEG XL, small; or raw files, Bayer DNG.",
         ),
     ] = "png"
     layout: Annotated[

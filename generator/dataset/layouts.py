@@ -960,8 +960,8 @@ def _reading(description: Description) -> str:
         return joined.reading
     return (
         f"`images/NNNNNN.{form}` are linear, 16 bits where the format has them; `load_dataset` gives the rows of "
-        "`ground_truth.csv`, whose column `image` names the file. Pillow keeps 8 of 16 bits of a PNG: use "
-        "`cv2.imread(path, cv2.IMREAD_UNCHANGED)` (then BGR) or `generator.open_dataset`."
+        "`ground_truth.csv`, whose column `image` names the file. Pillow, and imageio by it, keep 8 of 16 bits of a "
+        "PNG: use `cv2.imread(path, cv2.IMREAD_UNCHANGED)` (then BGR) or `generator.open_dataset`."
     )
 
 
