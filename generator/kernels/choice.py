@@ -81,16 +81,10 @@ def philox4x32(c0: Any, c1: Any, c2: Any, c3: Any, seed: Any) -> Any:
 
 
 @inlined
-def row_words(y: Any, place: Any, image: Any, seed: Any) -> Any:
-    """Return the three keys (uint32) of row `y`, and a fourth word of them; `seed` is uint64."""
-    k0, k1, k2, k3 = philox4x32(uint32(y), uint32(place), uint32(image), _PURPOSE, seed)
-    return (k0, k1, k2), k3
-
-
-@inlined
 def row_keys(y: Any, place: Any, image: Any, seed: Any) -> Any:
     """Return the three keys (uint32) of row `y`; `seed` is uint64."""
-    return row_words(y, place, image, seed)[0]
+    k0, k1, k2, _ = philox4x32(uint32(y), uint32(place), uint32(image), _PURPOSE, seed)
+    return k0, k1, k2
 
 
 @inlined

@@ -15,7 +15,7 @@ inside:
   above are lowered by one number that keeps the cell's mean. Where a cell is darker than what is taken out, it is 0.
 - Rounding keeps the mean of a cell: each sample takes over what rounding the one before has left.
 - Of images rendered by codes the black cell's b is taken out whole, its tint included. Rendered by colour, black is not
-  that cell: it was mapped to the darkest grey that mixtures of cells make, which is brighter. There b is that grey, of
+  that cell: it was mapped to the darkest grey that the print shows, which is brighter. There b is that grey, of
   every light on the image, so that a share of 1 undoes the mapping and greys stay grey.
 - What is saturated stays saturated: with W above the white level, the white level is taken for it.
 - Several lights on a pixel: each light's samples lose that light's veil before they are mixed, since light adds. To
@@ -162,7 +162,7 @@ def veil_of(lut: Lut, light: Mixture, share: float, grey: float | None = None) -
     """Return what taking out a share of the print's black means under a light.
 
     `share`: 0 … 1. `grey`: what black was mapped to, over the light's white, of images rendered by colour
-    (`CellMixtures.black`); None for the black cell.
+    (`ColorimetricRendering.black`); None for the black cell.
     """
     black = black_of(lut, light) if grey is None else grey * light.white(lut)
     white = np.minimum(light.white(lut), lut.provenance.white_level)
