@@ -10,6 +10,7 @@ from __future__ import annotations
 import sys
 from importlib import import_module
 from pathlib import Path
+from types import ModuleType
 
 COMMANDS = {
     "acquire": "acquisition.cli",
@@ -20,43 +21,26 @@ COMMANDS = {
 }
 """The commands, and the module of each."""
 
-_HOMES = {
-    "open_lut": "generator",
-    "read_picture": "generator",
-    "render": "generator",
-    "find_pictures": "generator",
-    "generate_dataset": "generator",
-    "DatasetOptions": "generator",
-    "Workers": "generator",
-    "Callbacks": "generator",
-    "open_dataset": "generator",
-    "draw_samples": "generator",
-    "draw_mosaic": "generator",
-    "draw_planar": "generator",
-    "draw_batch": "generator",
-    "mix_samples": "generator",
-    "mixed_table": "generator",
-    "flash": "generator",
-    "Crops": "generator.training",
-    "gallery_of": "generator.training",
-    "open_gallery": "generator.training",
-    "recovery_error": "evaluation.metrics",
-    "reproduction_error": "evaluation.metrics",
-    "summarise": "evaluation.metrics",
-}
-
-__all__ = list(_HOMES)  # pyright: ignore[reportUnsupportedDunderAll] - names are loaded when used
+_HOMES = "generator", "generator.training", "evaluation.metrics"
+"""Where the names are; each says in `__all__` which are public."""
 
 
 def __getattr__(name: str) -> object:
-    if name not in _HOMES:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    _require_own_packages()
-    return getattr(import_module(_HOMES[name]), name)
+    homes: list[ModuleType] = []
+    # Python asks modules for names of its own, such as __path__.
+    if name == "__all__" or not name.startswith("__"):
+        _require_own_packages()
+        homes = [import_module(home) for home in _HOMES]
+    if name == "__all__":
+        return [public for home in homes for public in home.__all__]
+    for home in homes:
+        if name in home.__all__:
+            return getattr(home, name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 
 def __dir__() -> list[str]:
-    return [*globals(), *__all__]
+    return [*globals(), *__getattr__("__all__")]  # pyright: ignore[reportGeneralTypeIssues, reportUnknownVariableType]
 
 
 def _require_own_packages() -> None:

@@ -74,15 +74,24 @@ def insert_rows(connection: sqlite3.Connection, rows: Rows) -> None:
             connection.execute(f"INSERT INTO {table} ({', '.join(row)}) VALUES ({marks})", tuple(row.values()))
 
 
-def read_ledger(path: Path, *, without_last: bool = False) -> Rows:
-    """Return the facts that a ledger holds; `without_last`: but those of its last line."""
-    rows: Rows = {}
+def read_ledger(path: Path) -> Rows:
+    """Return the facts that a ledger holds."""
+    return _gathered(_read(path))
+
+
+def _read(path: Path) -> list[Mapping[str, Sequence[Row]]]:
+    """Return the transactions of a ledger."""
     try:
-        with path.open("rb") as stream:
-            transactions = list(_transactions(path, stream.read().split(b"\n")))
+        lines = path.read_bytes().split(b"\n")
     except OSError as error:
         raise reading_error(path, error, "restore the session from a copy") from error
-    for transaction in transactions[: -1 if without_last else None]:
+    return list(_transactions(path, lines))
+
+
+def _gathered(transactions: Sequence[Mapping[str, Sequence[Row]]]) -> Rows:
+    """Return the facts that transactions left."""
+    rows: Rows = {}
+    for transaction in transactions:
         for table, changes in transaction.items():
             for row in changes:
                 _put(rows, table, row)
@@ -203,13 +212,12 @@ class Ledger:
     def _is_of(self, rows: Rows) -> bool:
         """Return whether the file holds these facts; refuse where it knows of frames that are not among them."""
         try:
-            known = read_ledger(self._path)
-            if known == rows:
-                return True
-            kept = read_ledger(self._path, without_last=True)
+            transactions = _read(self._path)
         except FormatError:
             return False
-        if lacking := len(_frames(kept) - _frames(rows)):
+        if _gathered(transactions) == rows:
+            return True
+        if lacking := len(_frames(_gathered(transactions[:-1])) - _frames(rows)):
             raise FormatError(
                 f"the journal of {self._path.parent} lacks {lacking} frames that {self._path} has: it is an older "
                 "one, or was damaged",

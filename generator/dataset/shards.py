@@ -41,7 +41,6 @@ from generator.variation.variation import Varied
 
 if TYPE_CHECKING:
     from calibration.table.lut import Lut
-    from generator.kernels.printing import PrintedLight
     from generator.rendering.colorimetric import ColorimetricRendering
 
 
@@ -100,13 +99,7 @@ def _printed(
 ) -> tuple[npt.NDArray[np.uint16], Details]:
     """Return the raw image (H, W, 3) of a picture (H, W, 3) by colour, and what is recorded of it."""
     from generator.kernels.printing import draw_printed, nearest_nodes
-    from generator.rendering.black_points import veil_of
 
-    lut = rendering.lut
-    lights: list[PrintedLight] = []
-    for mixture in lighting.mixtures:
-        taken = veil_of(lut, mixture, share, rendering.black(mixture)).taken if share else None
-        lights.append(rendering.printed(mixture, taken))
     outside, distance = rendering.map.missed(nearest_nodes(picture))
     details: Details = {
         "cells": rendering.map.sha256[:16],
@@ -114,9 +107,9 @@ def _printed(
         "distance": round(distance, 6),
     }
     image = draw_printed(
-        lut.samples,
+        rendering.lut.samples,
         picture,
-        lights,
+        [rendering.printed(mixture, share) for mixture in lighting.mixtures],
         rendering.cells,
         shares=weights,
         most=most,

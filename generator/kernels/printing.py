@@ -232,6 +232,13 @@ def _plan_group(row: Any, first: int, stop: int, part: Any, cells: Any, plan: An
 
 
 @inlined
+def _key_row(keys: Any, y: int, image: int, seed: Any) -> None:
+    """Write the keys of row `y` of each component, (C, 3) uint32."""
+    for number in range(len(keys)):
+        keys[number, 0], keys[number, 1], keys[number, 2] = row_keys(y, number, image, seed)
+
+
+@inlined
 def _print_group(
     row: Any,
     first: int,
@@ -303,8 +310,7 @@ def _print(
     top, half, line = np.float32(most), np.float32(0.5), memory[2]
     width = picture.shape[1]
     for y in range(len(picture)):
-        for number in range(len(keys)):
-            keys[number, 0], keys[number, 1], keys[number, 2] = row_keys(first_row + y, number, image, seed)
+        _key_row(keys, first_row + y, image, seed)
         row, shared = picture[y], shares[y if masked else 0]
         for begin in range(0, width, GROUP):
             stop, word = min(begin + GROUP, width), uint32(begin // GROUP * LANES)
@@ -326,7 +332,6 @@ def _print_crop(
     members: Any,
     count: Any,
     seed: Any,
-    image: int,
     scales: Any,
     memory: Any,
     out: Any,
@@ -336,8 +341,7 @@ def _print_crop(
     shares, line = np.ones((1, 1), np.float32), memory[2]
     x0, y0, width, height = window
     for y in range(height):
-        for number in range(len(keys)):
-            keys[number, 0], keys[number, 1], keys[number, 2] = row_keys(y0 + y, number, image, seed)
+        _key_row(keys, y0 + y, 0, seed)
         row = picture[y0 + y]
         for begin in range(GROUP * (x0 // GROUP), x0 + width, GROUP):
             first, stop, word = max(begin, x0), min(begin + GROUP, x0 + width), uint32(begin // GROUP * LANES)
@@ -471,7 +475,6 @@ def draw_printed_crops(
                 components.members,
                 np.uint32(count),
                 seeds[item],
-                0,
                 scales[item],
                 memory.arrays,
                 out[item],

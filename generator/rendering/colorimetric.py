@@ -40,9 +40,11 @@ from calibration.radiometry.table_noise import noise_curve
 from foundation.colorimetry import angles_deg, decode_srgb
 from foundation.errors import CropError, InputError, QualityError
 from foundation.files import cache_folder, sha256_of, whole_file
+from generator.kernels.choice import channels_of
 from generator.kernels.printing import NODE_CODES, NODES, SIDE, PrintedLight, means_at
 from generator.lights.lighting import Mixture
 from generator.rendering import print_inverse, print_profiles
+from generator.rendering.black_points import veil_of
 from generator.rendering.print_inverse import corners, invert, nearest_to
 from generator.rendering.print_profiles import PrintProfile, profile_of
 
@@ -234,8 +236,7 @@ def find_map(lut: Lut, matrix: ColourMatrix) -> PrintMap:
     around, weights = corners(places, bits)
     weights = weights * usable[around]
     sums = weights.sum(axis=1)
-    fit = np.flatnonzero(usable)
-    nearest = fit[_nearest(places, fit, bits)]
+    nearest = _nearest(places, np.flatnonzero(usable), bits)
     lost = sums < 1e-6
     weights[lost], around[lost] = np.eye(8)[0], nearest[lost, None]
     weights[~lost] /= sums[~lost, None]
@@ -279,19 +280,16 @@ def _filled(colours: _Array, usable: npt.NDArray[np.bool_], bits: int) -> _Array
     lost, fit = np.flatnonzero(~usable), np.flatnonzero(usable)
     filled = colours.copy()
     if len(lost):
-        shifts = np.array([2 * bits, bits, 0])
-        codes = (lost[:, None] >> shifts & (1 << bits) - 1).astype(np.float64)
-        filled[lost] = colours[fit[_nearest(codes, fit, bits)]]
+        filled[lost] = colours[_nearest(channels_of(lost, bits), fit, bits)]
     return filled
 
 
-def _nearest(places: _Array, cells: npt.NDArray[np.int64], bits: int) -> npt.NDArray[np.int64]:
-    """Return for each place in the chart (K, 3) which of some cells (N,) is nearest to it, (K,) int64."""
+def _nearest(places: npt.NDArray[Any], cells: npt.NDArray[np.int64], bits: int) -> npt.NDArray[np.int64]:
+    """Return for each place in the chart (K, 3) the nearest of some cells (N,), (K,) int64."""
     from scipy.spatial import KDTree
 
-    shifts = np.array([2 * bits, bits, 0])
-    tree: Any = KDTree(cells[:, None] >> shifts & (1 << bits) - 1)
-    return np.asarray(tree.query(places)[1], np.int64)
+    tree: Any = KDTree(channels_of(cells, bits))
+    return cells[np.asarray(tree.query(places)[1], np.int64)]
 
 
 def black_point(profile: PrintProfile, colours: _Array, bits: int) -> float:
@@ -383,26 +381,27 @@ class ColorimetricRendering:
 
     def black(self, light: Mixture) -> float:
         """Return what black is mapped to under a light, over its white."""
-        return float((self.seen(light)[0] / light.white(self.lut)).mean())
+        return self._black(self.seen(light), light)
 
-    def printed(self, light: Mixture, taken: _Array | None = None) -> PrintedLight:
+    def _black(self, seen: _Array, light: Mixture) -> float:
+        return float((seen[0] / light.white(self.lut)).mean())
+
+    def printed(self, light: Mixture, share: float = 0.0) -> PrintedLight:
         """Return what a light makes of the print, for `kernels.printing`.
 
-        `taken`: (3,) counts of the print's black that are taken out, the rest stretched so that white stays; noise that
-        would reach below 0 is made smaller. None: nothing.
+        `share`: of the print's black that is taken out, 0 … 1; noise that would reach below 0 is then made smaller.
         """
         seen = self.seen(light)
-        white = np.minimum(light.white(self.lut), self.lut.provenance.white_level)
         cells = np.stack([self._lights(number)[1] for number in light.lights])
         each = np.sqrt(self._variance(seen))
         means = np.empty((NODES, 4), np.float32)
         means[:, 3] = np.linalg.norm(each, axis=1)
         cells[:, :, 1, :3] /= means[:, 3, None]
-        if taken is not None:
-            stretch = 1 / (1 - taken / white)
-            seen = np.maximum((seen - taken) * stretch, 0.0)
+        if share:
+            veil = veil_of(self.lut, light, share, self._black(seen, light))
+            seen = np.maximum((seen - veil.taken) * veil.stretch, 0.0)
             # Counts have no sign: noise that reached below 0 would be cut off there, and black be too bright.
-            cells[:, :, 1, :3] *= stretch * np.minimum(seen / (NOISE_ABOVE * each * stretch), 1.0)
+            cells[:, :, 1, :3] *= veil.stretch * np.minimum(seen / (NOISE_ABOVE * each * veil.stretch), 1.0)
         means[:, :3] = seen
         return PrintedLight(means, cells, np.array(light.lights, np.int64), np.sqrt(light.weights).astype(np.float32))
 

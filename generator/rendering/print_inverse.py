@@ -22,6 +22,8 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
+from generator.kernels.choice import channels_of
+
 _Array = npt.NDArray[np.float64]
 
 STEPS: Final = 8
@@ -146,7 +148,7 @@ def _grey_places(colours: _Array, levels: _Array, bits: int) -> _Array:
     start = np.empty((len(levels), 3))
     for row, target in enumerate(np.log(wanted) @ _SCALE.T):
         cell = int(((logs - target) ** 2).sum(axis=1).argmin())
-        start[row] = cell >> 2 * bits, cell >> bits & top, cell & top
+        start[row] = channels_of(cell, bits)
     # On a chart of few cells the nearest may lie beside the grey axis, at a kink of its own: two starts, the better.
     found = [nearest_to(colours, wanted, start, bits)]
     brightness = np.maximum.accumulate(np.sort(colours.mean(axis=1)[_diagonal(bits)]))

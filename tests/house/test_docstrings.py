@@ -15,18 +15,9 @@ from pathlib import Path
 
 import pytest
 
+from foundation.packages import PACKAGES
+
 ROOT = Path(__file__).parents[2]
-PACKAGES = (
-    "foundation",
-    "drivers",
-    "sim",
-    "experiment",
-    "calibration",
-    "acquisition",
-    "synthesis",
-    "generator",
-    "evaluation",
-)
 
 Function = ast.FunctionDef | ast.AsyncFunctionDef
 

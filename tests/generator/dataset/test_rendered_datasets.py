@@ -94,7 +94,7 @@ def test_an_image_is_that_of_its_light_without_a_share_of_black(
         light = plain(int(entry.lights[0]))
         share = BY_COLOUR.black_point.share(5, number)
         assert row["cells"] == rendering.map.sha256[:16]
-        printed = rendering.printed(light, veil_of(lut, light, share, rendering.black(light)).taken)
+        printed = rendering.printed(light, share)
         image = draw_printed(lut.samples, sources[entry.source], [printed], rendering.cells, seed=5, image=number)
         np.testing.assert_array_equal(dataset.read_image(entry), np.minimum(image, lut.provenance.white_level))
         assert float(row["black_taken"]) == pytest.approx(share, abs=1e-8)
@@ -195,10 +195,7 @@ def test_several_lights_share_an_image(make_lut: MakeLut, pictures: Path, tmp_pa
     for number, (entry, source) in enumerate(zip(dataset.entries, sources, strict=True)):
         lighting = choice.lightings_of(number)[0]
         weights = dataset.read_weights(entry)
-        lights = [
-            rendering.printed(mixture, veil_of(lut, mixture, 1.0, rendering.black(mixture)).taken)
-            for mixture in lighting.mixtures
-        ]
+        lights = [rendering.printed(mixture, 1.0) for mixture in lighting.mixtures]
         wanted = draw_printed(
             lut.samples,
             source.read().picture,
