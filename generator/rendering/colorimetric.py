@@ -35,11 +35,13 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 import numpy.typing as npt
 
+from calibration.radiometry import table_noise
 from calibration.radiometry.greys import tint_deg
 from calibration.radiometry.table_noise import noise_curve
 from foundation.colorimetry import angles_deg, decode_srgb
 from foundation.errors import CropError, InputError, QualityError
 from foundation.files import cache_folder, sha256_of, whole_file
+from generator.kernels import printing
 from generator.kernels.choice import channels_of
 from generator.kernels.printing import NODE_CODES, NODES, SIDE, PrintedLight, means_at
 from generator.lights.lighting import Mixture
@@ -83,6 +85,10 @@ spread of their own that is off by a seventh, and that of the nearest cell is of
 NOISE_ABOVE: Final = 1.5
 """Standard deviations of noise that are left between a mean and 0 where black is taken out: what is cut off then lifts
 a mean by 2 %."""
+
+_STEPS: Final = 1024
+"""Steps of a code, and of a level, that places are known to: a thousandth of what neighbouring cells differ, and far
+more than rounding leaves between processors."""
 
 _GREYS: Final = np.arange(SIDE) * (SIDE * SIDE + SIDE + 1)
 """Nodes of three equal codes."""
@@ -196,7 +202,8 @@ def _keep(found: PrintMap, path: Path | None) -> None:
 @lru_cache(maxsize=1)
 def _code() -> str:
     """Return a hash of the code that finds maps, so that those of older code are not taken for its own."""
-    files = [Path(str(module.__file__)) for module in (print_profiles, print_inverse)] + [Path(__file__)]
+    modules = (print_profiles, print_inverse, printing, table_noise)
+    files = [Path(str(module.__file__)) for module in modules] + [Path(__file__)]
     return sha256_of(b"".join(file.read_bytes() for file in files))
 
 
@@ -232,7 +239,8 @@ def find_map(lut: Lut, matrix: ColourMatrix) -> PrintMap:
     black = black_point(profile, colours, bits)
     share = source_colours(matrix)
     wanted = black + (profile.white - black) * share
-    places = invert(colours, wanted.mean(axis=1), wanted, bits)
+    # Last digits differ between processors and libraries, and pixels are not to.
+    places = _rounded(invert(colours, wanted.mean(axis=1), wanted, bits))
     around, weights = corners(places, bits)
     weights = weights * usable[around]
     sums = weights.sum(axis=1)
@@ -243,7 +251,7 @@ def find_map(lut: Lut, matrix: ColourMatrix) -> PrintMap:
     seen = np.einsum("kc,kcx->kx", weights, profile.colours[around])
     cells, places_of = np.unique(np.concatenate([around.ravel(), nearest]), return_inverse=True)
     brightness = np.asarray(share.mean(axis=1), np.float64)
-    levels = np.asarray(np.interp(brightness, brightness[_GREYS], np.arange(SIDE)), np.float64)
+    levels = _rounded(np.asarray(np.interp(brightness, brightness[_GREYS], np.arange(SIDE)), np.float64))
     return PrintMap(
         cells,
         places_of[: NODES * 8].reshape(NODES, 8),
@@ -254,6 +262,10 @@ def find_map(lut: Lut, matrix: ColourMatrix) -> PrintMap:
         np.asarray((np.abs(seen - wanted) > MET_WITHIN * wanted).any(axis=1)),
         _noise_of(lut),
     )
+
+
+def _rounded(numbers: _Array) -> _Array:
+    return np.round(numbers * _STEPS) / _STEPS
 
 
 def _require_contrast(lut: Lut, light: int | str, black: float, white: float) -> None:
@@ -313,7 +325,8 @@ def _noise_of(lut: Lut) -> _Array:
     with contextlib.suppress(InputError):
         curve = noise_curve(lut)
         if curve is not None:
-            return np.stack([curve.read_noise**2, 1 / curve.gain_e, curve.response**2])
+            terms = np.stack([curve.read_noise**2, 1 / curve.gain_e, curve.response**2])
+            return np.array([[float(f"{term:.6g}") for term in row] for row in terms.tolist()])
     return np.zeros((3, 3))
 
 
