@@ -648,7 +648,7 @@ class IpTransport(CableTransport):
         self._initiator = InitCommandRequest(guid, name)
         self._clock = clock
         self._place = label
-        self._connection = self._connect()
+        self._connection = self._connect(DeviceRefused)
 
     @classmethod
     def connect(
@@ -684,26 +684,25 @@ class IpTransport(CableTransport):
     def reset(self) -> None:
         """Hang up and connect anew; the session that was open is over."""
         self.close()
-        # A device needs a moment to see that the old connection is gone; until then we ourselves keep it busy.
-        deadline = self._clock.monotonic() + EVENT_CHANNEL_S
-        while True:
-            try:
-                self._connection = self._connect()
-            except (DeviceRefused, LinkClosed):
-                if self._clock.monotonic() >= deadline:
-                    raise
-                self._clock.sleep(RETRY_S)
-            else:
-                self.closed, self.between_transactions = False, True
-                return
+        self._connection = self._connect(DeviceRefused, LinkClosed)
+        self.closed, self.between_transactions = False, True
 
     def close(self) -> None:
         """Hang up both connections; a second call does nothing."""
         self.closed = True
         self._connection.close()
 
-    def _connect(self) -> IpConnection:
-        return greet(self._open_command, self._open_event, self._initiator, self._clock, self._place)
+    def _connect(self, *passing: type[Exception]) -> IpConnection:
+        # A device needs a moment to see that a connection is gone, ours or that of the command that ran before; until
+        # then it calls itself busy.
+        deadline = self._clock.monotonic() + EVENT_CHANNEL_S
+        while True:
+            try:
+                return greet(self._open_command, self._open_event, self._initiator, self._clock, self._place)
+            except passing:
+                if self._clock.monotonic() >= deadline:
+                    raise
+                self._clock.sleep(RETRY_S)
 
     def _send(self, request: PtpRequest, send: bytes | None, timeout: float) -> None:
         self._connection.write_command(encode(OperationRequest(request, send is not None)), timeout)

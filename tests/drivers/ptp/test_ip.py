@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from itertools import pairwise
 
 import pytest
@@ -249,6 +249,17 @@ class FarEnd:
         return link.read(1 << 20, 0)
 
 
+def connect_in_turn(far_end: Callable[[], FarEnd], clock: SimulatedClock) -> IpTransport:
+    """Connect to a device that is another at each try."""
+    current: list[FarEnd] = []
+
+    def open_command() -> Link:
+        current.append(far_end())
+        return current[-1].open_command()
+
+    return IpTransport(open_command, lambda: current[-1].open_event(), guid=GUID, name="Cr", clock=clock)
+
+
 def test_greets_in_the_standards_bytes() -> None:
     # CIPA DC-005-2005, 2.3.1 and 2.3.3.
     far = FarEnd()
@@ -327,10 +338,10 @@ def test_does_not_wait_for_it_for_ever() -> None:
     ("reason", "remedy"), [(1, "pair the two anew"), (2, "another program"), (3, "off and on"), (9, "reason 9")]
 )
 def test_a_refusal_says_what_helps(reason: int, remedy: str) -> None:
-    with pytest.raises(DeviceRefused, match=remedy):
-        FarEnd(packet(5, reason.to_bytes(4, "little"))).connect()
-    with pytest.raises(DeviceRefused, match=remedy):
-        FarEnd(ACK, packet(5, reason.to_bytes(4, "little"))).connect()
+    refusal = packet(5, reason.to_bytes(4, "little"))
+    for words in ((refusal,), (ACK, refusal)):
+        with pytest.raises(DeviceRefused, match=remedy):
+            connect_in_turn(lambda words=words: FarEnd(*words), SimulatedClock())
 
 
 def test_what_is_no_camera_is_named() -> None:
@@ -482,16 +493,12 @@ def test_reset_is_a_new_connection() -> None:
     assert transport.transact(PtpRequest(0x9116, 5), timeout=PATIENCE_S).response.ok
 
 
-def test_reset_waits_for_a_device_that_still_holds_the_old_connection() -> None:
+@pytest.mark.parametrize("taken_up_before", [True, False])
+def test_waits_for_a_device_that_still_holds_an_old_connection(taken_up_before: bool) -> None:
     busy = [FarEnd(packet(5, (2).to_bytes(4, "little"))) for _ in range(3)]
-    ends = [FarEnd(), *busy, FarEnd()]
+    ends = [FarEnd(), *busy, *([FarEnd()] if taken_up_before else [])]
     clock = SimulatedClock()
-    current: list[FarEnd] = []
-
-    def open_command() -> Link:
-        current.append(ends.pop())
-        return current[-1].open_command()
-
-    transport = IpTransport(open_command, lambda: current[-1].open_event(), guid=GUID, name="Cr", clock=clock)
-    transport.reset()
+    transport = connect_in_turn(ends.pop, clock)
+    if taken_up_before:
+        transport.reset()
     assert 0.2 < clock.monotonic() < 0.5
