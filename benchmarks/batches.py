@@ -75,7 +75,7 @@ def measure(lut: Lut) -> None:
     # Every page of the table is read once, so that no round waits for the disk.
     int(np.asarray(lut.samples).reshape(-1)[::2048].max())
     ours = {
-        threads: Crops(lut, gallery, (SIDE, SIDE), exposure=(0.5, 1.0), threads=threads)
+        threads: Crops(lut, gallery, (SIDE, SIDE), exposure=(0.5, 1.0), threads=threads, rendering="codes")
         for threads in sorted({1, processor_count()})
     }
     coloured: dict[int, list[float]] = {threads: [] for threads in ours}

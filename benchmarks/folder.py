@@ -39,6 +39,7 @@ from foundation.compiled import processor_count
 from generator.dataset.making import DatasetOptions, generate_dataset
 from generator.files import encode_pieces
 from generator.pictures.sources import find_pictures
+from generator.rendering import Rendering
 from generator.stores import LocalStore
 
 SMALL_PICTURES = 400
@@ -144,10 +145,9 @@ def compare(scratch: Path, lut: Lut, name: str, pictures: list[npt.NDArray[np.ui
         for share in shares:
             share.result()
 
-    def by_suite(previews: bool = False) -> None:
-        generate_dataset(
-            lut, ours, find_pictures([sources]), [0], options=DatasetOptions(previews=previews), workers=workers
-        )
+    def by_suite(previews: bool = False, rendering: Rendering = "codes") -> None:
+        options = DatasetOptions(previews=previews, rendering=rendering)
+        generate_dataset(lut, ours, find_pictures([sources]), [0], options=options, workers=workers)
 
     by_suite()
     images = images_of(ours)
@@ -185,6 +185,7 @@ def compare(scratch: Path, lut: Lut, name: str, pictures: list[npt.NDArray[np.ui
                 "files": write,
                 "isal": pack,
                 "previews": lambda: by_suite(previews=True),
+                "colour": lambda: by_suite(rendering="colorimetric"),
                 "ours": by_suite,
             },
             repeats,
@@ -194,7 +195,9 @@ def compare(scratch: Path, lut: Lut, name: str, pictures: list[npt.NDArray[np.ui
     what = f"folder to folder, {name}, {workers} workers"
     against = "cv2.imread, numpy gather, cv2.imwrite, one process"
     alone = "the encoder alone on the finished images, as many threads"
+    report(f"{what}, by colour", len(pictures) / wall["colour"], "images/s")
     report(what, len(pictures) / wall["ours"], "images/s")
+    report(f"{what}, by colour", wall["ours"] / wall["colour"], "ratio", "by codes")
     report(what, wall["usual"] / wall["ours"], "ratio", against)
     many = "cv2.imread, numpy gather, cv2.imwrite, as many processes as workers"
     report(what, wall["processes"] / wall["ours"], "ratio", many)

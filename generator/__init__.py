@@ -22,10 +22,11 @@ if TYPE_CHECKING:
     from generator.dataset.reader import open_dataset
     from generator.kernels.mixing import mix_samples, mixed_table
     from generator.kernels.planar import draw_batch, draw_planar
-    from generator.kernels.rendering import draw_mosaic, draw_samples, render
+    from generator.kernels.rendering import draw_mosaic, draw_samples
     from generator.pictures.picture import read_picture
     from generator.pictures.preview import flash
     from generator.pictures.sources import find_pictures
+    from generator.rendering.render import render
 
 __all__ = [
     "Callbacks",
@@ -61,7 +62,7 @@ _HOMES = {
     "mixed_table": "generator.kernels.mixing",
     "open_dataset": "generator.dataset.reader",
     "read_picture": "generator.pictures.picture",
-    "render": "generator.kernels.rendering",
+    "render": "generator.rendering.render",
 }
 
 

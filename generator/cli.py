@@ -27,15 +27,11 @@ from generator.command.options import (
 from generator.command.output import matrix_sentence, table_folder
 
 if TYPE_CHECKING:
-    from calibration.table.lut import Lut
     from generator.dataset.making import Workers
     from generator.dataset.plan import Plan
     from generator.dataset.reader import Dataset
 
 app = new_app()
-
-CAUTION_DEG: Final = 1.0
-"""Tint of the print's greys that is worth a line, degrees: learned methods err by as much on real photographs."""
 
 _STORE_READERS: Final = 16
 """Threads that read the files of an object store: a reader waits for the store most of the time."""
@@ -129,35 +125,24 @@ def _plan(
 ) -> Plan:
     """Return the plan of a dataset whose place is free, or holds a dataset, which may be the one planned."""
     from calibration.table.lut import open_lut
+    from generator.dataset.making import begun_rendering
     from generator.dataset.plan import DatasetOptions, Plan
     from generator.dataset.workplace import holds_dataset, require_free_place
 
     if not holds_dataset(out):
         require_free_place(out)
     table = open_lut(table_folder(lut))
-    rendered = rendering.of(DatasetOptions(bits=images.bits), table)
+    begun = begun_rendering(out)
+    rendered = rendering.of(DatasetOptions(bits=images.bits), table, begun)
     chosen = choose(table, likeness, pictures, light, variation, rendered, images.seed, processor_count())
-    for line in (*chosen.lines, *_tint_caution(table, rendering.rendering)):
+    for line in chosen.lines:
         print(line)
     varied = variation.variation(table, chosen.exposure)
     options = images.dataset_options(work.shard_images, chosen.reading, varied, chosen.crops, chosen.weighted)
-    plan = Plan(table, chosen.sources, chosen.choice, images.seed, rendering.of(options, table))
+    plan = Plan(table, chosen.sources, chosen.choice, images.seed, rendering.of(options, table, begun))
     if plan.options.matrix is not None:
         print(matrix_sentence(plan.options.matrix, table.provenance.camera, chosen=rendering.matrix is not None))
     return plan
-
-
-def _tint_caution(table: Lut, rendering: str | None) -> tuple[str, ...]:
-    """Return a line about greys that are not grey, unless the user has said how to render."""
-    from generator.rendering.colorimetric import grey_tint_deg
-
-    tint = None if rendering else grey_tint_deg(table)
-    if tint is None or tint[0] < CAUTION_DEG:
-        return ()
-    return (
-        f"greys of this print are up to {tint[0]:.1f} degrees off the light (under light {tint[1]}), and by codes so "
-        "are those of pictures; for training add --rendering colorimetric, or --rendering codes to leave it at that",
-    )
 
 
 def _make_whole(plan: Plan, out: str, workers: Workers, output: JsonOutput) -> Dataset:

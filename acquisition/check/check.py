@@ -523,8 +523,8 @@ def _tint(table: Forecast, why_not: str) -> Finding:
     return judged(
         LIMITS["grey tint"],
         tint,
-        f"printed greys are up to {tint:.1f}° off paper white",
-        "generate with --rendering colorimetric, or have the chart printed through the printer's profile",
+        f"printed greys are up to {tint:.1f}° off paper white, which images by codes have and those by colour have not",
+        "generate by colour, as it does unless told otherwise, or have the chart printed through the printer's profile",
     )
 
 

@@ -639,11 +639,12 @@ def _tint_row(table: TableMeasurements) -> SummaryRow | None:
 
 GREY_TINT_DEG = Figure(
     "grey_tint_deg", "Tint of the print's greys against paper", "radiometry", "°", "at most", 6.0, None,
-    why="greys are not neutral; the ground truth is paper's, so methods that rely on grey are judged by another grey",
+    why="greys are not neutral; the ground truth is paper's, so methods that rely on grey are judged by another grey "
+    "on images by codes",
     source=JUDGEMENT + "; simulated prints have 1 to 2.5 through the printer's profile, 4.5 (poster paper) to 8 "
     "(glossy) where codes are ink codes, as the publication printed them",
-    remedy="generate with --rendering colorimetric, which takes the print as it is measured; or have the chart printed "
-    "through the printer's profile (docs/printing.md)",
+    remedy="generate by colour, as it does unless told otherwise, which takes the print as it is measured; or have the "
+    "chart printed through the printer's profile (docs/printing.md)",
     measure=_tint, forecast=lambda check: check.tint_deg,
     worst=NO_PLACE, where=OF_ITS_CAUSE, retake=NO_FRAMES, cause=NO_CAUSE,
     drawing=NOT_DRAWN, lines=(Line(270, _tint_row),),

@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from generator.lights.request import LightRequest
     from generator.pictures.picture import Preparation
     from generator.pictures.sources import Source
+    from generator.rendering import Rendering
     from generator.variation.variation import ExposureChoice, Variation
 
 
@@ -296,8 +297,8 @@ class RenderingOptions:
         Literal["codes", "colorimetric"] | None,
         _image_option(
             None,
-            "Take a picture's codes as those of the print, as the paper did; or let each pixel be a cell that looks "
-            "to the camera as the picture's colour should. \\[default: codes]",
+            "Print a picture so that it looks to the camera as its colours should; or take its codes as those of the "
+            "print, as the paper did. \\[default: colorimetric; a dataset that was begun goes on as it was]",
         ),
     ] = None
     matrix: Annotated[
@@ -319,12 +320,15 @@ class RenderingOptions:
         ),
     ] = "keep"
 
-    def of(self, options: DatasetOptions, table: Lut) -> DatasetOptions:
-        """Return the options of a dataset with these; an InputError says which cannot be used."""
+    def of(self, options: DatasetOptions, table: Lut, begun: Rendering | None) -> DatasetOptions:
+        """Return the options of a dataset with these; an InputError says which cannot be used.
+
+        `begun`: how the dataset is rendered that is there, or was begun; None for a new one.
+        """
         from generator.rendering.black_points import parse_black_point
         from generator.rendering.matrices import matrix_for
 
-        rendering = self.rendering or options.rendering
+        rendering = self.rendering or begun or options.rendering
         if rendering == "codes" and self.matrix is not None:
             raise InputError("--matrix is for --rendering colorimetric; add that, or leave --matrix out")
         matrix = matrix_for(table, self.matrix) if rendering == "colorimetric" else None

@@ -56,7 +56,15 @@ from generator.dataset.records import (
     image_key,
 )
 from generator.dataset.shards import SILENT, Callbacks, ShardCancelled, ShardDone, make_elsewhere, make_shard
-from generator.dataset.workplace import Workplace, differences, finished, holds_dataset, stored_identity, workplace
+from generator.dataset.workplace import (
+    Workplace,
+    differences,
+    finished,
+    holds_dataset,
+    is_begun,
+    stored_identity,
+    workplace,
+)
 from generator.files import suffix_of
 from generator.lights.choices import ListedLights
 from generator.lights.lighting import LightChoice
@@ -68,6 +76,7 @@ if TYPE_CHECKING:
 
     from calibration.table.lut import Lut
     from generator.pictures.sources import Source
+    from generator.rendering import Rendering
 
 
 @dataclass(frozen=True)
@@ -389,6 +398,17 @@ def make_dataset(plan: Plan, out: Path | str, workers: Workers | None = None, ca
                 place.discard()
                 raise
     return open_dataset(out)
+
+
+def begun_rendering(out: Path | str) -> Rendering | None:
+    """Return how the dataset is rendered that is at `out`, or was begun there; None where there is none."""
+    if holds_dataset(out):
+        options: Mapping[str, Any] = open_dataset(out).description.options
+    elif is_begun(out):
+        options = stored_identity(out)["options"]
+    else:
+        return None
+    return "codes" if options.get("rendering") is None else "colorimetric"
 
 
 def made_before(plan: Plan, out: Path | str) -> Dataset | None:

@@ -31,7 +31,7 @@ from generator.dataset.layouts import library_of, require_library
 from generator.dataset.records import SPLITS, Layout, Light, Scale, Split, TableRecord
 from generator.files import FORMATS, Format, libraries_of
 from generator.pictures.sources import PictureFile
-from generator.rendering import Rendering
+from generator.rendering import DEFAULT, Rendering
 from generator.rendering.black_points import KEEP, BlackPoint
 from generator.rendering.matrices import ColourMatrix
 from generator.stores import is_remote
@@ -46,8 +46,6 @@ if TYPE_CHECKING:
 SHARD_IMAGES: Final = 256
 """Images of a shard unless said otherwise: all that a kill can cost, for each shard that was being made."""
 
-RENDERING: Final[Rendering] = "codes"
-"""Rendering unless said otherwise: the paper's."""
 STRETCHED: Final[tuple[Format, ...]] = ("png", "tiff", "jxl")
 """Formats without a place for the white level that readers use, whose counts may be stretched over 16 bits."""
 
@@ -83,8 +81,8 @@ class DatasetOptions:
     weighted
         Whether sources were drawn by weights, which are recorded of each image.
     rendering
-        ``"codes"``: codes of a picture are those of the print, the paper's way; ``"colorimetric"``: the print shows
-        the camera the picture's colours.
+        ``"colorimetric"``: the print shows the camera the picture's colours; ``"codes"``: codes of a picture are those
+        of the print, the paper's way.
     matrix
         Linear sRGB to the camera's RGB, for colorimetric rendering; None for that of the table's camera.
     black_point
@@ -122,7 +120,7 @@ class DatasetOptions:
     crops: int = 1
     reading: Mapping[str, Any] = field(default_factory=dict[str, Any])
     weighted: bool = False
-    rendering: Rendering = RENDERING
+    rendering: Rendering = DEFAULT
     matrix: ColourMatrix | None = None
     black_point: BlackPoint = KEEP
     bits: int | None = None

@@ -65,6 +65,7 @@ def photograph(
     what is recorded of the rendering.
     """
     from generator.kernels.mixing import mix_samples
+    from generator.kernels.printing import nearest_nodes
     from generator.kernels.rendering import draw_samples
 
     # The hash of the table stands for its samples in the dataset's description.
@@ -76,8 +77,22 @@ def photograph(
     weights = None if lighting.masks is None else lighting.weights_of(*picture.shape[:2])
     if options.rendering == "colorimetric":
         rendering = rendering_of(lut, options)
-        most = lut.provenance.white_level if weights is None else white_level
-        image, seen = _printed(rendering, picture, lighting, weights, share, seed, number, most)
+        outside, distance = rendering.map.missed(nearest_nodes(picture))
+        seen: Details = {
+            "cells": rendering.map.sha256[:16],
+            "outside": round(outside, 6),
+            "distance": round(distance, 6),
+        }
+        image = rendering.draw(
+            picture,
+            lighting.mixtures,
+            share,
+            weights,
+            most=lut.provenance.white_level if weights is None else white_level,
+            seed=seed,
+            image=number,
+            out=_reused(picture.shape),
+        )
         return image, weights, seen | details
     tables = [_samples(lut, mixture, picture, share, seed) for mixture in lighting.mixtures]
     if weights is None:
@@ -85,39 +100,6 @@ def photograph(
         return draw_samples(tables[0], picture, seed=seed, image=number, out=out), None, details
     image = mix_samples(tables, picture, weights, white_level=white_level, seed=seed, image=number)
     return image, weights, details
-
-
-def _printed(
-    rendering: ColorimetricRendering,
-    picture: Picture,
-    lighting: Lighting,
-    weights: npt.NDArray[np.float32] | None,
-    share: float,
-    seed: int,
-    number: int,
-    most: int,
-) -> tuple[npt.NDArray[np.uint16], Details]:
-    """Return the raw image (H, W, 3) of a picture (H, W, 3) by colour, and what is recorded of it."""
-    from generator.kernels.printing import draw_printed, nearest_nodes
-
-    outside, distance = rendering.map.missed(nearest_nodes(picture))
-    details: Details = {
-        "cells": rendering.map.sha256[:16],
-        "outside": round(outside, 6),
-        "distance": round(distance, 6),
-    }
-    image = draw_printed(
-        rendering.lut.samples,
-        picture,
-        [rendering.printed(mixture, share) for mixture in lighting.mixtures],
-        rendering.cells,
-        shares=weights,
-        most=most,
-        seed=seed,
-        image=number,
-        out=_reused(picture.shape),
-    )
-    return image, details
 
 
 def _samples(lut: Lut, mixture: Mixture, picture: Picture, share: float, seed: int) -> npt.NDArray[np.uint16]:
@@ -134,20 +116,12 @@ def _samples(lut: Lut, mixture: Mixture, picture: Picture, share: float, seed: i
     return without_veil(samples, veil, lut.provenance.white_level, colours)
 
 
-@lru_cache(maxsize=4)
-def _rendering(lut: Lut, name: str, rows: tuple[float, ...], source: str) -> ColorimetricRendering:
-    from generator.rendering.colorimetric import ColorimetricRendering
-    from generator.rendering.matrices import ColourMatrix
-
-    return ColorimetricRendering(lut, ColourMatrix(name, np.array(rows).reshape(3, 3), source))
-
-
 def rendering_of(lut: Lut, options: DatasetOptions) -> ColorimetricRendering:
     """Return the rendering by colour that the options ask for; it keeps what it has found out of a table."""
+    from generator.rendering.colorimetric import rendering_with
     from generator.rendering.matrices import matrix_for
 
-    matrix = options.matrix or matrix_for(lut)
-    return _rendering(lut, matrix.name, tuple(matrix.rows.ravel().tolist()), matrix.source)
+    return rendering_with(lut, options.matrix or matrix_for(lut))
 
 
 def _reused(shape: tuple[int, ...]) -> npt.NDArray[np.uint16]:

@@ -115,7 +115,7 @@ def _remove_notes(notes: Store) -> None:
 
 def require_free_place(out: str | Path) -> None:
     """Raise an InputError if `out` is taken, so that a command can say so before it does any work."""
-    if _notes(out).has(PLAN):
+    if is_begun(out):
         return
     if isinstance(out, str) and is_remote(out):
         if RemoteStore(out).has(DESCRIPTION):
@@ -126,7 +126,12 @@ def require_free_place(out: str | Path) -> None:
 
 def holds_dataset(out: str | Path) -> bool:
     """Return whether a dataset is complete at `out`, and no plan lies there that its making was ended by."""
-    return open_store(out).has(DESCRIPTION) and not _notes(out).has(PLAN)
+    return open_store(out).has(DESCRIPTION) and not is_begun(out)
+
+
+def is_begun(out: str | Path) -> bool:
+    """Return whether a plan lies at `out` of a dataset that is being made, or was before its program ended."""
+    return _notes(out).has(PLAN)
 
 
 def differences(stored: Any, wanted: Any) -> list[str]:

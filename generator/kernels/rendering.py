@@ -36,7 +36,6 @@ from generator.kernels.choice import (
     packed_rows,
     prefetch_group,
     readable,
-    replace_unfit_colours,
     row_keys,
     run_in_threads,
     writable,
@@ -401,49 +400,3 @@ def read_light(lut: Lut, light: int, pixels: int = WHOLE_LIGHT_PIXELS) -> npt.ND
         raise InputError(f"there is no light {number}; the table {lut.folder} has lights 0 to {len(lut.samples) - 1}")
     mapped = lut.light_samples(number)
     return np.array(mapped) if pixels >= WHOLE_LIGHT_PIXELS else mapped
-
-
-def render(
-    lut: Lut, picture: npt.NDArray[np.uint8], light: int, *, seed: int = 0, image: int = 0, threads: int = 1
-) -> npt.NDArray[np.uint16]:
-    """Return the raw linear image of `picture` printed, lit by the table's light `light` and photographed.
-
-    Colours that the table lists as unfit are replaced by the nearest fit one; see `palette.replace_unfit_colours`.
-
-    Parameters
-    ----------
-    lut
-        A table, from `calibration.table.lut.open_lut`.
-    picture
-        (H, W, 3) uint8 sRGB codes, from `pictures.picture.read_picture` or any array.
-    light
-        Number of the light in the table.
-    seed, image, threads
-        As for `draw_samples`.
-
-    Returns
-    -------
-    ndarray
-        (H, W, 3) uint16, linear camera RGB, `lut.provenance.white_level` = saturation of the sensor.
-
-    Raises
-    ------
-    InputError
-        The table has no such light, or the picture is not of that shape and type.
-
-    Examples
-    --------
-    >>> from types import SimpleNamespace
-    >>> samples = np.arange(8 * 2 * 3, dtype=np.uint16).reshape(1, 8, 2, 3)
-    >>> known = SimpleNamespace(bits=1, white_level=100, unfit=())
-    >>> lut = SimpleNamespace(samples=samples, light_samples=samples.__getitem__, provenance=known)
-    >>> render(lut, np.full((1, 2, 3), 255, np.uint8), light=0)
-    array([[[45, 46, 47],
-            [45, 46, 47]]], dtype=uint16)
-
-    Usually the table comes from `generator.open_lut` and the picture from `generator.read_picture`.
-    """
-    check_picture(picture)
-    samples = read_light(lut, light, picture.shape[0] * picture.shape[1])
-    fit, _ = replace_unfit_colours(picture, lut.provenance)
-    return draw_samples(samples, fit, seed=seed, image=image, threads=threads)

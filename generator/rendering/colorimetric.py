@@ -25,6 +25,7 @@ import json
 import threading
 import uuid
 import zipfile
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from importlib.metadata import version
@@ -36,7 +37,6 @@ import numpy as np
 import numpy.typing as npt
 
 from calibration.radiometry import table_noise
-from calibration.radiometry.greys import tint_deg
 from calibration.radiometry.table_noise import noise_curve
 from foundation.colorimetry import angles_deg, decode_srgb
 from foundation.errors import CropError, InputError, QualityError
@@ -273,7 +273,7 @@ def _require_contrast(lut: Lut, light: int | str, black: float, white: float) ->
         raise QualityError(
             f"under light {light} the table {lut.folder} has a black as bright as {black:.2g} of white, "
             "expected less than half of its paper: its cell is spoilt or the print has no contrast; leave the "
-            "light out, build the table again, or render by codes"
+            "light out, build the table again, or render by codes (--rendering codes)"
         )
 
 
@@ -418,6 +418,25 @@ class ColorimetricRendering:
         means[:, :3] = seen
         return PrintedLight(means, cells, np.array(light.lights, np.int64), np.sqrt(light.weights).astype(np.float32))
 
+    def draw(
+        self,
+        picture: npt.NDArray[np.uint8],
+        mixtures: Sequence[Mixture],
+        black_taken: float = 0.0,
+        weights: npt.NDArray[np.float32] | None = None,
+        **drawing: Any,
+    ) -> npt.NDArray[np.uint16]:
+        """Return the raw image (H, W, 3) of a picture (H, W, 3) under lights, or several by `weights` (H, W, K).
+
+        `black_taken`: share of the print's black that is taken out, 0 … 1. `drawing`: keywords of
+        `kernels.printing.draw_printed`.
+        """
+        lights = [self.printed(mixture, black_taken) for mixture in mixtures]
+        most = drawing.pop("most", self.lut.provenance.white_level)
+        return printing.draw_printed(
+            self.lut.samples, picture, lights, self.cells, shares=weights, most=most, **drawing
+        )
+
     def _variance(self, counts: _Array) -> _Array:
         """Return the variance of samples of so many counts (N, 3) in the mean; photon noise where it is not known."""
         kept = np.maximum(counts, 0.0)
@@ -425,32 +444,13 @@ class ColorimetricRendering:
         return np.maximum(one + linear * kept + square * kept**2, 1e-6)
 
 
-DARKEST: Final = 0.1
-"""Share of white below which a grey is left out: the tint of ink black is not what a picture's greys suffer from."""
+@lru_cache(maxsize=4)
+def _rendering(lut: Lut, name: str, rows: tuple[float, ...], source: str) -> ColorimetricRendering:
+    from generator.rendering.matrices import ColourMatrix
+
+    return ColorimetricRendering(lut, ColourMatrix(name, np.array(rows).reshape(3, 3), source))
 
 
-def grey_tint_deg(lut: Lut) -> tuple[float, int] | None:
-    """Return the largest angle between a grey of the print and the light, and the light it was found under.
-
-    Greys are the chart's cells with three equal codes between black and white, as the camera sees them under the light
-    of the table that is brightest in its darkest channel; cells that are unfit or dark are left out.
-
-    Returns the angle in degrees, and the number of the light; None where the chart has no such grey.
-
-    Examples
-    --------
-    >>> from pathlib import Path
-    >>> from calibration.table.lut import open_lut
-    >>> angle, light = grey_tint_deg(open_lut(Path("lut")))
-    >>> round(angle, 1), light
-    (0.6, 0)
-    """
-    bits, light = lut.provenance.bits, int(np.argmax(lut.white.min(axis=1)))
-    levels = np.arange(1, (1 << bits) - 1)
-    cells = levels * (1 | 1 << bits | 1 << 2 * bits)
-    unfit = [cell.colour for cell in lut.provenance.unfit]
-    cells = cells[~np.isin(cells, unfit)]
-    white = lut.white[light]
-    greys = lut.samples[light, cells].mean(axis=1, dtype=np.float64)
-    greys = greys[(greys / white).min(axis=1) > DARKEST]
-    return (float(tint_deg(white, greys).max()), light) if len(greys) else None
+def rendering_with(lut: Lut, matrix: ColourMatrix) -> ColorimetricRendering:
+    """Return the rendering by colour with a table and a matrix; it keeps what it has found out of a table."""
+    return _rendering(lut, matrix.name, tuple(matrix.rows.ravel().tolist()), matrix.source)

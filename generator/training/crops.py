@@ -36,7 +36,7 @@ from generator.kernels.choice import replace_unfit_colours
 from generator.kernels.planar import draw_batch, scales_of
 from generator.kernels.printing import PrintedLight, draw_printed_crops
 from generator.lights.lighting import Mixture
-from generator.rendering import Rendering
+from generator.rendering import DEFAULT, Rendering
 from generator.rendering.black_points import KEEP, BlackPoint, veil_of
 from generator.variation.exposing import add_noise
 from generator.variation.iso_speed import IsoSpeed
@@ -163,9 +163,9 @@ class Crops:
     threads
         Threads that share a batch; no value depends on it.
     rendering
-        ``"codes"``: a picture's codes are those of the print; ``"colorimetric"``: the print shows the picture's colours
-        to the camera. Where in the chart they are takes seconds a table, once: it lies in the user's cache folder then.
-        Each light takes half a megabyte of memory.
+        ``"colorimetric"``: the print shows the picture's colours to the camera. Where in the chart they are takes
+        seconds a table, once: it lies in the user's cache folder then. Each light takes half a megabyte of memory.
+        ``"codes"``: a picture's codes are those of the print, as in the paper.
     matrix
         Linear sRGB to the camera's RGB, for colorimetric rendering; None for that of the table's camera.
     black_point
@@ -201,7 +201,7 @@ class Crops:
         seed: int = 0,
         epoch: int = 0,
         threads: int = 1,
-        rendering: Rendering = "codes",
+        rendering: Rendering = DEFAULT,
         matrix: ColourMatrix | None = None,
         black_point: BlackPoint = KEEP,
     ) -> None:

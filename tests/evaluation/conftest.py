@@ -55,7 +55,8 @@ def make_dataset(made_lut: Path, tmp_path: Path) -> Callable[[int, int], Path]:
 
     def make(width: int, height: int) -> Path:
         scenes = random_scenes(8, width, height)
-        generate_dataset(open_lut(made_lut), tmp_path / "made", scenes, [0, 1], options=DatasetOptions(previews=False))
+        options = DatasetOptions(previews=False, rendering="codes")
+        generate_dataset(open_lut(made_lut), tmp_path / "made", scenes, [0, 1], options=options)
         return tmp_path / "made"
 
     return make

@@ -44,7 +44,8 @@ def generate(monkeypatch: pytest.MonkeyPatch, make_lut: Callable[..., Lut], tmp_
 
 def test_a_dataset_with_its_contact_sheet(generate: Generate, capsys: pytest.CaptureFixture[str]) -> None:
     Path("pictures/bad.png").write_bytes(b"?")
-    wish = ("--sources", "pictures", "--illuminations", "0,2-3", "--seed", "4", "--contact-sheet", "sheet.png")
+    wish = ("--sources", "pictures", "--illuminations", "0,2-3", "--seed", "4", "--rendering", "codes")
+    wish += ("--contact-sheet", "sheet.png")
     assert generate("lut", "out", *wish, "--max-side", "30") == 0
     printed = capsys.readouterr()
     assert "out: 6 images of 2 pictures under 3 lights" in printed.out
@@ -66,7 +67,7 @@ def test_a_dataset_with_its_contact_sheet(generate: Generate, capsys: pytest.Cap
     }
     # The three lines of the package's docstring make the same image.
     lut = open_lut("lut")
-    raw = render(lut, read_picture("pictures/one.png", 30), light=2, seed=4, image=4)
+    raw = render(lut, read_picture("pictures/one.png", 30), light=2, rendering="codes", seed=4, image=4)
     stored = cv2.imread("out/images/000004.png", cv2.IMREAD_UNCHANGED)
     assert stored is not None
     np.testing.assert_array_equal(stored[..., ::-1], raw)

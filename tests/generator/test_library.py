@@ -28,7 +28,8 @@ def test_the_lines_of_the_page_for_programmers() -> None:
         exec(textwrap.dedent(block), names)
     raw, lut = names["raw"], names["lut"]
     assert (raw.dtype, raw.shape) == (np.uint16, (40, 50, 3))
-    assert {tuple(pixel) for pixel in raw.reshape(-1, 3)} <= {tuple(row) for row in lut.samples[3].reshape(-1, 3)}
+    by_codes = names["render"](lut, names["read_picture"]("cat.png"), light=3, rendering="codes", seed=1)
+    assert {tuple(one) for one in by_codes.reshape(-1, 3)} <= {tuple(row) for row in lut.samples[3].reshape(-1, 3)}
     assert sum(names["truth"]) == pytest.approx(1)
     assert names["balanced"].max() == 1
     assert names["image"].shape == (40, 50, 3)

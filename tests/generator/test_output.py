@@ -92,7 +92,10 @@ def test_the_matrix_is_told(
 
 
 def test_by_codes_no_matrix_is_told(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["lut", "out", "--sources", "grey.png", "--illuminations", "1", "--no-preview"]) == 0
+    assert (
+        main(["lut", "out", "--sources", "grey.png", "--illuminations", "1", "--no-preview", "--rendering", "codes"])
+        == 0
+    )
     assert "colour matrix" not in capsys.readouterr().out
 
 

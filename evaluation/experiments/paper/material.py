@@ -75,7 +75,10 @@ class RenderedScene:
         """Return the image (H, W, 3) uint16, linear camera RGB, and no mask."""
         from generator import render
 
-        return render(self.lut, self.source.read().picture, self.light, seed=self.seed, image=self.number), None
+        # The publication's rendering.
+        picture = self.source.read().picture
+        image = render(self.lut, picture, self.light, rendering="codes", seed=self.seed, image=self.number)
+        return image, None
 
 
 @dataclass(frozen=True, eq=False)

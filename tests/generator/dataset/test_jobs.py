@@ -52,11 +52,12 @@ class TestBits:
     def test_all_bits_of_the_table_change_nothing_and_more_are_refused(
         self, lut: Lut, capsys: pytest.CaptureFixture[str]
     ) -> None:
+        by_codes = ("--rendering", "codes")
         for name, more in (("plain", ()), ("all", ("--bits", "3"))):
-            assert main(("lut", name, "--sources", "pictures", *more)) == 0
+            assert main(("lut", name, "--sources", "pictures", *by_codes, *more)) == 0
         assert Path("plain/images/000003.png").read_bytes() == Path("all/images/000003.png").read_bytes()
         assert "bits" not in open_dataset("plain").description.options
-        assert main(("lut", "more", "--sources", "pictures", "--bits", "4")) == 2
+        assert main(("lut", "more", "--sources", "pictures", *by_codes, "--bits", "4")) == 2
         assert "4 bits of each code were to be kept, where the table has 3; ask for fewer" in capsys.readouterr().err
 
 

@@ -17,11 +17,11 @@ import pytest
 from foundation.errors import FormatError, InputError
 from generator.dataset.making import Callbacks, DatasetOptions, generate_dataset
 from generator.dataset.reader import open_dataset
-from generator.kernels.rendering import render
 from generator.lights.choices import ListedLights, RandomLights
 from generator.lights.lighting import mixture_of
 from generator.pictures.picture import read_picture
 from generator.pictures.sources import find_pictures, random_scenes
+from generator.rendering.render import render
 
 pytestmark = pytest.mark.slow
 
@@ -144,7 +144,9 @@ def test_workers_change_no_byte(make_lut: Callable[..., Lut], pictures: Path, tm
 def test_replaced_pixels_are_counted(make_lut: Callable[..., Lut], pictures: Path, tmp_path: Path) -> None:
     lut = make_lut(unfit=(0, 21))
     (source,) = find_pictures([pictures / "a.png"])
-    made = generate_dataset(lut, tmp_path / "out", [source], [0], options=DatasetOptions(previews=False))
+    made = generate_dataset(
+        lut, tmp_path / "out", [source], [0], options=DatasetOptions(previews=False, rendering="codes")
+    )
     top = source.read().picture >> 6
     count = int(((top == 0).all(axis=2) | (top == 1).all(axis=2)).sum())  # colour 21 is (1, 1, 1)
     assert count > 0
@@ -162,11 +164,15 @@ def test_images_come_of_samples_as_they_were_measured(
         stream.seek(-1, os.SEEK_END)
         stream.write(b"\xff")
     sources = find_pictures([pictures])
-    generate_dataset(lut, tmp_path / "sound", sources, [0, 1])
+    by_codes = DatasetOptions(rendering="codes")
+    generate_dataset(lut, tmp_path / "sound", sources, [0, 1], options=by_codes)
     with pytest.raises(FormatError, match="samples of light 3 are not those that were measured"):
-        generate_dataset(lut, tmp_path / "out", sources, [0, 3])
+        generate_dataset(lut, tmp_path / "out", sources, [0, 3], options=by_codes)
     with pytest.raises(FormatError, match="samples of light 3 are not those that were measured"):
-        generate_dataset(lut, tmp_path / "mixed", sources, ListedLights((mixture_of({0: 1, 3: 1}),)))
+        generate_dataset(lut, tmp_path / "mixed", sources, ListedLights((mixture_of({0: 1, 3: 1}),)), options=by_codes)
+    # By colour the map of the print may rest on any light.
+    with pytest.raises(FormatError, match="samples of light 3 are not those that were measured"):
+        generate_dataset(lut, tmp_path / "by-colour", sources, [3])
 
 
 def test_pictures_too_small_for_the_format_are_passed_over(make_lut: Callable[..., Lut], tmp_path: Path) -> None:

@@ -32,6 +32,7 @@ from generator.pictures.sources import find_pictures
 from generator.rendering.black_points import BlackPoint, veil_of, without_veil
 from generator.rendering.colorimetric import ColorimetricRendering
 from generator.rendering.matrices import ColourMatrix
+from generator.rendering.render import render
 from tests.generator.rendering.conftest import make_table as make_table_of_a_print
 
 pytestmark = pytest.mark.slow
@@ -120,7 +121,7 @@ def test_an_image_is_that_of_its_light_without_a_share_of_black(
 def test_by_codes_with_black_kept_a_dataset_says_nothing_of_rendering(
     make_lut: MakeLut, pictures: Path, tmp_path: Path
 ) -> None:
-    files = made(make_lut(), pictures, tmp_path / "out", DatasetOptions())
+    files = made(make_lut(), pictures, tmp_path / "out", DatasetOptions(rendering="codes"))
     assert "images.csv" not in files
     described = json.loads((tmp_path / "out" / "dataset.json").read_text())
     assert "rendering" not in described
@@ -132,15 +133,42 @@ def test_by_codes_with_black_kept_a_dataset_says_nothing_of_rendering(
 
 def test_black_alone_is_recorded_and_needs_no_profile(make_lut: MakeLut, pictures: Path, tmp_path: Path) -> None:
     lut = make_lut()
-    made(lut, pictures, tmp_path / "out", DatasetOptions(black_point=BlackPoint("compensate")))
+    made(lut, pictures, tmp_path / "out", DatasetOptions(rendering="codes", black_point=BlackPoint("compensate")))
     dataset = open_dataset(tmp_path / "out")
     assert rows_of(tmp_path / "out")[0] == {"image": "000000.png", "black_taken": "1"}
     assert dataset.description.rendering is not None
     assert (dataset.description.rendering.black_taken, dataset.description.rendering.outside) == (1, None)
-    made(lut, pictures, tmp_path / "kept", DatasetOptions())
+    made(lut, pictures, tmp_path / "kept", DatasetOptions(rendering="codes"))
     before = open_dataset(tmp_path / "kept")
     for one, other in zip(dataset.entries, before.entries, strict=True):
         assert dataset.read_image(one).mean() < before.read_image(other).mean()
+
+
+def test_by_colour_is_what_is_made_unasked_and_rendered_in_one_call(
+    make_lut: MakeLut, pictures: Path, tmp_path: Path
+) -> None:
+    lut = make_lut()
+    wish = (str(lut.folder), str(tmp_path / "out"), "--sources", str(pictures), "--illuminations", "1,3", "--seed", "5")
+    assert main(wish) == 0
+    dataset = open_dataset(tmp_path / "out")
+    assert dataset.description.options["rendering"]["name"] == "colorimetric"
+    (first, *_) = find_pictures(pictures)
+    image = render(lut, first.read().picture, 3, seed=5, image=1)
+    np.testing.assert_array_equal(image, dataset.read_image(dataset.entries[1]))
+    with pytest.raises(InputError, match="'inks'"):
+        render(lut, first.read().picture, 3, rendering="inks")  # pyright: ignore[reportArgumentType] - the fault
+
+
+def test_what_was_begun_or_made_by_codes_goes_on_so(make_lut: MakeLut, pictures: Path, tmp_path: Path) -> None:
+    lut, out = make_lut(), str(tmp_path / "out")
+    wish = (str(lut.folder), out, "--sources", str(pictures), "--illuminations", "1,2", "--seed", "5")
+    assert main((*wish, "--rendering", "codes", "--shard", "0/2", "--shard-images", "2")) == 0
+    assert main((*wish, "--shard-images", "2")) == 0
+    image = open_dataset(out).read_image(open_dataset(out).entries[0])
+    assert hashlib.sha256(image.tobytes()).hexdigest() == BY_CODES
+    # It is there, and nothing else was asked for.
+    assert main((*wish, "--shard-images", "2")) == 0
+    assert main((*wish, "--shard-images", "2", "--rendering", "colorimetric")) == 2
 
 
 def test_workers_shards_shares_and_other_processes_change_no_byte(
@@ -165,7 +193,7 @@ def test_workers_shards_shares_and_other_processes_change_no_byte(
 @pytest.mark.parametrize(
     "other",
     [
-        DatasetOptions(previews=False),
+        DatasetOptions(previews=False, rendering="codes"),
         DatasetOptions(previews=False, rendering="colorimetric", matrix=MATRIX),
         DatasetOptions(
             previews=False,
@@ -245,7 +273,7 @@ def test_a_raw_file_holds_the_sites_of_the_image(make_lut: MakeLut, pictures: Pa
 def test_a_mixture_of_lights_has_the_black_of_the_mixture(make_lut: MakeLut, pictures: Path, tmp_path: Path) -> None:
     lut = make_lut()
     mixture = Mixture((0, 3), (0.25, 0.75))
-    options = DatasetOptions(black_point=BlackPoint("compensate"))
+    options = DatasetOptions(rendering="codes", black_point=BlackPoint("compensate"))
     request = LightRequest(light=(mixture.label,)).choose(lut, 5)
     dataset = generate_dataset(lut, tmp_path / "out", find_pictures(pictures), request, seed=5, options=options)
     picture = next(iter(find_pictures(pictures))).read().picture
@@ -270,6 +298,6 @@ def test_what_the_print_cannot_show_is_told(
 
 def test_faults_are_named() -> None:
     with pytest.raises(InputError, match="a colour matrix is for colorimetric rendering"):
-        DatasetOptions(matrix=MATRIX)
+        DatasetOptions(rendering="codes", matrix=MATRIX)
     with pytest.raises(InputError, match="'inks'"):
         DatasetOptions(rendering="inks")  # pyright: ignore[reportArgumentType] - the fault under test

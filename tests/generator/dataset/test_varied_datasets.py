@@ -19,11 +19,11 @@ from foundation.errors import InputError
 from generator.cli import main
 from generator.dataset.making import DatasetOptions, Workers, generate_dataset
 from generator.dataset.reader import Dataset, file_faults, open_dataset
-from generator.kernels.rendering import render
 from generator.lights.choices import RandomLights, SimultaneousLights
 from generator.masks.making import parse_masks
 from generator.pictures.picture import Preparation, read_picture
 from generator.pictures.sources import find_pictures
+from generator.rendering.render import render
 from generator.variation.iso_speed import parse_iso
 from generator.variation.variation import Variation, parse_exposure, parse_gradient, varied_by
 
@@ -86,7 +86,7 @@ def everything(lut: Lut) -> Variation:
 
 
 def test_without_options_nothing_is_recorded_and_nothing_changes(make: Make, tmp_path: Path) -> None:
-    dataset = make("plain")
+    dataset = make("plain", rendering="codes")
     assert dataset.details == {}
     assert not (tmp_path / "plain" / "images.csv").exists()
     assert "variation" not in dataset.description.options
@@ -99,9 +99,10 @@ def test_truths_and_choices_do_not_change_with_exposure_and_noise(lut: Lut, make
         (e.image, e.source, e.lights, e.truths, e.truth) for e in varied.entries
     ]
     assert list(varied.details) == [entry.image for entry in varied.entries]
+    names = ["end_r", "end_g", "end_b", "exposure", "iso", "clipped"]
     for entry in varied.entries:
-        row = {name: float(value) for name, value in varied.details[entry.image].items()}
-        assert list(row) == ["end_r", "end_g", "end_b", "exposure", "iso", "clipped"]
+        assert [*varied.details[entry.image]] == ["cells", "outside", "distance", *names]
+        row = {name: float(varied.details[entry.image][name]) for name in names}
         assert 0.25 <= row["exposure"] <= 4
         assert row["iso"] == pytest.approx(400)
         # Where light falls off, all channels do by as much: an image's mean is the plain one's times some number.

@@ -14,7 +14,8 @@ from hypothesis import strategies as st
 from foundation.errors import InputError
 from generator.kernels import vector as streaming
 from generator.kernels.choice import bits_of
-from generator.kernels.rendering import PATTERNS, draw_mosaic, draw_samples, render
+from generator.kernels.rendering import PATTERNS, draw_mosaic, draw_samples
+from generator.rendering.render import render
 
 if TYPE_CHECKING:
     from calibration.table.lut import Lut
@@ -170,7 +171,7 @@ def test_a_patch_measures_what_the_table_holds(make_lut: Callable[..., Lut]) -> 
     patches = ((np.stack([code >> 4 & 3, code >> 2 & 3, code & 3], axis=-1) << 6) + 0b10101).astype(np.uint8)
     picture = patches.reshape(8, 8, 3).repeat(40, axis=0).repeat(40, axis=1)
     for light in (0, 3):
-        image = render(lut, picture, light, seed=11, image=1)
+        image = render(lut, picture, light, rendering="codes", seed=11, image=1)
         measured = image.reshape(8, 40, 8, 40, 3).mean(axis=(1, 3)).reshape(64, 3)
         table = lut.samples[light].astype(np.float64)
         error = table.std(axis=1) / np.sqrt(1600)
@@ -182,9 +183,9 @@ def test_a_patch_measures_what_the_table_holds(make_lut: Callable[..., Lut]) -> 
 
 def test_render_replaces_unfit_colours_by_the_nearest(make_lut: Callable[..., Lut]) -> None:
     lut = make_lut(bits=2, unfit=(0, 1))
-    black = render(lut, np.zeros((4, 8, 3), np.uint8), 0, seed=1)
+    black = render(lut, np.zeros((4, 8, 3), np.uint8), 0, rendering="codes", seed=1)
     # Colour 0 is (0, 0, 0) and 1 (0, 0, 1), both unfit; at distance 1 of black remain 4 (0, 1, 0) and 16 (1, 0, 0).
-    green = render(lut, np.zeros((4, 8, 3), np.uint8) + np.array([0, 64, 0], np.uint8), 0, seed=1)
+    green = render(lut, np.zeros((4, 8, 3), np.uint8) + np.array([0, 64, 0], np.uint8), 0, rendering="codes", seed=1)
     np.testing.assert_array_equal(black, green)
 
 

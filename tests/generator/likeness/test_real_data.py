@@ -187,7 +187,7 @@ def test_drawn_sources_keep_their_names_and_know_their_weights() -> None:
     assert sources[0].to_json() == {**first.to_json(), "weight": sources[0].weight}
 
 
-PLAIN = DatasetOptions()
+PLAIN = DatasetOptions(rendering="codes")
 FREED = DatasetOptions(rendering="colorimetric", black_point=BlackPoint("like"))
 
 
@@ -350,7 +350,7 @@ def test_what_other_options_say_is_not_followed(table: Lut) -> None:
     assert main(("lut", "out", *wish, "--illuminations", "1,2", "--max-side", "20", "--exposure", "1")) == 0
     assert recorded()["like"]["in"] == ["pictures"]
     assert recorded()["lights"] == {"choice": "listed", "lights": [1, 2]}
-    assert main(("lut", "lights", *wish, "--like-in", "lights")) == 0
+    assert main(("lut", "lights", *wish, "--like-in", "lights", "--rendering", "codes")) == 0
     assert recorded("lights")["like"]["in"] == ["lights"]
     assert not Path("lights/images.csv").exists()
 
@@ -452,6 +452,7 @@ def test_shadows_are_made_like_the_real_ones_by_the_black_of_each_picture(
 ) -> None:
     write_stats(Path("s.json"), lights_of(table), real_numbers(table, 0.5, black_taken=0.5))
     wish = ("--sources", "pictures", "--no-preview", "--like", "s.json", "--like-in", "pictures", "--draw", "150")
+    wish += ("--rendering", "codes")
     away: dict[str, float] = {}
     for black in ("compensate", "keep", "like"):
         assert main(("lut", black, *wish, "--black-point", black, "--random", "1")) == 0

@@ -7,7 +7,7 @@ import subprocess
 import sys
 import threading
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 import numpy.typing as npt
@@ -19,6 +19,7 @@ from foundation.errors import FormatError, InputError
 from generator.lights.lighting import Mixture
 from generator.pictures.picture import Picture
 from generator.pictures.sources import random_scenes
+from generator.rendering import Rendering
 from generator.rendering.black_points import BlackPoint, veil_of
 from generator.rendering.colorimetric import ColorimetricRendering
 from generator.rendering.matrices import ColourMatrix
@@ -107,7 +108,7 @@ def gallery() -> Gallery:
 
 def test_every_value_is_a_sample_of_its_colour_under_its_light(make_lut: MakeLut, gallery: Gallery) -> None:
     lut = make_lut(bits=BITS)
-    batch = Crops(lut, gallery, (7, 8), flip=False, length=300).batch(np.arange(300))
+    batch = Crops(lut, gallery, (7, 8), flip=False, length=300, rendering="codes").batch(np.arange(300))
     assert batch.images.shape == (300, 3, 7, 8)
     assert batch.images.dtype == np.float32
     assert set(batch.lights.tolist()) == set(range(4))
@@ -159,8 +160,9 @@ def test_seeds_and_epochs_differ_and_threads_do_not(make_lut: MakeLut, gallery: 
     )
 
 
-def test_a_batch_fills_the_memory_it_is_given(make_lut: MakeLut, gallery: Gallery) -> None:
-    crops = Crops(make_lut(bits=BITS), gallery, (5, 6), length=40, threads=2)
+@pytest.mark.parametrize("rendering", get_args(Rendering))
+def test_a_batch_fills_the_memory_it_is_given(make_lut: MakeLut, gallery: Gallery, rendering: Rendering) -> None:
+    crops = Crops(make_lut(bits=BITS), gallery, (5, 6), length=40, threads=2, rendering=rendering)
     memory = np.full((12, 3, 5, 6), np.nan, np.float32)
     batch = crops.batch(np.arange(9, 20), out=memory[1:])
     assert np.shares_memory(batch.images, memory)
@@ -202,7 +204,8 @@ def test_mirrored_items_are_the_others_mirrored(make_lut: MakeLut) -> None:
 def test_unfit_colours_take_their_stand_ins(make_lut: MakeLut) -> None:
     lut = make_lut(bits=BITS, unfit=(63,))
     white = np.full((8, 8, 3), 255, np.uint8)
-    images = Crops(lut, gallery_of([white]), (4, 4), lights=[1], flip=False, length=9).batch(np.arange(9)).images
+    crops = Crops(lut, gallery_of([white]), (4, 4), lights=[1], flip=False, length=9, rendering="codes")
+    images = crops.batch(np.arange(9)).images
     from generator.kernels.choice import nearest_fit_colours
 
     wanted = lut.samples[1, int(nearest_fit_colours([63], BITS)[0])].astype(np.float32) / lut.provenance.white_level
@@ -288,7 +291,7 @@ def test_crops_by_colour_are_windows_of_the_image_that_is_rendered_so(
     crops = Crops(lut, gallery, (7, 8), rendering="colorimetric", black_point=black_point, **options)
     batch = crops.batch(np.arange(30))
     kept = Crops(lut, gallery, (7, 8), rendering="colorimetric", **options).batch(np.arange(30))
-    by_codes = Crops(lut, gallery, (7, 8), lights=[1, 3], length=30, seed=8).batch(np.arange(30))
+    by_codes = Crops(lut, gallery, (7, 8), lights=[1, 3], length=30, seed=8, rendering="codes").batch(np.arange(30))
     np.testing.assert_array_equal(batch.illuminants, by_codes.illuminants)
     np.testing.assert_array_equal(batch.lights, by_codes.lights)
     assert (kept.images != by_codes.images).mean() > 0.5
@@ -312,4 +315,4 @@ def test_renderings_that_cannot_be_are_named(make_lut: MakeLut, gallery: Gallery
     with pytest.raises(InputError, match="'inks'"):
         Crops(lut, gallery, (5, 6), rendering="inks")  # pyright: ignore[reportArgumentType] - the fault under test
     with pytest.raises(InputError, match="a colour matrix is for colorimetric rendering"):
-        Crops(lut, gallery, (5, 6), matrix=MATRIX)
+        Crops(lut, gallery, (5, 6), rendering="codes", matrix=MATRIX)

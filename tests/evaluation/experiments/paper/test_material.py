@@ -112,7 +112,7 @@ def test_a_light_has_three_channels(light: list[float]) -> None:
 
 SOURCES = random_scenes(6, 40, 30, seed=3)
 TRUTHS = np.array([[2.0, 3.1, 1.0], [0.3, 0.7, 1.0], [1.5, 3.0, 2.4]])
-PLAIN = DatasetOptions(previews=False)
+PLAIN = DatasetOptions(previews=False, rendering="codes")
 
 
 def test_random_lights_are_those_of_the_command(make_table: TableMaker, tmp_path: Path) -> None:

@@ -57,7 +57,12 @@ class Maker:
         silent = SensorNoise((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
         variation = NO_VARIATION if gradient is None else Variation(gradient=parse_gradient(gradient), noise=silent)
         options = DatasetOptions(
-            previews=False, split=split, reading=reading, crops=preparation.crops, variation=variation
+            previews=False,
+            split=split,
+            reading=reading,
+            crops=preparation.crops,
+            variation=variation,
+            rendering="codes",
         )
         sources = find_pictures(pictures or self.pictures, preparation)
         generate_dataset(self.lut, self.folder / name, sources, lights, seed=seed, options=options)

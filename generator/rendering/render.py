@@ -1,0 +1,81 @@
+"""One picture under one light of a table, by colour or by codes: the pixels of a dataset in one call."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, get_args
+
+import numpy as np
+import numpy.typing as npt
+
+from foundation.errors import InputError
+from generator.kernels.choice import check_picture, replace_unfit_colours
+from generator.kernels.rendering import draw_samples, read_light
+from generator.lights.lighting import plain
+from generator.rendering import DEFAULT, Rendering
+from generator.rendering.matrices import matrix_for
+
+if TYPE_CHECKING:
+    from calibration.table.lut import Lut
+
+
+def render(
+    lut: Lut,
+    picture: npt.NDArray[np.uint8],
+    light: int,
+    *,
+    rendering: Rendering = DEFAULT,
+    seed: int = 0,
+    image: int = 0,
+    threads: int = 1,
+) -> npt.NDArray[np.uint16]:
+    """Return the raw linear image of `picture` printed, lit by the table's light `light` and photographed.
+
+    It is image number `image` of the dataset that `generate` makes with the same seed, where that shows the whole
+    picture and keeps the print's black.
+
+    Parameters
+    ----------
+    lut
+        A table, from `calibration.table.lut.open_lut`.
+    picture
+        (H, W, 3) uint8 sRGB codes, from `pictures.picture.read_picture` or any array.
+    light
+        Number of the light in the table.
+    rendering
+        ``"colorimetric"``: the print shows the camera the picture's colours; where in the chart they are takes seconds
+        a table, once. ``"codes"``: a picture's codes are those of the print, as in the paper; colours that the table
+        lists as unfit are replaced by the nearest fit one.
+    seed, image, threads
+        As for `kernels.rendering.draw_samples`.
+
+    Returns
+    -------
+    ndarray
+        (H, W, 3) uint16, linear camera RGB, `lut.provenance.white_level` = saturation of the sensor.
+
+    Raises
+    ------
+    InputError
+        The table has no such light, there is no such rendering, or the picture is not of that shape and type.
+    QualityError
+        The print has no contrast under the light, so that there is no rendering by colour.
+
+    Examples
+    --------
+    >>> from generator import open_lut, read_picture
+    >>> lut, picture = open_lut("lut"), read_picture("cat.png")
+    >>> image = render(lut, picture, light=3, seed=1)
+    >>> image.shape == picture.shape, image.dtype
+    (True, dtype('uint16'))
+    """
+    from generator.rendering.colorimetric import rendering_with
+
+    check_picture(picture)
+    if rendering not in get_args(Rendering):
+        raise InputError(f"{rendering!r} is no rendering; use one of {', '.join(get_args(Rendering))}")
+    samples = read_light(lut, light, picture.shape[0] * picture.shape[1])
+    if rendering == "codes":
+        fit, _ = replace_unfit_colours(picture, lut.provenance)
+        return draw_samples(samples, fit, seed=seed, image=image, threads=threads)
+    by_colour = rendering_with(lut, matrix_for(lut))
+    return by_colour.draw(picture, [plain(int(light))], seed=seed, image=image, threads=threads)
