@@ -3,12 +3,16 @@
 `python -m benchmarks.monitor` prints one JSON object a line: the page itself; all of a session of the paper's 707
 lights with 800 attempts and 12 checks each, which a page asks for once; what one more frame adds; a sign of life; and
 the answer that nothing is new, which is most of them. A page asks every two seconds.
+
+Last, how long viewers wait beside an attack from their own address: connections whose request trickles in, a byte a
+second, others that never send one, each made anew when it is closed, and viewers with a new connection for each answer.
 """
 
 from __future__ import annotations
 
 import gzip
 import json
+import socket
 import tempfile
 import time
 import urllib.request
@@ -16,7 +20,7 @@ from collections.abc import Callable
 from contextlib import closing
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
-from threading import Thread
+from threading import Event, Thread
 from typing import Any
 
 from acquisition.monitor.server import open_monitor
@@ -32,6 +36,9 @@ CHECKS = 12
 
 REPEATS = 15
 """Answers of each kind of which the fastest counts: other programs only make them slower."""
+
+TRICKLING, SILENT, VIEWERS, ANSWERS = 64, 400, 4, 100
+"""Connections of the attack, viewers, and answers that each of them asks for."""
 
 BEGUN = datetime(2026, 1, 1, 22, 0, tzinfo=UTC)
 
@@ -92,6 +99,51 @@ def _cost(address: str, what: str, cursor: Callable[[], str], before: Callable[[
     return {"answer": what, "ms": round(1000 * best, 2), "bytes": sizes[0], "unpacked": sizes[1]}
 
 
+def _besieged(port: int) -> dict[str, Any]:
+    """Return how long each answer took beside `TRICKLING` slow and `SILENT` silent connections, seconds."""
+    ended = Event()
+
+    def attack(words: bytes) -> None:
+        links: list[socket.socket] = []
+        while not ended.wait(1.0):
+            alive: list[socket.socket] = []
+            for link in links or [None] * (TRICKLING if words else SILENT):
+                try:
+                    made = link or socket.create_connection(("127.0.0.1", port), timeout=5)
+                    made.sendall(words)
+                    alive.append(made)
+                except OSError:
+                    alive.append(socket.create_connection(("127.0.0.1", port), timeout=5))
+            links = alive
+
+    took: list[float] = []
+
+    def view() -> None:
+        for _ in range(ANSWERS):
+            start = time.perf_counter()
+            _ask(f"http://127.0.0.1:{port}/")
+            took.append(time.perf_counter() - start)
+            time.sleep(0.2)
+
+    attackers = [Thread(target=attack, args=(words,), daemon=True) for words in (b"G", b"")]
+    viewers = [Thread(target=view) for _ in range(VIEWERS)]
+    for thread in attackers:
+        thread.start()
+    time.sleep(3)
+    for thread in viewers:
+        thread.start()
+    for thread in viewers:
+        thread.join()
+    ended.set()
+    return {
+        "beside": f"{TRICKLING} trickling and {SILENT} silent connections",
+        "answers": len(took),
+        "asked": VIEWERS * ANSWERS,
+        "median_s": round(sorted(took)[len(took) // 2], 4),
+        "longest_s": round(max(took), 4),
+    }
+
+
 def main() -> None:
     """Print the costs."""
     with tempfile.TemporaryDirectory(prefix="crop-") as scratch:
@@ -119,6 +171,7 @@ def main() -> None:
                 )
                 for what, cursor, before in costs:
                     print(json.dumps(_cost(address, what, cursor, before)), flush=True)
+                print(json.dumps(_besieged(server.port)), flush=True)
                 server.shutdown()
 
 

@@ -1,19 +1,11 @@
-"""The monitor's server: what it answers, to whom, and what it never does.
-
-Who may look, and at what.
-
-The QR code in the terminal is read by a reader of such codes.
-"""
+"""The monitor's server: what it answers, and what it never does."""
 
 from __future__ import annotations
 
 import gzip
 import http.client
-import ipaddress
 import json
-import re
 import shutil
-import socket
 import sys
 import threading
 import tomllib
@@ -23,108 +15,31 @@ from http.server import ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
 
-import cv2
-import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from acquisition.cli import main
-from acquisition.monitor import server
-from acquisition.monitor.server import (
-    Access,
-    MonitorServer,
-    Refusal,
-    Request,
-    is_loopback,
-    open_monitor,
-    qr_text,
-    reachable_addresses,
-)
+from acquisition.monitor.server import MonitorServer, Request, open_monitor, request_of
 from foundation.errors import FormatError, InputError
 from tests.acquisition.monitor.made_up import MadeUpRun, jpeg
 
-OPEN = Access("", frozenset({"localhost"}))
-CLOSED = Access("secret", frozenset({"localhost"}))
-
 
 @pytest.mark.parametrize(
-    ("target", "request_"),
+    ("path", "query", "asked"),
     [
-        ("/", Request("page")),
-        ("/?", Request("page")),
-        ("/state.json", Request("state")),
-        ("/state.json?since=a.1.b&x=1", Request("state", since="a.1.b")),
-        ("/frame/12.jpg?1", Request("frame", attempt=12)),
-        ("/status.json", Request("status")),
+        ("", "", Request("page")),
+        ("state.json", "", Request("state")),
+        ("state.json", "since=a.1.b&x=1", Request("state", since="a.1.b")),
+        ("frame/12.jpg", "1", Request("frame", attempt=12)),
+        ("status.json", "", Request("status")),
     ],
 )
-def test_the_four_addresses(target: str, request_: Request) -> None:
-    assert OPEN.judge(target, "localhost") == request_
-    assert CLOSED.judge(f"/secret{target}", "localhost") == request_
+def test_the_four_addresses(path: str, query: str, asked: Request) -> None:
+    assert request_of(path, query) == asked
 
 
-@pytest.mark.parametrize("target", ["/frame/١.jpg", "/frame/1.jpg\n", "//[", "/%", "", "http://localhost/", "*"])
-def test_what_is_no_address_is_refused(target: str) -> None:
-    answer = OPEN.judge(target, "localhost")
-    assert answer == Request("page") if target == "" else isinstance(answer, Refusal)
-
-
-@given(st.text(max_size=40), st.text(max_size=20))
-def test_without_the_token_nothing_is_shown(target: str, host: str) -> None:
-    for asked in (target, f"/{target}", "/" + target.replace("secret", "")):
-        assert isinstance(CLOSED.judge(asked, host), Refusal) or asked.startswith("/secret/")
-
-
-@given(st.text(max_size=60))
-def test_only_numbers_and_own_names_are_known(host: str) -> None:
-    answer = OPEN.judge("/", host)
-    if answer == Request("page"):
-        name = host.lower().partition(":")[0] if not host.startswith("[") else host[1:].partition("]")[0]
-        assert name == "localhost" or ipaddress.ip_address(name)
-
-
-def test_a_token_is_asked_for_wherever_others_reach_it() -> None:
-    assert Access.to("127.0.0.1").token == ""
-    assert Access.to("localhost").token == ""
-    assert Access.to("::1").token == ""
-    for host in ("0.0.0.0", "::", "192.168.1.7", socket.gethostname() + ".example"):
-        assert len(Access.to(host).token) >= 22
-    assert not is_loopback("127.0.0.1.example")
-
-
-def test_where_others_reach_it() -> None:
-    assert reachable_addresses("192.168.1.7") == ("192.168.1.7",)
-    assert reachable_addresses("fd00::7") == ("[fd00::7]",)
-    assert reachable_addresses("lab.local") == ("lab.local",)
-    assert all(name and "0.0.0.0" not in name for name in reachable_addresses("0.0.0.0"))
-
-
-def test_without_a_network_it_goes_by_its_name(monkeypatch: pytest.MonkeyPatch) -> None:
-    def unreachable(self: socket.socket, address: object) -> None:
-        raise OSError("Network is unreachable")
-
-    monkeypatch.setattr(socket.socket, "connect", unreachable)
-    assert reachable_addresses("0.0.0.0") == (socket.gethostname(),)
-
-
-ADDRESS = "http://192.168.178.123:8707/abcdefghijklmnopqrstuv/"
-
-
-def test_a_reader_finds_the_address_in_what_is_printed() -> None:
-    lines = [re.sub(r"\x1b\[[0-9;]*m", "", line) for line in qr_text(ADDRESS).splitlines()]
-    assert len({len(line) for line in lines}) == 1
-    light = {"█": (1, 1), "▀": (1, 0), "▄": (0, 1), " ": (0, 0)}
-    rows = [[light[character][half] for character in line] for line in lines for half in (0, 1)]
-    picture = np.kron(np.array(rows, np.uint8) * 255, np.ones((8, 8), np.uint8))
-    assert cv2.QRCodeDetector().detectAndDecode(picture)[0] == ADDRESS
-    # ISO/IEC 18004, 6.3.8: four light modules on each side.
-    assert all(all(row[:4]) and all(row[-4:]) for row in rows)
-    assert all(all(row) for row in rows[:4] + rows[-4:])
-
-
-def test_it_fits_a_terminal_of_80_columns() -> None:
-    assert max(len(re.sub(r"\x1b\[[0-9;]*m", "", line)) for line in qr_text(ADDRESS).splitlines()) <= 80
+@pytest.mark.parametrize("path", ["frame/١.jpg", "frame/1.jpg\n", "[", "%", "http://localhost/", "*"])
+def test_what_is_no_address_is_none(path: str) -> None:
+    assert request_of(path, "") is None
 
 
 SCRIPT = "<script>alert(1)</script>"
@@ -319,30 +234,6 @@ def test_a_large_answer_is_compressed_for_who_can_read_it(opened: MonitorServer)
     assert gzip.decompress(body) == ask(opened, "/")[2]
 
 
-def test_connections_without_number_are_turned_away(run: MadeUpRun, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(server, "MOST_CONNECTIONS", 3)
-    with served(run.folder) as monitor:
-        held = [socket.create_connection(("127.0.0.1", monitor.port)) for _ in range(3)]
-        try:
-            # Connections are accepted in their order: the first three wait for a request, the fourth finds no room.
-            with socket.create_connection(("127.0.0.1", monitor.port), timeout=20) as one_more:
-                assert one_more.recv(1) == b""
-        finally:
-            for connection in held:
-                connection.close()
-        assert answered_in_the_end(monitor)
-
-
-def answered_in_the_end(monitor: MonitorServer) -> bool:
-    """Return whether there is room again, once the threads of closed connections have ended."""
-    for _ in range(1000):
-        try:
-            return ask(monitor, "/status.json")[0] == 200
-        except (http.client.HTTPException, OSError):
-            continue
-    return False
-
-
 def test_a_session_may_be_deleted_and_come_back_under_the_open_page(opened: MonitorServer, run: MadeUpRun) -> None:
     first = state_of(opened)
     away = run.folder.with_name("away")
@@ -433,7 +324,7 @@ def test_the_address_for_a_phone_is_printed_with_a_warning_and_as_a_code(
     def addresses(host: str) -> tuple[str, ...]:
         return ("192.168.1.7",)
 
-    monkeypatch.setattr(server, "reachable_addresses", addresses)
+    monkeypatch.setattr("foundation.page_server.reachable_addresses", addresses)
     monkeypatch.setattr(sys.stdout, "isatty", lambda: True)
     assert main(["monitor", str(run.folder), "--port", "0", "--host", "0.0.0.0"]) == 0
     printed = capsys.readouterr()

@@ -1,0 +1,245 @@
+"""A page that a command serves: who may look, who gives way to whom, and how long a request may take."""
+
+from __future__ import annotations
+
+import http.client
+import ipaddress
+import re
+import socket
+import threading
+from collections.abc import Generator
+from contextlib import ExitStack, contextmanager, suppress
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from foundation.page_server import (
+    ANSWER_S,
+    TEXT,
+    Access,
+    Connections,
+    PageHandler,
+    PageServer,
+    Refusal,
+    is_loopback,
+    qr_text,
+    reachable_addresses,
+)
+
+OPEN = Access("", frozenset({"localhost"}))
+CLOSED = Access("secret", frozenset({"localhost"}))
+
+
+@given(st.text(max_size=40), st.text(max_size=20))
+def test_without_the_token_nothing_is_shown(target: str, host: str) -> None:
+    for asked in (target, f"/{target}", "/" + target.replace("secret", "")):
+        assert isinstance(CLOSED.judge(asked, host), Refusal) or asked.startswith("/secret/")
+
+
+@given(st.text(max_size=60))
+def test_only_numbers_and_own_names_are_known(host: str) -> None:
+    if OPEN.judge("/", host) == ("", ""):
+        name = host.lower().partition(":")[0] if not host.startswith("[") else host[1:].partition("]")[0]
+        assert name == "localhost" or ipaddress.ip_address(name)
+
+
+def test_a_token_is_asked_for_wherever_others_reach_it() -> None:
+    assert Access.to("127.0.0.1").token == ""
+    assert Access.to("localhost").token == ""
+    assert Access.to("::1").token == ""
+    for host in ("0.0.0.0", "::", "192.168.1.7", socket.gethostname() + ".example"):
+        assert len(Access.to(host).token) >= 22
+    assert not is_loopback("127.0.0.1.example")
+
+
+def test_where_others_reach_it() -> None:
+    assert reachable_addresses("192.168.1.7") == ("192.168.1.7",)
+    assert reachable_addresses("fd00::7") == ("[fd00::7]",)
+    assert reachable_addresses("lab.local") == ("lab.local",)
+    assert all(name and "0.0.0.0" not in name for name in reachable_addresses("0.0.0.0"))
+
+
+def test_without_a_network_it_goes_by_its_name(monkeypatch: pytest.MonkeyPatch) -> None:
+    def unreachable(self: socket.socket, address: object) -> None:
+        raise OSError("Network is unreachable")
+
+    monkeypatch.setattr(socket.socket, "connect", unreachable)
+    assert reachable_addresses("0.0.0.0") == (socket.gethostname(),)
+
+
+ADDRESS = "http://192.168.178.123:8707/abcdefghijklmnopqrstuv/"
+
+
+def test_a_reader_finds_the_address_in_what_is_printed() -> None:
+    lines = [re.sub(r"\x1b\[[0-9;]*m", "", line) for line in qr_text(ADDRESS).splitlines()]
+    assert len({len(line) for line in lines}) == 1
+    light = {"█": (1, 1), "▀": (1, 0), "▄": (0, 1), " ": (0, 0)}
+    rows = [[light[character][half] for character in line] for line in lines for half in (0, 1)]
+    picture = np.kron(np.array(rows, np.uint8) * 255, np.ones((8, 8), np.uint8))
+    assert cv2.QRCodeDetector().detectAndDecode(picture)[0] == ADDRESS
+    # ISO/IEC 18004, 6.3.8: four light modules on each side.
+    assert all(all(row[:4]) and all(row[-4:]) for row in rows)
+    assert all(all(row) for row in rows[:4] + rows[-4:])
+
+
+def test_it_fits_a_terminal_of_80_columns() -> None:
+    assert max(len(re.sub(r"\x1b\[[0-9;]*m", "", line)) for line in qr_text(ADDRESS).splitlines()) <= 80
+
+
+@given(st.text(max_size=40))
+def test_an_address_is_handed_on_without_its_token(target: str) -> None:
+    path, _, query = target.partition("?")
+    assert OPEN.judge(f"/{target}", "localhost") == (path, query)
+    assert CLOSED.judge(f"/secret/{target}", "localhost") == (path, query)
+
+
+class Echo(PageHandler):
+    def respond(self, path: str, query: str) -> None:
+        self.answer(200, TEXT, path.encode())
+
+
+@contextmanager
+def served(**limits: Any) -> Generator[PageServer]:
+    with PageServer("127.0.0.1", 0, Echo, **limits) as server:
+        thread = threading.Thread(target=lambda: server.serve_forever(0.01))
+        thread.start()
+        yield server
+        server.shutdown()
+        thread.join()
+
+
+def connect(server: PageServer) -> socket.socket:
+    return socket.create_connection(("127.0.0.1", server.port), timeout=20)
+
+
+def asked(link: socket.socket) -> bytes:
+    """Ask on a connection and return what comes, without its head."""
+    link.sendall(b"GET /here HTTP/1.1\r\nHost: localhost\r\n\r\n")
+    answer = http.client.HTTPResponse(link)
+    answer.begin()
+    assert answer.status == 200
+    return answer.read()
+
+
+def test_viewers_are_answered_beside_those_who_never_finish_their_request() -> None:
+    with served(most=8) as server, ExitStack() as held:
+        for number in range(40):
+            link = held.enter_context(connect(server))
+            link.sendall(b"GET / HTTP/1.1\r\nX: "[: number % 3 * 9])
+        viewer = held.enter_context(connect(server))
+        assert asked(viewer) == b"here"
+        # Whoever has asked stays where more come who do not.
+        for _ in range(20):
+            held.enter_context(connect(server))
+        assert asked(viewer) == b"here"
+
+
+def test_a_head_that_trickles_ends_at_its_deadline() -> None:
+    with served(head_s=0.05) as server, connect(server) as link:
+        link.settimeout(0.005)
+        while not is_closed(link):
+            with suppress(ConnectionError):
+                link.sendall(b"G")
+
+
+def test_a_page_that_asks_now_and_then_keeps_its_connection() -> None:
+    with served(head_s=0.05) as server, connect(server) as link:
+        assert asked(link) == b"here"
+        # Nothing is asked for longer than a head may take.
+        link.settimeout(0.2)
+        with pytest.raises(TimeoutError):
+            link.recv(1)
+        link.settimeout(20)
+        assert asked(link) == b"here"
+    with served(idle_s=0.05) as server, connect(server) as link:
+        assert asked(link) == b"here"
+        assert link.recv(1) == b"", "an idle one ends"
+
+
+class Time:
+    def __init__(self) -> None:
+        self.now = 0.0
+
+    def __call__(self) -> float:
+        return self.now
+
+
+def is_closed(far: socket.socket) -> bool:
+    try:
+        return far.recv(1) == b""
+    except TimeoutError:
+        return False
+    except ConnectionError:
+        return True
+
+
+def crowd(stack: ExitStack, *addresses: str) -> list[tuple[socket.socket, socket.socket, str]]:
+    """Return both ends of a connection from each address."""
+    made = [(*socket.socketpair(), address) for address in addresses]
+    for near, far, _ in made:
+        stack.enter_context(near)
+        stack.enter_context(far).settimeout(0.01)
+    return made
+
+
+def test_who_gives_way_to_a_new_connection() -> None:
+    time = Time()
+    connections = Connections(4, time)
+    with ExitStack() as stack:
+        made = crowd(stack, "viewer", "many", "many", "many", "new", "new", "new", "new", "new")
+        for near, _, address in made[:4]:
+            time.now += 1
+            assert connections.admit(near, address)
+        connections.mark(made[0][0], "idle")
+        connections.mark(made[1][0], "idle")
+        # Of the address with the most, first who never asked, the oldest of them.
+        gone: list[int] = []
+        for near, _, address in made[4:7]:
+            time.now += 1
+            assert connections.admit(near, address)
+            gone += [number for number, (_, far, _) in enumerate(made) if number not in gone and is_closed(far)]
+        assert gone == [2, 3, 4]
+
+
+def test_nobody_gives_way_who_is_being_answered_unless_he_is_slow() -> None:
+    time = Time()
+    connections = Connections(2, time)
+    with ExitStack() as stack:
+        (one, far, _), (two, _, _), (three, _, _) = crowd(stack, "a", "a", "b")
+        for near in (one, two):
+            assert connections.admit(near, "a")
+            connections.mark(near, "answered")
+        assert not connections.admit(three, "b")
+        time.now += ANSWER_S / 2
+        connections.mark(two, "answered")
+        time.now += ANSWER_S * 0.6
+        assert connections.admit(three, "b")
+        assert is_closed(far)
+        connections.forget(two)
+        assert connections.admit(one, "a"), "there is room"
+
+
+def test_a_viewer_who_takes_nothing_loses_the_place() -> None:
+    class Flood(PageHandler):
+        def respond(self, path: str, query: str) -> None:
+            self.answer(200, "image/raw", bytes(1 << 26))
+
+    with PageServer("127.0.0.1", 0, Flood, most=1, idle_s=0.05) as server:
+        thread = threading.Thread(target=lambda: server.serve_forever(0.01))
+        thread.start()
+        with connect(server) as link:
+            link.sendall(b"GET / HTTP/1.1\r\nHost: localhost\r\n\r\n")
+            got = 0
+            answer = http.client.HTTPResponse(link)
+            answer.begin()
+            # What the system had taken is all that comes.
+            threading.Event().wait(0.2)
+            with pytest.raises((http.client.IncompleteRead, ConnectionError)):
+                got = len(answer.read())
+            assert got == 0
+        server.shutdown()
+        thread.join()
