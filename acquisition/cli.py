@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
-from contextlib import suppress
 from enum import Enum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -448,22 +447,10 @@ def monitor(
     a token, new at each start: whoever has the address can look, and nobody can change anything. It is printed as a QR
     code, too.
     """
-    from acquisition.monitor.server import is_loopback, open_monitor, reachable_addresses
+    from acquisition.monitor.serving import open_monitor
 
-    with open_monitor(session, port, host) as server, suppress(KeyboardInterrupt):
-        addresses = [f"http://{name}:{server.port}/{server.path}" for name in reachable_addresses(host)]
-        print(f"{' and '.join(addresses)} shows {session}; Ctrl-C ends it", flush=True)
-        if not is_loopback(host):
-            print(
-                "warning: everybody who has this address and can reach this machine can look at the session, and what "
-                "is sent is not encrypted; use it in your own network only",
-                file=sys.stderr,
-            )
-            if sys.stdout.isatty() and "utf" in sys.stdout.encoding.lower():
-                from acquisition.monitor.server import qr_text
-
-                print(qr_text(addresses[0]), flush=True)
-        server.serve_forever()
+    with open_monitor(session, port, host) as server:
+        server.serve(str(session), "can look at the session")
 
 
 @app.command(epilog=EXIT_CODES)

@@ -30,44 +30,52 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from acquisition.cli import main
-from acquisition.monitor import server
-from acquisition.monitor.server import (
-    Access,
-    MonitorServer,
-    Refusal,
-    Request,
-    is_loopback,
-    open_monitor,
-    qr_text,
-    reachable_addresses,
-)
+from acquisition.monitor.serving import MonitorServer, open_monitor
+from foundation import local_server as server
 from foundation.errors import FormatError, InputError
+from foundation.local_server import Access, Refusal, Request, is_loopback, qr_text, reachable_addresses
 from tests.acquisition.monitor.made_up import MadeUpRun, jpeg
 
-OPEN = Access("", frozenset({"localhost"}))
-CLOSED = Access("secret", frozenset({"localhost"}))
+OPEN = Access("", frozenset({"localhost"}), "acquire monitor")
+CLOSED = Access("secret", frozenset({"localhost"}), "acquire monitor")
 
 
 @pytest.mark.parametrize(
     ("target", "request_"),
     [
-        ("/", Request("page")),
-        ("/?", Request("page")),
-        ("/state.json", Request("state")),
-        ("/state.json?since=a.1.b&x=1", Request("state", since="a.1.b")),
-        ("/frame/12.jpg?1", Request("frame", attempt=12)),
-        ("/status.json", Request("status")),
+        ("/", Request("")),
+        ("/?", Request("")),
+        ("/state.json", Request("state.json")),
+        ("/state.json?since=a.1.b&since=c", Request("state.json", {"since": "a.1.b"})),
+        ("/frame/12.jpg?1", Request("frame/12.jpg")),
     ],
 )
-def test_the_four_addresses(target: str, request_: Request) -> None:
+def test_an_address_is_a_path_and_a_query(target: str, request_: Request) -> None:
     assert OPEN.judge(target, "localhost") == request_
     assert CLOSED.judge(f"/secret{target}", "localhost") == request_
 
 
 @pytest.mark.parametrize("target", ["/frame/١.jpg", "/frame/1.jpg\n", "//[", "/%", "", "http://localhost/", "*"])
-def test_what_is_no_address_is_refused(target: str) -> None:
-    answer = OPEN.judge(target, "localhost")
-    assert answer == Request("page") if target == "" else isinstance(answer, Refusal)
+def test_what_is_no_address_is_refused(opened: MonitorServer, target: str) -> None:
+    asked = OPEN.judge(target, "localhost")
+    assert isinstance(asked, Request)
+    assert isinstance(opened.answer(asked), Refusal) == (target != "")
+
+
+@pytest.mark.parametrize(
+    ("origin", "is_taken"),
+    [
+        (None, True),
+        ("http://localhost:8707", True),
+        ("HTTP://LOCALHOST:8707", True),
+        ("http://localhost:80", False),
+        ("https://localhost:8707", False),
+        ("http://evil.example", False),
+        ("null", False),
+    ],
+)
+def test_what_another_sites_page_sends_is_refused(origin: str | None, is_taken: bool) -> None:
+    assert isinstance(OPEN.judge("/", "localhost:8707", origin), Request) == is_taken
 
 
 @given(st.text(max_size=40), st.text(max_size=20))
@@ -79,17 +87,17 @@ def test_without_the_token_nothing_is_shown(target: str, host: str) -> None:
 @given(st.text(max_size=60))
 def test_only_numbers_and_own_names_are_known(host: str) -> None:
     answer = OPEN.judge("/", host)
-    if answer == Request("page"):
+    if answer == Request(""):
         name = host.lower().partition(":")[0] if not host.startswith("[") else host[1:].partition("]")[0]
         assert name == "localhost" or ipaddress.ip_address(name)
 
 
 def test_a_token_is_asked_for_wherever_others_reach_it() -> None:
-    assert Access.to("127.0.0.1").token == ""
-    assert Access.to("localhost").token == ""
-    assert Access.to("::1").token == ""
+    assert Access.to("127.0.0.1", "x").token == ""
+    assert Access.to("localhost", "x").token == ""
+    assert Access.to("::1", "x").token == ""
     for host in ("0.0.0.0", "::", "192.168.1.7", socket.gethostname() + ".example"):
-        assert len(Access.to(host).token) >= 22
+        assert len(Access.to(host, "x").token) >= 22
     assert not is_loopback("127.0.0.1.example")
 
 

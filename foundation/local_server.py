@@ -1,13 +1,14 @@
-"""The live page's server: four addresses, answered from the journal, to anybody whom `Access` lets look.
+"""A page's own server on this machine: a few addresses, answered to anybody whom `Access` lets look.
 
-It never writes, and holds nothing open between two requests; any number of pages may look, and it may be ended at any
-time.
+It holds nothing open between two requests; any number of pages may look, and it may be ended at any time. A page's
+server is a subclass that answers requests (`LocalServer.answer`); all else is the same for each.
 
 Who may look, and at what, is decided from a request's text alone. A page on this machine's loopback needs no token: who
-is logged in here may read the folder anyway. Two things are still refused there: names that another site has made to
-point here (DNS rebinding, by which a web page could read what answers on loopback), and everything that is not one of
-the four addresses. For other machines the address itself holds a token, as its first part, so that the page's relative
-addresses carry it on and nothing has to be typed; a QR code (ISO/IEC 18004) in the terminal gives it to a phone.
+is logged in here may read the files anyway. Names that another site has made to point here are still refused there (DNS
+rebinding, by which a web page could read what answers on loopback), and so is what another site's page sends: browsers
+ask before a PUT, and say where the page is from. For other machines the address itself holds a token, as its first
+part, so that the page's relative addresses carry it on and nothing has to be typed; a QR code (ISO/IEC 18004) in the
+terminal gives it to a phone.
 """
 
 from __future__ import annotations
@@ -15,23 +16,19 @@ from __future__ import annotations
 import gzip
 import hmac
 import ipaddress
-import json
-import re
 import secrets
 import socket
+import sys
 import threading
-from dataclasses import dataclass
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
-from pathlib import Path
-from typing import Any, Literal
+from typing import Any, ClassVar
 from urllib.parse import parse_qs
 
-import numpy as np
-
-from acquisition.monitor.feed import SessionWatch, live_page, to_bytes
-from acquisition.monitor.view import read_session
-from experiment.session.journal import JOURNAL_FILE
-from foundation.errors import FormatError, InputError
+from foundation.errors import InputError
 
 TOKEN_BYTES = 16
 """Random bytes of a token: 128 bits cannot be guessed, and still make a QR code that a terminal has room for."""
@@ -53,40 +50,86 @@ GZIP_FROM_BYTES = 2048
 
 _TEXT = "text/plain; charset=utf-8"
 
-_FRAME = re.compile(r"frame/([1-9][0-9]{0,8})\.jpg")
+_PICTURES = frozenset({"image/jpeg", "image/png", "application/octet-stream"})
+"""Kinds of answers that gzip does not make smaller: pictures, and numbers with noise."""
 
 
-def open_monitor(folder: Path, port: int, host: str = "127.0.0.1") -> MonitorServer:
-    """Return a server for a session, not yet serving."""
-    if (folder / JOURNAL_FILE).exists():
-        read_session(folder)
-    elif folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise FormatError(
-            f"{folder} is no session: it holds no {JOURNAL_FILE}; name a folder made by acquire run or import, or one "
-            "that is not there yet"
-        )
-    try:
-        return MonitorServer(SessionWatch(folder), host, port)
-    except (OSError, OverflowError) as error:
-        reason = error.strerror if isinstance(error, OSError) and error.strerror else error
-        own = "" if is_loopback(host) else " or an address of this machine with --host"
-        raise InputError(f"cannot serve on {host} port {port}: {reason}; name another with --port{own}") from error
+@dataclass(frozen=True)
+class Request:
+    """What is asked for.
+
+    - `path`: the address behind the server's own, without a slash before it; empty for the page.
+    - `query`: the first value of each name behind the question mark.
+    - `body`: what was sent along by a PUT; None where something is asked for.
+    """
+
+    path: str
+    query: Mapping[str, str] = field(default_factory=dict[str, str])
+    body: bytes | None = None
 
 
-class MonitorServer(ThreadingHTTPServer):
-    """Serves one session; not yet serving when it is made."""
+@dataclass(frozen=True)
+class Refusal:
+    """Why a request is not answered: HTTP status and sentence."""
+
+    status: int
+    sentence: str
+
+
+@dataclass(frozen=True)
+class Answer:
+    """An answer: its media type, its bytes, and headers beside the usual ones; one without a type says nothing new."""
+
+    kind: str
+    body: bytes
+    headers: Mapping[str, str] = field(default_factory=dict[str, str])
+
+
+class LocalServer(ABC, ThreadingHTTPServer):
+    """Serves one page; not yet serving when it is made. An InputError says why it cannot listen there."""
+
+    command: ClassVar[str]
+    """The command that serves, as messages name it."""
+    most_bytes: ClassVar[int] = 0
+    """Bytes of the largest body of a PUT that is taken; 0 takes none."""
 
     daemon_threads = True
     request_queue_size = MOST_CONNECTIONS
 
-    def __init__(self, watch: SessionWatch, host: str, port: int) -> None:
-        self.watch = watch
-        self.access = Access.to(host)
-        self.page = live_page(watch.folder.resolve().name)
+    def __init__(self, host: str, port: int) -> None:
+        self.access = Access.to(host, self.command)
+        self._host = host
         self._free = threading.BoundedSemaphore(MOST_CONNECTIONS)
         if ":" in host:
             self.address_family = socket.AF_INET6
-        super().__init__((host, port), _Handler)
+        try:
+            super().__init__((host, port), _Handler)
+        except (OSError, OverflowError) as error:
+            reason = error.strerror if isinstance(error, OSError) and error.strerror else error
+            own = "" if is_loopback(host) else " or an address of this machine with --host"
+            raise InputError(f"cannot serve on {host} port {port}: {reason}; name another with --port{own}") from error
+
+    @abstractmethod
+    def answer(self, request: Request) -> Answer | Refusal:
+        """Return the answer to a request; called from any number of threads."""
+
+    def serve(self, shows: str, warning: str) -> None:
+        """Print the page's address and serve until interrupted.
+
+        `shows`: what the page shows. `warning`: what everybody who has the address can do, where others reach it.
+        """
+        with suppress(KeyboardInterrupt):
+            addresses = [f"http://{name}:{self.port}/{self.path}" for name in reachable_addresses(self._host)]
+            print(f"{' and '.join(addresses)} shows {shows}; Ctrl-C ends it", flush=True)
+            if not is_loopback(self._host):
+                print(
+                    f"warning: everybody who has this address and can reach this machine {warning}, and what is sent "
+                    "is not encrypted; use it in your own network only",
+                    file=sys.stderr,
+                )
+                if sys.stdout.isatty() and "utf" in sys.stdout.encoding.lower():
+                    print(qr_text(addresses[0]), flush=True)
+            self.serve_forever()
 
     @property
     def port(self) -> int:
@@ -117,48 +160,46 @@ class MonitorServer(ThreadingHTTPServer):
 
 
 class _Handler(BaseHTTPRequestHandler):
-    server: MonitorServer  # pyright: ignore[reportIncompatibleVariableOverride]  # the handler's own server, by construction
+    server: LocalServer  # pyright: ignore[reportIncompatibleVariableOverride]  # the handler's own server, by construction
     protocol_version = "HTTP/1.1"
     timeout = IDLE_S
 
     def do_GET(self) -> None:  # the name is http.server's
         asked = self.server.access.judge(self.path, self.headers.get("Host"))
-        if isinstance(asked, Refusal):
-            self._answer(asked.status, _TEXT, f"{asked.sentence}\n".encode())
-            return
-        match asked.what:
-            case "page":
-                text, policy = self.server.page
-                self._answer(200, "text/html; charset=utf-8", text.encode(), {"Content-Security-Policy": policy})
-            case "state":
-                state = self.server.watch.state(asked.since)
-                if state is None:
-                    self._answer(204, "", b"")
-                else:
-                    self._answer(200, "application/json", to_bytes(state))
-            case "status":
-                self._answer(200, "application/json", json.dumps(self.server.watch.head().to_plain()).encode())
-            case "frame":
-                self._send_picture(asked)
+        self._send(asked if isinstance(asked, Refusal) else self.server.answer(asked))
 
     do_HEAD = do_GET  # noqa: N815
+
+    def do_PUT(self) -> None:  # the name is http.server's
+        if not self.server.most_bytes:
+            self._refuse()
+            return
+        asked = self.server.access.judge(self.path, self.headers.get("Host"), self.headers.get("Origin"))
+        if isinstance(asked, Refusal):
+            self._send(asked, close=True)
+            return
+        length = self.headers.get("Content-Length", "")
+        if not (length.isascii() and length.isdigit() and 0 < int(length) <= self.server.most_bytes):
+            most = self.server.most_bytes >> 20
+            self._send(Refusal(413, f"expected up to {most} MiB, and their number in the head"), close=True)
+            return
+        self._send(self.server.answer(replace(asked, body=self.rfile.read(int(length)))))
 
     def _refuse(self) -> None:
         # A body that comes along is not read: what follows on this connection would be taken for a request.
         more = {"Allow": "GET, HEAD", "Connection": "close"}
         self._answer(405, _TEXT, b"this server only shows; ask with GET\n", more)
 
-    do_POST = do_PUT = do_DELETE = do_PATCH = do_OPTIONS = _refuse  # noqa: N815
+    do_POST = do_DELETE = do_PATCH = do_OPTIONS = _refuse  # noqa: N815
 
-    def _send_picture(self, asked: Request) -> None:
-        data = self.server.watch.picture(asked.attempt)
-        if not data:
-            self._answer(404, _TEXT, b"there is no picture of that frame\n")
-            return
-        # The page names the version of a picture, so that one that is written anew has another address.
-        self._answer(200, "image/jpeg", data, {"Cache-Control": "private, max-age=86400"})
+    def _send(self, answer: Answer | Refusal, close: bool = False) -> None:
+        if isinstance(answer, Refusal):
+            more = {"Connection": "close"} if close else {}
+            self._answer(answer.status, _TEXT, f"{answer.sentence}\n".encode(), more)
+        else:
+            self._answer(200 if answer.kind else 204, answer.kind, answer.body, answer.headers)
 
-    def _answer(self, status: int, kind: str, body: bytes, more: dict[str, str] | None = None) -> None:
+    def _answer(self, status: int, kind: str, body: bytes, more: Mapping[str, str]) -> None:
         headers = {"Content-Type": kind} if kind else {}
         headers |= {
             "Cache-Control": "no-store",
@@ -166,13 +207,13 @@ class _Handler(BaseHTTPRequestHandler):
             "Referrer-Policy": "no-referrer",
             "Cross-Origin-Resource-Policy": "same-origin",
         }
-        if kind != "image/jpeg" and len(body) >= GZIP_FROM_BYTES and "gzip" in self.headers.get("Accept-Encoding", ""):
+        if kind not in _PICTURES and len(body) >= GZIP_FROM_BYTES and "gzip" in self.headers.get("Accept-Encoding", ""):
             body = gzip.compress(body, 5, mtime=0)
             headers["Content-Encoding"] = "gzip"
         if status != 204:
             headers["Content-Length"] = str(len(body))
         self.send_response(status)
-        for name, value in (headers | (more or {})).items():
+        for name, value in (headers | dict(more)).items():
             self.send_header(name, value)
         self.end_headers()
         if self.command != "HEAD":
@@ -180,65 +221,45 @@ class _Handler(BaseHTTPRequestHandler):
 
     def version_string(self) -> str:
         """Return what the Server header says: no versions for strangers."""
-        return "acquire monitor"
+        return self.server.command
 
     def log_message(self, format: str, *args: object) -> None:
         """Log nothing: the terminal is the user's."""
 
 
 @dataclass(frozen=True)
-class Request:
-    """What is asked for: the page, its state since a cursor, the picture of an attempt, or the old summary."""
-
-    what: Literal["page", "state", "frame", "status"]
-    since: str = ""
-    attempt: int = 0
-
-
-@dataclass(frozen=True)
-class Refusal:
-    """Why a request is not answered: HTTP status and sentence."""
-
-    status: int
-    sentence: str
-
-
-@dataclass(frozen=True)
 class Access:
-    """The rule of one server: the token that addresses must begin with, empty on loopback, and the names it goes by."""
+    """The rule of one server: the token that addresses must begin with, empty on loopback, and the names it goes by.
+
+    `command`: what printed the server's address, as messages name it.
+    """
 
     token: str
     names: frozenset[str]
+    command: str
 
     @classmethod
-    def to(cls, host: str) -> Access:
+    def to(cls, host: str, command: str) -> Access:
         """Return the rule of a server that listens on `host`, with a new token unless that is loopback."""
         own = socket.gethostname().lower()
         names = frozenset({"localhost", host.lower(), own, f"{own}.local"})
-        return cls("" if is_loopback(host) else secrets.token_urlsafe(TOKEN_BYTES), names)
+        return cls("" if is_loopback(host) else secrets.token_urlsafe(TOKEN_BYTES), names, command)
 
-    def judge(self, target: str, host: str | None) -> Request | Refusal:
+    def judge(self, target: str, host: str | None, origin: str | None = None) -> Request | Refusal:
         """Return what a request asks for, or why it is refused.
 
-        `host`: the Host header; None if there is none.
+        `host`: the Host header; None if there is none. `origin`: the Origin header, where something is sent.
         """
         if not self._knows(host):
-            return Refusal(421, "this server does not go by that name; open the address that acquire monitor printed")
+            return Refusal(421, f"this server does not go by that name; open the address that {self.command} printed")
+        if origin is not None and origin.lower() != f"http://{host}".lower():
+            return Refusal(403, "only this server's own page may send something; use the page")
         path, _, query = target.removeprefix("/").partition("?")
         if self.token:
             token, slash, path = path.partition("/")
             if not slash or not hmac.compare_digest(token.encode(), self.token.encode()):
-                return Refusal(403, "the address lacks its token; open the one that acquire monitor printed, whole")
-        since = parse_qs(query).get("since", [""])[0]
-        if path == "":
-            return Request("page")
-        if path == "state.json":
-            return Request("state", since=since)
-        if path == "status.json":
-            return Request("status")
-        if found := _FRAME.fullmatch(path):
-            return Request("frame", attempt=int(found[1]))
-        return Refusal(404, "here are /, /state.json, /status.json and /frame/ATTEMPT.jpg")
+                return Refusal(403, f"the address lacks its token; open the one that {self.command} printed, whole")
+        return Request(path, {name: values[0] for name, values in parse_qs(query).items()})
 
     def _knows(self, host: str | None) -> bool:
         """Return whether a Host header (RFC 9110, 7.2) names this server: an address by number cannot be rebound."""
@@ -293,6 +314,7 @@ def reachable_addresses(host: str) -> tuple[str, ...]:
 def qr_text(text: str) -> str:
     """Return a QR code of `text` as lines of half blocks, dark on light on any terminal: two rows of modules a line."""
     import cv2
+    import numpy as np
 
     code = np.asarray(cv2.QRCodeEncoder.create().encode(text)) < 128
     rows, columns = np.flatnonzero(code.any(axis=1)), np.flatnonzero(code.any(axis=0))
