@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
-from contextlib import suppress
 from enum import Enum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -448,12 +447,10 @@ def monitor(
     a token, new at each start: whoever has the address can look, and nobody can change anything. It is printed as a QR
     code, too.
     """
-    from acquisition.monitor.server import open_monitor
-    from foundation.page_server import announce
+    from acquisition.monitor.serving import open_monitor
 
-    with open_monitor(session, port, host) as server, suppress(KeyboardInterrupt):
-        announce(server, str(session))
-        server.serve_forever()
+    with open_monitor(session, port, host) as server:
+        server.serve(str(session), "can look at the session")
 
 
 @app.command(epilog=EXIT_CODES)

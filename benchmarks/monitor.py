@@ -23,7 +23,7 @@ from pathlib import Path
 from threading import Event, Thread
 from typing import Any
 
-from acquisition.monitor.server import open_monitor
+from acquisition.monitor.serving import open_monitor
 from experiment.lights import plan_illuminations, save_illuminations
 from experiment.session.journal import JOURNAL_FILE, Journal
 from experiment.session.records import RESPONSE, Check, Judgement, SessionStep, plan_steps

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from acquisition.monitor.server import open_monitor
+from acquisition.monitor.serving import open_monitor
 from acquisition.run.run import run_session
 from experiment.chart.model import Chart, load_chart
 from experiment.config import load_lab

@@ -16,7 +16,7 @@ from pathlib import Path
 import pytest
 
 from acquisition.monitor.feed import write_session_report
-from acquisition.monitor.server import MonitorServer, open_monitor
+from acquisition.monitor.serving import MonitorServer, open_monitor
 from experiment.lights import plan_illuminations
 from tests.acquisition.monitor.browser import Tab, browser_tab, needs_chromium
 from tests.acquisition.monitor.made_up import LIGHTS, MadeUpRun

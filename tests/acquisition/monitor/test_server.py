@@ -18,29 +18,10 @@ from typing import Any
 import pytest
 
 from acquisition.cli import main
-from acquisition.monitor.server import MonitorServer, Request, open_monitor, request_of
+from acquisition.monitor.serving import MonitorServer, open_monitor
 from foundation.errors import FormatError, InputError
+from foundation.local_server import Refusal, Request
 from tests.acquisition.monitor.made_up import MadeUpRun, jpeg
-
-
-@pytest.mark.parametrize(
-    ("path", "query", "asked"),
-    [
-        ("", "", Request("page")),
-        ("state.json", "", Request("state")),
-        ("state.json", "since=a.1.b&x=1", Request("state", since="a.1.b")),
-        ("frame/12.jpg", "1", Request("frame", attempt=12)),
-        ("status.json", "", Request("status")),
-    ],
-)
-def test_the_four_addresses(path: str, query: str, asked: Request) -> None:
-    assert request_of(path, query) == asked
-
-
-@pytest.mark.parametrize("path", ["frame/١.jpg", "frame/1.jpg\n", "[", "%", "http://localhost/", "*"])
-def test_what_is_no_address_is_none(path: str) -> None:
-    assert request_of(path, "") is None
-
 
 SCRIPT = "<script>alert(1)</script>"
 
@@ -89,6 +70,13 @@ def state_of(monitor: MonitorServer, since: str = "") -> dict[str, Any]:
     status, _, body = ask(monitor, f"/state.json?since={since}")
     assert status == 200
     return json.loads(body)
+
+
+@pytest.mark.parametrize("target", ["/frame/١.jpg", "/frame/1.jpg\n", "//[", "/%", "", "http://localhost/", "*"])
+def test_what_is_no_address_is_refused(opened: MonitorServer, target: str) -> None:
+    asked = opened.access.judge(target, "localhost")
+    assert isinstance(asked, Request)
+    assert isinstance(opened.answer(asked), Refusal) == (target != "")
 
 
 def test_how_the_session_stands_is_told_to_scripts(opened: MonitorServer) -> None:
@@ -324,7 +312,7 @@ def test_the_address_for_a_phone_is_printed_with_a_warning_and_as_a_code(
     def addresses(host: str) -> tuple[str, ...]:
         return ("192.168.1.7",)
 
-    monkeypatch.setattr("foundation.page_server.reachable_addresses", addresses)
+    monkeypatch.setattr("foundation.local_server.reachable_addresses", addresses)
     monkeypatch.setattr(sys.stdout, "isatty", lambda: True)
     assert main(["monitor", str(run.folder), "--port", "0", "--host", "0.0.0.0"]) == 0
     printed = capsys.readouterr()

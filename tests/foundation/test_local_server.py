@@ -17,21 +17,52 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from foundation.page_server import (
+from foundation.local_server import (
     ANSWER_S,
-    TEXT,
     Access,
+    Answer,
     Connections,
-    PageHandler,
-    PageServer,
+    LocalServer,
     Refusal,
+    Request,
     is_loopback,
     qr_text,
     reachable_addresses,
 )
 
-OPEN = Access("", frozenset({"localhost"}))
-CLOSED = Access("secret", frozenset({"localhost"}))
+OPEN = Access("", frozenset({"localhost"}), "acquire monitor")
+CLOSED = Access("secret", frozenset({"localhost"}), "acquire monitor")
+
+
+@pytest.mark.parametrize(
+    ("target", "request_"),
+    [
+        ("/", Request("")),
+        ("/?", Request("")),
+        ("/state.json", Request("state.json")),
+        ("/state.json?since=a.1.b&since=c", Request("state.json", {"since": "a.1.b"})),
+        ("/frame/12.jpg?1", Request("frame/12.jpg")),
+    ],
+)
+def test_an_address_is_a_path_and_a_query(target: str, request_: Request) -> None:
+    assert OPEN.judge(target, "localhost") == request_
+    assert CLOSED.judge(f"/secret{target}", "localhost") == request_
+
+
+@pytest.mark.parametrize(
+    ("origin", "is_taken"),
+    [
+        (None, True),
+        ("http://localhost:8707", True),
+        ("HTTP://LOCALHOST:8707", True),
+        ("http://localhost:80", False),
+        ("https://localhost:8707", False),
+        ("http://evil.example", False),
+        ("null", False),
+    ],
+)
+def test_what_another_sites_page_sends_is_refused(origin: str | None, is_taken: bool) -> None:
+    assert isinstance(OPEN.judge("/", "localhost:8707", origin), Request) == is_taken
 
 
 @given(st.text(max_size=40), st.text(max_size=20))
@@ -42,17 +73,18 @@ def test_without_the_token_nothing_is_shown(target: str, host: str) -> None:
 
 @given(st.text(max_size=60))
 def test_only_numbers_and_own_names_are_known(host: str) -> None:
-    if OPEN.judge("/", host) == ("", ""):
+    answer = OPEN.judge("/", host)
+    if answer == Request(""):
         name = host.lower().partition(":")[0] if not host.startswith("[") else host[1:].partition("]")[0]
         assert name == "localhost" or ipaddress.ip_address(name)
 
 
 def test_a_token_is_asked_for_wherever_others_reach_it() -> None:
-    assert Access.to("127.0.0.1").token == ""
-    assert Access.to("localhost").token == ""
-    assert Access.to("::1").token == ""
+    assert Access.to("127.0.0.1", "x").token == ""
+    assert Access.to("localhost", "x").token == ""
+    assert Access.to("::1", "x").token == ""
     for host in ("0.0.0.0", "::", "192.168.1.7", socket.gethostname() + ".example"):
-        assert len(Access.to(host).token) >= 22
+        assert len(Access.to(host, "x").token) >= 22
     assert not is_loopback("127.0.0.1.example")
 
 
@@ -90,21 +122,16 @@ def test_it_fits_a_terminal_of_80_columns() -> None:
     assert max(len(re.sub(r"\x1b\[[0-9;]*m", "", line)) for line in qr_text(ADDRESS).splitlines()) <= 80
 
 
-@given(st.text(max_size=40))
-def test_an_address_is_handed_on_without_its_token(target: str) -> None:
-    path, _, query = target.partition("?")
-    assert OPEN.judge(f"/{target}", "localhost") == (path, query)
-    assert CLOSED.judge(f"/secret/{target}", "localhost") == (path, query)
+class Echo(LocalServer):
+    command = "echo"
 
-
-class Echo(PageHandler):
-    def respond(self, path: str, query: str) -> None:
-        self.answer(200, TEXT, path.encode())
+    def answer(self, request: Request) -> Answer:
+        return Answer("text/plain", request.path.encode())
 
 
 @contextmanager
-def served(**limits: Any) -> Generator[PageServer]:
-    with PageServer("127.0.0.1", 0, Echo, **limits) as server:
+def served(**limits: Any) -> Generator[LocalServer]:
+    with Echo("127.0.0.1", 0, **limits) as server:
         thread = threading.Thread(target=lambda: server.serve_forever(0.01))
         thread.start()
         yield server
@@ -112,7 +139,7 @@ def served(**limits: Any) -> Generator[PageServer]:
         thread.join()
 
 
-def connect(server: PageServer) -> socket.socket:
+def connect(server: LocalServer) -> socket.socket:
     return socket.create_connection(("127.0.0.1", server.port), timeout=20)
 
 
@@ -224,11 +251,11 @@ def test_nobody_gives_way_who_is_being_answered_unless_he_is_slow() -> None:
 
 
 def test_a_viewer_who_takes_nothing_loses_the_place() -> None:
-    class Flood(PageHandler):
-        def respond(self, path: str, query: str) -> None:
-            self.answer(200, "image/raw", bytes(1 << 26))
+    class Flood(Echo):
+        def answer(self, request: Request) -> Answer:
+            return Answer("image/png", bytes(1 << 26))
 
-    with PageServer("127.0.0.1", 0, Flood, most=1, idle_s=0.05) as server:
+    with Flood("127.0.0.1", 0, most=1, idle_s=0.05) as server:
         thread = threading.Thread(target=lambda: server.serve_forever(0.01))
         thread.start()
         with connect(server) as link:

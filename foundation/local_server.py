@@ -1,12 +1,14 @@
-"""A web page that a command serves: who may look, how many at once, and how long a request may take.
+"""A page's own server on this machine: a few addresses, answered to anybody whom `Access` lets look.
 
-A command serves a few addresses, each answered by `PageHandler.respond`; nothing is changed by looking.
+It holds nothing open between two requests; any number of pages may look, and it may be ended at any time. A page's
+server is a subclass that answers requests (`LocalServer.answer`); all else is the same for each.
 
-Who may look is decided from a request's text alone. A page on this machine's loopback needs no token: who is logged in
-here may read the files anyway. Two things are still refused there: names that another site has made to point here (DNS
-rebinding, by which a web page could read what answers on loopback), and everything that is none of the addresses. For
-other machines the address itself holds a token, as its first part, so that the page's relative addresses carry it on
-and nothing has to be typed; a QR code (ISO/IEC 18004) in the terminal gives it to a phone.
+Who may look, and at what, is decided from a request's text alone. A page on this machine's loopback needs no token: who
+is logged in here may read the files anyway. Names that another site has made to point here are still refused there (DNS
+rebinding, by which a web page could read what answers on loopback), and so is what another site's page sends: browsers
+ask before a PUT, and say where the page is from. For other machines the address itself holds a token, as its first
+part, so that the page's relative addresses carry it on and nothing has to be typed; a QR code (ISO/IEC 18004) in the
+terminal gives it to a phone.
 
 Everybody can connect, with or without a token, so connections cost little and give way: a request's head must be there
 in `HEAD_S` from its first byte; and where there are as many connections as there may be, a new one takes the place of
@@ -24,36 +26,78 @@ import socket
 import sys
 import threading
 import time
+from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
-from typing import Any, Final, Literal
+from typing import Any, ClassVar, Literal
+from urllib.parse import parse_qs
 
-import numpy as np
+from foundation.errors import InputError
 
-TOKEN_BYTES: Final = 16
+TOKEN_BYTES = 16
 """Random bytes of a token: 128 bits cannot be guessed, and still make a QR code that a terminal has room for."""
 
-QUIET_MODULES: Final = 4
+
+QUIET_MODULES = 4
 """Light modules around a code, as ISO/IEC 18004 asks for."""
 
-MOST_CONNECTIONS: Final = 64
+
+MOST_CONNECTIONS = 64
 """Connections at once; a page holds one or two."""
 
-HEAD_S: Final = 5.0
+HEAD_S = 5.0
 """A request whose head is not whole so long after its first byte, or after the connection was made, is none."""
 
-IDLE_S: Final = 30.0
-"""A connection on which nothing is asked for so long is closed; a page that is hidden asks every ten seconds."""
+BODY_S = 30.0
+"""What is sent along must be there in this time behind the head."""
 
-ANSWER_S: Final = 2.0
+ANSWER_S = 2.0
 """A viewer who has not taken an answer in this time may lose the place to another, in seconds."""
 
-GZIP_FROM_BYTES: Final = 2048
+IDLE_S = 30.0
+"""A connection on which nothing is asked for so long is closed; a page that is hidden asks every ten seconds."""
+
+GZIP_FROM_BYTES = 2048
 """A smaller answer is one packet or two either way."""
 
-TEXT: Final = "text/plain; charset=utf-8"
+_TEXT = "text/plain; charset=utf-8"
+
+_PICTURES = frozenset({"image/jpeg", "image/png", "application/octet-stream"})
+"""Kinds of answers that gzip does not make smaller: pictures, and numbers with noise."""
+
+
+@dataclass(frozen=True)
+class Request:
+    """What is asked for.
+
+    - `path`: the address behind the server's own, without a slash before it; empty for the page.
+    - `query`: the first value of each name behind the question mark.
+    - `body`: what was sent along by a PUT; None where something is asked for.
+    """
+
+    path: str
+    query: Mapping[str, str] = field(default_factory=dict[str, str])
+    body: bytes | None = None
+
+
+@dataclass(frozen=True)
+class Refusal:
+    """Why a request is not answered: HTTP status and sentence."""
+
+    status: int
+    sentence: str
+
+
+@dataclass(frozen=True)
+class Answer:
+    """An answer: its media type, its bytes, and headers beside the usual ones; one without a type says nothing new."""
+
+    kind: str
+    body: bytes
+    headers: Mapping[str, str] = field(default_factory=dict[str, str])
 
 
 class Connections:
@@ -135,9 +179,9 @@ class _PatientLink(io.RawIOBase):
         del mode, size
         return io.BufferedReader(self)
 
-    def expect(self) -> None:
-        """Begin to wait for the next request."""
-        self._until = None
+    def expect(self, within_s: float | None = None) -> None:
+        """Begin to wait for the next request; or for what must be there in so many seconds."""
+        self._until = None if within_s is None else time.monotonic() + within_s
 
     def readable(self) -> bool:
         return True
@@ -157,11 +201,13 @@ class _PatientLink(io.RawIOBase):
         return count
 
 
-class PageServer(ThreadingHTTPServer):
-    """Serves one page on a host and port; not yet serving when it is made.
+class LocalServer(ABC, ThreadingHTTPServer):
+    """Serves one page; not yet serving when it is made. An InputError says why it cannot listen there."""
 
-    `most`, `head_s`, `idle_s`: as `MOST_CONNECTIONS`, `HEAD_S`, `IDLE_S`.
-    """
+    command: ClassVar[str]
+    """The command that serves, as messages name it."""
+    most_bytes: ClassVar[int] = 0
+    """Bytes of the largest body of a PUT that is taken; 0 takes none."""
 
     daemon_threads = True
     request_queue_size = MOST_CONNECTIONS
@@ -170,19 +216,46 @@ class PageServer(ThreadingHTTPServer):
         self,
         host: str,
         port: int,
-        handler: type[PageHandler],
         *,
         most: int = MOST_CONNECTIONS,
         head_s: float = HEAD_S,
         idle_s: float = IDLE_S,
     ) -> None:
-        self.access = Access.to(host)
+        self.access = Access.to(host, self.command)
+        self._host = host
         self.connections = Connections(most)
-        self.head_s = head_s
-        self.idle_s = idle_s
+        self._head_s = head_s
+        self._idle_s = idle_s
         if ":" in host:
             self.address_family = socket.AF_INET6
-        super().__init__((host, port), handler)
+        try:
+            super().__init__((host, port), _Handler)
+        except (OSError, OverflowError) as error:
+            reason = error.strerror if isinstance(error, OSError) and error.strerror else error
+            own = "" if is_loopback(host) else " or an address of this machine with --host"
+            raise InputError(f"cannot serve on {host} port {port}: {reason}; name another with --port{own}") from error
+
+    @abstractmethod
+    def answer(self, request: Request) -> Answer | Refusal:
+        """Return the answer to a request; called from any number of threads."""
+
+    def serve(self, shows: str, warning: str) -> None:
+        """Print the page's address and serve until interrupted.
+
+        `shows`: what the page shows. `warning`: what everybody who has the address can do, where others reach it.
+        """
+        with suppress(KeyboardInterrupt):
+            addresses = [f"http://{name}:{self.port}/{self.path}" for name in reachable_addresses(self._host)]
+            print(f"{' and '.join(addresses)} shows {shows}; Ctrl-C ends it", flush=True)
+            if not is_loopback(self._host):
+                print(
+                    f"warning: everybody who has this address and can reach this machine {warning}, and what is sent "
+                    "is not encrypted; use it in your own network only",
+                    file=sys.stderr,
+                )
+                if sys.stdout.isatty() and "utf" in sys.stdout.encoding.lower():
+                    print(qr_text(addresses[0]), flush=True)
+            self.serve_forever()
 
     @property
     def port(self) -> int:
@@ -210,48 +283,61 @@ class PageServer(ThreadingHTTPServer):
 
     def finish_request(self, request: Any, client_address: Any) -> None:
         """Answer what a connection asks, which has a deadline."""
-        super().finish_request(_PatientLink(request, self.head_s, self.idle_s), client_address)  # pyright: ignore[reportArgumentType]
+        super().finish_request(_PatientLink(request, self._head_s, self._idle_s), client_address)  # pyright: ignore[reportArgumentType]
 
     def handle_error(self, request: Any, client_address: Any) -> None:
         """Say nothing of viewers that went away: the terminal is the user's."""
 
 
-class PageHandler(BaseHTTPRequestHandler):
-    """Answers the requests of one connection; `respond` says what."""
-
-    server: PageServer  # pyright: ignore[reportIncompatibleVariableOverride]  # the handler's own server, by construction
+class _Handler(BaseHTTPRequestHandler):
+    server: LocalServer  # pyright: ignore[reportIncompatibleVariableOverride]  # the handler's own server, by construction
     protocol_version = "HTTP/1.1"
 
-    def respond(self, path: str, query: str) -> None:
-        """Answer, by `answer`, what is asked for by somebody who may look: `path` without slash and token."""
-        raise NotImplementedError
-
     def handle_one_request(self) -> None:
-        """Answer one request, and wait for the next."""
         super().handle_one_request()
         self.server.connections.mark(self.request.link, "idle")
         self.request.expect()
 
     def do_GET(self) -> None:  # the name is http.server's
-        """Answer whoever may look."""
         self.server.connections.mark(self.request.link, "answered")
         asked = self.server.access.judge(self.path, self.headers.get("Host"))
-        if isinstance(asked, Refusal):
-            self.answer(asked.status, TEXT, f"{asked.sentence}\n".encode())
-        else:
-            self.respond(*asked)
+        self._send(asked if isinstance(asked, Refusal) else self.server.answer(asked))
 
     do_HEAD = do_GET  # noqa: N815
+
+    def do_PUT(self) -> None:  # the name is http.server's
+        if not self.server.most_bytes:
+            self._refuse()
+            return
+        asked = self.server.access.judge(self.path, self.headers.get("Host"), self.headers.get("Origin"))
+        if isinstance(asked, Refusal):
+            self._send(asked, close=True)
+            return
+        length = self.headers.get("Content-Length", "")
+        if not (length.isascii() and length.isdigit() and 0 < int(length) <= self.server.most_bytes):
+            most = self.server.most_bytes >> 20
+            self._send(Refusal(413, f"expected up to {most} MiB, and their number in the head"), close=True)
+            return
+        self.request.expect(BODY_S)
+        body = self.rfile.read(int(length))
+        self.server.connections.mark(self.request.link, "answered")
+        self._send(self.server.answer(replace(asked, body=body)))
 
     def _refuse(self) -> None:
         # A body that comes along is not read: what follows on this connection would be taken for a request.
         more = {"Allow": "GET, HEAD", "Connection": "close"}
-        self.answer(405, TEXT, b"this server only shows; ask with GET\n", more)
+        self._answer(405, _TEXT, b"this server only shows; ask with GET\n", more)
 
-    do_POST = do_PUT = do_DELETE = do_PATCH = do_OPTIONS = _refuse  # noqa: N815
+    do_POST = do_DELETE = do_PATCH = do_OPTIONS = _refuse  # noqa: N815
 
-    def answer(self, status: int, kind: str, body: bytes, more: Mapping[str, str] | None = None) -> None:
-        """Send an answer of a media type, compressed where the viewer reads that; `more` are headers."""
+    def _send(self, answer: Answer | Refusal, close: bool = False) -> None:
+        if isinstance(answer, Refusal):
+            more = {"Connection": "close"} if close else {}
+            self._answer(answer.status, _TEXT, f"{answer.sentence}\n".encode(), more)
+        else:
+            self._answer(200 if answer.kind else 204, answer.kind, answer.body, answer.headers)
+
+    def _answer(self, status: int, kind: str, body: bytes, more: Mapping[str, str]) -> None:
         headers = {"Content-Type": kind} if kind else {}
         headers |= {
             "Cache-Control": "no-store",
@@ -259,14 +345,13 @@ class PageHandler(BaseHTTPRequestHandler):
             "Referrer-Policy": "no-referrer",
             "Cross-Origin-Resource-Policy": "same-origin",
         }
-        packed = kind.startswith("image/")
-        if not packed and len(body) >= GZIP_FROM_BYTES and "gzip" in self.headers.get("Accept-Encoding", ""):
+        if kind not in _PICTURES and len(body) >= GZIP_FROM_BYTES and "gzip" in self.headers.get("Accept-Encoding", ""):
             body = gzip.compress(body, 5, mtime=0)
             headers["Content-Encoding"] = "gzip"
         if status != 204:
             headers["Content-Length"] = str(len(body))
         self.send_response(status)
-        for name, value in {**headers, **(more or {})}.items():
+        for name, value in (headers | dict(more)).items():
             self.send_header(name, value)
         self.end_headers()
         if self.command != "HEAD":
@@ -274,63 +359,45 @@ class PageHandler(BaseHTTPRequestHandler):
 
     def version_string(self) -> str:
         """Return what the Server header says: no versions for strangers."""
-        return "croplab"
+        return self.server.command
 
     def log_message(self, format: str, *args: object) -> None:
         """Log nothing: the terminal is the user's."""
 
 
-def announce(server: PageServer, what: str) -> None:
-    """Print where a server shows `what`, such as a session; for other machines with a warning and as a QR code."""
-    host = str(server.server_address[0])
-    addresses = [f"http://{name}:{server.port}/{server.path}" for name in reachable_addresses(host)]
-    print(f"{' and '.join(addresses)} shows {what}; Ctrl-C ends it", flush=True)
-    if is_loopback(host):
-        return
-    print(
-        f"warning: everybody who has this address and can reach this machine can look at {what}, and what is sent is "
-        "not encrypted; use it in your own network only",
-        file=sys.stderr,
-    )
-    if sys.stdout.isatty() and "utf" in sys.stdout.encoding.lower():
-        print(qr_text(addresses[0]), flush=True)
-
-
-@dataclass(frozen=True)
-class Refusal:
-    """Why a request is not answered: HTTP status and sentence."""
-
-    status: int
-    sentence: str
-
-
 @dataclass(frozen=True)
 class Access:
-    """The rule of one server: the token that addresses must begin with, empty on loopback, and the names it goes by."""
+    """The rule of one server: the token that addresses must begin with, empty on loopback, and the names it goes by.
+
+    `command`: what printed the server's address, as messages name it.
+    """
 
     token: str
     names: frozenset[str]
+    command: str
 
     @classmethod
-    def to(cls, host: str) -> Access:
+    def to(cls, host: str, command: str) -> Access:
         """Return the rule of a server that listens on `host`, with a new token unless that is loopback."""
         own = socket.gethostname().lower()
         names = frozenset({"localhost", host.lower(), own, f"{own}.local"})
-        return cls("" if is_loopback(host) else secrets.token_urlsafe(TOKEN_BYTES), names)
+        return cls("" if is_loopback(host) else secrets.token_urlsafe(TOKEN_BYTES), names, command)
 
-    def judge(self, target: str, host: str | None) -> tuple[str, str] | Refusal:
-        """Return the path that a request asks for, without slash and token, and its query; or why it is refused.
+    def judge(self, target: str, host: str | None, origin: str | None = None) -> Request | Refusal:
+        """Return what a request asks for, or why it is refused.
 
-        `host`: the Host header; None if there is none.
+        `host`: the Host header; None if there is none. `origin`: the Origin header, where something is sent.
         """
         if not self._knows(host):
-            return Refusal(421, "this server does not go by that name; open the address that was printed")
+            return Refusal(421, f"this server does not go by that name; open the address that {self.command} printed")
+        if origin is not None and origin.lower() != f"http://{host}".lower():
+            return Refusal(403, "only this server's own page may send something; use the page")
         path, _, query = target.removeprefix("/").partition("?")
         if self.token:
             token, slash, path = path.partition("/")
             if not slash or not hmac.compare_digest(token.encode(), self.token.encode()):
-                return Refusal(403, "the address lacks its token; open the one that was printed, whole")
-        return path, query
+                return Refusal(403, f"the address lacks its token; open the one that {self.command} printed, whole")
+        return Request(path, {name: values[0] for name, values in parse_qs(query).items()})
 
     def _knows(self, host: str | None) -> bool:
         """Return whether a Host header (RFC 9110, 7.2) names this server: an address by number cannot be rebound."""
@@ -385,6 +452,7 @@ def reachable_addresses(host: str) -> tuple[str, ...]:
 def qr_text(text: str) -> str:
     """Return a QR code of `text` as lines of half blocks, dark on light on any terminal: two rows of modules a line."""
     import cv2
+    import numpy as np
 
     code = np.asarray(cv2.QRCodeEncoder.create().encode(text)) < 128
     rows, columns = np.flatnonzero(code.any(axis=1)), np.flatnonzero(code.any(axis=0))

@@ -1,0 +1,57 @@
+"""The live page's server: four addresses, answered from the journal; see `foundation.local_server`. It never writes."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+
+from acquisition.monitor.feed import SessionWatch, live_page, to_bytes
+from acquisition.monitor.view import read_session
+from experiment.session.journal import JOURNAL_FILE
+from foundation.errors import FormatError
+from foundation.local_server import Answer, LocalServer, Refusal, Request
+
+_FRAME = re.compile(r"frame/([1-9][0-9]{0,8})\.jpg")
+
+
+def open_monitor(folder: Path, port: int, host: str = "127.0.0.1") -> MonitorServer:
+    """Return a server for a session, not yet serving."""
+    if (folder / JOURNAL_FILE).exists():
+        read_session(folder)
+    elif folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        raise FormatError(
+            f"{folder} is no session: it holds no {JOURNAL_FILE}; name a folder made by acquire run or import, or one "
+            "that is not there yet"
+        )
+    return MonitorServer(SessionWatch(folder), host, port)
+
+
+class MonitorServer(LocalServer):
+    """Serves one session."""
+
+    command = "acquire monitor"
+
+    def __init__(self, watch: SessionWatch, host: str, port: int) -> None:
+        self.watch = watch
+        self.page = live_page(watch.folder.resolve().name)
+        super().__init__(host, port)
+
+    def answer(self, request: Request) -> Answer | Refusal:
+        """Return the page, the session's state since a cursor, the old summary, or the picture of an attempt."""
+        match request.path:
+            case "":
+                text, policy = self.page
+                return Answer("text/html; charset=utf-8", text.encode(), {"Content-Security-Policy": policy})
+            case "state.json":
+                state = self.watch.state(request.query.get("since", ""))
+                return Answer("", b"") if state is None else Answer("application/json", to_bytes(state))
+            case "status.json":
+                return Answer("application/json", json.dumps(self.watch.head().to_plain()).encode())
+            case path if found := _FRAME.fullmatch(path):
+                data = self.watch.picture(int(found[1]))
+                # The page names the version of a picture, so that one that is written anew has another address.
+                kept = {"Cache-Control": "private, max-age=86400"}
+                return Answer("image/jpeg", data, kept) if data else Refusal(404, "there is no picture of that frame")
+            case _:
+                return Refusal(404, "here are /, /state.json, /status.json and /frame/ATTEMPT.jpg")
