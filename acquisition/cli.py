@@ -347,10 +347,8 @@ def run(
 def _print_plan(settings: LabSettings, session: Path, retake: str | None, told: JsonOutput) -> None:
     from acquisition.run.plan import dry_run, plan_lines
 
-    if retake is not None:
-        raise InputError("a dry run voids nothing; leave --retake out")
     with orderly_end():
-        plan = dry_run(settings, session)
+        plan = dry_run(settings, session, retake)
     told.add(
         session=session,
         frames=plan.work.left,

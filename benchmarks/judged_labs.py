@@ -71,7 +71,9 @@ class Lab:
         if self.flicker:
             own = float(np.random.default_rng([7, key]).normal(1, self.flicker))
             situation = replace(situation, ambient=tuple(0.01 * own * share for share in (1.2, 1.0, 0.7)))
-        counts = self.world.expose(colour, self.settings.camera.exposure, key=(key,), situation=situation)
+        counts = self.world.expose(
+            gone_wrong.shown(moment), self.settings.camera.exposure, key=(key,), situation=situation
+        )
         return gone_wrong.counted(counts, moment)
 
     def show(self, counts: Counts, step: SessionStep, **writing: Any) -> Judgement:

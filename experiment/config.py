@@ -124,6 +124,9 @@ class SequenceSettings(Settings):
     lamp_if_unfinished: Literal["off", "on"] = "off"
     """What the lamp does when a run ends by itself before the session is complete: it goes out, for nobody may be
     there, or burns on, so that the next run needs no warm-up. After Ctrl-C it is left as it is."""
+    relight: bool = False
+    """Whether a projector that is in standby during a run, as after a power cut, is lit again; the run goes on when it
+    is warm. Not unless asked for: whoever switched it off may have had a reason."""
     refused_gb: Annotated[float, Field(gt=0)] = 5.0
     """Gigabytes that refused and voided frames of one run may take of the disk before it ends: two hundred frames of an
     18-megapixel body, a quarter of a session's; ``inf``: as many as there is space for."""

@@ -20,6 +20,7 @@ import errno
 import fcntl
 import logging
 import os
+import re
 import shutil
 import stat
 from collections.abc import Callable, Collection, Generator, Iterator, Mapping
@@ -35,6 +36,9 @@ MOST_JSON_BYTES: Final = 256 << 20
 
 MOST_LINE_BYTES: Final = 1 << 20
 """Longest line of a file that is read by lines: the longest of ours are some hundred bytes, names of files 4096."""
+
+FSTAB: Final = Path("/etc/fstab")
+MOUNTS: Final = Path("/proc/self/mounts")
 
 _MOST_NAME: Final = 4096
 """Longest name, as PATH_MAX of Linux has it."""
@@ -115,6 +119,28 @@ def _require_size(path: Path, most: int) -> None:
         raise FormatError(
             f"{path} has {found.st_size} bytes, at most {most} expected; it is not what it is called, or damaged"
         )
+
+
+def unmounted_at(path: Path, fstab: Path = FSTAB, mounts: Path = MOUNTS) -> Path | None:
+    """Return the folder at or above `path` where a disk of `fstab` is not mounted; None where each is, or none is told.
+
+    `fstab`, `mounts`: the table of disks and that of mounted ones (fstab(5), proc(5)).
+    """
+    try:
+        known, mounted = ({_place(line) for line in table.read_text().splitlines()} for table in (fstab, mounts))
+    except OSError:
+        return None
+    whole = path.absolute()
+    missing = [place for place in known - mounted if place is not None and whole.is_relative_to(place)]
+    return max(missing, key=lambda place: len(place.parts), default=None)
+
+
+def _place(line: str) -> Path | None:
+    """Return the second field of a line of such a table; None of a comment and of what is mounted nowhere."""
+    fields = line.split()
+    if len(fields) < 3 or fields[0].startswith("#") or not fields[1].startswith("/") or fields[1] == "/":
+        return None
+    return Path(re.sub(r"\\([0-7]{3})", lambda code: chr(int(code[1], 8)), fields[1]))
 
 
 def clear_folder(folder: Path, kept: Collection[str] = ()) -> None:

@@ -32,6 +32,14 @@ _SAME_FLOOR = 4e-4
 _NEAREST = 12
 """Lights of the plan that are compared in full with one that is not the one ordered."""
 
+_PRIMARIES = ("red", "green", "blue")
+
+_ASKED_LEAST = 0.005
+"""Light of a primary, of its full light, from which on it can be missed."""
+
+_GONE = 0.05
+"""Share of the ordered light of a primary below which it is missing: a leak of black is less."""
+
 _Array = npt.NDArray[np.float64]
 
 
@@ -137,6 +145,9 @@ class _SeenLight:
         fits_before = same < limits.LIGHT_SIGMAS and squared - same**2 > limits.STALE_ADVANTAGE
         if self.before is not None and changed and fits_before:
             return _stale_reason(self.before, self.codes), 0.0
+        missing = self._missing()
+        if missing:
+            return missing, 0.0
         remains, ambient = self._added_of(self.before), self._added_of(None)
         if wrong and remains is not None and (ambient is None or remains[1] + 9 < ambient[1]):
             elsewhere = ", or does light from elsewhere fall on the chart?" if self._coloured() else ""
@@ -176,16 +187,39 @@ class _SeenLight:
             return np.inf
         return same_light(self.light.amounts, self.before.amounts, self.model.chroma_sd)
 
-    def _wrong_reason(self) -> str:
-        parts = ", ".join(
-            f"{name} {100 * seen:.1f} % instead of {100 * wanted:.1f} %"
-            for name, seen, wanted in zip(
-                ("red", "green", "blue"), self.light.amounts, self.expected.amounts, strict=True
-            )
+    def _missing(self) -> str:
+        """Return the sentence that names primaries without light, where the others are as ordered; empty if none."""
+        seen, wanted = self.light.amounts, self.expected.amounts
+        sd = np.sqrt(
+            np.diag(self.expected.with_lamp + self.light.covariance) + (self.model.brightness_sd * wanted) ** 2
         )
+        asked = wanted > np.maximum(_ASKED_LEAST, limits.LIGHT_SIGMAS * sd)
+        gone = asked & (seen < _GONE * wanted)
+        if (
+            not gone.any()
+            or (np.abs(seen - wanted) > limits.LIGHT_SIGMAS * sd)[~gone].any()
+            or not (asked & ~gone).any()
+        ):
+            return ""
+        names = " and ".join(name for name, lost in zip(_PRIMARIES, gone, strict=True) if lost)
         return (
-            f"the light is not the one ordered, {_named(self.codes)}: {parts} of the primaries; look for what covers "
-            "the picture or changes its colours, a pop-up, a screen saver, a picture mode"
+            f"no {names} comes through, the rest is as ordered ({self._parts()} of the primaries); does the "
+            f"projector's {names} fail, its lamp, panel or filter, is the picture's cable damaged, or does a picture "
+            "mode leave it out?"
+        )
+
+    def _parts(self) -> str:
+        numbers = zip(_PRIMARIES, self.light.amounts, self.expected.amounts, strict=True)
+        return ", ".join(
+            f"{name} {100 * max(seen, 0.0):.1f} % instead of {100 * wanted:.1f} %" for name, seen, wanted in numbers
+        )
+
+    def _wrong_reason(self) -> str:
+        darker = bool((self.light.amounts < self.expected.amounts).all())
+        why = "its brightness or contrast was changed or power is saved, or " if darker else ""
+        return (
+            f"the light is not the one ordered, {_named(self.codes)}: {self._parts()} of the primaries; see whether "
+            f"{why}something covers the picture or changes its colours, a pop-up, a screen saver, a picture mode"
         )
 
     def _other(self, squared: float) -> str:
@@ -264,12 +298,12 @@ def _brightness_reason(brightness: float) -> str:
     percent = 100 * float(np.expm1(brightness))
     if percent < 0:
         return (
-            f"the light is {-percent:.1f} % weaker than expected, its colour is right; does the lamp fail, or did its "
-            "power mode, the shutter or the aperture change?"
+            f"the light is {-percent:.1f} % weaker than expected, its colour is right; does the lamp fail, did its "
+            "power mode, the picture's brightness, the shutter or the aperture change, or stands somebody in the light?"
         )
     return (
         f"the light is {percent:.1f} % stronger than expected, its colour is right; did the lamp's power mode, the "
-        "shutter or the aperture change, or does other light fall on the chart?"
+        "picture's brightness, the shutter or the aperture change, or does other light fall on the chart?"
     )
 
 
@@ -418,12 +452,17 @@ def _judge_rows(basis: Basis, light: FrameLight, frame: Measured, moved_px: _Arr
     # Rows of another place are brighter and darker by turns; a shadow or another light is one of both.
     signed = rest.signed[wrong]
     brighter = float((signed > 0).mean())
-    if uneven and min(brighter, 1 - brighter) < _BY_TURNS and not _is_ragged(rest, wrong):
+    ragged = _is_ragged(rest, wrong)
+    if uneven and min(brighter, 1 - brighter) < _BY_TURNS and not ragged:
         return checks
+    cause = "the file was damaged on its way: check the cable and the memory card"
+    if uneven and not ragged:
+        # What is drawn on the screen, too, is brighter here and darker there, and goes on from row to row.
+        cause = f"look at the picture: a screen saver or a window covers the projector's, or {cause}"
     rows = np.flatnonzero(wrong.reshape(-1, SEGMENTS).any(axis=1))
     reason = (
         f"{len(rows)} rows of blocks, from row {2 * int(rows[0])} of the frame to {2 * int(rows[-1]) + 1}, do not show "
-        "what belongs there; the file was damaged on its way: check the cable and the memory card"
+        f"what belongs there; {cause}"
     )
     return [Check("rows", float(count), None, float(limits.ROWS), "", reason)]
 
@@ -472,17 +511,18 @@ def _uneven_reason(rest: Residuals, off: npt.NDArray[np.bool_], late: float) -> 
         )
     if share > _BOTH_PARTS:
         return (
-            f"{share:.0%} of the frame are not what the primaries give together; did the picture change during the "
-            "exposure, or does other light fall on the chart?"
+            f"{share:.0%} of the frame are not what the primaries give together; does a screen saver or another "
+            "program draw on the screen, did the picture change during the exposure, or does other light fall there?"
         )
     if median < _DARKER:
         return (
             f"{amount} are {-median:.0%} darker than the light of the rest; does somebody or something stand before "
             "the chart or the projector, does a window cover the picture, or did only a part of the picture change?"
         )
+    passed = "did somebody walk past, " if median < 0 else ""
     return (
-        f"{amount} show another light than the rest, {median:+.0%} bright; did only a part of the picture change, does "
-        "a window cover it, or does other light fall there?"
+        f"{amount} show another light than the rest, {median:+.0%} bright; {passed}did only a part of the picture "
+        "change, does a window cover it or a screen saver draw on it, or does other light fall there?"
     )
 
 

@@ -7,7 +7,8 @@ Rules that hold inside:
 - A projector that reports a fault, shows no picture or does not answer is unhealthy: the run pauses, with the cause
   that holds now (`acquisition.run.retry`).
 - A projector that was out of reach for as long as a lamp takes to light may have lost its power meanwhile.
-- It is lit by the program once, before the first frame: whoever switched it off later may have had a reason.
+- It is lit by the program once, before the first frame: whoever switched it off later may have had a reason. With
+  `sequence.relight` it is lit again where it is in standby, once a pause: a lamp that does not light is not worn out.
 - Whatever ends the run, the screen goes black, and the lamp's fate is decided and said:
 
 ====================  =====================================  =========================================
@@ -69,7 +70,7 @@ def make_ready(projector: Projector, sequence: SequenceSettings, retry: RetryPol
     found_lit = _light(projector, retry)
     retry.attempt(lambda: _unmute(projector), _NAME)
     pause = retry.pause(_NAME)
-    went_out = _outlast(projector, retry, pause)
+    went_out = _outlast(projector, retry, pause, sequence.relight)
     pause.over()
     if not found_lit or went_out:
         _warm_up(projector, sequence, retry)
@@ -78,7 +79,7 @@ def make_ready(projector: Projector, sequence: SequenceSettings, retry: RetryPol
 def await_health(projector: Projector, sequence: SequenceSettings, retry: RetryPolicy) -> None:
     """Pause while the projector is unhealthy; return when it is healthy, and warm, again."""
     pause = retry.pause(_NAME)
-    if _outlast(projector, retry, pause):
+    if _outlast(projector, retry, pause, sequence.relight):
         _warm_up(projector, sequence, retry)
     pause.over()
 
@@ -157,14 +158,19 @@ class HealthWatch:
         return health_fault(self._projector, (question,))
 
 
-def _outlast(projector: Projector, retry: RetryPolicy, pause: Pause) -> bool:
-    """Wait until the projector is healthy; return whether its lamp went out meanwhile, or may have."""
+def _outlast(projector: Projector, retry: RetryPolicy, pause: Pause, relight: bool) -> bool:
+    """Wait until the projector is healthy, light it if asked to; return whether its lamp went out, or may have."""
     answered = retry.clock.monotonic()
     went_out = False
     while (fault := health_fault(projector)) is not None:
         if not isinstance(fault, LinkError):
             answered = retry.clock.monotonic()
             went_out = went_out or not _is_lit(projector)
+        if relight and _power(projector) is Power.STANDBY:
+            relight = False
+            with suppress(DeviceError):
+                projector.switch_on()
+                retry.report("relit", "the projector is in standby, as after a power cut; it is switched on again")
         pause.wait(fault)
     return went_out or retry.clock.monotonic() - answered >= RELIGHT_S
 
@@ -224,14 +230,15 @@ def _is_lit(projector: Projector) -> bool:
 
 def _warm_up(projector: Projector, sequence: SequenceSettings, retry: RetryPolicy) -> None:
     """Wait until the lamp has burned for its time without a break."""
-    while sequence.warm_up_s and not _burned(projector, sequence.warm_up_s, retry):
+    while sequence.warm_up_s and not _burned(projector, sequence, retry):
         pass
 
 
-def _burned(projector: Projector, warm_up_s: float, retry: RetryPolicy) -> bool:
+def _burned(projector: Projector, sequence: SequenceSettings, retry: RetryPolicy) -> bool:
     """Wait for a lamp that was just lit, its health being looked at; return False where it went out meanwhile."""
-    until = retry.clock.monotonic() + warm_up_s
-    retry.report("warming up", f"the lamp was just lit; waiting {duration_text(warm_up_s)} until its colour is steady")
+    until = retry.clock.monotonic() + sequence.warm_up_s
+    wait = duration_text(sequence.warm_up_s)
+    retry.report("warming up", f"the lamp was just lit; waiting {wait} until its colour is steady")
 
     def countdown() -> str:
         return f"the lamp warms up, {duration_text(max(until - retry.clock.monotonic(), 0))} left"
@@ -240,7 +247,7 @@ def _burned(projector: Projector, warm_up_s: float, retry: RetryPolicy) -> bool:
         retry.wait(min(left, PAUSE_S), "waiting", countdown)
         if health_fault(projector) is not None:
             pause = retry.pause(_NAME)
-            went_out = _outlast(projector, retry, pause)
+            went_out = _outlast(projector, retry, pause, sequence.relight)
             pause.over()
             if went_out:
                 return False

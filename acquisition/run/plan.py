@@ -93,12 +93,14 @@ def planned_steps(settings: LabSettings, lights: Sequence[Illumination]) -> tupl
     return plan_steps(lights, sequence.reference_every, seed=seed, response=RESPONSE if settings.judge.response else ())
 
 
-def outline(settings: LabSettings, folder: Path, session: Session | None) -> Work:
+def outline(settings: LabSettings, folder: Path, session: Session | None, retake: str | None = None) -> Work:
     """Return what a run has to do, new in `folder`, or with a session that it takes up.
 
-    Frames that were taken tell their times and sizes.
+    Frames that were taken tell their times and sizes. `retake`: what would be taken again (`Session.retake`).
     """
     if session is None:
+        if retake is not None:
+            raise nothing_to_retake(folder)
         chart, lights = load_chart(settings.chart), load_illuminations(settings.illuminations)
         steps, sha256 = planned_steps(settings, lights), file_sha256(settings.illuminations)
         return Work(folder, True, steps, frozenset(), order_of(steps, settings), chart, lights, sha256)
@@ -106,11 +108,12 @@ def outline(settings: LabSettings, folder: Path, session: Session | None) -> Wor
     taken = [frame.taken_at for frame in sorted(session.frames(), key=lambda frame: frame.attempt)]
     gaps = [(after - before).total_seconds() for before, after in pairwise(taken) if after >= before]
     sizes = [frame.size for frame in session.journal.accepted_files()]
+    again = {frame.step for frame in session.asked_again(retake).frames} if retake is not None else set[int]()
     return Work(
         folder,
         False,
         session.steps,
-        frozenset(session.done_steps() & {step.number for step in session.steps}),
+        frozenset(session.done_steps() & {step.number for step in session.steps} - again),
         order_of(session.steps, settings),
         session.chart,
         session.illuminations,
@@ -118,6 +121,11 @@ def outline(settings: LabSettings, folder: Path, session: Session | None) -> Wor
         max(sizes) if len(sizes) >= KNOWN_AFTER else None,
         statistics.median(gaps) if len(gaps) >= KNOWN_AFTER else None,
     )
+
+
+def nothing_to_retake(folder: Path) -> InputError:
+    """Return the error that says that a session is not there yet."""
+    return InputError("nothing was taken yet that could be taken again", about=folder, remedy="leave --retake out")
 
 
 def require_same(session: Session, settings: LabSettings) -> None:
@@ -602,11 +610,11 @@ def _turns(settings: LabSettings) -> str:
     return f" = {turns:.2f} {plural}, which are not whole"
 
 
-def dry_run(settings: LabSettings, folder: Path) -> RunPlan:
+def dry_run(settings: LabSettings, folder: Path, retake: str | None = None) -> RunPlan:
     """Return the plan of the run that `settings` and `folder` would begin; devices that cannot be opened are faults."""
     with ExitStack() as opened:
         session = opened.enter_context(Session.open(folder)) if session_exists(folder) else None
-        work = outline(settings, folder, session)
+        work = outline(settings, folder, session, retake)
         try:
             devices = opened.enter_context(open_rig(settings, work.chart, session))
         except CropError as fault:

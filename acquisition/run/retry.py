@@ -76,7 +76,10 @@ class Report(Protocol):
     """Where words and sentences of a run go: terminal first, then journal, then whoever is notified."""
 
     def __call__(self, what: str, sentence: str, /) -> None:
-        """Tell what happens (``retry``, ``paused``, ``still paused``, ``resumed``, ``warming up``), with its cause."""
+        """Tell what happens, with its cause.
+
+        ``retry``, ``paused``, ``still paused``, ``resumed``, ``relit`` or ``warming up``.
+        """
         ...
 
 

@@ -23,7 +23,7 @@ from acquisition.run.gaps import GapWatch
 from acquisition.run.life import Life
 from acquisition.run.notices import Notices, PauseNotices
 from acquisition.run.pipeline import Job, Pipeline, Saver, Taken
-from acquisition.run.plan import planned_steps, require_plan, require_same
+from acquisition.run.plan import nothing_to_retake, planned_steps, require_plan, require_same
 from acquisition.run.queue import StepQueue, link_runs, unclosed_kinds, white_first
 from acquisition.run.retry import TRY_S, RetryPolicy
 from acquisition.run.rig.opening import open_rig
@@ -63,9 +63,7 @@ def run_session(
     with ExitStack() as at_last, ExitStack() as opened:
         session = opened.enter_context(_taken_up(settings, folder, announce)) if session_exists(folder) else None
         if session is None and retake is not None:
-            raise InputError(
-                "nothing was taken yet that could be taken again", about=folder, remedy="leave --retake out"
-            )
+            raise nothing_to_retake(folder)
         if session is not None:
             if retake is not None:
                 session.retake(retake)

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import csv
 import io
+import os
 import sqlite3
 import sys
 from collections.abc import Callable, Mapping, Sequence
@@ -39,7 +40,7 @@ from experiment.session.repair import (
     require_frames_folder,
     unsound_files,
 )
-from foundation.errors import DeviceError, FormatError, InputError
+from foundation.errors import DeviceError, FormatError, InputError, StorageError
 from foundation.files import (
     is_partial,
     read_text,
@@ -51,10 +52,26 @@ from foundation.files import (
     whole_folder,
     write_whole,
 )
-from foundation.folders import held_folder, require_plain_folder
+from foundation.folders import held_folder, require_plain_folder, unmounted_at
 
 FRAME_COLUMNS = ("kind", "illumination", "file", "sha256", "taken_at", "exposure_s", "verdict")
 """Columns of `frames.csv` (docs/formats.md)."""
+
+
+@dataclass(frozen=True)
+class Retake:
+    """What is to be taken again.
+
+    - `lights`: their numbers.
+    - `frames`: accepted frames that will be voided.
+    - `reason`: why, for the journal; empty where they have been.
+    - `text`: the lights as a record of the journal; empty where a report names the frames.
+    """
+
+    lights: tuple[int, ...]
+    frames: tuple[AcceptedFile, ...]
+    reason: str
+    text: str = ""
 
 
 class Session:
@@ -221,12 +238,14 @@ class Session:
             self.journal.void([attempt], at or datetime.now(UTC), reason)
         return tuple(unsound.values())
 
-    def retake(self, selection: str, at: datetime | None = None) -> tuple[int, ...]:
-        """Void accepted frames so that they are taken again; return the lights that this is about.
+    def asked_again(self, selection: str) -> Retake:
+        """Return what a selection such as "12,40-44" or "bad" would take again; nothing is written.
 
-        `at`: when this happens, for the journal; now by the machine's clock if None.
+        Raises
+        ------
+        InputError
+            It names no light of the session, or "bad" and no report names a frame.
         """
-        at = at or datetime.now(UTC)
         accepted = self.journal.accepted_files()
         known = range(len(self.illuminations))
         if selection.strip() == BAD:
@@ -236,17 +255,28 @@ class Session:
                     f"--retake bad: {refused.report}, the newest report on {self.folder}, names no frame to be taken "
                     "again; leave --retake out, or name the lights, as in --retake 12,40-44"
                 )
-            chosen = [frame.attempt for frame in accepted if frame.sha256 in refused.sha256]
-            self.journal.void(chosen, at, f"refused by build-lut, as {refused.report} says")
-            return parse_lights(refused.lights, known) if refused.lights else ()
+            chosen = tuple(frame for frame in accepted if frame.sha256 in refused.sha256)
+            lights = parse_lights(refused.lights, known) if refused.lights else ()
+            return Retake(lights, chosen, f"refused by build-lut, as {refused.report} says")
         lights = parse_lights(selection, known)
-        chosen = [frame.attempt for frame in accepted if frame.illumination in lights]
-        done = {frame.illumination for frame in accepted}
         asked = lights_text(lights)
-        if self.journal.records().get("retake") != asked or done.issuperset(lights):
-            self.journal.record("retake", asked)
-            self.journal.void(chosen, at, f"to be taken again, as asked for with --retake {asked}")
-        return lights
+        done = {frame.illumination for frame in accepted}
+        if self.journal.records().get("retake") == asked and not done.issuperset(lights):
+            # It was asked for before, and is not done yet.
+            return Retake(lights, (), "", asked)
+        chosen = tuple(frame for frame in accepted if frame.illumination in lights)
+        return Retake(lights, chosen, f"to be taken again, as asked for with --retake {asked}", asked)
+
+    def retake(self, selection: str, at: datetime | None = None) -> tuple[int, ...]:
+        """Void accepted frames so that they are taken again; return the lights that this is about.
+
+        `at`: when this happens, for the journal; now by the machine's clock if None.
+        """
+        asked = self.asked_again(selection)
+        if asked.text and asked.reason:
+            self.journal.record("retake", asked.text)
+        self.journal.void([frame.attempt for frame in asked.frames], at or datetime.now(UTC), asked.reason)
+        return asked.lights
 
     def done_steps(self) -> set[int]:
         """Return the numbers of the steps whose frame was taken, accepted, and is still there in full size."""
@@ -375,6 +405,7 @@ def session_exists(folder: Path) -> bool:
         return True
     if _is_file(folder / "session.toml") and (folder / "frames").is_dir():
         raise FormatError(_without_journal(folder))
+    _require_mounted(folder)
     require_free(folder, "the session")
     return False
 
@@ -390,10 +421,26 @@ def journal_path(folder: Path) -> Path:
     if not _is_file(path):
         if _is_file(ledger_path(folder)) or (_is_file(folder / "session.toml") and (folder / "frames").is_dir()):
             raise FormatError(_without_journal(folder))
+        _require_mounted(folder)
         raise FormatError(
             f"{folder} is no session: it holds no {JOURNAL_FILE}; name a folder made by acquire run or import"
         )
     return path
+
+
+def _require_mounted(folder: Path) -> None:
+    """Refuse a place that is not on the disk that it should be on."""
+    if place := unmounted_at(folder):
+        raise StorageError(
+            f"nothing is mounted at {place}, where /etc/fstab has a disk, so that {folder} is not the folder on it",
+            remedy="mount it, or name a folder on another disk",
+        )
+    if os.path.isdir(folder / "frames"):  # noqa: PTH112 - a disk that cannot be asked is told by what comes next
+        raise FormatError(
+            f"{folder} is no session, and has frames/: a part of one, or what was left below the place where a disk is "
+            f"mounted; see that the disk of the session is mounted, or name another folder; keep what is there until "
+            "it is known what it is",
+        )
 
 
 def _without_journal(folder: Path) -> str:

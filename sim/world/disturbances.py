@@ -26,6 +26,7 @@ from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
 from pydantic_core import ErrorDetails
 
 from drivers.presenter import BLACK, Colour
+from foundation.colorimetry import decode_srgb
 from foundation.errors import ConfigurationError
 
 Place = tuple[float, float, float, float]
@@ -241,6 +242,11 @@ _QUARTER: Final[Place] = (0.5, 0.35, 1.1, 1.4)
 
 _SPOT: Final[Place] = (0.1, -0.2, 0.9, 0.8)
 """Most of the upper half of the page: what a matt surface mirrors of a lamp is broad."""
+
+_PRIMARIES: Final = ("red", "green", "blue")
+
+_PATCH: Final = 6.0
+"""Standard deviation of a screen saver's patches, sixtieths of the picture's height."""
 
 _SLANTED_DEG: Final = 30.0
 """Direction of a push, clockwise from the right: along neither axis."""
@@ -524,9 +530,41 @@ class Reflection(Disturbance):
         return replace(situation, glares=(*situation.glares, Glare(self.place, self.percent / 100)))
 
 
+@dataclass(frozen=True)
+class DeadPrimary(Disturbance):
+    """The projector gives none of a primary's light: an LED, a panel or a wire of the cable has failed."""
+
+    what: Literal["dead primary"] = "dead primary"
+    primary: Literal["red", "green", "blue"] = "red"
+
+    def shown(self, colour: Colour, moment: Moment) -> Colour:
+        """Return the colour without it."""
+        return Colour(**{name: 0 if name == self.primary else getattr(colour, name) for name in _PRIMARIES})
+
+
+@dataclass(frozen=True)
+class ScreenSaver(Disturbance):
+    """Another picture of soft patches is drawn over the projector's; `share`: of its light, the rest is as ordered."""
+
+    what: Literal["screen saver"] = "screen saver"
+    share: float = 1.0
+    seed: int = 1
+
+    def changed(self, situation: Situation, moment: Moment) -> Situation:
+        """Draw it."""
+        from scipy.ndimage import gaussian_filter
+
+        noise = np.random.default_rng(self.seed).random((60, 96, 3))
+        soft = gaussian_filter(noise, (_PATCH, _PATCH, 0))
+        drawn = (soft - soft.min()) / np.ptp(soft)
+        ordered = decode_srgb(np.array(moment.colour.codes) / 255)
+        mixed = self.share * drawn + (1 - self.share) * ordered
+        return replace(situation, picture=mixed.astype(np.float32))
+
+
 AnyDisturbance = (
     FrozenScreen | PopUp | HalfChanged | Bump | LampStep | LampDrift | AmbientStep | Defocus | Person | SensorWarming
-    | StaleFile | ZeroedStrip | ScrambledRows | Reflection
+    | StaleFile | ZeroedStrip | ScrambledRows | Reflection | DeadPrimary | ScreenSaver
 )  # fmt: skip
 """Every event, by its `what`."""
 

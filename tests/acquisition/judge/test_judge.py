@@ -17,12 +17,14 @@ from experiment.session.records import Check, Judgement, SessionStep, link_steps
 from sim.world.disturbances import (
     AmbientStep,
     Bump,
+    DeadPrimary,
     Defocus,
     HalfChanged,
     LampStep,
     Person,
     PopUp,
     ScrambledRows,
+    ScreenSaver,
     Situation,
     ZeroedStrip,
 )
@@ -158,6 +160,39 @@ def test_a_covered_part_is_told_and_where(taught: Bench) -> None:
     hand = lab.take(lab.light(*DEEP_BLUE), Person(place=(0.7, 0.6, 0.82, 0.78), left=0.3))
     assert cause(hand) == "uniformity"
     assert "bottom right" in hand.reason
+
+
+def test_who_walks_past_is_no_chart_that_moved(taught: Bench) -> None:
+    passing = taught.fork().take(WHITE_STEP, Person(place=(0.2, -0.2, 0.55, 1.2), left=0.9))
+    assert cause(passing) == "uniformity"
+    assert "walk past" in passing.reason
+    # Nor does a chart that moved, or lost its focus, become somebody who passes.
+    assert cause(taught.fork().take(WHITE_STEP, Bump(px=0.4))) == "movement"
+    assert cause(taught.fork().take(WHITE_STEP, Defocus(px=0.5))) == "blur"
+
+
+@pytest.mark.parametrize("share", [1.0, 0.3])
+@pytest.mark.parametrize("codes", [ORANGE, DEEP_BLUE])
+def test_a_screen_saver_is_named(taught: Bench, codes: tuple[int, int, int], share: float) -> None:
+    lab = taught.fork()
+    drawn = lab.take(lab.light(*codes), ScreenSaver(share=share))
+    assert cause(drawn) == "uniformity"
+    assert "screen saver" in drawn.reason
+    assert "cable" not in drawn.reason
+
+
+@pytest.mark.parametrize("codes", [ORANGE, (255, 255, 255), (40, 180, 220)])
+def test_a_primary_without_light_is_named(taught: Bench, codes: tuple[int, int, int]) -> None:
+    lab = taught.fork()
+    judgement = lab.take(lab.light(*codes), DeadPrimary())
+    assert cause(judgement) == "light"
+    assert "no red comes through" in judgement.reason
+    # One that was dimmed, or another light that lacks red, is not called dead.
+    for other in ((codes[0] // 2, *codes[1:]), (0, codes[1], codes[2] // 2)):
+        lab = taught.fork()
+        seen = lab.show(lab.counts(lab.light(*other)), lab.light(*codes))
+        assert not seen.accepted
+        assert "comes through" not in seen.reason
 
 
 @pytest.mark.parametrize("part", [HalfChanged(), HalfChanged(place=(-9, -9, 0.2, 0.2)), HalfChanged(share=0.3)])

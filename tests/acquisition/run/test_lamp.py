@@ -320,6 +320,36 @@ def test_a_picture_muted_while_the_lamp_warms_up_costs_no_minutes() -> None:
     assert room.clock.monotonic() <= 600 + room.device.traits.warm_up_s + 2 * PAUSE_S
 
 
+def test_a_projector_without_power_is_lit_again_if_asked_to() -> None:
+    room = Room()
+    switched: list[float] = []
+
+    def power_back() -> None:
+        room.device = SimulatedProjector(room.clock)
+        lit = room.device.switch_on
+        room.device.switch_on = lambda: (switched.append(room.clock.monotonic()), lit())  # pyright: ignore
+        room.pull(False)
+
+    room.at(0, room.pull)
+    room.at(60, power_back)
+    room.clock.sleep(0)
+    await_health(room.projector, SEQUENCE.model_copy(update={"relight": True}), room.retry)
+    assert len(switched) == 1
+    assert room.words == ["retry", "paused", "relit", "still paused", "still paused", "warming up", "resumed"]
+    assert room.device.power() is Power.ON
+    assert room.clock.monotonic() >= switched[0] + SEQUENCE.warm_up_s
+
+
+def test_a_lamp_that_does_not_light_is_not_switched_on_again_and_again() -> None:
+    room = Room()
+    tries: list[float] = []
+    room.device.switch_off()
+    room.device.switch_on = lambda: tries.append(room.clock.monotonic())  # pyright: ignore
+    with pytest.raises(DeviceFault, match="standby"):
+        await_health(room.projector, SEQUENCE.model_copy(update={"relight": True}), room.retry)
+    assert len(tries) == 1
+
+
 def test_a_projector_that_came_back_in_standby_is_said_to_be_so() -> None:
     room = Room()
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 from dataclasses import replace
 from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -14,9 +15,10 @@ from drivers.camera import CapturedFrame
 from drivers.presenter import Colour
 from experiment.chart.layout import design_chart
 from experiment.lights import Illumination, save_illuminations
-from experiment.session.folder import Session, session_exists
+from experiment.session.folder import Session, journal_path, session_exists
 from experiment.session.records import Judgement, plan_steps
 from foundation.errors import FormatError, InputError, StorageError
+from foundation.folders import unmounted_at
 
 LIGHTS = tuple(Illumination(number, "uniform", None, Colour(255, number, 0)) for number in range(5))
 NOW = datetime(2026, 1, 1, 9, 30, tzinfo=UTC)
@@ -132,6 +134,34 @@ def test_a_disk_that_fails_is_no_traceback(session: Session, call: str, monkeypa
         with pytest.raises(StorageError, match="frames: Input/output error"):
             session.set_aside_strays()
     assert len(session.set_aside_strays()) == 1, "when the disk is back the same goes through"
+
+
+def test_what_was_left_below_a_mount_point_is_no_session(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Frames without a journal and without settings, and an empty place where a disk should be."""
+    folder = tmp_path / "night"
+    (folder / "frames").mkdir(parents=True)
+    for look in (session_exists, journal_path):
+        with pytest.raises(FormatError, match="mounted") as told:
+            look(folder)
+        assert "remove" not in str(told.value)
+    (folder / "frames").rmdir()
+    assert not session_exists(folder)
+    tables = tmp_path / "fstab", tmp_path / "mounts"
+    disks = ("# <disk>", "UUID=1 / ext4 defaults 0 1", f"UUID=2 {tmp_path} ext4 noauto 0 0", "UUID=3 none swap sw 0 0")
+    tables[0].write_text("\n".join(disks))
+    tables[1].write_text("/dev/sda1 / ext4 rw 0 0\n")
+    assert unmounted_at(folder, *tables) == tmp_path
+    monkeypatch.setattr(
+        "experiment.session.folder.unmounted_at", partial(unmounted_at, fstab=tables[0], mounts=tables[1])
+    )
+    for look in (session_exists, journal_path):
+        with pytest.raises(StorageError, match="nothing is mounted"):
+            look(folder)
+    tables[1].write_text(f"/dev/sda1 / ext4 rw 0 0\n/dev/sdb1 {tmp_path} ext4 rw 0 0\n")
+    assert unmounted_at(folder, *tables) is None
+    assert unmounted_at(folder, tmp_path / "none", tables[1]) is None
+    tables[0].write_text(f"UUID=2 {tmp_path}/two\\040words ext4 rw 0 0\n")
+    assert unmounted_at(tmp_path / "two words" / "night", *tables) == tmp_path / "two words"
 
 
 def test_a_journal_that_cannot_be_looked_for_is_not_missing(session: Session, monkeypatch: pytest.MonkeyPatch) -> None:
