@@ -34,6 +34,7 @@ import numpy.typing as npt
 
 from drivers.camera import ExposureSettings
 from drivers.raw.rawfile import Mosaic, read_raw
+from drivers.raw.wholeness import filled_fault
 from experiment.chart.model import Chart
 from experiment.config import LabSettings, LimitSettings
 from experiment.framing.field import FoundField
@@ -678,12 +679,21 @@ def refusal(exposure: Exposure, kind: FrameKind, limits: LimitSettings) -> str |
     return None
 
 
-def judge_file(path: Path, kind: FrameKind, settings: LabSettings) -> str | None:
-    """Decode a raw file and return why it cannot be used, or None when it can."""
+def whole_frame(path: Path) -> Mosaic | str:
+    """Return the frame of a raw file, or why there is none, or none that is whole."""
     try:
         mosaic = read_raw(path)
     except FormatError as error:
         return str(error)
+    fault = filled_fault(mosaic.counts, mosaic.black)
+    return mosaic if fault is None else f"{path}: {fault}"
+
+
+def judge_file(path: Path, kind: FrameKind, settings: LabSettings) -> str | None:
+    """Decode a raw file and return why it cannot be used, or None when it can."""
+    mosaic = whole_frame(path)
+    if isinstance(mosaic, str):
+        return mosaic
     # What was asked for is not known of frames taken by other means.
     differs = None if settings.rig == "imported" else disagreement(mosaic, settings.camera.exposure)
     return differs or refusal(measure_exposure(mosaic), kind, settings.limits)

@@ -14,7 +14,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import BinaryIO
 
-from acquisition.judge.measure import judge_file
+from acquisition.judge.measure import judge_file, whole_frame
 from drivers.camera import CapturedFrame
 from drivers.presenter import BLACK, WHITE
 from experiment.chart.model import load_chart
@@ -165,9 +165,12 @@ def _take_over(
 
     attempt = session.journal.begin(step, f"frames/{step.stem}", frame.taken_at)
     received = session.receive(step.stem, copy)
-    if frame.verdict:
-        listed = frame.verdict.removeprefix(REFUSED).removeprefix(":").strip() or "for no reason that is listed"
-        reason = None if frame.verdict == ACCEPTED else listed
+    if frame.verdict == ACCEPTED:
+        # Whoever judged it may not have seen that its file is damaged, or saw it before it was.
+        found = whole_frame(received.path)
+        reason = found if isinstance(found, str) else None
+    elif frame.verdict:
+        reason = frame.verdict.removeprefix(REFUSED).removeprefix(":").strip() or "for no reason that is listed"
     else:
         reason = judge_file(received.path, frame.kind, settings)
     session.commit(

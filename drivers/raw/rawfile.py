@@ -33,6 +33,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.raw.cr3 import Cr3, Cr3Damaged, is_cr3, read_cr3
+from drivers.raw.lossless_jpeg import lossless_fault
 from drivers.raw.plain_dng import (
     BAYER_PATTERNS,
     Area,
@@ -43,7 +44,7 @@ from drivers.raw.plain_dng import (
     stated_areas,
     stated_black,
 )
-from drivers.raw.wholeness import extents_fault, size_fault
+from drivers.raw.wholeness import extents_fault, is_deflated, size_fault
 from drivers.tiff import CFA, Directory, Tags, TiffDamaged, TiffTag, ValueType, head, is_tiff, read_directories, text
 from foundation.errors import FormatError
 from foundation.files import read_whole
@@ -484,7 +485,14 @@ def _check_structure(path: Path, data: bytes | memoryview) -> list[Directory]:
         raise _unreadable(path, str(error)) from error
     pixels = raw_pixels(directories)
     if pixels is not None:
+        if is_deflated(pixels):
+            raise FormatError(
+                f"{path} cannot be read: its pixels are compressed by Deflate, which is not supported; convert it to a "
+                "DNG of lossless JPEG, as Adobe's DNG Converter and dnglab make it, or name the camera's own file"
+            )
         fault = extents_fault(data, pixels, dng=any(one.integers(TiffTag.DNG_VERSION) for one in directories))
+        for offset, size in pixels.extents():
+            fault = fault or lossless_fault(data[offset : offset + size])
         if fault is not None:
             raise _unreadable(path, fault)
     return directories

@@ -40,8 +40,6 @@ def extents_fault(data: bytes | memoryview, pixels: Directory, *, dng: bool) -> 
 
     `data`: the file's bytes; `dng`: whether what it states of compression and bits is what the standard means by it.
     """
-    if any(number in _DEFLATE for number in pixels.integers(TiffTag.COMPRESSION)):
-        return "its pixels are compressed by Deflate, which is not supported; convert it to a DNG of lossless JPEG"
     for places, sizes in (
         (TiffTag.STRIP_OFFSETS, TiffTag.STRIP_BYTE_COUNTS),
         (TiffTag.TILE_OFFSETS, TiffTag.TILE_BYTE_COUNTS),
@@ -61,6 +59,11 @@ def extents_fault(data: bytes | memoryview, pixels: Directory, *, dng: bool) -> 
     plain = dng and pixels.integers(TiffTag.COMPRESSION) == (_UNCOMPRESSED,)
     least = max(bits, default=0) if plain else _LEAST_BITS
     return _too_few(sum(size for _, size in extents), photosites, least) if extents else None
+
+
+def is_deflated(pixels: Directory) -> bool:
+    """Return whether raw pixels are compressed by Deflate, as DNG of floating point are."""
+    return any(number in _DEFLATE for number in pixels.integers(TiffTag.COMPRESSION))
 
 
 def size_fault(data: bytes | memoryview, directories: Sequence[Directory], photosites: int) -> str | None:

@@ -7,6 +7,7 @@ import shutil
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from acquisition.cli import main
@@ -16,6 +17,7 @@ from experiment.chart.layout import design_chart
 from experiment.lights import Illumination, save_illuminations
 from experiment.session.folder import FRAME_COLUMNS, Session
 from foundation.errors import FormatError
+from tests.drivers.raw.raw_files import write_dng
 from tests.json_of import json_of
 
 LIGHTS = tuple(Illumination(number, "uniform", None, Colour(255, number, 0)) for number in range(3))
@@ -24,11 +26,12 @@ Row = Mapping[str, object]
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """Return a folder with a chart, lights, and a raw file for each; their content does not matter, it is judged."""
+    """Return a folder with a chart, lights, and a raw file for each."""
     design_chart(bits=1).save(tmp_path / "chart.json")
     save_illuminations(LIGHTS, tmp_path / "illuminations.csv")
     for light in LIGHTS:
-        (tmp_path / f"{light.index}.cr2").write_bytes(b"raw of light %d" % light.index)
+        counts = np.random.default_rng(light.index).integers(100, 3000, (32, 32)).astype(np.uint16)
+        write_dng(tmp_path / f"{light.index}.cr2", counts)
     return tmp_path
 
 
@@ -55,6 +58,15 @@ def test_listed_frames_make_a_session(folder: Path) -> None:
     with Session.open(folder / "session") as session:
         assert [frame.accepted for frame in session.frames()] == [True, False, True, True, True]
         assert [frame.verdict for frame in session.frames()][1] == "refused: a hand"
+
+
+def test_a_damaged_file_is_refused_whatever_the_list_says_of_it(folder: Path) -> None:
+    write_dng(folder / "1.cr2", np.where(np.arange(1024).reshape(32, 32) > 800, 0, 900).astype(np.uint16))
+    (folder / "2.cr2").write_bytes(b"II*\0")
+    filled, cut = import_rows(folder, [light(0), light(1), light(2)]).refused
+    assert "1.cr2: " in filled
+    assert "half of its black level" in filled
+    assert "2.cr2: " in cut
 
 
 def test_two_lights_of_one_file_leave_nothing(folder: Path) -> None:

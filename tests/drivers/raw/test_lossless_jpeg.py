@@ -1,0 +1,129 @@
+"""Damage inside a lossless JPEG is seen, which LibRaw decodes over; whole streams of two encoders are none."""
+
+from __future__ import annotations
+
+import re
+import struct
+from collections.abc import Callable
+from pathlib import Path
+
+import imagecodecs
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from drivers.raw.lossless_jpeg import lossless_fault
+from drivers.raw.rawfile import read_raw
+from foundation.errors import FormatError
+from tests.drivers.raw.raw_files import longs, lossless_jpeg, shorts, write_cr2, write_dng
+
+Counts = NDArray[np.uint16]
+NOISE: Counts = (2048 + np.random.default_rng(3).poisson(900, (64, 96))).astype(np.uint16)
+RAMP: Counts = (1000 + 20 * np.arange(64)[:, None] + np.random.default_rng(4).integers(0, 9, (64, 96))).astype(
+    np.uint16
+)
+FLAT: Counts = np.full((64, 96), 2048, np.uint16)
+
+
+def by_imagecodecs(counts: Counts) -> bytes:
+    """Return counts as another encoder writes them: one component, Huffman codes of the picture's own."""
+    return bytes(imagecodecs.ljpeg_encode(counts, bitspersample=14))
+
+
+@pytest.mark.parametrize("encode", [lossless_jpeg, by_imagecodecs])
+@pytest.mark.parametrize("counts", [NOISE, RAMP, FLAT], ids=["noise", "ramp", "flat"])
+def test_whole_streams_are_whole(counts: Counts, encode: Callable[[Counts], bytes]) -> None:
+    stream = encode(counts)
+    assert lossless_fault(stream) is None
+    # Whole words, or a sector, behind the last sample.
+    for padding in (bytes(3), b"\xff\xd9" + bytes(500)):
+        assert lossless_fault(stream[:-2] + padding) is None
+
+
+@pytest.mark.parametrize("encode", [lossless_jpeg, by_imagecodecs])
+@pytest.mark.parametrize("counts", [NOISE, RAMP], ids=["noise", "ramp"])
+def test_zeroed_bytes_are_seen_wherever_they_are(counts: Counts, encode: Callable[[Counts], bytes]) -> None:
+    stream = encode(counts)
+    begin = stream.index(b"\xff\xda") + 14
+    missed = [
+        at
+        for at in range(begin, len(stream) - 70, 41)
+        if lossless_fault(stream[:at] + bytes(64) + stream[at + 64 :]) is None
+    ]
+    assert not missed
+
+
+@pytest.mark.parametrize("cut", [1, 3, 50, 3000])
+def test_a_stream_that_ends_early_is_seen(cut: int) -> None:
+    stream = lossless_jpeg(NOISE)
+    assert re.search("ends before|no code", lossless_fault(stream[: -2 - cut]) or "")
+
+
+def test_bytes_that_are_too_many_are_seen() -> None:
+    stream = lossless_jpeg(NOISE)
+    assert "goes on" in (lossless_fault(stream[:-2] + stream[-200:]) or "")
+
+
+@given(st.integers(0, 400), st.binary(max_size=6))
+def test_whatever_the_header_says_is_no_traceback(at: int, words: bytes) -> None:
+    stream = lossless_jpeg(NOISE[:4])
+    lossless_fault(stream[:at] + words + stream[at + len(words) :])
+    lossless_fault(stream[:at])
+
+
+def test_other_jpegs_are_not_looked_at() -> None:
+    assert lossless_fault(b"") is None
+    assert lossless_fault(bytes(imagecodecs.jpeg8_encode(np.zeros((8, 8), np.uint8)))) is None
+    # Restart intervals are no maker's.
+    stream = lossless_jpeg(NOISE)
+    restart = b"\xff\xdd\0\x04\0\x08"
+    assert lossless_fault(stream[:2] + restart + stream[2:]) is None
+
+
+@pytest.mark.parametrize("predictor", range(1, 8))
+def test_samples_are_predicted_as_the_standard_says(predictor: int) -> None:
+    """T.81, table H.1, in numpy: where the predictor is another one, samples leave their precision."""
+    counts = NOISE.astype(np.int64)
+    left, up, corner = (np.roll(counts, shift, axes) for shift, axes in (((1), 1), ((1), 0), ((1, 1), (0, 1))))
+    predicted = {
+        1: left, 2: up, 3: corner, 4: left + up - corner, 5: left + (up - corner >> 1), 6: up + (left - corner >> 1),
+        7: left + up >> 1,
+    }[predictor].copy()  # fmt: skip
+    predicted[0, 1:], predicted[1:, 0], predicted[0, 0] = left[0, 1:], up[1:, 0], 1 << 13
+    # The differences of that predictor, written as if they were those of counts by the first.
+    stream = _stream_of((counts - predicted).ravel(), predictor)
+    assert lossless_fault(stream) is None
+
+
+def _stream_of(differences: NDArray[np.int64], predictor: int) -> bytes:
+    rebuilt = lossless_jpeg(NOISE)
+    head = rebuilt[: rebuilt.index(b"\xff\xda")]
+    size = np.ceil(np.log2(np.abs(differences) + 1)).astype(int)
+    bits = "".join(
+        f"{number:05b}" + (f"{value if value > 0 else value + (1 << number) - 1:0{number}b}" if number else "")
+        for number, value in zip(size.tolist(), differences.tolist(), strict=True)
+    )
+    bits += "1" * (-len(bits) % 8)
+    data = int(bits, 2).to_bytes(len(bits) // 8, "big").replace(b"\xff", b"\xff\0")
+    frame = head.index(b"\xff\xc3")
+    one = head[:frame] + b"\xff\xc3" + struct.pack(">HBHHB", 11, 14, *NOISE.shape, 1) + bytes([1, 0x11, 0])
+    scan = b"\xff\xda" + struct.pack(">H", 8) + bytes([1, 1, 0x00, predictor, 0, 0])
+    return one + scan + data + b"\xff\xd9"
+
+
+def test_files_are_refused_with_that_reason(tmp_path: Path) -> None:
+    strip = lossless_jpeg(np.tile(NOISE, (4, 4)))
+    write_dng(
+        tmp_path / "a.dng", np.tile(NOISE, (4, 4)), {259: shorts(7), 258: shorts(14), 279: longs(len(strip))}, strip
+    )
+    write_cr2(tmp_path / "a.cr2", np.tile(NOISE, (4, 4)), "Canon EOS 550D")
+    for name in ("a.dng", "a.cr2"):
+        path = tmp_path / name
+        data = path.read_bytes()
+        read_raw(path)
+        middle = len(data) // 2
+        path.write_bytes(data[:middle] + bytes(64) + data[middle + 64 :])
+        with pytest.raises(FormatError, match="lossless JPEG is damaged"):
+            read_raw(path)
