@@ -77,8 +77,8 @@ class Refusal:
 
 
 @dataclass(frozen=True)
-class Answer:
-    """An answer: its media type, its bytes, and headers beside the usual ones; one without a type says nothing new."""
+class Response:
+    """What a request is answered: media type, bytes, headers beside the usual ones; without a type, that nothing is new."""
 
     kind: str
     body: bytes
@@ -110,7 +110,7 @@ class LocalServer(ABC, ThreadingHTTPServer):
             raise InputError(f"cannot serve on {host} port {port}: {reason}; name another with --port{own}") from error
 
     @abstractmethod
-    def answer(self, request: Request) -> Answer | Refusal:
+    def answer(self, request: Request) -> Response | Refusal:
         """Return the answer to a request; called from any number of threads."""
 
     def serve(self, shows: str, warning: str) -> None:
@@ -142,14 +142,14 @@ class LocalServer(ABC, ThreadingHTTPServer):
         return f"{self.access.token}/" if self.access.token else ""
 
     def process_request(self, request: Any, client_address: Any) -> None:
-        """Answer in a thread of its own, unless there are too many."""
+        """Response in a thread of its own, unless there are too many."""
         if not self._free.acquire(blocking=False):
             self.shutdown_request(request)
             return
         super().process_request(request, client_address)
 
     def process_request_thread(self, request: Any, client_address: Any) -> None:
-        """Answer one connection, and make room for the next."""
+        """Response one connection, and make room for the next."""
         try:
             super().process_request_thread(request, client_address)
         finally:
@@ -192,7 +192,7 @@ class _Handler(BaseHTTPRequestHandler):
 
     do_POST = do_DELETE = do_PATCH = do_OPTIONS = _refuse  # noqa: N815
 
-    def _send(self, answer: Answer | Refusal, close: bool = False) -> None:
+    def _send(self, answer: Response | Refusal, close: bool = False) -> None:
         if isinstance(answer, Refusal):
             more = {"Connection": "close"} if close else {}
             self._answer(answer.status, _TEXT, f"{answer.sentence}\n".encode(), more)
