@@ -78,7 +78,7 @@ class Refusal:
 
 @dataclass(frozen=True)
 class Response:
-    """What a request is answered: media type, bytes, headers beside the usual ones; without a type, that nothing is new."""
+    """What a request is answered: media type, bytes, further headers; without a type, that nothing is new."""
 
     kind: str
     body: bytes
