@@ -31,6 +31,7 @@ from generator.lights.lighting import Lighting, Mixture
 from generator.pictures.picture import Picture, Preparation, open_picture
 from generator.pictures.sources import SUFFIXES, PictureFile
 from generator.rendering import Rendering
+from generator.rendering.colorimetric import reference_light
 from generator.rendering.matrices import ColourMatrix, matrix_for
 from generator.stores import is_remote
 
@@ -112,6 +113,7 @@ class Explorer:
             ],
             "hull": gamut.rb[hull].tolist(),
             "black_bodies": self._black_bodies(),
+            "first": reference_light(lut),
             "pictures": len(self._sources),
         }
 

@@ -60,8 +60,8 @@ function drawLight(wanted) {
   swatch.style.backgroundColor = `rgb(${[red, green, blue].map((part) => Math.round(255 * (part / brightest) ** (1 / GAMMA)))})`;
   const far = wanted && Math.hypot(shown.rb[0] - wanted[0], shown.rb[1] - wanted[1]) > SAME;
   const parts = shown.parts.map(([light, weight]) => {
-    const name = `${light} ${table.lights[light].label}`;
-    return shown.parts.length > 1 ? `${name} × ${short(weight)}` : name;
+    const name = `light ${light} (${table.lights[light].label})`;
+    return shown.parts.length > 1 ? `${short(weight)} × ${name}` : name;
   });
   const facts = [
     ["ground truth", `r ${short(red)}  g ${short(green)}  b ${short(blue)}`],
@@ -172,7 +172,7 @@ function measure() {
 }
 
 function listen() {
-  const options = table.lights.map(({ label }, number) => element("option", { value: number }, `${number}  ${label}`));
+  const options = table.lights.map(({ label }, number) => element("option", { value: number }, `${number}: ${label}`));
   $("light").append(element("option", { value: "", disabled: "" }, "a mixture"), ...options);
   $("other").append(element("option", { value: "" }, "nothing"), ...options.map((option) => option.cloneNode(true)));
   $("light").addEventListener("change", () => choose({ base: $("light").value, parts: [[Number($("light").value), 1]] }));
@@ -219,7 +219,7 @@ async function begin() {
   panels = Object.entries(RENDERINGS).map(([name, title]) => new Panel(name, title, table.white_level, point));
   plane = new Plane($("plane"), table, pick, stepLight, move);
   listen();
-  update();
+  pick(table.first);
 }
 
 begin();

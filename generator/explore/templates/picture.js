@@ -80,7 +80,9 @@ function toneMap(counts, most, white, gains, out) {
 /** Fill `out`, four bytes a pixel, with counts as they are: 0 black, `white` white. */
 function showCounts(counts, white, out) {
   for (let at = 0, to = 0; at < counts.length; at += 3, to += 4) {
-    for (const channel of [0, 1, 2]) out[to + channel] = (255 * counts[at + channel]) / white;
+    out[to] = (255 * counts[at]) / white;
+    out[to + 1] = (255 * counts[at + 1]) / white;
+    out[to + 2] = (255 * counts[at + 2]) / white;
     out[to + 3] = 255;
   }
 }
@@ -147,10 +149,12 @@ class Panel {
       const [height, width] = new Uint32Array(data, 0, 2);
       this.counts = new Uint16Array(data, 8);
       this.drawn = `${picture} ${light}`;
-      this.most = this.counts.reduce((most, count) => (count > most ? count : most), 0);
+      this.most = 0;
+      for (let at = 0; at < this.counts.length; at++) if (this.counts[at] > this.most) this.most = this.counts[at];
       [this.canvas.width, this.canvas.height] = [width, height];
       this.say("");
       this.draw(look());
+      this.drawHistogram();
     } catch (error) {
       this.counts = null;
       this.say(error.message, true);
@@ -175,16 +179,18 @@ class Panel {
     if (view === "counts") showCounts(this.counts, this.white, shown.data);
     else toneMap(this.counts, this.most, this.white, gains, shown.data);
     context.putImageData(shown, 0, 0);
-    this.drawHistogram();
     this.point(at);
   }
 
   drawHistogram() {
     const [width, height] = [320, 110];
     const bins = [0, 1, 2].map(() => new Uint32Array(BINS + 1));
-    const part = BINS / this.white;
-    for (let at = 0; at < this.counts.length; at += 3)
-      for (const channel of [0, 1, 2]) bins[channel][(this.counts[at + channel] * part) | 0]++;
+    const [counts, part] = [this.counts, BINS / this.white];
+    for (let at = 0; at < counts.length; at += 3) {
+      bins[0][(counts[at] * part) | 0]++;
+      bins[1][(counts[at + 1] * part) | 0]++;
+      bins[2][(counts[at + 2] * part) | 0]++;
+    }
     const tallest = Math.log1p(Math.max(...bins.flatMap((one) => [...one])));
     const x = (bin) => 4 + (bin / BINS) * (width - 8);
     const svg = shape("svg", { viewBox: `0 0 ${width} ${height + 18}`, role: "img" });

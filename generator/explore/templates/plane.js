@@ -24,6 +24,8 @@ const short = (number) => number.toFixed(3).replace(/^0\./, ".");
 /** How far a pointer may move between down and up, and be from a light, px: a finger is not steadier. */
 const STEADY_PX = 5;
 const NEAR = 12;
+/** Lights of which small marks are drawn, since large ones would cover each other. */
+const MANY = 60;
 /** Steps of the arrow keys: about a tenth of a degree, and with Shift ten of them. */
 const STEP = 0.001;
 
@@ -41,15 +43,16 @@ class Plane {
     const path = (points) => points.map((rb, index) => `${index ? "L" : "M"}${this.place(rb).join(" ")}`).join("");
     this.svg.append(
       shape("path", { class: "gamut", d: `${path(table.hull)}Z` }),
-      shape("path", { class: "bodies", d: path(table.black_bodies.map(([, r, b]) => [r, b])) }),
     );
     this.line = shape("path", { class: "mixing" });
     this.svg.append(this.line);
+    const radius = table.lights.length > MANY ? 2.5 : 5;
     table.lights.forEach(({ label, codes, rb }, number) => {
       const [cx, cy] = this.place(rb);
       const title = shape("title", {}, `light ${number}: ${label}`);
-      this.svg.append(shape("circle", { class: "light", cx, cy, r: 5, fill: `rgb(${codes.join(",")})` }, title));
+      this.svg.append(shape("circle", { class: "light", cx, cy, r: radius, fill: `rgb(${codes.join(",")})` }, title));
     });
+    this.svg.append(shape("path", { class: "bodies", d: path(table.black_bodies.map(([, r, b]) => [r, b])) }));
     this.rings = ["chosen halo", "chosen"].map((name) => shape("circle", { class: name, r: 9 }));
     this.svg.append(...this.rings);
     box.append(this.svg);

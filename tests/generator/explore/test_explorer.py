@@ -80,6 +80,7 @@ def test_the_table_is_described(explorer: Explorer) -> None:
     assert [light["label"] for light in told["lights"]] == ["2000 K", "5600 K", "10000 K"]
     assert np.array([light["rb"] for light in told["lights"]]) == pytest.approx(rb_of(lut.white))
     assert {tuple(place) for place in told["hull"]} == {tuple(light["rb"]) for light in told["lights"]}
+    assert told["first"] == 1, "the black body nearest to 5600 K"
     bodies = np.array(told["black_bodies"])
     assert bodies[[0, -1], 0].tolist() == [2000, 10000]
     assert bodies[[0, -1], 1:] == pytest.approx(rb_of(lut.white[[0, 2]]))

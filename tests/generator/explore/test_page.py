@@ -72,7 +72,10 @@ def shown(tab: Tab, explorer: Explorer, *, width: int = 1280, dark: bool = False
         try:
             tab.errors.clear()
             tab.open(f"http://127.0.0.1:{server.port}/", width=width, dark=dark)
-            tab.wait_for(f"document.readyState === 'complete' && {DRAWN}")
+            # The black body nearest to 5600 K comes first, and tests begin with the reddest light.
+            tab.wait_for(f"document.readyState === 'complete' && {DRAWN} && shown.light === '1'")
+            tab.value("pick(0)")
+            tab.wait_for(f"{DRAWN} && shown.light === '0'")
             yield server
         finally:
             errors = list(tab.errors)
@@ -274,11 +277,11 @@ def test_a_rendering_that_cannot_be_is_said_beside_the_other(
         threading.Thread(target=lambda: server.serve_forever(0.01), daemon=True).start()
         tab.open(f"http://127.0.0.1:{server.port}/")
         tab.wait_for("typeof panels !== 'undefined' && panels[1]?.wait.textContent.includes('no contrast')")
-        tab.wait_for("panels[0].drawn === '0 0'")
+        tab.wait_for("panels[0].drawn === '0 1'")
         assert tab.value("[panels[0].screen.hidden, panels[1].screen.hidden]") == [False, True]
         network = {"latency": 0, "downloadThroughput": -1, "uploadThroughput": -1}
         tab.call("Network.emulateNetworkConditions", offline=True, **network)
-        tab.value("pick(1)")
+        tab.value("pick(2)")
         tab.wait_for("document.getElementById('fault').textContent.includes('still runs')")
         tab.call("Network.emulateNetworkConditions", offline=False, **network)
         tab.open("about:blank")
