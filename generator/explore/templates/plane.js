@@ -46,7 +46,9 @@ class Plane {
     );
     this.line = shape("path", { class: "mixing" });
     this.svg.append(this.line);
-    const radius = table.lights.length > MANY ? 2.5 : 5;
+    const many = table.lights.length > MANY;
+    const radius = many ? 2.5 : 5;
+    this.svg.classList.toggle("many", many);
     table.lights.forEach(({ label, codes, rb }, number) => {
       const [cx, cy] = this.place(rb);
       const title = shape("title", {}, `light ${number}: ${label}`);
