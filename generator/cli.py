@@ -24,6 +24,7 @@ from foundation.console import (
     Verbose,
     Version,
     grouped,
+    is_common,
     json_output,
     loaded,
     new_app,
@@ -88,9 +89,10 @@ class _Generate(StyledCommand):
     ) -> Any:
         """Run the command that the arguments name."""
         words = list(sys.argv[1:] if args is None else args)
-        below = self.commands.get(words[0]) if words else None
-        if below is not None:
-            return below.main(words[1:], f"{prog_name} {words[0]}", **more)
+        place = next((place for place, word in enumerate(words) if not is_common(word)), len(words))
+        name = words[place] if place < len(words) else ""
+        if name in self.commands:
+            return self.commands[name].main([*words[:place], *words[place + 1 :]], f"{prog_name} {name}", **more)
         return super().main(words, prog_name, **more)
 
 

@@ -98,8 +98,8 @@ class Explorer:
 
         lut, gamut = self.lut, self._gamut
         lights = [light_of(lut, number) for number in range(len(lut.white))]
-        on_a_line = not len(gamut.triangles)
-        hull = np.unique(gamut.edges.ravel()) if on_a_line else np.asarray(ConvexHull(gamut.rb).vertices)
+        # Lights on a line have two ends, and neighbours between them; one light has no neighbour.
+        around = ConvexHull(gamut.rb).vertices.tolist() if len(gamut.triangles) else {0, *gamut.edges.ravel().tolist()}
         return {
             "name": self._given,
             "camera": lut.provenance.camera,
@@ -111,7 +111,7 @@ class Explorer:
                 {"label": light.label, "codes": light.codes, "rb": rb}
                 for light, rb in zip(lights, gamut.rb.tolist(), strict=True)
             ],
-            "hull": gamut.rb[hull].tolist(),
+            "hull": gamut.rb[[*around]].tolist(),
             "black_bodies": self._black_bodies(),
             "first": reference_light(lut),
             "pictures": len(self._sources),
@@ -147,6 +147,7 @@ class Explorer:
         white = mixture.white(self.lut)
         height, width = scene.picture.shape[:2]
         return {
+            "number": number,
             "light": mixture.label,
             "parts": [list(part) for part in zip(mixture.lights, mixture.weights, strict=True)],
             "rb": rb_of(white).tolist(),

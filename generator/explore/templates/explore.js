@@ -125,7 +125,7 @@ function pick(number) {
 
 /** Go to the light of the table that is so many after the first that the chosen one is made of. */
 function stepLight(by) {
-  pick((shown.parts[0][0] + by + table.lights.length) % table.lights.length);
+  pick(((shown?.parts[0][0] ?? 0) + by + table.lights.length) % table.lights.length);
 }
 
 function move(rb) {
@@ -155,6 +155,7 @@ async function send(file) {
 
 /** Look at a pixel [x, y], or one that is so far from the last. */
 function point(place, relative = false) {
+  if (!shown) return;
   const { width, height } = shown.picture;
   const from = relative ? (state.at ?? [width >> 1, height >> 1]) : [0, 0];
   const most = [width - 1, height - 1];
@@ -166,7 +167,7 @@ function point(place, relative = false) {
 function measure() {
   if (!state.at || !shown) return;
   const [x, y] = state.at;
-  for (const panel of panels) panel.measure(state.picture, shown.light, state.at);
+  for (const panel of panels) panel.measure(shown.number, shown.light, state.at);
   $("pixel-note").textContent =
     `Pixel ${x}, ${y}. Each pixel is one draw; mean and standard deviation are those of 256 draws of the same colour.`;
 }
@@ -187,7 +188,7 @@ function listen() {
     radio.addEventListener("change", () => {
       state.view = radio.value;
       $("view-note").textContent = VIEWS[state.view];
-      for (const panel of panels) panel.draw(look());
+      if (shown) for (const panel of panels) panel.draw(look());
     });
   $("previous").addEventListener("click", () => step(-1));
   $("next").addEventListener("click", () => step(1));

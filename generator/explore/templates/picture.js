@@ -49,24 +49,25 @@ function toneMap(counts, most, white, gains, out) {
   const scaled = gains.map((gain) => Float32Array.from({ length: most + 1 }, (_, count) => count * gain));
   const roots = scaled.map((values) => values.map((value) => (value / white) ** (1 / GAMMA)));
   const [red, green, blue] = scaled;
-  const brightest = Math.ceil(most * Math.max(...gains));
+  // Brightness is known to a whole count, or to a part of the brightest where a light has hardly any of a colour.
+  const brightest = Math.min(65535, Math.ceil(most * Math.max(...gains)));
+  const unit = Math.max(1, (most * Math.max(...gains)) / 65535);
   const histogram = new Uint32Array(brightest + 1);
   const brightness = new Uint16Array(counts.length / 3);
   for (let at = 0, pixel = 0; at < counts.length; at += 3, pixel++) {
-    const level = Math.min(65535, Math.max(red[counts[at]], green[counts[at + 1]], blue[counts[at + 2]]));
-    brightness[pixel] = level;
+    brightness[pixel] = Math.max(red[counts[at]], green[counts[at + 1]], blue[counts[at + 2]]) / unit;
     histogram[brightness[pixel]]++;
   }
   let [sum, peak] = [0, DARK];
   histogram.forEach((pixels, level) => {
     if (!pixels) return;
-    peak = Math.max(level / white, DARK);
+    peak = Math.max((level * unit) / white, DARK);
     sum += pixels * Math.log(peak);
   });
   const k = STRENGTH * Math.exp(sum / brightness.length);
   const scale = 255 / (peak / (peak + k)) ** (1 / GAMMA);
   const shades = Float32Array.from({ length: brightest + 1 }, (_, level) => {
-    return scale * (Math.max(level / white, DARK) + k) ** (-1 / GAMMA);
+    return scale * (Math.max((level * unit) / white, DARK) + k) ** (-1 / GAMMA);
   });
   for (let at = 0, pixel = 0, to = 0; at < counts.length; at += 3, pixel++, to += 4) {
     const shade = shades[brightness[pixel]];
@@ -142,7 +143,7 @@ class Panel {
   }
 
   async fetchImage(picture, light, look) {
-    const waits = setTimeout(() => this.say("wait: the print is searched for colours, some seconds the first time"), 400);
+    const waits = setTimeout(() => this.say(this.counts ? "…" : "… (by colour, the first picture takes some seconds)"), 400);
     try {
       const answer = await ask(`counts?${new URLSearchParams({ picture, light, rendering: this.rendering })}`);
       const data = await answer.arrayBuffer();

@@ -94,6 +94,11 @@ def test_two_lights_have_a_line_for_a_gamut_and_one_body_no_curve(make_lut: Make
     assert told["black_bodies"] == []
 
 
+def test_one_light_is_all_that_it_can_make(make_lut: MakeLut) -> None:
+    explorer = Explorer("lut", make_lut(lights=1), ())
+    assert explorer.describe()["hull"] == [explorer.describe()["lights"][0]["rb"]]
+
+
 def test_what_the_table_cannot_make_becomes_the_nearest_light(explorer: Explorer) -> None:
     shown = explorer.show(0, "r=.9,b=.05")
     assert shown["light"] == "0"

@@ -288,6 +288,28 @@ def test_a_rendering_that_cannot_be_is_said_beside_the_other(
         server.shutdown()
 
 
+def test_a_light_without_one_colour_is_balanced_as_well(tab: Tab, explorer: Explorer) -> None:
+    image = explorer.counts(0, "0", "codes").astype(np.float64)
+    with shown(tab, explorer):
+        # As if the light had a thousandth of its blue: what is divided by that is brighter than any count.
+        truth = explorer.lut.white[0] * [1, 1, 1e-3]
+        tab.value(f"shown.truth = {json.dumps((truth / truth.sum()).tolist())}")
+        wanted = flash(image / explorer.lut.provenance.white_level * truth[1] / truth)
+        assert np.abs(shades(tab, "balanced").astype(int) - wanted).max() <= 2
+
+
+def test_a_picture_that_cannot_be_read_is_named_and_passed(tab: Tab, explorer: Explorer, tmp_path: Path) -> None:
+    with shown(tab, explorer):
+        (tmp_path / "pictures" / "other.png").write_bytes(b"no picture")
+        tab.value("document.getElementById('next').click()")
+        tab.wait_for("document.getElementById('fault').textContent.includes('other.png')")
+        tab.value("point([3, 4])")
+        tab.wait_for("panels[0].rows.textContent.includes('±')")
+        tab.value("document.getElementById('next').click()")
+        tab.wait_for("document.getElementById('fault').hidden && state.picture === 0")
+        forget_refusals(tab)
+
+
 @pytest.mark.parametrize("dark", [False, True])
 @pytest.mark.parametrize("width", [390, 1280])
 def test_nothing_is_cut_faint_or_nameless(tab: Tab, explorer: Explorer, width: int, dark: bool) -> None:

@@ -151,6 +151,7 @@ def test_the_command_says_where_and_ends_with_ctrl_c(
     printed = capsys.readouterr()
     assert "http://127.0.0.1:" in printed.out
     assert printed.err == ""
+    assert main(["-q", "explore", "lut", "--sources", "cat.png", "--port", "0"]) == 0
     assert main(["explore", "lut", "--sources", "dog.png"]) == 2
     assert "there is no dog.png" in capsys.readouterr().err
     assert main(["explore", "nothing"]) == 2
