@@ -3,7 +3,8 @@
 `python -m benchmarks.explore [LUT]` prints one JSON object a line: median and slowest time of each answer over
 loopback, at 1000 x 750 px, and of the three that a page draws a light from, one after another (a page asks for both
 images at once). The demo table unless another is named. Each light is asked for once: none is in any cache, but for
-what a table keeps of its own lights. What a browser adds, tone mapping and drawing, is not in it.
+what a table keeps of its own lights. Where Chromium is installed, a last line has the time from a light's choice on the
+page to both pictures tone mapped and drawn.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from threading import Thread
 
 import cv2
 import numpy as np
+import numpy.typing as npt
 
 from calibration.table.lut import open_lut
 from generator.command.output import table_folder
@@ -28,9 +30,26 @@ from generator.explore.server import ExploreServer
 from generator.lights.gamut import Gamut
 from generator.pictures.picture import Preparation
 from generator.pictures.sources import find_pictures
+from tests.acquisition.monitor.browser import CHROMIUM, browser_tab
 
 PLACES = 40
 """Lights that are asked for."""
+
+DRAGGED = """
+(async () => {
+  const times = [];
+  for (const rb of PLACES) {
+    const before = panels.map((panel) => panel.drawn);
+    const begun = performance.now();
+    move(rb);
+    while (panels.some((panel, at) => panel.drawn === before[at])) await new Promise((go) => setTimeout(go, 1));
+    times.push(performance.now() - begun);
+    while (panels.some((panel) => panel.drawn !== `0 ${shown.light}`)) await new Promise((go) => setTimeout(go, 1));
+  }
+  return times;
+})()
+"""
+"""A script that moves the light on the page from place to place, and comes to the time of each, ms."""
 
 SIZE = MAX_SIDE, 750
 """Of the picture, px."""
@@ -50,6 +69,15 @@ def _ask(address: str, **query: object) -> tuple[float, bytes]:
     with urllib.request.urlopen(f"{address}?{urllib.parse.urlencode(query)}") as answer:
         body = answer.read()
     return time.perf_counter() - begun, body
+
+
+def _drawn(base: str, ways: npt.NDArray[np.float64]) -> list[float]:
+    """Return how long each of some chromaticities (N, 2) takes to be drawn on the page, ms."""
+    with tempfile.TemporaryDirectory(prefix="crop-") as profile, browser_tab(Path(profile)) as tab:
+        tab.open(base)
+        tab.wait_for("document.readyState === 'complete' && panels.length === 2 && panels.every((one) => one.drawn)")
+        # Lights that are not in the program's caches yet: a little beside those before.
+        return tab.value(DRAGGED.replace("PLACES", json.dumps((ways + 1e-4).tolist())))
 
 
 def main() -> None:
@@ -78,9 +106,12 @@ def main() -> None:
                         times[name].append(1000 * seconds)
                 else:
                     print(json.dumps({"answer": "first of a process", "ms": round(1000 * (took + codes + colour))}))
+            times["drawn by Chromium"] = _drawn(base, ways[1:]) if CHROMIUM else []
             server.shutdown()
     times["light and both"] = [sum(parts) for parts in zip(*list(times.values())[:3], strict=True)]
     for name, each in times.items():
+        if not each:
+            continue
         print(json.dumps({"answer": name, "ms": round(statistics.median(each), 1), "slowest": round(max(each), 1)}))
 
 
