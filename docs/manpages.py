@@ -80,7 +80,8 @@ def _paragraphs(command: Any) -> list[str]:
 def _synopsis(words: tuple[str, ...], command: Any) -> str:
     """Return the line that shows how a command is called."""
     shown = [f".B {_text(' '.join(words))}\n", "[\\fIoptions\\fR]\n"]
-    if hasattr(command, "commands"):
+    takes = any(parameter.param_type_name == "argument" for parameter in command.params)
+    if hasattr(command, "commands") and not takes:
         shown.append("\\fIcommand\\fR \\&...\n")
     for parameter in command.params:
         if parameter.param_type_name == "argument":

@@ -367,7 +367,7 @@ def _type_name(parameter: Any) -> str:
     return name.removesuffix(" range")
 
 
-class _StyledCommand(TyperCommand):
+class StyledCommand(TyperCommand):
     """A command whose help is in the style of all."""
 
     def __init__(self, *arguments: Any, **named: Any) -> None:
@@ -402,7 +402,7 @@ class _StyledTyper(typer.Typer):
 
     def command(self, name: str | None = None, **more: Any) -> Callable[[Any], Any]:
         """Register a command."""
-        named: dict[str, Any] = {"cls": _StyledCommand, **more}
+        named: dict[str, Any] = {"cls": StyledCommand, **more}
         return super().command(name, **named)
 
 

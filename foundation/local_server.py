@@ -92,8 +92,8 @@ class Refusal:
 
 
 @dataclass(frozen=True)
-class Answer:
-    """An answer: its media type, its bytes, and headers beside the usual ones; one without a type says nothing new."""
+class Response:
+    """What a request is answered: media type, bytes, further headers; without a type, that nothing is new."""
 
     kind: str
     body: bytes
@@ -173,6 +173,7 @@ class _PatientLink(io.RawIOBase):
         link.settimeout(idle_s)
         self.sendall = link.sendall
         self.fileno = link.fileno
+        self.setsockopt = link.setsockopt
 
     def makefile(self, mode: str, size: int) -> io.BufferedReader:
         """Return what is read from."""
@@ -236,7 +237,7 @@ class LocalServer(ABC, ThreadingHTTPServer):
             raise InputError(f"cannot serve on {host} port {port}: {reason}; name another with --port{own}") from error
 
     @abstractmethod
-    def answer(self, request: Request) -> Answer | Refusal:
+    def answer(self, request: Request) -> Response | Refusal:
         """Return the answer to a request; called from any number of threads."""
 
     def serve(self, shows: str, warning: str) -> None:
@@ -292,6 +293,8 @@ class LocalServer(ABC, ThreadingHTTPServer):
 class _Handler(BaseHTTPRequestHandler):
     server: LocalServer  # pyright: ignore[reportIncompatibleVariableOverride]  # the handler's own server, by construction
     protocol_version = "HTTP/1.1"
+    # Head and body are written one after the other: the second would wait for the first to be acknowledged, 40 ms.
+    disable_nagle_algorithm = True
 
     def handle_one_request(self) -> None:
         super().handle_one_request()
@@ -330,7 +333,7 @@ class _Handler(BaseHTTPRequestHandler):
 
     do_POST = do_DELETE = do_PATCH = do_OPTIONS = _refuse  # noqa: N815
 
-    def _send(self, answer: Answer | Refusal, close: bool = False) -> None:
+    def _send(self, answer: Response | Refusal, close: bool = False) -> None:
         if isinstance(answer, Refusal):
             more = {"Connection": "close"} if close else {}
             self._answer(answer.status, _TEXT, f"{answer.sentence}\n".encode(), more)

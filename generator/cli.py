@@ -1,16 +1,35 @@
 """The command `generate`: images and datasets from a table.
 
-Parses, builds, calls, prints. Libraries that take long to load are imported when the work begins.
+Parses, builds, calls, prints. Libraries that take long to load are imported when the work begins. The first word may be
+a command of its own, ``explore``; a table in a folder of that name is ``./explore``.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import sys
+from collections.abc import Mapping, Sequence
+from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Annotated, Any, Final
+
+import typer
+from typer.main import get_command
 
 from foundation.compiled import processor_count
-from foundation.console import EXIT_CODES, JsonOutput, grouped, json_output, loaded, new_app, run
+from foundation.console import (
+    EXIT_CODES,
+    JsonOutput,
+    Quiet,
+    StyledCommand,
+    Verbose,
+    Version,
+    grouped,
+    is_common,
+    json_output,
+    loaded,
+    new_app,
+    run,
+)
 from foundation.errors import InputError
 from foundation.secret_texts import masked, printable
 from generator.command.likeness_options import LikenessOptions, choose
@@ -32,6 +51,7 @@ if TYPE_CHECKING:
     from generator.dataset.reader import Dataset
 
 app = new_app()
+_explore_app = new_app()
 
 _STORE_READERS: Final = 16
 """Threads that read the files of an object store: a reader waits for the store most of the time."""
@@ -46,11 +66,33 @@ Each picture is printed, lit and photographed by the table: every pixel becomes 
 of its colour under the light. The same seed, pictures and table give the same bytes, whatever the workers. A picture
 that cannot be read is left out, and named. When it was interrupted or killed, run the same command again to go on.
 
+generate explore LUT shows a table in the browser: its lights, and pictures under them.
+
 {EXIT_CODES}
 """
 
 
-@app.command(help=_HELP)
+class _Generate(StyledCommand):
+    """The command, and those that its first word may name instead."""
+
+    @cached_property
+    def commands(self) -> Mapping[str, Any]:
+        """The commands below it by their names."""
+        return {"explore": get_command(_explore_app)}
+
+    def main(  # pyright: ignore[reportIncompatibleMethodOverride]  # the others are passed on by name
+        self, args: Sequence[str] | None = None, prog_name: str | None = None, **more: Any
+    ) -> Any:
+        """Run the command that the arguments name."""
+        words = list(sys.argv[1:] if args is None else args)
+        place = next((place for place, word in enumerate(words) if not is_common(word)), len(words))
+        name = words[place] if place < len(words) else ""
+        if name in self.commands:
+            return self.commands[name].main([*words[:place], *words[place + 1 :]], f"{prog_name} {name}", **more)
+        return super().main(words, prog_name, **more)
+
+
+@app.command(help=_HELP, cls=_Generate)
 @grouped
 def generate(
     places: Places,
@@ -101,6 +143,53 @@ def generate(
             else:
                 dataset = _make_whole(plan, places.out, workers, output)
                 _draw_sheet(dataset, places.out, sheet)
+
+
+@_explore_app.command(epilog=EXIT_CODES)
+def explore(
+    lut: Annotated[Path, typer.Argument(metavar="LUT", help="Folder of the table; demo: for a small one.")],
+    sources: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="PLACE",
+            help="A picture, or a folder that is searched, or a URL of either; may be repeated. Three computed "
+            "pictures if there is none.",
+            show_default=False,
+        ),
+    ] = None,
+    max_side: Annotated[
+        int, typer.Option(metavar="PX", help="Make larger pictures this small.", min=16, max=4000)
+    ] = 1000,
+    port: Annotated[int, typer.Option(min=0, max=65535, help="Port; 0 takes a free one.")] = 8708,
+    host: Annotated[
+        str,
+        typer.Option(help="Address to listen on; 0.0.0.0 lets other machines in the house look, a phone for one."),
+    ] = "127.0.0.1",
+    version: Version = False,
+    verbose: Verbose = 0,
+    quiet: Quiet = False,
+) -> None:
+    """Show a table in the browser, until interrupted: its lights, and pictures under any of them.
+
+    Reads the table LUT and pictures; writes nothing but what can be computed again, to the cache. The page has the
+    table's lights in the plane of chromaticities, with the black bodies and all that they can make together: pick a
+    light, drag one, or mix two. A picture is shown as the camera would take its print, by codes and by colour, with
+    ground truth, histogram, single pixels and their noise, and with the command that makes a dataset of it. A picture
+    dropped onto the page stays in memory. With --host the address holds a token, new at each start.
+    """
+    del version, verbose, quiet
+    from calibration.table.lut import open_lut
+    from generator.explore.explorer import Explorer
+    from generator.explore.samples import sample_folder
+    from generator.explore.server import ExploreServer
+    from generator.pictures.picture import Preparation
+    from generator.pictures.sources import find_pictures
+
+    loaded()
+    table = open_lut(table_folder(lut))
+    found = find_pictures(sources or [str(sample_folder())], Preparation(max_side=max_side))
+    with ExploreServer(Explorer(str(lut), table, found, max_side), host, port) as server:
+        server.serve(str(lut), "can look at the table and the pictures, and send pictures of their own")
 
 
 def _require_alone(commands: dict[str, str | None], more: Path | None) -> None:

@@ -10,7 +10,7 @@ from acquisition.monitor.feed import SessionWatch, live_page, to_bytes
 from acquisition.monitor.view import read_session
 from experiment.session.journal import JOURNAL_FILE
 from foundation.errors import FormatError
-from foundation.local_server import Answer, LocalServer, Refusal, Request
+from foundation.local_server import LocalServer, Refusal, Request, Response
 
 _FRAME = re.compile(r"frame/([1-9][0-9]{0,8})\.jpg")
 
@@ -37,21 +37,21 @@ class MonitorServer(LocalServer):
         self.page = live_page(watch.folder.resolve().name)
         super().__init__(host, port)
 
-    def answer(self, request: Request) -> Answer | Refusal:
+    def answer(self, request: Request) -> Response | Refusal:
         """Return the page, the session's state since a cursor, the old summary, or the picture of an attempt."""
         match request.path:
             case "":
                 text, policy = self.page
-                return Answer("text/html; charset=utf-8", text.encode(), {"Content-Security-Policy": policy})
+                return Response("text/html; charset=utf-8", text.encode(), {"Content-Security-Policy": policy})
             case "state.json":
                 state = self.watch.state(request.query.get("since", ""))
-                return Answer("", b"") if state is None else Answer("application/json", to_bytes(state))
+                return Response("", b"") if state is None else Response("application/json", to_bytes(state))
             case "status.json":
-                return Answer("application/json", json.dumps(self.watch.head().to_plain()).encode())
+                return Response("application/json", json.dumps(self.watch.head().to_plain()).encode())
             case path if found := _FRAME.fullmatch(path):
                 data = self.watch.picture(int(found[1]))
                 # The page names the version of a picture, so that one that is written anew has another address.
                 kept = {"Cache-Control": "private, max-age=86400"}
-                return Answer("image/jpeg", data, kept) if data else Refusal(404, "there is no picture of that frame")
+                return Response("image/jpeg", data, kept) if data else Refusal(404, "there is no picture of that frame")
             case _:
                 return Refusal(404, "here are /, /state.json, /status.json and /frame/ATTEMPT.jpg")

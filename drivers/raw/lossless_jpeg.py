@@ -20,6 +20,7 @@ from numpy import int64, uint64
 from foundation.compiled import compiled
 
 _SOI, _EOI, _SOF3, _DHT, _DRI, _SOS = 0xD8, 0xD9, 0xC3, 0xC4, 0xDD, 0xDA
+"""Markers (T.81, table B.1)."""
 
 _PADDING: Final = 4
 """Bytes behind the last sample that say nothing: some encoders write whole words. More are padding if all are alike."""

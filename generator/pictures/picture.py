@@ -413,12 +413,17 @@ def read_picture(path: Path | str, max_side: int | None = None) -> Picture:
 
 
 def open_picture(
-    path: Path, preparation: Preparation = UNPREPARED, name: str | None = None, data: bytes | None = None
+    path: Path,
+    preparation: Preparation = UNPREPARED,
+    name: str | None = None,
+    data: bytes | None = None,
+    most_pixels: int = LARGEST_PICTURE,
 ) -> Reading:
     """Return the sRGB codes of a picture file and how its profile was treated; the head of this file lists the steps.
 
     `name`: name of the picture, which chooses the place of a random crop; its file's name if None. `data`: the file's
-    bytes, where they were read already. Returns the codes (H, W, 3) uint8 and the treatment of its profile.
+    bytes, where they were read already. `most_pixels`: of the largest file that is read. Returns the
+    codes (H, W, 3) uint8 and the treatment of its profile.
 
     Examples
     --------
@@ -430,7 +435,7 @@ def open_picture(
     >>> reading.picture.shape, reading.profile
     ((8, 8, 3), 'none, taken as sRGB')
     """
-    values = _read(path, data)
+    values = _read(path, data, most_pixels)
     light = values.light
     if values.linear:
         light = np.clip(np.nan_to_num(light, nan=0.0, posinf=1.0, neginf=0.0), 0.0, None)
@@ -471,17 +476,17 @@ class _Values:
     adobe_rgb: bool
 
 
-def _read(path: Path, data: bytes | None) -> _Values:
+def _read(path: Path, data: bytes | None, most_pixels: int) -> _Values:
     if not path.is_file():
         raise FormatError(f"cannot read {path}: there is no such file; name a picture")
     if path.suffix.lower() == ".avif":
-        picture = read_avif(path, LARGEST_PICTURE)
+        picture = read_avif(path, most_pixels)
         return _Values(picture.codes, picture.alpha, False, False, picture.orientation, picture.icc, False)
     with _named_in_text(path) as name:
-        return _read_named(path, name, data)
+        return _read_named(path, name, data, most_pixels)
 
 
-def _read_named(path: Path, name: str, data: bytes | None) -> _Values:
+def _read_named(path: Path, name: str, data: bytes | None, most_pixels: int) -> _Values:
     import OpenImageIO as oiio  # noqa: N813
 
     request = oiio.ImageSpec()
@@ -494,9 +499,9 @@ def _read_named(path: Path, name: str, data: bytes | None) -> _Values:
         spec = stream.spec()
         if spec.deep or spec.depth > 1 or spec.nchannels < 1:
             raise FormatError(f"cannot read {path}: it is no flat picture; use another, or convert it to PNG")
-        if spec.width * spec.height > LARGEST_PICTURE:
+        if spec.width * spec.height > most_pixels:
             raise FormatError(
-                f"cannot read {path}: {spec.width}x{spec.height} px are more than {LARGEST_PICTURE}; make it smaller"
+                f"cannot read {path}: {spec.width}x{spec.height} px are more than {most_pixels}; make it smaller"
             )
         space = str(spec.get_string_attribute("oiio:ColorSpace")).lower()
         kind = spec.format.basetype

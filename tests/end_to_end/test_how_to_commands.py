@@ -31,7 +31,7 @@ SIMULATED = '[simulated]\nbody = "Test"\nseed = 11\n'
 _REAL = (
     "takes the real data set of the page, which is downloaded from its makers; tests/evaluation/commands has it made up"
 )
-_SERVES = "serves until somebody ends it; tests/acquisition/monitor"
+_SERVES = "serves until somebody ends it; tests/acquisition/monitor, tests/generator/explore"
 
 
 @dataclass(frozen=True)
@@ -83,6 +83,9 @@ PAGES = {
     "evaluate.md": Page(
         {"DATA": "dataset", "brightest.py": "brightest.py", "c5.csv": "estimates.csv", "out/fc4.csv": "estimates.csv"},
         fresh={"evaluate": "RESULTS"},
+    ),
+    "explore.md": Page(
+        _GENERATE, written={"photographs/coffee.png": "photographs/0.png"}, skipped={"generate explore": _SERVES}
     ),
     "night-run.md": Page(
         _LAB | {"session": "session"},

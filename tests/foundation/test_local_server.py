@@ -20,11 +20,11 @@ from hypothesis import strategies as st
 from foundation.local_server import (
     ANSWER_S,
     Access,
-    Answer,
     Connections,
     LocalServer,
     Refusal,
     Request,
+    Response,
     is_loopback,
     qr_text,
     reachable_addresses,
@@ -125,8 +125,8 @@ def test_it_fits_a_terminal_of_80_columns() -> None:
 class Echo(LocalServer):
     command = "echo"
 
-    def answer(self, request: Request) -> Answer:
-        return Answer("text/plain", request.path.encode())
+    def answer(self, request: Request) -> Response:
+        return Response("text/plain", request.path.encode())
 
 
 @contextmanager
@@ -252,8 +252,8 @@ def test_nobody_gives_way_who_is_being_answered_unless_he_is_slow() -> None:
 
 def test_a_viewer_who_takes_nothing_loses_the_place() -> None:
     class Flood(Echo):
-        def answer(self, request: Request) -> Answer:
-            return Answer("image/png", bytes(1 << 26))
+        def answer(self, request: Request) -> Response:
+            return Response("image/png", bytes(1 << 26))
 
     with Flood("127.0.0.1", 0, most=1, idle_s=0.05) as server:
         thread = threading.Thread(target=lambda: server.serve_forever(0.01))

@@ -66,6 +66,12 @@ def parse(words: list[str]) -> None:
         # Data alone are run with the usual methods (evaluation.cli).
         rest = ["run", *rest]
     while hasattr(command, "commands"):
+        if (
+            rest
+            and rest[0] not in command.commands
+            and any(one.param_type_name == "argument" for one in command.params)
+        ):
+            break
         assert rest, f"{words} names no command"
         assert rest[0] in command.commands, f"{rest[0]} is no command below {words[0]}"
         command, rest = command.commands[rest[0]], rest[1:]

@@ -27,6 +27,7 @@ WITHOUT_FIGURES = {
     "acquire rebuild",
     "acquire monitor",
     "acquire report",
+    "generate explore",
     "sim projector",
     "sim camera",
 }
@@ -36,9 +37,9 @@ REFERENCE = Path(__file__).parents[2] / "docs/reference/json.md"
 
 
 def leaves(words: tuple[str, ...], command: Any) -> Iterator[tuple[str, Any]]:
-    """Yield every command without others below it, with its words."""
+    """Yield every command that does something itself, with its words."""
     below = getattr(command, "commands", {})
-    if not below:
+    if not below or any(parameter.param_type_name == "argument" for parameter in command.params):
         yield " ".join(words), command
     for name, found in below.items():
         yield from leaves((*words, name), found)

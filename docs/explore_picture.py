@@ -1,0 +1,61 @@
+"""Photograph the page of a table for the site: ``python -m docs.explore_picture`` writes docs/images/explore.jpg.
+
+A table of 707 lights is computed (`sim table`), and Chromium, without a screen, shows it with the photographs of
+examples/photographs.py.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import tempfile
+import threading
+from pathlib import Path
+
+from PIL import Image
+
+from calibration.table.lut import open_lut
+from examples.photographs import main as save_photographs
+from generator.explore.explorer import Explorer
+from generator.explore.server import ExploreServer
+from generator.pictures.picture import Preparation
+from generator.pictures.sources import find_pictures
+from synthesis.cli import main as sim
+from tests.acquisition.monitor.browser import browser_tab
+
+WINDOW = 1280, 790
+"""Of the browser, px: the light, the picture and the pixel."""
+
+SETTINGS = "[chart]\nbits = 4\n"
+"""Few colours, so that the table takes seconds; what is rendered by colour does not show it."""
+
+DRAWN = "panels.every((one) => one.drawn.endsWith(shown.light) && one.rows.textContent.includes('±'))"
+"""All that is asked of the program is there."""
+
+
+def main() -> None:
+    """Write the picture beside the others of the documentation."""
+    target = Path(__file__).resolve().with_name("images") / "explore.jpg"
+    with tempfile.TemporaryDirectory(prefix="crop-") as folder, contextlib.chdir(folder):
+        Path("settings.toml").write_text(SETTINGS, encoding="utf-8")
+        sim(["table", "lut", "--camera", "EOS 550D", "--print", "managed", "--settings", "settings.toml"])
+        save_photographs(Path("photographs"))
+        sources = find_pictures("photographs/coffee.png", Preparation(max_side=1000))
+        explorer = Explorer("lut", open_lut(Path("lut")), sources)
+        with ExploreServer(explorer, "127.0.0.1", 0) as server, browser_tab(Path("profile")) as tab:
+            threading.Thread(target=server.serve_forever, daemon=True).start()
+            tab.call("Emulation.setScrollbarsHidden", hidden=True)
+            tab.open(f"http://127.0.0.1:{server.port}/", width=WINDOW[0], height=WINDOW[1])
+            tab.wait_for("document.readyState === 'complete' && typeof shown !== 'undefined' && shown !== null")
+            tab.value("move([0.2, 0.36])")
+            tab.wait_for("shown.parts.length === 3")
+            tab.value("point([246, 203])")
+            tab.wait_for(DRAWN)
+            picture = tab.screenshot(Path("page.png"), whole=False)
+            server.shutdown()
+        Image.open(io.BytesIO(picture.read_bytes())).convert("RGB").save(target, quality=85, optimize=True)
+    print(target.name)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,244 @@
+"""What a page may ask of a table: its lights, a picture under one of them, one pixel's noise, and the command for it.
+
+Images are made as `generate` makes them (`generator.dataset.shards.photograph`): the first image of a dataset of this
+picture alone, under this light alone, with seed 0. So the command that is shown makes the bytes that are shown.
+"""
+
+from __future__ import annotations
+
+import os
+import shlex
+import tempfile
+import threading
+from collections import OrderedDict
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+from pathlib import Path, PurePosixPath
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+import numpy.typing as npt
+
+from foundation.errors import FormatError, InputError
+from foundation.secret_texts import masked
+from generator.dataset.plan import DatasetOptions, light_of
+from generator.dataset.shards import chromaticity, photograph
+from generator.kernels.choice import replace_unfit_colours
+from generator.lights.choices import parse_light
+from generator.lights.gamut import Gamut, black_body, rb_of
+from generator.lights.lighting import Lighting, Mixture
+from generator.pictures.picture import Picture, Preparation, open_picture
+from generator.pictures.sources import SUFFIXES, PictureFile
+from generator.rendering import DEFAULT, Rendering
+from generator.rendering.colorimetric import reference_light
+from generator.rendering.matrices import ColourMatrix, matrix_for
+from generator.stores import is_remote
+
+if TYPE_CHECKING:
+    from calibration.table.lut import Lut
+
+MAX_SIDE: Final = 1000
+"""Longest side of a picture on the page unless said otherwise, px: what a window shows, and made in milliseconds."""
+
+MOST_DROPPED: Final = 8
+"""Pictures sent by pages that are kept, the newest; and decoded pictures that are at hand."""
+
+MOST_DROPPED_PIXELS: Final = 1 << 26
+"""Pixels of a picture that a page sends: those of the largest cameras, 200 MB while it is decoded."""
+
+_DRAWS: Final = 16
+"""Side of the field of equal pixels whose spread is a pixel's noise: 256 draws tell a deviation to a twentieth."""
+
+_STEPS: Final = 33
+"""Points of the curve of the black bodies."""
+
+_PLACE: Final = "dataset"
+"""Where the command that is shown makes its dataset."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Scene:
+    """A picture: its name, how its profile was treated, and its codes (H, W, 3) uint8."""
+
+    name: str
+    profile: str
+    picture: Picture
+
+
+class Explorer:
+    """A table, and pictures to hold under its lights; may be asked from several threads.
+
+    Parameters
+    ----------
+    given
+        The table as the user named it, for the command.
+    lut
+        The table.
+    sources
+        Pictures on this machine or a store.
+    max_side
+        Longest side of a picture, px.
+    """
+
+    def __init__(self, given: str, lut: Lut, sources: Sequence[PictureFile], max_side: int = MAX_SIDE) -> None:
+        self.lut = lut
+        self._given = given
+        self._sources = sources
+        self._preparation = Preparation(max_side=max_side)
+        self._gamut = Gamut.of(lut)
+        self._dropped: OrderedDict[int, _Scene] = OrderedDict()
+        self._adding = threading.Lock()
+        self._added = len(sources)
+        self._read = lru_cache(maxsize=MOST_DROPPED)(self._read_source)
+
+    def describe(self) -> dict[str, Any]:
+        """Return the table as plain values: lights with their chromaticities, gamut, black bodies; and the pictures."""
+        from scipy.spatial import ConvexHull
+
+        lut, gamut = self.lut, self._gamut
+        lights = [light_of(lut, number) for number in range(len(lut.white))]
+        # Lights on a line have two ends, and neighbours between them; one light has no neighbour.
+        around = ConvexHull(gamut.rb).vertices.tolist() if len(gamut.triangles) else {0, *gamut.edges.ravel().tolist()}
+        return {
+            "name": self._given,
+            "camera": lut.provenance.camera,
+            "computed": lut.provenance.computed is not None,
+            "colours": 8**lut.provenance.bits,
+            "samples": int(lut.samples.shape[2]),
+            "white_level": lut.provenance.white_level,
+            "lights": [
+                {"label": light.label, "codes": light.codes, "rb": rb}
+                for light, rb in zip(lights, gamut.rb.tolist(), strict=True)
+            ],
+            "hull": gamut.rb[[*around]].tolist(),
+            "black_bodies": self._black_bodies(),
+            "first": reference_light(lut),
+            "pictures": len(self._sources),
+        }
+
+    def add(self, name: str, data: bytes) -> int:
+        """Keep a picture that a page sent and return its number; a FormatError says why it cannot be read.
+
+        `name`: of its file. The oldest of more than `MOST_DROPPED` is forgotten.
+        """
+        plain = "".join(character for character in PurePosixPath(name).name if character.isprintable()) or "picture"
+        suffix = PurePosixPath(plain).suffix.lower()
+        with tempfile.NamedTemporaryFile(prefix="crop-", suffix=suffix if suffix in SUFFIXES else "") as file:
+            file.write(data)
+            file.flush()
+            try:
+                read = open_picture(Path(file.name), self._preparation, plain, data, MOST_DROPPED_PIXELS)
+            except FormatError as error:
+                raise FormatError(str(error).replace(file.name, plain)) from error
+        with self._adding:
+            number, self._added = self._added, self._added + 1
+            self._dropped[number] = _Scene(plain, read.profile, read.picture)
+            while len(self._dropped) > MOST_DROPPED:
+                self._dropped.popitem(last=False)
+        return number
+
+    def show(self, number: int, light: str) -> dict[str, Any]:
+        """Return what is known of a picture under a light, as `generate --light` takes it, without its pixels.
+
+        A chromaticity that the table cannot make becomes the nearest that it can.
+        """
+        scene, mixture = self._scene(number), self._mixture(light)
+        white = mixture.white(self.lut)
+        height, width = scene.picture.shape[:2]
+        return {
+            "number": number,
+            "light": mixture.label,
+            "parts": [list(part) for part in zip(mixture.lights, mixture.weights, strict=True)],
+            "rb": rb_of(white).tolist(),
+            "truth": chromaticity(white),
+            "picture": {"name": scene.name, "width": width, "height": height, "profile": scene.profile},
+            "is_here": number < len(self._sources),
+            "commands": {
+                "codes": self.command(number, mixture, "codes"),
+                "colorimetric": self.command(number, mixture, "colorimetric"),
+            },
+        }
+
+    def counts(self, number: int, light: str, rendering: Rendering) -> npt.NDArray[np.uint16]:
+        """Return the raw image (H, W, 3) uint16, linear camera RGB, of a picture under a light."""
+        return self._photograph(self._scene(number).picture, self._mixture(light), rendering, 0)
+
+    def pixel(self, number: int, light: str, rendering: Rendering, x: int, y: int) -> dict[str, Any]:
+        """Return the codes of one pixel of a picture, and mean and standard deviation of what is drawn for them."""
+        picture = self._scene(number).picture
+        if not (0 <= y < picture.shape[0] and 0 <= x < picture.shape[1]):
+            raise InputError(f"there is no pixel {x}, {y} in a picture of {picture.shape[1]}x{picture.shape[0]} px")
+        field = np.broadcast_to(picture[y, x], (_DRAWS, _DRAWS, 3)).copy()
+        drawn = self._photograph(field, self._mixture(light), rendering, 1).reshape(-1, 3).astype(np.float64)
+        mean, deviation = drawn.mean(axis=0), drawn.std(axis=0, ddof=1)
+        return {
+            "codes": picture[y, x].tolist(),
+            "mean": mean.tolist(),
+            "deviation": deviation.tolist(),
+            "draws": len(drawn),
+        }
+
+    def command(self, number: int, mixture: Mixture, rendering: Rendering) -> str:
+        """Return the command that makes a dataset of the image, to be run where this program was started.
+
+        For a picture that a page sent it names the file alone: a browser does not tell where it lies.
+        """
+        if number < len(self._sources):
+            location = self._sources[number].location
+            place = masked(location) if is_remote(location) else _seen_from_here(location)
+        else:
+            place = self._scene(number).name
+        words = ["generate", self._given, _PLACE, "--sources", f"./{place}" if place.startswith("-") else place]
+        words += ["--max-side", str(self._preparation.max_side), "--light", mixture.label]
+        if rendering != DEFAULT:
+            words += ["--rendering", rendering]
+        return shlex.join(words)
+
+    @cached_property
+    def _matrix(self) -> ColourMatrix:
+        return matrix_for(self.lut)
+
+    def _black_bodies(self) -> list[list[float]]:
+        """Return the curve of the black bodies between those of the table: kelvin, r and b; none of fewer than two."""
+        bodies = {light.cct_k for light in self.lut.illuminations if light.cct_k is not None}
+        if len(bodies) < 2:
+            return []
+        mired = np.linspace(1e6 / min(bodies), 1e6 / max(bodies), _STEPS)
+        kelvins = np.clip(1e6 / mired, min(bodies), max(bodies)).tolist()
+        return [[kelvin, *rb_of(black_body(self.lut, kelvin).white(self.lut)).tolist()] for kelvin in kelvins]
+
+    def _scene(self, number: int) -> _Scene:
+        if 0 <= number < len(self._sources):
+            return self._read(number)
+        with self._adding:
+            scene = self._dropped.get(number)
+        if scene is None:
+            raise InputError(f"there is no picture {number}; the last {MOST_DROPPED} that pages sent are kept: send it")
+        return scene
+
+    def _read_source(self, number: int) -> _Scene:
+        source = self._sources[number]
+        read = source.read()
+        return _Scene(source.name, read.profile or "", read.picture)
+
+    def _mixture(self, light: str) -> Mixture:
+        return parse_light(light, self.lut, self._gamut, "nearest")
+
+    def _photograph(
+        self, picture: Picture, mixture: Mixture, rendering: Rendering, image: int
+    ) -> npt.NDArray[np.uint16]:
+        """Return the image (H, W, 3) uint16, in memory that the calling thread's next call overwrites."""
+        lut = self.lut
+        if rendering == "codes":
+            picture = replace_unfit_colours(picture, lut.provenance)[0]
+        matrix = self._matrix if rendering == "colorimetric" else None
+        options = DatasetOptions(rendering=rendering, matrix=matrix)
+        made = photograph(lut, picture, Lighting((mixture,)), options, 0, image, lut.provenance.white_level)
+        return made[0]
+
+
+def _seen_from_here(location: str) -> str:
+    """Return a file's path from the working folder if it lies below that."""
+    path = Path(location)
+    return os.fspath(path.relative_to(Path.cwd())) if path.is_relative_to(Path.cwd()) else location

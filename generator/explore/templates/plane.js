@@ -1,0 +1,154 @@
+// The plane of chromaticities: lights of a table, what they can make together, and the light that is chosen.
+
+const $ = (id) => document.getElementById(id);
+
+/** Return an element with attributes and children; text among them stays text. */
+function element(name, attributes = {}, ...children) {
+  const made = document.createElement(name);
+  for (const [key, value] of Object.entries(attributes)) made.setAttribute(key, value);
+  made.append(...children);
+  return made;
+}
+
+/** Return an element of a drawing. */
+function shape(name, attributes = {}, ...children) {
+  const made = document.createElementNS("http://www.w3.org/2000/svg", name);
+  for (const [key, value] of Object.entries(attributes)) made.setAttribute(key, value);
+  made.append(...children);
+  return made;
+}
+
+/** Return a number with three decimals and no zero before them, as chromaticities are written. */
+const short = (number) => number.toFixed(3).replace(/^0\./, ".");
+
+/** How far a pointer may move between down and up, and be from a light, px: a finger is not steadier. */
+const STEADY_PX = 5;
+const NEAR = 12;
+/** Lights of which small marks are drawn, since large ones would cover each other. */
+const MANY = 60;
+/** Steps of the arrow keys: about a tenth of a degree, and with Shift ten of them. */
+const STEP = 0.001;
+
+class Plane {
+  /** `onPick` gets the number of a light, `onStep` how many lights to go on, `onMove` a chromaticity [r, b]. */
+  constructor(box, table, onPick, onStep, onMove) {
+    const places = table.lights.map((light) => light.rb);
+    const [low, high] = [0, 1].map((axis) => [Math.min, Math.max].map((of) => of(...places.map((rb) => rb[axis]))));
+    this.span = Math.max(low[1] - low[0], high[1] - high[0], 0.02) * 1.3;
+    this.origin = [low, high].map(([from, to]) => (from + to) / 2 - this.span / 2);
+    this.lights = places;
+    this.chosen = places[0];
+    this.svg = shape("svg", { viewBox: `0 0 ${Plane.SIDE + 44} ${Plane.SIDE + 40}`, "aria-hidden": "true" });
+    this.drawGrid();
+    const path = (points) => points.map((rb, index) => `${index ? "L" : "M"}${this.place(rb).join(" ")}`).join("");
+    this.svg.append(
+      shape("path", { class: "gamut", d: `${path(table.hull)}Z` }),
+    );
+    this.line = shape("path", { class: "mixing" });
+    this.svg.append(this.line);
+    const many = table.lights.length > MANY;
+    const radius = many ? 2.5 : 5;
+    this.svg.classList.toggle("many", many);
+    table.lights.forEach(({ label, codes, rb }, number) => {
+      const [cx, cy] = this.place(rb);
+      const title = shape("title", {}, `light ${number}: ${label}`);
+      this.svg.append(shape("circle", { class: "light", cx, cy, r: radius, fill: `rgb(${codes.join(",")})` }, title));
+    });
+    this.svg.append(shape("path", { class: "bodies", d: path(table.black_bodies.map(([, r, b]) => [r, b])) }));
+    this.rings = ["chosen halo", "chosen"].map((name) => shape("circle", { class: name, r: 9 }));
+    this.svg.append(...this.rings);
+    box.append(this.svg);
+    this.listen(box, onPick, onStep, onMove);
+  }
+
+  place([r, b]) {
+    const [x, y] = [r, b].map((value, axis) => ((value - this.origin[axis]) / this.span) * Plane.SIDE);
+    return [40 + x, 6 + Plane.SIDE - y];
+  }
+
+  drawGrid() {
+    const step = [0.01, 0.02, 0.05, 0.1, 0.2].find((one) => this.span / one < 7) ?? 0.5;
+    const [left, bottom] = [40, 6 + Plane.SIDE];
+    for (const axis of [0, 1]) {
+      const first = Math.ceil(this.origin[axis] / step);
+      for (let tick = first; tick * step < this.origin[axis] + this.span; tick++) {
+        const rb = [...this.origin];
+        rb[axis] = tick * step;
+        const [x, y] = this.place(rb);
+        const line = axis ? { x1: left, x2: left + Plane.SIDE, y1: y, y2: y } : { x1: x, x2: x, y1: 6, y2: bottom };
+        const at = axis ? { x: left - 5, y: y + 4, "text-anchor": "end" } : { x, y: bottom + 15, "text-anchor": "middle" };
+        this.svg.append(shape("line", { class: "gridline", ...line }));
+        this.svg.append(shape("text", at, (tick * step).toFixed(2).replace(/^0\./, ".")));
+      }
+    }
+    this.svg.append(
+      shape("text", { x: left + Plane.SIDE / 2, y: bottom + 30, "text-anchor": "middle" }, "r = R / (R + G + B)"),
+      shape("text", { x: 4, y: 16 }, "b"),
+    );
+  }
+
+  listen(box, onPick, onStep, onMove) {
+    let down = null;
+    const at = (event) => new DOMPoint(event.clientX, event.clientY).matrixTransform(this.svg.getScreenCTM().inverse());
+    const move = (event) => {
+      const { x, y } = at(event);
+      const place = [x - 40, 6 + Plane.SIDE - y];
+      onMove(this.within(place.map((value, axis) => this.origin[axis] + (value / Plane.SIDE) * this.span)));
+    };
+    box.addEventListener("pointerdown", (event) => {
+      if (event.button) return;
+      box.setPointerCapture(event.pointerId);
+      down = [event.clientX, event.clientY];
+    });
+    box.addEventListener("pointermove", (event) => {
+      if (down && Math.hypot(event.clientX - down[0], event.clientY - down[1]) > STEADY_PX) down = [Infinity, 0];
+      if (down && down[0] === Infinity) move(event);
+    });
+    box.addEventListener("pointerup", (event) => {
+      const light = down && down[0] !== Infinity ? this.nearest(at(event)) : null;
+      if (light !== null) onPick(light);
+      else if (down) move(event);
+      down = null;
+    });
+    box.addEventListener("pointercancel", () => (down = null));
+    box.addEventListener("keydown", (event) => {
+      const way = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowDown: [0, -1], ArrowUp: [0, 1] }[event.key];
+      const page = { PageUp: -1, PageDown: 1 }[event.key];
+      if (!way && !page) return;
+      event.preventDefault();
+      const step = STEP * (event.shiftKey ? 10 : 1);
+      if (way) onMove(this.within(this.chosen.map((value, axis) => value + step * way[axis])));
+      else onStep(page);
+    });
+  }
+
+  /** Return the chromaticity nearest to one that has no negative part. */
+  within([r, b]) {
+    const [red, blue] = [r, b].map((value) => Math.min(Math.max(value, 0), 1));
+    const sum = Math.max(red + blue, 1);
+    return [red / sum, blue / sum];
+  }
+
+  nearest({ x, y }) {
+    let [found, least] = [null, NEAR];
+    this.lights.forEach((rb, number) => {
+      const [px, py] = this.place(rb);
+      const distance = Math.hypot(px - x, py - y);
+      if (distance < least) [found, least] = [number, distance];
+    });
+    return found;
+  }
+
+  /** Show the light that is chosen, and the lights that it is mixed of. */
+  choose(rb, parts) {
+    this.chosen = rb;
+    const [cx, cy] = this.place(rb);
+    for (const ring of this.rings) {
+      ring.setAttribute("cx", cx);
+      ring.setAttribute("cy", cy);
+    }
+    const lines = parts.map(([light]) => `M${cx} ${cy}L${this.place(this.lights[light]).join(" ")}`);
+    this.line.setAttribute("d", lines.join(""));
+  }
+}
+Plane.SIDE = 300;

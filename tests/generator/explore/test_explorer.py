@@ -1,0 +1,151 @@
+"""What the page of a table is told: lights, pixels, noise, and a command that makes the very image that is shown."""
+
+from __future__ import annotations
+
+import shlex
+from pathlib import Path
+from typing import get_args
+
+import cv2
+import numpy as np
+import pytest
+
+from foundation.errors import FormatError, InputError
+from generator.cli import main
+from generator.dataset.reader import open_dataset
+from generator.explore.explorer import MOST_DROPPED, Explorer
+from generator.explore.samples import sample_folder
+from generator.lights.gamut import black_body, rb_of
+from generator.pictures.picture import Preparation, read_picture
+from generator.pictures.sources import find_pictures
+from generator.rendering import Rendering
+from tests.generator.conftest import MakeLut
+from tests.generator.rendering.conftest import MakeTable
+from tests.generator.rendering.conftest import make_table as make_table_of_a_print
+
+make_table = make_table_of_a_print
+SIDE = 60
+
+
+@pytest.fixture(autouse=True)
+def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    monkeypatch.chdir(tmp_path)
+
+
+def png(seed: int, width: int = 90, height: int = 50) -> bytes:
+    codes = np.random.default_rng(seed).integers(0, 256, (height // 10, width // 10, 3)).astype(np.uint8)
+    return cv2.imencode(".png", codes.repeat(10, axis=0).repeat(10, axis=1))[1].tobytes()
+
+
+@pytest.fixture
+def explorer(make_table: MakeTable, tmp_path: Path) -> Explorer:
+    """Return an explorer of a print under three black bodies, with two pictures in a folder with blanks."""
+    lut = make_table()
+    folder = tmp_path / "my pictures"
+    folder.mkdir()
+    for number in range(2):
+        (folder / f"it's {number}.png").write_bytes(png(number))
+    return Explorer("lut", lut, find_pictures([str(folder)], Preparation(max_side=SIDE)), SIDE)
+
+
+@pytest.mark.parametrize("rendering", get_args(Rendering))
+@pytest.mark.parametrize("light", ["1", "1:.3+2:.7", "r=.25,b=.3", "4000K"])
+def test_the_command_makes_the_image_that_is_shown(explorer: Explorer, light: str, rendering: Rendering) -> None:
+    shown = explorer.show(1, light)
+    image = explorer.counts(1, light, rendering).copy()
+    assert image.shape == (round(SIDE * 5 / 9), SIDE, 3)
+    words = shlex.split(shown["commands"][rendering])
+    assert words[0] == "generate"
+    assert main(words[1:]) == 0
+    made = open_dataset("dataset")
+    assert (made.read_image(made.entries[0]) == image).all()
+    assert made.entries[0].truth == pytest.approx(shown["truth"], abs=1e-9)
+    assert [made.entries[0].lights[0], len(made.entries)] == [shown["light"], 1]
+
+
+def test_the_command_of_a_picture_that_was_sent_is_run_beside_the_picture(explorer: Explorer, tmp_path: Path) -> None:
+    number = explorer.add("/somewhere/-far .png", png(7))
+    image = explorer.counts(number, "0", "codes").copy()
+    assert not explorer.show(number, "0")["is_here"]
+    (tmp_path / "-far .png").write_bytes(png(7))
+    assert main(shlex.split(explorer.show(number, "0")["commands"]["codes"])[1:]) == 0
+    made = open_dataset("dataset")
+    assert (made.read_image(made.entries[0]) == image).all()
+
+
+def test_the_table_is_described(explorer: Explorer) -> None:
+    told = explorer.describe()
+    lut = explorer.lut
+    assert [light["label"] for light in told["lights"]] == ["2000 K", "5600 K", "10000 K"]
+    assert np.array([light["rb"] for light in told["lights"]]) == pytest.approx(rb_of(lut.white))
+    assert {tuple(place) for place in told["hull"]} == {tuple(light["rb"]) for light in told["lights"]}
+    assert told["first"] == 1, "the black body nearest to 5600 K"
+    bodies = np.array(told["black_bodies"])
+    assert bodies[[0, -1], 0].tolist() == [2000, 10000]
+    assert bodies[[0, -1], 1:] == pytest.approx(rb_of(lut.white[[0, 2]]))
+    assert bodies[9, 1:] == pytest.approx(rb_of(black_body(lut, bodies[9, 0]).white(lut)))
+
+
+def test_two_lights_have_a_line_for_a_gamut_and_one_body_no_curve(make_lut: MakeLut) -> None:
+    lut = make_lut(lights=2)
+    told = Explorer("lut", lut, ()).describe()
+    assert np.sort(told["hull"], axis=0) == pytest.approx(np.sort(rb_of(lut.white), axis=0))
+    assert told["black_bodies"] == []
+
+
+def test_one_light_is_all_that_it_can_make(make_lut: MakeLut) -> None:
+    explorer = Explorer("lut", make_lut(lights=1), ())
+    assert explorer.describe()["hull"] == [explorer.describe()["lights"][0]["rb"]]
+
+
+def test_what_the_table_cannot_make_becomes_the_nearest_light(explorer: Explorer) -> None:
+    shown = explorer.show(0, "r=.9,b=.05")
+    assert shown["light"] == "0"
+    with pytest.raises(InputError, match="no mixture"):
+        explorer.show(0, "sunny")
+
+
+def test_noise_of_a_pixel_is_that_of_the_table(explorer: Explorer) -> None:
+    picture = read_picture(Path("my pictures") / "it's 0.png", SIDE)
+    told = explorer.pixel(0, "1", "codes", 3, 20)
+    assert told["codes"] == picture[20, 3].tolist()
+    bits = [int(code) >> 5 for code in picture[20, 3]]
+    cell = np.asarray(explorer.lut.samples[1, bits[0] << 6 | bits[1] << 3 | bits[2]], np.float64)
+    # Means of 256 draws are off by a sixteenth of the deviation; four of these are exceeded once in ten thousand.
+    assert np.abs(np.array(told["mean"]) - cell.mean(axis=0)).max() < (cell.std(axis=0) / 4).max()
+    assert np.array(told["deviation"]) == pytest.approx(cell.std(axis=0), rel=0.25)
+    with pytest.raises(InputError, match="no pixel 60, 3"):
+        explorer.pixel(0, "1", "codes", 60, 3)
+
+
+def test_pictures_that_cannot_be_read_are_named(explorer: Explorer) -> None:
+    with pytest.raises(FormatError, match=r"^cannot read letter\.txt"):
+        explorer.add("letter.txt", b"Dear Sir")
+    with pytest.raises(InputError, match="no picture 99"):
+        explorer.show(99, "0")
+
+
+def test_a_small_file_that_claims_a_large_picture_is_refused(
+    explorer: Explorer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("generator.explore.explorer.MOST_DROPPED_PIXELS", 90 * 50 - 1)
+    with pytest.raises(FormatError, match="90x50"):
+        explorer.add("large.png", png(1))
+
+
+def test_only_the_newest_pictures_that_were_sent_are_kept(explorer: Explorer) -> None:
+    numbers = [explorer.add(f"{seed}.png", png(seed)) for seed in range(MOST_DROPPED + 1)]
+    with pytest.raises(InputError, match="send it"):
+        explorer.counts(numbers[0], "0", "codes")
+    assert explorer.show(numbers[1], "0")["picture"]["name"] == "1.png"
+
+
+def test_sample_pictures_are_made_once(tmp_path: Path) -> None:
+    folder = sample_folder(tmp_path / "kept")
+    before = {path.name: path.stat().st_mtime_ns for path in folder.iterdir()}
+    assert len(before) == 3
+    assert sample_folder(tmp_path / "kept") == folder
+    assert before == {path.name: path.stat().st_mtime_ns for path in folder.iterdir()}
+    for path in folder.iterdir():
+        assert len(np.unique(read_picture(path).reshape(-1, 3), axis=0)) >= 20
