@@ -1,4 +1,4 @@
-"""What `make demo` and `make test` install, and that no page or example leads out of the repository."""
+"""What people meet first: what `make demo` and `make test` install, README, and paths that pages name."""
 
 from __future__ import annotations
 
@@ -63,3 +63,11 @@ def test_no_page_leads_out_of_the_repository(page: Path) -> None:
 def test_a_path_beside_the_repository_is_seen() -> None:
     beside = f"../{ROOT.parent.name}/x ../shared/data ../examples"
     assert astray(ROOT / "docs" / "transfer.md", beside) == beside.split()[:2]
+
+
+def test_readme_is_read_in_one_go() -> None:
+    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    assert len(text.splitlines()) <= 80
+    places = re.findall(r"\]\(([^):#]+)", text)
+    assert len(places) >= 20
+    assert [place for place in places if not (ROOT / place).exists()] == []
