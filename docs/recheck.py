@@ -156,6 +156,8 @@ def differences(check: Check, folder: Path) -> list[str]:
     """Return what the table states otherwise than the file that its commands left in `folder`, a line each."""
     with (folder / check.mark.reads).open(encoding="utf-8", newline="") as file:
         printed = [row for row in csv.DictReader(file) if all(row[k] == v for k, v in check.mark.where.items())]
+    if not any(NUMBER.search(cell) for cells in check.table.rows for cell in cells[max(len(check.mark.rows), 1) :]):
+        return [f"{check.place}: the table states no figure"]
     return [line for cells in check.table.rows for line in _differences_of_row(check, cells, printed)]
 
 
@@ -185,7 +187,7 @@ def _printed(mark: Mark, heading: str, label: str, rows: Sequence[dict[str, str]
         rows = [row for row in rows if _plain(row[mark.columns]) == _plain(heading)]
     name = mark.names.get(heading, heading) if mark.columns is None else mark.value or label
     found = [value for row in rows for key, value in row.items() if _plain(key) == _plain(name)]
-    return float(found[0]) if len(found) == 1 and NUMBER.fullmatch(found[0]) else None
+    return float(found[0]) if len(found) == 1 and re.fullmatch(r"-?[\d.]+(?:e[+-]?\d+)?", found[0]) else None
 
 
 def _plain(text: str) -> str:
@@ -225,7 +227,17 @@ def _run_block(command: str, block: Sequence[Check], folder: Path) -> list[str]:
     if done.returncode:
         said = (done.stderr or done.stdout).strip()[-500:]
         return [f"{block[0].place}: the commands ended with {done.returncode}: {said}"]
-    return [line for check in block for line in differences(check, folder)]
+    return [line for check in block for line in _differences_or_why_not(check, folder)]
+
+
+def _differences_or_why_not(check: Check, folder: Path) -> list[str]:
+    """Return what differs, or why nothing could be compared."""
+    try:
+        return differences(check, folder)
+    except OSError as error:
+        return [f"{check.place}: the commands left no {check.mark.reads} ({error.strerror})"]
+    except KeyError as error:
+        return [f"{check.place}: {check.mark.reads} has no column {error.args[0]!r}"]
 
 
 def _found(name: str, folders: Sequence[Path]) -> Path | None:

@@ -49,6 +49,9 @@ def test_what_is_printed_is_found() -> None:
         ("| – |", "| 4 |", "B; 1: 4 stated, not one figure printed"),
         ("| B |", "| C |", "C; 0: 3.25 stated, not one figure printed"),
         ("mkdir FOLDER", "exit 7", "the commands ended with 7"),
+        ('reads = "FOLDER/out.csv"', 'reads = "FOLDER/other.csv"', "left no FOLDER/other.csv"),
+        ('rows = ["Method"]', 'rows = ["Name"]', "FOLDER/out.csv has no column 'Name'"),
+        ("| **a** | 1.23 / 7 | 2.5 |\n| B | 3.25 | – |\n", "| a | – | – |\n", "states no figure"),
         ("A,1,2.5,x", "A,1,2.5,x\\nA,1,2.6,x", "a**; 1: 2.5 stated, not one figure printed"),
     ],
 )
