@@ -1,23 +1,34 @@
-# Two commands on a fresh machine with Python 3.11+ and make: `make demo` and `make test`.
+# Two commands on a fresh machine with Python 3.11+ and make: `make demo` and `make test`. Each installs what it needs.
 
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
+DEMO_READY := $(VENV)/.demo
 READY := $(VENV)/.ready
+REST := \# What follows is for work on the repository.
+INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check
 DEMO := build/demo
 ROOMS := foundation drivers sim experiment calibration acquisition synthesis generator evaluation
 
-.PHONY: demo test quick lint docs bench full-session lock clean
+.PHONY: install demo test quick lint docs bench full-session lock clean
 
-$(READY): requirements.lock pyproject.toml
+# The first part of the lock: what a plain installation has, and the photographs of the demo.
+$(DEMO_READY): requirements.lock pyproject.toml
 	$(PYTHON) -c 'import sys; sys.exit(0 if sys.version_info >= (3, 11) else "Python 3.11 or newer is needed, this is " + sys.version.split()[0] + "; name one with make PYTHON=python3.12 ...")'
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --requirement requirements.lock
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --editable .
+	sed '/^$(REST)/,$$d' requirements.lock | $(INSTALL) --requirement /dev/stdin
+	$(INSTALL) --no-deps --editable .
 	touch $@
 
+$(READY): $(DEMO_READY)
+	$(INSTALL) --requirement requirements.lock
+	touch $@
+
+# What the demo needs, into .venv; no more than a plain installation and a few photographs.
+install: $(DEMO_READY)
+
 # The main job in the simulated lab: print, light, photograph, calibrate, generate. About 12 lights, full-size frames.
-demo: $(READY)
+demo: $(DEMO_READY)
 	rm -rf $(DEMO)
 	mkdir -p $(DEMO)
 	$(BIN)/acquire chart $(DEMO)/chart --no-tiff
@@ -58,16 +69,21 @@ bench: $(READY)
 	@for file in benchmarks/[!_]*.py; do $(BIN)/python -m benchmarks.$$(basename $$file .py) || exit 1; done
 
 # A complete table of full-size frames, 707 lights, in the simulated lab: half an hour or more, 60 GB of disk meanwhile.
-full-session: $(READY)
+full-session: $(DEMO_READY)
 	$(BIN)/python examples/full_session.py build/full-session
 
-# Rewrites the lock from pyproject.toml; needs the network.
+# Rewrites the lock from pyproject.toml, the demo's part first; needs the network.
+COMPILE = $(BIN)/uv pip compile pyproject.toml --universal --python-version 3.11 --generate-hashes --no-emit-index-url \
+	--no-emit-find-links --no-annotate --custom-compile-command "make lock" --quiet --extra demo
 lock:
+	mkdir -p build
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet uv
-	$(BIN)/uv pip compile pyproject.toml --extra dev --extra docs --universal --python-version 3.11 --generate-hashes \
-		--no-emit-index-url --no-emit-find-links --no-annotate --custom-compile-command "make lock" \
-		--quiet --upgrade --output-file requirements.lock
+	$(COMPILE) --extra dev --extra docs --upgrade --output-file build/all.lock
+	$(COMPILE) --constraint build/all.lock --upgrade --output-file build/demo.lock
+	{ cat build/demo.lock; echo; echo '$(REST)'; \
+		awk 'NR == FNR { if (/==/) demo[$$0]; next } /==/ { kept = !($$0 in demo) } kept' build/demo.lock build/all.lock; \
+	} > requirements.lock
 
 clean:
 	rm -rf build $(VENV)

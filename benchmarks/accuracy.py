@@ -182,6 +182,12 @@ def measure(case: str, body: str, room: Changes, folder: Path) -> None:
         f"World.white, {len(lights)} lights",
     )
     report(f"{case}: ground truth, worst angle", float(degrees.max()), "degrees", f"World.white, {len(lights)} lights")
+    stated, stated_cells = lut.truth_uncertainty_deg, lut.cell_uncertainty
+    assert stated is not None
+    assert stated_cells is not None
+    for name, value in (("median", np.median(stated)), ("worst", stated.max())):
+        report(f"{case}: ground truth, {name} stated", float(value), "degrees, k = 2", "uncertainty.csv")
+    report(f"{case}: cells, RMS stated", 100 * float(np.sqrt((stated_cells**2).mean())), "%, k = 2", "cells.csv")
 
     frames = {frame.record.illumination: frame for frame in result.figures.frames if frame.record.kind == "light"}
     fields = [frames[number].paper.field.at(cells) for number in range(len(lights))]

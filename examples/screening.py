@@ -7,7 +7,9 @@ lights of the other half of the camera's images, learners of the suite, cross-va
 ratios with bootstrap intervals paired by image, means over the seeds.
 
     python examples/screening.py --pictures BSDS500/data/images --pictures imagenet-sample-images \
-        --archives ../shared/data/benchmark --sensitivities ../shared/data/ssf --lever naive-matrix --lever random-like
+        --archives ARCHIVES --lever naive-matrix --lever random-like
+
+ARCHIVES is the folder with the three cameras' thumbnails, as examples/worth.sh has it.
 
 Levers: naive, naive-matrix; codes; and keep, compensate, random (the print's black), each of colorimetric rendering
 under the projector's white, with -neutral (the 75 % of the pictures whose mean is most neutral) or -like (pictures
@@ -18,7 +20,6 @@ from __future__ import annotations
 
 import argparse
 import itertools
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -36,6 +37,7 @@ from evaluation.learning.standard import standard_learners
 from evaluation.metrics import recovery_error
 from foundation.colorimetry import decode_srgb
 from generator.rendering.matrices import camera_matrix
+from sim.spectral import read_sensitivities
 from sim.world.room import print_reflectance, projector_primaries
 
 Floats = npt.NDArray[Any]
@@ -108,10 +110,8 @@ def _halved(pixels: Floats) -> Floats:
 class Print:
     """What a camera sees of the simulated print under the projector's primaries."""
 
-    def __init__(self, sensitivities: Path, name: str) -> None:
-        file = sensitivities / f"{CAMERAS[name][1]}_380_780_5.json"
-        table = json.loads(file.read_text())["spectral_data"]["data"]["main"]
-        seen = np.array([table[str(wavelength)] for wavelength in range(380, 781, 5)])
+    def __init__(self, name: str) -> None:
+        seen = read_sensitivities(CAMERAS[name][1]).at(np.arange(380.0, 781.0, 5.0))
         red, green, blue = np.meshgrid(CODES, CODES, CODES, indexing="ij")
         self.codes: Floats = np.stack([red.ravel(), green.ravel(), blue.ravel()], axis=1)
         responses: Floats = np.einsum(
@@ -238,8 +238,7 @@ def main() -> None:
     """Print the pooled ratios of each lever."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--pictures", type=Path, action="append", required=True, help="folder; may be repeated")
-    parser.add_argument("--archives", type=Path, required=True)
-    parser.add_argument("--sensitivities", type=Path, required=True)
+    parser.add_argument("--archives", type=Path, required=True, help="folder of the three files in CAMERAS")
     parser.add_argument("--lever", action="append", required=True)
     parser.add_argument("--learners", default="regression-trees,kernel-ridge,log-chroma")
     parser.add_argument("--cameras", default=",".join(CAMERAS))
@@ -251,7 +250,7 @@ def main() -> None:
     seeds = range(given.seeds)
     pictures = read_pictures(given.pictures)
     real = {name: read_real(given.archives, name) for name in CAMERAS}
-    prints = {name: Print(given.sensitivities, name) for name in cameras}
+    prints = {name: Print(name) for name in cameras}
     known = {(c, k): features_of(one, list(real[c].images), True) for c in cameras for k, one in learners.items()}
     places = {key: np.zeros((given.seeds, len(real[key[0]].lights))) for key in known}
     errors: dict[str, dict[tuple[str, str], Floats]] = {"real": places}

@@ -85,8 +85,8 @@ ReportBuild = Callable[[int, int, str], None]
 """Called with frames taken in, frames in all, and what is being done."""
 
 LEAST_COUNTS = 300.0
-"""Counts above which a cell is compared: 25 samples of 300 counts have a mean good to 1 %, and README's figures of a
-table's error are of the same cells."""
+"""Counts above which a cell is compared: 25 samples of 300 counts have a mean good to 1 %, and the errors
+of tables in docs/measured.md are of the same cells."""
 
 MOST_THREADS = 4
 """Each holds a light of both tables, 10 MB with 25 samples; reading the disk is what takes the time."""

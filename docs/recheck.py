@@ -1,0 +1,270 @@
+"""Run what the pages state as printed by commands, and list the figures that differ from what is printed now.
+
+`python -m docs.recheck [PAGE…] [--data FOLDER]… [--seconds S]` runs, before a release, all of README and docs, in
+folders that are removed afterwards. A table of figures that commands print has a comment before it, in TOML:
+
+    <!-- recheck
+    reads = "FOLDER/bits.csv"          # the file that holds the figures; commands write to FOLDER
+    rows = ["Algorithm"]               # its columns that name a row, as the table's first ones do; "a, b" joins two
+    columns = "Bits set to zero"       # its column with the table's other headings; else they are names of columns
+    value = "Med."                     # its column with the figures; else, with `columns`, the row's label names it
+    where = { error = "recovery" }     # which rows are meant, by columns that the table does not show
+    names = { "Best 25 %" = "best25" } # columns whose names are not the table's headings
+    needs = ["thumbnails.npz"]         # files that do not come with the suite, looked for below the folders of --data
+    seconds = 2                        # what the commands take
+    tolerance = 0.02                   # by default a bit more than half of the last digit's unit
+    command = "evaluate …"             # by default the last block of commands above
+    first = "sim table …"              # commands further up that it needs
+    -->
+
+The first number of each cell is compared; figures in sentences are not. Commands run as they stand, so recheck only a
+copy that you trust. Figures that cannot be run so, because they take hours or data that nobody may pass on, have in
+their section the words "taken with version", the version and the date; on pages of measurements (`MEASURED`) a table
+with neither counts as a difference.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import itertools
+import math
+import os
+import re
+import subprocess
+import sys
+import tempfile
+import tomllib
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from pydantic import BaseModel, ConfigDict
+
+ROOT = Path(__file__).resolve().parents[1]
+
+MEASURED = (
+    "README.md",
+    "docs/measured.md",
+    "docs/paper.md",
+    "docs/transfer.md",
+    "docs/how-to/describing.md",
+    "docs/how-to/rendering.md",
+    "docs/how-to/table-without-a-lab.md",
+    "docs/how-to/transfer.md",
+    "docs/how-to/tune.md",
+)
+"""Pages whose tables of decimals are measurements; tables of other pages state limits, formats and settings."""
+
+NO_SOURCE = 'figures with neither a recheck comment nor, in their section, "taken with version X, YYYY-MM-DD"'
+NUMBER = re.compile(r"-?(?:\d+\.?\d*|\.\d+)")
+TAKEN = re.compile(r"taken\s+with\s+version\s+(\S+),\s+(\d{4}-\d\d-\d\d)", re.IGNORECASE)
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table of a page: the line it begins in, headings, and rows of cells."""
+
+    line: int
+    headings: list[str]
+    rows: list[list[str]]
+
+    def has_figures(self) -> bool:
+        """Return whether a cell has a decimal."""
+        return any(re.search(r"\d?\.\d", cell) for row in self.rows for cell in row)
+
+
+class Mark(BaseModel):
+    """What the comment says; see above."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    reads: str
+    rows: tuple[str, ...] = ()
+    columns: str | None = None
+    value: str | None = None
+    where: dict[str, str] = {}
+    names: dict[str, str] = {}
+    needs: tuple[str, ...] = ()
+    seconds: float
+    tolerance: float | None = None
+    command: str | None = None
+    first: str = ""
+
+
+@dataclass(frozen=True)
+class Check:
+    """A table of a page, the commands that print its figures, and how these are found."""
+
+    page: str
+    table: Table
+    command: str
+    mark: Mark
+
+    @property
+    def place(self) -> str:
+        """Return page and line."""
+        return f"{self.page}:{self.table.line}"
+
+
+def checks_of(page: str, text: str) -> list[Check]:
+    """Return the checks of a page."""
+    found: list[Check] = []
+    for comment in re.finditer(r"^<!-- recheck\n(.*?)^-->\n", text, re.MULTILINE | re.DOTALL):
+        mark = Mark.model_validate(tomllib.loads(comment[1]))
+        line = text.count("\n", 0, comment.end()) + 1
+        table = next((one for one in tables_of(text) if one.line >= line), None)
+        if table is None:
+            raise ValueError(f"{page}:{line}: a recheck comment has no table below it")
+        command = mark.command or _commands_above(text[: comment.start()])
+        found.append(Check(page, table, f"{mark.first}\n{command}", mark))
+    return found
+
+
+def tables_of(text: str) -> list[Table]:
+    """Return the tables of a page, in its order."""
+    lines = text.splitlines()
+    found: list[Table] = []
+    for is_table, group in itertools.groupby(enumerate(lines, 1), key=lambda pair: pair[1].startswith("|")):
+        if is_table and len(rows := [(n, [cell.strip() for cell in row[1:-1].split("|")]) for n, row in group]) > 2:
+            found.append(Table(rows[0][0], rows[0][1], [cells for _, cells in rows[2:]]))
+    return found
+
+
+def without_a_source(text: str) -> list[Table]:
+    """Return the tables of figures that have neither commands nor, in their section, a version and a date."""
+    checked = {check.table.line for check in checks_of("", text)}
+    starts = [1, *(n for n, line in enumerate(text.splitlines(), 1) if line.startswith("## "))]
+    lines = text.splitlines()
+    left: list[Table] = []
+    for table in tables_of(text):
+        start = max(n for n in starts if n <= table.line)
+        end = min((n for n in starts if n > table.line), default=len(lines) + 1)
+        dated = TAKEN.search("\n".join(lines[start - 1 : end - 1]))
+        if table.has_figures() and table.line not in checked and not dated:
+            left.append(table)
+    return left
+
+
+def _commands_above(text: str) -> str:
+    """Return the last block of commands: lines with four spaces, or a fenced block."""
+    blocks = re.findall(r"(?:^    .*\n)+|^```(?:sh|console)?\n(?:.*\n)*?```\n", text, re.MULTILINE)
+    return "\n".join(line.removeprefix("    ") for line in blocks[-1].splitlines() if not line.startswith("```"))
+
+
+def differences(check: Check, folder: Path) -> list[str]:
+    """Return what the table states otherwise than the file that its commands left in `folder`, a line each."""
+    with (folder / check.mark.reads).open(encoding="utf-8", newline="") as file:
+        printed = [row for row in csv.DictReader(file) if all(row[k] == v for k, v in check.mark.where.items())]
+    if not any(NUMBER.search(cell) for cells in check.table.rows for cell in cells[max(len(check.mark.rows), 1) :]):
+        return [f"{check.place}: the table states no figure"]
+    return [line for cells in check.table.rows for line in _differences_of_row(check, cells, printed)]
+
+
+def _differences_of_row(check: Check, cells: Sequence[str], printed: Sequence[dict[str, str]]) -> Iterator[str]:
+    labels = max(len(check.mark.rows), 1)
+    named = [_plain(cell) for cell in cells[: len(check.mark.rows)]]
+    rows = [row for row in printed if [_label(row, names) for names in check.mark.rows] == named]
+    for heading, cell in zip(check.table.headings[labels:], cells[labels:], strict=True):
+        stated = NUMBER.search(_plain(cell))
+        if stated is None:
+            continue
+        value = _printed(check.mark, heading, cells[0], rows)
+        where = f"{check.place}: {', '.join(cells[:labels])}; {heading}"
+        if value is None:
+            yield f"{where}: {stated[0]} stated, not one figure printed"
+        elif abs(float(stated[0]) - value) > _tolerance(check.mark, stated[0]):
+            yield f"{where}: {stated[0]} stated, {value:.6g} printed"
+
+
+def _label(row: Mapping[str, str], names: str) -> str:
+    return _plain(", ".join(row[name.strip()] for name in names.split(",")))
+
+
+def _printed(mark: Mark, heading: str, label: str, rows: Sequence[dict[str, str]]) -> float | None:
+    """Return the printed figure; None where there is none, or more than one."""
+    if mark.columns is not None:
+        rows = [row for row in rows if _plain(row[mark.columns]) == _plain(heading)]
+    name = mark.names.get(heading, heading) if mark.columns is None else mark.value or label
+    found = [value for row in rows for key, value in row.items() if _plain(key) == _plain(name)]
+    return float(found[0]) if len(found) == 1 and re.fullmatch(r"-?[\d.]+(?:e[+-]?\d+)?", found[0]) else None
+
+
+def _plain(text: str) -> str:
+    """Return a cell or a name without emphasis, typographic signs and differences of case and blanks."""
+    return re.sub(r"[*`\s]", "", text).replace("−", "-").casefold()
+
+
+def _tolerance(mark: Mark, stated: str) -> float:
+    digits = len(stated.partition(".")[2])
+    return mark.tolerance if mark.tolerance is not None else 0.51 * 10.0**-digits
+
+
+def run(checks: Sequence[Check], data: Sequence[Path], most_s: float = math.inf) -> tuple[list[str], list[str]]:
+    """Run the commands of checks, each block once; return what differs and what was not run, a line each."""
+    differ: list[str] = []
+    skipped: list[str] = []
+    for command, group in itertools.groupby(checks, key=lambda check: check.command):
+        block = list(group)
+        places = {name: _found(name, data) for check in block for name in check.mark.needs}
+        missing = [name for name, place in places.items() if place is None]
+        seconds = max(check.mark.seconds for check in block)
+        if missing or seconds > most_s:
+            why = f"needs {', '.join(missing)}; name its folder by --data" if missing else f"takes {seconds:g} s"
+            skipped += [f"{check.place}: {why}" for check in block]
+            continue
+        with tempfile.TemporaryDirectory() as folder:
+            for name, place in (places | {"examples": ROOT / "examples"}).items():
+                (Path(folder) / name).symlink_to(str(place))
+            differ += _run_block(command, block, Path(folder))
+    return differ, skipped
+
+
+def _run_block(command: str, block: Sequence[Check], folder: Path) -> list[str]:
+    paths = os.pathsep.join([str(Path(sys.executable).parent), os.environ.get("PATH", "")])
+    settings = os.environ | {"PATH": paths, "PYTHONPATH": str(ROOT)}
+    done = subprocess.run(["bash", "-euc", command], cwd=folder, env=settings, capture_output=True, text=True)
+    if done.returncode:
+        said = (done.stderr or done.stdout).strip()[-500:]
+        return [f"{block[0].place}: the commands ended with {done.returncode}: {said}"]
+    return [line for check in block for line in _differences_or_why_not(check, folder)]
+
+
+def _differences_or_why_not(check: Check, folder: Path) -> list[str]:
+    """Return what differs, or why nothing could be compared."""
+    try:
+        return differences(check, folder)
+    except OSError as error:
+        return [f"{check.place}: the commands left no {check.mark.reads} ({error.strerror})"]
+    except KeyError as error:
+        return [f"{check.place}: {check.mark.reads} has no column {error.args[0]!r}"]
+
+
+def _found(name: str, folders: Sequence[Path]) -> Path | None:
+    return next((path.resolve() for folder in folders for path in sorted(folder.rglob(name))), None)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the checks of pages and print what differs and what was not run; return 1 where something differs."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("pages", nargs="*", metavar="PAGE", help="by default README.md and all of docs")
+    parser.add_argument("--data", type=Path, action="append", default=[], help="where files lie that commands need")
+    parser.add_argument("--seconds", type=float, default=math.inf, help="leave out commands that take longer")
+    given = parser.parse_args(arguments)
+    named = [Path(page).resolve() for page in given.pages]
+    pages = named or [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
+    texts = {page.relative_to(ROOT).as_posix(): page.read_text(encoding="utf-8") for page in pages}
+    checks = [check for page, text in texts.items() for check in checks_of(page, text)]
+    differ, skipped = run(checks, given.data, given.seconds)
+    for page in set(texts).intersection(MEASURED):
+        differ += [f"{page}:{table.line}: {NO_SOURCE}" for table in without_a_source(texts[page])]
+    for page, text in texts.items():
+        taken = sorted(set(TAKEN.findall(text)))
+        skipped += [f"{page}: taken with version {version}, {date}" for version, date in taken]
+    print("\n".join([*(f"not run  {line}" for line in skipped), *(f"differs  {line}" for line in differ)]))
+    print(f"{len(checks)} tables have commands; {len(differ)} differences")
+    return int(bool(differ))
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

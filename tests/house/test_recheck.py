@@ -1,0 +1,110 @@
+"""Figures that pages state as printed by commands are those that the commands print."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from docs.recheck import MEASURED, ROOT, checks_of, run, tables_of, without_a_source
+from tests.data_files import LOCAL
+
+FEW_SECONDS = 5.0
+"""What a block of commands may take in the suite; the others are run before a release."""
+
+PAGE = """
+    mkdir FOLDER
+    printf 'Method,Bits,Med.,Note\\nA,0,1.234,x\\nA,1,2.5,x\\nB,0,3.249,x\\n' > FOLDER/out.csv
+
+<!-- recheck
+reads = "FOLDER/out.csv"
+rows = ["Method"]
+columns = "Bits"
+value = "Med."
+seconds = 0
+-->
+
+| method | 0 | 1 |
+|---|---|---|
+| **a** | 1.23 / 7 | 2.5 |
+| B | 3.25 | – |
+"""
+
+
+def page_with(text: str, instead: str) -> str:
+    assert PAGE.count(text) == 1
+    return PAGE.replace(text, instead)
+
+
+def test_what_is_printed_is_found() -> None:
+    (check,) = checks_of("page.md", PAGE)
+    assert check.place == f"page.md:{PAGE.splitlines().index('| method | 0 | 1 |') + 1}"
+    assert run([check], []) == ([], [])
+
+
+@pytest.mark.parametrize(
+    ("text", "instead", "said"),
+    [
+        ("1.23 /", "1.24 /", "a**; 0: 1.24 stated, 1.234 printed"),
+        ("| – |", "| 4 |", "B; 1: 4 stated, not one figure printed"),
+        ("| B |", "| C |", "C; 0: 3.25 stated, not one figure printed"),
+        ("mkdir FOLDER", "exit 7", "the commands ended with 7"),
+        ('reads = "FOLDER/out.csv"', 'reads = "FOLDER/other.csv"', "left no FOLDER/other.csv"),
+        ('rows = ["Method"]', 'rows = ["Name"]', "FOLDER/out.csv has no column 'Name'"),
+        ("| **a** | 1.23 / 7 | 2.5 |\n| B | 3.25 | – |\n", "| a | – | – |\n", "states no figure"),
+        ("A,1,2.5,x", "A,1,2.5,x\\nA,1,2.6,x", "a**; 1: 2.5 stated, not one figure printed"),
+    ],
+)
+def test_what_differs_is_said(text: str, instead: str, said: str) -> None:
+    differ, skipped = run(checks_of("page.md", page_with(text, instead)), [])
+    assert len(differ) == 1
+    assert said in differ[0]
+    assert skipped == []
+
+
+def test_a_tolerance_is_kept_to() -> None:
+    for tolerance, count in ((0.01, 0), (0.005, 1)):
+        text = page_with("seconds = 0", f"seconds = 0\ntolerance = {tolerance}").replace("1.23 /", "1.24 /")
+        assert len(run(checks_of("page.md", text), [])[0]) == count
+
+
+def test_columns_may_be_named_and_rows_chosen() -> None:
+    text = page_with(
+        'columns = "Bits"\nvalue = "Med."', 'where = { Bits = "0" }\nnames = { "0" = "Med.", "1" = "Bits" }'
+    )
+    differ, _ = run(checks_of("page.md", text), [])
+    assert [line.split("; ")[1] for line in differ] == ["1: 2.5 stated, 0 printed"]
+
+
+def test_what_cannot_be_run_is_said(tmp_path: Path) -> None:
+    needs = page_with("seconds = 0", 'seconds = 9\nneeds = ["a.npz"]').replace(
+        "mkdir FOLDER", "cat a.npz; mkdir FOLDER"
+    )
+    assert "needs a.npz" in run(checks_of("page.md", needs), [tmp_path])[1][0]
+    (tmp_path / "below").mkdir()
+    (tmp_path / "below" / "a.npz").touch()
+    assert "takes 9 s" in run(checks_of("page.md", needs), [tmp_path], 8)[1][0]
+    assert run(checks_of("page.md", needs), [tmp_path], 9) == ([], [])
+
+
+def test_a_table_without_a_source_is_found() -> None:
+    bare = PAGE.replace("<!-- recheck", "<!-- nothing")
+    assert without_a_source(bare) == tables_of(PAGE)
+    assert without_a_source(f"taken\nwith version 0.1.0, 2026-11-24\n{bare}") == []
+    assert without_a_source(f"taken with version 0.1.0, 2026-11-24\n\n## Next\n{bare}") != []
+    assert without_a_source(PAGE) == []
+
+
+@pytest.mark.parametrize("page", MEASURED)
+def test_each_figure_of_a_page_has_a_source(page: str) -> None:
+    left = without_a_source((ROOT / page).read_text(encoding="utf-8"))
+    assert [(table.line, table.headings) for table in left] == []
+
+
+@pytest.mark.slow
+def test_pages_state_what_commands_print() -> None:
+    pages = [ROOT / "README.md", *(ROOT / "docs").rglob("*.md")]
+    checks = [check for page in pages for check in checks_of(page.name, page.read_text(encoding="utf-8"))]
+    differ, skipped = run(checks, [folder for folder in LOCAL if folder.is_dir()], FEW_SECONDS)
+    assert differ == []
+    assert len(skipped) < len(checks)
