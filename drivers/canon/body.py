@@ -22,6 +22,7 @@ number of mirror lockup among the custom functions as ExifTool names it (CanonCu
 from __future__ import annotations
 
 import contextlib
+import re
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from typing import BinaryIO, TypeVar
@@ -325,6 +326,10 @@ CAPTURE_TIMEOUT_S = 100.0
 
 _REMOTE_ON, _REMOTE_OFF = 1, 0
 """Parameter of SetRemoteMode, as the recorded conversations and libgphoto2 send it."""
+_OTHER_REMOTE_MODE = re.compile(r"Canon (?!EOS)|Canon EOS (Kiss )?M(?!6 Mark II\b)")
+"""Bodies to which libgphoto2 sends 0x15 or 0x11 as remote mode (`is_canon_eos_m` in its ptp-private.h), with live view
+on before each frame: EOS M, but for the M6 Mark II, which is as the reflex bodies, and compact cameras. "Canon EOS
+Kiss M" is the M50's name in Japan."""
 _WITHOUT_AF = 1
 """Second parameter of RemoteReleaseOn: a release without autofocus."""
 _HOST_CLUSTERS, _HOST_CLUSTER_BYTES = 0x04FFFFFF, 0x1000
@@ -395,6 +400,12 @@ class EosBody:
             raise DeviceRefused(
                 f"{self.label} is a {self._info.manufacturer} {self._info.model}, which does not speak as a Canon EOS "
                 "does; connect an EOS body, or take the frames otherwise and use `acquire import`"
+            )
+        if _OTHER_REMOTE_MODE.match(self._info.model):
+            raise DeviceRefused(
+                f"{self.label} is a {self._info.model}; EOS M and compact bodies want another remote mode than 1, and "
+                'other steps to a frame, which are not known well enough here; set connection = "gphoto2" in '
+                "[lab.camera], or take the frames otherwise and use `acquire import`"
             )
         self._session.call(Operation.EOS_SET_REMOTE_MODE, _REMOTE_ON)
         self._session.call(Operation.EOS_SET_EVENT_MODE, _REMOTE_ON)

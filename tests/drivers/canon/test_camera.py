@@ -918,6 +918,29 @@ def test_another_makers_camera_is_refused(lab: Lab) -> None:
         Lab(body).camera.identity()
 
 
+# Names from libgphoto2's table of cameras (camlibs/ptp2/library.c); which of them want 0x15 or 0x11 as remote mode,
+# from `is_canon_eos_m` in its ptp-private.h and camera_prepare_canon_eos_capture in its config.c (2.5.34).
+
+
+@pytest.mark.parametrize(
+    "model", ["EOS M50", "EOS M", "EOS Kiss M", "EOS M50m2", "PowerShot SX540 HS", "PowerShot G5 X"]
+)
+def test_a_body_with_another_remote_mode_is_refused_untouched(model: str) -> None:
+    lab = Lab(replace(EOS_550D, info=replace(EOS_550D.info, model=f"Canon {model}")))
+    listening = listen(lab)
+    with pytest.raises(DeviceRefused, match=rf'{model}; .*remote mode.*connection = "gphoto2"'):
+        lab.camera.identity()
+    assert not listening.parameters(Operation.EOS_SET_REMOTE_MODE)
+
+
+@pytest.mark.parametrize("model", ["EOS M6 Mark II", "EOS Kiss X4", "EOS-1D X Mark II", "EOS R5", "EOS REBEL T2i"])
+def test_reflex_bodies_and_those_like_them_are_taken_with_remote_mode_1(model: str) -> None:
+    lab = Lab(replace(EOS_550D, info=replace(EOS_550D.info, model=f"Canon {model}")))
+    listening = listen(lab)
+    assert lab.camera.identity().model == f"Canon {model}"
+    assert listening.parameters(Operation.EOS_SET_REMOTE_MODE) == [(1,)]
+
+
 def test_a_release_that_stays_refused_says_where_to_look(lab: Lab) -> None:
     lab.camera.configure(SETTINGS)
     lab.device = faults.Declining(
