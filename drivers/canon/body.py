@@ -4,7 +4,7 @@ Rules that hold inside:
 
 - Every step is one that the recorded conversations have, or one that libgphoto2 takes; an operation that the body does
   not list is never sent. One that it lists and does not know all the same (0x2005) is not sent again, and done without
-  where that is possible: serial number, room on the host, staying awake, half of the ways to release and to fetch.
+  where that is possible: serial number, room on the host, staying awake, the other ways to release and to fetch.
 - GetEvent is asked until it has nothing more, but never without end: some firmware repeats itself. `EosState` takes its
   records in their order and holds nothing that was not reported, and no more of it than `MAX_PROPERTIES` values of
   `MAX_VALUE` bytes and as many lists, which no real body comes near.
@@ -22,6 +22,7 @@ number of mirror lockup among the custom functions as ExifTool names it (CanonCu
 from __future__ import annotations
 
 import contextlib
+import re
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from typing import BinaryIO, TypeVar
@@ -251,10 +252,19 @@ def plan(state: EosState, settings: ExposureSettings) -> dict[int, bytes]:
         (Property.EOS_APERTURE, APERTURE, settings.aperture),
         (Property.EOS_SHUTTER_SPEED, SHUTTER, settings.shutter_s),
     ):
-        try:
-            wanted[code] = number_value(_code(state, code, scale, value))
-        except InputError as error:
-            refused.append(str(error))
+        offered = _offered(state, code, scale)
+        if value is None:
+            if offered:
+                refused.append(f"the lens has apertures, {scale.label(offered[0])} among them: name one as f-number")
+        elif scale is APERTURE and not offered:
+            refused.append(
+                f'aperture {value:g} cannot be set, for the lens tells of none: set aperture = "none" for it'
+            )
+        else:
+            try:
+                wanted[code] = number_value(scale.code(value, offered))
+            except InputError as error:
+                refused.append(str(error))
     if refused:
         raise DeviceRefused(f"the camera cannot take the series: {'; '.join(refused)}")
     if WhiteBalance.DAYLIGHT in state.lists.get(Property.EOS_WHITE_BALANCE, ()):
@@ -270,12 +280,11 @@ def shutter_speeds(state: EosState) -> tuple[float, ...]:
 
 
 def host_destination(state: EosState) -> bytes:
-    """Return the value of property 0xd11c that sends frames to the host."""
+    """Return the value of property 0xd11c that sends frames to the host; a body that lists none is given it to try."""
     offered = state.lists.get(Property.EOS_CAPTURE_DESTINATION, ())
-    if CaptureDestination.HOST not in offered and state.number(Property.EOS_CAPTURE_DESTINATION) != int(
-        CaptureDestination.HOST
-    ):
-        listed = ", ".join(str(value) for value in offered) or "nothing"
+    known = (*offered, state.number(Property.EOS_CAPTURE_DESTINATION))
+    if offered and CaptureDestination.HOST not in known:
+        listed = ", ".join(str(value) for value in offered)
         raise DeviceRefused(
             f"the camera offers the capture destinations {listed}, but not {CaptureDestination.HOST.value}, the host; "
             "such a body cannot be tethered here"
@@ -291,13 +300,11 @@ def _raw_format(state: EosState) -> ImageFormat:
     return RAW_ONLY
 
 
-def _code(state: EosState, code: int, scale: Scale, wanted: float) -> int:
-    offered = state.lists.get(code, ())
+def _offered(state: EosState, code: int, scale: Scale) -> tuple[int, ...]:
+    """Return the codes that a body can be set to, or stands at where it lists nothing: then nothing can be set."""
     current = state.number(code)
-    if not offered and current is not None and current not in scale.specials:
-        # A body that lists nothing lets nothing be set: then it must stand right already.
-        offered = (current,)
-    return scale.code(wanted, offered)
+    standing = () if current is None or current in scale.specials else (current,)
+    return state.lists.get(code) or standing
 
 
 def _named(kind: type[AeMode] | type[DriveMode], value: int) -> str:
@@ -317,14 +324,21 @@ KEEP_ALIVE_S = 10.0
 """After this long a body is asked to stay awake, as libgphoto2 asks it."""
 SETTLE_LIMIT_S = 5.0
 """How long a body may take to report a value that it was given, or room for a frame."""
+BUSY_LIMIT_S = 30.0
+"""How long a body may be busy after it was connected, or when it is to release, before it is refused: an EOS 2000D is
+for seconds at either (gphoto2, issue 382)."""
 RELEASE_TRIES = 5
-"""Presses in all, spread over `PASSING_LIMIT_S`: what keeps a body busy ends by itself or by what is fetched
+"""Presses in a row, spread over `PASSING_LIMIT_S`: what keeps a body busy ends by itself or by what is fetched
 between."""
 CAPTURE_TIMEOUT_S = 100.0
 """Wait for the answer to a release; some bodies expose before they answer. libgphoto2 waits as long."""
 
 _REMOTE_ON, _REMOTE_OFF = 1, 0
 """Parameter of SetRemoteMode, as the recorded conversations and libgphoto2 send it."""
+_OTHER_REMOTE_MODE = re.compile(r"Canon (?!EOS)|Canon EOS (Kiss )?M(?!6 Mark II\b)")
+"""Bodies to which libgphoto2 sends 0x15 or 0x11 as remote mode (`is_canon_eos_m` in its ptp-private.h), with live view
+on before each frame: EOS M, but for the M6 Mark II, which is as the reflex bodies, and compact cameras. "Canon EOS
+Kiss M" is the M50's name in Japan."""
 _WITHOUT_AF = 1
 """Second parameter of RemoteReleaseOn: a release without autofocus."""
 _HOST_CLUSTERS, _HOST_CLUSTER_BYTES = 0x04FFFFFF, 0x1000
@@ -337,10 +351,17 @@ _PIECE_TRIES = 5
 retaken."""
 _FREE_TRIES = 3
 """Few, as the next `make_ready` tries again."""
-_LASTING = (ResponseCode.INVALID_OBJECT_HANDLE, ResponseCode.SESSION_NOT_OPEN, ResponseCode.DEVICE_BUSY)
-"""Responses to a request for a piece that asking again does not change."""
+_IN_PIECES = (Operation.EOS_GET_PARTIAL_OBJECT, Operation.GET_PARTIAL_OBJECT)
+"""Operations that give a part of an object, the preferred one first."""
 _NOT_GOT = (ResponseCode.OPERATION_NOT_SUPPORTED, ResponseCode.EOS_UNKNOWN_COMMAND)
 """Responses to an operation that a body has not got, whatever it lists."""
+_LASTING = (
+    *_NOT_GOT,
+    ResponseCode.INVALID_OBJECT_HANDLE,
+    ResponseCode.SESSION_NOT_OPEN,
+    ResponseCode.DEVICE_BUSY,
+)
+"""Responses to a request for a piece that asking again does not change."""
 _NOTHING_THERE = (
     ResponseCode.PARAMETER_NOT_SUPPORTED,
     ResponseCode.INVALID_STORAGE_ID,
@@ -387,7 +408,10 @@ class EosBody:
 
     def connect(self) -> None:
         """Open the session, take the body under remote control and learn its state."""
-        self._session.open()
+        self._while_busy(self._session.open)
+        self._while_busy(self._take_control)
+
+    def _take_control(self) -> None:
         _, data = self._session.call(Operation.GET_DEVICE_INFO)
         self._info = DeviceInfo.decode(data)
         remote = (Operation.EOS_SET_REMOTE_MODE, Operation.EOS_GET_EVENT)
@@ -396,13 +420,20 @@ class EosBody:
                 f"{self.label} is a {self._info.manufacturer} {self._info.model}, which does not speak as a Canon EOS "
                 "does; connect an EOS body, or take the frames otherwise and use `acquire import`"
             )
+        if _OTHER_REMOTE_MODE.match(self._info.model):
+            raise DeviceRefused(
+                f"{self.label} is a {self._info.model}; EOS M and compact bodies want another remote mode than 1, and "
+                'other steps to a frame, which are not known well enough here; set connection = "gphoto2" in '
+                "[lab.camera], or take the frames otherwise and use `acquire import`"
+            )
         self._session.call(Operation.EOS_SET_REMOTE_MODE, _REMOTE_ON)
         self._session.call(Operation.EOS_SET_EVENT_MODE, _REMOTE_ON)
         self.drain()
+        # libgphoto2 asks again, too: newer bodies have nothing to tell when they are asked at once.
+        if not self._settled(lambda: bool(self.state.values)):
+            raise ProtocolError(f"{self.label} sends no state when asked for events; switch it off and on")
         if self._requested(Property.EOS_SERIAL_NUMBER):
             self._settled(lambda: Property.EOS_SERIAL_NUMBER in self.state.values)
-        if not self.state.lists:
-            raise ProtocolError(f"{self.label} sends no state when asked for events; switch it off and on")
         self._receive_frames()
 
     def supplies(self) -> Supplies:
@@ -461,7 +492,7 @@ class EosBody:
         """Press the release down and let it go, without autofocus."""
         if self._offers(Operation.EOS_REMOTE_RELEASE_ON):
             try:
-                self._press()
+                self._while_busy(self._press)
             except OperationDeclined as error:
                 if not self._lacks(Operation.EOS_REMOTE_RELEASE_ON, error):
                     raise
@@ -520,7 +551,15 @@ class EosBody:
                 f"{self.label} announces {waiting.name!r} of {waiting.size} bytes; 1 to {MAX_FRAME_BYTES} were expected"
             )
         while offset < waiting.size:
-            offset += into.write(self._piece(waiting, offset))
+            operation = next((known for known in _IN_PIECES if self._offers(known)), None)
+            if operation is None:
+                self._fetch_whole(waiting, into, offset)
+                return
+            try:
+                offset += into.write(self._piece(operation, waiting, offset))
+            except OperationDeclined as error:
+                if not self._lacks(operation, error):
+                    raise
             self._keep_awake()
 
     def free(self, waiting: WaitingObject) -> None:
@@ -543,18 +582,28 @@ class EosBody:
         for waiting in list(self.state.waiting.values()):
             self.free(waiting)
 
-    def _piece(self, waiting: WaitingObject, offset: int) -> bytes:
+    def _fetch_whole(self, waiting: WaitingObject, into: BinaryIO, offset: int) -> None:
+        """Append an object's bytes from `offset` on, from a body that gives no parts: those before come again."""
+        came = 0
+
+        def take(piece: bytes) -> None:
+            nonlocal came
+            if came + len(piece) > waiting.size:
+                raise ProtocolError(f"{self.label} announced {waiting.size} bytes for {waiting.name!r} and gives more")
+            into.write(piece[max(offset - came, 0) :])
+            came += len(piece)
+
+        self._session.call(Operation.GET_OBJECT, waiting.handle, receive=take)
+        if came < waiting.size:
+            raise self._cut(waiting, came)
+
+    def _piece(self, operation: Operation, waiting: WaitingObject, offset: int) -> bytes:
         """Return the next bytes of an object; fewer than were asked for are good, for the rest follows."""
         wanted = min(PIECE_BYTES, waiting.size - offset)
         for left in reversed(range(_PIECE_TRIES)):
-            operation = Operation.EOS_GET_PARTIAL_OBJECT
-            if not self._offers(operation):
-                operation = Operation.GET_PARTIAL_OBJECT
             try:
                 sent, data = self._session.call(operation, waiting.handle, offset, wanted)
             except OperationDeclined as error:
-                if operation == Operation.EOS_GET_PARTIAL_OBJECT and self._lacks(operation, error):
-                    continue
                 if not left or error.code in _LASTING:
                     raise
             else:
@@ -565,8 +614,11 @@ class EosBody:
                 if data and counted == len(data):
                     return data
             self._clock.sleep(_PAUSES_S[-1])
-        raise DeviceError(
-            f"{self.label} announced {waiting.size} bytes for {waiting.name!r}, but gives only {offset}; "
+        raise self._cut(waiting, offset)
+
+    def _cut(self, waiting: WaitingObject, came: int) -> DeviceError:
+        return DeviceError(
+            f"{self.label} announced {waiting.size} bytes for {waiting.name!r}, but gives only {came}; "
             "the frame is worthless and may be retaken"
         )
 
@@ -595,6 +647,18 @@ class EosBody:
             f"{self.label} was given {value.hex()} for property 0x{code:04x} and reports "
             f"{came.hex() if came is not None else 'nothing'}; set it by hand, or switch the camera off and on"
         )
+
+    def _while_busy(self, action: Callable[[], None]) -> None:
+        """Do something until the body is not busy, for a limited time: a new session would only begin its work anew."""
+        end = self._clock.monotonic() + BUSY_LIMIT_S
+        while True:
+            try:
+                return action()
+            except OperationDeclined as error:
+                if error.code != ResponseCode.DEVICE_BUSY:
+                    raise
+                if self._clock.monotonic() >= end:
+                    raise DeviceRefused(f"{error}; it has been so for {BUSY_LIMIT_S:g} s") from error
 
     def _let_go(self) -> None:
         with contextlib.suppress(OperationDeclined):

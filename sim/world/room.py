@@ -421,7 +421,10 @@ def _table(on: PaperName) -> _Array:
     return table
 
 
-REFERENCE_EXPOSURE: Final = ExposureSettings(iso=100, aperture=8.0, shutter_s=0.5)
+REFERENCE_APERTURE: Final = 8.0
+"""f-number of that exposure; a lens without contacts is taken to be stopped down to it."""
+
+REFERENCE_EXPOSURE: Final = ExposureSettings(iso=100, aperture=REFERENCE_APERTURE, shutter_s=0.5)
 """The exposure at which `Room.white_level_share` holds."""
 
 

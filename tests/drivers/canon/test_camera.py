@@ -26,6 +26,7 @@ from drivers.canon.body import (
 )
 from drivers.canon.camera import CanonEos
 from drivers.canon.records import (
+    AvailableFormats,
     AvailableValues,
     ImageFile,
     ImageFormat,
@@ -290,6 +291,50 @@ def test_a_body_without_an_operation_is_used_by_another(absent: Operation) -> No
     assert lab.openings == 1
 
 
+CHANGES: dict[str, Callable[[bytes], bytes]] = {
+    "short": lambda data: data[:-3],
+    "surplus": lambda data: data + b"more",
+    "nothing": lambda data: b"",
+    "garbage": lambda data: b"\xff" * 64,
+}
+
+
+# libgphoto2 asks GetPartialObject only of a body that has it, else GetObject (get_file_func in its library.c, 2.5.34).
+
+PIECES = (Operation.EOS_GET_PARTIAL_OBJECT, Operation.GET_PARTIAL_OBJECT)
+
+
+@pytest.mark.parametrize("lists", [False, True], ids=["lists none", "refuses both"])
+def test_a_body_that_gives_no_parts_gives_whole_frames(lists: bool) -> None:
+    lab = Lab(film_bytes=2_500_000, without=() if lists else PIECES)
+    lab.device = faults.Declining(
+        lab.eos, ResponseCode.OPERATION_NOT_SUPPORTED, Occasion(set(PIECES) if lists else set(), times=None)
+    )
+    listening = listen(lab)
+    lab.camera.configure(SETTINGS)
+    for _ in range(3):
+        lab.take(attempts=1)
+    assert lab.openings == 1
+    assert [len(listening.parameters(code)) for code in PIECES] == [lists, lists], "it is not asked again"
+    assert lab.waiting() == 0
+
+
+@pytest.mark.parametrize("after", [1_500_000, 2_499_990])
+def test_a_whole_frame_that_broke_off_is_completed(after: int) -> None:
+    lab = Lab(film_bytes=2_500_000, without=PIECES)
+    lab.pipes = lambda pipes: faults.CutOff(pipes, after) if lab.openings == 1 else pipes
+    goes_on(lab)
+    assert lab.openings > 1
+    assert len(lab.film.frames) == 3
+
+
+@pytest.mark.parametrize("change", ["short", "surplus", "nothing"])
+def test_wrong_data_in_a_whole_frame(change: str) -> None:
+    lab = Lab(without=PIECES)
+    lab.device = faults.Falsifying(lab.eos, CHANGES[change], Occasion({Operation.GET_OBJECT}))
+    goes_on(lab)
+
+
 def test_the_body_is_kept_awake_in_a_long_wait() -> None:
     lab = Lab(auto_power_off_s=30)
     lab.eos.set_menu(Property.EOS_AUTO_POWER_OFF, 0)
@@ -400,14 +445,6 @@ def test_whatever_way_the_bytes_come(way: str) -> None:
     lab.pipes = WAYS[way]
     goes_on(lab)
     assert lab.openings == 1
-
-
-CHANGES: dict[str, Callable[[bytes], bytes]] = {
-    "short": lambda data: data[:-3],
-    "surplus": lambda data: data + b"more",
-    "nothing": lambda data: b"",
-    "garbage": lambda data: b"\xff" * 64,
-}
 
 
 @pytest.mark.parametrize("change", CHANGES)
@@ -918,6 +955,139 @@ def test_another_makers_camera_is_refused(lab: Lab) -> None:
         Lab(body).camera.identity()
 
 
+# As vcam 47260ba plays an EOS 1300D (src/canon/canon.c): every property's value, and no list of what it can be set to.
+
+
+def without_lists(records: tuple[Record, ...]) -> tuple[Record, ...]:
+    return tuple(record for record in records if not isinstance(record, AvailableValues | AvailableFormats))
+
+
+def test_a_body_that_lists_nothing_works_with_the_values_that_it_sends(lab: Lab) -> None:
+    lab.device = Announcing(lab.eos, without_lists)
+    lab.eos.set_menu(Property.EOS_ISO_SPEED, 0x48)
+    lab.camera.configure(SETTINGS)
+    lab.take(attempts=1)
+    assert lab.film.settings == [SETTINGS]
+    assert lab.camera.shutter_speeds() == ()
+    with pytest.raises(DeviceRefused, match=r"ISO speed 200 is not offered; near it: 100$"):
+        lab.camera.configure(replace(SETTINGS, iso=200))
+
+
+def test_a_body_that_tells_its_state_late_is_asked_again(lab: Lab) -> None:
+    # "The new EOS occasionally returned an empty event set": camera_prepare_canon_eos_capture of libgphoto2 2.5.34.
+    held: list[Record] = []
+
+    def late(records: tuple[Record, ...]) -> tuple[Record, ...]:
+        if lab.clock.monotonic() < 1:
+            held.extend(records)
+            return ()
+        now, held[:] = (*held, *records), []
+        return now
+
+    lab.device = Announcing(lab.eos, late)
+    goes_on(lab)
+    assert lab.openings == 1
+
+
+def test_a_body_that_sends_no_values_is_told_apart(lab: Lab) -> None:
+    lab.device = Announcing(lab.eos, lambda records: ())
+    with pytest.raises(DeviceError, match="sends no state"):
+        lab.camera.configure(SETTINGS)
+
+
+def test_times_of_an_electronic_shutter_are_offered_and_set() -> None:
+    lab = Lab(replace(EOS_550D, shutter_codes=(0x98, 0xA0, 0xA3, 0xA5, 0xA8, 0xAB, 0xAD, 0xB0)))
+    assert [round(1 / time) for time in lab.camera.shutter_speeds()] == [
+        32000, 25600, 20000, 16000, 12800, 10000, 8000, 4000,
+    ]  # fmt: skip
+    lab.camera.configure(replace(SETTINGS, shutter_s=1 / 25600))
+    lab.take(attempts=1)
+    assert lab.film.settings[-1].shutter_s == 1 / 25600
+
+
+class Slow(faults.TroubledResponder):
+    """Is busy for `seconds` after each OpenSession, and as long before each first release on a connection.
+
+    An EOS 2000D answers so what is sent soon after connecting, and its second release (gphoto2, issue 382).
+    """
+
+    def __init__(self, lab: Lab, seconds: float) -> None:
+        super().__init__(lab.eos)
+        self._clock, self._seconds = lab.clock, seconds
+        self._ready = self._pressed = float("inf")
+
+    def answer(self, request: PtpRequest, data: bytes | None) -> Answer:
+        now = self._clock.monotonic()
+        if request.code == Operation.OPEN_SESSION:
+            self._ready, self._pressed = now + self._seconds, float("inf")
+        elif request.code == Operation.EOS_REMOTE_RELEASE_ON:
+            self._pressed = min(self._pressed, now)
+            if now < self._pressed + self._seconds:
+                return Answer(PtpResponse(ResponseCode.DEVICE_BUSY, request.transaction))
+        elif now < self._ready and request.code != Operation.GET_DEVICE_INFO:
+            return Answer(PtpResponse(ResponseCode.DEVICE_BUSY, request.transaction))
+        return super().answer(request, data)
+
+
+def test_a_body_that_is_busy_for_a_while_is_waited_for_on_the_same_connection(lab: Lab) -> None:
+    lab.device = Slow(lab, 24)
+    lab.camera.configure(SETTINGS)
+    assert 24 <= lab.clock.monotonic() < 30
+    lab.take(attempts=1)
+    lab.take(attempts=1)
+    assert lab.openings == 1
+
+
+def test_a_body_that_is_never_ready_is_refused_without_a_new_connection(lab: Lab) -> None:
+    lab.device = Slow(lab, 1000)
+    with pytest.raises(DeviceRefused, match=r"DEVICE_BUSY .* it has been so for 30 s"):
+        lab.camera.configure(SETTINGS)
+    assert lab.openings == 1
+    assert lab.clock.monotonic() < 45
+
+
+# Names from libgphoto2's table of cameras (camlibs/ptp2/library.c); which of them want 0x15 or 0x11 as remote mode,
+# from `is_canon_eos_m` in its ptp-private.h and camera_prepare_canon_eos_capture in its config.c (2.5.34).
+
+
+@pytest.mark.parametrize(
+    "model", ["EOS M50", "EOS M", "EOS Kiss M", "EOS M50m2", "PowerShot SX540 HS", "PowerShot G5 X"]
+)
+def test_a_body_with_another_remote_mode_is_refused_untouched(model: str) -> None:
+    lab = Lab(replace(EOS_550D, info=replace(EOS_550D.info, model=f"Canon {model}")))
+    listening = listen(lab)
+    with pytest.raises(DeviceRefused, match=rf'{model}; .*remote mode.*connection = "gphoto2"'):
+        lab.camera.identity()
+    assert not listening.parameters(Operation.EOS_SET_REMOTE_MODE)
+
+
+@pytest.mark.parametrize("model", ["EOS M6 Mark II", "EOS Kiss X4", "EOS-1D X Mark II", "EOS R5", "EOS REBEL T2i"])
+def test_reflex_bodies_and_those_like_them_are_taken_with_remote_mode_1(model: str) -> None:
+    lab = Lab(replace(EOS_550D, info=replace(EOS_550D.info, model=f"Canon {model}")))
+    listening = listen(lab)
+    assert lab.camera.identity().model == f"Canon {model}"
+    assert listening.parameters(Operation.EOS_SET_REMOTE_MODE) == [(1,)]
+
+
+# Code 0 and no list, as of a telescope or an adapter: "implicit auto" in libgphoto2's table (canon_aperture in
+# camlibs/ptp2/config.c, 2.5.34).
+
+
+def test_a_lens_without_contacts_takes_frames_and_no_aperture() -> None:
+    lab = Lab(replace(EOS_550D, aperture_codes=()))
+    with pytest.raises(DeviceRefused, match=r'aperture 8 cannot be set.*set aperture = "none"'):
+        lab.camera.configure(SETTINGS)
+    bare = replace(SETTINGS, aperture=None)
+    lab.camera.configure(bare)
+    lab.take(attempts=1)
+    assert lab.film.settings == [bare]
+
+
+def test_a_lens_with_contacts_is_not_left_to_stand_as_it_does(lab: Lab) -> None:
+    with pytest.raises(DeviceRefused, match=r"the lens has apertures, .* among them: name one as f-number"):
+        lab.camera.configure(replace(SETTINGS, aperture=None))
+
+
 def test_a_release_that_stays_refused_says_where_to_look(lab: Lab) -> None:
     lab.camera.configure(SETTINGS)
     lab.device = faults.Declining(
@@ -927,6 +1097,7 @@ def test_a_release_that_stays_refused_says_where_to_look(lab: Lab) -> None:
     with pytest.raises(DeviceRefused, match="look for mirror lockup"):
         lab.take()
     lab.device = lab.eos
+    lab.pull()
     lab.take()
 
 
