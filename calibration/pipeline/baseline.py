@@ -733,7 +733,7 @@ def decode_frame(session: Session, record: FrameRecord) -> DecodedFrame:
             f"{path} is not the file that was taken: its SHA-256 is {found[:16]}…, the journal says "
             f"{record.sha256[:16]}…; restore the file from a copy, {_TAKEN_AGAIN}"
         )
-    mosaic = decode_raw(data, path)
+    mosaic = decode_raw(data, path, known_whole=session.frames_are_known_whole)
     fault = filled_fault(mosaic.counts, mosaic.black)
     if fault is not None:
         raise FormatError(

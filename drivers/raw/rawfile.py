@@ -358,12 +358,15 @@ def read_raw(path: Path) -> Mosaic:
     return decode_raw(_read_bytes(path), path)
 
 
-def decode_raw(data: bytes | memoryview, path: Path) -> Mosaic:
-    """Return the mosaic of a raw file's bytes, for those who have read them already; `path` names it in messages."""
+def decode_raw(data: bytes | memoryview, path: Path, *, known_whole: bool = False) -> Mosaic:
+    """Return the mosaic of a raw file's bytes, for those who have read them already; `path` names it in messages.
+
+    `known_whole`: whether the same bytes were decoded before, so that its lossless JPEG needs not be looked at again.
+    """
     if not data:
         raise _unreadable(path, "it is empty")
     cr3 = _check_cr3(path, data)
-    directories = _check_structure(path, data)
+    directories = _check_structure(path, data, known_whole)
     plain = read_plainly(data, directories)
     if plain is not None:
         return _plain_mosaic(data, directories, plain)
@@ -475,7 +478,7 @@ def _read_bytes(path: Path) -> memoryview:
     return data
 
 
-def _check_structure(path: Path, data: bytes | memoryview) -> list[Directory]:
+def _check_structure(path: Path, data: bytes | memoryview, known_whole: bool) -> list[Directory]:
     """Return the file's TIFF directories, none for other formats; refuse a file that ends before its pixels do."""
     if not is_tiff(data):
         return []
@@ -491,7 +494,7 @@ def _check_structure(path: Path, data: bytes | memoryview) -> list[Directory]:
                 "DNG of lossless JPEG, as Adobe's DNG Converter and dnglab make it, or name the camera's own file"
             )
         fault = extents_fault(data, pixels, dng=any(one.integers(TiffTag.DNG_VERSION) for one in directories))
-        for offset, size in pixels.extents():
+        for offset, size in () if known_whole else pixels.extents():
             fault = fault or lossless_fault(data[offset : offset + size])
         if fault is not None:
             raise _unreadable(path, fault)

@@ -21,8 +21,9 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from functools import cached_property
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, Final
 
 from drivers.camera import CapturedFrame
 from drivers.presenter import Colour
@@ -56,6 +57,10 @@ from foundation.folders import held_folder, require_plain_folder, unmounted_at
 
 FRAME_COLUMNS = ("kind", "illumination", "file", "sha256", "taken_at", "exposure_s", "verdict")
 """Columns of `frames.csv` (docs/formats.md)."""
+
+
+_DECODED: Final = "decoded"
+"""Record of a session whose frames were all looked at by software that sees damage inside of lossless JPEG."""
 
 
 @dataclass(frozen=True)
@@ -104,6 +109,11 @@ class Session:
                     "restore it from a copy"
                 )
 
+    @cached_property
+    def frames_are_known_whole(self) -> bool:
+        """Whether each frame was decoded to its end when it was taken, which older software did not do."""
+        return _DECODED in self.journal.records()
+
     @property
     def frames_folder(self) -> Path:
         """Where the raw files are, exactly as the camera wrote them."""
@@ -128,7 +138,9 @@ class Session:
             chart.save(new / "chart.json")
             save_illuminations(illuminations, new / "illuminations.csv")
             Journal.create(new / JOURNAL_FILE, steps)
-        return cls.open_for_run(folder)
+        session = cls.open_for_run(folder)
+        session.journal.record(_DECODED, "each frame, to its end, when it was taken")
+        return session
 
     @classmethod
     def open(cls, folder: Path) -> Session:
