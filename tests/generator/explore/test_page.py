@@ -65,13 +65,15 @@ def explorer(make_table: MakeTable, tmp_path: Path, monkeypatch: pytest.MonkeyPa
 
 
 @contextmanager
-def shown(tab: Tab, explorer: Explorer, *, width: int = 1280, dark: bool = False) -> Generator[ExploreServer]:
-    with ExploreServer(explorer, "127.0.0.1", 0) as server:
+def shown(
+    tab: Tab, explorer: Explorer, *, width: int = 1280, dark: bool = False, host: str = "127.0.0.1"
+) -> Generator[ExploreServer]:
+    with ExploreServer(explorer, host, 0) as server:
         thread = threading.Thread(target=lambda: server.serve_forever(0.01))
         thread.start()
         try:
             tab.errors.clear()
-            tab.open(f"http://127.0.0.1:{server.port}/", width=width, dark=dark)
+            tab.open(f"http://127.0.0.1:{server.port}/{server.path}", width=width, dark=dark)
             # The black body nearest to 5600 K comes first, and tests begin with the reddest light.
             tab.wait_for(f"document.readyState === 'complete' && {DRAWN} && shown.light === '1'")
             tab.value("pick(0)")
@@ -260,6 +262,14 @@ def test_pictures_are_gone_through_and_dropped(tab: Tab, explorer: Explorer) -> 
         tab.wait_for("document.getElementById('fault').textContent.includes('letter.txt')")
         assert tab.value("state.picture") == 0
         forget_refusals(tab)
+
+
+def test_a_phone_is_shown_the_same_behind_the_token(tab: Tab, explorer: Explorer) -> None:
+    with shown(tab, explorer, width=390, dark=True, host="0.0.0.0") as server:
+        assert len(server.path) > 20
+        drop(tab, "mine.png", png(3, 80, 60))
+        tab.wait_for(f"shown.picture.name === 'mine.png' && {DRAWN}")
+        assert tab.value(OUTSIDE) == []
 
 
 def test_a_rendering_that_cannot_be_is_said_beside_the_other(
