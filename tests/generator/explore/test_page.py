@@ -105,6 +105,13 @@ def light(tab: Tab) -> str:
     return tab.wait_for(f"!document.hidden && {DRAWN} && shown.light")
 
 
+def histogram(tab: Tab, panel: int) -> list[list[int]]:
+    """Return which of 96 bins hold pixels of red, green and blue, as drawn: a curve is on the ground in the others."""
+    paths = tab.value(f"[...panels[{panel}].histogram.querySelectorAll('path')].map((one) => one.getAttribute('d'))")
+    heights = [[float(point.split()[1]) for point in path[1:].split("L")][:96] for path in paths]
+    return [[bin_ for bin_, height in enumerate(curve) if height < 110] for curve in heights]
+
+
 def test_a_table_is_seen_at_once(tab: Tab, explorer: Explorer) -> None:
     with shown(tab, explorer):
         assert tab.value("document.querySelectorAll('circle.light').length") == 3
@@ -115,7 +122,12 @@ def test_a_table_is_seen_at_once(tab: Tab, explorer: Explorer) -> None:
         for panel, rendering in enumerate(("codes", "colorimetric")):
             image = explorer.counts(0, "0", rendering)
             assert tab.value(f"[...panels[{panel}].counts.slice(0, 600)]") == image.ravel()[:600].tolist()
-            assert tab.value(f"panels[{panel}].histogram.querySelectorAll('path').length") == 3
+            label = tab.value(f"panels[{panel}].histogram.querySelector('svg').getAttribute('aria-label')")
+            assert f"up to {image.max()} of {explorer.lut.provenance.white_level}" in label
+            assert histogram(tab, panel) == [
+                np.histogram(image[..., channel], 96, (0, explorer.lut.provenance.white_level))[0].nonzero()[0].tolist()
+                for channel in range(3)
+            ]
         assert tab.value(OUTSIDE) == []
         assert "NaN" not in tab.value("document.body.innerHTML")
         assert "undefined" not in tab.value("document.querySelector('main').innerHTML")
@@ -204,6 +216,10 @@ def test_a_pixel_is_measured(tab: Tab, explorer: Explorer) -> None:
                 mean, deviation = (float(part) for part in spread.split("±"))
                 assert int(count) == image[at[1], at[0], channel]
                 assert abs(int(count) - mean) < 5 * deviation
+        middle = "[...panels[0].loupe.getContext('2d').getImageData(66, 66, 1, 1).data]"
+        assert tab.value(middle) == tab.value(
+            f"[...panels[0].canvas.getContext('2d').getImageData({at[0]}, {at[1]}, 1, 1).data]"
+        )
         tab.value("pick(2)")
         tab.wait_for("panels[0].drawn === '0 2' && panels[0].rows.textContent.includes('±')")
         count, spread = tab.value(rows.format(0))[1][1:]
