@@ -189,7 +189,7 @@ class Explorer:
             place = masked(location) if is_remote(location) else _seen_from_here(location)
         else:
             place = self._scene(number).name
-        words = ["generate", self._given, _PLACE, "--sources", f"./{place}" if place.startswith("-") else place]
+        words = ["generate", _as_place(self._given), _PLACE, "--sources", _as_place(place)]
         words += ["--max-side", str(self._preparation.max_side), "--light", mixture.label]
         if rendering != DEFAULT:
             words += ["--rendering", rendering]
@@ -236,6 +236,11 @@ class Explorer:
         options = DatasetOptions(rendering=rendering, matrix=matrix)
         made = photograph(lut, picture, Lighting((mixture,)), options, 0, image, lut.provenance.white_level)
         return made[0]
+
+
+def _as_place(name: str) -> str:
+    """Return a path that is taken for no option, nor for the command that shows the page."""
+    return f"./{name}" if name.startswith("-") or name == "explore" else name
 
 
 def _seen_from_here(location: str) -> str:

@@ -417,13 +417,13 @@ def open_picture(
     preparation: Preparation = UNPREPARED,
     name: str | None = None,
     data: bytes | None = None,
-    most_pixels: int = LARGEST_PICTURE,
+    most_pixels: int | None = None,
 ) -> Reading:
     """Return the sRGB codes of a picture file and how its profile was treated; the head of this file lists the steps.
 
     `name`: name of the picture, which chooses the place of a random crop; its file's name if None. `data`: the file's
-    bytes, where they were read already. `most_pixels`: of the largest file that is read. Returns the
-    codes (H, W, 3) uint8 and the treatment of its profile.
+    bytes, where they were read already. `most_pixels`: of the largest file that is read; `LARGEST_PICTURE` if None.
+    Returns the codes (H, W, 3) uint8 and the treatment of its profile.
 
     Examples
     --------
@@ -435,7 +435,7 @@ def open_picture(
     >>> reading.picture.shape, reading.profile
     ((8, 8, 3), 'none, taken as sRGB')
     """
-    values = _read(path, data, most_pixels)
+    values = _read(path, data, LARGEST_PICTURE if most_pixels is None else most_pixels)
     light = values.light
     if values.linear:
         light = np.clip(np.nan_to_num(light, nan=0.0, posinf=1.0, neginf=0.0), 0.0, None)

@@ -106,7 +106,7 @@ class Panel {
     $("panels").append(element("div", {}, element("h3", {}, title), this.screen, this.wait));
     this.loupe = element("canvas", { width: 132, height: 132, role: "img", "aria-label": `Pixels around, ${title}` });
     this.rows = element("tbody");
-    const heads = ["", "counts", "mean ± deviation"].map((text) => element("th", { scope: "col" }, text));
+    const heads = ["", "counts", "mean ± sd"].map((text) => element("th", { scope: "col" }, text));
     const table = element("table", {}, element("thead", {}, element("tr", {}, ...heads)), this.rows);
     $("loupes").append(
       element("div", {}, element("h3", {}, title), element("div", { class: "loupe" }, this.loupe, table)),
@@ -227,9 +227,10 @@ class Panel {
     context.imageSmoothingEnabled = false;
     context.clearRect(0, 0, side, side);
     context.drawImage(this.canvas, at[0] - half, at[1] - half, LOUPE, LOUPE, 0, 0, side, side);
-    context.strokeStyle = "#fff";
-    context.lineWidth = 2;
-    context.strokeRect((half * side) / LOUPE, (half * side) / LOUPE, side / LOUPE, side / LOUPE);
+    for (const [colour, wide] of [["#000", 4], ["#fff", 2]]) {
+      [context.strokeStyle, context.lineWidth] = [colour, wide];
+      context.strokeRect((half * side) / LOUPE, (half * side) / LOUPE, side / LOUPE, side / LOUPE);
+    }
   }
 
   async fetchNoise(picture, light, at) {

@@ -54,7 +54,8 @@ class Plane {
       const title = shape("title", {}, `light ${number}: ${label}`);
       this.svg.append(shape("circle", { class: "light", cx, cy, r: radius, fill: `rgb(${codes.join(",")})` }, title));
     });
-    this.svg.append(shape("path", { class: "bodies", d: path(table.black_bodies.map(([, r, b]) => [r, b])) }));
+    const curve = path(table.black_bodies.map(([, r, b]) => [r, b]));
+    this.svg.append(...["bodies halo", "bodies"].map((name) => shape("path", { class: name, d: curve })));
     this.rings = ["chosen halo", "chosen"].map((name) => shape("circle", { class: name, r: 9 }));
     this.svg.append(...this.rings);
     box.append(this.svg);

@@ -74,6 +74,12 @@ def test_the_command_of_a_picture_that_was_sent_is_run_beside_the_picture(explor
     assert (made.read_image(made.entries[0]) == image).all()
 
 
+def test_a_table_called_as_the_command_is_named_otherwise(make_table: MakeTable, tmp_path: Path) -> None:
+    (tmp_path / "cat.png").write_bytes(png(1))
+    explorer = Explorer("explore", make_table(name="explore"), find_pictures("cat.png"), SIDE)
+    assert main(shlex.split(explorer.show(0, "0")["commands"]["codes"])[1:]) == 0
+
+
 def test_the_table_is_described(explorer: Explorer) -> None:
     told = explorer.describe()
     lut = explorer.lut

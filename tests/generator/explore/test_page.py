@@ -65,13 +65,15 @@ def explorer(make_table: MakeTable, tmp_path: Path, monkeypatch: pytest.MonkeyPa
 
 
 @contextmanager
-def shown(tab: Tab, explorer: Explorer, *, width: int = 1280, dark: bool = False) -> Generator[ExploreServer]:
-    with ExploreServer(explorer, "127.0.0.1", 0) as server:
+def shown(
+    tab: Tab, explorer: Explorer, *, width: int = 1280, dark: bool = False, host: str = "127.0.0.1"
+) -> Generator[ExploreServer]:
+    with ExploreServer(explorer, host, 0) as server:
         thread = threading.Thread(target=lambda: server.serve_forever(0.01))
         thread.start()
         try:
             tab.errors.clear()
-            tab.open(f"http://127.0.0.1:{server.port}/", width=width, dark=dark)
+            tab.open(f"http://127.0.0.1:{server.port}/{server.path}", width=width, dark=dark)
             # The black body nearest to 5600 K comes first, and tests begin with the reddest light.
             tab.wait_for(f"document.readyState === 'complete' && {DRAWN} && shown.light === '1'")
             tab.value("pick(0)")
@@ -103,6 +105,13 @@ def light(tab: Tab) -> str:
     return tab.wait_for(f"!document.hidden && {DRAWN} && shown.light")
 
 
+def histogram(tab: Tab, panel: int) -> list[list[int]]:
+    """Return which of 96 bins hold pixels of red, green and blue, as drawn: a curve is on the ground in the others."""
+    paths = tab.value(f"[...panels[{panel}].histogram.querySelectorAll('path')].map((one) => one.getAttribute('d'))")
+    heights = [[float(point.split()[1]) for point in path[1:].split("L")][:96] for path in paths]
+    return [[bin_ for bin_, height in enumerate(curve) if height < 110] for curve in heights]
+
+
 def test_a_table_is_seen_at_once(tab: Tab, explorer: Explorer) -> None:
     with shown(tab, explorer):
         assert tab.value("document.querySelectorAll('circle.light').length") == 3
@@ -113,7 +122,12 @@ def test_a_table_is_seen_at_once(tab: Tab, explorer: Explorer) -> None:
         for panel, rendering in enumerate(("codes", "colorimetric")):
             image = explorer.counts(0, "0", rendering)
             assert tab.value(f"[...panels[{panel}].counts.slice(0, 600)]") == image.ravel()[:600].tolist()
-            assert tab.value(f"panels[{panel}].histogram.querySelectorAll('path').length") == 3
+            label = tab.value(f"panels[{panel}].histogram.querySelector('svg').getAttribute('aria-label')")
+            assert f"up to {image.max()} of {explorer.lut.provenance.white_level}" in label
+            assert histogram(tab, panel) == [
+                np.histogram(image[..., channel], 96, (0, explorer.lut.provenance.white_level))[0].nonzero()[0].tolist()
+                for channel in range(3)
+            ]
         assert tab.value(OUTSIDE) == []
         assert "NaN" not in tab.value("document.body.innerHTML")
         assert "undefined" not in tab.value("document.querySelector('main').innerHTML")
@@ -202,6 +216,10 @@ def test_a_pixel_is_measured(tab: Tab, explorer: Explorer) -> None:
                 mean, deviation = (float(part) for part in spread.split("±"))
                 assert int(count) == image[at[1], at[0], channel]
                 assert abs(int(count) - mean) < 5 * deviation
+        middle = "[...panels[0].loupe.getContext('2d').getImageData(66, 66, 1, 1).data]"
+        assert tab.value(middle) == tab.value(
+            f"[...panels[0].canvas.getContext('2d').getImageData({at[0]}, {at[1]}, 1, 1).data]"
+        )
         tab.value("pick(2)")
         tab.wait_for("panels[0].drawn === '0 2' && panels[0].rows.textContent.includes('±')")
         count, spread = tab.value(rows.format(0))[1][1:]
@@ -260,6 +278,14 @@ def test_pictures_are_gone_through_and_dropped(tab: Tab, explorer: Explorer) -> 
         tab.wait_for("document.getElementById('fault').textContent.includes('letter.txt')")
         assert tab.value("state.picture") == 0
         forget_refusals(tab)
+
+
+def test_a_phone_is_shown_the_same_behind_the_token(tab: Tab, explorer: Explorer) -> None:
+    with shown(tab, explorer, width=390, dark=True, host="0.0.0.0") as server:
+        assert len(server.path) > 20
+        drop(tab, "mine.png", png(3, 80, 60))
+        tab.wait_for(f"shown.picture.name === 'mine.png' && {DRAWN}")
+        assert tab.value(OUTSIDE) == []
 
 
 def test_a_rendering_that_cannot_be_is_said_beside_the_other(
