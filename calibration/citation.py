@@ -239,7 +239,8 @@ def origin_record(stated: StatedOrigin, records: Sequence[FrameRecord], origins:
     usual = _most([(one.iso, one.aperture, one.shutter_s) for one in exposures])
     by = None if usual is None and stated.camera is None else "settings" if usual is None else "raw files"
     if usual is None and stated.camera is not None:
-        usual = stated.camera.iso, stated.camera.aperture, stated.camera.shutter_s
+        asked = stated.camera.exposure
+        usual = asked.iso, asked.aperture, asked.shutter_s
     iso, aperture, shutter_s = usual or (None, None, None)
     return OriginRecord(
         rig=stated.rig,

@@ -30,11 +30,15 @@ class CameraIdentity:
 
 @dataclass(frozen=True)
 class ExposureSettings:
-    """How a frame is exposed: ISO speed, aperture as f-number, shutter time in seconds."""
+    """How a frame is exposed: ISO speed, f-number, None where the body has no say in it, shutter time in seconds."""
 
     iso: int
-    aperture: float
+    aperture: float | None
     shutter_s: float
+
+    def __str__(self) -> str:
+        opening = "aperture not set by the body" if self.aperture is None else f"f/{self.aperture:g}"
+        return f"ISO {self.iso}, {opening}, {self.shutter_s:g} s"
 
 
 @dataclass(frozen=True)

@@ -96,6 +96,11 @@ class BodySetting:
     bounds: tuple[float, float] | None = None
     fixed: bool = False
 
+    @property
+    def is_silent(self) -> bool:
+        """Whether it names no number that it has, nor any that it could have."""
+        return not self.choices and self.bounds is None and number_of(self.value) is None
+
     def offered(self) -> str:
         """Return what it can be set to, as a message lists it."""
         if self.bounds is not None:
@@ -145,6 +150,15 @@ def plan(body: Body, settings: ExposureSettings) -> dict[str, str]:
         (SHUTTER, settings.shutter_s),
     ):
         setting = first_of(body, names)
+        if value is None:
+            if setting is not None and number_of(setting.value) is not None:
+                refused.append(f"the lens has apertures, it stands at {setting.value}: name one as f-number")
+            continue
+        if names is APERTURE and setting is not None and setting.is_silent:
+            refused.append(
+                f'aperture {value:g} cannot be set, for the lens tells of none: set aperture = "none" for it'
+            )
+            continue
         label = None if setting is None else label_of(setting, value)
         if setting is None:
             refused.append(f"{' or '.join(names)} {value:g} cannot be asked for: the body does not show it")

@@ -15,7 +15,16 @@ from typing import Annotated, Any, Literal, TypeVar, cast
 from urllib.parse import urlsplit
 
 import tomli_w
-from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, PrivateAttr, ValidationError
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    PlainValidator,
+    PrivateAttr,
+    ValidationError,
+)
 
 from drivers.camera import ExposureSettings
 from foundation.errors import ConfigurationError
@@ -74,6 +83,15 @@ def _endless(value: object) -> object:
     return math.inf if isinstance(value, str) and value.strip().lower() == "forever" else value
 
 
+def _f_number(value: object) -> float | Literal["none"]:
+    """Return an f-number as it is given, or the word ``none``."""
+    if value == "none":
+        return "none"
+    if isinstance(value, int | float) and not isinstance(value, bool) and 0 < value < math.inf:
+        return float(value)
+    raise ValueError('an f-number above 0 was expected, or "none" for a lens without contacts')
+
+
 class Settings(BaseModel):
     """What a settings file may say: frozen, and a key that is not known is an error."""
 
@@ -88,15 +106,15 @@ class CameraSettings(Settings):
 
     iso: Annotated[int, Field(gt=0)] = 100
     """ISO speed."""
-    aperture: Positive = 8.0
-    """f-number."""
+    aperture: Annotated[float | Literal["none"], PlainValidator(_f_number)] = 8.0
+    """f-number; ``"none"`` where the body has no say in it: a lens without contacts, an adapter, a telescope."""
     shutter_s: Positive = 0.5
     """Shutter time in seconds; under a DLP projector at least 0.5 and a whole multiple of 1/60."""
 
     @property
     def exposure(self) -> ExposureSettings:
         """The same as the camera drivers take it."""
-        return ExposureSettings(self.iso, self.aperture, self.shutter_s)
+        return ExposureSettings(self.iso, None if self.aperture == "none" else self.aperture, self.shutter_s)
 
 
 class SequenceSettings(Settings):

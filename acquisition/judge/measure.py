@@ -641,13 +641,13 @@ def disagreement(mosaic: Mosaic, asked: ExposureSettings) -> str | None:
     A value that the file does not state is passed over, and so is 0, the aperture of a lens without contacts.
     """
     differing = [
-        f"{name} {stated:g} instead of {wanted:g}"
+        f"{name} {stated:g} instead of {'none' if wanted is None else f'{wanted:g}'}"
         for name, stated, wanted, stops in (
             ("ISO speed", mosaic.iso, asked.iso, 1),
             ("aperture", mosaic.aperture, asked.aperture, 2),
             ("shutter time in s", mosaic.shutter_s, asked.shutter_s, 1),
         )
-        if stated and abs(stops * math.log2(stated / wanted)) >= EXPOSURE_TOLERANCE_STOPS
+        if stated and (wanted is None or abs(stops * math.log2(stated / wanted)) >= EXPOSURE_TOLERANCE_STOPS)
     ]
     if not differing:
         return None

@@ -542,7 +542,7 @@ def _exposure(plan: RunPlan) -> str:
         None: "whether the body offers this time is not known",
     }
     offered = said[is_offered(exposure.shutter_s, plan.answers.offered_s)]
-    return f"ISO {exposure.iso}, f/{exposure.aperture:g}, {exposure.shutter_s:g} s{_turns(plan.settings)}; {offered}"
+    return f"{exposure.exposure}{_turns(plan.settings)}; {offered}"
 
 
 def _time(plan: RunPlan, count: str) -> str:

@@ -252,10 +252,19 @@ def plan(state: EosState, settings: ExposureSettings) -> dict[int, bytes]:
         (Property.EOS_APERTURE, APERTURE, settings.aperture),
         (Property.EOS_SHUTTER_SPEED, SHUTTER, settings.shutter_s),
     ):
-        try:
-            wanted[code] = number_value(_code(state, code, scale, value))
-        except InputError as error:
-            refused.append(str(error))
+        offered = _offered(state, code, scale)
+        if value is None:
+            if offered:
+                refused.append(f"the lens has apertures, {scale.label(offered[0])} among them: name one as f-number")
+        elif scale is APERTURE and not offered:
+            refused.append(
+                f'aperture {value:g} cannot be set, for the lens tells of none: set aperture = "none" for it'
+            )
+        else:
+            try:
+                wanted[code] = number_value(scale.code(value, offered))
+            except InputError as error:
+                refused.append(str(error))
     if refused:
         raise DeviceRefused(f"the camera cannot take the series: {'; '.join(refused)}")
     if WhiteBalance.DAYLIGHT in state.lists.get(Property.EOS_WHITE_BALANCE, ()):
@@ -292,13 +301,11 @@ def _raw_format(state: EosState) -> ImageFormat:
     return RAW_ONLY
 
 
-def _code(state: EosState, code: int, scale: Scale, wanted: float) -> int:
-    offered = state.lists.get(code, ())
+def _offered(state: EosState, code: int, scale: Scale) -> tuple[int, ...]:
+    """Return the codes that a body can be set to, or stands at where it lists nothing: then nothing can be set."""
     current = state.number(code)
-    if not offered and current is not None and current not in scale.specials:
-        # A body that lists nothing lets nothing be set: then it must stand right already.
-        offered = (current,)
-    return scale.code(wanted, offered)
+    standing = () if current is None or current in scale.specials else (current,)
+    return state.lists.get(code) or standing
 
 
 def _named(kind: type[AeMode] | type[DriveMode], value: int) -> str:

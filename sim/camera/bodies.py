@@ -78,7 +78,7 @@ class EosModel:
     - `properties`: every property, as the body stands when it is switched on with its dial at M and the lens on manual
       focus.
     - `shutter_codes`, `aperture_codes`: what the lists of shutter times and apertures hold where the dial lets them be
-      set.
+      set; of apertures nothing where the lens has no contacts.
     - `burst`: raw frames that its memory holds.
     - `frames_per_s`: pace of continuous drive.
     - `frame_bytes`: what it reckons with for one frame; sizes of real raw files vary.

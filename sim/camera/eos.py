@@ -235,6 +235,8 @@ class SimulatedEosState:
             self._properties[code].value = text_value("")
         if auto_power_off_s is not None:
             self._properties[Property.EOS_AUTO_POWER_OFF].value = number_value(auto_power_off_s)
+        if not body.aperture_codes:
+            self._properties[Property.EOS_APERTURE].value = number_value(0)
         self._renew_destinations()
         self._renew_exposure_lists()
 
@@ -666,7 +668,9 @@ class EosRelease(EosFiles):
         mode = self._number_of(Property.EOS_AE_MODE)
         return ExposureSettings(
             round(records.ISO.value(iso)) if iso else _AUTO_ISO,
-            records.APERTURE.value(aperture)
+            None
+            if not self.body.aperture_codes
+            else records.APERTURE.value(aperture)
             if aperture and mode in (AeMode.MANUAL, AeMode.APERTURE_PRIORITY, AeMode.BULB)
             else _METERED_APERTURE,
             records.SHUTTER.value(shutter)

@@ -136,7 +136,7 @@ def write_dng(
     stamp = text(taken_at.astimezone(UTC).strftime("%Y:%m:%d %H:%M:%S"))
     exif: Tags = {
         TiffTag.EXPOSURE_TIME: rationals(settings.shutter_s),
-        TiffTag.F_NUMBER: rationals(settings.aperture),
+        TiffTag.F_NUMBER: rationals(settings.aperture or 0),
         TiffTag.PHOTOGRAPHIC_SENSITIVITY: (ValueType.SHORT, [settings.iso]),
         TiffTag.EXIF_VERSION: (ValueType.UNDEFINED, b"0232"),
         TiffTag.DATE_TIME_ORIGINAL: stamp,
@@ -329,5 +329,5 @@ def _accept(settings: ExposureSettings) -> None:
         ("aperture", settings.aperture, 1.0, 32.0),
         ("shutter_s", settings.shutter_s, 1 / 8000, 30.0),
     ):
-        if not low <= value <= high:
+        if value is not None and not low <= value <= high:
             raise DeviceRefused(f"the simulated camera offers {name} {low:g} … {high:g}, not {value:g}")

@@ -421,7 +421,9 @@ def _table(on: PaperName) -> _Array:
     return table
 
 
-REFERENCE_EXPOSURE: Final = ExposureSettings(iso=100, aperture=8.0, shutter_s=0.5)
+REFERENCE_APERTURE: Final = 8.0
+"""Also what a lens without contacts is set to by hand in the simulated room."""
+REFERENCE_EXPOSURE: Final = ExposureSettings(iso=100, aperture=REFERENCE_APERTURE, shutter_s=0.5)
 """The exposure at which `Room.white_level_share` holds."""
 
 

@@ -30,7 +30,15 @@ from foundation.compiled import processor_count
 from sim.optics import APERTURE_VARIANCE, PhotographicLens, lens_falloff, projector_falloff
 from sim.world.disturbances import UNDISTURBED, Situation, moved, moved_back
 from sim.world.rendering import PAPER, Print, View, label_map, surface_of
-from sim.world.room import REFERENCE_EXPOSURE, Room, printed_reflectance, projector_primaries, sensitivities, worn
+from sim.world.room import (
+    REFERENCE_APERTURE,
+    REFERENCE_EXPOSURE,
+    Room,
+    printed_reflectance,
+    projector_primaries,
+    sensitivities,
+    worn,
+)
 from sim.world.sensors import Body, HotPattern
 
 _BACKDROP_REFLECTANCE: Final = 0.04
@@ -258,7 +266,9 @@ class World:
         shown = lamp * (leak + (1 - leak) * linear) + self.room.ambient + ambient
         reference = REFERENCE_EXPOSURE
         time = settings.shutter_s / reference.shutter_s
-        return shown * time * (reference.aperture / settings.aperture) ** 2 * (settings.iso / reference.iso)
+        # A lens that the body does not set stands as it does for the reference.
+        opening = 1.0 if settings.aperture is None else (REFERENCE_APERTURE / settings.aperture) ** 2
+        return shown * time * opening * (settings.iso / reference.iso)
 
     def worn(self, points_mm: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return what stain and fold leave of the light of a clean flat print.

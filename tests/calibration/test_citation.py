@@ -66,6 +66,12 @@ def test_what_raw_files_do_not_state_comes_from_settings_journal_and_lab() -> No
     assert (found.lens, found.camera_serial) == ("Nikkor 50", "77")
 
 
+def test_a_lens_without_an_aperture_has_none_in_the_origin() -> None:
+    known = replace(stated(), camera=CameraSettings(iso=200, aperture="none"))
+    found = origin_record(known, RECORDS, [FrameOrigin()])
+    assert (found.iso, found.aperture, found.shutter_s) == (200, None, 0.5)
+
+
 def test_settings_of_a_session_that_set_no_camera_are_no_exposure() -> None:
     known = StatedOrigin(CitationSettings(), "imported", None, {})
     found = origin_record(known, RECORDS, [FrameOrigin()])

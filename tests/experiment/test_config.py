@@ -33,9 +33,18 @@ def test_settings_as_used_read_back_equal() -> None:
     assert again.simulated.room == {"waviness_mm": 6.0}
 
 
+def test_a_lens_without_an_aperture_stays_one_in_what_is_written() -> None:
+    settings = parse_lab(MINIMAL + '[camera]\naperture = "none"\n', "LAB.toml")
+    assert settings.camera.exposure.aperture is None
+    assert parse_lab(settings.to_toml(), "session.toml").camera == settings.camera
+
+
 @pytest.mark.parametrize(
     ("text", "expected"),
     [
+        (MINIMAL + "[camera]\naperture = 0\n", "camera.aperture = 0: an f-number above 0"),
+        (MINIMAL + "[camera]\naperture = inf\n", "camera.aperture = inf: an f-number above 0"),
+        (MINIMAL + "[camera]\naperture = 'open'\n", "camera.aperture = 'open': an f-number above 0"),
         (MINIMAL + "[camera]\nshuter_s = 1\n", "unknown key 'camera.shuter_s'; did you mean 'shutter_s'?"),
         (MINIMAL + "[camra]\niso = 1\n", "unknown key 'camra'; did you mean 'camera'?"),
         (MINIMAL + "[sequence]\nxyzzy = 1\n", "known are attempts"),

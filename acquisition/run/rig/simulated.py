@@ -64,7 +64,8 @@ def open_simulated(settings: LabSettings, chart: Chart, session: Session | None,
     # On mains power, as a camera that takes 707 frames is.
     # A body of sensitivities alone speaks as an EOS 550D does: only what its sensor sees is its own.
     spoken = EOS_BODIES.get(settings.simulated.body, EOS_BODIES["EOS 550D"])
-    body = replace(spoken, shots_per_charge=10**9)
+    apertures = () if settings.camera.exposure.aperture is None else spoken.aperture_codes
+    body = replace(spoken, shots_per_charge=10**9, aperture_codes=apertures)
     eos = SimulatedEos(body, film, clock, serial=SERIAL, auto_power_off_s=0)
     peer = PjLinkPeer(simulated)
     projector = PjLinkProjector(lambda: memory_link(peer))

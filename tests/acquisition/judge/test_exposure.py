@@ -88,10 +88,12 @@ def test_a_file_that_states_what_was_asked_agrees(tmp_path: Path) -> None:
         ({"iso": 1250}, {"iso": 1270}),
         ({}, {"iso": None, "aperture": None, "shutter_s": None}),
         ({}, {"aperture": 0.0}),
+        ({"aperture": None}, {"aperture": 0.0}),
+        ({"aperture": None}, {"aperture": None}),
     ],
 )
 def test_a_nominal_value_agrees_with_the_exact_one_behind_it(
-    tmp_path: Path, asked: dict[str, float], stated: dict[str, float | None]
+    tmp_path: Path, asked: dict[str, float | None], stated: dict[str, float | None]
 ) -> None:
     mosaic = replace(mosaic_of(tmp_path, 4000), **stated)  # pyright: ignore[reportArgumentType] - names from the table
     assert disagreement(mosaic, replace(ASKED, **asked)) is None  # pyright: ignore[reportArgumentType] - likewise
@@ -110,3 +112,8 @@ def test_a_nominal_value_agrees_with_the_exact_one_behind_it(
 def test_a_dial_turned_by_one_third_of_a_stop_is_seen(tmp_path: Path, stated: dict[str, float], expected: str) -> None:
     mosaic = replace(mosaic_of(tmp_path, 4000), **stated)  # pyright: ignore[reportArgumentType] - names from the table
     assert expected in (disagreement(mosaic, ASKED) or "")
+
+
+def test_a_lens_put_on_in_place_of_one_without_contacts_is_seen(tmp_path: Path) -> None:
+    mosaic = replace(mosaic_of(tmp_path, 4000), aperture=5.6)
+    assert "aperture 5.6 instead of none" in (disagreement(mosaic, replace(ASKED, aperture=None)) or "")

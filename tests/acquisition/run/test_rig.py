@@ -13,7 +13,7 @@ from acquisition.run.rig.simulated import simulated_body, simulated_room
 from acquisition.run.run import run_session
 from drivers.raw.rawfile import read_raw
 from experiment.chart.layout import design_chart
-from experiment.config import LabSettings, SimulatedSettings, load_lab, parse_lab
+from experiment.config import CameraSettings, LabSettings, SimulatedSettings, load_lab, parse_lab
 from experiment.lights import plan_illuminations, save_illuminations
 from experiment.session.folder import Session
 from foundation.clock import Clock
@@ -74,22 +74,25 @@ def test_a_body_may_be_sensitivities_and_facts() -> None:
 
 
 @pytest.mark.slow
-def test_a_session_taken_with_such_a_body_is_its(tmp_path: Path) -> None:
+def test_a_session_taken_with_such_a_body_and_a_lens_without_contacts_is_its(tmp_path: Path) -> None:
     design_chart(1, (148, 105)).save(tmp_path / "chart.json")
     save_illuminations(plan_illuminations(0, (3000, 6000)), tmp_path / "lights.csv")
     lab = LabSettings(
         rig="simulated",
         chart=tmp_path / "chart.json",
         illuminations=tmp_path / "lights.csv",
+        camera=CameraSettings(aperture="none"),
         simulated=SimulatedSettings(body="Canon_EOS-1Ds_Mark_III", camera={"pixels": [800, 556]}),
     )
     run_session(lab, tmp_path / "session", lambda done, total: None)
     with Session.open(tmp_path / "session") as session:
         frames = [frame for frame in session.frames() if frame.kind == "light"]
         assert len(frames) == 2
+        assert 'aperture = "none"' in session.settings_text()
         mosaic = read_raw(session.folder / frames[0].file)
     assert mosaic.camera == "Canon EOS-1Ds Mark III"
     assert mosaic.counts.shape == (556, 800)
+    assert mosaic.aperture is None
     black = mosaic.masked_black()
     assert black is not None
     assert black == pytest.approx(FACTS["Canon_EOS-1Ds_Mark_III"].black, abs=1)

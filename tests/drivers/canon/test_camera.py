@@ -941,6 +941,25 @@ def test_reflex_bodies_and_those_like_them_are_taken_with_remote_mode_1(model: s
     assert listening.parameters(Operation.EOS_SET_REMOTE_MODE) == [(1,)]
 
 
+# Code 0 and no list, as of a telescope or an adapter: "implicit auto" in libgphoto2's table (canon_aperture in
+# camlibs/ptp2/config.c, 2.5.34).
+
+
+def test_a_lens_without_contacts_takes_frames_and_no_aperture() -> None:
+    lab = Lab(replace(EOS_550D, aperture_codes=()))
+    with pytest.raises(DeviceRefused, match=r'aperture 8 cannot be set.*set aperture = "none"'):
+        lab.camera.configure(SETTINGS)
+    bare = replace(SETTINGS, aperture=None)
+    lab.camera.configure(bare)
+    lab.take(attempts=1)
+    assert lab.film.settings == [bare]
+
+
+def test_a_lens_with_contacts_is_not_left_to_stand_as_it_does(lab: Lab) -> None:
+    with pytest.raises(DeviceRefused, match=r"the lens has apertures, .* among them: name one as f-number"):
+        lab.camera.configure(replace(SETTINGS, aperture=None))
+
+
 def test_a_release_that_stays_refused_says_where_to_look(lab: Lab) -> None:
     lab.camera.configure(SETTINGS)
     lab.device = faults.Declining(

@@ -173,6 +173,17 @@ def test_a_body_that_stands_at_raw_and_cannot_be_set_is_good() -> None:
     assert "imagequality" not in plan(tree.get, SETTINGS)
 
 
+def test_a_lens_without_contacts_is_used_as_one() -> None:
+    # As libgphoto2 2.5.34 shows a Canon's aperture of code 0: "implicit auto" (canon_aperture in its config.c).
+    for value in ("implicit auto", "f/0", ""):
+        bare = (NIKON_Z7 | {"f-number": BodySetting("f-number", value)}).get
+        assert "f-number" not in plan(bare, replace(SETTINGS, aperture=None))
+        with pytest.raises(DeviceRefused, match=r'aperture 8 cannot be set.*aperture = "none"'):
+            plan(bare, SETTINGS)
+    with pytest.raises(DeviceRefused, match=r"it stands at f/5\.6: name one as f-number"):
+        plan(NIKON_Z7.get, replace(SETTINGS, aperture=None))
+
+
 def test_an_aperture_ring_that_stands_right_is_good() -> None:
     ring = BodySetting("f-number", "f/8", ("f/8", "f/11"), fixed=True)
     assert plan((NIKON_Z7 | {"f-number": ring}).get, SETTINGS)["f-number"] == "f/8"
