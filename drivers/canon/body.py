@@ -4,7 +4,7 @@ Rules that hold inside:
 
 - Every step is one that the recorded conversations have, or one that libgphoto2 takes; an operation that the body does
   not list is never sent. One that it lists and does not know all the same (0x2005) is not sent again, and done without
-  where that is possible: serial number, room on the host, staying awake, half of the ways to release and to fetch.
+  where that is possible: serial number, room on the host, staying awake, the other ways to release and to fetch.
 - GetEvent is asked until it has nothing more, but never without end: some firmware repeats itself. `EosState` takes its
   records in their order and holds nothing that was not reported, and no more of it than `MAX_PROPERTIES` values of
   `MAX_VALUE` bytes and as many lists, which no real body comes near.
@@ -349,10 +349,17 @@ _PIECE_TRIES = 5
 retaken."""
 _FREE_TRIES = 3
 """Few, as the next `make_ready` tries again."""
-_LASTING = (ResponseCode.INVALID_OBJECT_HANDLE, ResponseCode.SESSION_NOT_OPEN, ResponseCode.DEVICE_BUSY)
-"""Responses to a request for a piece that asking again does not change."""
+_IN_PIECES = (Operation.EOS_GET_PARTIAL_OBJECT, Operation.GET_PARTIAL_OBJECT)
+"""Operations that give a part of an object, the preferred one first."""
 _NOT_GOT = (ResponseCode.OPERATION_NOT_SUPPORTED, ResponseCode.EOS_UNKNOWN_COMMAND)
 """Responses to an operation that a body has not got, whatever it lists."""
+_LASTING = (
+    *_NOT_GOT,
+    ResponseCode.INVALID_OBJECT_HANDLE,
+    ResponseCode.SESSION_NOT_OPEN,
+    ResponseCode.DEVICE_BUSY,
+)
+"""Responses to a request for a piece that asking again does not change."""
 _NOTHING_THERE = (
     ResponseCode.PARAMETER_NOT_SUPPORTED,
     ResponseCode.INVALID_STORAGE_ID,
@@ -538,7 +545,15 @@ class EosBody:
                 f"{self.label} announces {waiting.name!r} of {waiting.size} bytes; 1 to {MAX_FRAME_BYTES} were expected"
             )
         while offset < waiting.size:
-            offset += into.write(self._piece(waiting, offset))
+            operation = next((known for known in _IN_PIECES if self._offers(known)), None)
+            if operation is None:
+                self._fetch_whole(waiting, into, offset)
+                return
+            try:
+                offset += into.write(self._piece(operation, waiting, offset))
+            except OperationDeclined as error:
+                if not self._lacks(operation, error):
+                    raise
             self._keep_awake()
 
     def free(self, waiting: WaitingObject) -> None:
@@ -561,18 +576,28 @@ class EosBody:
         for waiting in list(self.state.waiting.values()):
             self.free(waiting)
 
-    def _piece(self, waiting: WaitingObject, offset: int) -> bytes:
+    def _fetch_whole(self, waiting: WaitingObject, into: BinaryIO, offset: int) -> None:
+        """Append an object's bytes from `offset` on, from a body that gives no parts: those before come again."""
+        came = 0
+
+        def take(piece: bytes) -> None:
+            nonlocal came
+            if came + len(piece) > waiting.size:
+                raise ProtocolError(f"{self.label} announced {waiting.size} bytes for {waiting.name!r} and gives more")
+            into.write(piece[max(offset - came, 0) :])
+            came += len(piece)
+
+        self._session.call(Operation.GET_OBJECT, waiting.handle, receive=take)
+        if came < waiting.size:
+            raise self._cut(waiting, came)
+
+    def _piece(self, operation: Operation, waiting: WaitingObject, offset: int) -> bytes:
         """Return the next bytes of an object; fewer than were asked for are good, for the rest follows."""
         wanted = min(PIECE_BYTES, waiting.size - offset)
         for left in reversed(range(_PIECE_TRIES)):
-            operation = Operation.EOS_GET_PARTIAL_OBJECT
-            if not self._offers(operation):
-                operation = Operation.GET_PARTIAL_OBJECT
             try:
                 sent, data = self._session.call(operation, waiting.handle, offset, wanted)
             except OperationDeclined as error:
-                if operation == Operation.EOS_GET_PARTIAL_OBJECT and self._lacks(operation, error):
-                    continue
                 if not left or error.code in _LASTING:
                     raise
             else:
@@ -583,8 +608,11 @@ class EosBody:
                 if data and counted == len(data):
                     return data
             self._clock.sleep(_PAUSES_S[-1])
-        raise DeviceError(
-            f"{self.label} announced {waiting.size} bytes for {waiting.name!r}, but gives only {offset}; "
+        raise self._cut(waiting, offset)
+
+    def _cut(self, waiting: WaitingObject, came: int) -> DeviceError:
+        return DeviceError(
+            f"{self.label} announced {waiting.size} bytes for {waiting.name!r}, but gives only {came}; "
             "the frame is worthless and may be retaken"
         )
 

@@ -290,6 +290,50 @@ def test_a_body_without_an_operation_is_used_by_another(absent: Operation) -> No
     assert lab.openings == 1
 
 
+CHANGES: dict[str, Callable[[bytes], bytes]] = {
+    "short": lambda data: data[:-3],
+    "surplus": lambda data: data + b"more",
+    "nothing": lambda data: b"",
+    "garbage": lambda data: b"\xff" * 64,
+}
+
+
+# libgphoto2 asks GetPartialObject only of a body that has it, else GetObject (get_file_func in its library.c, 2.5.34).
+
+PIECES = (Operation.EOS_GET_PARTIAL_OBJECT, Operation.GET_PARTIAL_OBJECT)
+
+
+@pytest.mark.parametrize("lists", [False, True], ids=["lists none", "refuses both"])
+def test_a_body_that_gives_no_parts_gives_whole_frames(lists: bool) -> None:
+    lab = Lab(film_bytes=2_500_000, without=() if lists else PIECES)
+    lab.device = faults.Declining(
+        lab.eos, ResponseCode.OPERATION_NOT_SUPPORTED, Occasion(set(PIECES) if lists else set(), times=None)
+    )
+    listening = listen(lab)
+    lab.camera.configure(SETTINGS)
+    for _ in range(3):
+        lab.take(attempts=1)
+    assert lab.openings == 1
+    assert [len(listening.parameters(code)) for code in PIECES] == [lists, lists], "it is not asked again"
+    assert lab.waiting() == 0
+
+
+@pytest.mark.parametrize("after", [1_500_000, 2_499_990])
+def test_a_whole_frame_that_broke_off_is_completed(after: int) -> None:
+    lab = Lab(film_bytes=2_500_000, without=PIECES)
+    lab.pipes = lambda pipes: faults.CutOff(pipes, after) if lab.openings == 1 else pipes
+    goes_on(lab)
+    assert lab.openings > 1
+    assert len(lab.film.frames) == 3
+
+
+@pytest.mark.parametrize("change", ["short", "surplus", "nothing"])
+def test_wrong_data_in_a_whole_frame(change: str) -> None:
+    lab = Lab(without=PIECES)
+    lab.device = faults.Falsifying(lab.eos, CHANGES[change], Occasion({Operation.GET_OBJECT}))
+    goes_on(lab)
+
+
 def test_the_body_is_kept_awake_in_a_long_wait() -> None:
     lab = Lab(auto_power_off_s=30)
     lab.eos.set_menu(Property.EOS_AUTO_POWER_OFF, 0)
@@ -400,14 +444,6 @@ def test_whatever_way_the_bytes_come(way: str) -> None:
     lab.pipes = WAYS[way]
     goes_on(lab)
     assert lab.openings == 1
-
-
-CHANGES: dict[str, Callable[[bytes], bytes]] = {
-    "short": lambda data: data[:-3],
-    "surplus": lambda data: data + b"more",
-    "nothing": lambda data: b"",
-    "garbage": lambda data: b"\xff" * 64,
-}
 
 
 @pytest.mark.parametrize("change", CHANGES)
