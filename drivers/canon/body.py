@@ -325,8 +325,11 @@ KEEP_ALIVE_S = 10.0
 """After this long a body is asked to stay awake, as libgphoto2 asks it."""
 SETTLE_LIMIT_S = 5.0
 """How long a body may take to report a value that it was given, or room for a frame."""
+BUSY_LIMIT_S = 30.0
+"""How long a body may be busy after it was connected, or when it is to release, before it is refused: an EOS 2000D is
+for seconds at either (gphoto2, issue 382)."""
 RELEASE_TRIES = 5
-"""Presses in all, spread over `PASSING_LIMIT_S`: what keeps a body busy ends by itself or by what is fetched
+"""Presses in a row, spread over `PASSING_LIMIT_S`: what keeps a body busy ends by itself or by what is fetched
 between."""
 CAPTURE_TIMEOUT_S = 100.0
 """Wait for the answer to a release; some bodies expose before they answer. libgphoto2 waits as long."""
@@ -406,7 +409,10 @@ class EosBody:
 
     def connect(self) -> None:
         """Open the session, take the body under remote control and learn its state."""
-        self._session.open()
+        self._while_busy(self._session.open)
+        self._while_busy(self._take_control)
+
+    def _take_control(self) -> None:
         _, data = self._session.call(Operation.GET_DEVICE_INFO)
         self._info = DeviceInfo.decode(data)
         remote = (Operation.EOS_SET_REMOTE_MODE, Operation.EOS_GET_EVENT)
@@ -486,7 +492,7 @@ class EosBody:
         """Press the release down and let it go, without autofocus."""
         if self._offers(Operation.EOS_REMOTE_RELEASE_ON):
             try:
-                self._press()
+                self._while_busy(self._press)
             except OperationDeclined as error:
                 if not self._lacks(Operation.EOS_REMOTE_RELEASE_ON, error):
                     raise
@@ -641,6 +647,18 @@ class EosBody:
             f"{self.label} was given {value.hex()} for property 0x{code:04x} and reports "
             f"{came.hex() if came is not None else 'nothing'}; set it by hand, or switch the camera off and on"
         )
+
+    def _while_busy(self, action: Callable[[], None]) -> None:
+        """Do something until the body is not busy, for a limited time: a new session would only begin its work anew."""
+        end = self._clock.monotonic() + BUSY_LIMIT_S
+        while True:
+            try:
+                return action()
+            except OperationDeclined as error:
+                if error.code != ResponseCode.DEVICE_BUSY:
+                    raise
+                if self._clock.monotonic() >= end:
+                    raise DeviceRefused(f"{error}; it has been so for {BUSY_LIMIT_S:g} s") from error
 
     def _let_go(self) -> None:
         with contextlib.suppress(OperationDeclined):

@@ -954,6 +954,47 @@ def test_another_makers_camera_is_refused(lab: Lab) -> None:
         Lab(body).camera.identity()
 
 
+class Slow(faults.TroubledResponder):
+    """Is busy for `seconds` after each OpenSession, and as long before each first release on a connection.
+
+    An EOS 2000D answers so what is sent soon after connecting, and its second release (gphoto2, issue 382).
+    """
+
+    def __init__(self, lab: Lab, seconds: float) -> None:
+        super().__init__(lab.eos)
+        self._clock, self._seconds = lab.clock, seconds
+        self._ready = self._pressed = float("inf")
+
+    def answer(self, request: PtpRequest, data: bytes | None) -> Answer:
+        now = self._clock.monotonic()
+        if request.code == Operation.OPEN_SESSION:
+            self._ready, self._pressed = now + self._seconds, float("inf")
+        elif request.code == Operation.EOS_REMOTE_RELEASE_ON:
+            self._pressed = min(self._pressed, now)
+            if now < self._pressed + self._seconds:
+                return Answer(PtpResponse(ResponseCode.DEVICE_BUSY, request.transaction))
+        elif now < self._ready and request.code != Operation.GET_DEVICE_INFO:
+            return Answer(PtpResponse(ResponseCode.DEVICE_BUSY, request.transaction))
+        return super().answer(request, data)
+
+
+def test_a_body_that_is_busy_for_a_while_is_waited_for_on_the_same_connection(lab: Lab) -> None:
+    lab.device = Slow(lab, 24)
+    lab.camera.configure(SETTINGS)
+    assert 24 <= lab.clock.monotonic() < 30
+    lab.take(attempts=1)
+    lab.take(attempts=1)
+    assert lab.openings == 1
+
+
+def test_a_body_that_is_never_ready_is_refused_without_a_new_connection(lab: Lab) -> None:
+    lab.device = Slow(lab, 1000)
+    with pytest.raises(DeviceRefused, match=r"DEVICE_BUSY .* it has been so for 30 s"):
+        lab.camera.configure(SETTINGS)
+    assert lab.openings == 1
+    assert lab.clock.monotonic() < 45
+
+
 # Names from libgphoto2's table of cameras (camlibs/ptp2/library.c); which of them want 0x15 or 0x11 as remote mode,
 # from `is_canon_eos_m` in its ptp-private.h and camera_prepare_canon_eos_capture in its config.c (2.5.34).
 
@@ -1005,6 +1046,7 @@ def test_a_release_that_stays_refused_says_where_to_look(lab: Lab) -> None:
     with pytest.raises(DeviceRefused, match="look for mirror lockup"):
         lab.take()
     lab.device = lab.eos
+    lab.pull()
     lab.take()
 
 
