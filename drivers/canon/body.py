@@ -280,12 +280,11 @@ def shutter_speeds(state: EosState) -> tuple[float, ...]:
 
 
 def host_destination(state: EosState) -> bytes:
-    """Return the value of property 0xd11c that sends frames to the host."""
+    """Return the value of property 0xd11c that sends frames to the host; a body that lists none is given it to try."""
     offered = state.lists.get(Property.EOS_CAPTURE_DESTINATION, ())
-    if CaptureDestination.HOST not in offered and state.number(Property.EOS_CAPTURE_DESTINATION) != int(
-        CaptureDestination.HOST
-    ):
-        listed = ", ".join(str(value) for value in offered) or "nothing"
+    known = (*offered, state.number(Property.EOS_CAPTURE_DESTINATION))
+    if offered and CaptureDestination.HOST not in known:
+        listed = ", ".join(str(value) for value in offered)
         raise DeviceRefused(
             f"the camera offers the capture destinations {listed}, but not {CaptureDestination.HOST.value}, the host; "
             "such a body cannot be tethered here"
@@ -430,10 +429,11 @@ class EosBody:
         self._session.call(Operation.EOS_SET_REMOTE_MODE, _REMOTE_ON)
         self._session.call(Operation.EOS_SET_EVENT_MODE, _REMOTE_ON)
         self.drain()
+        # libgphoto2 asks again, too: newer bodies have nothing to tell when they are asked at once.
+        if not self._settled(lambda: bool(self.state.values)):
+            raise ProtocolError(f"{self.label} sends no state when asked for events; switch it off and on")
         if self._requested(Property.EOS_SERIAL_NUMBER):
             self._settled(lambda: Property.EOS_SERIAL_NUMBER in self.state.values)
-        if not self.state.lists:
-            raise ProtocolError(f"{self.label} sends no state when asked for events; switch it off and on")
         self._receive_frames()
 
     def supplies(self) -> Supplies:

@@ -26,6 +26,7 @@ from drivers.canon.body import (
 )
 from drivers.canon.camera import CanonEos
 from drivers.canon.records import (
+    AvailableFormats,
     AvailableValues,
     ImageFile,
     ImageFormat,
@@ -952,6 +953,46 @@ def test_another_makers_camera_is_refused(lab: Lab) -> None:
     body = replace(EOS_550D, info=replace(EOS_550D.info, manufacturer="Nikon Corporation", model="D90"))
     with pytest.raises(DeviceRefused, match="Nikon Corporation D90"):
         Lab(body).camera.identity()
+
+
+# As vcam 47260ba plays an EOS 1300D (src/canon/canon.c): every property's value, and no list of what it can be set to.
+
+
+def without_lists(records: tuple[Record, ...]) -> tuple[Record, ...]:
+    return tuple(record for record in records if not isinstance(record, AvailableValues | AvailableFormats))
+
+
+def test_a_body_that_lists_nothing_works_with_the_values_that_it_sends(lab: Lab) -> None:
+    lab.device = Announcing(lab.eos, without_lists)
+    lab.eos.set_menu(Property.EOS_ISO_SPEED, 0x48)
+    lab.camera.configure(SETTINGS)
+    lab.take(attempts=1)
+    assert lab.film.settings == [SETTINGS]
+    assert lab.camera.shutter_speeds() == ()
+    with pytest.raises(DeviceRefused, match=r"ISO speed 200 is not offered; near it: 100$"):
+        lab.camera.configure(replace(SETTINGS, iso=200))
+
+
+def test_a_body_that_tells_its_state_late_is_asked_again(lab: Lab) -> None:
+    # "The new EOS occasionally returned an empty event set": camera_prepare_canon_eos_capture of libgphoto2 2.5.34.
+    held: list[Record] = []
+
+    def late(records: tuple[Record, ...]) -> tuple[Record, ...]:
+        if lab.clock.monotonic() < 1:
+            held.extend(records)
+            return ()
+        now, held[:] = (*held, *records), []
+        return now
+
+    lab.device = Announcing(lab.eos, late)
+    goes_on(lab)
+    assert lab.openings == 1
+
+
+def test_a_body_that_sends_no_values_is_told_apart(lab: Lab) -> None:
+    lab.device = Announcing(lab.eos, lambda records: ())
+    with pytest.raises(DeviceError, match="sends no state"):
+        lab.camera.configure(SETTINGS)
 
 
 class Slow(faults.TroubledResponder):
