@@ -626,12 +626,14 @@ SHUTTER = _scale(
     55=1/13 58=1/15 5B=1/20 5C=1/20 5D=1/25 60=1/30 63=1/40 64=1/45 65=1/50 68=1/60 6B=1/80 6C=1/90 6D=1/100
     70=1/125 73=1/160 74=1/180 75=1/200 78=1/250 7B=1/320 7C=1/350 7D=1/400 80=1/500 83=1/640 84=1/750 85=1/800
     88=1/1000 8B=1/1250 8C=1/1500 8D=1/1600 90=1/2000 93=1/2500 94=1/3000 95=1/3200 98=1/4000 9B=1/5000 9C=1/6000
-    9D=1/6400 A0=1/8000 A8=1/16000
+    9D=1/6400 A0=1/8000 A3=1/10000 A5=1/12800 A8=1/16000 AB=1/20000 AD=1/25600 B0=1/32000 B3=1/40000 B5=1/51200
+    B8=1/64000
     """,
     {0x00: "auto", 0x0C: "bulb", 0x04: "bulb"},
     lambda code: 2.0 ** ((0x38 - code) / 8),
 )
-"""Shutter time in seconds (property 0xd102)."""
+"""Shutter time in seconds (property 0xd102); beyond 1/8000 s of electronic shutters, as Canon's EDSDK names them up to
+1/32000 s. The last three follow the law, and 1/64000 s is the shortest that an EOS R3 offers."""
 
 APERTURE = _scale(
     "aperture",

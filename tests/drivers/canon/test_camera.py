@@ -995,6 +995,16 @@ def test_a_body_that_sends_no_values_is_told_apart(lab: Lab) -> None:
         lab.camera.configure(SETTINGS)
 
 
+def test_times_of_an_electronic_shutter_are_offered_and_set() -> None:
+    lab = Lab(replace(EOS_550D, shutter_codes=(0x98, 0xA0, 0xA3, 0xA5, 0xA8, 0xAB, 0xAD, 0xB0)))
+    assert [round(1 / time) for time in lab.camera.shutter_speeds()] == [
+        32000, 25600, 20000, 16000, 12800, 10000, 8000, 4000,
+    ]  # fmt: skip
+    lab.camera.configure(replace(SETTINGS, shutter_s=1 / 25600))
+    lab.take(attempts=1)
+    assert lab.film.settings[-1].shutter_s == 1 / 25600
+
+
 class Slow(faults.TroubledResponder):
     """Is busy for `seconds` after each OpenSession, and as long before each first release on a connection.
 

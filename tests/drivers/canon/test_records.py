@@ -337,6 +337,12 @@ APERTURES_60D = (0x25, 0x28, 0x2B, 0x2D, 0x30, 0x33, 0x35, 0x38, 0x3B, 0x3D, 0x4
         (SHUTTER, 0x45, "0.3", 0.3),
         (SHUTTER, 0x68, "1/60", 1 / 60),
         (SHUTTER, 0xA0, "1/8000", 1 / 8000),
+        (SHUTTER, 0xA3, "1/10000", 1 / 10000),  # from here to 0xb0 as tables made from Canon's EDSDK have them
+        (SHUTTER, 0xA5, "1/12800", 1 / 12800),
+        (SHUTTER, 0xAB, "1/20000", 1 / 20000),
+        (SHUTTER, 0xAD, "1/25600", 1 / 25600),
+        (SHUTTER, 0xB0, "1/32000", 1 / 32000),
+        (SHUTTER, 0xB8, "1/64000", 1 / 64000),
         (APERTURE, 0x10, "1.4", 1.4),
         (APERTURE, 0x25, "3.5", 3.5),
         (APERTURE, 0x38, "8", 8),
