@@ -9,8 +9,10 @@ Rules that hold inside:
   follows from the state of cooling or from our own last command.
 
 Source: NEC, Projector Control Command Reference Manual, revision 6.1 (037, 078-2 to 078-5), and Control Commands
-(Basic), revision 5.16 (009, 015, table of error codes). Not confirmed by a manual: the bytes of 016 power off, 020 and
-021 picture mute (as other drivers have them), 02h 0Eh, and the running status during warm-up.
+(Basic), revision 5.16 (009, 015, table of error codes); revision 7.1 as public lists quote it (051, 052 shutter,
+078-6 cover, 079 freeze, 305-3 basic information, 02h 0Fh). Not confirmed by a manual: the bytes of 016 power off, 020
+and 021 picture mute (as other drivers have them), 02h 0Eh, the running status during warm-up, and that a laser's closed
+shutter is told of as its cover, for no question about the shutter itself is listed.
 """
 
 from __future__ import annotations
@@ -60,6 +62,12 @@ ERRORS = NecCommand(0, 0x88)
 RUNNING = NecCommand(0, 0x85, b"\x01")
 MUTES = NecCommand(0, 0x85, b"\x03")
 MODEL = NecCommand(0, 0x85, b"\x04")
+COVER = NecCommand(0, 0x85, b"\x05")
+BASIC_INFORMATION = NecCommand(0, 0xBF, b"\x02")
+SHUTTER_CLOSE = NecCommand(2, 0x16)
+SHUTTER_OPEN = NecCommand(2, 0x17)
+FREEZE_ON = NecCommand(1, 0x98, b"\x01")
+FREEZE_OFF = NecCommand(1, 0x98, b"\x02")
 INFORMATION = NecCommand(3, 0x8A)
 
 UNKNOWN_COMMAND = (0, 0)
@@ -70,12 +78,17 @@ POWER_IS_OFF = (2, 0x0D)
 """Not possible in standby (same table)."""
 EXECUTION_FAILED = (2, 0x0E)
 """Not confirmed by a manual."""
+NO_AUTHORITY = (2, 0x0F)
+"""The command needs authority (same table)."""
 _FAILURES = {
     UNKNOWN_COMMAND: "it does not know this command",
     UNKNOWN_TO_MODEL: "its model cannot do this",
     (1, 0): "it does not know this value",
     (1, 1): "it has no such terminal",
     (2, 3): "it cannot be set now",
+    (2, 4): "its on-screen mute is forced on; release it",
+    (2, 8): "it shows a test pattern; leave that with its remote control",
+    NO_AUTHORITY: "it wants authority for this; log in, or switch off the lock of its controls, in its menu",
     POWER_IS_OFF: "it is off, or on the way; wait until its power is on and try again",
 }
 
@@ -219,6 +232,26 @@ def parse_information(data: bytes) -> tuple[str, int]:
     return parse_text(data[:49]), int.from_bytes(data[82:86], "little")
 
 
+NO_SIGNAL = 1
+"""What a projector shows, of the basic information: nothing comes in (305-3)."""
+TEST_PATTERNS = (3, 5)
+"""Its own test patterns; other numbers stand for pictures that come from outside (same place)."""
+
+
+def format_basic_information(shown: int, frozen: bool) -> bytes:
+    """Return the data of the basic information: its number, then 15 bytes."""
+    data = bytearray(BASIC_INFORMATION.data.ljust(16, b"\0"))
+    data[2], data[9] = shown, frozen
+    return bytes(data)
+
+
+def parse_basic_information(data: bytes) -> tuple[int, bool]:
+    """Return the number of what is shown, and whether the picture is frozen."""
+    if len(data) < 10 or data[9] not in (0, 1):
+        raise ProtocolError(f"the basic information is {quoted(data)}; expected 16 bytes, the tenth 00 or 01")
+    return data[2], data[9] == 1
+
+
 def parse_text(data: bytes) -> str:
     """Return a text that ends with NUL."""
     return data.split(b"\0")[0].decode("ascii", "replace").strip()
@@ -263,6 +296,22 @@ class NecProjector(SerialProjector):
     def set_muted(self, muted: bool) -> None:
         """Blank the picture, or show it; refused unless the projector is on."""
         self._ask(MUTE_ON if muted else MUTE_OFF)
+
+    def picture_fault(self) -> str | None:
+        """Return why the picture does not follow the signal, or reaches nobody; None where it does, or cannot tell."""
+        if (self._ask_if_known(COVER) or b"\0")[0] == 1:
+            return "the projector's shutter or lens cover is closed; open it"
+        data = self._ask_if_known(BASIC_INFORMATION)
+        if data is None:
+            return None
+        shown, frozen = parse_basic_information(data)
+        if frozen:
+            return "the projector's picture is frozen; release freeze on its remote control"
+        if shown == NO_SIGNAL:
+            return "no signal arrives at the projector's input; check the cable, the input and the display's settings"
+        if shown in TEST_PATTERNS:
+            return "the projector shows a test pattern of its own; leave that with its remote control"
+        return None
 
     def faults(self) -> tuple[Fault, ...]:
         """Return every fault reported now; empty when healthy, and where its model does not report any.

@@ -108,6 +108,8 @@ class SimulatedProjector:
         self._faults: dict[str, Severity] = {}
         self._input = "31"
         self._frozen = False
+        self.shutter_closed = False
+        """Whether a shutter before the lens holds the light back; change it at will."""
         self.signal: Resolution | NoResolution = self.traits.panel
         """What arrives at its input; change it at will."""
         self.speaker = MAX_VOLUME // 2
@@ -207,11 +209,11 @@ class SimulatedProjector:
     def light(self) -> float:
         """Return the fraction of the full light that reaches the screen now, 0 … 1.
 
-        0 when off, muted or with a dead lamp; rises in proportion to time while the lamp warms up.
+        0 when off, muted, behind a closed shutter or with a dead lamp; rises in proportion to time during warm-up.
         """
         with self._guard:
             self._move()
-            if self._muted or not self._lit():
+            if self._muted or self.shutter_closed or not self._lit():
                 return 0.0
             if self._power is Power.WARMING:
                 return (self.clock.monotonic() - self._since) / self.traits.warm_up_s

@@ -17,6 +17,7 @@ from collections.abc import Mapping
 from typing import Protocol
 
 from drivers.links.link import Peer
+from drivers.pjlink.wire import NoResolution
 from drivers.projector import Power, Severity
 from drivers.serial_projectors import benq, epson, nec, optoma
 from drivers.serial_projectors.driver import take_line
@@ -281,6 +282,17 @@ class NecPeer(_Listener):
                 projector.set_muted(True)
             case nec.MUTE_OFF:
                 projector.set_muted(False)
+            case nec.SHUTTER_CLOSE | nec.SHUTTER_OPEN:
+                projector.shutter_closed = command == nec.SHUTTER_CLOSE
+            case nec.FREEZE_ON | nec.FREEZE_OFF:
+                projector.set_frozen(command == nec.FREEZE_ON)
+                return b"\0"
+            case nec.COVER:
+                return bytes([projector.shutter_closed])
+            case nec.BASIC_INFORMATION:
+                on = projector.power() is Power.ON
+                silent = projector.signal is NoResolution.NO_SIGNAL
+                return nec.format_basic_information(nec.NO_SIGNAL if silent else 0, on and projector.frozen())
             case nec.RUNNING:
                 return nec.format_running(projector.power())
             case nec.MUTES:

@@ -17,7 +17,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from drivers.links.link import MAX_MESSAGE, Link
-from drivers.projector import Fault, Lamp, Power, Projector, ProjectorIdentity, Severity
+from drivers.projector import Fault, Lamp, Power, Projector, ProjectorIdentity, ReportsPictureFault, Severity
 from drivers.serial_projectors import LANGUAGES, benq, epson, language, nec, optoma
 from drivers.serial_projectors.benq import BenqProjector
 from drivers.serial_projectors.driver import take_line
@@ -37,7 +37,7 @@ from foundation.errors import (
 from sim.buses.serial import SerialPeerLink
 from sim.clock import SimulatedClock
 from sim.projectors.projector import SimulatedProjector
-from sim.projectors.serial import PEERS, SERIAL_NUMBER, BenqPeer, EpsonPeer, OptomaPeer
+from sim.projectors.serial import PEERS, SERIAL_NUMBER, BenqPeer, EpsonPeer, NecPeer, OptomaPeer
 from tests.contracts.projector import Bench, ProjectorContract
 from tests.drivers.links.troubled_links import Deaf, Dribbling, DroppedAfter, Garbling
 
@@ -618,6 +618,65 @@ def test_nec_error_bits() -> None:
     # Fan (bit 4 of the first byte) and dust (bit 2 of the fourth).
     projector, _ = nec_script(("00 88 00 00 00 88", "20 88 01 40 0C 10 00 00 04" + " 00" * 8 + "09"))
     assert set(projector.faults()) == {Fault("fan", Severity.ERROR), Fault("temperature", Severity.WARNING)}
+
+
+# Cover (078-6), basic information (305-3) and the refusal 02h 0Fh as public command lists quote revision 7.1 of NEC's
+# manual: 20 BF ID1 ID2 10 02 DATA01 … 15, DATA02 what is shown, DATA09 freeze.
+OPEN_COVER = ("00 85 00 00 01 05 8B", "20 85 01 40 01 00 E7")
+
+
+def basic_information(shown: int, frozen: int) -> tuple[str, str]:
+    body = bytes([0x20, 0xBF, 1, 0x40, 0x10, 2, 4, shown, 1, 0x21, 0xFF, 0, 0, 0, frozen, 0, 0, 0, 0, 0, 0])
+    return "00 BF 00 00 01 02 C2", (body + bytes([sum(body) % 256])).hex()
+
+
+@pytest.mark.parametrize(
+    ("turns", "fault"),
+    [
+        ([OPEN_COVER, basic_information(0, 0)], None),
+        ([("00 85 00 00 01 05 8B", "20 85 01 40 01 01 E8")], "shutter or lens cover is closed"),
+        ([OPEN_COVER, basic_information(0, 1)], "frozen"),
+        ([OPEN_COVER, basic_information(1, 0)], "no signal"),
+        ([OPEN_COVER, basic_information(3, 0)], "test pattern"),
+        (
+            [
+                ("00 85 00 00 01 05 8B", "A0 85 01 40 02 00 01 69"),
+                ("00 BF 00 00 01 02 C2", "A0 BF 01 40 02 00 01 A3"),
+            ],
+            None,
+        ),
+    ],
+)
+def test_nec_tells_what_keeps_its_picture_away(turns: list[tuple[str, str]], fault: str | None) -> None:
+    projector, script = nec_script(*turns)
+    told = projector.picture_fault()
+    assert (told is None) if fault is None else (fault in (told or ""))
+    assert script.ended()
+
+
+def test_nec_that_wants_authority_says_where_to_get_it() -> None:
+    projector, _ = nec_script(("02 11 00 00 00 13", "A2 11 01 40 02 02 0F 07"))
+    with pytest.raises(DeviceRefused, match=r"02h 0Fh: it wants authority.*in its menu"):
+        projector.set_muted(False)
+
+
+def test_a_closed_shutter_of_a_simulated_nec_is_a_fault_and_no_mute() -> None:
+    device = SimulatedProjector(SimulatedClock(), Power.ON)
+    peer = NecPeer(device)
+    projector = NecProjector(lambda: SerialPeerLink(peer))
+    assert isinstance(projector, ReportsPictureFault)
+    assert projector.picture_fault() is None
+    # Somebody else's controller closes it, and freezes the picture: 051 and 079 of the manual.
+    assert peer.receive(bytes.fromhex("02 16 00 00 00 18")) == bytes.fromhex("22 16 01 40 00 79")
+    assert device.light() == 0
+    assert not projector.muted()
+    assert "shutter" in (projector.picture_fault() or "")
+    peer.receive(bytes.fromhex("02 17 00 00 00 19"))
+    peer.receive(bytes.fromhex("01 98 00 00 01 01 9B"))
+    assert "frozen" in (projector.picture_fault() or "")
+    peer.receive(bytes.fromhex("01 98 00 00 01 02 9C"))
+    assert projector.picture_fault() is None
+    assert device.light() == 1
 
 
 def test_nec_wrong_sum_and_wrong_answer() -> None:
