@@ -13,6 +13,7 @@ Rules that hold inside:
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol, TypeVar
@@ -33,12 +34,21 @@ from drivers.pjlink.wire import (
 )
 from drivers.projector import Fault, Lamp, Power, ProjectorIdentity
 from foundation.clock import Clock, SystemClock
-from foundation.errors import DeviceFault, DeviceRefused, LinkTimeout, ProtocolError
+from foundation.errors import DeviceFault, DeviceRefused, LinkError, LinkTimeout, ProtocolError
 
 DEFAULT_TIMEOUT_S = 5.0
 """The standard asks for an answer within 2 s; real projectors take longer while they warm up."""
 _SILENT = "check that it is on the network, and that PJLink is enabled on it in standby too"
 _CHECK_PORT = "check that a projector answers at this port"
+
+_STRANGER_S = 2.0
+"""How long another server may take to answer its own kind of question; on a local network it takes milliseconds."""
+_HTTP_QUESTION = b"GET / HTTP/1.0\r\n\r\n"
+_HTTP_ANSWERS = (b"http/", b"rtsp/", b"<!doc", b"<html")
+_PTPIP_QUESTION = struct.pack("<II16s10sI", 38, 1, b"", "CroP".encode("utf-16-le"), 0x10000)
+"""InitCommandRequest: length, type, an identifier of zeros, name, version (CIPA DC-005, 2.3.1)."""
+_PTPIP_ANSWERS = tuple(struct.pack("<I", kind) for kind in (2, 5))
+"""Types of packets, behind their length: InitCommandAck and InitFail (same place)."""
 
 _SYSTEM_CLOCK = SystemClock()
 
@@ -65,6 +75,7 @@ class PjLinkProjector:
         self._class: int | None = None
         self._password = password
         self._label = label
+        self._connect, self._met = connect, False
         self._exchange = Exchange(connect, timeout, label, clock, self._greet, _SILENT, _CHECK_PORT)
         self._unknown: set[PjLinkRequest] = set()
 
@@ -230,7 +241,19 @@ class PjLinkProjector:
 
     def _greet(self, exchange: Exchange) -> bytes:
         """Return the digest that the first command must begin with."""
-        greeting = wire.parse_greeting(exchange.listen(wire.take_line, wire.is_notice_of_start))
+        try:
+            line = exchange.listen(wire.take_line, wire.is_notice_of_start)
+        except LinkTimeout as error:
+            exchange.close()
+            stranger = None if self._met else self._stranger()
+            if stranger is None:
+                raise
+            raise DeviceRefused(
+                f"{self._label}: {stranger} answers at its address and port, no projector; give the address of the "
+                f"projector, and as port {wire.PORT} unless its menu says another"
+            ) from error
+        greeting = wire.parse_greeting(line)
+        self._met = True
         if isinstance(greeting, Refused):
             raise self._wrong_password()
         if greeting.seed is None:
@@ -238,6 +261,30 @@ class PjLinkProjector:
         if self._password is None:
             raise DeviceRefused(f"{self._label} asks for a password; give the one set for PJLink in its menu")
         return wire.authentication_digest(greeting.seed, self._password).encode("ascii")
+
+    def _stranger(self) -> str | None:
+        """Return what answers where nobody greets, by what it says to questions of its own kind; None if nothing does.
+
+        It is asked only where no projector was met before, for one that is starting is silent as well.
+        """
+        said = self._answer_to(_HTTP_QUESTION)
+        if said[:5].lower() in _HTTP_ANSWERS:
+            return "an HTTP server"
+        return "a camera (PTP/IP)" if self._answer_to(_PTPIP_QUESTION)[4:8] in _PTPIP_ANSWERS else None
+
+    def _answer_to(self, question: bytes) -> bytes:
+        """Return what comes first over a new connection after a question that is no projector's."""
+        try:
+            link = self._connect()
+        except LinkError:
+            return b""
+        try:
+            link.write(question, _STRANGER_S)
+            return link.read(wire.MAX_LINE, _STRANGER_S)
+        except LinkError:
+            return b""
+        finally:
+            link.close()
 
     def _wrong_password(self) -> DeviceRefused:
         return DeviceRefused(f"{self._label} refuses the password; give the one set for PJLink in its menu")

@@ -168,6 +168,11 @@ def parse_greeting(line: bytes) -> Greeting | Refused:
             return Greeting(seed)
         case ["PJLINK", word] if word.upper() == "ERRA":
             return Refused.WRONG_PASSWORD
+        case [word, *_] if word.startswith("HTTP/"):
+            raise ProtocolError(
+                f"an HTTP server answers {_quoted(line)}, no projector; give the projector's port, {PORT} unless its "
+                "menu says another"
+            )
         case _:
             raise ProtocolError(
                 f"the projector greets with {_quoted(line)}, PJLINK 0 or PJLINK 1 and a seed of 8 characters was "

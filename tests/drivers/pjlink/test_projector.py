@@ -5,7 +5,10 @@ The conversations are written after PJLink 1.04, 2.00 (sections 4 and 5), not af
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+import threading
+from collections.abc import Callable, Generator, Iterator
+from contextlib import AbstractContextManager, contextmanager
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 
 import pytest
 
@@ -15,9 +18,13 @@ from drivers.pjlink.projector import PjLinkProjector
 from drivers.pjlink.wire import Input, NoResolution, Resolution
 from drivers.projector import Fault, Lamp, Power, ProjectorIdentity, Severity
 from foundation.errors import DeviceFault, DeviceRefused, LinkClosed, LinkTimeout, ProtocolError
+from sim.buses.ptp import serve_ptpip
+from sim.camera.bodies import EOS_550D
+from sim.camera.eos import SimulatedEos
 from sim.clock import SimulatedClock
 from sim.projectors.pjlink import PjLinkPeer, memory_link, serve_pjlink
 from sim.projectors.projector import ProjectorTraits, SimulatedProjector
+from tests.contracts.camera import SeededFilm
 from tests.contracts.projector import Bench, ProjectorContract
 from tests.drivers.links.troubled_links import Deaf, Dribbling, DroppedAfter, Garbling, Slow
 from tests.drivers.script import Script
@@ -66,6 +73,48 @@ def test_a_wrong_password_is_refused_in_words() -> None:
         driver(script, password=PASSWORD).power()
     assert script.ended()
     assert script.closed
+
+
+class Refusing(BaseHTTPRequestHandler):
+    """A web page that is none."""
+
+    def log_message(self, format: str, *args: object) -> None:
+        """Say nothing."""
+
+
+@contextmanager
+def http_server() -> Generator[tuple[str, int]]:
+    with ThreadingHTTPServer(("127.0.0.1", 0), Refusing) as server:
+        threading.Thread(target=server.serve_forever, args=(0.01,), daemon=True).start()
+        yield "127.0.0.1", server.server_port
+        server.shutdown()
+
+
+@contextmanager
+def camera() -> Generator[tuple[str, int]]:
+    with serve_ptpip(SimulatedEos(EOS_550D, SeededFilm(600), SimulatedClock()), 0) as server:
+        yield server.address
+
+
+@pytest.mark.parametrize(
+    ("stranger", "name"), [(http_server, "an HTTP server"), (camera, r"a camera \(PTP/IP\)")], ids=["http", "camera"]
+)
+def test_what_answers_at_a_projectors_port_and_is_none_is_named(
+    stranger: Callable[[], AbstractContextManager[tuple[str, int]]], name: str
+) -> None:
+    with stranger() as address:
+        projector = PjLinkProjector(lambda: TcpLink.connect(*address, 10.0), timeout=0.05)
+        with pytest.raises(DeviceRefused, match=rf"^the projector: {name} answers at its .* as port 4352"):
+            projector.power()
+
+
+def test_a_projector_that_falls_silent_is_asked_for_nothing_else() -> None:
+    first = Script(b"PJLINK 0\r", b"%1POWR ?\r", b"%1POWR=1\r")
+    projector = driver(first, Script())
+    assert projector.power() is Power.ON
+    projector.close()
+    with pytest.raises(LinkTimeout):
+        projector.power()
 
 
 def test_a_missing_password_is_asked_for_before_anything_is_sent() -> None:
@@ -326,6 +375,9 @@ def test_an_answer_that_never_ends_is_a_timeout() -> None:
         def read(self, limit: int, timeout: float) -> bytes:
             clock.sleep(1.0)
             return b"P"
+
+        def write(self, data: bytes, timeout: float) -> None:
+            """Hear what it is, without a word on that."""
 
     with pytest.raises(LinkTimeout, match="within 5 s"):
         PjLinkProjector(lambda: Endless(b""), timeout=5.0, clock=clock).power()

@@ -66,6 +66,12 @@ def test_what_is_no_greeting_is_quoted(line: bytes) -> None:
         wire.parse_greeting(line)
 
 
+def test_an_http_server_that_speaks_first_is_said_to_be_one() -> None:
+    # RFC 9110, 15.5.9: what a server may send that has waited too long for a request.
+    with pytest.raises(ProtocolError, match=r"an HTTP server answers 'HTTP/1\.1 408"):
+        wire.parse_greeting(b"HTTP/1.1 408 Request Timeout")
+
+
 def test_commands_are_the_standards_bytes() -> None:
     # PJLink 1.04, 4.1 and 5.1.
     assert wire.encode_request(PjLinkRequest("POWR", "1")) == b"%1POWR 1\r"
