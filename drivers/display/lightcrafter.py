@@ -49,6 +49,9 @@ _READ, _REPLY, _ERROR = 0x80, 0x40, 0x20
 """Bits of the flags of a report: it reads, it is answered or is an answer, it is refused (same sources)."""
 
 
+_REPLUG = "unplug its USB cable and put it back, or switch it off and on"
+
+
 class LightCrafterCommand(IntEnum):
     """The commands that are used here."""
 
@@ -110,7 +113,9 @@ def parse_reply(report: bytes) -> LightCrafterReply:
     """Return the reply in a report."""
     flags, sequence, length = struct.unpack_from("<BBH", _whole(report))
     if length > REPORT - 4:
-        raise ProtocolError(f"a reply of {length} bytes; {REPORT - 4} fit in a report: {report.hex(' ')}")
+        raise ProtocolError(
+            f"the LightCrafter's report claims {length} bytes of data, at most {REPORT - 4} fit in it; {_REPLUG}"
+        )
     return LightCrafterReply(sequence, report[4 : 4 + length], bool(flags & _ERROR))
 
 
@@ -134,15 +139,17 @@ def encode_colour(colour: Colour) -> bytes:
 
 def parse_colour(data: bytes) -> tuple[int, int, int]:
     """Return the foreground in the data of `LightCrafterCommand.PATTERN_COLOUR`, 10 bits each."""
-    codes = struct.unpack("<6H", data) if len(data) == 12 else ()
-    if not codes or max(codes) > FULL:
-        raise ProtocolError(f"no colours in {data.hex(' ')!r}; expected six 10-bit codes in 12 bytes")
+    if len(data) != 12:
+        raise ProtocolError(f"the LightCrafter gives its colours in {len(data)} bytes, 12 expected; {_REPLUG}")
+    codes = struct.unpack("<6H", data)
+    if max(codes) > FULL:
+        raise ProtocolError(f"the LightCrafter gives {codes} as its colours, 0 … {FULL} expected; {_REPLUG}")
     return codes[0], codes[1], codes[2]
 
 
 def _whole(report: bytes) -> bytes:
     if len(report) != REPORT:
-        raise ProtocolError(f"a report of {len(report)} bytes; expected {REPORT}: {report.hex(' ')}")
+        raise ProtocolError(f"the LightCrafter's report has {len(report)} bytes, {REPORT} expected; {_REPLUG}")
     return report
 
 

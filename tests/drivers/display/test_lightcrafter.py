@@ -99,6 +99,24 @@ def test_any_bytes_are_a_report_or_a_protocol_error(data: bytes) -> None:
             parse(data)
 
 
+@pytest.mark.parametrize(
+    ("parse", "data", "told"),
+    [
+        (wire.parse_reply, b"\xaa" * 64, "claims 43690 bytes of data, at most 60"),
+        (wire.parse_reply, b"\xaa" * 63, "has 63 bytes, 64 expected"),
+        (wire.parse_colour, b"\xaa" * 60, "in 60 bytes, 12 expected"),
+        (wire.parse_colour, b"\xff\x0f" * 6, "gives (4095, 4095, 4095, 4095, 4095, 4095) as its colours, 0 … 1023"),
+    ],
+)
+def test_what_is_wrong_with_a_report_is_said_in_figures(
+    parse: Callable[[bytes], object], data: bytes, told: str
+) -> None:
+    with pytest.raises(ProtocolError) as caught:
+        parse(data)
+    assert told in str(caught.value)
+    assert "aa" not in str(caught.value), "no dump of it"
+
+
 def test_ten_bits_are_the_nearest_fraction_of_full() -> None:
     for code in range(256):
         assert abs(wire.ten_bits(code) / 1023 - code / 255) <= 0.5 / 1023
