@@ -99,7 +99,7 @@ class BodySetting:
     @property
     def is_silent(self) -> bool:
         """Whether it names no number that it has, nor any that it could have."""
-        return not self.choices and self.bounds is None and number_of(self.value) is None
+        return self.bounds is None and all(number_of(label) is None for label in (self.value, *self.choices))
 
     def offered(self) -> str:
         """Return what it can be set to, as a message lists it."""

@@ -167,7 +167,9 @@ class MemoryTransport(UsbTransport):
 
 
 GUID = bytes(range(16))
-"""What a simulated device calls itself unless another is given."""
+"""Identifier of a simulated device unless another is given."""
+NAME = "CroP camera"
+"""What a simulated device calls itself unless another is given; ptpy fails on names of more than 19 characters."""
 DATA_PIECE = 256 * 1024
 """Bytes of data in a packet to the initiator; what fits goes out in one EndData."""
 
@@ -183,7 +185,7 @@ def serve_ptpip(
     responder: Responder,
     port: int = PORT,
     *,
-    name: str = "CroP simulated camera",
+    name: str = NAME,
     guid: bytes = GUID,
     host: str = LOOPBACK,
 ) -> TcpServer:
@@ -197,7 +199,7 @@ def serve_ptpip(
 class PtpIpService:
     """Speaks PTP/IP for a responder on connections that it is given."""
 
-    def __init__(self, responder: Responder, name: str = "CroP simulated camera", guid: bytes = GUID) -> None:
+    def __init__(self, responder: Responder, name: str = NAME, guid: bytes = GUID) -> None:
         self._responder = responder
         self._name = name
         self._guid = guid

@@ -15,6 +15,7 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
 from typing import BinaryIO
@@ -168,6 +169,15 @@ def test_the_lists_are_those_of_a_real_550d(served: Served) -> None:
     assert served.choices("reviewtime") == ["None", "2 seconds", "4 seconds", "8 seconds", "Hold"]
     assert served.current("model") == "2147484272"
     assert served.current("lensname") == "EF-S18-55mm f/3.5-5.6 IS"
+
+
+@pytest.mark.parametrize("served", [replace(TEST_BODY, aperture_codes=())], indirect=True)
+def test_a_lens_without_contacts_is_shown_as_libgphoto2_shows_one(served: Served) -> None:
+    assert served.current("aperture") == "implicit auto"
+    assert served.choices("aperture") == ["implicit auto"]
+    served.gphoto2("--capture-image-and-download", "--filename", "frame.%C")
+    assert [file.read_bytes() for file in served.folder.glob("frame.*")] == served.film.frames
+    assert [settings.aperture for settings in served.film.exposures] == [None]
 
 
 @pytest.mark.parametrize("served", [EOS_6D_MARK_II], indirect=True)
