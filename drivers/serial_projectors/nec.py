@@ -233,10 +233,9 @@ def parse_information(data: bytes) -> tuple[str, int]:
 
 
 NO_SIGNAL = 1
-"""What it shows where nothing comes in, of the basic information (command 305-3)."""
-
+"""What a projector shows, of the basic information: nothing comes in (305-3)."""
 TEST_PATTERNS = (3, 5)
-"""What a projector shows, of the basic information: other numbers stand for pictures that come from outside."""
+"""Its own test patterns; other numbers stand for pictures that come from outside (same place)."""
 
 
 def format_basic_information(shown: int, frozen: bool) -> bytes:

@@ -422,8 +422,7 @@ def _table(on: PaperName) -> _Array:
 
 
 REFERENCE_APERTURE: Final = 8.0
-"""f-number of that exposure; a lens without contacts is taken to be stopped down to it."""
-
+"""Also what a lens without contacts is set to by hand in the simulated room."""
 REFERENCE_EXPOSURE: Final = ExposureSettings(iso=100, aperture=REFERENCE_APERTURE, shutter_s=0.5)
 """The exposure at which `Room.white_level_share` holds."""
 

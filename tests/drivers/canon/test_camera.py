@@ -21,6 +21,7 @@ from drivers.canon.body import (
     EosState,
     battery_level,
     custom_functions,
+    plan,
     power_source,
     problems,
 )
@@ -1081,6 +1082,28 @@ def test_a_lens_without_contacts_takes_frames_and_no_aperture() -> None:
     lab.camera.configure(bare)
     lab.take(attempts=1)
     assert lab.film.settings == [bare]
+
+
+# Some records of what an EOS 1300D without a lens sent: bin/eos/eos_events.bin of vcam 47260ba. Mode M, focus by hand,
+# timer, no power off, aperture 0 and its list empty, ISO 3200 and its list.
+RECORDED_1300D = """
+    1000000089c1000005d1000003000000 1000000089c1000008d1000003000000 1000000089c1000006d1000011000000
+    1000000089c1000014d1000000000000 1000000089c1000001d1000000000000 1000000089c1000003d1000070000000
+    140000008ac1000001d100000300000000000000
+    380000008ac1000003d100000300000009000000000000004800000050000000580000006000000068000000700000007800000080000000
+    0800000000000000
+"""
+
+
+@pytest.mark.parametrize(("aperture", "told"), [(8.0, True), (None, False)])
+def test_a_recorded_body_without_a_lens_has_no_aperture(aperture: float | None, told: bool) -> None:
+    state = EosState()
+    state.take(decode_events(bytes.fromhex(RECORDED_1300D)))
+    assert problems(state) == ["the drive mode is timer 2 s: set single shooting"]
+    with pytest.raises(DeviceRefused) as caught:
+        plan(state, ExposureSettings(100, aperture, 0.5))
+    assert ('set aperture = "none"' in str(caught.value)) is told
+    assert "ISO" not in str(caught.value)
 
 
 def test_a_lens_with_contacts_is_not_left_to_stand_as_it_does(lab: Lab) -> None:
