@@ -35,7 +35,10 @@ class ReportedFilm(SeededFilm):
 def main() -> None:
     """Serve until standard input ends."""
     port, mode = sys.argv[1:]
-    eos = SimulatedEos(replace(EOS_550D, write_s=0.02), ReportedFilm(FILM_BYTES), SystemClock(), auto_power_off_s=0)
+    body = replace(EOS_550D, write_s=0.02)
+    if mode == "no contacts":
+        body = replace(body, aperture_codes=())
+    eos = SimulatedEos(body, ReportedFilm(FILM_BYTES), SystemClock(), auto_power_off_s=0)
     if mode == "unprepared":
         eos.turn_dial(AeMode.APERTURE_PRIORITY)
         eos.switch_focus(automatic=True)

@@ -9,6 +9,7 @@ import subprocess
 import sys
 from collections.abc import Generator
 from contextlib import contextmanager, suppress
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -79,6 +80,21 @@ def test_a_body_that_is_not_set_up_is_refused_with_all_reasons_at_once() -> None
         with pytest.raises(DeviceRefused, match=r"autoexposuremode is AV.*focusmode is One Shot"):
             camera.configure(SETTINGS)
         camera.close()
+
+
+def test_a_lens_without_contacts_takes_frames_and_no_aperture() -> None:
+    with served(mode="no contacts") as (port, film):
+        camera = Gphoto2Camera(port, MODEL)
+        with pytest.raises(DeviceRefused, match=r'aperture .* cannot be set.*set aperture = "none"'):
+            camera.configure(SETTINGS)
+        bare = replace(SETTINGS, aperture=None)
+        camera.configure(bare)
+        into = io.BytesIO()
+        capture(camera, into)
+        camera.close()
+        film.catch_up()
+    assert [into.getvalue()] == film.frames
+    assert film.settings == [bare]
 
 
 def test_a_lost_connection_is_renewed_by_the_next_call() -> None:
