@@ -80,6 +80,9 @@ class SceneSet:
         on a published copy.
     folds
         The fold of each scene, counted from 0, where the data set's authors divide it; else None.
+    truth_uncertainty_deg
+        What the direction of a ground truth may be off by at worst, degrees, expanded (k = 2), where the data set
+        states it; else None.
     """
 
     name: str
@@ -88,3 +91,4 @@ class SceneSet:
     scenes: tuple[Scene, ...]
     treatment: Mapping[str, str] = field(default_factory=dict[str, str])
     folds: tuple[int, ...] | None = None
+    truth_uncertainty_deg: float | None = None

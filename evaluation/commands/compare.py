@@ -13,7 +13,7 @@ from foundation.console import EXIT_CODES, JsonOutput, option, with_json
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from evaluation.experiments.comparing import Matched
+    from evaluation.experiments.comparing import Comparison, Matched
     from evaluation.metrics import ErrorKind
     from evaluation.results.files import MethodErrors
 
@@ -84,6 +84,7 @@ def compare(
         *_unchecked(runs, results),
         *_unlike(results),
         *_guessed(runs, results),
+        *_indistinct(comparisons, results),
     )
     show_notes(told, notes)
     verdicts = [comparing.verdict(made, level) for made in comparisons]
@@ -222,6 +223,35 @@ def _record(place: str) -> dict[str, str]:
         return {"images": str(content["data_set"]["place"]), **{str(what): str(treatment[what]) for what in treatment}}
     except (OSError, ValueError, KeyError, TypeError):
         return {}
+
+
+def _indistinct(comparisons: Sequence[Comparison], places: Sequence[str]) -> list[str]:
+    """Return a sentence for each comparison whose medians differ by less than ground truths may be off by."""
+    stated = [_truth_uncertainty(place) for place in places]
+    known = max((one for one in stated if one is not None), default=None)
+    if known is None:
+        return []
+    medians = [
+        (made, next(one.difference[0] for one in made.statistics if one.statistic == "median")) for made in comparisons
+    ]
+    return [
+        "the medians of {} and {} differ by ".format(*made.matched.names)
+        + f"{abs(apart):.2g} degrees, less than the {known:.2g} that ground truths may be off by (k = 2)"
+        for made, apart in medians
+        if abs(apart) < known
+    ]
+
+
+def _truth_uncertainty(place: str) -> float | None:
+    """Return what ground truths of a results folder may be off by, degrees; None if it does not say."""
+    import json
+
+    path = Path(place)
+    try:
+        content = json.loads((path if path.is_dir() else path.parent).joinpath("run.json").read_text(encoding="utf-8"))
+        return float(content["data_set"]["truth_uncertainty_deg"])
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
 
 
 def _guessed(runs: Sequence[Mapping[str, MethodErrors]], places: Sequence[str]) -> list[str]:

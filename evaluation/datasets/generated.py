@@ -76,6 +76,9 @@ def open_generated(place: Path | str) -> SceneSet:
         computed["bits"] = f"the pictures' codes were reduced to {made['bits']} bits a channel before they were printed"
     if made.get("scale") == "full":
         computed["scale"] = "counts were stretched over 16 bits in the files, which is undone"
+    stated = [light.uncertainty_deg for light in dataset.description.lights]
+    known = max((one for one in stated if one is not None), default=None) if None not in stated else None
+    within = "" if known is None else f"; its direction is known to {known:.2g} degrees at worst (k = 2)"
     return SceneSet(
         name=_name_of(str(place)),
         layout="generated",
@@ -89,8 +92,10 @@ def open_generated(place: Path | str) -> SceneSet:
             "black level": "subtracted when the table was made",
             "saturation": f"from {white:g}, the white level of the table",
             "mask": "none",
-            "ground truth": "white of the light as the table has it; of several lights their mean over the image",
+            "ground truth": "white of the light as the table has it; of several lights their mean over the image"
+            + within,
         },
+        truth_uncertainty_deg=known,
     )
 
 

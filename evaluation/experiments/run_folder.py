@@ -32,7 +32,7 @@ from evaluation.reports.run_page import MOST_SHOWN, chosen_images, developed, ru
 from evaluation.reports.table_output import table_to_latex
 from evaluation.results.files import ERRORS_FILE, errors_csv, run_json, several_lights_csv
 from evaluation.results.method_records import describe_method
-from evaluation.results.result import Result, Run, SceneAnswer, Subject, results_of
+from evaluation.results.result import Result, Run, SceneAnswer, Subject, indistinct, results_of
 from evaluation.results.tables import lights_tables, statistics_rows, summary_table, table_to_csv
 from evaluation.scene import MixedScene, Scene, SceneSet
 from foundation.compiled import ordered_map
@@ -155,7 +155,8 @@ def run_methods(
 
     def finished(answers: Sequence[Sequence[SceneAnswer]]) -> Run:
         results = results_of(names, truths, answers)
-        return replace(run, results=results, notes=(*run.notes, *suspicions(run.subject.images, truths, results)))
+        odd = suspicions(run.subject.images, truths, results)
+        return replace(run, results=results, notes=(*run.notes, *odd, *indistinct(results, data.truth_uncertainty_deg)))
 
     if folder is None:
         return finished(_answers(data.scenes, methods, [], None, workers, on_scene))
@@ -216,6 +217,7 @@ def describe_run(
         folds=folds,
         notes=notes,
         software=software(),
+        truth_uncertainty_deg=data.truth_uncertainty_deg,
     )
 
 
@@ -341,6 +343,7 @@ def _files(run: Run, kind: ErrorKind, pictures: Mapping[tuple[int, int], bytes])
             "images": len(subject.images),
             "images_under_several_lights": sum(subject.mixed),
             "sha256": run.data_sha256,
+            **({} if run.truth_uncertainty_deg is None else {"truth_uncertainty_deg": run.truth_uncertainty_deg}),
         },
         "treatment": dict(run.treatment),
         "methods": [dict(method) for method in run.methods],

@@ -10,6 +10,7 @@ import io
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import combinations
 from typing import Any
 
 import numpy as np
@@ -18,6 +19,7 @@ import numpy.typing as npt
 from evaluation.methods.prepared import GREY
 from evaluation.metrics import ErrorKind, MapError, Summary, recovery_error, reproduction_error, summarise
 from evaluation.scene import Scene
+from foundation.errors import first_of
 
 
 def csv_text(rows: Iterable[Sequence[object]]) -> str:
@@ -264,3 +266,24 @@ class Run:
     folds: npt.NDArray[np.int64] | None = None
     notes: tuple[str, ...] = ()
     software: str = ""
+    truth_uncertainty_deg: float | None = None
+
+
+def indistinct(results: Sequence[Result], uncertainty_deg: float | None) -> tuple[str, ...]:
+    """Return a sentence on methods whose medians differ by less than ground truths may be off by, if there are any.
+
+    `uncertainty_deg`: expanded (k = 2), degrees; None where the data set does not state it.
+    """
+    if uncertainty_deg is None:
+        return ()
+    medians = [(result.method, result.summary("reproduction").median) for result in results]
+    pairs = [
+        f"{one} and {other}"
+        for (one, first), (other, second) in combinations(medians, 2)
+        if abs(first - second) < uncertainty_deg
+    ]
+    told = (
+        f"ground truths may be off by {uncertainty_deg:.2g} degrees (k = 2), more than the medians of "
+        f"{first_of(pairs, 3)} differ by: they do not tell these apart"
+    )
+    return (told,) if pairs else ()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import get_args
 
@@ -10,6 +11,7 @@ import pytest
 from fsspec.core import url_to_fs
 
 from calibration.table.lut import open_lut
+from evaluation.cli import main
 from evaluation.datasets import open_scenes
 from evaluation.scene import MixedScene
 from generator.dataset.making import DatasetOptions, generate_dataset
@@ -20,6 +22,31 @@ from generator.pictures.sources import random_scenes
 from tests.evaluation.datasets import contract
 
 pytestmark = pytest.mark.slow
+
+
+def test_methods_that_ground_truths_do_not_tell_apart_are_named(
+    made_lut: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    generate_dataset(open_lut(made_lut), tmp_path / "made", random_scenes(3, 24, 20), [0, 1])
+    assert open_scenes(tmp_path / "made").truth_uncertainty_deg is None
+    wish = ("run", str(tmp_path / "made"), "--method", "gray-world", "--method", "gray-edge-1")
+    described = json.loads((tmp_path / "made" / "dataset.json").read_text())
+    for uncertainty, said in ((170.0, True), (1e-9, False)):
+        for light in described["lights"]:
+            light["uncertainty_deg"] = uncertainty
+        (tmp_path / "made" / "dataset.json").write_text(json.dumps(described))
+        assert open_scenes(tmp_path / "made").truth_uncertainty_deg == uncertainty
+        out = tmp_path / f"results-{uncertainty:g}"
+        assert main((*wish, "--out", str(out))) == 0
+        printed = capsys.readouterr().out
+        assert ("medians of Gray-world and 1st-order Gray-Edge differ by: they do not" in printed) is said
+        assert f"is known to {uncertainty:.2g} degrees" in printed
+        assert main(("compare", str(out))) == 0
+        assert ("degrees, less than the 1.7e+02 that ground" in capsys.readouterr().out) is said
+    # One light of which it is not stated, and nothing is said of any.
+    del described["lights"][0]["uncertainty_deg"]
+    (tmp_path / "made" / "dataset.json").write_text(json.dumps(described))
+    assert open_scenes(tmp_path / "made").truth_uncertainty_deg is None
 
 
 @pytest.mark.parametrize("layout", get_args(Layout))
