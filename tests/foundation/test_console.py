@@ -259,6 +259,7 @@ def test_what_is_printed_beside_a_bar_on_the_terminal_goes_where_standard_output
     assert done.stdout.splitlines() == [b"found"]
 
 
+@pytest.mark.usefixtures("hang_up")
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
 def test_a_hang_up_that_is_ignored_stays_ignored(number: int) -> None:
     """As under nohup, which starts a program that way."""
@@ -271,6 +272,7 @@ def test_a_hang_up_that_is_ignored_stays_ignored(number: int) -> None:
         signal.signal(number, before)
 
 
+@pytest.mark.usefixtures("hang_up")
 def test_a_terminal_that_went_away_takes_no_last_line() -> None:
     def draw() -> None:
         raise OSError(errno.EIO, "Input/output error")

@@ -50,11 +50,11 @@ def make_seeds(work: Path) -> dict[str, Seed]:
     several = SimultaneousLights(ListedLights((0, 1)), 2, parse_masks("half-plane", 2, 1))
     scenes = random_scenes(2, 12, 8)
     options = {
-        "dataset folder": DatasetOptions(split=(0.5, 0.5, 0.0)),
-        "dataset tiff": DatasetOptions(form="tiff", previews=False, crops=1),
-        "dataset exr": DatasetOptions(form="exr", previews=False),
-        "dataset tar": DatasetOptions(layout="webdataset", shard_images=2),
-        "dataset parquet": DatasetOptions(layout="parquet", shard_images=2),
+        "dataset folder": DatasetOptions(rendering="codes", split=(0.5, 0.5, 0.0)),
+        "dataset tiff": DatasetOptions(rendering="codes", form="tiff", previews=False, crops=1),
+        "dataset exr": DatasetOptions(rendering="codes", form="exr", previews=False),
+        "dataset tar": DatasetOptions(rendering="codes", layout="webdataset", shard_images=2),
+        "dataset parquet": DatasetOptions(rendering="codes", layout="parquet", shard_images=2),
     }
     for kind, chosen in options.items():
         lights = several if kind in ("dataset folder", "dataset tar") else ListedLights((0, 2))
