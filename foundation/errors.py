@@ -25,7 +25,8 @@ of these at the place where the library is called, with ``from error``.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import re
+from collections.abc import Iterable, Sequence
 
 from foundation.secret_texts import masked
 
@@ -148,6 +149,23 @@ def counted(number: int, what: str, plural: str | None = None) -> str:
     ('1 image', '0 images', '2 are left')
     """
     return f"{number} {what if number == 1 else plural or what + 's'}"
+
+
+def nearest_names(wanted: str, known: Iterable[str], most: int = 1) -> str:
+    """Return the question whether one of the known names was meant, ending with a mark; empty where none is near.
+
+    Capitals, spaces and underscores make no difference.
+
+    Examples
+    --------
+    >>> nearest_names("Grey_World", ["gray-world", "white-patch"])
+    "did you mean 'gray-world'?"
+    """
+    import difflib
+
+    plain = {re.sub(r"[\s_-]+", "", name).lower(): name for name in known}
+    near = difflib.get_close_matches(re.sub(r"[\s_-]+", "", wanted).lower(), plain, n=most, cutoff=0.5)
+    return f"did you mean {' or '.join(repr(plain[name]) for name in near)}?" if near else ""
 
 
 def first_of(things: Sequence[object], most: int = 10) -> str:

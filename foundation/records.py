@@ -6,7 +6,6 @@ added has a default. Arrays are lists in the file, numbers that are not finite a
 
 from __future__ import annotations
 
-import difflib
 import json
 import math
 from collections.abc import Collection, Iterable, Mapping
@@ -26,7 +25,7 @@ from pydantic import (
     model_serializer,
 )
 
-from foundation.errors import ConfigurationError, FormatError
+from foundation.errors import ConfigurationError, FormatError, nearest_names
 
 T = TypeVar("T")
 
@@ -122,8 +121,7 @@ def damaged(error: ValidationError, about: object, remedy: str) -> FormatError:
 def unknown_key(key: str, known: Iterable[str], where: str) -> ConfigurationError:
     """Return the error for an unknown key, naming the nearest one that is known."""
     names = sorted(known)
-    near = difflib.get_close_matches(key.rsplit(".", 1)[-1], names, n=1, cutoff=0.5)
-    hint = f"did you mean {near[0]!r}?" if near else f"known are {', '.join(names)}"
+    hint = nearest_names(key.rsplit(".", 1)[-1], names) or f"known are {', '.join(names)}"
     return ConfigurationError(f"{where}: unknown key {key!r}; {hint}")
 
 

@@ -283,7 +283,8 @@ def _print_summary(dataset: Dataset, out: str, output: JsonOutput, was_there: bo
     there = ", complete already; nothing was made" if was_there else ""
     print(f"{masked(out)}: {_counted(made.images, 'image')} of {pictures} under {_counted(lights, 'light')}{there}")
     if made.splits:
-        print(", ".join(f"{images} for {part}" for part, images in made.splits.items()))
+        parts = ", ".join(f"{images} for {part}" for part, images in made.splits.items())
+        print(parts if made.splits.get("validation") else f"{parts}: two shares are those of train and test")
     if made.skipped:
         tried = made.sources + len(made.skipped)
         print(f"{len(made.skipped)} of {tried} pictures were left out; dataset.json lists them")

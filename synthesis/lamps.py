@@ -25,7 +25,6 @@ patch has the light of its middle; the chart lies exactly where it is looked for
 from __future__ import annotations
 
 import csv
-import difflib
 import io
 import re
 from collections.abc import Iterable, Mapping, Sequence
@@ -44,7 +43,7 @@ from drivers.raw.plain_dng import Area
 from drivers.raw.rawfile import Mosaic
 from experiment.lights import Illumination, parse_ccts, shown_colour
 from foundation.colorimetry import linear_srgb, planck, xyz_of
-from foundation.errors import FormatError, InputError
+from foundation.errors import FormatError, InputError, nearest_names
 from sim.spectral import PublishedSpectrum, daylight, published_spectra, regridded, require_grid
 from sim.world.rendering import PAPER
 from sim.world.room import WAVELENGTHS_NM, Room, printed_reflectance, sensitivities
@@ -212,8 +211,7 @@ def _named(name: str, known: list[str], given: str) -> list[str]:
         return [key for key in known if re.fullmatch(pattern, key)]
     if name in known:
         return [name]
-    near = difflib.get_close_matches(name, [*known, *SETS], n=3, cutoff=0.4)
-    hint = f"did you mean {' or '.join(map(repr, near))}?" if near else "name such as D65, A, FL2, LED-B3, cie-led"
+    hint = nearest_names(name, [*known, *SETS], 3) or "name such as D65, A, FL2, LED-B3, cie-led"
     raise InputError(f"--lights {given}: there is no file and no published light {name!r}; {hint}")
 
 

@@ -44,7 +44,7 @@ from evaluation.methods.gray_edge import GrayEdge
 from evaluation.methods.green_stability import FAMILIES
 from evaluation.methods.standard import local_methods, standard_methods
 from evaluation.methods.wrapped import PATCHES, PatchwiseMethod, ResizedMethod
-from foundation.errors import InputError
+from foundation.errors import InputError, nearest_names
 from foundation.packages import require_own_packages
 
 if TYPE_CHECKING:
@@ -95,7 +95,8 @@ def find_method(text: str) -> Method | Learner:
         known = {**standard_methods(), **local_methods()}
         if wanted in known:
             return known[wanted]
-        raise InputError(f"{wanted!r} is no method; the methods are {', '.join(known)}, or give module:Class or a file")
+        near = nearest_names(wanted, known) or f"the methods are {', '.join(known)}"
+        raise InputError(f"{wanted!r} is no method; {near}; module:Class or a file names one of your own")
     if not place or not name:
         raise InputError(f"{wanted!r} names no method; expected {_FORMS}")
     is_file = place.endswith(".py")

@@ -221,8 +221,8 @@ class ImageOptions:
         str | None,
         _image_option(
             "SHARES",
-            "Divide by source into train, validation and test, such as 0.8,0.1,0.1; by a hash of each picture, so that "
-            "parts have these sizes on average.",
+            "Divide by source into train, validation and test, such as 0.8,0.1,0.1; two shares are train and test. By "
+            "a hash of each picture, so that parts have these sizes on average.",
         ),
     ] = None
     exact_split: Annotated[

@@ -8,14 +8,16 @@ position in the list of sources and on a seed, and on nothing else.
 
 from __future__ import annotations
 
+import math
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final, Literal
 
 import numpy as np
 import numpy.typing as npt
 
-from foundation.errors import InputError, first_of
+from foundation.errors import InputError, first_of, nearest_names
 from generator import philox
 from generator.lights.distributions import Distribution, load_ground_truths
 from generator.lights.gamut import Gamut, Match, OutsideGamut, OutsideGamutError, black_body, rgb_of
@@ -259,6 +261,22 @@ def parse_lights(text: str, total: int) -> ListedLights:
     return ListedLights(tuple(lights))
 
 
+_LEAST_K: Final = 1000
+"""From here on a number is rather a temperature in kelvin than that of a light."""
+
+_DAYLIGHT: Final = {"sunny": 5200, "sun": 5200, "daylight": 5500, "cloudy": 6500, "shade": 7500, "tungsten": 2850}
+"""White balances of cameras, kelvin: what makers print in their manuals, rounded."""
+
+
+def _no_light(text: str, names: Sequence[str]) -> str:
+    """Return what is said of a text that names no light."""
+    known = _DAYLIGHT.get(text.lower())
+    near = f"write {known}K for a black body like it" if known else nearest_names(text, names)
+    usual = "write a light such as 12, 12:0.25+40:0.75, 5600K or r=.3,b=.25"
+    of_these = f", or a name: {first_of(names)}" if names else ""
+    return f"{text!r} is no light; {near or usual + of_these}"
+
+
 def parse_light(text: str, lut: Lut, gamut: Gamut | None = None, outside: OutsideGamut = "refuse") -> Mixture:
     """Return the light that a text names.
 
@@ -276,7 +294,12 @@ def parse_light(text: str, lut: Lut, gamut: Gamut | None = None, outside: Outsid
         try:
             mixture = parse_mixture(text.strip())
         except InputError as error:
-            raise InputError(f"{error}, or a name: {first_of(list(named))}" if named else str(error)) from error
+            raise InputError(_no_light(text.strip(), list(named))) from error
+        if len(mixture.lights) == 1 and mixture.lights[0] >= max(_LEAST_K, len(lut.white)):
+            raise InputError(
+                f"there is no light {text.strip()}; the table has lights 0 to {len(lut.white) - 1}; write "
+                f"{text.strip()}K for the black body of that temperature"
+            )
         mixture.white(lut)
         return mixture
     numbers = parse_numbers(
@@ -284,8 +307,15 @@ def parse_light(text: str, lut: Lut, gamut: Gamut | None = None, outside: Outsid
     )
     if numbers.keys() == {"cct"}:
         return black_body(lut, numbers["cct"])
-    if numbers.keys() != {"r", "b"} or numbers["r"] + numbers["b"] > 1:
-        raise InputError(f"{text!r} is no light; write cct=4500, or r=.3,b=.25 with a sum of at most 1")
+    if numbers.keys() != {"r", "b"}:
+        raise InputError(f"{text!r} is no light; write cct=4500, or both r and b, such as r=.3,b=.25")
+    total = numbers["r"] + numbers["b"]
+    if total > 1:
+        red, blue = (f"{math.floor(100 * numbers[name] / total) / 100:g}" for name in "rb")
+        raise InputError(
+            f"{text!r} is no light: r, g and b sum to 1, and r and b to {total:g} already; such a light without green "
+            f"is r={red},b={blue}"
+        )
     return (gamut or Gamut.of(lut)).match(rgb_of([numbers["r"], numbers["b"]]), outside).mixture
 
 

@@ -136,8 +136,10 @@ def test_lights_of_a_table_may_have_names(make_lut: Callable[..., Lut]) -> None:
     lut = replace(lut, illuminations=tuple(named))
     assert parse_light(" FL2 ", lut) == plain(1)
     assert parse_light("2", lut) == plain(2)
-    with pytest.raises(InputError, match=r"'fl2' is no mixture of lights; .*, or a name: A, FL2, D65"):
+    with pytest.raises(InputError, match=r"'fl2' is no light; did you mean 'FL2'\?"):
         parse_light("fl2", lut)
+    with pytest.raises(InputError, match="or a name: A, FL2, D65"):
+        parse_light("xyzzy", lut)
 
 
 @pytest.mark.parametrize(
@@ -145,11 +147,13 @@ def test_lights_of_a_table_may_have_names(make_lut: Callable[..., Lut]) -> None:
     [
         ("5", "there is no light 5; the table"),
         ("0:0.5+9:0.5", "there is no light 9; the table"),
-        ("blue", "'blue' is no mixture of lights"),
+        ("blue", "'blue' is no light; write"),
+        ("Sunny", "write 5200K"),
+        ("5600", "write 5600K for the black body"),
         ("cct=100", "100 K is outside the black bodies"),
-        ("cct=3001,r=.3", "is no light; write cct=4500, or r=.3,b=.25"),
+        ("cct=3001,r=.3", "is no light; write cct=4500, or both r and b"),
         ("r=.3", "is no light; write cct"),
-        ("r=.7,b=.7", "with a sum of at most 1"),
+        ("r=.9,b=.6", "without green is r=0.6,b=0.4"),
         ("r=-.1,b=.3", "expected a number from 0 to 1"),
         ("r=.9,b=.05", r"r=0\.9000, b=0\.0500 lies .*° outside what the table .* can make"),
         ("t=3000", "'t=3000' is no option of a light"),
