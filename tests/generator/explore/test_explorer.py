@@ -108,7 +108,7 @@ def test_one_light_is_all_that_it_can_make(make_lut: MakeLut) -> None:
 def test_what_the_table_cannot_make_becomes_the_nearest_light(explorer: Explorer) -> None:
     shown = explorer.show(0, "r=.9,b=.05")
     assert shown["light"] == "0"
-    with pytest.raises(InputError, match="no mixture"):
+    with pytest.raises(InputError, match="is no light"):
         explorer.show(0, "sunny")
 
 
