@@ -58,7 +58,7 @@ lint: $(READY)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/lint-imports
-	$(BIN)/basedpyright
+	$(BIN)/basedpyright --threads 2
 
 # The site: tutorial, how-to, reference from the docstrings, explanation; a warning is an error. Needs no network.
 docs: $(READY)
