@@ -81,7 +81,7 @@ def read_plainly(data: bytes | memoryview, directories: Sequence[Directory]) -> 
     size = (*pixels.integers(TiffTag.IMAGE_LENGTH), *pixels.integers(TiffTag.IMAGE_WIDTH))
     pattern = pixels.integers(TiffTag.CFA_PATTERN)
     white, black, strips = pixels.integers(TiffTag.WHITE_LEVEL), stated_black(pixels), pixels.extents()
-    letters = "".join("RGB"[index] for index in pattern if index < 3)
+    letters = "".join("RGB"[index] for index in pattern if 0 <= index < 3)
     if len(size) != 2 or letters not in BAYER_PATTERNS or len(white) != 1 or black is None or not strips:
         return None
     active, start = active_area(pixels, size), strips[0][0]
