@@ -154,7 +154,7 @@ def counted(number: int, what: str, plural: str | None = None) -> str:
 def nearest_names(wanted: str, known: Iterable[str], most: int = 1) -> str:
     """Return the question whether one of the known names was meant, ending with a mark; empty where none is near.
 
-    Capitals, spaces and underscores make no difference.
+    Capitals, spaces, hyphens and underscores make no difference.
 
     Examples
     --------

@@ -115,10 +115,10 @@ class Connections:
     def admit(self, link: socket.socket, address: str) -> bool:
         """Return whether there is room for a connection; another is closed for it if need be."""
         with self._guard:
-            gives_way = None if len(self._open) < self._most else self._who_gives_way()
-            if len(self._open) >= self._most and gives_way is None:
-                return False
-            if gives_way is not None:
+            if len(self._open) >= self._most:
+                gives_way = self._who_gives_way()
+                if gives_way is None:
+                    return False
                 del self._open[id(gives_way.link)]
                 _hang_up(gives_way.link)
             self._open[id(link)] = _Connection(link, address, "new", self._now())

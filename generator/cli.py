@@ -221,7 +221,7 @@ def _plan(
     if not holds_dataset(out):
         require_free_place(out)
     table = open_lut(table_folder(lut))
-    begun = begun_rendering(out)
+    begun = None if rendering.rendering else begun_rendering(out)
     rendered = rendering.of(DatasetOptions(bits=images.bits), table, begun)
     chosen = choose(table, likeness, pictures, light, variation, rendered, images.seed, processor_count())
     for line in chosen.lines:

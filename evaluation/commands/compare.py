@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -214,14 +214,22 @@ def _unlike(places: Sequence[str]) -> list[str]:
 
 def _record(place: str) -> dict[str, str]:
     """Return where the images of a results folder came from and what was done to them; nothing if it does not say."""
+    content = _run_json(place)
+    try:
+        treatment = content["treatment"]
+        return {"images": str(content["data_set"]["place"]), **{str(what): str(treatment[what]) for what in treatment}}
+    except (KeyError, TypeError):
+        return {}
+
+
+def _run_json(place: str) -> Any:
+    """Return the content of a results folder's run.json; an empty object if it has none that can be read."""
     import json
 
     path = Path(place)
     try:
-        content = json.loads((path if path.is_dir() else path.parent).joinpath("run.json").read_text(encoding="utf-8"))
-        treatment = content["treatment"]
-        return {"images": str(content["data_set"]["place"]), **{str(what): str(treatment[what]) for what in treatment}}
-    except (OSError, ValueError, KeyError, TypeError):
+        return json.loads((path if path.is_dir() else path.parent).joinpath("run.json").read_text(encoding="utf-8"))
+    except (OSError, ValueError):
         return {}
 
 
@@ -244,13 +252,9 @@ def _indistinct(comparisons: Sequence[Comparison], places: Sequence[str]) -> lis
 
 def _truth_uncertainty(place: str) -> float | None:
     """Return what ground truths of a results folder may be off by, degrees; None if it does not say."""
-    import json
-
-    path = Path(place)
     try:
-        content = json.loads((path if path.is_dir() else path.parent).joinpath("run.json").read_text(encoding="utf-8"))
-        return float(content["data_set"]["truth_uncertainty_deg"])
-    except (OSError, ValueError, KeyError, TypeError):
+        return float(_run_json(place)["data_set"]["truth_uncertainty_deg"])
+    except (ValueError, KeyError, TypeError):
         return None
 
 

@@ -27,7 +27,7 @@ from foundation.files import HashingWriter
 from foundation.version import software
 from generator.dataset.layouts import card, croissant, datasheet
 from generator.dataset.plan import DatasetOptions, Plan
-from generator.dataset.reader import Dataset, open_dataset
+from generator.dataset.reader import Dataset, load_description, open_dataset
 from generator.dataset.records import (
     CARD,
     COMPLETED_BY_HAND,
@@ -69,7 +69,7 @@ from generator.files import suffix_of
 from generator.lights.choices import ListedLights
 from generator.lights.lighting import LightChoice
 from generator.pictures.sources import hash_since
-from generator.stores import DESCRIPTION, Store, is_remote, local_path
+from generator.stores import DESCRIPTION, Store, is_remote, local_path, open_store
 
 if TYPE_CHECKING:
     import distributed
@@ -403,7 +403,7 @@ def make_dataset(plan: Plan, out: Path | str, workers: Workers | None = None, ca
 def begun_rendering(out: Path | str) -> Rendering | None:
     """Return how the dataset is rendered that is at `out`, or was begun there; None where there is none."""
     if holds_dataset(out):
-        options: Mapping[str, Any] = open_dataset(out).description.options
+        options: Mapping[str, Any] = load_description(open_store(out)).options
     elif is_begun(out):
         options = stored_identity(out)["options"]
     else:

@@ -408,11 +408,12 @@ def open_dataset(place: Path | str) -> Dataset:
     store = open_store(place)
     if not store.has(DESCRIPTION):
         raise FormatError(f"{place} is no dataset: it has no {DESCRIPTION}; make one with generate")
-    description = _load_description(store)
+    description = load_description(store)
     return Dataset(store, description, tuple(read_entries(store, description)))
 
 
-def _load_description(store: Store) -> Description:
+def load_description(store: Store) -> Description:
+    """Return the content of a dataset's `dataset.json`; a FormatError says why it cannot be used."""
     name = f"{store.place}/{DESCRIPTION}"
     try:
         content = _content(store)

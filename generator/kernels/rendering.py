@@ -387,16 +387,21 @@ def draw_mosaic(
     return copied_back(work, target)
 
 
-def read_light(lut: Lut, light: int, pixels: int = WHOLE_LIGHT_PIXELS) -> npt.NDArray[np.uint16]:
-    """Return the samples (8**bits, S, 3) uint16 of light number `light`.
-
-    For a picture of `WHOLE_LIGHT_PIXELS` or more they are copied to memory, else they stay on disk until they are used.
-    """
+def known_light(lut: Lut, light: int) -> int:
+    """Return the number of a light; an InputError if the table has no such light."""
     try:
         number = operator.index(light)
     except TypeError as error:
         raise InputError(f"light {light!r} is no number of a light; give a whole one from 0") from error
     if not 0 <= number < len(lut.samples):
         raise InputError(f"there is no light {number}; the table {lut.folder} has lights 0 to {len(lut.samples) - 1}")
-    mapped = lut.light_samples(number)
+    return number
+
+
+def read_light(lut: Lut, light: int, pixels: int = WHOLE_LIGHT_PIXELS) -> npt.NDArray[np.uint16]:
+    """Return the samples (8**bits, S, 3) uint16 of light number `light`.
+
+    For a picture of `WHOLE_LIGHT_PIXELS` or more they are copied to memory, else they stay on disk until they are used.
+    """
+    mapped = lut.light_samples(known_light(lut, light))
     return np.array(mapped) if pixels >= WHOLE_LIGHT_PIXELS else mapped

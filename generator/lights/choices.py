@@ -264,13 +264,13 @@ def parse_lights(text: str, total: int) -> ListedLights:
 _LEAST_K: Final = 1000
 """From here on a number is rather a temperature in kelvin than that of a light."""
 
-_DAYLIGHT: Final = {"sunny": 5200, "sun": 5200, "daylight": 5500, "cloudy": 6500, "shade": 7500, "tungsten": 2850}
-"""White balances of cameras, kelvin: what makers print in their manuals, rounded."""
+_WHITE_BALANCES: Final = {"sunny": 5200, "daylight": 5200, "shade": 7000, "cloudy": 6000, "tungsten": 3200}
+"""White balances that cameras name, kelvin, as manuals of EOS bodies have them."""
 
 
 def _no_light(text: str, names: Sequence[str]) -> str:
     """Return what is said of a text that names no light."""
-    known = _DAYLIGHT.get(text.lower())
+    known = _WHITE_BALANCES.get(text.lower())
     near = f"write {known}K for a black body like it" if known else nearest_names(text, names)
     usual = "write a light such as 12, 12:0.25+40:0.75, 5600K or r=.3,b=.25"
     of_these = f", or a name: {first_of(names)}" if names else ""

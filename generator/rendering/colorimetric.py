@@ -432,10 +432,7 @@ class ColorimetricRendering:
         `kernels.printing.draw_printed`.
         """
         lights = [self.printed(mixture, black_taken) for mixture in mixtures]
-        most = drawing.pop("most", self.lut.provenance.white_level)
-        return printing.draw_printed(
-            self.lut.samples, picture, lights, self.cells, shares=weights, most=most, **drawing
-        )
+        return printing.draw_printed(self.lut.samples, picture, lights, self.cells, shares=weights, **drawing)
 
     def _variance(self, counts: _Array) -> _Array:
         """Return the variance of samples of so many counts (N, 3) in the mean; photon noise where it is not known."""

@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 from foundation.errors import InputError
 from generator.kernels.choice import check_picture, replace_unfit_colours
-from generator.kernels.rendering import draw_samples, read_light
+from generator.kernels.rendering import draw_samples, known_light, read_light
 from generator.lights.lighting import plain
 from generator.rendering import DEFAULT, Rendering
 from generator.rendering.matrices import matrix_for
@@ -73,9 +73,10 @@ def render(
     check_picture(picture)
     if rendering not in get_args(Rendering):
         raise InputError(f"{rendering!r} is no rendering; use one of {', '.join(get_args(Rendering))}")
-    samples = read_light(lut, light, picture.shape[0] * picture.shape[1])
     if rendering == "codes":
+        samples = read_light(lut, light, picture.shape[0] * picture.shape[1])
         fit, _ = replace_unfit_colours(picture, lut.provenance)
         return draw_samples(samples, fit, seed=seed, image=image, threads=threads)
-    by_colour = rendering_with(lut, matrix_for(lut))
-    return by_colour.draw(picture, [plain(int(light))], seed=seed, image=image, threads=threads)
+    alone = plain(known_light(lut, light))
+    by_colour, most = rendering_with(lut, matrix_for(lut)), lut.provenance.white_level
+    return by_colour.draw(picture, [alone], most=most, seed=seed, image=image, threads=threads)

@@ -7,8 +7,7 @@ import ipaddress
 import re
 import socket
 import threading
-from collections.abc import Generator
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import AbstractContextManager, ExitStack, suppress
 from typing import Any
 
 import cv2
@@ -29,6 +28,7 @@ from foundation.local_server import (
     qr_text,
     reachable_addresses,
 )
+from tests.serving import serving
 
 OPEN = Access("", frozenset({"localhost"}), "acquire monitor")
 CLOSED = Access("secret", frozenset({"localhost"}), "acquire monitor")
@@ -129,14 +129,8 @@ class Echo(LocalServer):
         return Response("text/plain", request.path.encode())
 
 
-@contextmanager
-def served(**limits: Any) -> Generator[LocalServer]:
-    with Echo("127.0.0.1", 0, **limits) as server:
-        thread = threading.Thread(target=lambda: server.serve_forever(0.01))
-        thread.start()
-        yield server
-        server.shutdown()
-        thread.join()
+def served(**limits: Any) -> AbstractContextManager[LocalServer]:
+    return serving(Echo("127.0.0.1", 0, **limits))
 
 
 def connect(server: LocalServer) -> socket.socket:
@@ -251,22 +245,21 @@ def test_nobody_gives_way_who_is_being_answered_unless_he_is_slow() -> None:
 
 
 def test_a_viewer_who_takes_nothing_loses_the_place() -> None:
+    ended = threading.Event()
+
     class Flood(Echo):
         def answer(self, request: Request) -> Response:
             return Response("image/png", bytes(1 << 26))
 
-    with Flood("127.0.0.1", 0, most=1, idle_s=0.05) as server:
-        thread = threading.Thread(target=lambda: server.serve_forever(0.01))
-        thread.start()
-        with connect(server) as link:
-            link.sendall(b"GET / HTTP/1.1\r\nHost: localhost\r\n\r\n")
-            got = 0
-            answer = http.client.HTTPResponse(link)
-            answer.begin()
-            # What the system had taken is all that comes.
-            threading.Event().wait(0.2)
-            with pytest.raises((http.client.IncompleteRead, ConnectionError)):
-                got = len(answer.read())
-            assert got == 0
-        server.shutdown()
-        thread.join()
+        def process_request_thread(self, request: Any, client_address: Any) -> None:
+            super().process_request_thread(request, client_address)
+            ended.set()
+
+    with serving(Flood("127.0.0.1", 0, most=1, idle_s=0.05)) as server, connect(server) as link:
+        link.sendall(b"GET / HTTP/1.1\r\nHost: localhost\r\n\r\n")
+        answer = http.client.HTTPResponse(link)
+        answer.begin()
+        assert ended.wait(20)
+        # What the system had taken is all that comes.
+        with pytest.raises((http.client.IncompleteRead, ConnectionError)):
+            answer.read()

@@ -5,7 +5,6 @@ from __future__ import annotations
 import signal
 import subprocess
 import sys
-import threading
 from collections.abc import Generator, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -25,6 +24,7 @@ from tests.acquisition.monitor.browser import (
     needs_chromium,
 )
 from tests.acquisition.monitor.made_up import LIGHTS, MadeUpRun
+from tests.serving import serving
 
 pytestmark = [pytest.mark.slow, needs_chromium]
 ROOT = Path(__file__).parents[3]
@@ -78,17 +78,13 @@ def run(tmp_path: Path) -> Iterator[MadeUpRun]:
 def shown(
     tab: Tab, folder: Path, *, width: int = 1280, dark: bool = False, host: str = "127.0.0.1"
 ) -> Generator[MonitorServer]:
-    with open_monitor(folder, 0, host) as server:
-        thread = threading.Thread(target=lambda: server.serve_forever(0.01))
-        thread.start()
+    with serving(open_monitor(folder, 0, host)) as server:
         try:
             tab.open(f"http://127.0.0.1:{server.port}/{server.path}", width=width, dark=dark)
             tab.wait_for("document.readyState === 'complete' && typeof model !== 'undefined' && model.cursor !== ''")
             yield server
         finally:
             tab.open("about:blank")
-            server.shutdown()
-            thread.join()
 
 
 def marks(tab: Tab, plane: str, state: str) -> int:

@@ -7,10 +7,9 @@ import http.client
 import json
 import shutil
 import sys
-import threading
 import tomllib
-from collections.abc import Generator, Iterator
-from contextlib import contextmanager
+from collections.abc import Iterator
+from contextlib import AbstractContextManager
 from http.server import ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
@@ -22,6 +21,7 @@ from acquisition.monitor.serving import MonitorServer, open_monitor
 from foundation.errors import FormatError, InputError
 from foundation.local_server import Refusal, Request
 from tests.acquisition.monitor.made_up import MadeUpRun, jpeg
+from tests.serving import serving
 
 SCRIPT = "<script>alert(1)</script>"
 
@@ -37,14 +37,8 @@ def run(tmp_path: Path) -> Iterator[MadeUpRun]:
     made.journal.close()
 
 
-@contextmanager
-def served(folder: Path, host: str = "127.0.0.1") -> Generator[MonitorServer]:
-    with open_monitor(folder, 0, host) as opened:
-        thread = threading.Thread(target=lambda: opened.serve_forever(0.01))
-        thread.start()
-        yield opened
-        opened.shutdown()
-        thread.join()
+def served(folder: Path, host: str = "127.0.0.1") -> AbstractContextManager[MonitorServer]:
+    return serving(open_monitor(folder, 0, host))
 
 
 @pytest.fixture

@@ -234,6 +234,7 @@ def test_a_plain_dng_is_what_libraw_reads(
         {33421: shorts(2, 3)},
         {33422: (1, 4, b"\0\0\1\2")},
         {33422: (1, 4, b"\3\1\1\2")},
+        {33422: (6, 4, b"\xfd\xfe\xfe\xff")},  # -3, -2, -2, -1, which Python takes for places from the end
         {50711: shorts(2)},
         {50717: longs(4095, 4095)},
         {279: longs(10)},

@@ -33,6 +33,7 @@ from tests.acquisition.monitor.browser import (
 )
 from tests.generator.rendering.conftest import MakeTable
 from tests.generator.rendering.conftest import make_table as make_table_of_a_print
+from tests.serving import serving
 
 pytestmark = [pytest.mark.slow, needs_chromium]
 make_table = make_table_of_a_print
@@ -68,9 +69,7 @@ def explorer(make_table: MakeTable, tmp_path: Path, monkeypatch: pytest.MonkeyPa
 def shown(
     tab: Tab, explorer: Explorer, *, width: int = 1280, dark: bool = False, host: str = "127.0.0.1"
 ) -> Generator[ExploreServer]:
-    with ExploreServer(explorer, host, 0) as server:
-        thread = threading.Thread(target=lambda: server.serve_forever(0.01))
-        thread.start()
+    with serving(ExploreServer(explorer, host, 0)) as server:
         try:
             tab.errors.clear()
             tab.open(f"http://127.0.0.1:{server.port}/{server.path}", width=width, dark=dark)
@@ -82,8 +81,6 @@ def shown(
         finally:
             errors = list(tab.errors)
             tab.open("about:blank")
-            server.shutdown()
-            thread.join()
         assert errors == []
 
 

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import http.client
 import json
-import threading
-from collections.abc import Generator, Iterator
-from contextlib import contextmanager
+from collections.abc import Iterator
+from contextlib import AbstractContextManager
 from http.server import ThreadingHTTPServer
 
 import cv2
@@ -18,18 +17,13 @@ from generator.explore.explorer import Explorer
 from generator.explore.server import ExploreServer
 from generator.pictures.sources import RandomScene
 from tests.generator.conftest import MakeLut
+from tests.serving import serving
 
 PNG = cv2.imencode(".png", RandomScene(0, 40, 30).read().picture)[1].tobytes()
 
 
-@contextmanager
-def served(explorer: Explorer, host: str = "127.0.0.1") -> Generator[ExploreServer]:
-    with ExploreServer(explorer, host, 0) as opened:
-        thread = threading.Thread(target=lambda: opened.serve_forever(0.01))
-        thread.start()
-        yield opened
-        opened.shutdown()
-        thread.join()
+def served(explorer: Explorer, host: str = "127.0.0.1") -> AbstractContextManager[ExploreServer]:
+    return serving(ExploreServer(explorer, host, 0))
 
 
 @pytest.fixture
