@@ -17,11 +17,10 @@ from drivers.links.network import LOOPBACK
 from drivers.links.usb import open_usb
 from drivers.ptp.codes import Operation, ResponseCode
 from drivers.ptp.ip import IpTransport
-from drivers.ptp.session import PtpEvent, PtpRequest, PtpResponse, Transport
+from drivers.ptp.session import Answer, PtpEvent, PtpRequest, PtpResponse, Transport
 from drivers.ptp.usb import UsbTransport
 from foundation.clock import SystemClock
 from sim.buses.ptp import serve_ptpip
-from sim.buses.responder import Answer
 from sim.buses.usb import PtpUsbDevice, SimulatedBus
 
 OBJECT = bytes(range(256)) * 117_188

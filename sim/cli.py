@@ -69,7 +69,7 @@ def projector(
     (Ctrl-C), which is its proper end: exit code 0. Exit code 2 when there is no such language or not exactly one
     cable, 3 when the port is taken.
     """
-    from drivers.pjlink.wire import MAX_PASSWORD
+    from drivers.pjlink import MAX_PASSWORD
     from drivers.projector import Power
     from foundation.clock import SystemClock
     from foundation.errors import ConfigurationError, InputError
@@ -220,7 +220,7 @@ def _film(
 ) -> Generator[Film]:
     """Yield pictures of a world under white light, or lit by a screen that is watched."""
     from drivers.links.network import TcpLink
-    from drivers.pjlink.projector import PjLinkProjector
+    from drivers.pjlink import PjLinkProjector
     from drivers.presenter import WHITE
     from foundation.clock import SystemClock
     from sim.camera.film import WatchedFilm, WorldFilm

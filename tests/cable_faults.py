@@ -1,6 +1,6 @@
 """Faults of cameras and cables, each as a wrapper around a device or cable that works.
 
-Three places can be troubled: the device, as a `sim.buses.responder.Responder`; its pipes, as
+Three places can be troubled: the device, as a `drivers.ptp.session.Responder`; its pipes, as
 `drivers.links.link.UsbPipes`; the whole cable, as a `drivers.ptp.session.Transport`. A wrapper keeps the contract
 of what it wraps and may be wrapped again. What happens and when is set on construction; nothing is random.
 
@@ -13,10 +13,9 @@ from __future__ import annotations
 from collections.abc import Callable, Collection
 
 from drivers.links.link import Pipe, PipeStalled, UsbPipes
-from drivers.ptp.session import PtpEvent, PtpRequest, PtpResponse, Transaction, Transport
+from drivers.ptp.session import Answer, NoAnswer, PtpEvent, PtpRequest, PtpResponse, Responder, Transaction, Transport
 from drivers.ptp.usb import HEADER_LENGTH
 from foundation.errors import LinkClosed, LinkTimeout
-from sim.buses.responder import Answer, NoAnswer, Responder
 
 
 class Occasion:

@@ -20,12 +20,12 @@ from __future__ import annotations
 
 import math
 import struct
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Final
 
-from drivers.ptp.codes import EosEvent, Property, describe
-from drivers.ptp.datasets import MAX_DATASET, Cursor, encode_array, encode_integer
+from drivers.ptp.codes import EosEvent, Property
+from drivers.ptp.datasets import MAX_DATASET, Cursor, describe, encode_array, encode_integer
 from foundation.errors import InputError, ProtocolError
 
 _RAW: Final = 6
@@ -519,8 +519,6 @@ def _encode_transfer_request(record: TransferRequest) -> bytes:
 
 TOLERANCE = 0.01
 """How far, of one, a wanted value may lie from a nominal one; neighbouring nominal values are 5 % apart or more."""
-_HIGHEST_CODE = 0xFF
-"""Codes are one byte: the law of stops has no meaning beyond."""
 
 
 @dataclass(frozen=True)
@@ -534,18 +532,11 @@ class DialPosition:
 
 @dataclass(frozen=True)
 class Scale:
-    """A dial: its steps by ascending code, special codes without a value, and the law behind them."""
+    """A dial: its steps by ascending code, and special codes without a value."""
 
     name: str
     steps: tuple[DialPosition, ...]
     specials: dict[int, str]
-    law: Callable[[int], float] = field(repr=False)
-
-    def exact(self, code: int) -> float:
-        """Return the value that `code` stands for in stops, unrounded: 2^(−5) s where the camera shows 1/30."""
-        if code in self.specials or not 0 <= code <= _HIGHEST_CODE:
-            raise ProtocolError(f"{self.name} {self.label(code)} has no value")
-        return self.law(code)
 
     def label(self, code: int) -> str:
         """Return what the camera shows for `code`; the code itself where it is in no table."""
@@ -608,14 +599,14 @@ def _near(number: float, nominal: float) -> bool:
     return abs(number / nominal - 1) <= TOLERANCE
 
 
-def _scale(name: str, table: str, specials: dict[int, str], law: Callable[[int], float]) -> Scale:
+def _scale(name: str, table: str, specials: dict[int, str]) -> Scale:
     steps: list[DialPosition] = []
     for entry in table.split():
         code, label = entry.split("=")
         value = _number(label)
         assert value is not None
         steps.append(DialPosition(int(code, 16), label, value))
-    return Scale(name, tuple(sorted(steps, key=lambda step: step.code)), specials, law)
+    return Scale(name, tuple(sorted(steps, key=lambda step: step.code)), specials)
 
 
 SHUTTER = _scale(
@@ -630,10 +621,9 @@ SHUTTER = _scale(
     B8=1/64000
     """,
     {0x00: "auto", 0x0C: "bulb", 0x04: "bulb"},
-    lambda code: 2.0 ** ((0x38 - code) / 8),
 )
 """Shutter time in seconds (property 0xd102); beyond 1/8000 s of electronic shutters, as Canon's EDSDK names them up to
-1/32000 s. The last three follow the law, and 1/64000 s is the shortest that an EOS R3 offers."""
+1/32000 s. The last three follow the law of eighths of a stop, and 1/64000 s is the shortest that an EOS R3 offers."""
 
 APERTURE = _scale(
     "aperture",
@@ -643,7 +633,6 @@ APERTURE = _scale(
     4C=19 4D=20 50=22 53=25 54=27 55=29 58=32 5B=36 5C=38 5D=40 60=45
     """,
     {0x00: "auto", 0xB0: "auto", 0xFFFF: "auto"},
-    lambda code: 2.0 ** ((code - 8) / 16),
 )
 """Aperture as f-number (property 0xd101); 0 also where the lens has no contacts."""
 
@@ -656,6 +645,5 @@ ISO = _scale(
     A0=204800 A8=409600
     """,
     {0x00: "auto", 0x01: "auto"},
-    lambda code: 100 * 2.0 ** ((code - 0x48) / 8),
 )
 """ISO speed (property 0xd103)."""

@@ -14,7 +14,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable
 from enum import Enum
-from typing import Final, Protocol, TypeVar
+from typing import Final, Protocol, Self, TypeVar
 
 from foundation.clock import Clock
 from foundation.errors import LinkClosed, LinkError, LinkTimeout, ProtocolError
@@ -110,6 +110,20 @@ class UsbPipes(Protocol):
         ...
 
 
+class ClosedAtEnd:
+    """What is closed at the end of its `with` block."""
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Release it; a second call does nothing."""
+        raise NotImplementedError
+
+
 class Peer(Protocol):
     """The far side of a connection as a pure machine: bytes in, bytes out."""
 
@@ -161,7 +175,7 @@ class PeerLink:
 
 _log = logging.getLogger(__name__)
 
-GLANCE_S = 0.1
+POLL_S = 0.1
 """How long to look for something that may have come and answers no question."""
 
 MAX_MESSAGE = 512
@@ -201,36 +215,24 @@ class Exchange:
         self._link: Link | None = None
         self._rest = b""
 
-    def ask(self, question: bytes, take: MessageParser[_T], overheard: Callable[[_T], bool] | None = None) -> _T:
-        """Send `question` and return the first message that `overheard` does not claim."""
-        used = self._link is not None
-        try:
-            return self._ask_once(question, take, overheard)
-        except LinkClosed:
-            if not used:
-                raise
-            return self._ask_once(question, take, overheard)
+    def ask(self, question: bytes, take: MessageParser[_T], unsolicited: Callable[[_T], bool] | None = None) -> _T:
+        """Send `question` and return the first message that `unsolicited` does not claim."""
+        return self._again_if_lost(lambda: self._ask_once(question, take, unsolicited))
 
     def open_with(self, question: bytes, take: MessageParser[_T]) -> _T:
         """Send `question` over the connection just opened and return its answer; only for `greet`."""
         return self._ask_once(question, take, None)
 
-    def listen(self, take: MessageParser[_T], overheard: Callable[[_T], bool] | None = None) -> _T:
+    def listen(self, take: MessageParser[_T], unsolicited: Callable[[_T], bool] | None = None) -> _T:
         """Return what the other side says first over the connection just opened; only for `greet`."""
         assert self._link is not None
-        return self._answer(self._link, take, overheard)
+        return self._answer(self._link, take, unsolicited)
 
     def send(self, command: bytes) -> None:
-        """Send `command`, whose answer will take its time and be met by `glance`."""
-        used = self._link is not None
-        try:
-            self._send_once(command)
-        except LinkClosed:
-            if not used:
-                raise
-            self._send_once(command)
+        """Send `command`, whose answer will take its time and be met by `poll`."""
+        self._again_if_lost(lambda: self._send_once(command))
 
-    def glance(self, take: MessageParser[_T], wait: float = GLANCE_S) -> _T | None:
+    def poll(self, take: MessageParser[_T], wait: float = POLL_S) -> _T | None:
         """Return the next message if it comes within `wait` seconds; None without one, or without a connection."""
         if self._link is None:
             return None
@@ -254,18 +256,28 @@ class Exchange:
         if link is not None:
             link.close()
 
-    def _ask_once(self, question: bytes, take: MessageParser[_T], overheard: Callable[[_T], bool] | None) -> _T:
+    def _again_if_lost(self, action: Callable[[], _T]) -> _T:
+        """Do something over the connection there is, once more over a new one where that turns out to be lost."""
+        used = self._link is not None
+        try:
+            return action()
+        except LinkClosed:
+            if not used:
+                raise
+            return action()
+
+    def _ask_once(self, question: bytes, take: MessageParser[_T], unsolicited: Callable[[_T], bool] | None) -> _T:
         link = self._send_once(question)
         try:
-            return self._answer(link, take, overheard)
+            return self._answer(link, take, unsolicited)
         except BaseException:
             self.close()
             raise
 
-    def _answer(self, link: Link, take: MessageParser[_T], overheard: Callable[[_T], bool] | None) -> _T:
+    def _answer(self, link: Link, take: MessageParser[_T], unsolicited: Callable[[_T], bool] | None) -> _T:
         while True:
             message = self._next(link, take, self._timeout)
-            if overheard is None or not overheard(message):
+            if unsolicited is None or not unsolicited(message):
                 return message
 
     def _send_once(self, command: bytes) -> Link:

@@ -14,8 +14,8 @@ import socket
 import threading
 import time
 from collections.abc import Callable
-from types import TracebackType
 
+from drivers.links.link import ClosedAtEnd, Peer
 from foundation.errors import LinkClosed, LinkError, LinkTimeout
 
 LOOPBACK = "127.0.0.1"
@@ -99,7 +99,7 @@ class TcpLink:
         return LinkClosed(f"the connection to {self._far_end} is lost ({reason}); open a new one")
 
 
-class TcpServer:
+class TcpServer(ClosedAtEnd):
     """Takes connections and gives each to `handle` in a thread of its own, until closed.
 
     Use it in a `with` block; leaving it hangs up every connection and joins every thread.
@@ -121,14 +121,6 @@ class TcpServer:
         """Host and port on which it listens."""
         self._accepting = threading.Thread(target=self._accept, name=f"listening at {self.address[1]}", daemon=True)
         self._accepting.start()
-
-    def __enter__(self) -> TcpServer:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
 
     def hang_up(self) -> None:
         """End every connection there is, as a device does that restarts; new ones are still taken."""
@@ -179,6 +171,33 @@ class TcpServer:
                 self._links.discard(link)
 
 
+POLLING_S = 0.02
+"""How often a peer is asked what it has to say by now: drivers wait seconds for an answer."""
+
+_TIMEOUT_S = 30.0
+"""Longest wait for a client to take an answer."""
+
+
+def serve_peer(
+    peer: Callable[[], Peer], port: int = 0, host: str = LOOPBACK, think: Callable[[], None] = lambda: None
+) -> TcpServer:
+    """Return a running server that gives each connection a peer, which thinks before it answers; close it."""
+
+    def handle(link: TcpLink) -> None:
+        there = peer()
+        link.write(there.connect(), _TIMEOUT_S)
+        while not there.closed:
+            try:
+                said = there.receive(link.read(4096, POLLING_S))
+            except LinkTimeout:
+                said = there.receive(b"")
+            if said:
+                think()
+                link.write(said, _TIMEOUT_S)
+
+    return TcpServer(handle, port, host)
+
+
 ANY_HOST = "0.0.0.0"
 BROADCAST = "255.255.255.255"
 MAX_DATAGRAM = 65535
@@ -187,7 +206,7 @@ MAX_DATAGRAM = 65535
 Address = tuple[str, int]
 
 
-class UdpSocket:
+class UdpSocket(ClosedAtEnd):
     """Sends and receives datagrams at one port, until closed; use it in a `with` block."""
 
     def __init__(self, port: int = 0, host: str = ANY_HOST) -> None:
@@ -202,14 +221,6 @@ class UdpSocket:
             ) from error
         self.address: Address = self._socket.getsockname()[:2]
         """Host and port at which it listens."""
-
-    def __enter__(self) -> UdpSocket:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
 
     def send(self, data: bytes, address: Address) -> None:
         """Send one datagram to host and port; whether it arrives is unknown."""

@@ -417,8 +417,8 @@ class HidDevice(_ClaimedDevice):
         super().__init__(device, label)
         try:
             with self._transfer("does not answer"):
-                self._pipes = _report_pipes(self._configuration(), label)
-                self._claim(self._pipes.interface)
+                interface, self._inward, self._outward = _report_pipes(self._configuration(), label)
+                self._claim(interface)
         except BaseException:
             self.close()
             raise
@@ -426,25 +426,19 @@ class HidDevice(_ClaimedDevice):
     def write(self, report: bytes, timeout: float) -> None:
         """Send one report; raises `LinkTimeout` or `LinkClosed`."""
         with self._transfer(f"takes no report for {timeout:g} s"):
-            self._device.write(self._pipes.outward, report, _milliseconds(timeout))
+            self._device.write(self._outward, report, _milliseconds(timeout))
 
     def read(self, timeout: float) -> bytes:
         """Return the next report; raises `LinkTimeout` or `LinkClosed`."""
         with self._transfer(f"has not answered for {timeout:g} s"):
-            return self._device.read(self._pipes.inward, REPORT, _milliseconds(timeout)).tobytes()
+            return self._device.read(self._inward, REPORT, _milliseconds(timeout)).tobytes()
 
 
-@dataclass(frozen=True)
-class _ReportPipes:
-    """Number of a HID interface, and addresses of its two interrupt endpoints."""
+def _report_pipes(configuration: usb.core.Configuration, label: str) -> tuple[int, int, int]:
+    """Return the number of the first HID interface that has interrupt pipes both ways, and their addresses, in and out.
 
-    interface: int
-    inward: int
-    outward: int
-
-
-def _report_pipes(configuration: usb.core.Configuration, label: str) -> _ReportPipes:
-    """Return the first HID interface that has interrupt pipes both ways; `label` names the device."""
+    `label` names the device.
+    """
     for interface in configuration:
         ends = {
             bool(endpoint.bEndpointAddress & 0x80): endpoint.bEndpointAddress
@@ -452,7 +446,7 @@ def _report_pipes(configuration: usb.core.Configuration, label: str) -> _ReportP
             if endpoint.bmAttributes & 3 == _INTERRUPT
         }
         if interface.bInterfaceClass == _HID_CLASS and len(ends) == 2:
-            return _ReportPipes(interface.bInterfaceNumber, ends[True], ends[False])
+            return interface.bInterfaceNumber, ends[True], ends[False]
     raise ProtocolError(f"{label} has no HID interface with pipes both ways; it is another device")
 
 

@@ -1,7 +1,8 @@
 """The numbers of PTP and their names: the standard's, and Canon's for its EOS bodies.
 
-Messages carry plain integers, for a device may use codes that no one has named; `describe` turns one into words. Of
-responses and event records all that are known have a name here, for users read them; of the rest those in use.
+Messages carry plain integers, for a device may use codes that no one has named; `drivers.ptp.datasets.describe` turns
+one into words. Of responses and event records all that are known have a name here, for users read them; of the rest
+those in use.
 Canon's meanings hold for EOS bodies alone: other makers use the same numbers for other things.
 
 Sources: ISO 15740:2013, tables of clauses 10 to 13; Canon's extensions have no public standard, their numbers were
@@ -339,11 +340,3 @@ class ReleaseButton(IntEnum):
 
 VENDOR_CANON_USB = 0x04A9
 """Canon's USB vendor id."""
-
-
-def describe(kind: type[IntEnum], code: int) -> str:
-    """Return a code for people: ``DEVICE_BUSY (0x2019)``, or ``0x2fff`` where no name is known."""
-    try:
-        return f"{kind(code).name} (0x{code:04x})"
-    except ValueError:
-        return f"0x{code:04x}"

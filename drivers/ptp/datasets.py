@@ -17,14 +17,22 @@ Source: ISO 15740:2013, clauses 5 (types and datasets) and 13 (properties).
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
 from enum import IntEnum
 from functools import cache
-from typing import Annotated, Self, get_origin, get_type_hints
+from typing import Annotated, Any, Self, get_origin, get_type_hints
 
 from drivers.ptp.codes import DataType
 from foundation.errors import ProtocolError
+
+
+def describe(kind: type[IntEnum], code: int) -> str:
+    """Return a code for people: ``DEVICE_BUSY (0x2019)``, or ``0x2fff`` where no name is known."""
+    try:
+        return f"{kind(code).name} (0x{code:04x})"
+    except ValueError:
+        return f"0x{code:04x}"
 
 
 class Cursor:
@@ -197,11 +205,27 @@ def encode_value(data_type: int, value: Value) -> bytes:
     raise ValueError(f"{value!r} is not of type 0x{data_type:04x}")
 
 
-U16 = Annotated[int, DataType.UINT16]
-U32 = Annotated[int, DataType.UINT32]
-U64 = Annotated[int, DataType.UINT64]
-U16s = Annotated[tuple[int, ...], _ARRAY + DataType.UINT16]
-Text = Annotated[str, DataType.STRING]
+@dataclass(frozen=True)
+class FieldKind:
+    """How a dataset's field stands on the wire: `read` takes it at a cursor and is given its name, for messages."""
+
+    read: Callable[[Cursor, str], Any]
+    encode: Callable[[Any], bytes]
+
+
+def of_type(data_type: int) -> FieldKind:
+    """Return how a field of one of ISO 15740's types stands on the wire."""
+    return FieldKind(
+        lambda cursor, field: read_value(cursor, data_type, field), lambda value: encode_value(data_type, value)
+    )
+
+
+U16 = Annotated[int, of_type(DataType.UINT16)]
+U32 = Annotated[int, of_type(DataType.UINT32)]
+U64 = Annotated[int, of_type(DataType.UINT64)]
+U16s = Annotated[tuple[int, ...], of_type(_ARRAY + DataType.UINT16)]
+Text = Annotated[str, of_type(DataType.STRING)]
+Rest = Annotated[bytes, FieldKind(lambda cursor, _: cursor.rest(), bytes)]
 """What a dataset's fields are on the wire."""
 
 
@@ -210,10 +234,10 @@ class PtpDataset:
 
     @classmethod
     @cache
-    def _layout(cls) -> tuple[tuple[str, int], ...]:
-        """Return name and `DataType` of every field."""
+    def _layout(cls) -> tuple[tuple[str, FieldKind], ...]:
+        """Return name and kind of every field."""
         hints = get_type_hints(cls, include_extras=True)
-        return tuple((name, int(hint.__metadata__[0])) for name, hint in hints.items() if get_origin(hint) is Annotated)
+        return tuple((name, hint.__metadata__[0]) for name, hint in hints.items() if get_origin(hint) is Annotated)
 
     @classmethod
     def decode(cls, data: bytes) -> Self:
@@ -223,11 +247,11 @@ class PtpDataset:
     @classmethod
     def read(cls, cursor: Cursor) -> Self:
         """Return the value at a cursor."""
-        return cls(**{name: read_value(cursor, kind, name.replace("_", " ")) for name, kind in cls._layout()})
+        return cls(**{name: kind.read(cursor, name.replace("_", " ")) for name, kind in cls._layout()})
 
     def encode(self) -> bytes:
         """Return the dataset."""
-        return b"".join(encode_value(kind, getattr(self, name)) for name, kind in self._layout())
+        return b"".join(kind.encode(getattr(self, name)) for name, kind in self._layout())
 
 
 @dataclass(frozen=True)
@@ -290,83 +314,37 @@ class StorageInfo(PtpDataset):
     free_images: U32 = 0xFFFFFFFF
     description: Text = ""
     label: Text = ""
-    padding: bytes = field(default=b"", repr=False)
-
-    @classmethod
-    def read(cls, cursor: Cursor) -> Self:
-        """Return the store at a cursor, with what follows it."""
-        return replace(super().read(cursor), padding=cursor.rest())
-
-    def encode(self) -> bytes:
-        """Return the dataset."""
-        return super().encode() + self.padding
+    padding: Rest = field(default=b"", repr=False)
 
 
-class Form(IntEnum):
-    """How a property's values are listed (13.3.3)."""
-
-    NONE = 0
-    RANGE = 1
-    ENUMERATION = 2
-
-
-@dataclass(frozen=True)
-class RangeForm:
-    """A property's values lie between two, in steps."""
-
-    minimum: Value
-    maximum: Value
-    step: Value
-
-
-@dataclass(frozen=True)
-class EnumerationForm:
-    """A property takes the values of a list.
-
-    `widened`: the device sends values of one byte as two, as the EOS 60D does for the battery's level
-    (0x5001: 100, 75, 50, 25, 0); the standard does not allow it, but the bytes that are left show it.
-    """
-
-    values: tuple[Value, ...]
-    widened: bool = False
+_NO_FORM, _ENUMERATION = 0, 2
+"""How a property's values are listed (13.3.3): not at all, or one by one."""
 
 
 @dataclass(frozen=True)
 class DevicePropDesc:
-    """A property of a device (GetDevicePropDesc, 13.3.3): its type, whether it can be set, its values."""
+    """A property of a device (GetDevicePropDesc, 13.3.3): its type, whether it can be set, its values.
+
+    - `choices`: what it can be set to; empty where they are not listed.
+    - `widened`: the device sends the choices' one byte as two, as the EOS 60D does for the battery's level
+      (0x5001: 100, 75, 50, 25, 0); the standard does not allow it.
+    """
 
     code: int
     data_type: int
     writable: bool
     default: Value
     current: Value
-    form: RangeForm | EnumerationForm | None = None
-
-    @classmethod
-    def decode(cls, data: bytes) -> DevicePropDesc:
-        """Return the property in a dataset."""
-        cursor = Cursor(data, "DevicePropDesc", MAX_DATASET)
-        code = cursor.u16("property")
-        cursor.what = f"DevicePropDesc of 0x{code:04x}"
-        data_type = cursor.u16("type")
-        writable = cursor.u8("get/set") != 0
-        default = read_value(cursor, data_type, "default value")
-        current = read_value(cursor, data_type, "current value")
-        form = _read_form(cursor, data_type)
-        return cls(code, data_type, writable, default, current, form)
+    choices: tuple[Value, ...] = ()
+    widened: bool = False
 
     def encode(self) -> bytes:
         """Return the dataset."""
-        match self.form:
-            case None:
-                form = bytes([Form.NONE])
-            case RangeForm(minimum, maximum, step):
-                values = (minimum, maximum, step)
-                form = bytes([Form.RANGE]) + b"".join(encode_value(self.data_type, value) for value in values)
-            case EnumerationForm(values, widened):
-                count = bytes([Form.ENUMERATION]) + encode_integer(len(values), 2)
-                gap = b"\0" if widened else b""
-                form = count + b"".join(encode_value(self.data_type, value) + gap for value in values)
+        form = bytes([_NO_FORM])
+        if self.choices:
+            gap = b"\0" if self.widened else b""
+            listed = b"".join(encode_value(self.data_type, value) + gap for value in self.choices)
+            form = bytes([_ENUMERATION]) + encode_integer(len(self.choices), 2) + listed
         return b"".join(
             (
                 encode_integer(self.code, 2),
@@ -377,28 +355,3 @@ class DevicePropDesc:
                 form,
             )
         )
-
-
-def _read_form(cursor: Cursor, data_type: int) -> RangeForm | EnumerationForm | None:
-    flag = cursor.u8("form")
-    match flag:
-        case Form.NONE:
-            return None
-        case Form.RANGE:
-            return RangeForm(
-                read_value(cursor, data_type, "minimum"),
-                read_value(cursor, data_type, "maximum"),
-                read_value(cursor, data_type, "step"),
-            )
-        case Form.ENUMERATION:
-            # Each value takes at least one byte, so that the bytes left bound the loop whatever the count says.
-            count = cursor.u16("the count of values")
-            if data_type == DataType.UINT8 and count and cursor.left == 2 * count:
-                start = cursor.at
-                wide = cursor.integers(count, 2, "values")
-                if max(wide) <= 0xFF:
-                    return EnumerationForm(wide, widened=True)
-                cursor.at = start
-            return EnumerationForm(tuple(read_value(cursor, data_type, "a value") for _ in range(count)))
-        case _:
-            raise cursor.fault("form", "0, 1 or 2", flag)

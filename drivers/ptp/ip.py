@@ -22,23 +22,15 @@ from __future__ import annotations
 
 import contextlib
 from collections import deque
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import Final, Self, cast
+from typing import Annotated, Final, TypeVar
 
 from drivers.links.link import Link
 from drivers.links.network import TcpLink
-from drivers.ptp.datasets import U32, Cursor, PtpDataset, encode_integer
-from drivers.ptp.session import (
-    MAX_PARAMETERS,
-    CableTransport,
-    PtpEvent,
-    PtpRequest,
-    PtpResponse,
-    Reception,
-    Transaction,
-)
+from drivers.ptp.datasets import U32, Cursor, FieldKind, PtpDataset, Rest, encode_integer
+from drivers.ptp.session import CableTransport, PtpEvent, PtpRequest, PtpResponse, Reception, Transaction
 from foundation.clock import Clock
 from foundation.errors import DeviceRefused, LinkClosed, LinkError, LinkTimeout, ProtocolError
 
@@ -85,41 +77,81 @@ class FailReason(IntEnum):
     UNSPECIFIED = 3
 
 
+def _encode_guid(guid: bytes) -> bytes:
+    if len(guid) != GUID_LENGTH:
+        raise ValueError(f"a GUID of {len(guid)} bytes; {GUID_LENGTH} are right")
+    return guid
+
+
+def _read_name(cursor: Cursor, field: str) -> str:
+    octets = bytearray()
+    while (unit := cursor.take(2, f"{field}, or its closing NUL,")) != b"\0\0":
+        octets += unit
+        if len(octets) > 2 * MAX_NAME_UNITS:
+            raise cursor.fault(field, f"at most {MAX_NAME_UNITS} UTF-16 units", "longer")
+    return octets.decode("utf-16-le", "replace")
+
+
+def _encode_name(name: str) -> bytes:
+    octets = name.encode("utf-16-le")
+    if "\0" in name or len(octets) > 2 * MAX_NAME_UNITS:
+        raise ValueError(f"{name[:40]!r} is no PTP/IP name; at most {MAX_NAME_UNITS} UTF-16 units, no NUL")
+    return octets + b"\0\0"
+
+
+def _read_version(cursor: Cursor, field: str) -> int:
+    # Some responders end with the name.
+    return cursor.u32(field) if cursor.left else VERSION
+
+
+def _read_total(cursor: Cursor, field: str) -> int | None:
+    total = cursor.u64(field)
+    return None if total == UNKNOWN_TOTAL else total
+
+
+def _read_sends_data(cursor: Cursor, _: str) -> bool:
+    phase = cursor.u32("data phase")
+    if phase > _DATA_OUT:
+        raise cursor.fault("data phase", "1 none or in, 2 out", phase)
+    return phase == _DATA_OUT
+
+
+_NO_DATA_OR_IN = 1
+"""Data phase information of an operation without data, or whose data come to the initiator."""
+_DATA_OUT = 2
+"""Data phase information of an operation whose data go to the responder."""
+
+Guid = Annotated[bytes, FieldKind(lambda cursor, field: cursor.take(GUID_LENGTH, field), _encode_guid)]
+Name = Annotated[str, FieldKind(_read_name, _encode_name)]
+Version = Annotated[int, FieldKind(_read_version, lambda version: encode_integer(version, 4))]
+Total = Annotated[
+    int | None,
+    FieldKind(_read_total, lambda total: encode_integer(UNKNOWN_TOTAL if total is None else total, 8)),
+]
+SendsData = Annotated[
+    bool, FieldKind(_read_sends_data, lambda sends: encode_integer(_DATA_OUT if sends else _NO_DATA_OR_IN, 4))
+]
+Request = Annotated[PtpRequest, FieldKind(lambda cursor, _: PtpRequest.read(cursor), PtpRequest.encode)]
+"""What a packet's fields are on the wire, beside those of every dataset."""
+
+
 @dataclass(frozen=True)
 class InitCommandRequest(PtpDataset):
     """The initiator names itself: a GUID of 16 bytes, which a camera may have been paired with, and a name."""
 
-    guid: bytes
-    name: str
-    version: int = VERSION
-
-    @classmethod
-    def read(cls, cursor: Cursor) -> Self:
-        """Return the initiator at a cursor."""
-        return cls(*_read_names(cursor))
-
-    def encode(self) -> bytes:
-        """Return the initiator as bytes."""
-        return _encode_names(self.guid, self.name, self.version)
+    guid: Guid
+    name: Name
+    version: Version = VERSION
 
 
 @dataclass(frozen=True)
 class InitCommandAck(PtpDataset):
     """The responder accepts, numbers the connection and names itself."""
 
-    connection: int
-    guid: bytes
-    name: str
-    version: int = VERSION
-
-    @classmethod
-    def read(cls, cursor: Cursor) -> Self:
-        """Return the responder at a cursor."""
-        return cls(cursor.u32("connection number"), *_read_names(cursor))
-
-    def encode(self) -> bytes:
-        """Return the responder as bytes."""
-        return encode_integer(self.connection, 4) + _encode_names(self.guid, self.name, self.version)
+    connection: U32
+    guid: Guid
+    name: Name
+    version: Version = VERSION
 
 
 @dataclass(frozen=True)
@@ -143,58 +175,34 @@ class InitFail(PtpDataset):
 
 @dataclass(frozen=True)
 class OperationRequest(PtpDataset):
-    """A request, and whether the initiator will send the data phase."""
+    """Whether the initiator will send the data phase of a request, and the request."""
 
-    request: PtpRequest
-    sends_data: bool = False
-
-    @classmethod
-    def read(cls, cursor: Cursor) -> Self:
-        """Return the request at a cursor."""
-        phase = cursor.u32("data phase")
-        if phase > _DATA_OUT:
-            raise cursor.fault("data phase", "1 none or in, 2 out", phase)
-        return cls(PtpRequest(*_read_message(cursor)), phase == _DATA_OUT)
-
-    def encode(self) -> bytes:
-        """Return the request as bytes."""
-        return encode_integer(_DATA_OUT if self.sends_data else _NO_DATA_OR_IN, 4) + _message(self.request)
+    sends_data: SendsData
+    request: Request
 
 
 @dataclass(frozen=True)
 class StartData(PtpDataset):
     """A data phase begins; `total` counts its bytes, None where the sender does not know."""
 
-    transaction: int
-    total: int | None
-
-    @classmethod
-    def read(cls, cursor: Cursor) -> Self:
-        """Return the beginning at a cursor."""
-        transaction, total = cursor.u32("transaction"), cursor.u64("total")
-        return cls(transaction, None if total == UNKNOWN_TOTAL else total)
-
-    def encode(self) -> bytes:
-        """Return the beginning as bytes."""
-        return encode_integer(self.transaction, 4) + encode_integer(
-            UNKNOWN_TOTAL if self.total is None else self.total, 8
-        )
+    transaction: U32
+    total: Total
 
 
 @dataclass(frozen=True)
-class Data:
+class Data(PtpDataset):
     """The next bytes of a data phase."""
 
-    transaction: int
-    data: bytes
+    transaction: U32
+    data: Rest
 
 
 @dataclass(frozen=True)
-class EndData:
+class EndData(PtpDataset):
     """The last bytes of a data phase, all or none of it."""
 
-    transaction: int
-    data: bytes = b""
+    transaction: U32
+    data: Rest = b""
 
 
 @dataclass(frozen=True)
@@ -214,42 +222,35 @@ class Pong(PtpDataset):
     """Answers `Ping`."""
 
 
-Packet = (
-    InitCommandRequest
-    | InitCommandAck
-    | InitEventRequest
-    | InitEventAck
-    | InitFail
-    | OperationRequest
-    | PtpResponse
-    | PtpEvent
-    | StartData
-    | Data
-    | EndData
-    | Cancel
-    | Ping
-    | Pong
-)
+Packet = PtpDataset
+"""One of `_PACKETS`."""
 
+_PACKETS: dict[int, type[Packet]] = {
+    PacketType.INIT_COMMAND_REQUEST: InitCommandRequest,
+    PacketType.INIT_COMMAND_ACK: InitCommandAck,
+    PacketType.INIT_EVENT_REQUEST: InitEventRequest,
+    PacketType.INIT_EVENT_ACK: InitEventAck,
+    PacketType.INIT_FAIL: InitFail,
+    PacketType.OPERATION_REQUEST: OperationRequest,
+    PacketType.OPERATION_RESPONSE: PtpResponse,
+    PacketType.EVENT: PtpEvent,
+    PacketType.START_DATA: StartData,
+    PacketType.DATA: Data,
+    PacketType.CANCEL: Cancel,
+    PacketType.END_DATA: EndData,
+    PacketType.PING: Ping,
+    PacketType.PONG: Pong,
+}
+_KINDS = {packet: kind for kind, packet in _PACKETS.items()}
 _DATA_TYPES = (PacketType.DATA, PacketType.END_DATA)
-_NO_DATA_OR_IN = 1
-"""Data phase information of an operation without data, or whose data come to the initiator."""
-_DATA_OUT = 2
-"""Data phase information of an operation whose data go to the responder."""
+_P = TypeVar("_P", bound=Packet)
+_T = TypeVar("_T")
 
 
 def encode(packet: Packet) -> bytes:
     """Return a packet's bytes."""
-    match packet:
-        case PtpResponse():
-            kind, body = PacketType.OPERATION_RESPONSE, _message(packet)
-        case PtpEvent():
-            kind, body = PacketType.EVENT, _message(packet)
-        case Data(transaction, data) | EndData(transaction, data):
-            return encode_data(transaction, data, last=isinstance(packet, EndData))
-        case _:
-            kind, body = _KINDS[type(packet)], packet.encode()
-    return encode_integer(HEADER_LENGTH + len(body), 4) + encode_integer(kind, 4) + body
+    body = packet.encode()
+    return encode_integer(HEADER_LENGTH + len(body), 4) + encode_integer(_KINDS[type(packet)], 4) + body
 
 
 def encode_data(transaction: int, data: bytes | memoryview, *, last: bool) -> bytes:
@@ -266,7 +267,7 @@ def decode(data: bytes) -> Packet:
     if length != len(data):
         raise cursor.fault("length", f"{len(data)}, the bytes there are", length, at=0)
     _checked(kind, length)
-    packet = _read(kind, cursor)
+    packet = _PACKETS[kind].read(cursor)
     if cursor.left:
         raise cursor.fault("the end", "no more bytes", f"followed by {cursor.left} bytes", at=cursor.at)
     return packet
@@ -346,10 +347,9 @@ class PacketCutter:
 
 def _checked(kind: int, length: int) -> None:
     """Raise ProtocolError unless a packet of this type can be of this length."""
-    if kind not in _SHORTEST:
+    if kind not in _PACKETS:
         raise _unusable(f"a packet of type {kind} and {length} bytes; a type of 1 to 14 was expected")
-    least = _SHORTEST[kind]
-    most = 0xFFFFFFFF if kind in _DATA_TYPES else MAX_PACKET
+    least, most = (HEADER_LENGTH + 4, 0xFFFFFFFF) if kind in _DATA_TYPES else (HEADER_LENGTH, MAX_PACKET)
     if not least <= length <= most:
         raise _unusable(f"a {PacketType(kind).name} packet of {length} bytes; {least} to {most} were expected")
 
@@ -358,92 +358,40 @@ def _unusable(what: str) -> ProtocolError:
     return ProtocolError(f"the PTP/IP connection gives {what}; check that a camera answers at this port, and reconnect")
 
 
-def _encode_names(guid: bytes, name: str, version: int) -> bytes:
-    octets = name.encode("utf-16-le")
-    if len(guid) != GUID_LENGTH:
-        raise ValueError(f"a GUID of {len(guid)} bytes; {GUID_LENGTH} are right")
-    if "\0" in name or len(octets) > 2 * MAX_NAME_UNITS:
-        raise ValueError(f"{name[:40]!r} is no PTP/IP name; at most {MAX_NAME_UNITS} UTF-16 units, no NUL")
-    return guid + octets + b"\0\0" + encode_integer(version, 4)
+READ: Final = 256 * 1024
+"""Bytes asked of a link at once: as large as a piece of data, which makes few calls of a long transfer."""
 
 
-def _read_names(cursor: Cursor) -> tuple[bytes, str, int]:
-    guid = cursor.take(GUID_LENGTH, "GUID")
-    octets = bytearray()
-    while (unit := cursor.take(2, "name, or its closing NUL,")) != b"\0\0":
-        octets += unit
-        if len(octets) > 2 * MAX_NAME_UNITS:
-            raise cursor.fault("name", f"at most {MAX_NAME_UNITS} UTF-16 units", "longer")
-    # Some responders end with the name.
-    version = cursor.u32("version") if cursor.left else VERSION
-    return guid, octets.decode("utf-16-le", "replace"), version
+class Channel:
+    """The packets on one of the two connections, in both directions."""
 
+    def __init__(self, link: Link) -> None:
+        self._link = link
+        self._cutter = PacketCutter()
+        self._packets: deque[Packet] = deque()
 
-def _message(message: PtpRequest | PtpResponse | PtpEvent) -> bytes:
-    if len(message.parameters) > MAX_PARAMETERS:
-        raise ValueError(f"{message} has {len(message.parameters)} parameters; at most {MAX_PARAMETERS} are possible")
-    return (
-        encode_integer(message.code, 2)
-        + encode_integer(message.transaction, 4)
-        + b"".join(encode_integer(parameter, 4) for parameter in message.parameters)
-    )
+    def send(self, packet: Packet, timeout: float) -> None:
+        """Send a packet."""
+        self._link.write(encode(packet), timeout)
 
+    def send_data(self, transaction: int, data: bytes, piece: int, timeout: float) -> Iterator[None]:
+        """Announce a data phase, and send `piece` bytes of it at each step; what fits goes out in one `EndData`."""
+        self.send(StartData(transaction, len(data)), timeout)
+        view = memoryview(data)
+        last = max(0, len(data) - 1) // piece * piece
+        for at in range(0, last + 1, piece):
+            yield
+            self._link.write(encode_data(transaction, view[at : at + piece], last=at == last), timeout)
 
-def _read_message(cursor: Cursor) -> tuple[int, int, tuple[int, ...]]:
-    code, transaction = cursor.u16("code"), cursor.u32("transaction")
-    count, odd = divmod(cursor.left, 4)
-    if odd or count > MAX_PARAMETERS:
-        raise cursor.fault(
-            "the list of parameters", f"0 to {MAX_PARAMETERS} of 4 bytes", f"{cursor.left} bytes", at=cursor.at
-        )
-    return code, transaction, cursor.integers(count, 4, "parameters")
+    def next(self, timeout: float) -> Packet:
+        """Return the next packet, waiting `timeout` seconds for each of its bytes."""
+        while not self._packets:
+            self._packets.extend(self._cutter.feed(self._link.read(READ, timeout)))
+        return self._packets.popleft()
 
-
-_PACKETS: dict[int, type[PtpDataset]] = {
-    PacketType.INIT_COMMAND_REQUEST: InitCommandRequest,
-    PacketType.INIT_COMMAND_ACK: InitCommandAck,
-    PacketType.INIT_EVENT_REQUEST: InitEventRequest,
-    PacketType.INIT_EVENT_ACK: InitEventAck,
-    PacketType.INIT_FAIL: InitFail,
-    PacketType.OPERATION_REQUEST: OperationRequest,
-    PacketType.START_DATA: StartData,
-    PacketType.CANCEL: Cancel,
-    PacketType.PING: Ping,
-    PacketType.PONG: Pong,
-}
-_KINDS = {packet: kind for kind, packet in _PACKETS.items()}
-
-
-def _read(kind: int, cursor: Cursor) -> Packet:
-    match kind:
-        case PacketType.OPERATION_RESPONSE:
-            return PtpResponse(*_read_message(cursor))
-        case PacketType.EVENT:
-            return PtpEvent(*_read_message(cursor))
-        case PacketType.DATA:
-            return Data(cursor.u32("transaction"), cursor.rest())
-        case PacketType.END_DATA:
-            return EndData(cursor.u32("transaction"), cursor.rest())
-        case _:
-            return cast("Packet", _PACKETS[kind].read(cursor))
-
-
-_SHORTEST: dict[int, int] = {
-    PacketType.INIT_COMMAND_REQUEST: HEADER_LENGTH + GUID_LENGTH + 2,
-    PacketType.INIT_COMMAND_ACK: HEADER_LENGTH + 4 + GUID_LENGTH + 2,
-    PacketType.INIT_EVENT_REQUEST: HEADER_LENGTH + 4,
-    PacketType.INIT_EVENT_ACK: HEADER_LENGTH,
-    PacketType.INIT_FAIL: HEADER_LENGTH + 4,
-    PacketType.OPERATION_REQUEST: HEADER_LENGTH + 10,
-    PacketType.OPERATION_RESPONSE: HEADER_LENGTH + 6,
-    PacketType.EVENT: HEADER_LENGTH + 6,
-    PacketType.START_DATA: HEADER_LENGTH + 12,
-    PacketType.DATA: HEADER_LENGTH + 4,
-    PacketType.CANCEL: HEADER_LENGTH + 4,
-    PacketType.END_DATA: HEADER_LENGTH + 4,
-    PacketType.PING: HEADER_LENGTH,
-    PacketType.PONG: HEADER_LENGTH,
-}
+    def close(self) -> None:
+        """Hang up; a second call does nothing."""
+        self._link.close()
 
 
 MAX_EVENTS: Final = 4096
@@ -453,169 +401,16 @@ CONNECT_S: Final = 10.0
 """Wait for each connection and each greeting: a camera wakes its network up in a few seconds."""
 
 EVENT_CHANNEL_S: Final = 2.0
-"""How long the second connection is tried: devices refuse it for about 0.1 s after they acknowledged the first."""
+"""How long a connection is tried: devices refuse the second for about 0.1 s after they acknowledged the first."""
 
 RETRY_S: Final = 0.1
 """Pause between two such tries."""
 
-_READ: Final = 128 * 1024
-"""Bytes asked of a link at once: two pieces of data as bodies send them."""
-
 _PING_EVERY_S: Final = 1.0
 """Longest wait on the command connection without a look at the event connection."""
 
-_EVENT_READS: Final = 64
-"""Reads of the event connection at one look: a device that never stops talking must not keep us there."""
-
-
-class IpConnection:
-    """Both connections to one device, which has accepted this initiator.
-
-    `name`: what the device calls itself; may be empty.
-    """
-
-    def __init__(
-        self,
-        command: tuple[Link, PacketCutter],
-        event: tuple[Link, PacketCutter],
-        name: str,
-        events: Iterable[PtpEvent],
-    ) -> None:
-        self._command, self._command_cutter = command
-        self._event, self._event_cutter = event
-        self.name = name
-        self._packets: deque[Packet] = deque()
-        self._events = deque(events, maxlen=MAX_EVENTS)
-
-    def write_command(self, data: bytes, timeout: float) -> None:
-        """Send bytes on the command connection."""
-        self._command.write(data, timeout)
-
-    def write_event(self, data: bytes, timeout: float) -> None:
-        """Send bytes on the event connection."""
-        self._event.write(data, timeout)
-
-    def next_command(self, timeout: float) -> Packet:
-        """Return the next packet on the command connection, waiting `timeout` seconds for each of its bytes."""
-        left = timeout
-        while not self._packets:
-            wait = min(left, _PING_EVERY_S)
-            try:
-                piece = self._command.read(_READ, wait)
-            except LinkTimeout:
-                left -= wait
-                if left <= 0:
-                    raise
-                self.attend()
-                continue
-            left = timeout
-            self._packets.extend(self._command_cutter.feed(piece))
-        return self._packets.popleft()
-
-    def attend(self) -> None:
-        """Take what the event connection holds, and answer pings; never waits."""
-        for _ in range(_EVENT_READS):
-            try:
-                piece = self._event.read(_READ, 0.0)
-            except LinkTimeout:
-                return
-            for packet in self._event_cutter.feed(piece):
-                match packet:
-                    case PtpEvent():
-                        self._events.append(packet)
-                    case Ping():
-                        self._event.write(encode(Pong()), _PING_EVERY_S)
-                    case _:
-                        pass
-
-    def keep_event(self, event: PtpEvent) -> None:
-        """Keep an event that came on the command connection."""
-        self._events.append(event)
-
-    def take_events(self) -> tuple[PtpEvent, ...]:
-        """Return the events kept since the last call."""
-        events = tuple(self._events)
-        self._events.clear()
-        return events
-
-    def close(self) -> None:
-        """Hang up both connections; a second call does nothing."""
-        self._event.close()
-        self._command.close()
-
-
-def greet(
-    open_command: Callable[[], Link],
-    open_event: Callable[[], Link],
-    initiator: InitCommandRequest,
-    clock: Clock,
-    place: str,
-) -> IpConnection:
-    """Open both connections and introduce the initiator on them (clause 2.2).
-
-    `open_command`, `open_event`: open the two connections; the second is tried for `EVENT_CHANNEL_S`.
-    """
-    hello = encode(initiator)
-    command, cutter = open_command(), PacketCutter()
-    try:
-        command.write(hello, CONNECT_S)
-        acknowledgement, events = _greeting(command, cutter, place)
-        if not isinstance(acknowledgement, InitCommandAck):
-            raise _refusal(acknowledgement, place)
-        event, event_cutter = _dial(open_event, clock), PacketCutter()
-    except BaseException:
-        command.close()
-        raise
-    try:
-        event.write(encode(InitEventRequest(acknowledgement.connection)), CONNECT_S)
-        answer, more = _greeting(event, event_cutter, place)
-        if not isinstance(answer, InitEventAck):
-            raise _refusal(answer, place)
-    except BaseException:
-        event.close()
-        command.close()
-        raise
-    return IpConnection((command, cutter), (event, event_cutter), acknowledgement.name.strip(), [*events, *more])
-
-
-def _dial(open_event: Callable[[], Link], clock: Clock) -> Link:
-    """Open the second connection."""
-    deadline = clock.monotonic() + EVENT_CHANNEL_S
-    while True:
-        try:
-            return open_event()
-        except LinkClosed:
-            if clock.monotonic() >= deadline:
-                raise
-            clock.sleep(RETRY_S)
-
-
-def _greeting(link: Link, cutter: PacketCutter, place: str) -> tuple[Packet, list[PtpEvent]]:
-    """Return the first packet on a new connection, and the events behind it; nothing else comes unasked."""
-    while True:
-        try:
-            packets = cutter.feed(link.read(_READ, CONNECT_S))
-        except ProtocolError as error:
-            raise ProtocolError(f"what answers in place of {place} speaks no PTP/IP: {error}") from error
-        if packets:
-            return packets[0], [packet for packet in packets[1:] if isinstance(packet, PtpEvent)]
-
-
-def _refusal(answer: Packet, place: str) -> DeviceRefused | ProtocolError:
-    if not isinstance(answer, InitFail):
-        return ProtocolError(
-            f"{place} answers a greeting with {type(answer).__name__}; an acknowledgement was expected: "
-            f"check that a camera listens at this port"
-        )
-    match answer.reason:
-        case FailReason.REJECTED:
-            why = "does not know this computer: pair the two anew in the camera's wireless menu"
-        case FailReason.BUSY:
-            why = "is in use by another program or computer: disconnect that one, or switch the camera off and on"
-        case _:
-            why = f"gives reason {answer.reason}: switch it off and on"
-    return DeviceRefused(f"{place} refuses the connection; it {why}")
-
+_MOST_AT_A_LOOK: Final = 1 << 17
+"""Packets taken off the event connection at one look: a device that never stops talking must not keep us there."""
 
 DATA_PIECE: Final = 64 * 1024
 """Bytes of data in a packet to the device; what libgphoto2 sends, and bodies are used to it."""
@@ -648,7 +443,8 @@ class IpTransport(CableTransport):
         self._initiator = InitCommandRequest(guid, name)
         self._clock = clock
         self._place = label
-        self._connection = self._connect(DeviceRefused)
+        self._events: deque[PtpEvent] = deque(maxlen=MAX_EVENTS)
+        self._command, self._event, self._name = self._connect(DeviceRefused)
 
     @classmethod
     def connect(
@@ -668,57 +464,17 @@ class IpTransport(CableTransport):
     @property
     def label(self) -> str:
         """The name that the device gave, and its address."""
-        name = self._connection.name
-        return f"{name} ({self._place})" if name else self._place
+        return f"{self._name} ({self._place})" if self._name else self._place
 
     def exchange(self, reception: Reception, send: bytes | None, timeout: float) -> Transaction:
         """Send the request and the data phase to the device, and return what the device answers."""
-        self._send(reception.request, send, timeout)
-        return self._receive(reception, timeout)
-
-    def events(self) -> tuple[PtpEvent, ...]:
-        """Return the events that have come since the last call, and answer pings; never waits."""
-        self._connection.attend()
-        return self._connection.take_events()
-
-    def reset(self) -> None:
-        """Hang up and connect anew; the session that was open is over."""
-        self.close()
-        self._connection = self._connect(DeviceRefused, LinkClosed)
-        self.closed, self.between_transactions = False, True
-
-    def close(self) -> None:
-        """Hang up both connections; a second call does nothing."""
-        self.closed = True
-        self._connection.close()
-
-    def _connect(self, *passing: type[Exception]) -> IpConnection:
-        # A device needs a moment to see that a connection is gone, ours or that of the command that ran before; until
-        # then it calls itself busy.
-        deadline = self._clock.monotonic() + EVENT_CHANNEL_S
+        request = reception.request
+        self._command.send(OperationRequest(send is not None, request), timeout)
+        if send is not None:
+            for _ in self._command.send_data(request.transaction, send, DATA_PIECE, timeout):
+                pass
         while True:
-            try:
-                return greet(self._open_command, self._open_event, self._initiator, self._clock, self._place)
-            except passing:
-                if self._clock.monotonic() >= deadline:
-                    raise
-                self._clock.sleep(RETRY_S)
-
-    def _send(self, request: PtpRequest, send: bytes | None, timeout: float) -> None:
-        self._connection.write_command(encode(OperationRequest(request, send is not None)), timeout)
-        if send is None:
-            return
-        transaction = request.transaction
-        self._connection.write_command(encode(StartData(transaction, len(send))), timeout)
-        view = memoryview(send)
-        last = max(0, len(send) - 1) // DATA_PIECE * DATA_PIECE
-        for at in range(0, last, DATA_PIECE):
-            self._connection.write_command(encode_data(transaction, view[at : at + DATA_PIECE], last=False), timeout)
-        self._connection.write_command(encode_data(transaction, view[last:], last=True), timeout)
-
-    def _receive(self, reception: Reception, timeout: float) -> Transaction:
-        while True:
-            match self._connection.next_command(timeout):
+            match self._next(timeout):
                 case StartData(transaction, total):
                     reception.start(transaction, total)
                 case Data(_, data) | EndData(_, data):
@@ -726,9 +482,9 @@ class IpTransport(CableTransport):
                 case PtpResponse() as response:
                     return reception.end(response)
                 case PtpEvent() as event:
-                    self._connection.keep_event(event)
+                    self._events.append(event)
                 case Ping():
-                    self._connection.write_command(encode(Pong()), timeout)
+                    self._command.send(Pong(), timeout)
                 case Pong():
                     pass
                 case other:
@@ -736,13 +492,109 @@ class IpTransport(CableTransport):
                         f"{self.label} sends {type(other).__name__} in the middle of a transaction; reset it"
                     )
 
+    def events(self) -> tuple[PtpEvent, ...]:
+        """Return the events that have come since the last call, and answer pings; never waits."""
+        self._attend()
+        events = tuple(self._events)
+        self._events.clear()
+        return events
+
+    def reset(self) -> None:
+        """Hang up and connect anew; the session that was open is over."""
+        self.close()
+        self._events.clear()
+        self._command, self._event, self._name = self._connect(DeviceRefused, LinkClosed)
+        self.closed, self.between_transactions = False, True
+
+    def close(self) -> None:
+        """Hang up both connections; a second call does nothing."""
+        self.closed = True
+        self._event.close()
+        self._command.close()
+
     def call_off(self, transaction: int) -> bool:
         """Cancel a transaction whose data the caller cannot take, and wait for its end; return whether it came."""
         deadline = self._clock.monotonic() + _CALL_OFF_S
         with contextlib.suppress(LinkError, ProtocolError):
-            self._connection.write_event(encode(Cancel(transaction)), _CALL_OFF_S)
+            self._event.send(Cancel(transaction), _CALL_OFF_S)
             while self._clock.monotonic() < deadline:
-                packet = self._connection.next_command(_CALL_OFF_S)
+                packet = self._next(_CALL_OFF_S)
                 if isinstance(packet, PtpResponse) and packet.transaction == transaction:
                     return True
         return False
+
+    def _next(self, timeout: float) -> Packet:
+        """Return the next packet on the command connection; answer pings on the other one meanwhile."""
+        left = timeout
+        while True:
+            wait = min(left, _PING_EVERY_S)
+            try:
+                return self._command.next(wait)
+            except LinkTimeout:
+                left -= wait
+                if left <= 0:
+                    raise
+                self._attend()
+
+    def _attend(self) -> None:
+        """Take what the event connection holds, and answer pings; never waits."""
+        with contextlib.suppress(LinkTimeout):
+            for _ in range(_MOST_AT_A_LOOK):
+                match self._event.next(0.0):
+                    case PtpEvent() as event:
+                        self._events.append(event)
+                    case Ping():
+                        self._event.send(Pong(), _PING_EVERY_S)
+                    case _:
+                        pass
+
+    def _connect(self, *passing: type[Exception]) -> tuple[Channel, Channel, str]:
+        # A device needs a moment to see that a connection is gone, ours or that of the command that ran before; until
+        # then it calls itself busy.
+        return self._tried(self._greet, *passing)
+
+    def _greet(self) -> tuple[Channel, Channel, str]:
+        """Open both connections and introduce the initiator on them (clause 2.2); return them and the device's name."""
+        with contextlib.ExitStack() as opened:
+            command = opened.enter_context(contextlib.closing(Channel(self._open_command())))
+            command.send(self._initiator, CONNECT_S)
+            accepted = self._acknowledged(command, InitCommandAck)
+            event = opened.enter_context(contextlib.closing(Channel(self._tried(self._open_event, LinkClosed))))
+            event.send(InitEventRequest(accepted.connection), CONNECT_S)
+            self._acknowledged(event, InitEventAck)
+            opened.pop_all()
+        return command, event, accepted.name.strip()
+
+    def _tried(self, attempt: Callable[[], _T], *passing: type[Exception]) -> _T:
+        """Return what an attempt gives, made again for `EVENT_CHANNEL_S` where it fails for a reason that passes."""
+        deadline = self._clock.monotonic() + EVENT_CHANNEL_S
+        while True:
+            try:
+                return attempt()
+            except passing:
+                if self._clock.monotonic() >= deadline:
+                    raise
+            self._clock.sleep(RETRY_S)
+
+    def _acknowledged(self, channel: Channel, expected: type[_P]) -> _P:
+        """Return the first packet on a new connection, which is to be an acknowledgement."""
+        try:
+            answer = channel.next(CONNECT_S)
+        except ProtocolError as error:
+            raise ProtocolError(f"what answers in place of {self._place} speaks no PTP/IP: {error}") from error
+        if isinstance(answer, expected):
+            return answer
+        if not isinstance(answer, InitFail):
+            raise ProtocolError(
+                f"{self._place} answers a greeting with {type(answer).__name__}; an acknowledgement was expected: "
+                f"check that a camera listens at this port"
+            )
+        why = _REFUSALS.get(answer.reason, f"gives reason {answer.reason}: switch it off and on")
+        raise DeviceRefused(f"{self._place} refuses the connection; it {why}")
+
+
+_REFUSALS: dict[int, str] = {
+    FailReason.REJECTED: "does not know this computer: pair the two anew in the camera's wireless menu",
+    FailReason.BUSY: "is in use by another program or computer: disconnect that one, or switch the camera off and on",
+}
+"""Why a device refuses, and what helps."""

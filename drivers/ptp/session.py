@@ -18,9 +18,10 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import ClassVar, Protocol
+from typing import Annotated, ClassVar, Protocol
 
-from drivers.ptp.codes import EventCode, Operation, ResponseCode, describe
+from drivers.ptp.codes import EventCode, Operation, ResponseCode
+from drivers.ptp.datasets import U16, U32, Cursor, FieldKind, PtpDataset, describe, encode_integer
 from foundation.clock import Clock
 from foundation.errors import DeviceError, DeviceRefused, LinkClosed, LinkError, LinkTimeout, ProtocolError
 
@@ -94,7 +95,7 @@ class PtpSession:
     def close(self) -> None:
         """Close the session as far as the device still answers; the cable stays open."""
         with contextlib.suppress(DeviceError):
-            self.call(Operation.CLOSE_SESSION, timeout=START_TIMEOUT_S, patience=0.0)
+            self.call(Operation.CLOSE_SESSION, timeout=START_TIMEOUT_S, retry_s=0.0)
 
     def call(
         self,
@@ -103,15 +104,15 @@ class PtpSession:
         send: bytes | None = None,
         receive: Callable[[bytes], object] | None = None,
         timeout: float = TIMEOUT_S,
-        patience: float = PASSING_LIMIT_S,
+        retry_s: float = PASSING_LIMIT_S,
     ) -> tuple[tuple[int, ...], bytes]:
         """Carry out an operation.
 
         `send`: the data phase to the device; None where the operation has none. `receive`: takes the data phase from
-        the device piece by piece; None collects it. `timeout`: longest wait for each answer, seconds. `patience`: how
+        the device piece by piece; None collects it. `timeout`: longest wait for each answer, seconds. `retry_s`: how
         long it is asked again when the device declines for the moment, seconds.
         """
-        pauses = self._pauses(patience)
+        pauses = self._pauses(retry_s)
         while True:
             self._transaction = next_transaction(self._transaction)
             request = PtpRequest(operation, self._transaction, parameters)
@@ -148,14 +149,28 @@ LAST_TRANSACTION = 0xFFFFFFFE
 """The highest transaction number; 1 follows it, for 0 and 0xffffffff are taken."""
 
 
+def _read_parameters(cursor: Cursor, field: str) -> tuple[int, ...]:
+    count, odd = divmod(cursor.left, 4)
+    if odd or count > MAX_PARAMETERS:
+        expected = f"0 to {MAX_PARAMETERS} of 4 bytes"
+        raise cursor.fault(f"the list of {field}", expected, f"{cursor.left} bytes", at=cursor.at)
+    return cursor.integers(count, 4, field)
+
+
+def _encode_parameters(parameters: tuple[int, ...]) -> bytes:
+    if len(parameters) > MAX_PARAMETERS:
+        raise ValueError(f"{len(parameters)} parameters; at most {MAX_PARAMETERS} are possible")
+    return b"".join(encode_integer(parameter, 4) for parameter in parameters)
+
+
 @dataclass(frozen=True)
-class _Coded:
+class _Coded(PtpDataset):
     """What request, response and event have: a number of `codes`, and parameters; in text ``NAME(0x1, 0x2)``."""
 
     codes: ClassVar[type[IntEnum]]
-    code: int
-    transaction: int = 0
-    parameters: tuple[int, ...] = ()
+    code: U16
+    transaction: U32 = 0
+    parameters: Annotated[tuple[int, ...], FieldKind(_read_parameters, _encode_parameters)] = ()
 
     def __str__(self) -> str:
         listed = ", ".join(f"0x{parameter:x}" for parameter in self.parameters)
@@ -186,7 +201,7 @@ class PtpEvent(_Coded):
     """Something that happened in the device; `transaction` is 0xffffffff where it belongs to none."""
 
     codes = EventCode
-    transaction: int = 0xFFFFFFFF
+    transaction: U32 = 0xFFFFFFFF
 
 
 def next_transaction(transaction: int) -> int:
@@ -240,6 +255,42 @@ class Transport(Protocol):
 
     def close(self) -> None:
         """Release the device; a second call does nothing."""
+        ...
+
+
+@dataclass(frozen=True)
+class Answer:
+    """A response, and the data phase before it; None where there is none (an empty one is b"")."""
+
+    response: PtpResponse
+    data: bytes | None = None
+
+
+class NoAnswer(Exception):
+    """Raised instead of answering: the device says nothing, and the initiator waits in vain."""
+
+
+class Responder(Protocol):
+    """The other end of a cable: a device that answers one request at a time, without containers or packets."""
+
+    def takes_data(self, request: PtpRequest) -> bool:
+        """Return whether the initiator sends a data phase with this operation."""
+        ...
+
+    def answer(self, request: PtpRequest, data: bytes | None) -> Answer:
+        """Carry out a request; `data` is the initiator's data phase."""
+        ...
+
+    def events(self) -> tuple[PtpEvent, ...]:
+        """Return the events that have come up since the last call."""
+        ...
+
+    def cancelled(self, transaction: int) -> None:
+        """Note that the initiator gave up a transaction."""
+        ...
+
+    def unplugged(self) -> None:
+        """Note that the cable was pulled or reset: the session is over."""
         ...
 
 

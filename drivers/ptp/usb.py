@@ -42,6 +42,8 @@ from foundation.errors import LinkError, LinkTimeout, ProtocolError
 
 HEADER_LENGTH = 12
 """Bytes of length, type, code and transaction (clause 7)."""
+_LENGTH_AND_TYPE = 6
+"""Bytes before the code: what follows them is a message as ISO 15740 has it."""
 UNKNOWN_LENGTH = 0xFFFFFFFF
 """A container's length where the payload goes on until a short packet: more than 4 GiB, or not known."""
 HIGH_SPEED_PACKET = 512
@@ -74,6 +76,12 @@ class DataPiece:
     last: bool = False
 
 
+_MESSAGES: dict[int, type[PtpRequest | PtpResponse | PtpEvent]] = {
+    ContainerType.COMMAND: PtpRequest,
+    ContainerType.RESPONSE: PtpResponse,
+    ContainerType.EVENT: PtpEvent,
+}
+_KINDS = {message: kind for kind, message in _MESSAGES.items()}
 Message = PtpRequest | PtpResponse | PtpEvent | DataStart | DataPiece
 
 
@@ -127,19 +135,11 @@ class ContainerReader:
                 raise _unusable(f"a data container of {length} bytes; its header alone has {HEADER_LENGTH}")
             self._start_data(messages, code, transaction, length, piece)
             return bool(self._in_data or self._rest)
-        parameters = _parameter_count(kind, length)
+        _check_length(kind, length)
         if len(self._rest) < length:
             return False
-        body = Cursor(bytes(self._rest[HEADER_LENGTH:length]), "a USB container")
+        messages.append(_MESSAGES[kind].decode(bytes(self._rest[_LENGTH_AND_TYPE:length])))
         del self._rest[:length]
-        values = body.integers(parameters, 4, "parameters")
-        match kind:
-            case ContainerType.COMMAND:
-                messages.append(PtpRequest(code, transaction, values))
-            case ContainerType.RESPONSE:
-                messages.append(PtpResponse(code, transaction, values))
-            case _:
-                messages.append(PtpEvent(code, transaction, values))
         return bool(self._rest)
 
     def _start_data(self, messages: list[Message], code: int, transaction: int, length: int, piece: bytes) -> None:
@@ -174,25 +174,15 @@ class ContainerReader:
 
 def encode(message: PtpRequest | PtpResponse | PtpEvent) -> bytes:
     """Return the container of a message."""
-    if len(message.parameters) > MAX_PARAMETERS:
-        raise ValueError(f"{message} has {len(message.parameters)} parameters; at most {MAX_PARAMETERS} are possible")
-    match message:
-        case PtpRequest():
-            kind = ContainerType.COMMAND
-        case PtpResponse():
-            kind = ContainerType.RESPONSE
-        case PtpEvent():
-            kind = ContainerType.EVENT
-    length = HEADER_LENGTH + 4 * len(message.parameters)
-    return _header(length, kind, message.code, message.transaction) + b"".join(
-        encode_integer(parameter, 4) for parameter in message.parameters
-    )
+    body = message.encode()
+    return encode_integer(_LENGTH_AND_TYPE + len(body), 4) + encode_integer(_KINDS[type(message)], 2) + body
 
 
 def encode_data_header(code: int, transaction: int, length: int | None) -> bytes:
     """Return what stands before a payload of `length` bytes; None, or too many for 32 bits, until a short packet."""
     total = UNKNOWN_LENGTH if length is None else min(HEADER_LENGTH + length, UNKNOWN_LENGTH)
-    return _header(total, ContainerType.DATA, code, transaction)
+    kind = ContainerType.DATA
+    return encode_integer(total, 4) + encode_integer(kind, 2) + encode_integer(code, 2) + encode_integer(transaction, 4)
 
 
 def encode_data(code: int, transaction: int, payload: bytes) -> bytes:
@@ -208,14 +198,9 @@ def ends_with_empty_packet(total: int, packet_size: int) -> bool:
     return total % packet_size == 0
 
 
-def _header(length: int, kind: ContainerType, code: int, transaction: int) -> bytes:
-    return (
-        encode_integer(length, 4) + encode_integer(kind, 2) + encode_integer(code, 2) + encode_integer(transaction, 4)
-    )
-
-
-def _parameter_count(kind: int, length: int) -> int:
-    if kind not in (ContainerType.COMMAND, ContainerType.RESPONSE, ContainerType.EVENT):
+def _check_length(kind: int, length: int) -> None:
+    """Raise ProtocolError unless a container without payload can be of this type and length."""
+    if kind not in _MESSAGES:
         raise _unusable(f"a container of type {kind}; 1 command, 2 data, 3 response or 4 event was expected")
     count, odd = divmod(length - HEADER_LENGTH, 4)
     if odd or not 0 <= count <= MAX_PARAMETERS:
@@ -223,7 +208,6 @@ def _parameter_count(kind: int, length: int) -> int:
             f"a {ContainerType(kind).name.lower()} container of {length} bytes; "
             f"12 and 4 for each of 0 to {MAX_PARAMETERS} parameters were expected"
         )
-    return count
 
 
 def _unusable(what: str) -> ProtocolError:

@@ -159,7 +159,7 @@ class EpsonProjector(SerialProjector):
 
     def power(self) -> Power:
         """Return the power state now; while it carries out our own command, what that brings about."""
-        self._meet_late_answer()
+        self._take_late_answer()
         return self._under_way or parse_power(self._get("PWR"))
 
     def switch(self, on: bool) -> None:
@@ -179,7 +179,7 @@ class EpsonProjector(SerialProjector):
 
     def set_muted(self, muted: bool) -> None:
         """Blank picture and sound, or show them; refused unless the projector is on."""
-        self._wait_its_turn()
+        self._require_idle()
         command = encode_set("MUTE", "ON" if muted else "OFF")
         reply = self.exchange.ask(command, take_reply)
         if reply == REFUSAL:
@@ -207,13 +207,13 @@ class EpsonProjector(SerialProjector):
         self._under_way = None
         super().close()
 
-    def _meet_late_answer(self) -> None:
+    def _take_late_answer(self) -> None:
         """Check whether the command under way has been carried out."""
         if self._under_way is None:
             return
         command = "PWR ON" if self._under_way is Power.WARMING else "PWR OFF"
         try:
-            reply = self.exchange.glance(take_reply)
+            reply = self.exchange.poll(take_reply)
         except BaseException:
             self._under_way = None
             raise
@@ -229,13 +229,13 @@ class EpsonProjector(SerialProjector):
         if reply == REFUSAL:
             raise DeviceRefused(f"{self.label} answers ERR to {command}; look at its indicators and try again")
 
-    def _wait_its_turn(self) -> None:
-        self._meet_late_answer()
+    def _require_idle(self) -> None:
+        self._take_late_answer()
         if self._under_way is not None:
             raise DeviceRefused(f"{self.label} is busy with its {self._under_way.value}; wait until that is done")
 
     def _get(self, name: str) -> str:
-        self._wait_its_turn()
+        self._require_idle()
         reply = self.exchange.ask(encode_get(name), take_reply)
         try:
             return value_of(name, reply)

@@ -5,7 +5,7 @@ Rules that hold inside:
 - A command is answered by ``P`` or ``F``, a question by ``OK`` and a value, all ended by CR.
 - The projector sends ``INFO`` and a number unasked when it changes its power state or has a fault. `OptomaProjector`
   keeps what it has received so: warm-up and cooling are known from there only, as power is else on or off.
-- A fault once overheard is reported until the projector warms up again; none can be asked for.
+- A fault once announced is reported until the projector warms up again; none can be asked for.
 - Mute cannot be asked of older models; then what this driver has set last is the answer.
 
 Source: Optoma, RS232 Protocol Function List of several models (syntax, P, F, OK, 00, 02, 108, 124, 150, 151, INFO 0 to
@@ -43,28 +43,9 @@ _PARTS = {4: "lamp", 6: "fan", 7: "temperature"}
 _PART_NUMBERS = {part: number for number, part in _PARTS.items()}
 
 
-@dataclass(frozen=True)
-class PassFail:
-    """The answer to a command: whether it was carried out."""
-
-    passed: bool
-
-
-@dataclass(frozen=True)
-class AnswerText:
-    """The answer to a question."""
-
-    text: str
-
-
-@dataclass(frozen=True)
-class Info:
-    """What a projector sends unasked: the number of its new state or fault."""
-
-    number: int
-
-
-Message = PassFail | AnswerText | Info
+PASSED, FAILED = "P", "F"
+"""Answers to a command; that to a question begins with `ANSWER`, what is sent unasked with `INFO` and a number."""
+ANSWER, INFO = "OK", "INFO"
 
 
 @dataclass(frozen=True)
@@ -95,19 +76,13 @@ def take_command(data: bytes) -> tuple[OptomaCommand | None, int] | None:
     return (OptomaCommand(int(found[2]), found[3].strip(), int(found[1])) if found else None), end + 1
 
 
-def encode_message(message: Message) -> bytes:
-    """Return the projector's line."""
-    match message:
-        case PassFail(passed):
-            return b"P\r" if passed else b"F\r"
-        case AnswerText(text):
-            return f"OK{text}\r".encode("ascii")
-        case Info(number):
-            return f"INFO{number}\r".encode("ascii")
+def encode_message(message: str) -> bytes:
+    """Return the projector's line: `PASSED`, `FAILED`, or `ANSWER` or `INFO` with what follows them."""
+    return f"{message}\r".encode("ascii")
 
 
-def take_message(data: bytes) -> tuple[Message, int] | None:
-    """Take one message off the front of `data`."""
+def take_message(data: bytes) -> tuple[str, int] | None:
+    """Take one message off the front of `data`, as `encode_message` takes it."""
     found = _MESSAGE.match(data)
     if found is None:
         if not _BEGINNING.fullmatch(data):
@@ -115,22 +90,20 @@ def take_message(data: bytes) -> tuple[Message, int] | None:
         return None
     done, value, info = found.groups()
     if done is not None:
-        return PassFail(done == b"P"), found.end()
+        return done.decode("ascii"), found.end()
     if value is not None:
-        return AnswerText(text_of(value).strip()), found.end()
-    return Info(int(info)), found.end()
+        return ANSWER + text_of(value).strip(), found.end()
+    return f"{INFO}{int(info)}", found.end()
 
 
-def info_of_power(power: Power) -> Info | None:
+def info_of_power(power: Power) -> str | None:
     """Return what is sent when a power state begins; nothing when the projector has warmed up."""
-    number = _POWER_NUMBERS.get(power)
-    return None if number is None else Info(number)
+    return f"{INFO}{_POWER_NUMBERS[power]}" if power in _POWER_NUMBERS else None
 
 
-def info_of_fault(part: str) -> Info | None:
+def info_of_fault(part: str) -> str | None:
     """Return what is sent when a part fails, None if there is no number for it."""
-    number = _PART_NUMBERS.get(part)
-    return None if number is None else Info(number)
+    return f"{INFO}{_PART_NUMBERS[part]}" if part in _PART_NUMBERS else None
 
 
 class OptomaProjector(SerialProjector):
@@ -155,7 +128,7 @@ class OptomaProjector(SerialProjector):
         return f"model {self._get(MODEL)}"
 
     def power(self) -> Power:
-        """Return the power state now; before the first change is overheard, on or standby only."""
+        """Return the power state now; before the first change is announced, on or standby only."""
         value = self._get(POWER_STATE)
         match value, self._on_the_way:
             case "1", Power.COOLING:
@@ -186,11 +159,11 @@ class OptomaProjector(SerialProjector):
         self._muted = muted
 
     def faults(self) -> tuple[Fault, ...]:
-        """Return every fault overheard since the lamp was last struck; the language cannot ask for them."""
+        """Return every fault announced since the lamp was last struck; the language cannot ask for them."""
         # To be silent because the cable is out must not look like health.
         self.power()
-        while (message := self.exchange.glance(take_message)) is not None:
-            self._overheard(message)
+        while (message := self.exchange.poll(take_message)) is not None:
+            self._take_unsolicited(message)
         return tuple(Fault(part, Severity.ERROR) for part in self._faults)
 
     def lamp_hours(self) -> tuple[int, ...]:
@@ -202,42 +175,40 @@ class OptomaProjector(SerialProjector):
         return self.hours_in("its lamp hours", value)
 
     def _get(self, number: int) -> str:
-        match self._ask(OptomaCommand(number, "1")):
-            case AnswerText(text):
-                return text
-            case PassFail(passed=False):
-                raise DeviceRefused(f"{self.label} answers F to question {number}: its model does not know it, or now")
-            case message:
-                self.exchange.close()
-                raise ProtocolError(f"{self.label} answers {message} to question {number}; expected OK…")
+        message = self._ask(OptomaCommand(number, "1"))
+        if message == FAILED:
+            raise DeviceRefused(f"{self.label} answers F to question {number}: its model does not know it, or now")
+        if not message.startswith(ANSWER):
+            self.exchange.close()
+            raise ProtocolError(f"{self.label} answers {message} to question {number}; expected OK…")
+        return message.removeprefix(ANSWER)
 
     def _set(self, number: int, value: str) -> None:
-        match self._ask(OptomaCommand(number, value)):
-            case PassFail(passed=True):
-                return
-            case PassFail(passed=False):
-                raise DeviceRefused(
-                    f"{self.label} answers F to command {number} {value}; wait until its power is on and try again"
-                )
-            case message:
-                self.exchange.close()
-                raise ProtocolError(f"{self.label} answers {message} to command {number} {value}; expected P or F")
+        message = self._ask(OptomaCommand(number, value))
+        if message == FAILED:
+            raise DeviceRefused(
+                f"{self.label} answers F to command {number} {value}; wait until its power is on and try again"
+            )
+        if message != PASSED:
+            self.exchange.close()
+            raise ProtocolError(f"{self.label} answers {message} to command {number} {value}; expected P or F")
 
-    def _ask(self, command: OptomaCommand) -> Message:
+    def _ask(self, command: OptomaCommand) -> str:
         # The exchange throws away what waits when a question is asked; here it may be news.
-        while (message := self.exchange.glance(take_message, 0.0)) is not None:
-            self._overheard(message)
-        return self.exchange.ask(encode_command(command), take_message, self._overheard)
+        while (message := self.exchange.poll(take_message, 0.0)) is not None:
+            self._take_unsolicited(message)
+        return self.exchange.ask(encode_command(command), take_message, self._take_unsolicited)
 
-    def _overheard(self, message: Message) -> bool:
-        if not isinstance(message, Info):
+    def _take_unsolicited(self, message: str) -> bool:
+        if not message.startswith(INFO):
             return False
-        if message.number in _POWERS:
-            power = _POWERS[message.number]
+        number = int(message.removeprefix(INFO))
+        if number in _POWERS:
+            power = _POWERS[number]
             self._on_the_way = None if power is Power.STANDBY else power
             self._muted = None if power is Power.STANDBY else self._muted
             if power is Power.WARMING:
                 self._faults.clear()
-        if message.number in _PARTS:
-            self._faults[_PARTS[message.number]] = None
+        if number in _PARTS:
+            self._faults[_PARTS[number]] = None
         return True

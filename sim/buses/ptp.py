@@ -1,6 +1,4 @@
-"""A PTP device without a USB cable: in memory, without a thread or a wait, or on a TCP port for any initiator (PTP/IP).
-
-Rules of the network's device:
+"""A PTP device on a TCP port, for any initiator (PTP/IP).
 
 - One initiator at a time, known by the number that joins its two connections; a second one hears that the device is
   busy.
@@ -15,14 +13,14 @@ from __future__ import annotations
 
 import itertools
 import threading
-from collections.abc import Iterator
 
-from drivers.links.link import Link, Pipe, PipeStalled
+from drivers.links.link import Link
 from drivers.links.network import LOOPBACK, TcpServer
 from drivers.ptp.codes import ResponseCode
 from drivers.ptp.ip import (
     PORT,
     Cancel,
+    Channel,
     Data,
     EndData,
     FailReason,
@@ -33,138 +31,11 @@ from drivers.ptp.ip import (
     InitFail,
     OperationRequest,
     Packet,
-    PacketCutter,
     Ping,
     Pong,
-    StartData,
-    encode,
-    encode_data,
 )
-from drivers.ptp.session import PtpRequest, PtpResponse
-from drivers.ptp.usb import UsbTransport
+from drivers.ptp.session import Answer, NoAnswer, PtpRequest, PtpResponse, Responder
 from foundation.errors import LinkClosed, LinkTimeout, ProtocolError
-from sim.buses.responder import Answer, NoAnswer, Responder
-from sim.buses.usb import (
-    BULK_IN,
-    BULK_OUT,
-    INTERRUPT_IN,
-    INTERRUPT_PACKET,
-    PACKET,
-    Overflowed,
-    PtpUsbDevice,
-    Setup,
-    Stalled,
-)
-from sim.clock import SimulatedClock
-
-_ADDRESSES = {Pipe.BULK_OUT: BULK_OUT, Pipe.BULK_IN: BULK_IN, Pipe.INTERRUPT_IN: INTERRUPT_IN}
-
-
-class MemoryPipes:
-    """The `drivers.links.link.UsbPipes` of a device in the same thread; what it has not sent yet, it will not send."""
-
-    def __init__(self, device: PtpUsbDevice) -> None:
-        self._device = device
-        self._there = True
-
-    @property
-    def label(self) -> str:
-        """The device's name."""
-        return f"the simulated {self._device.identity.name}"
-
-    @property
-    def packet_size(self) -> int:
-        """Bytes of a full packet on the bulk pipes."""
-        return PACKET
-
-    @property
-    def polling_s(self) -> float:
-        """No time at all."""
-        return 0.0
-
-    def bulk_write(self, data: bytes, timeout: float) -> None:
-        """Hand `data` to the device."""
-        self._check()
-        try:
-            self._device.bulk_out(data)
-        except Stalled as error:
-            raise PipeStalled(f"{self.label} stalls") from error
-
-    def bulk_read(self, limit: int, timeout: float) -> bytes:
-        """Return what one transfer brings."""
-        self._check()
-        try:
-            return self._said(self._device.bulk_in(limit), timeout)
-        except Stalled as error:
-            raise PipeStalled(f"{self.label} stalls") from error
-        except Overflowed as error:
-            raise ProtocolError(f"{self.label} sends more than the {limit} bytes asked for") from error
-
-    def interrupt_read(self, timeout: float) -> bytes:
-        """Return the next packet of the interrupt pipe."""
-        self._check()
-        try:
-            return self._said(self._device.interrupt_in(INTERRUPT_PACKET), timeout)
-        except Stalled as error:
-            raise PipeStalled(f"{self.label} stalls") from error
-
-    def control_out(self, request: int, data: bytes, timeout: float) -> None:
-        """Send a request of the interface's class."""
-        self._check()
-        try:
-            self._device.control(Setup(0x21, request, 0, 0, len(data)), data)
-        except Stalled as error:
-            raise PipeStalled(f"{self.label} stalls") from error
-
-    def control_in(self, request: int, limit: int, timeout: float) -> bytes:
-        """Return the answer to a request of the interface's class."""
-        self._check()
-        try:
-            return self._device.control(Setup(0xA1, request, 0, 0, limit))
-        except Stalled as error:
-            raise PipeStalled(f"{self.label} stalls") from error
-
-    def clear_halt(self, pipe: Pipe) -> None:
-        """Let a stalled pipe transfer again."""
-        self._check()
-        self._device.control(Setup(0x02, 1, 0, _ADDRESSES[pipe], 0))
-
-    def reset_port(self) -> None:
-        """Have the device forget everything."""
-        self._check()
-        self._device.unplugged()
-
-    def close(self) -> None:
-        """Let go of the device."""
-        self._there = False
-
-    def pull(self) -> None:
-        """Pull the cable: the device is gone for good."""
-        if self._there:
-            self._there = False
-            self._device.unplugged()
-
-    def _check(self) -> None:
-        if not self._there:
-            raise LinkClosed(f"{self.label} was unplugged; open it again")
-
-    def _said(self, data: bytes | None, timeout: float) -> bytes:
-        if data is None:
-            raise LinkTimeout(f"{self.label} sent nothing for {timeout:g} s")
-        return data
-
-
-class MemoryTransport(UsbTransport):
-    """A `drivers.ptp.session.Transport` straight to a responder."""
-
-    def __init__(self, responder: Responder) -> None:
-        self._memory = MemoryPipes(PtpUsbDevice(responder))
-        super().__init__(self._memory, SimulatedClock())
-
-    def pull(self) -> None:
-        """Pull the cable."""
-        self._memory.pull()
-
 
 GUID = bytes(range(16))
 """Identifier of a simulated device unless another is given."""
@@ -173,11 +44,9 @@ NAME = "CroP camera"
 DATA_PIECE = 256 * 1024
 """Bytes of data in a packet to the initiator; what fits goes out in one EndData."""
 
-_READ = 256 * 1024
-"""Bytes read at once; as large as a piece of data, which makes few calls of a long transfer."""
 _TICK_S = 0.05
 """Between two looks for events while no command comes: soon enough for a host, and hardly any load."""
-_PATIENCE_S = 10.0
+_TIMEOUT_S = 10.0
 """For the first packet, a data phase under way, and a host that reads slowly; long beside a transfer on one machine."""
 
 
@@ -209,42 +78,40 @@ class PtpIpService:
 
     def handle(self, link: Link) -> None:
         """Serve one connection, command or event, until it ends."""
+        channel = Channel(link)
         try:
-            self._serve(link, _Incoming(link))
+            match channel.next(_TIMEOUT_S):
+                case InitCommandRequest():
+                    self._serve_commands(channel)
+                case InitEventRequest(number):
+                    self._serve_events(channel, number)
+                case _:
+                    _send(channel, InitFail(FailReason.UNSPECIFIED))
         except ProtocolError as error:
             raise LinkClosed(f"a stream without packets is of no use: {error}") from error
 
-    def _serve(self, link: Link, packets: _Incoming) -> None:
-        match packets.next(_PATIENCE_S):
-            case InitCommandRequest():
-                self._serve_commands(link, packets)
-            case InitEventRequest(number):
-                self._serve_events(link, packets, number)
-            case _:
-                _send(link, InitFail(FailReason.UNSPECIFIED))
-
-    def _serve_commands(self, link: Link, packets: _Incoming) -> None:
-        initiator = _Initiator(next(self._numbers), link)
+    def _serve_commands(self, channel: Channel) -> None:
+        initiator = _Initiator(next(self._numbers), channel)
         with self._guard:
             free = self._initiator is None
             if free:
                 self._initiator = initiator
         if not free:
-            _send(link, InitFail(FailReason.BUSY))
+            _send(channel, InitFail(FailReason.BUSY))
             return
         try:
-            _send(link, InitCommandAck(initiator.number, self._guid, self._name))
+            _send(channel, InitCommandAck(initiator.number, self._guid, self._name))
             while True:
                 try:
-                    packet = packets.next(_TICK_S)
+                    packet = channel.next(_TICK_S)
                 except LinkTimeout:
-                    self._tell_events(initiator)
+                    self._send_events(initiator)
                     continue
                 match packet:
-                    case OperationRequest(request, sends_data):
-                        self._operate(initiator, packets, request, sends_data)
+                    case OperationRequest(sends_data, request):
+                        self._operate(initiator, request, sends_data)
                     case Ping():
-                        _send(link, Pong())
+                        _send(channel, Pong())
                     case _:
                         # What is left of a transaction that was called off.
                         pass
@@ -254,36 +121,34 @@ class PtpIpService:
             with self._guard:
                 self._initiator = None
 
-    def _serve_events(self, link: Link, packets: _Incoming, number: int) -> None:
+    def _serve_events(self, channel: Channel, number: int) -> None:
         with self._guard:
             initiator = self._initiator
         if initiator is None or initiator.number != number:
-            _send(link, InitFail(FailReason.REJECTED))
+            _send(channel, InitFail(FailReason.REJECTED))
             return
-        _send(link, InitEventAck())
-        initiator.join(link)
+        _send(channel, InitEventAck())
+        initiator.join(channel)
         while True:
             try:
-                packet = packets.next(_PATIENCE_S)
+                packet = channel.next(_TIMEOUT_S)
             except LinkTimeout:
                 continue
             match packet:
                 case Ping():
                     initiator.send_event(Pong())
                 case Cancel(transaction):
-                    initiator.cancel(transaction)
+                    initiator.cancelled = transaction
                 case _:
                     pass
 
-    def _operate(self, initiator: _Initiator, packets: _Incoming, request: PtpRequest, sends_data: bool) -> None:
-        initiator.forget_cancellation()
-        data: bytes | None = None
+    def _operate(self, initiator: _Initiator, request: PtpRequest, sends_data: bool) -> None:
+        initiator.cancelled = None  # what was given up before has ended
+        command, data = initiator.command, None
         if sends_data:
-            data = _collect(packets)
+            data = _collect(command)
             if data is None:
-                self._responder.cancelled(request.transaction)
-                response = PtpResponse(ResponseCode.TRANSACTION_CANCELLED, request.transaction)
-                _send(initiator.command, response)
+                self._call_off(command, request)
                 return
         if data is None and self._responder.takes_data(request):
             answer = Answer(PtpResponse(ResponseCode.GENERAL_ERROR, request.transaction))
@@ -292,47 +157,40 @@ class PtpIpService:
                 answer = self._responder.answer(request, data)
             except NoAnswer:
                 return
-        self._tell_events(initiator)
+        self._send_events(initiator)
         if answer.data is not None:
-            for packet in _data_packets(request.transaction, answer.data):
+            for _ in command.send_data(request.transaction, answer.data, DATA_PIECE, _TIMEOUT_S):
                 if initiator.gave_up(request.transaction):
-                    _send(initiator.command, EndData(request.transaction))
-                    self._responder.cancelled(request.transaction)
-                    response = PtpResponse(ResponseCode.TRANSACTION_CANCELLED, request.transaction)
-                    _send(initiator.command, response)
+                    _send(command, EndData(request.transaction))
+                    self._call_off(command, request)
                     return
-                initiator.command.write(packet, _PATIENCE_S)
-        _send(initiator.command, answer.response)
+        _send(command, answer.response)
 
-    def _tell_events(self, initiator: _Initiator) -> None:
+    def _call_off(self, command: Channel, request: PtpRequest) -> None:
+        self._responder.cancelled(request.transaction)
+        _send(command, PtpResponse(ResponseCode.TRANSACTION_CANCELLED, request.transaction))
+
+    def _send_events(self, initiator: _Initiator) -> None:
         for event in self._responder.events():
             initiator.send_event(event)
 
 
 class _Initiator:
-    """Who is connected: the number and the two connections that it joins."""
+    """Who is connected: the number and the two connections that it joins, and the transaction that it gave up last."""
 
-    def __init__(self, number: int, command: Link) -> None:
+    def __init__(self, number: int, command: Channel) -> None:
         self.number = number
         self.command = command
-        self._cancelled: int | None = None
-        self._event: Link | None = None
+        self.cancelled: int | None = None
+        self._event: Channel | None = None
         self._waiting: list[Packet] = []
         self._guard = threading.Lock()
 
-    def cancel(self, transaction: int) -> None:
-        """Note that the initiator gave up a transaction; the thread that serves it will see."""
-        self._cancelled = transaction
-
     def gave_up(self, transaction: int) -> bool:
         """Return whether this transaction was given up."""
-        return self._cancelled == transaction
+        return self.cancelled == transaction
 
-    def forget_cancellation(self) -> None:
-        """Begin a transaction; what was given up before has ended."""
-        self._cancelled = None
-
-    def join(self, event: Link) -> None:
+    def join(self, event: Channel) -> None:
         """Take the second connection, and send on it what came up before."""
         with self._guard:
             self._event = event
@@ -355,29 +213,15 @@ class _Initiator:
                 self._event.close()
 
 
-class _Incoming:
-    """The packets on a connection, one after the other."""
-
-    def __init__(self, link: Link) -> None:
-        self._link = link
-        self._cutter = PacketCutter()
-        self._packets: list[Packet] = []
-
-    def next(self, timeout: float) -> Packet:
-        while not self._packets:
-            self._packets = self._cutter.feed(self._link.read(_READ, timeout))
-        return self._packets.pop(0)
+def _send(channel: Channel, packet: Packet) -> None:
+    channel.send(packet, _TIMEOUT_S)
 
 
-def _send(link: Link, packet: Packet) -> None:
-    link.write(encode(packet), _PATIENCE_S)
-
-
-def _collect(packets: _Incoming) -> bytes | None:
+def _collect(packets: Channel) -> bytes | None:
     """Return the initiator's data phase, None if it is called off."""
     data = bytearray()
     while True:
-        match packets.next(_PATIENCE_S):
+        match packets.next(_TIMEOUT_S):
             case Data(_, piece):
                 data += piece
             case EndData(_, piece):
@@ -386,12 +230,3 @@ def _collect(packets: _Incoming) -> bytes | None:
                 return None
             case _:
                 pass
-
-
-def _data_packets(transaction: int, data: bytes) -> Iterator[bytes]:
-    yield encode(StartData(transaction, len(data)))
-    view = memoryview(data)
-    last = max(0, len(data) - 1) // DATA_PIECE * DATA_PIECE
-    for at in range(0, last, DATA_PIECE):
-        yield encode_data(transaction, view[at : at + DATA_PIECE], last=False)
-    yield encode_data(transaction, view[last:], last=True)

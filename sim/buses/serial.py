@@ -1,4 +1,4 @@
-"""Serial cables to a simulated device: a pseudo-terminal (Linux and macOS), one in memory, and one through TCP.
+"""Serial cables to a simulated device: a pseudo-terminal (Linux and macOS), and one in memory.
 
 Rules of the pseudo-terminal:
 
@@ -14,19 +14,11 @@ import os
 import select
 import threading
 import tty
-from collections.abc import Callable
-from types import TracebackType
 from typing import Final
 
-from drivers.links.link import Peer, PeerLink
-from drivers.links.network import TcpLink, TcpServer
-from foundation.errors import LinkClosed, LinkTimeout
-
-POLLING_S: Final = 0.02
-"""How often a peer on a real cable is asked what it has to say by now: drivers wait seconds for an answer."""
-
-_CABLE_PATIENCE_S: Final = 5.0
-"""Longest wait for a client to take an answer."""
+from drivers.links.link import ClosedAtEnd, Peer, PeerLink
+from drivers.links.network import POLLING_S
+from foundation.errors import LinkClosed
 
 
 class SerialPeerLink(PeerLink):
@@ -39,32 +31,15 @@ class SerialPeerLink(PeerLink):
         return super().read(limit, timeout)
 
 
-def serve_network(peer: Callable[[], Peer], port: int = 0) -> TcpServer:
-    """Return a running server that gives each connection a peer of its own; close it, or use it in a `with` block."""
-
-    def handle(link: TcpLink) -> None:
-        there = peer()
-        said = there.connect()
-        while True:
-            if said:
-                link.write(said, _CABLE_PATIENCE_S)
-            try:
-                said = there.receive(link.read(4096, POLLING_S))
-            except LinkTimeout:
-                said = there.receive(b"")
-
-    return TcpServer(handle, port)
-
-
 _WAKE: Final = b"w"
 _END: Final = b"e"
 """What rings the serving thread: to say when it has caught up, and to end."""
 
-_PATIENCE_S: Final = 10.0
+_TIMEOUT_S: Final = 10.0
 """Longest wait for the thread to catch up; it takes milliseconds unless the machine is overloaded."""
 
 
-class PseudoTerminal:
+class PseudoTerminal(ClosedAtEnd):
     """A serial port at `path` whose far end is `peer`, until closed; use it in a `with` block."""
 
     def __init__(self, peer: Peer) -> None:
@@ -83,19 +58,11 @@ class PseudoTerminal:
         self._thread = threading.Thread(target=self._serve, name=f"serving {self.path}", daemon=True)
         self._thread.start()
 
-    def __enter__(self) -> PseudoTerminal:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
-
     def catch_up(self) -> None:
         """Return when all that was sent has been answered and nothing more comes: before and after a clock leaps."""
         self._caught_up.clear()
         os.write(self._ringer, _WAKE)
-        self._caught_up.wait(_PATIENCE_S)
+        self._caught_up.wait(_TIMEOUT_S)
 
     def close(self) -> None:
         """Pull the cable out and wait for the thread; a second call does nothing."""

@@ -15,7 +15,7 @@ Sources: pyusb's `usb.backend`; libusb 1.0's error codes.
 - Nothing waits: a pipe without anything to say returns None, which on a bus is a NAK.
 - A transfer that is no PTP halts the bulk pipes, until the host clears them.
 
-`sim.buses.usbip` puts it on a network for USB/IP, `sim.buses.ptp` on no cable at all.
+`sim.buses.usbip` puts it on a network for USB/IP.
 
 Sources: USB 2.0, clauses 8.5 (transactions), 9.4 (standard requests) and 9.6 (descriptors); USB Still Image Capture
 Device Definition 1.0, clauses 5 to 7.
@@ -25,19 +25,20 @@ from __future__ import annotations
 
 import errno
 import struct
+from abc import ABC, abstractmethod
 from array import array
 from collections import deque
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from types import SimpleNamespace
-from typing import Protocol
+from typing import ClassVar
 
 import usb.core
 from usb.backend import IBackend
 
 from drivers.links.link import STILL_IMAGE_CLASS
+from drivers.links.usb import open_usb
 from drivers.ptp.codes import VENDOR_CANON_USB, ResponseCode
-from drivers.ptp.session import PtpRequest
+from drivers.ptp.session import NoAnswer, PtpRequest, Responder
 from drivers.ptp.usb import (
     HIGH_SPEED_PACKET,
     ContainerReader,
@@ -46,13 +47,14 @@ from drivers.ptp.usb import (
     DataStart,
     DeviceStatus,
     Message,
+    UsbTransport,
     decode_cancel,
     encode,
     encode_data_header,
     ends_with_empty_packet,
 )
 from foundation.errors import ProtocolError
-from sim.buses.responder import NoAnswer, Responder
+from sim.clock import SimulatedClock
 
 PACKET = HIGH_SPEED_PACKET
 INTERRUPT_PACKET = 8
@@ -66,7 +68,7 @@ INTERRUPT_IN = 0x83
 
 _BULK, _INTERRUPT = 2, 3
 """Transfer types in an endpoint's bmAttributes (USB 2.0, 9.6.6)."""
-_DEVICE, _CONFIGURATION, _STRING = 1, 2, 3
+_DEVICE, _CONFIGURATION, _STRING, _INTERFACE, _ENDPOINT = 1, 2, 3, 4, 5
 """Types of descriptors (USB 2.0, 9.4, table 9-5)."""
 _LANGUAGE_ENGLISH = 0x0409
 """The one language of the string descriptors: LANGID of English, United States (USB 2.0, 9.6.7)."""
@@ -89,6 +91,8 @@ class UsbIdentity:
     serial: str | None = "0123456789"
     manufacturer: str = "Canon Inc."
     name: str = "Canon Digital Camera"
+    version: int = 0x0200
+    """bcdUSB: high speed from 2.00 on."""
 
 
 @dataclass(frozen=True)
@@ -125,32 +129,52 @@ class _Exchange:
     events: deque[memoryview] = field(default_factory=deque[memoryview])
 
 
-class PtpUsbDevice:
-    """A still image device of one configuration and one interface, at high speed."""
+def endpoint_descriptor(address: int, kind: int, packet: int, interval: int = 0) -> bytes:
+    """Return the 7 bytes that describe a pipe; `kind` 2 is bulk, 3 interrupt."""
+    return struct.pack("<BBBBHB", 7, _ENDPOINT, address, kind, packet, interval)
 
-    def __init__(self, responder: Responder, identity: UsbIdentity | None = None) -> None:
-        self.identity = identity or UsbIdentity()
-        self._responder = responder
+
+class UsbDevice(ABC):
+    """A device of one configuration and one interface: its descriptors and standard requests, and its pipes."""
+
+    pipes: ClassVar[frozenset[int]]
+    """Addresses of its endpoints."""
+
+    def __init__(self, identity: UsbIdentity) -> None:
+        self.identity = identity
         self._halted: set[int] = set()
         self._configuration = 1
-        self._exchange = _Exchange()
+
+    @abstractmethod
+    def interface_descriptors(self) -> bytes:
+        """Return the descriptors of the interface and its endpoints."""
+
+    @abstractmethod
+    def write(self, endpoint: int, data: bytes) -> None:
+        """Take packets from the host: `data` in full packets, the last perhaps short or, for b"", empty."""
+
+    @abstractmethod
+    def read(self, endpoint: int, limit: int) -> bytes | None:
+        """Return up to `limit` bytes of a transfer to the host, None where there is nothing yet."""
+
+    @abstractmethod
+    def unplugged(self) -> None:
+        """Forget everything: the cable was pulled, or the bus was reset."""
+
+    def class_request(self, setup: Setup, data: bytes) -> bytes:
+        """Carry out a request of the interface's class and return its data, if it goes to the host."""
+        raise Stalled
 
     def device_descriptor(self) -> bytes:
         """Return the 18 bytes that name the device."""
         identity = self.identity
         serial = 0 if identity.serial is None else 3
-        numbers = (0x0200, 0, 0, 0, 64, identity.vendor, identity.product, 0x0002, 1, 2, serial, 1)
+        numbers = (identity.version, 0, 0, 0, 64, identity.vendor, identity.product, 0x0002, 1, 2, serial, 1)
         return struct.pack("<BBHBBBBHHHBBBB", 18, _DEVICE, *numbers)
 
     def configuration_descriptor(self) -> bytes:
-        """Return the descriptors of the configuration, its interface and the three endpoints."""
-        interface = struct.pack("<BBBBBBBBB", 9, 4, 0, 0, 3, *STILL_IMAGE_CLASS, 0)
-        endpoints = (
-            struct.pack("<BBBBHB", 7, 5, BULK_IN, _BULK, PACKET, 0),
-            struct.pack("<BBBBHB", 7, 5, BULK_OUT, _BULK, PACKET, 0),
-            struct.pack("<BBBBHB", 7, 5, INTERRUPT_IN, _INTERRUPT, INTERRUPT_PACKET, 6),
-        )
-        body = interface + b"".join(endpoints)
+        """Return the descriptors of the configuration, its interface and its endpoints."""
+        body = self.interface_descriptors()
         return struct.pack("<BBHBBBBB", 9, _CONFIGURATION, 9 + len(body), 1, 1, 0, 0xC0, 1) + body
 
     def control(self, setup: Setup, data: bytes = b"") -> bytes:
@@ -159,13 +183,73 @@ class PtpUsbDevice:
             case 0x00, recipient:
                 answer = self._standard(setup, recipient)
             case 0x20, 1:
-                answer = self._class(setup, data)
+                answer = self.class_request(setup, data)
             case _:
                 raise Stalled
         return answer[: setup.length]
 
-    def bulk_out(self, data: bytes) -> None:
-        """Take packets from the host: `data` in full packets, the last perhaps short or, for b"", empty."""
+    def halt(self, endpoint: int) -> None:
+        """Stall a pipe until the host clears it."""
+        self._halted.add(endpoint)
+
+    def _standard(self, setup: Setup, recipient: int) -> bytes:
+        match setup.request, setup.value >> 8:
+            case 6, 1:
+                return self.device_descriptor()
+            case 6, 2:
+                return self.configuration_descriptor()
+            case 6, 3:
+                return self._string(setup.value & 0xFF)
+            case 8, _:
+                return bytes([self._configuration])
+            case 9, _:
+                self._configuration = setup.value & 0xFF
+                return b""
+            case 10, _:
+                return b"\0"
+            case 11, _:
+                return b""
+            case 0, _:
+                return bytes([recipient == 2 and setup.index in self._halted, 0])
+            case 1, _ if recipient == 2:
+                self._halted.discard(setup.index)
+                return b""
+            case 3, _ if recipient == 2:
+                self._halted.add(setup.index)
+                return b""
+            case _:
+                raise Stalled
+
+    def _string(self, index: int) -> bytes:
+        identity = self.identity
+        texts = (identity.manufacturer, identity.name, identity.serial)
+        if index == 0:
+            body = struct.pack("<H", _LANGUAGE_ENGLISH)
+        elif index <= len(texts) and (text := texts[index - 1]) is not None:
+            body = text.encode("utf-16-le")
+        else:
+            raise Stalled
+        return bytes([2 + len(body), _STRING]) + body
+
+
+class PtpUsbDevice(UsbDevice):
+    """A still image device, at high speed."""
+
+    pipes = frozenset({BULK_IN, BULK_OUT, INTERRUPT_IN})
+
+    def __init__(self, responder: Responder, identity: UsbIdentity | None = None) -> None:
+        super().__init__(identity or UsbIdentity())
+        self._responder = responder
+        self._exchange = _Exchange()
+
+    def interface_descriptors(self) -> bytes:
+        """Return the descriptors of the interface and the three endpoints."""
+        interface = struct.pack("<BBBBBBBBB", 9, _INTERFACE, 0, 0, 3, *STILL_IMAGE_CLASS, 0)
+        bulk = endpoint_descriptor(BULK_IN, _BULK, PACKET) + endpoint_descriptor(BULK_OUT, _BULK, PACKET)
+        return interface + bulk + endpoint_descriptor(INTERRUPT_IN, _INTERRUPT, INTERRUPT_PACKET, 6)
+
+    def write(self, endpoint: int, data: bytes) -> None:
+        """Take packets from the host."""
         if BULK_OUT in self._halted:
             raise Stalled
         exchange = self._exchange
@@ -181,19 +265,13 @@ class PtpUsbDevice:
             exchange.complete = None
             self._answer(request, payload)
 
-    def bulk_in(self, limit: int) -> bytes | None:
+    def read(self, endpoint: int, limit: int) -> bytes | None:
         """Return up to `limit` bytes of a transfer to the host, None where there is nothing yet."""
-        return self._packets(BULK_IN, self._exchange.outgoing, PACKET, limit)
-
-    def interrupt_in(self, limit: int) -> bytes | None:
-        """Return up to `limit` bytes of events, None where there are none."""
+        if endpoint == BULK_IN:
+            return self._packets(BULK_IN, self._exchange.outgoing, PACKET, limit)
         for event in self._responder.events():
             self._exchange.events.append(memoryview(encode(event)))
         return self._packets(INTERRUPT_IN, self._exchange.events, INTERRUPT_PACKET, limit)
-
-    def halt(self, endpoint: int) -> None:
-        """Stall a pipe until the host clears it."""
-        self._halted.add(endpoint)
 
     def unplugged(self) -> None:
         """Forget everything: the cable was pulled, or the bus was reset."""
@@ -258,46 +336,8 @@ class PtpUsbDevice:
                 break
         return b"".join(taken)
 
-    def _standard(self, setup: Setup, recipient: int) -> bytes:
-        match setup.request, setup.value >> 8:
-            case 6, 1:
-                return self.device_descriptor()
-            case 6, 2:
-                return self.configuration_descriptor()
-            case 6, 3:
-                return self._string(setup.value & 0xFF)
-            case 8, _:
-                return bytes([self._configuration])
-            case 9, _:
-                self._configuration = setup.value & 0xFF
-                return b""
-            case 10, _:
-                return b"\0"
-            case 11, _:
-                return b""
-            case 0, _:
-                return bytes([recipient == 2 and setup.index in self._halted, 0])
-            case 1, _ if recipient == 2:
-                self._halted.discard(setup.index)
-                return b""
-            case 3, _ if recipient == 2:
-                self._halted.add(setup.index)
-                return b""
-            case _:
-                raise Stalled
-
-    def _string(self, index: int) -> bytes:
-        identity = self.identity
-        texts = (identity.manufacturer, identity.name, identity.serial)
-        if index == 0:
-            body = struct.pack("<H", _LANGUAGE_ENGLISH)
-        elif index <= len(texts) and (text := texts[index - 1]) is not None:
-            body = text.encode("utf-16-le")
-        else:
-            raise Stalled
-        return bytes([2 + len(body), _STRING]) + body
-
-    def _class(self, setup: Setup, data: bytes) -> bytes:
+    def class_request(self, setup: Setup, data: bytes) -> bytes:
+        """Carry out a request of the still image class and return its data, if it goes to the host."""
         match setup.request:
             case ControlRequest.CANCEL:
                 try:
@@ -330,76 +370,23 @@ _ERRORS = {
 }
 _HIGH_SPEED = 3
 """LIBUSB_SPEED_HIGH, 480 Mbit/s, as the real bodies."""
-_DEVICE_FIELDS = (
-    "bLength",
-    "bDescriptorType",
-    "bcdUSB",
-    "bDeviceClass",
-    "bDeviceSubClass",
-    "bDeviceProtocol",
-    "bMaxPacketSize0",
-    "idVendor",
-    "idProduct",
-    "bcdDevice",
-    "iManufacturer",
-    "iProduct",
-    "iSerialNumber",
-    "bNumConfigurations",
-)
-_CONFIGURATION_FIELDS = (
-    "bLength",
-    "bDescriptorType",
-    "wTotalLength",
-    "bNumInterfaces",
-    "bConfigurationValue",
-    "iConfiguration",
-    "bmAttributes",
-    "bMaxPower",
-)
-_INTERFACE_FIELDS = (
-    "bLength",
-    "bDescriptorType",
-    "bInterfaceNumber",
-    "bAlternateSetting",
-    "bNumEndpoints",
-    "bInterfaceClass",
-    "bInterfaceSubClass",
-    "bInterfaceProtocol",
-    "iInterface",
-)
-_ENDPOINT_FIELDS = (
-    "bLength",
-    "bDescriptorType",
-    "bEndpointAddress",
-    "bmAttributes",
-    "wMaxPacketSize",
-    "bInterval",
-)
-
-
-class PluggedDevice(Protocol):
-    """What the bus asks of a device; `sim.buses.usb.PtpUsbDevice` says what each method does."""
-
-    def device_descriptor(self) -> bytes: ...  # noqa: D102
-
-    def configuration_descriptor(self) -> bytes: ...  # noqa: D102
-
-    def control(self, setup: Setup, data: bytes = b"") -> bytes: ...  # noqa: D102
-
-    def bulk_out(self, data: bytes) -> None: ...  # noqa: D102
-
-    def bulk_in(self, limit: int) -> bytes | None: ...  # noqa: D102
-
-    def interrupt_in(self, limit: int) -> bytes | None: ...  # noqa: D102
-
-    def unplugged(self) -> None: ...  # noqa: D102
+_FIELDS = {
+    _DEVICE: "bcdUSB bDeviceClass bDeviceSubClass bDeviceProtocol bMaxPacketSize0 idVendor idProduct bcdDevice "
+    "iManufacturer iProduct iSerialNumber bNumConfigurations",
+    _CONFIGURATION: "wTotalLength bNumInterfaces bConfigurationValue iConfiguration bmAttributes bMaxPower",
+    _INTERFACE: "bInterfaceNumber bAlternateSetting bNumEndpoints bInterfaceClass bInterfaceSubClass "
+    "bInterfaceProtocol iInterface",
+    _ENDPOINT: "bEndpointAddress bmAttributes wMaxPacketSize bInterval",
+}
+"""Fields of each type of descriptor behind length and type; what begins with w, id or bcd has two bytes, the rest one
+(USB 2.0, 9.6)."""
 
 
 @dataclass(frozen=True)
 class Place:
     """Where a device is plugged in, and since when: two places of one device differ in their address."""
 
-    device: PluggedDevice
+    device: UsbDevice
     port: int
     address: int
 
@@ -415,49 +402,51 @@ class Handle:
 class SimulatedBus(IBackend):
     """A bus with devices that can be plugged in and pulled out."""
 
-    def __init__(self) -> None:
+    def __init__(self, *devices: UsbDevice) -> None:
         self._places: list[Place] = []
         self._addresses = 1
         self._claims: dict[Place, Handle] = {}
-        self._held: set[PluggedDevice] = set()
-        self._locked: set[PluggedDevice] = set()
-        self._kernel: set[PluggedDevice] = set()
+        self._held: set[UsbDevice] = set()
+        self._locked: set[UsbDevice] = set()
+        self._kernel: set[UsbDevice] = set()
+        for port, device in enumerate(devices, 1):
+            self.plug(device, port)
 
-    def plug(self, device: PluggedDevice, port: int = 1) -> None:
+    def plug(self, device: UsbDevice, port: int = 1) -> None:
         """Plug a device in."""
         self._addresses += 1
         self._places.append(Place(device, port, self._addresses))
 
-    def unplug(self, device: PluggedDevice) -> None:
+    def unplug(self, device: UsbDevice) -> None:
         """Pull a device out; does nothing if it is not plugged in."""
         for place in [place for place in self._places if place.device is device]:
             self._places.remove(place)
             self._claims.pop(place, None)
             device.unplugged()
 
-    def replug(self, device: PluggedDevice) -> None:
+    def replug(self, device: UsbDevice) -> None:
         """Pull a device out and plug it in again at its port, as it does itself when it restarts."""
         port = next((place.port for place in self._places if place.device is device), 1)
         self.unplug(device)
         self.plug(device, port)
 
-    def hold(self, device: PluggedDevice, held: bool = True) -> None:
+    def hold(self, device: UsbDevice, held: bool = True) -> None:
         """Have another program hold the device's interface, or let go of it."""
         (self._held.add if held else self._held.discard)(device)
 
-    def lock(self, device: PluggedDevice, locked: bool = True) -> None:
+    def lock(self, device: UsbDevice, locked: bool = True) -> None:
         """Take away the permission to open the device, or give it."""
         (self._locked.add if locked else self._locked.discard)(device)
 
-    def bind_kernel_driver(self, device: PluggedDevice) -> None:
+    def bind_kernel_driver(self, device: UsbDevice) -> None:
         """Have the system's own driver sit on the interface."""
         self._kernel.add(device)
 
-    def kernel_driver_sits_on(self, device: PluggedDevice) -> bool:
+    def kernel_driver_sits_on(self, device: UsbDevice) -> bool:
         """Return whether the system's own driver sits on the interface."""
         return device in self._kernel
 
-    def is_claimed(self, device: PluggedDevice) -> bool:
+    def is_claimed(self, device: UsbDevice) -> bool:
         """Return whether the interface is claimed on this bus."""
         return any(place.device is device for place in self._claims)
 
@@ -472,31 +461,22 @@ class SimulatedBus(IBackend):
 
     def get_device_descriptor(self, dev: Place) -> SimpleNamespace:
         """Return the device's descriptor and its place."""
-        fields = struct.unpack("<BBHBBBBHHHBBBB", dev.device.device_descriptor())
-        return SimpleNamespace(
-            **dict(zip(_DEVICE_FIELDS, fields, strict=True)),
-            bus=1,
-            address=dev.address,
-            port_number=dev.port,
-            port_numbers=(dev.port,),
-            speed=_HIGH_SPEED,
-        )
+        described = _described(dev.device.device_descriptor(), _DEVICE)
+        described.bus, described.address, described.speed = 1, dev.address, _HIGH_SPEED
+        described.port_number, described.port_numbers = dev.port, (dev.port,)
+        return described
 
     def get_configuration_descriptor(self, dev: Place, config: int) -> SimpleNamespace:
         """Return the only configuration's descriptor."""
-        if config:
-            raise IndexError(f"configuration {config}")
-        return _described(dev, 2, 0, "<BBHBBBBB", _CONFIGURATION_FIELDS)
+        return _described(dev.device.configuration_descriptor(), _CONFIGURATION, config)
 
     def get_interface_descriptor(self, dev: Place, intf: int, alt: int, config: int) -> SimpleNamespace:
         """Return the only interface's descriptor."""
-        if intf or alt or config:
-            raise IndexError(f"interface {intf}, alternate setting {alt}")
-        return _described(dev, 4, 0, "<BBBBBBBBB", _INTERFACE_FIELDS)
+        return _described(dev.device.configuration_descriptor(), _INTERFACE, intf + alt + config)
 
     def get_endpoint_descriptor(self, dev: Place, ep: int, intf: int, alt: int, config: int) -> SimpleNamespace:
         """Return an endpoint's descriptor."""
-        described = _described(dev, 5, ep, "<BBBBHB", _ENDPOINT_FIELDS)
+        described = _described(dev.device.configuration_descriptor(), _ENDPOINT, ep)
         described.bRefresh = described.bSynchAddress = 0
         return described
 
@@ -541,24 +521,30 @@ class SimulatedBus(IBackend):
             del self._claims[dev_handle.place]
 
     def bulk_write(self, dev_handle: Handle, ep: int, intf: int, data: array[int], timeout: int) -> int:
-        """Send to the bulk pipe."""
-        self._check_transfer(dev_handle, ep, BULK_OUT)
+        """Send to a pipe."""
+        self._check_transfer(dev_handle, ep)
         try:
-            dev_handle.device.bulk_out(data.tobytes())
+            dev_handle.device.write(ep, data.tobytes())
         except Stalled as error:
             raise _error(errno.EPIPE) from error
         self._check(dev_handle)
         return len(data)
 
     def bulk_read(self, dev_handle: Handle, ep: int, intf: int, buff: array[int], timeout: int) -> int:
-        """Read from the bulk pipe."""
-        self._check_transfer(dev_handle, ep, BULK_IN)
-        return _fill(buff, dev_handle.device.bulk_in)
+        """Read from a pipe."""
+        self._check_transfer(dev_handle, ep)
+        try:
+            data = dev_handle.device.read(ep, len(buff))
+        except Stalled as error:
+            raise _error(errno.EPIPE) from error
+        except Overflowed as error:
+            raise _error(errno.EOVERFLOW) from error
+        if data is None:
+            raise _error(errno.ETIMEDOUT)
+        memoryview(buff)[: len(data)] = data
+        return len(data)
 
-    def intr_read(self, dev_handle: Handle, ep: int, intf: int, buff: array[int], timeout: int) -> int:
-        """Read from the interrupt pipe."""
-        self._check_transfer(dev_handle, ep, INTERRUPT_IN)
-        return _fill(buff, dev_handle.device.interrupt_in)
+    intr_write, intr_read = bulk_write, bulk_read
 
     def ctrl_transfer(
         self,
@@ -607,9 +593,9 @@ class SimulatedBus(IBackend):
         if handle.place not in self._places:
             raise _error(errno.ENODEV)
 
-    def _check_transfer(self, handle: Handle, endpoint: int, expected: int) -> None:
+    def _check_transfer(self, handle: Handle, endpoint: int) -> None:
         self._check(handle)
-        if endpoint != expected:
+        if endpoint not in handle.device.pipes:
             raise _error(errno.ENOENT)
         if self._claims.get(handle.place) is not handle:
             raise _error(errno.EIO)
@@ -622,34 +608,36 @@ class SimulatedBus(IBackend):
             raise _error(errno.EPIPE) from error
 
 
-def _fill(buff: array[int], read: Callable[[int], bytes | None]) -> int:
-    try:
-        data = read(len(buff))
-    except Stalled as error:
-        raise _error(errno.EPIPE) from error
-    except Overflowed as error:
-        raise _error(errno.EOVERFLOW) from error
-    if data is None:
-        raise _error(errno.ETIMEDOUT)
-    memoryview(buff)[: len(data)] = data
-    return len(data)
-
-
 def _error(number: int) -> usb.core.USBError:
     code, text = _ERRORS[number]
     kind = usb.core.USBTimeoutError if number == errno.ETIMEDOUT else usb.core.USBError
     return kind(text, code, number)
 
 
-def _described(place: Place, kind: int, index: int, layout: str, names: tuple[str, ...]) -> SimpleNamespace:
-    """Return the fields of the `index`-th descriptor of a kind in the configuration."""
-    descriptors = place.device.configuration_descriptor()
+def _described(descriptors: bytes, kind: int, index: int = 0) -> SimpleNamespace:
+    """Return the fields of the `index`-th descriptor of a kind."""
+    names = _FIELDS[kind].split()
+    layout = "<" + "".join("H" if name.startswith(("w", "id", "bcd")) else "B" for name in names)
     at = 0
     while at < len(descriptors):
         if descriptors[at + 1] == kind:
             if not index:
-                fields = struct.unpack_from(layout, descriptors, at)
-                return SimpleNamespace(**dict(zip(names, fields, strict=True)), extra_descriptors=[])
+                fields = struct.unpack_from(layout, descriptors, at + 2)
+                described = dict(zip(names, fields, strict=True))
+                return SimpleNamespace(bLength=descriptors[at], bDescriptorType=kind, **described, extra_descriptors=[])
             index -= 1
         at += descriptors[at]
     raise IndexError(f"descriptor {index} of type {kind}")
+
+
+class MemoryTransport(UsbTransport):
+    """A `drivers.ptp.session.Transport` to a responder on a bus of its own: no cable, no thread and no wait."""
+
+    def __init__(self, responder: Responder) -> None:
+        self._device = PtpUsbDevice(responder, UsbIdentity(name="the simulated Canon Digital Camera"))
+        self._bus = SimulatedBus(self._device)
+        super().__init__(open_usb(backend=self._bus), SimulatedClock())
+
+    def pull(self) -> None:
+        """Pull the cable."""
+        self._bus.unplug(self._device)

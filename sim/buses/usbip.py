@@ -36,7 +36,7 @@ from dataclasses import dataclass
 from drivers.links.link import Link
 from drivers.links.network import LOOPBACK, TcpServer
 from foundation.errors import LinkClosed, LinkTimeout, ProtocolError
-from sim.buses.usb import BULK_IN, BULK_OUT, INTERRUPT_IN, PACKET, Overflowed, PtpUsbDevice, Setup, Stalled
+from sim.buses.usb import BULK_OUT, PACKET, Overflowed, PtpUsbDevice, Setup, Stalled
 
 PORT = 3240
 """TCP port of a USB/IP server (usb/usbip_protocol)."""
@@ -192,22 +192,9 @@ def _describe(bus_id: str, device: PtpUsbDevice) -> bytes:
     bus, number = device_number(bus_id)
     vendor, product, release = struct.unpack_from("<HHH", device.device_descriptor(), 8)
     path = f"/sys/devices/simulated/usb{bus}/{bus_id}"
+    names = path.encode("ascii"), bus_id.encode("ascii")
     return struct.pack(
-        ">256s32sIIIHHHBBBBBB",
-        path.encode("ascii"),
-        bus_id.encode("ascii"),
-        bus,
-        number,
-        HIGH_SPEED,
-        vendor,
-        product,
-        release,
-        0,
-        0,
-        0,
-        1,
-        1,
-        1,
+        ">256s32sIIIHHHBBBBBB", *names, bus, number, HIGH_SPEED, vendor, product, release, 0, 0, 0, 1, 1, 1
     )
 
 
@@ -215,7 +202,7 @@ _READ = 256 * 1024
 """Bytes read at once; large beside a request, so that a long transfer out takes few calls."""
 _TICK_S = 0.02
 """Between two looks at transfers that wait for data: short beside the times a host waits."""
-_PATIENCE_S = 10.0
+_TIMEOUT_S = 10.0
 """For a host that is slow to read or write; an idle one is listened to again."""
 _EREMOTEIO = 121
 """Linux's number for a transfer that was short although that was not allowed; not every system has it in errno."""
@@ -241,11 +228,11 @@ class UsbIpService:
         """Serve one connection until it ends."""
         reader = RequestReader()
         try:
-            while not (requests := reader.feed(link.read(_READ, _PATIENCE_S))):
+            while not (requests := reader.feed(link.read(_READ, _TIMEOUT_S))):
                 pass
             match requests[0]:
                 case ListRequest():
-                    link.write(encode_list(self._devices), _PATIENCE_S)
+                    link.write(encode_list(self._devices), _TIMEOUT_S)
                 case ImportRequest(bus_id):
                     self._lend(link, reader, bus_id, requests[1:])
                 case _:
@@ -258,7 +245,7 @@ class UsbIpService:
             device = None if bus_id in self._lent else self._devices.get(bus_id)
             if device is not None:
                 self._lent.add(bus_id)
-        link.write(encode_import(bus_id, device), _PATIENCE_S)
+        link.write(encode_import(bus_id, device), _TIMEOUT_S)
         if device is None:
             return
         try:
@@ -290,7 +277,7 @@ class _Loan:
                         raise ProtocolError("a USB/IP client sends an operation among transfers")
             self._serve_waiting()
             try:
-                piece = self._link.read(_READ, _TICK_S if self._waiting else _PATIENCE_S)
+                piece = self._link.read(_READ, _TICK_S if self._waiting else _TIMEOUT_S)
             except LinkTimeout:
                 piece = b""
             requests = reader.feed(piece)
@@ -310,7 +297,7 @@ class _Loan:
         status = -errno.ECONNRESET if len(left) < len(self._waiting) else 0
         self._waiting = left
         self._held.discard(unlink.victim)
-        self._link.write(encode_unlinked(unlink, status), _PATIENCE_S)
+        self._link.write(encode_unlinked(unlink, status), _TIMEOUT_S)
 
     def _control(self, submit: Submit) -> None:
         try:
@@ -322,9 +309,9 @@ class _Loan:
 
     def _out(self, submit: Submit) -> None:
         try:
-            self._device.bulk_out(submit.data)
+            self._device.write(BULK_OUT, submit.data)
             if submit.flags & ZERO_PACKET and submit.data and len(submit.data) % PACKET == 0:
-                self._device.bulk_out(b"")
+                self._device.write(BULK_OUT, b"")
         except Stalled:
             self._end(submit, -errno.EPIPE)
         else:
@@ -343,13 +330,12 @@ class _Loan:
 
     def _try_in(self, submit: Submit) -> bool:
         """Serve one transfer in; return whether it has ended."""
-        pipes = {BULK_IN: self._device.bulk_in, INTERRUPT_IN: self._device.interrupt_in}
-        read = pipes.get(submit.endpoint | 0x80)
-        if read is None:
+        address = submit.endpoint | 0x80
+        if address not in self._device.pipes:
             self._end(submit, -errno.ENOENT)
             return True
         try:
-            data = read(submit.length)
+            data = self._device.read(address, submit.length)
         except Stalled:
             self._end(submit, -errno.EPIPE)
         except Overflowed:
@@ -364,4 +350,4 @@ class _Loan:
         return True
 
     def _end(self, submit: Submit, status: int, data: bytes = b"") -> None:
-        self._link.write(encode_result(submit, status, data), _PATIENCE_S)
+        self._link.write(encode_result(submit, status, data), _TIMEOUT_S)

@@ -11,8 +11,6 @@ users of libgphoto2 have listed them; battery and burst figures of Canon's speci
 
 What all bodies share:
 
-- `OPERATIONS` are those that `sim.camera.eos` answers, in the 60D's order, and no others: a real body has more
-  (uploads, live view, formatting).
 - `EVENTS_EX` are the record types that the 60D names in GetDeviceInfoEx.
 
 Source: a recorded EOS 60D (firmware 1.1.0); libgphoto2 2.5.34 for the structures.
@@ -37,7 +35,6 @@ from drivers.ptp.codes import (
     EventCode,
     FocusMode,
     ObjectFormat,
-    Operation,
     Property,
     WhiteBalance,
 )
@@ -73,7 +70,7 @@ class PropertySpec:
 class EosModel:
     """An EOS body as the wire shows it.
 
-    - `info`: its DeviceInfo; the serial number is the state machine's to add.
+    - `info`: its DeviceInfo; operations and the serial number are the state machine's to add.
     - `usb`: vendor and product.
     - `properties`: every property, as the body stands when it is switched on with its dial at M and the lens on manual
       focus.
@@ -112,48 +109,6 @@ class EosModel:
         return DeviceInfoEx(EVENTS_EX, tuple(spec.code for spec in self.properties), (0, 1, 2, 4))
 
 
-OPERATIONS = (
-    Operation.GET_DEVICE_PROP_DESC,
-    Operation.GET_DEVICE_PROP_VALUE,
-    Operation.SET_DEVICE_PROP_VALUE,
-    Operation.GET_DEVICE_INFO,
-    Operation.OPEN_SESSION,
-    Operation.CLOSE_SESSION,
-    Operation.GET_NUM_OBJECTS,
-    Operation.GET_STORAGE_IDS,
-    Operation.EOS_GET_STORAGE_IDS,
-    Operation.GET_STORAGE_INFO,
-    Operation.EOS_GET_STORAGE_INFO,
-    Operation.GET_OBJECT_HANDLES,
-    Operation.GET_OBJECT_INFO,
-    Operation.GET_OBJECT,
-    Operation.EOS_GET_OBJECT,
-    Operation.GET_THUMB,
-    Operation.GET_PARTIAL_OBJECT,
-    Operation.EOS_GET_PARTIAL_OBJECT,
-    Operation.DELETE_OBJECT,
-    Operation.EOS_DELETE_OBJECT,
-    Operation.EOS_SET_DEVICE_PROP_VALUE_EX,
-    Operation.EOS_REQUEST_DEVICE_PROP_VALUE,
-    Operation.EOS_GET_DEVICE_INFO_EX,
-    Operation.EOS_GET_OBJECT_INFO_EX,
-    Operation.EOS_REMOTE_RELEASE,
-    Operation.EOS_SET_EVENT_MODE,
-    Operation.EOS_SET_REMOTE_MODE,
-    Operation.EOS_GET_REMOTE_MODE,
-    Operation.EOS_GET_EVENT,
-    Operation.EOS_TRANSFER_COMPLETE,
-    Operation.EOS_CANCEL_TRANSFER,
-    Operation.EOS_RESET_TRANSFER,
-    Operation.EOS_KEEP_DEVICE_ON,
-    Operation.EOS_SET_UI_LOCK,
-    Operation.EOS_RESET_UI_LOCK,
-    Operation.EOS_PC_HDD_CAPACITY,
-    Operation.EOS_AF_CANCEL,
-    Operation.EOS_REMOTE_RELEASE_ON,
-    Operation.EOS_REMOTE_RELEASE_OFF,
-    Operation.EOS_RESET_MIRROR_LOCKUP_STATE,
-)
 EVENTS = (
     EventCode.REQUEST_OBJECT_TRANSFER,
     EventCode.STORE_ADDED,
@@ -250,7 +205,6 @@ def _device_info(model: str, version: str, manufacturer: str, extension_version:
     return DeviceInfo(
         vendor_extension_id=6,
         vendor_extension_version=extension_version,
-        operations=tuple(OPERATIONS),
         events=tuple(EVENTS),
         properties=tuple(STANDARD_PROPERTIES),
         capture_formats=(ObjectFormat.EXIF_JPEG,),

@@ -21,8 +21,9 @@ import hashlib
 import heapq
 import itertools
 import threading
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Generator, Iterable
 from concurrent.futures import Executor, Future
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime, timedelta
 from enum import Enum
@@ -68,7 +69,6 @@ from drivers.ptp.codes import (
 )
 from drivers.ptp.datasets import (
     DevicePropDesc,
-    EnumerationForm,
     ObjectInfo,
     StorageInfo,
     Value,
@@ -76,10 +76,9 @@ from drivers.ptp.datasets import (
     encode_u32_array,
     encode_value,
 )
-from drivers.ptp.session import PtpEvent, PtpRequest, PtpResponse
+from drivers.ptp.session import Answer, PtpEvent, PtpRequest, PtpResponse
 from foundation.clock import Clock
 from foundation.errors import CropError, DeviceError, DeviceRefused, LinkClosed, ProtocolError
-from sim.buses.responder import Answer
 from sim.camera.bodies import FOCUS_CENTRE, FREE, LIST, MIRROR_LOCKUP, EosModel, custom_functions, focus_points
 from sim.camera.film import Film
 
@@ -94,7 +93,7 @@ FOLDER = 0x91900000
 BULB = 0x0C
 """The shutter speed that lasts as long as the release is held."""
 U32 = 0xFFFFFFFF
-"""What a parameter or a time can hold at most."""
+"""What a parameter or a time can hold at most; in GetObjectHandles any store, any format, or the root (ISO 15740)."""
 _MEMORY = 0xA0000000
 """Handles of objects in the camera's memory are numbered from here (assumed)."""
 _MOST_SHOTS = 0x7FFFFFFF
@@ -172,8 +171,70 @@ class Card:
         return self.capacity - sum(len(item.data) for item in self.objects.values())
 
 
-class SimulatedEosState:
-    """The state of a body; see `sim.camera.eos.SimulatedEos` for the parameters."""
+_TIMERS_S: dict[int, float] = {
+    DriveMode.TIMER_10_S: 10.0,
+    DriveMode.TIMER_2_S: 2.0,
+    DriveMode.TIMER_CONTINUOUS: 10.0,
+}
+_CONTINUOUS = (
+    DriveMode.CONTINUOUS,
+    DriveMode.CONTINUOUS_HIGH,
+    DriveMode.CONTINUOUS_LOW,
+    DriveMode.CONTINUOUS_SILENT,
+)
+_AUTO_ISO = 400
+"""ISO speed where the body may choose (assumed; there is no meter)."""
+_METERED_S = 1 / 60
+"""Shutter time where the body may choose (assumed; there is no meter)."""
+_METERED_APERTURE = 5.6
+"""Aperture where the body may choose (assumed; there is no meter)."""
+_FORMATS_BY_SUFFIX = {".crw": ObjectFormat.CRW, ".cr3": ObjectFormat.CR3}
+_JPEG_SIZE = (160, 240)
+"""Height and width, px: enough for the file's name, and next to nothing to encode."""
+
+
+class _Refusal(Enum):
+    """Why a full press takes no picture: the response to RemoteReleaseOn, and the result of RemoteRelease."""
+
+    BUSY = (ResponseCode.DEVICE_BUSY, 0x2019)
+    NO_FOCUS = (ResponseCode.DEVICE_BUSY, 1)
+    MIRROR_LOCKUP = (ResponseCode.DEVICE_BUSY, 3)
+    MEMORY_FULL = (ResponseCode.DEVICE_BUSY, 7)
+    STORE_FULL = (ResponseCode.STORE_FULL, 7)
+    BATTERY_EMPTY = (ResponseCode.EOS_LOW_BATTERY, ResponseCode.EOS_LOW_BATTERY)
+    EXPOSURE = (ResponseCode.GENERAL_ERROR, ResponseCode.GENERAL_ERROR)
+
+    def __init__(self, response: int, result: int) -> None:
+        self.response = response
+        self.result = result
+
+
+@dataclass(frozen=True)
+class _Frame:
+    """A picture under way: what the film makes of it (None where it failed) and where it goes."""
+
+    number: int
+    taken_at: datetime
+    raw: Future[bytes | None]
+    formats: ImageFormat
+    destination: int
+
+
+_FREELY_SET = (*_TEXTS, Property.EOS_CAMERA_TIME)
+
+_SHUTDOWN_WARNING_S = 10.0
+"""How long before it goes to sleep the camera says so (assumed)."""
+
+
+class SimulatedEos:
+    """An EOS body on a cable; a `drivers.ptp.session.Responder`.
+
+    `card_bytes`: capacity of the card; None for an empty slot. `auto_power_off_s`: idle seconds after which it goes to
+    sleep; 0 for never, None for the body's own setting. Asking for events keeps no body awake, KeepDeviceOn does.
+    `battery`: charge, 0 … 1. `executor`: where the film is developed. None does it while the release is answered, and
+    is what tests want; a camera on a real cable hands in an executor of one thread, so that a large frame does not hold
+    up the answers.
+    """
 
     def __init__(
         self,
@@ -181,14 +242,17 @@ class SimulatedEosState:
         film: Film,
         clock: Clock,
         *,
-        serial: str,
-        card_bytes: int | None,
-        auto_power_off_s: int | None,
-        battery: float,
-        shutter_count: int,
-        forgetful: bool,
-        executor: Executor | None,
+        serial: str = "0000000001",
+        card_bytes: int | None = 8 << 30,
+        auto_power_off_s: int | None = None,
+        battery: float = 1.0,
+        shutter_count: int = 5000,
+        without: Iterable[int] = (),
+        forgetful: bool = False,
+        executor: Executor | None = None,
     ) -> None:
+        self._guard = threading.RLock()
+        self._operations = {code: answer for code, answer in self._handlers().items() if code not in set(without)}
         self.body = body
         self.serial = serial
         self._film = film
@@ -242,12 +306,37 @@ class SimulatedEosState:
 
     # Time.
 
+    @contextmanager
+    def _moved(self) -> Generator[None]:
+        """Let everything happen that has fallen due, and hold the state for the block."""
+        with self._guard:
+            self._move()
+            yield
+
     def _move(self) -> None:
-        """Let everything happen that has fallen due."""
+        """Let everything happen that has fallen due, and fall asleep in the end."""
         now = self._clock.monotonic()
         while self._due and self._due[0][0] <= now:
             _, _, happen = heapq.heappop(self._due)
             happen()
+        limit = number_of(self._properties[Property.EOS_AUTO_POWER_OFF].value)
+        if not self._session or not limit or self._is_busy:
+            return
+        idle = self._clock.monotonic() - self._idle_since
+        if idle >= limit:
+            self._end_session()
+            self._memory.clear()
+            self._asleep = True
+        elif idle >= limit - min(_SHUTDOWN_WARNING_S, limit / 2) and not self._warned:
+            self._warned = True
+            self._record(Notice(EosEvent.WILL_SOON_SHUT_DOWN, int(limit - idle)))
+
+    def _touch(self) -> None:
+        self._idle_since = self._clock.monotonic()
+        if self._warned:
+            self._warned = False
+            limit = number_of(self._properties[Property.EOS_AUTO_POWER_OFF].value)
+            self._record(Notice(EosEvent.SHUTDOWN_TIMER_UPDATED, limit))
 
     def _at(self, when: float, happen: Callable[[], None]) -> None:
         heapq.heappush(self._due, (when, next(self._order), happen))
@@ -380,15 +469,7 @@ class SimulatedEosState:
             free = card
         return min(max(free, 0) // self.body.frame_bytes, _MOST_SHOTS)
 
-
-_ROOT = 0xFFFFFFFF
-"""Parent in GetObjectHandles: only what lies in the root (ISO 15740, GetObjectHandles)."""
-_ANY_STORE = _ANY_FORMAT = 0xFFFFFFFF
-"""Store or format in GetObjectHandles: all of them."""
-
-
-class EosFiles(SimulatedEosState):
-    """What an initiator can ask of a body's files, and do with them."""
+    # What an initiator can ask of the files, and do with them.
 
     def _get_storage_ids(self, _: Arguments) -> OperationResult:
         return OperationResult(encode_u32_array((EMPTY_SLOT if self._card is None else CARD,)))
@@ -402,22 +483,22 @@ class EosFiles(SimulatedEosState):
         return OperationResult(info.encode())
 
     def _require_store(self, storage: int) -> None:
-        if storage not in (EMPTY_SLOT if self._card is None else CARD, _ANY_STORE):
+        if storage not in (EMPTY_SLOT if self._card is None else CARD, U32):
             raise OperationRefusal(ResponseCode.INVALID_STORAGE_ID)
 
     def _on_card(self) -> dict[int, StoredObject]:
         return {} if self._card is None else self._card.objects
 
     def _children(self, parent: int) -> list[StoredObject]:
-        if parent not in (0, _ROOT) and parent not in self._on_card():
+        if parent not in (0, U32) and parent not in self._on_card():
             raise OperationRefusal(ResponseCode.INVALID_OBJECT_HANDLE)
-        return [item for item in self._on_card().values() if item.parent == (0 if parent == _ROOT else parent)]
+        return [item for item in self._on_card().values() if item.parent == (0 if parent == U32 else parent)]
 
     def _listed(self, arguments: Arguments) -> list[StoredObject]:
         self._require_store(arguments.one)
         everything = arguments.three == 0
         found = list(self._on_card().values()) if everything else self._children(arguments.three)
-        return [item for item in found if arguments.two in (0, _ANY_FORMAT, item.format)]
+        return [item for item in found if arguments.two in (0, U32, item.format)]
 
     def _get_num_objects(self, arguments: Arguments) -> OperationResult:
         return OperationResult(parameters=(len(self._listed(arguments)),))
@@ -463,7 +544,7 @@ class EosFiles(SimulatedEosState):
         self._object(arguments.one)
         raise OperationRefusal(ResponseCode.NO_THUMBNAIL_PRESENT)
 
-    def _delete_object(self, arguments: Arguments) -> OperationResult:
+    def _delete_object(self, arguments: Arguments) -> None:
         item = self._object(arguments.one)
         if item.format == ObjectFormat.ASSOCIATION:
             raise OperationRefusal(ResponseCode.OBJECT_WRITE_PROTECTED)
@@ -473,21 +554,17 @@ class EosFiles(SimulatedEosState):
             self._report(Property.EOS_AVAILABLE_SHOTS)
         else:
             del self._memory[item.handle]
-        return OperationResult()
 
-    def _transfer_complete(self, arguments: Arguments) -> OperationResult:
+    def _transfer_complete(self, arguments: Arguments) -> None:
         if self._memory.pop(arguments.one, None) is None:
             raise OperationRefusal(ResponseCode.INVALID_OBJECT_HANDLE)
-        return OperationResult()
 
-    def _reset_transfer(self, _: Arguments) -> OperationResult:
+    def _reset_transfer(self, _: Arguments) -> None:
         self._memory.clear()
-        return OperationResult()
 
-    def _pc_hdd_capacity(self, arguments: Arguments) -> OperationResult:
+    def _pc_hdd_capacity(self, arguments: Arguments) -> None:
         self._host_bytes = arguments.one * arguments.two
         self._report(Property.EOS_AVAILABLE_SHOTS)
-        return OperationResult()
 
     def _frames_waiting(self) -> int:
         return len({item.name.rpartition(".")[0] for item in self._memory.values()})
@@ -497,60 +574,9 @@ class EosFiles(SimulatedEosState):
         request = EosEvent.REQUEST_OBJECT_TRANSFER_64 if wide else EosEvent.REQUEST_OBJECT_TRANSFER
         self._record(TransferRequest(item.handle, item.format, len(item.data), item.name, request))
 
+    # What a finger on the release does, at the camera or far away.
 
-_TIMERS_S: dict[int, float] = {
-    DriveMode.TIMER_10_S: 10.0,
-    DriveMode.TIMER_2_S: 2.0,
-    DriveMode.TIMER_CONTINUOUS: 10.0,
-}
-_CONTINUOUS = (
-    DriveMode.CONTINUOUS,
-    DriveMode.CONTINUOUS_HIGH,
-    DriveMode.CONTINUOUS_LOW,
-    DriveMode.CONTINUOUS_SILENT,
-)
-_AUTO_ISO = 400
-"""ISO speed where the body may choose (assumed; there is no meter)."""
-_METERED_S = 1 / 60
-"""Shutter time where the body may choose (assumed; there is no meter)."""
-_METERED_APERTURE = 5.6
-"""Aperture where the body may choose (assumed; there is no meter)."""
-_FORMATS_BY_SUFFIX = {".crw": ObjectFormat.CRW, ".cr3": ObjectFormat.CR3}
-_JPEG_SIZE = (160, 240)
-"""Height and width, px: enough for the file's name, and next to nothing to encode."""
-
-
-class _Refusal(Enum):
-    """Why a full press takes no picture: the response to RemoteReleaseOn, and the result of RemoteRelease."""
-
-    BUSY = (ResponseCode.DEVICE_BUSY, 0x2019)
-    NO_FOCUS = (ResponseCode.DEVICE_BUSY, 1)
-    MIRROR_LOCKUP = (ResponseCode.DEVICE_BUSY, 3)
-    MEMORY_FULL = (ResponseCode.DEVICE_BUSY, 7)
-    STORE_FULL = (ResponseCode.STORE_FULL, 7)
-    BATTERY_EMPTY = (ResponseCode.EOS_LOW_BATTERY, ResponseCode.EOS_LOW_BATTERY)
-    EXPOSURE = (ResponseCode.GENERAL_ERROR, ResponseCode.GENERAL_ERROR)
-
-    def __init__(self, response: int, result: int) -> None:
-        self.response = response
-        self.result = result
-
-
-@dataclass(frozen=True)
-class _Frame:
-    """A picture under way: what the film makes of it (None where it failed) and where it goes."""
-
-    number: int
-    taken_at: datetime
-    raw: Future[bytes | None]
-    formats: ImageFormat
-    destination: int
-
-
-class EosRelease(EosFiles):
-    """What a finger on the release does, at the camera or far away."""
-
-    def _remote_release_on(self, arguments: Arguments) -> OperationResult:
+    def _remote_release_on(self, arguments: Arguments) -> None:
         self._require_remote()
         if not 1 <= arguments.one <= ReleaseButton.HALF_AND_FULL:
             raise OperationRefusal(ResponseCode.INVALID_PARAMETER)
@@ -563,14 +589,12 @@ class EosRelease(EosFiles):
             refusal = self._full_press(automatic)
             if refusal is not None:
                 raise OperationRefusal(refusal.response)
-        return OperationResult()
 
-    def _remote_release_off(self, arguments: Arguments) -> OperationResult:
+    def _remote_release_off(self, arguments: Arguments) -> None:
         self._require_remote()
         if not 1 <= arguments.one <= ReleaseButton.HALF_AND_FULL:
             raise OperationRefusal(ResponseCode.INVALID_PARAMETER)
         self._let_go(arguments.one)
-        return OperationResult()
 
     def _remote_release(self, _: Arguments) -> OperationResult:
         self._require_remote()
@@ -588,9 +612,8 @@ class EosRelease(EosFiles):
             self._focused = self._finds_focus
             self._change(Property.EOS_FOCUS_INFO, focus_points((FOCUS_CENTRE,) if self._focused else ()))
 
-    def _cancel_focus(self, _: Arguments) -> OperationResult:
+    def _cancel_focus(self, _: Arguments) -> None:
         self._focused = False
-        return OperationResult()
 
     def _full_press(self, automatic: bool) -> _Refusal | None:
         settings = self._settings()
@@ -768,24 +791,9 @@ class EosRelease(EosFiles):
             self._host_bytes = max(self._host_bytes - len(data), 0)
             self._offer_transfer(self._memory[handle])
 
+    # What an initiator can ask of the settings, and set.
 
-def _small_jpeg(name: str) -> bytes:
-    """Return a JPEG file of a grey picture with its own name on it: what stands in for a rendered frame."""
-    import cv2
-    import numpy as np
-
-    picture = np.full((*_JPEG_SIZE, 3), 118, dtype=np.uint8)
-    picture = cv2.putText(picture, name, (20, 90), cv2.FONT_HERSHEY_SIMPLEX, 1.0, (255, 255, 255))
-    return cv2.imencode(".jpg", picture)[1].tobytes()
-
-
-_FREELY_SET = (Property.EOS_OWNER, Property.EOS_ARTIST, Property.EOS_COPYRIGHT, Property.EOS_CAMERA_TIME)
-
-
-class EosSettings(SimulatedEosState):
-    """What an initiator can ask of a body's settings, and set."""
-
-    def _set_device_prop_value_ex(self, arguments: Arguments) -> OperationResult:
+    def _set_device_prop_value_ex(self, arguments: Arguments) -> None:
         self._require_remote()
         try:
             setting = PropertySetting.decode(arguments.data or b"")
@@ -798,7 +806,6 @@ class EosSettings(SimulatedEosState):
         if self._is_busy or not self._allows(setting, known):
             raise OperationRefusal(ResponseCode.DEVICE_BUSY)
         self._store(setting.code, setting.value)
-        return OperationResult()
 
     def _allows(self, setting: PropertySetting, known: PropertyState) -> bool:
         try:
@@ -827,18 +834,17 @@ class EosSettings(SimulatedEosState):
         if code == Property.EOS_CAPTURE_DESTINATION:
             self._report(Property.EOS_AVAILABLE_SHOTS, Property.EOS_CURRENT_STORAGE, Property.EOS_CURRENT_FOLDER)
 
-    def _request_device_prop_value(self, arguments: Arguments) -> OperationResult:
+    def _request_device_prop_value(self, arguments: Arguments) -> None:
         if arguments.one not in self._properties:
             raise OperationRefusal(ResponseCode.GENERAL_ERROR)
         self._report(arguments.one)
-        return OperationResult()
 
     def _description(self, code: int) -> DevicePropDesc:
         match code:
             case Property.BATTERY_LEVEL:
                 percent = round(100 * self._battery)
-                levels = EnumerationForm((100, 75, 50, 25, 0), widened=True)
-                return DevicePropDesc(code, DataType.UINT8, False, percent, percent, levels)
+                levels = (100, 75, 50, 25, 0)
+                return DevicePropDesc(code, DataType.UINT8, False, percent, percent, levels, widened=True)
             case Property.DEVICE_FRIENDLY_NAME:
                 return DevicePropDesc(code, DataType.STRING, False, self.body.model, self.body.model)
             case Property.PERCEIVED_DEVICE_TYPE:
@@ -857,7 +863,7 @@ class EosSettings(SimulatedEosState):
         description = self._description(arguments.one)
         return OperationResult(encode_value(description.data_type, description.current))
 
-    def _set_device_prop_value(self, arguments: Arguments) -> OperationResult:
+    def _set_device_prop_value(self, arguments: Arguments) -> None:
         description = self._description(arguments.one)
         if not description.writable:
             raise OperationRefusal(ResponseCode.ACCESS_DENIED)
@@ -866,52 +872,6 @@ class EosSettings(SimulatedEosState):
         except ProtocolError:
             raise OperationRefusal(ResponseCode.INVALID_DEVICE_PROP_FORMAT) from None
         self._initiator = str(value)
-        return OperationResult()
-
-
-_SHUTDOWN_WARNING_S = 10.0
-"""How long before it goes to sleep the camera says so (assumed)."""
-
-
-class SimulatedEos(EosSettings, EosRelease):
-    """An EOS body on a cable; a `sim.buses.responder.Responder`.
-
-    `card_bytes`: capacity of the card; None for an empty slot. `auto_power_off_s`: idle seconds after which it goes to
-    sleep; 0 for never, None for the body's own setting. Asking for events keeps no body awake, KeepDeviceOn does.
-    `battery`: charge, 0 … 1. `executor`: where the film is developed. None does it while the release is answered, and
-    is what tests want; a camera on a real cable hands in an executor of one thread, so that a large frame does not hold
-    up the answers.
-    """
-
-    def __init__(
-        self,
-        body: EosModel,
-        film: Film,
-        clock: Clock,
-        *,
-        serial: str = "0000000001",
-        card_bytes: int | None = 8 << 30,
-        auto_power_off_s: int | None = None,
-        battery: float = 1.0,
-        shutter_count: int = 5000,
-        without: Iterable[int] = (),
-        forgetful: bool = False,
-        executor: Executor | None = None,
-    ) -> None:
-        super().__init__(
-            body,
-            film,
-            clock,
-            serial=serial,
-            card_bytes=card_bytes,
-            auto_power_off_s=auto_power_off_s,
-            battery=battery,
-            shutter_count=shutter_count,
-            forgetful=forgetful,
-            executor=executor,
-        )
-        self._guard = threading.RLock()
-        self._operations = self._handlers(frozenset(without))
 
     # The cable.
 
@@ -926,8 +886,7 @@ class SimulatedEos(EosSettings, EosRelease):
 
     def answer(self, request: PtpRequest, data: bytes | None) -> Answer:
         """Carry out a request."""
-        with self._guard:
-            self._move()
+        with self._moved():
             if self._asleep:
                 raise LinkClosed(f"the simulated {self.body.model} has switched itself off; wake it up")
             try:
@@ -938,8 +897,7 @@ class SimulatedEos(EosSettings, EosRelease):
 
     def events(self) -> tuple[PtpEvent, ...]:
         """Return hints that GetEvent has something to report, one for a queue that was empty."""
-        with self._guard:
-            self._move()
+        with self._moved():
             hints, self._hints = tuple(self._hints), []
             return hints
 
@@ -948,8 +906,7 @@ class SimulatedEos(EosSettings, EosRelease):
 
     def unplugged(self) -> None:
         """End the session; frames that wait in the camera's memory go on waiting, unless it is `forgetful`."""
-        with self._guard:
-            self._move()
+        with self._moved():
             self._end_session()
 
     # The hand on the camera.
@@ -957,43 +914,37 @@ class SimulatedEos(EosSettings, EosRelease):
     @property
     def asleep(self) -> bool:
         """Whether it has switched itself off."""
-        with self._guard:
-            self._move()
+        with self._moved():
             return self._asleep
 
     @property
     def busy(self) -> bool:
         """Whether a picture is being taken or written."""
-        with self._guard:
-            self._move()
+        with self._moved():
             return self._is_busy
 
     def wake(self) -> None:
         """Half-press the release of a sleeping camera."""
-        with self._guard:
-            self._move()
+        with self._moved():
             self._asleep = False
             self._touch()
 
     def turn_dial(self, mode: AeMode) -> None:
         """Turn the mode dial; shutter time and aperture can be set where `mode` leaves them to the photographer."""
-        with self._guard:
-            self._move()
+        with self._moved():
             self._change(Property.EOS_AE_MODE, number_value(mode))
             self._renew_exposure_lists()
 
     def switch_focus(self, automatic: bool, finds: bool = True) -> None:
         """Move the lens's switch to AF or MF; `finds` says whether AF will find anything to focus on."""
-        with self._guard:
-            self._move()
+        with self._moved():
             self._finds_focus = finds
             self._focused = False
             self._change(Property.EOS_FOCUS_MODE, number_value(FocusMode.ONE_SHOT if automatic else FocusMode.MANUAL))
 
     def switch_mirror_lockup(self, on: bool) -> None:
         """Set mirror lockup in the menu or the custom functions, wherever the body has it."""
-        with self._guard:
-            self._move()
+        with self._moved():
             self._mirror_lockup = on
             if Property.EOS_MIRROR_UP_SETTING in self._properties:
                 self._change(Property.EOS_MIRROR_UP_SETTING, number_value(int(on)))
@@ -1002,49 +953,22 @@ class SimulatedEos(EosSettings, EosRelease):
 
     def set_menu(self, code: int, value: int | ImageFormat) -> None:
         """Set a property by the camera's own menu, which no list restricts."""
-        with self._guard:
-            self._move()
+        with self._moved():
             self._store(code, value.encode() if isinstance(value, ImageFormat) else number_value(value))
 
     def insert_card(self, card_bytes: int) -> None:
         """Put an empty card into the slot."""
-        with self._guard:
-            self._move()
+        with self._moved():
             self._card = self._blank_card(card_bytes)
             self._record(Notice(EosEvent.STORE_ADDED, CARD))
             self._renew_destinations()
 
     def remove_card(self) -> None:
         """Take the card out, with what is on it."""
-        with self._guard:
-            self._move()
+        with self._moved():
             self._card = None
             self._record(Notice(EosEvent.STORE_REMOVED, CARD))
             self._renew_destinations()
-
-    # Falling asleep.
-
-    def _move(self) -> None:
-        """Let everything happen that has fallen due, and fall asleep in the end."""
-        super()._move()
-        limit = number_of(self._properties[Property.EOS_AUTO_POWER_OFF].value)
-        if not self._session or not limit or self._is_busy:
-            return
-        idle = self._clock.monotonic() - self._idle_since
-        if idle >= limit:
-            self._end_session()
-            self._memory.clear()
-            self._asleep = True
-        elif idle >= limit - min(_SHUTDOWN_WARNING_S, limit / 2) and not self._warned:
-            self._warned = True
-            self._record(Notice(EosEvent.WILL_SOON_SHUT_DOWN, int(limit - idle)))
-
-    def _touch(self) -> None:
-        self._idle_since = self._clock.monotonic()
-        if self._warned:
-            self._warned = False
-            limit = number_of(self._properties[Property.EOS_AUTO_POWER_OFF].value)
-            self._record(Notice(EosEvent.SHUTDOWN_TIMER_UPDATED, limit))
 
     # Operations.
 
@@ -1061,68 +985,30 @@ class SimulatedEos(EosSettings, EosRelease):
         if request.code not in (Operation.EOS_GET_EVENT, Operation.GET_DEVICE_INFO):
             self._touch()
         one, two, three, *_ = (*request.parameters, 0, 0, 0)
-        return operation(Arguments(one, two, three, data))
+        return operation(Arguments(one, two, three, data)) or OperationResult()
 
     def _check_transaction(self, transaction: int) -> None:
         """Refuse a number that is none or was used: one may be skipped, for a request can be lost in transit."""
-        advance = (transaction - self._last_transaction) & 0xFFFFFFFF
-        if transaction in (0, 0xFFFFFFFF) or not 0 < advance < 1 << 31:
+        advance = (transaction - self._last_transaction) & U32
+        if transaction in (0, U32) or not 0 < advance < 1 << 31:
             raise OperationRefusal(ResponseCode.INVALID_TRANSACTION_ID)
         self._last_transaction = transaction
-
-    def _handlers(self, without: frozenset[int]) -> dict[int, Callable[[Arguments], OperationResult]]:
-        operations: dict[int, Callable[[Arguments], OperationResult]] = {
-            Operation.GET_DEVICE_INFO: self._get_device_info,
-            Operation.OPEN_SESSION: self._open_session,
-            Operation.CLOSE_SESSION: self._close_session,
-            Operation.GET_STORAGE_IDS: self._get_storage_ids,
-            Operation.GET_STORAGE_INFO: self._get_storage_info,
-            Operation.GET_NUM_OBJECTS: self._get_num_objects,
-            Operation.GET_OBJECT_HANDLES: self._get_object_handles,
-            Operation.GET_OBJECT_INFO: self._get_object_info,
-            Operation.GET_OBJECT: self._get_object,
-            Operation.GET_THUMB: self._get_thumb,
-            Operation.DELETE_OBJECT: self._delete_object,
-            Operation.GET_DEVICE_PROP_DESC: self._get_device_prop_desc,
-            Operation.GET_DEVICE_PROP_VALUE: self._get_device_prop_value,
-            Operation.SET_DEVICE_PROP_VALUE: self._set_device_prop_value,
-            Operation.GET_PARTIAL_OBJECT: self._get_partial_object,
-            Operation.EOS_GET_STORAGE_IDS: self._get_storage_ids,
-            Operation.EOS_GET_STORAGE_INFO: self._get_storage_info,
-            Operation.EOS_GET_OBJECT: self._get_object,
-            Operation.EOS_DELETE_OBJECT: self._delete_object,
-            Operation.EOS_GET_PARTIAL_OBJECT: self._get_partial_object,
-            Operation.EOS_GET_DEVICE_INFO_EX: lambda _: OperationResult(self.body.info_ex.encode()),
-            Operation.EOS_GET_OBJECT_INFO_EX: self._get_object_info_ex,
-            Operation.EOS_REMOTE_RELEASE: self._remote_release,
-            Operation.EOS_SET_DEVICE_PROP_VALUE_EX: self._set_device_prop_value_ex,
-            Operation.EOS_REQUEST_DEVICE_PROP_VALUE: self._request_device_prop_value,
-            Operation.EOS_GET_REMOTE_MODE: lambda _: OperationResult(parameters=(self._remote_mode,)),
-            Operation.EOS_SET_REMOTE_MODE: self._set_remote_mode,
-            Operation.EOS_SET_EVENT_MODE: self._set_event_mode,
-            Operation.EOS_GET_EVENT: self._get_event,
-            Operation.EOS_TRANSFER_COMPLETE: self._transfer_complete,
-            Operation.EOS_CANCEL_TRANSFER: self._transfer_complete,
-            Operation.EOS_RESET_TRANSFER: self._reset_transfer,
-            Operation.EOS_PC_HDD_CAPACITY: self._pc_hdd_capacity,
-            Operation.EOS_SET_UI_LOCK: lambda _: OperationResult(),
-            Operation.EOS_RESET_UI_LOCK: lambda _: OperationResult(),
-            Operation.EOS_KEEP_DEVICE_ON: lambda _: OperationResult(),
-            Operation.EOS_AF_CANCEL: self._cancel_focus,
-            Operation.EOS_RESET_MIRROR_LOCKUP_STATE: lambda _: OperationResult(),
-            Operation.EOS_REMOTE_RELEASE_ON: self._remote_release_on,
-            Operation.EOS_REMOTE_RELEASE_OFF: self._remote_release_off,
-        }
-        return {code: operation for code, operation in operations.items() if code not in without}
 
     # Device and session.
 
     def _get_device_info(self, _: Arguments) -> OperationResult:
-        known = tuple(code for code in self.body.info.operations if code in self._operations)
         digits = hashlib.md5(self.serial.encode(), usedforsecurity=False).hexdigest()
-        return OperationResult(replace(self.body.info, operations=known, serial_number=digits).encode())
+        return OperationResult(
+            replace(self.body.info, operations=tuple(self._operations), serial_number=digits).encode()
+        )
 
-    def _open_session(self, arguments: Arguments) -> OperationResult:
+    def _get_device_info_ex(self, _: Arguments) -> OperationResult:
+        return OperationResult(self.body.info_ex.encode())
+
+    def _get_remote_mode(self, _: Arguments) -> OperationResult:
+        return OperationResult(parameters=(self._remote_mode,))
+
+    def _open_session(self, arguments: Arguments) -> None:
         if not arguments.one:
             raise OperationRefusal(ResponseCode.INVALID_PARAMETER)
         if self._session:
@@ -1130,11 +1016,9 @@ class SimulatedEos(EosSettings, EosRelease):
         self._session = arguments.one
         self._last_transaction = 0
         self._touch()
-        return OperationResult()
 
-    def _close_session(self, _: Arguments) -> OperationResult:
+    def _close_session(self, _: Arguments) -> None:
         self._end_session()
-        return OperationResult()
 
     def _end_session(self) -> None:
         self._session = 0
@@ -1149,20 +1033,18 @@ class SimulatedEos(EosSettings, EosRelease):
         self._let_go(ReleaseButton.HALF_AND_FULL)
         self._renew_destinations()
 
-    def _set_remote_mode(self, arguments: Arguments) -> OperationResult:
+    def _set_remote_mode(self, arguments: Arguments) -> None:
         self._remote_mode = arguments.one
         if not self._remote_mode:
             self._let_go(ReleaseButton.HALF_AND_FULL)
-        return OperationResult()
 
-    def _set_event_mode(self, arguments: Arguments) -> OperationResult:
+    def _set_event_mode(self, arguments: Arguments) -> None:
         self._event_mode = arguments.one
         self._queue.clear()
         if self._event_mode:
-            self._tell_everything()
-        return OperationResult()
+            self._report_everything()
 
-    def _tell_everything(self) -> None:
+    def _report_everything(self) -> None:
         for code, known in self._properties.items():
             if known.reported:
                 self._report(code)
@@ -1173,3 +1055,61 @@ class SimulatedEos(EosSettings, EosRelease):
         # Assumed: a frame that nobody fetched is offered to the next who listens.
         for item in self._memory.values():
             self._offer_transfer(item)
+
+    def _do_nothing(self, _: Arguments) -> None:
+        """Answer that it is done."""
+
+    def _handlers(self) -> dict[int, Callable[[Arguments], OperationResult | None]]:
+        """Return what is answered, in the 60D's order; a real body has more (uploads, live view, formatting)."""
+        return {
+            Operation.GET_DEVICE_PROP_DESC: self._get_device_prop_desc,
+            Operation.GET_DEVICE_PROP_VALUE: self._get_device_prop_value,
+            Operation.SET_DEVICE_PROP_VALUE: self._set_device_prop_value,
+            Operation.GET_DEVICE_INFO: self._get_device_info,
+            Operation.OPEN_SESSION: self._open_session,
+            Operation.CLOSE_SESSION: self._close_session,
+            Operation.GET_NUM_OBJECTS: self._get_num_objects,
+            Operation.GET_STORAGE_IDS: self._get_storage_ids,
+            Operation.EOS_GET_STORAGE_IDS: self._get_storage_ids,
+            Operation.GET_STORAGE_INFO: self._get_storage_info,
+            Operation.EOS_GET_STORAGE_INFO: self._get_storage_info,
+            Operation.GET_OBJECT_HANDLES: self._get_object_handles,
+            Operation.GET_OBJECT_INFO: self._get_object_info,
+            Operation.GET_OBJECT: self._get_object,
+            Operation.EOS_GET_OBJECT: self._get_object,
+            Operation.GET_THUMB: self._get_thumb,
+            Operation.GET_PARTIAL_OBJECT: self._get_partial_object,
+            Operation.EOS_GET_PARTIAL_OBJECT: self._get_partial_object,
+            Operation.DELETE_OBJECT: self._delete_object,
+            Operation.EOS_DELETE_OBJECT: self._delete_object,
+            Operation.EOS_SET_DEVICE_PROP_VALUE_EX: self._set_device_prop_value_ex,
+            Operation.EOS_REQUEST_DEVICE_PROP_VALUE: self._request_device_prop_value,
+            Operation.EOS_GET_DEVICE_INFO_EX: self._get_device_info_ex,
+            Operation.EOS_GET_OBJECT_INFO_EX: self._get_object_info_ex,
+            Operation.EOS_REMOTE_RELEASE: self._remote_release,
+            Operation.EOS_SET_EVENT_MODE: self._set_event_mode,
+            Operation.EOS_SET_REMOTE_MODE: self._set_remote_mode,
+            Operation.EOS_GET_REMOTE_MODE: self._get_remote_mode,
+            Operation.EOS_GET_EVENT: self._get_event,
+            Operation.EOS_TRANSFER_COMPLETE: self._transfer_complete,
+            Operation.EOS_CANCEL_TRANSFER: self._transfer_complete,
+            Operation.EOS_RESET_TRANSFER: self._reset_transfer,
+            Operation.EOS_KEEP_DEVICE_ON: self._do_nothing,
+            Operation.EOS_SET_UI_LOCK: self._do_nothing,
+            Operation.EOS_RESET_UI_LOCK: self._do_nothing,
+            Operation.EOS_PC_HDD_CAPACITY: self._pc_hdd_capacity,
+            Operation.EOS_AF_CANCEL: self._cancel_focus,
+            Operation.EOS_REMOTE_RELEASE_ON: self._remote_release_on,
+            Operation.EOS_REMOTE_RELEASE_OFF: self._remote_release_off,
+            Operation.EOS_RESET_MIRROR_LOCKUP_STATE: self._do_nothing,
+        }
+
+
+def _small_jpeg(name: str) -> bytes:
+    """Return a JPEG file of a grey picture with its own name on it: what stands in for a rendered frame."""
+    import cv2
+    import numpy as np
+
+    picture = np.full((*_JPEG_SIZE, 3), 118, dtype=np.uint8)
+    picture = cv2.putText(picture, name, (20, 90), cv2.FONT_HERSHEY_SIMPLEX, 1.0, (255, 255, 255))
+    return cv2.imencode(".jpg", picture)[1].tobytes()

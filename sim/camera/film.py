@@ -80,7 +80,7 @@ class ReplayFilm:
                 "set camera.shutter_s in LAB.toml to the recording's"
             )
 
-    def expose(self, settings: ExposureSettings, released_at: datetime, into: BinaryIO) -> int:
+    def expose(self, settings: ExposureSettings, released_at: datetime, into: BinaryIO) -> None:
         """Hand out the next recorded file of the colour on the screen."""
         del settings, released_at
         colour = self._look()
@@ -93,14 +93,12 @@ class ReplayFilm:
                 "replay it with the illuminations and sequence settings it was taken with"
             )
         path = frames[number].path
-        start = into.tell()
         try:
             with path.open("rb") as recorded:
                 shutil.copyfileobj(recorded, into, 1 << 20)
         except FileNotFoundError as error:
             raise DeviceError(f"the recording lacks {path}; restore the file") from error
         self._exposed[colour] += 1
-        return into.tell() - start
 
 
 SOFTWARE = "CroP simulated camera"
@@ -218,8 +216,8 @@ class Film(Protocol):
         """Refuse settings that no picture can be had with (DeviceRefused)."""
         ...
 
-    def expose(self, settings: ExposureSettings, released_at: datetime, into: BinaryIO) -> int:
-        """Write the raw file of a picture taken now; return its size in bytes."""
+    def expose(self, settings: ExposureSettings, released_at: datetime, into: BinaryIO) -> object:
+        """Write the raw file of a picture taken now."""
         ...
 
 
@@ -252,7 +250,7 @@ class WatchedFilm:
         """Refuse what no such body has."""
         _accept(settings)
 
-    def expose(self, settings: ExposureSettings, released_at: datetime, into: BinaryIO) -> int:
+    def expose(self, settings: ExposureSettings, released_at: datetime, into: BinaryIO) -> None:
         """Photograph the world as it is lit from now on, for the exposure's time."""
         seconds = (released_at - self._opened).total_seconds()
         moment = Moment(next(self._frames), seconds)
@@ -262,9 +260,7 @@ class WatchedFilm:
         key = (_WATCHED, moment.frame)
         counts = self._world.expose(BLACK, settings, key=key, lamp=lamp, situation=situation)
         counts = self._disturbances.counted(counts, moment)
-        start = into.tell()
         write_dng(into, counts, self._world.body, settings=settings, taken_at=released_at, serial=self._serial)
-        return into.seek(0, 2) - start
 
 
 class WorldFilm:
@@ -298,7 +294,7 @@ class WorldFilm:
         """Refuse what no such body has."""
         _accept(settings)
 
-    def expose(self, settings: ExposureSettings, released_at: datetime, into: BinaryIO) -> int:
+    def expose(self, settings: ExposureSettings, released_at: datetime, into: BinaryIO) -> None:
         """Photograph the world as it is lit now."""
         colour = self._look()
         seconds = (released_at - OPENING).total_seconds()
@@ -318,9 +314,7 @@ class WorldFilm:
             taken_at = released_at if stale.new_header else taken_at
         if self._disturbances.repeats_files:
             self._last = taken_at, counts
-        start = into.tell()
         write_dng(into, counts, self._world.body, settings=settings, taken_at=taken_at, serial=self._serial)
-        return into.seek(0, 2) - start
 
 
 def _accept(settings: ExposureSettings) -> None:

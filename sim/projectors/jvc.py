@@ -11,13 +11,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from drivers.display import jvc
-from drivers.links.network import TcpLink, TcpServer
 from drivers.presenter import WHITE, Colour
-from foundation.errors import LinkTimeout, ProtocolError
+from foundation.errors import ProtocolError
 from sim.projectors.projector import Screen
 
-_PATIENCE_S = 5.0
-"""For one read or write; a silent client is listened to again."""
 _CHANNELS = {text: channel for channel, text in jvc.LEVELS.items()}
 
 
@@ -90,19 +87,3 @@ class JvcPeer:
 
     def _show(self) -> None:
         self._screen.colour = Colour(**self._levels) if self._flat else WHITE
-
-
-def serve_jvc(peer: JvcPeer, port: int = 0) -> TcpServer:
-    """Return a running server on loopback that speaks for `peer`; close it, or use it in a `with` block."""
-
-    def handle(link: TcpLink) -> None:
-        link.write(peer.connect(), _PATIENCE_S)
-        while not peer.closed:
-            try:
-                answer = peer.receive(link.read(4096, _PATIENCE_S))
-            except LinkTimeout:
-                continue
-            if answer:
-                link.write(answer, _PATIENCE_S)
-
-    return TcpServer(handle, port)

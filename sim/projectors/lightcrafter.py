@@ -9,18 +9,14 @@ Rules that hold inside:
 
 from __future__ import annotations
 
-import errno
 import struct
-from array import array
 from collections import deque
-
-import usb.core
 
 from drivers.display import lightcrafter as wire
 from drivers.display.lightcrafter import PRODUCTS, VENDOR, LightCrafterCommand, LightCrafterReply
 from drivers.presenter import WHITE, Colour
 from foundation.errors import ProtocolError
-from sim.buses.usb import Handle, Setup, SimulatedBus, Stalled
+from sim.buses.usb import Stalled, UsbDevice, UsbIdentity, endpoint_descriptor
 from sim.projectors.projector import Screen
 
 REPORT_IN, REPORT_OUT = 0x81, 0x01
@@ -84,46 +80,27 @@ class Controller:
             self._screen.colour = VIDEO_INPUT
 
 
-class LightCrafterUsb:
-    """A controller's USB side, at full speed, for `HidBus`."""
+class LightCrafterUsb(UsbDevice):
+    """A controller's USB side, at full speed."""
+
+    pipes = frozenset({REPORT_IN, REPORT_OUT})
 
     def __init__(self, controller: Controller, product: int = PRODUCTS["DLPC350"], serial: str = "LCR4500") -> None:
+        super().__init__(UsbIdentity(VENDOR, product, serial, "Texas Instruments", "DLPC350", version=0x0110))
         self._controller = controller
-        self._product = product
-        self._serial = serial
         self._replies: deque[bytes] = deque()
 
-    def device_descriptor(self) -> bytes:
-        """Return the 18 bytes that name the device."""
-        return struct.pack("<BBHBBBBHHHBBBB", 18, 1, 0x0110, 0, 0, 0, 64, VENDOR, self._product, 0x0100, 1, 2, 3, 1)
+    def interface_descriptors(self) -> bytes:
+        """Return the descriptors of the HID interface and the two endpoints."""
+        interface = struct.pack("<BBBBBBBBB", 9, 4, 0, 0, 2, 3, 0, 0, 0)
+        hid = struct.pack("<BBHBBBH", 9, 0x21, 0x0111, 0, 1, 0x22, 36)
+        ends = (endpoint_descriptor(address, 3, wire.REPORT, 1) for address in (REPORT_IN, REPORT_OUT))
+        return interface + hid + b"".join(ends)
 
-    def configuration_descriptor(self) -> bytes:
-        """Return the descriptors of the configuration, its HID interface and the two endpoints."""
-        body = struct.pack("<BBBBBBBBB", 9, 4, 0, 0, 2, 3, 0, 0, 0)
-        body += struct.pack("<BBHBBBH", 9, 0x21, 0x0111, 0, 1, 0x22, 36)
-        body += struct.pack("<BBBBHB", 7, 5, REPORT_IN, 3, wire.REPORT, 1)
-        body += struct.pack("<BBBBHB", 7, 5, REPORT_OUT, 3, wire.REPORT, 1)
-        return struct.pack("<BBHBBBBB", 9, 2, 9 + len(body), 1, 1, 0, 0xC0, 50) + body
-
-    def control(self, setup: Setup, data: bytes = b"") -> bytes:
-        """Answer the standard requests that pyusb makes."""
-        match setup.request_type, setup.request, setup.value >> 8:
-            case 0x80, 6, 3 if setup.value & 0xFF <= 3:
-                texts = ("", "Texas Instruments", "DLPC350", self._serial)
-                index = setup.value & 0xFF
-                body = texts[index].encode("utf-16-le") if index else struct.pack("<H", 0x0409)
-                return bytes([2 + len(body), 3]) + body
-            case 0x80, 8, _:
-                return b"\x01"
-            case _, 9, _:
-                return b""
-            case _:
-                raise Stalled
-
-    def report_out(self, report: bytes) -> None:
+    def write(self, endpoint: int, data: bytes) -> None:
         """Take a report from the host."""
         try:
-            request = wire.parse_request(report)
+            request = wire.parse_request(data)
         except ProtocolError as error:
             raise Stalled from error
         if request.reads:
@@ -135,42 +112,10 @@ class LightCrafterUsb:
             )
         self._replies.append(wire.encode_reply(reply, reads=request.reads))
 
-    def interrupt_in(self, limit: int) -> bytes | None:
+    def read(self, endpoint: int, limit: int) -> bytes | None:
         """Return the next report to the host, None where there is none."""
         return self._replies.popleft() if self._replies else None
-
-    def bulk_out(self, data: bytes) -> None:
-        """Refuse: there is no such pipe."""
-        raise Stalled
-
-    def bulk_in(self, limit: int) -> bytes | None:
-        """Refuse: there is no such pipe."""
-        raise Stalled
 
     def unplugged(self) -> None:
         """Forget what was not fetched; the picture stays."""
         self._replies.clear()
-
-
-class HidBus(SimulatedBus):
-    """A simulated bus whose devices have interrupt pipes both ways."""
-
-    def intr_read(self, dev_handle: Handle, ep: int, intf: int, buff: array[int], timeout: int) -> int:
-        """Read a report."""
-        self._check_transfer(dev_handle, ep, REPORT_IN)
-        report = dev_handle.device.interrupt_in(len(buff))
-        if report is None:
-            raise usb.core.USBTimeoutError("Operation timed out", -7, errno.ETIMEDOUT)
-        memoryview(buff)[: len(report)] = report
-        return len(report)
-
-    def intr_write(self, dev_handle: Handle, ep: int, intf: int, data: array[int], timeout: int) -> int:
-        """Send a report."""
-        self._check_transfer(dev_handle, ep, REPORT_OUT)
-        device = dev_handle.device
-        assert isinstance(device, LightCrafterUsb)
-        try:
-            device.report_out(data.tobytes())
-        except Stalled as error:
-            raise usb.core.USBError("Pipe error", -9, errno.EPIPE) from error
-        return len(data)

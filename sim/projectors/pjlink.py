@@ -11,26 +11,14 @@ from __future__ import annotations
 import contextlib
 import secrets
 import threading
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
-from types import TracebackType
+from functools import partial
 
-from drivers.links.link import Link, PeerLink
-from drivers.links.network import LOOPBACK, Address, TcpLink, TcpServer, UdpSocket
-from drivers.pjlink import wire
-from drivers.pjlink.wire import (
-    ErrorCode,
-    FaultsChanged,
-    Found,
-    Greeting,
-    InputChanged,
-    LineCutter,
-    LinkUp,
-    PjLinkNotice,
-    PjLinkReply,
-    PjLinkRequest,
-    PowerChanged,
-    Refused,
-)
+from drivers import pjlink as wire
+from drivers.links.link import ClosedAtEnd
+from drivers.links.network import LOOPBACK, Address, TcpServer, UdpSocket, serve_peer
+from drivers.pjlink import ErrorCode, PjLinkReply, PjLinkRequest, Refused
 from foundation.errors import DeviceFault, DeviceRefused, LinkClosed, LinkTimeout, ProtocolError
 from sim.projectors.projector import SimulatedProjector
 
@@ -43,31 +31,31 @@ class Announcer:
 
     def __init__(self, projector: SimulatedProjector) -> None:
         self._projector = projector
-        self._sent: dict[type[PjLinkNotice], PjLinkNotice] = self._state()
+        self._sent = self._state()
         self._begun = False
 
-    def news(self) -> tuple[PjLinkNotice, ...]:
+    def news(self) -> tuple[PjLinkReply, ...]:
         """Return the notices that are due now."""
         if self._projector.traits.pjlink_class < 2:
             return ()
         begun, self._begun = self._begun, True
         if not begun:
-            return (LinkUp(self._projector.traits.mac),)
+            return (PjLinkReply("LKUP", self._projector.traits.mac, 2),)
         state = self._state()
-        news = tuple(notice for kind, notice in state.items() if self._sent.get(kind) != notice)
+        news = tuple(PjLinkReply(what, value, 2) for what, value in state.items() if self._sent.get(what) != value)
         self._sent |= state
         return news
 
-    def _state(self) -> dict[type[PjLinkNotice], PjLinkNotice]:
+    def _state(self) -> dict[str, str]:
         projector = self._projector
-        state: list[PjLinkNotice] = [FaultsChanged(projector.faults()), PowerChanged(projector.power())]
+        state = {"ERST": wire.format_faults(projector.faults()), "POWR": wire.format_power(projector.power())}
         # In standby there is no input.
         with contextlib.suppress(DeviceRefused):
-            state.append(InputChanged(projector.input()))
-        return {type(notice): notice for notice in state}
+            state["INPT"] = projector.input()
+        return state
 
 
-class ProjectorDatagrams:
+class ProjectorDatagrams(ClosedAtEnd):
     """The UDP side of a simulated projector, in threads of its own: answers searches, sends notices; close it.
 
     An answer goes to the port from which the question came, not always to 4352: here both may share one computer.
@@ -91,14 +79,6 @@ class ProjectorDatagrams:
         for thread in self._threads:
             thread.start()
 
-    def __enter__(self) -> ProjectorDatagrams:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
-
     def announce(self) -> None:
         """Send the notices that are due now; nobody need call it, for it is done every half second."""
         with self._guard:
@@ -106,7 +86,7 @@ class ProjectorDatagrams:
                 return
             for notice in self._announcer.news():
                 with contextlib.suppress(LinkClosed):
-                    self._socket.send(wire.encode_datagram(notice), self._controller)
+                    self._socket.send(wire.encode_reply(notice), self._controller)
 
     def close(self) -> None:
         """Stop listening and wait for the threads; a second call does nothing."""
@@ -130,7 +110,7 @@ class ProjectorDatagrams:
                 return
             if wire.is_search(datagram) and self._projector.traits.pjlink_class >= 2:
                 with contextlib.suppress(LinkClosed):
-                    self._socket.send(wire.encode_datagram(Found(self._projector.traits.mac)), sender)
+                    self._socket.send(wire.encode_reply(PjLinkReply("ACKN", self._projector.traits.mac, 2)), sender)
 
     def _watch(self) -> None:
         while not self._closing.wait(WATCH_S):
@@ -141,15 +121,15 @@ class ProjectorDatagrams:
 class _Connection:
     """One connection.
 
-    - `cutter`: cuts what comes into lines.
+    - `heard`: of a line that is not whole yet.
     - `last_heard`: when the last command came, by the projector's clock, seconds.
     - `expected_digest`: what proves the password by MD5; empty where none is wanted, or it has been proved.
     - `challenge`: what a proof by SHA-256 begins with; empty until the controller asks for one.
     - `closed`: whether the projector has hung up.
     """
 
-    cutter: LineCutter
     last_heard: float
+    heard: bytes = b""
     expected_digest: str = ""
     challenge: bytes = b""
     closed: bool = False
@@ -167,6 +147,7 @@ class PjLinkPeer:
         self._password = password
         self._fixed_seed = seed
         self._connection, _ = self._begun()
+        self._classes = _class_1(projector), _class_2(projector)
 
     def connect(self) -> bytes:
         """Begin a new connection, forgetting the last, and return the greeting."""
@@ -186,29 +167,31 @@ class PjLinkPeer:
         if self.closed:
             return b""
         connection, answer = self._connection, b""
+        connection.heard += data
+        if data:
+            connection.last_heard = self._projector.clock.monotonic()
         try:
-            for line in connection.cutter.feed(data):
+            while not connection.closed and (taken := wire.take_line(connection.heard, _LONGEST)) is not None:
+                line, length = taken
+                connection.heard = connection.heard[length:]
                 if wire.is_security_question(line) and connection.expected_digest:
                     answer += self._security_answer()
                 else:
                     reply = self._reply(wire.parse_request(line))
                     answer += wire.encode_reply(reply)
                     connection.closed = isinstance(reply, Refused)
-                if connection.closed:
-                    break
         except ProtocolError:
             connection.closed = True
-        connection.last_heard = self._projector.clock.monotonic()
         return answer
 
     def _begun(self) -> tuple[_Connection, bytes]:
         """Return a new connection and its greeting."""
-        cutter, now = LineCutter(wire.MAX_LINE + wire.MAX_DIGEST), self._projector.clock.monotonic()
+        now = self._projector.clock.monotonic()
         if self._password is None:
-            return _Connection(cutter, now), wire.encode_greeting(Greeting())
+            return _Connection(now), wire.encode_greeting(None)
         seed = self._fixed_seed or secrets.token_hex(4)
         digest = wire.authentication_digest(seed, self._password)
-        return _Connection(cutter, now, digest), wire.encode_greeting(Greeting(seed))
+        return _Connection(now, expected_digest=digest), wire.encode_greeting(seed)
 
     def _security_answer(self) -> bytes:
         if not self._projector.traits.sha256:
@@ -235,7 +218,7 @@ class PjLinkPeer:
                 return Refused.WRONG_PASSWORD
             self._connection.expected_digest = ""
         try:
-            value = self._value(request) if request.level == 1 else self._class_2_value(request)
+            value = self._value(request)
         except DeviceRefused:
             value = ErrorCode.UNAVAILABLE.value
         except DeviceFault:
@@ -245,110 +228,90 @@ class PjLinkPeer:
         return PjLinkReply(request.command, value, request.level)
 
     def _value(self, request: PjLinkRequest) -> str:
-        projector = self._projector
-        match request.command, request.parameter:
-            case "POWR", wire.QUERY:
-                return wire.format_power(projector.power())
-            case "POWR", "1":
-                projector.switch_on()
-            case "POWR", "0":
-                projector.switch_off()
-            case "INPT", wire.QUERY:
-                return projector.input()
-            case "INPT", code if wire.is_class_1_input(code):
-                projector.set_input(code)
-            case "AVMT", wire.QUERY:
-                return wire.format_mute(projector.muted())
-            case "AVMT", "10" | "11" | "30" | "31" as code:
-                projector.set_muted(wire.parse_mute(code))
-            case "AVMT", "20" | "21":
-                # It has no loudspeaker.
-                pass
-            case "ERST", wire.QUERY:
-                return wire.format_faults({fault.part: fault.severity for fault in projector.faults()})
-            case "LAMP", wire.QUERY:
-                return wire.format_lamps(projector.lamps())
-            case "INST", wire.QUERY:
-                codes = (source.code for source in projector.traits.inputs)
-                return " ".join(code for code in codes if wire.is_class_1_input(code))
-            case "NAME", wire.QUERY:
-                return projector.identity().name
-            case "INF1", wire.QUERY:
-                return projector.identity().maker
-            case "INF2", wire.QUERY:
-                return projector.identity().model
-            case "INFO", wire.QUERY:
-                return "simulated"
-            case "CLSS", wire.QUERY:
-                return str(projector.traits.pjlink_class)
-            case command, _ if command in _COMMANDS:
-                return ErrorCode.OUT_OF_PARAMETER.value
-            case _:
-                return ErrorCode.UNDEFINED.value
-        return wire.OK
-
-    def _class_2_value(self, request: PjLinkRequest) -> str:
-        projector = self._projector
-        traits = projector.traits
-        match request.command, request.parameter:
-            case _ if request.level > traits.pjlink_class:
-                return ErrorCode.UNDEFINED.value
-            case "INPT", wire.QUERY:
-                return projector.input()
-            case "INPT", code:
-                projector.set_input(code.upper())
-            case "INST", wire.QUERY:
-                return " ".join(source.code for source in traits.inputs)
-            case "INNM", question:
-                names = {wire.QUERY + source.code: source.name for source in traits.inputs}
-                return names.get(question.upper(), ErrorCode.OUT_OF_PARAMETER.value)
-            case "IRES", wire.QUERY:
-                return wire.format_resolution(projector.input_resolution())
-            case "RRES", wire.QUERY:
-                return wire.format_resolution(traits.panel)
-            case "SNUM", wire.QUERY:
-                return traits.serial_number
-            case "SVER", wire.QUERY:
-                return traits.software_version
-            case "FILT" | "RFIL", wire.QUERY if traits.filter_hours is None:
-                return ErrorCode.UNDEFINED.value
-            case "FILT", wire.QUERY:
-                return str(traits.filter_hours)
-            case "RFIL", wire.QUERY:
-                return traits.filter_model
-            case "RLMP", wire.QUERY:
-                return traits.lamp_model
-            case "FREZ", wire.QUERY:
-                return wire.format_freeze(projector.frozen())
-            case "FREZ", "0" | "1" as digit:
-                projector.set_frozen(wire.parse_freeze(digit))
-            case "SVOL", wire.RAISE | wire.LOWER as step:
-                projector.turn_speaker(1 if step == wire.RAISE else -1)
-            case "MVOL", wire.RAISE | wire.LOWER as step:
-                projector.turn_microphone(1 if step == wire.RAISE else -1)
-            case command, _ if command in _CLASS_2_COMMANDS:
-                return ErrorCode.OUT_OF_PARAMETER.value
-            case _:
-                return ErrorCode.UNDEFINED.value
-        return wire.OK
+        known = request.level <= self._projector.traits.pjlink_class
+        answers = self._classes[min(request.level, 2) - 1].get(request.command) if known else None
+        if answers is None:
+            return ErrorCode.UNDEFINED.value
+        answer = answers.get(request.parameter.upper())
+        if answer is None:
+            return ErrorCode.OUT_OF_PARAMETER.value
+        value = answer()
+        return value if isinstance(value, str) else wire.OK
 
 
-_COMMANDS = ("POWR", "INPT", "AVMT", "ERST", "LAMP", "INST", "NAME", "INF1", "INF2", "INFO", "CLSS")
-_CLASS_2_COMMANDS = (
-    "INPT", "INST", "INNM", "IRES", "RRES", "SNUM", "SVER", "FILT", "RLMP", "RFIL", "FREZ", "SVOL", "MVOL",
-)  # fmt: skip
+_LONGEST = wire.MAX_LINE + wire.MAX_DIGEST
+"""Bytes of a connection's first command."""
+_INPUTS = tuple(kind + number for kind in "123456" for number in "123456789ABCDEFGHIJKLMNOPQRSTUVWXYZ")
+_Answers = Mapping[str, Mapping[str, Callable[[], str | None]]]
+"""Command to parameter to what is done; None is OK."""
 
 
-def memory_link(peer: PjLinkPeer) -> Link:
-    """Return a new connection to `peer` that needs no thread and never waits."""
-    return PeerLink(peer)
+def _class_1(projector: SimulatedProjector) -> _Answers:
+    inputs = [code for code in _INPUTS if wire.is_class_1_input(code)]
+    offered = [source.code for source in projector.traits.inputs if wire.is_class_1_input(source.code)]
+    mute, show = lambda: projector.set_muted(True), lambda: projector.set_muted(False)
+    return {
+        "POWR": {
+            wire.QUERY: lambda: wire.format_power(projector.power()),
+            "1": projector.switch_on,
+            "0": projector.switch_off,
+        },
+        "INPT": _selecting(projector, inputs),
+        "AVMT": {
+            wire.QUERY: lambda: wire.format_mute(projector.muted()),
+            "11": mute,
+            "31": mute,
+            "10": show,
+            "30": show,
+            # It has no loudspeaker.
+            "20": lambda: None,
+            "21": lambda: None,
+        },
+        "ERST": {wire.QUERY: lambda: wire.format_faults(projector.faults())},
+        "LAMP": {wire.QUERY: lambda: wire.format_lamps(projector.lamps())},
+        "INST": {wire.QUERY: lambda: " ".join(offered)},
+        "NAME": {wire.QUERY: lambda: projector.identity().name},
+        "INF1": {wire.QUERY: lambda: projector.identity().maker},
+        "INF2": {wire.QUERY: lambda: projector.identity().model},
+        "INFO": {wire.QUERY: lambda: "simulated"},
+        "CLSS": {wire.QUERY: lambda: str(projector.traits.pjlink_class)},
+    }
+
+
+def _class_2(projector: SimulatedProjector) -> _Answers:
+    traits = projector.traits
+    answers: dict[str, Mapping[str, Callable[[], str | None]]] = {
+        "INPT": _selecting(projector, _INPUTS),
+        "INST": {wire.QUERY: lambda: " ".join(source.code for source in traits.inputs)},
+        "INNM": {wire.QUERY + source.code: lambda name=source.name: name for source in traits.inputs},
+        "IRES": {wire.QUERY: lambda: wire.format_resolution(projector.input_resolution())},
+        "RRES": {wire.QUERY: lambda: wire.format_resolution(traits.panel)},
+        "SNUM": {wire.QUERY: lambda: traits.serial_number},
+        "SVER": {wire.QUERY: lambda: traits.software_version},
+        "RLMP": {wire.QUERY: lambda: traits.lamp_model},
+        "FREZ": {
+            wire.QUERY: lambda: wire.format_freeze(projector.frozen()),
+            "0": lambda: projector.set_frozen(False),
+            "1": lambda: projector.set_frozen(True),
+        },
+        "SVOL": {wire.RAISE: lambda: projector.turn_speaker(1), wire.LOWER: lambda: projector.turn_speaker(-1)},
+        "MVOL": {wire.RAISE: lambda: projector.turn_microphone(1), wire.LOWER: lambda: projector.turn_microphone(-1)},
+    }
+    if traits.filter_hours is not None:
+        answers["FILT"] = {wire.QUERY: lambda: str(traits.filter_hours)}
+        answers["RFIL"] = {wire.QUERY: lambda: traits.filter_model}
+    return answers
+
+
+def _selecting(projector: SimulatedProjector, codes: Iterable[str]) -> dict[str, Callable[[], str | None]]:
+    return {wire.QUERY: projector.input, **{code: partial(projector.set_input, code) for code in codes}}
 
 
 def serve_pjlink(
     projector: SimulatedProjector,
     port: int = 0,
     password: str | None = None,
-    host: str | None = None,
+    host: str = LOOPBACK,
     answer_s: float = 0.0,
 ) -> TcpServer:
     """Return a running server that speaks PJLink for `projector`; close it, or use it in a `with` block.
@@ -356,16 +319,7 @@ def serve_pjlink(
     `answer_s`: how long it takes to answer, seconds of its clock.
     """
 
-    def handle(link: TcpLink) -> None:
-        peer = PjLinkPeer(projector, password)
-        link.write(peer.connect(), wire.IDLE_LIMIT_S)
-        while not peer.closed:
-            try:
-                answer = peer.receive(link.read(4096, wire.IDLE_LIMIT_S))
-            except LinkTimeout:
-                continue
-            if answer:
-                projector.clock.sleep(answer_s)
-                link.write(answer, wire.IDLE_LIMIT_S)
+    def think() -> None:
+        projector.clock.sleep(answer_s)
 
-    return TcpServer(handle, port) if host is None else TcpServer(handle, port, host)
+    return serve_peer(lambda: PjLinkPeer(projector, password), port, host, think)

@@ -10,9 +10,11 @@ Rules that hold inside:
 from __future__ import annotations
 
 import threading
+from collections.abc import Generator
+from contextlib import contextmanager
 from dataclasses import dataclass
 
-from drivers.pjlink.wire import FAULT_PARTS, Input, NoResolution, Resolution
+from drivers.pjlink import FAULT_PARTS, Input, NoResolution, Resolution
 from drivers.presenter import BLACK, Colour
 from drivers.projector import Fault, Lamp, Power, ProjectorIdentity, Severity
 from foundation.clock import Clock
@@ -137,58 +139,49 @@ class SimulatedProjector:
 
     def muted(self) -> bool:
         """Return whether the picture is blanked; refused unless it is on."""
-        with self._guard:
-            self._require_on()
+        with self._while_on():
             return self._muted
 
     def set_muted(self, muted: bool) -> None:
         """Blank the picture, or show it; refused unless it is on."""
-        with self._guard:
-            self._require_on()
+        with self._while_on():
             self._muted = muted
 
     def input(self) -> str:
         """Return the code of the input that is shown (PJLink INPT); refused unless it is on."""
-        with self._guard:
-            self._require_on()
+        with self._while_on():
             return self._input
 
     def set_input(self, code: str) -> None:
         """Show another of the inputs in its traits; refused unless it is on."""
-        with self._guard:
-            self._require_on()
+        with self._while_on():
             if code not in [source.code for source in self.traits.inputs]:
                 raise ValueError(code)
             self._input = code
 
     def input_resolution(self) -> Resolution | NoResolution:
         """Return the resolution of the signal at its input, or why there is none; refused unless it is on."""
-        with self._guard:
-            self._require_on()
+        with self._while_on():
             return self.signal
 
     def frozen(self) -> bool:
         """Return whether the picture is frozen; refused unless it is on."""
-        with self._guard:
-            self._require_on()
+        with self._while_on():
             return self._frozen
 
     def set_frozen(self, frozen: bool) -> None:
         """Freeze the picture, or let it move; refused unless it is on."""
-        with self._guard:
-            self._require_on()
+        with self._while_on():
             self._frozen = frozen
 
     def turn_speaker(self, step: int) -> None:
         """Turn the speaker by `step`, as far as it goes; refused unless it is on."""
-        with self._guard:
-            self._require_on()
+        with self._while_on():
             self.speaker = min(max(self.speaker + step, 0), MAX_VOLUME)
 
     def turn_microphone(self, step: int) -> None:
         """Turn the microphone by `step`, as far as it goes; refused unless it is on."""
-        with self._guard:
-            self._require_on()
+        with self._while_on():
             self.microphone = min(max(self.microphone + step, 0), MAX_VOLUME)
 
     def faults(self) -> tuple[Fault, ...]:
@@ -220,7 +213,7 @@ class SimulatedProjector:
             return 1.0
 
     def break_part(self, part: str, severity: Severity) -> None:
-        """Inject a fault in one of `drivers.pjlink.wire.FAULT_PARTS`; an error of the lamp puts it out."""
+        """Inject a fault in one of `drivers.pjlink.FAULT_PARTS`; an error of the lamp puts it out."""
         if part not in FAULT_PARTS:
             raise ValueError(f"{part} is no part that can be reported; choose of {', '.join(FAULT_PARTS)}")
         with self._guard:
@@ -246,10 +239,14 @@ class SimulatedProjector:
             raise DeviceFault("the lamp of the simulated projector is dead; repair it")
         self._enter(change, self.clock.monotonic())
 
-    def _require_on(self) -> None:
-        self._move()
-        if self._power is not Power.ON:
-            raise DeviceRefused(f"the simulated projector is in {self._power.value}; wait until it is on")
+    @contextmanager
+    def _while_on(self) -> Generator[None]:
+        """Hold the state for the block; refuse it unless the projector is on."""
+        with self._guard:
+            self._move()
+            if self._power is not Power.ON:
+                raise DeviceRefused(f"the simulated projector is in {self._power.value}; wait until it is on")
+            yield
 
     def _lit(self) -> bool:
         return self._power in (Power.ON, Power.WARMING)

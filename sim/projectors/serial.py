@@ -17,7 +17,7 @@ from collections.abc import Mapping
 from typing import Protocol
 
 from drivers.links.link import Peer
-from drivers.pjlink.wire import NoResolution
+from drivers.pjlink import NoResolution
 from drivers.projector import Power, Severity
 from drivers.serial_projectors import benq, epson, nec, optoma
 from drivers.serial_projectors.driver import take_line
@@ -217,13 +217,13 @@ class OptomaPeer(_Listener):
         self._sent_power, self._sent_faults = power, broken
         return b"".join(optoma.encode_message(info) for info in news if info is not None)
 
-    def _answer(self, command: optoma.OptomaCommand) -> optoma.Message:
+    def _answer(self, command: optoma.OptomaCommand) -> str:
         try:
             return self._done(command)
         except (DeviceRefused, DeviceFault, ValueError):
-            return optoma.PassFail(False)
+            return optoma.FAILED
 
-    def _done(self, command: optoma.OptomaCommand) -> optoma.Message:
+    def _done(self, command: optoma.OptomaCommand) -> str:
         projector = self._projector
         match command.number, command.value:
             case optoma.POWER, "1":
@@ -233,16 +233,16 @@ class OptomaPeer(_Listener):
             case optoma.AV_MUTE, "0" | "1" | "2":
                 projector.set_muted(command.value == "1")
             case optoma.LAMP_HOURS, "1":
-                return optoma.AnswerText(f"{projector.lamps()[0].hours:04d}")
+                return f"{optoma.ANSWER}{projector.lamps()[0].hours:04d}"
             case optoma.POWER_STATE, "1":
-                return optoma.AnswerText("1" if projector.power() is Power.ON else "0")
+                return optoma.ANSWER + ("1" if projector.power() is Power.ON else "0")
             case optoma.MODEL, "1":
-                return optoma.AnswerText(self.MODEL)
+                return optoma.ANSWER + self.MODEL
             case optoma.AV_MUTE_STATE, "1" if self._answers_mute:
-                return optoma.AnswerText("1" if projector.muted() else "0")
+                return optoma.ANSWER + ("1" if projector.muted() else "0")
             case _:
                 raise ValueError(command)
-        return optoma.PassFail(True)
+        return optoma.PASSED
 
 
 class NecPeer(_Listener):

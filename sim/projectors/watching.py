@@ -27,7 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.display.x11 import XScreen
-from drivers.pjlink.wire import Input
+from drivers.pjlink import Input
 from drivers.projector import Power
 from foundation.clock import Clock
 from foundation.errors import DeviceError, InputError
@@ -117,8 +117,8 @@ class Pictures(Protocol):
         ...
 
 
-class Asked(Protocol):
-    """What is asked of a projector; `drivers.pjlink.projector.PjLinkProjector` is one."""
+class WatchedProjector(Protocol):
+    """What is asked of a projector; `drivers.pjlink.PjLinkProjector` is one."""
 
     def power(self) -> Power:
         """Return the power state now."""
@@ -150,7 +150,7 @@ class LampState:
     source: str | None = None
 
 
-def ask(projector: Asked) -> LampState:
+def ask(projector: WatchedProjector) -> LampState:
     """Return a projector's state; one that does not answer gives no light."""
     try:
         power = projector.power()
@@ -198,7 +198,7 @@ class Beam:
     def __init__(
         self,
         pictures: Pictures,
-        projector: Asked | None,
+        projector: WatchedProjector | None,
         light_of: Callable[[NDArray[np.int64]], NDArray[np.float64]],
         clock: Clock,
     ) -> None:
@@ -270,7 +270,7 @@ class Beam:
         while not self._ended.wait(POLL_S):
             self._ask_once(self._projector)
 
-    def _ask_once(self, projector: Asked) -> None:
+    def _ask_once(self, projector: WatchedProjector) -> None:
         state = ask(projector)
         with self._looking:
             self._state = state

@@ -40,6 +40,12 @@ _BLOB_RIM: Final = 0.15
 """Share of a blob's radius over which its edge fades: what stands a metre before the chart is out of focus."""
 
 
+def _from_middle(place: Place, at: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return how far points (..., 2) lie from the middle of a place, across and down: 1 at its sides."""
+    left, top, right, bottom = place
+    return (2 * at[..., 0] - left - right) / (right - left), (2 * at[..., 1] - top - bottom) / (bottom - top)
+
+
 @dataclass(frozen=True)
 class Patch:
     """A rectangle of another colour in the projected picture.
@@ -72,10 +78,8 @@ class Blob:
 
     def passed(self, at: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the share (...) of the chart's light that is seen at points (..., 2) of the page, shares of it."""
-        left, top, right, bottom = self.place
-        x, y = at[..., 0], at[..., 1]
-        away = np.hypot((2 * x - left - right) / (right - left), (2 * y - top - bottom) / (bottom - top))
-        inside = np.clip((1 + _BLOB_RIM / 2 - away) / _BLOB_RIM, 0, 1)
+        across, down = _from_middle(self.place, at)
+        inside = np.clip((1 + _BLOB_RIM / 2 - np.hypot(across, down)) / _BLOB_RIM, 0, 1)
         return 1 - (1 - self.left) * inside * inside * (3 - 2 * inside)
 
 
@@ -93,10 +97,8 @@ class Glare:
 
     def added(self, at: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the mirrored light (...) at points (..., 2) of the page, shares of it, over that of bare paper."""
-        left, top, right, bottom = self.place
-        x, y = at[..., 0], at[..., 1]
-        away2 = ((2 * x - left - right) / (right - left)) ** 2 + ((2 * y - top - bottom) / (bottom - top)) ** 2
-        return self.share * np.exp(-2 * away2)
+        across, down = _from_middle(self.place, at)
+        return self.share * np.exp(-2 * (across**2 + down**2))
 
 
 @dataclass(frozen=True, eq=False)

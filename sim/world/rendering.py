@@ -22,7 +22,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Final, Protocol
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -90,65 +90,39 @@ class Waviness:
         return total
 
 
-class Surface(Protocol):
-    """The shape of a sheet of paper."""
-
-    @property
-    def page_mm(self) -> tuple[float, float]:
-        """Width and height of the page."""
-        ...
-
-    def height(self, points_mm: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the height (...) in mm, towards the camera, of points (..., 2) mm on the print, or off the page."""
-        ...
-
-
 @dataclass(frozen=True, eq=False)
-class Folded:
-    """A surface with a crease."""
+class Sheet:
+    """The shape of a sheet of paper: waves, a curl and a crease, added.
 
-    surface: Surface
-    fold: Fold
-
-    @property
-    def page_mm(self) -> tuple[float, float]:
-        """Width and height of the page."""
-        return self.surface.page_mm
-
-    def height(self, points_mm: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the height (...) in mm, towards the camera, of points (..., 2) mm on the print, or off the page."""
-        return self.surface.height(points_mm) + self.fold.height(points_mm)
-
-
-@dataclass(frozen=True, eq=False)
-class Curled:
-    """A surface whose left and right edges stand off its middle: a cylinder, to second order a parabola.
-
-    - `surface`: what it is without the curl.
-    - `curl_mm`: height of both edges above the middle, towards the camera.
+    - `waves`: its smooth waves.
+    - `curl_mm`: height of its left and right edges above its middle, towards the camera: a cylinder, to second order a
+      parabola.
+    - `fold`: its crease.
     """
 
-    surface: Surface
-    curl_mm: float
+    waves: Waviness
+    curl_mm: float = 0.0
+    fold: Fold | None = None
+
+    @classmethod
+    def of_room(cls, room: Room, page_mm: tuple[float, float], fold: Fold | None) -> Sheet:
+        """Return the shape of a room's sheet; waves and curl shrink with its size."""
+        size = math.hypot(*page_mm) / _A0_DIAGONAL_MM
+        waves = Waviness.random(room.seed, room.waviness_mm * size, page_mm, wave_mm=room.wave_mm * size)
+        return cls(waves, room.curl_mm * size, fold)
 
     @property
     def page_mm(self) -> tuple[float, float]:
         """Width and height of the page."""
-        return self.surface.page_mm
+        return self.waves.page_mm
 
     def height(self, points_mm: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the height (...) in mm, towards the camera, of points (..., 2) mm on the print, or off the page."""
-        across = 2 * points_mm[..., 0] / self.page_mm[0] - 1
-        return self.surface.height(points_mm) + self.curl_mm * across**2
-
-
-def surface_of(room: Room, page_mm: tuple[float, float], fold: Fold | None) -> Surface:
-    """Return the shape of a room's sheet; waves and curl shrink with its size."""
-    size = math.hypot(*page_mm) / _A0_DIAGONAL_MM
-    surface: Surface = Waviness.random(room.seed, room.waviness_mm * size, page_mm, wave_mm=room.wave_mm * size)
-    if room.curl_mm:
-        surface = Curled(surface, room.curl_mm * size)
-    return surface if fold is None else Folded(surface, fold)
+        height = self.waves.height(points_mm)
+        if self.curl_mm:
+            across = 2 * points_mm[..., 0] / self.page_mm[0] - 1
+            height = height + self.curl_mm * across**2
+        return height if self.fold is None else height + self.fold.height(points_mm)
 
 
 @dataclass(frozen=True, eq=False)
@@ -163,7 +137,7 @@ class View:
     - `distortion`: k1, k2, p1, p2.
     """
 
-    surface: Surface
+    surface: Sheet
     rotation: NDArray[np.float64]
     distance_mm: float
     focal_px: float
@@ -173,7 +147,7 @@ class View:
     @classmethod
     def framed(
         cls,
-        surface: Surface,
+        surface: Sheet,
         frame_px: tuple[float, float],
         *,
         fill: float,

@@ -29,7 +29,7 @@ from drivers.presenter import Colour
 from foundation.compiled import processor_count
 from sim.optics import APERTURE_VARIANCE, PhotographicLens, lens_falloff, projector_falloff
 from sim.world.disturbances import UNDISTURBED, Situation, moved, moved_back
-from sim.world.rendering import PAPER, Print, View, label_map, surface_of
+from sim.world.rendering import PAPER, Print, Sheet, View, label_map
 from sim.world.room import (
     REFERENCE_APERTURE,
     REFERENCE_EXPOSURE,
@@ -63,7 +63,7 @@ class World:
         rows, columns = body.half_size
         self.stain, self.fold = worn(room, sheet.page_mm, self._random(5))
         self.view = View.framed(
-            surface_of(room, sheet.page_mm, self.fold),
+            Sheet.of_room(room, sheet.page_mm, self.fold),
             (columns, rows),
             fill=room.fill,
             focal_diagonals=room.focal_diagonals,

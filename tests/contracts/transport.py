@@ -12,9 +12,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from drivers.ptp.codes import ResponseCode
-from drivers.ptp.session import MAX_COLLECTED, PtpEvent, PtpRequest, PtpResponse, Transport
+from drivers.ptp.session import MAX_COLLECTED, Answer, NoAnswer, PtpEvent, PtpRequest, PtpResponse, Transport
 from foundation.errors import LinkClosed, LinkTimeout, ProtocolError
-from sim.buses.responder import Answer, NoAnswer
 
 PATIENCE_S = 10.0
 """For what must come; nothing waits this long unless it fails."""
@@ -68,7 +67,7 @@ def payload(size: int) -> bytes:
 
 @dataclass
 class Echo:
-    """A `sim.buses.responder.Responder` that does what it is told."""
+    """A `drivers.ptp.session.Responder` that does what it is told."""
 
     raised: list[PtpEvent] = field(default_factory=list[PtpEvent])
     cancellations: list[int] = field(default_factory=list[int])

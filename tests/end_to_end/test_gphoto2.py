@@ -60,13 +60,12 @@ class WitnessedFilm:
     def accept(self, settings: ExposureSettings) -> None:
         self._film.accept(settings)
 
-    def expose(self, settings: ExposureSettings, released_at: datetime, into: BinaryIO) -> int:
+    def expose(self, settings: ExposureSettings, released_at: datetime, into: BinaryIO) -> None:
         start = into.tell()
-        size = self._film.expose(settings, released_at, into)
+        self._film.expose(settings, released_at, into)
         into.seek(start)
         self.frames.append(into.read())
         self.exposures.append(settings)
-        return size
 
 
 class Served:

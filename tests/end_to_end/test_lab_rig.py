@@ -19,6 +19,7 @@ from acquisition.cli import main
 from acquisition.run.rig.opening import open_rig
 from acquisition.run.rig.simulated import sheet, simulated_body, simulated_room
 from acquisition.run.run import run_session
+from drivers.links.network import serve_peer
 from drivers.links.usb import open_usb
 from drivers.presenter import Colour
 from drivers.projector import Power
@@ -28,7 +29,7 @@ from experiment.config import load_lab
 from experiment.session.folder import Session
 from foundation.clock import Clock, SystemClock
 from sim.buses.ptp import serve_ptpip
-from sim.buses.serial import PseudoTerminal, serve_network
+from sim.buses.serial import PseudoTerminal
 from sim.buses.usb import PtpUsbDevice, SimulatedBus
 from sim.camera.bodies import EOS_BODIES
 from sim.camera.eos import SimulatedEos
@@ -138,7 +139,7 @@ def test_a_makers_language_over_the_network(lab: Path, maker: str, monkeypatch: 
     monkeypatch.setattr("acquisition.run.rig.lab.FullScreen", simulated_display)
     beamer = SimulatedProjector(SystemClock(), power=Power.ON)
     peer = partial(EpsonPeer, beamer, network=True) if maker == "epson" else partial(BenqPeer, beamer, network=True)
-    with serve_network(peer) as server:
+    with serve_peer(peer) as server:
         host, port = server.address
         text = lab.read_text().replace('rig = "simulated"', 'rig = "lab"')
         text += f'[lab.camera]\nconnection = "ptpip"\nhost = "127.0.0.1"\n[lab.projector]\ncontrol = "{maker}"\n'

@@ -21,7 +21,7 @@ from acquisition.cli import main
 from drivers.display.fullscreen import Display, choose_display
 from drivers.links.network import TcpLink, TcpServer
 from drivers.links.usb import open_usb
-from drivers.pjlink.projector import PjLinkProjector
+from drivers.pjlink import PjLinkProjector
 from drivers.projector import Power
 from foundation.clock import Clock, SystemClock
 from foundation.errors import DeviceRefused

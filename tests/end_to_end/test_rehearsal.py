@@ -23,7 +23,7 @@ from typing import Any
 import pytest
 
 from drivers.links.network import TcpLink
-from drivers.pjlink.projector import PjLinkProjector
+from drivers.pjlink import PjLinkProjector
 from experiment.session.folder import Session
 from tests.drivers.display.x_servers import notification, two_outputs, virtual_screen
 

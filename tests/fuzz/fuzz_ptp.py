@@ -31,7 +31,6 @@ with atheris.instrument_imports():
     from drivers.ptp import usb as container
     from drivers.ptp.datasets import (
         DeviceInfo,
-        DevicePropDesc,
         ObjectInfo,
         StorageInfo,
         decode_u32_array,
@@ -107,10 +106,6 @@ CHECKS: tuple[tuple[Callable[[bytes], None], tuple[bytes, ...]], ...] = (
     (_both(DeviceInfo.decode, DeviceInfo.encode), (examples.DEVICE_INFO,)),
     (_both(ObjectInfo.decode, ObjectInfo.encode), (examples.OBJECT_INFO,)),
     (_both(StorageInfo.decode, StorageInfo.encode), (examples.STORAGE_INFO,)),
-    (
-        _both(DevicePropDesc.decode, DevicePropDesc.encode),
-        (examples.BATTERY_DESC, examples.STRING_DESC, examples.RANGE_DESC),
-    ),
     (_both(decode_u32_array, encode_u32_array), (b"\x01\0\0\0\x01\0\x02\0",)),
     (
         _both(records.decode_events, records.encode_events),

@@ -12,8 +12,7 @@ import usbip
 import usbip.host
 
 from drivers.links.network import TcpLink, TcpServer, UdpSocket
-from drivers.pjlink.projector import PjLinkProjector, search
-from drivers.pjlink.wire import LinkUp
+from drivers.pjlink import PjLinkProjector, PjLinkReply, search
 from drivers.projector import Power
 from sim.cli import main
 from tests.drivers.display.x_servers import virtual_screen
@@ -67,7 +66,7 @@ def test_is_found_and_announces_itself() -> None:
         finally:
             process.kill()
     assert [projector.mac for projector in found] == ["02:00:00:00:00:01"]
-    assert notice == LinkUp("02:00:00:00:00:01")
+    assert notice == PjLinkReply("LKUP", "02:00:00:00:00:01", 2)
     assert (process.returncode, out, err) == (0, "stopped\n", "")
 
 

@@ -19,8 +19,8 @@ from drivers.gphoto2_camera import Gphoto2Camera
 from drivers.links.network import TcpLink
 from drivers.links.serial import SerialLink, list_serial_ports
 from drivers.links.usb import list_devices, open_usb
-from drivers.pjlink.projector import PjLinkProjector, search
-from drivers.pjlink.wire import PORT as PJLINK_PORT
+from drivers.pjlink import PORT as PJLINK_PORT
+from drivers.pjlink import PjLinkProjector, search
 from drivers.presenter import Presenter
 from drivers.projector import Projector
 from drivers.ptp.codes import VENDOR_CANON_USB

@@ -13,7 +13,8 @@ from pathlib import Path
 
 from acquisition.run.devices import Devices
 from drivers.canon.camera import CanonEos
-from drivers.pjlink.projector import PjLinkProjector
+from drivers.links.link import PeerLink
+from drivers.pjlink import PjLinkProjector
 from drivers.presenter import Colour
 from drivers.projector import Power
 from experiment.chart.model import Chart
@@ -22,12 +23,12 @@ from experiment.config import LabSettings
 from experiment.session.folder import Session
 from experiment.session.records import last_moment
 from foundation.errors import ConfigurationError, FormatError
-from sim.buses.ptp import MemoryTransport
+from sim.buses.usb import MemoryTransport
 from sim.camera.bodies import EOS_BODIES
 from sim.camera.eos import SimulatedEos
 from sim.camera.film import Film, RecordedFrame, ReplayFilm, WorldFilm
 from sim.clock import OPENING, SimulatedClock
-from sim.projectors.pjlink import PjLinkPeer, memory_link
+from sim.projectors.pjlink import PjLinkPeer
 from sim.projectors.projector import Screen, SimulatedPresenter, SimulatedProjector
 from sim.spectral import known_sensitivities
 from sim.world.disturbances import read_disturbances
@@ -68,7 +69,7 @@ def open_simulated(settings: LabSettings, chart: Chart, session: Session | None,
     body = replace(spoken, shots_per_charge=10**9, aperture_codes=apertures)
     eos = SimulatedEos(body, film, clock, serial=SERIAL, auto_power_off_s=0)
     peer = PjLinkPeer(simulated)
-    projector = PjLinkProjector(lambda: memory_link(peer))
+    projector = PjLinkProjector(lambda: PeerLink(peer))
     opened.callback(projector.close)
     presenter = SimulatedPresenter(screen, clock)
     opened.callback(presenter.close)

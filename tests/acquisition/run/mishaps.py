@@ -20,12 +20,13 @@ from acquisition.run.devices import Devices
 from acquisition.run.run import RunOutcome, take_session
 from drivers.camera import ExposureSettings
 from drivers.canon.camera import CanonEos
-from drivers.links.link import Link, Pipe, UsbPipes
-from drivers.pjlink.projector import PjLinkProjector
+from drivers.links.link import Link, PeerLink, Pipe, UsbPipes
+from drivers.links.usb import open_usb
+from drivers.pjlink import PjLinkProjector
 from drivers.presenter import BLACK, Colour
 from drivers.projector import Power, Severity
 from drivers.ptp.codes import ResponseCode
-from drivers.ptp.session import Transport
+from drivers.ptp.session import Responder, Transport
 from drivers.ptp.usb import UsbTransport
 from experiment.chart.layout import design_chart
 from experiment.config import LabSettings
@@ -34,13 +35,11 @@ from experiment.session.folder import Session
 from experiment.session.journal import Journal
 from experiment.session.records import Judgement, SessionStep, plan_steps
 from foundation.errors import CropError, DeviceError, LinkClosed, StorageError
-from sim.buses.ptp import MemoryPipes
-from sim.buses.responder import Responder
-from sim.buses.usb import PtpUsbDevice
+from sim.buses.usb import PtpUsbDevice, SimulatedBus
 from sim.camera.bodies import EOS_550D
 from sim.camera.eos import SimulatedEos
 from sim.clock import SimulatedClock
-from sim.projectors.pjlink import PjLinkPeer, memory_link
+from sim.projectors.pjlink import PjLinkPeer
 from sim.projectors.projector import SimulatedProjector
 from tests import cable_faults as faults
 from tests.cable_faults import Occasion
@@ -154,13 +153,13 @@ class TroubledLab:
 
     def open(self) -> Transport:
         number, self.openings = self.openings, self.openings + 1
-        pipes = self.pipes.get(number, lambda good: good)(MemoryPipes(PtpUsbDevice(self.device)))
+        pipes = self.pipes.get(number, lambda good: good)(open_usb(backend=SimulatedBus(PtpUsbDevice(self.device))))
         return self.cables.get(number, lambda good: good)(UsbTransport(pipes, self.clock))
 
     def connect_beamer(self) -> Link:
         if self.pulled:
             raise LinkClosed("nothing listens at 127.0.0.1:4352")
-        cable = self.beamer_cable = memory_link(PjLinkPeer(self.beamer))
+        cable = self.beamer_cable = PeerLink(PjLinkPeer(self.beamer))
         return cable
 
     def take(self, session: Session) -> RunOutcome | CropError:

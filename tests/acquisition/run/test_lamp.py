@@ -26,9 +26,8 @@ from acquisition.run.devices import (
     make_ready,
 )
 from acquisition.run.retry import PAUSE_S, RetryPolicy
-from drivers.links.link import Link
-from drivers.pjlink.projector import PjLinkProjector
-from drivers.pjlink.wire import NoResolution
+from drivers.links.link import Link, PeerLink
+from drivers.pjlink import NoResolution, PjLinkProjector
 from drivers.presenter import BLACK, Colour
 from drivers.projector import Fault, Lamp, Power, Projector, Severity
 from drivers.serial_projectors.optoma import OptomaProjector
@@ -36,7 +35,7 @@ from experiment.config import SequenceSettings
 from foundation.errors import DeviceError, DeviceFault, LinkClosed, LinkTimeout, StorageError
 from sim.buses.serial import SerialPeerLink
 from sim.clock import SimulatedClock
-from sim.projectors.pjlink import PjLinkPeer, memory_link
+from sim.projectors.pjlink import PjLinkPeer
 from sim.projectors.projector import SimulatedProjector
 from sim.projectors.serial import OptomaPeer
 from tests.acquisition.run.scripted import Screen, ScriptedCamera
@@ -184,7 +183,7 @@ class Room:
     def _connect(self) -> Link:
         if self.pulled:
             raise LinkClosed("nothing listens at 127.0.0.1:4352")
-        cable = self.cable = memory_link(PjLinkPeer(self.device))
+        cable = self.cable = PeerLink(PjLinkPeer(self.device))
         return cable
 
     def pull(self, pulled: bool = True) -> None:
@@ -219,7 +218,7 @@ def test_a_picture_that_does_not_follow_is_noticed(fault: str, said: str) -> Non
     clock = SimulatedClock()
     beamer = SimulatedProjector(clock, power=Power.ON)
     peer = PjLinkPeer(beamer)
-    projector = PjLinkProjector(lambda: memory_link(peer), clock=clock)
+    projector = PjLinkProjector(lambda: PeerLink(peer), clock=clock)
     assert health_fault(projector) is None
     if fault == "frozen":
         beamer.set_frozen(True)

@@ -12,11 +12,11 @@ from acquisition.run.devices import Devices
 from acquisition.run.pipeline import Taken
 from acquisition.run.retry import PAUSE_S
 from acquisition.run.run import take_session
-from drivers.links.link import Link
-from drivers.pjlink.projector import PjLinkProjector
+from drivers.links.link import Link, PeerLink
+from drivers.pjlink import PjLinkProjector
 from drivers.projector import Power
 from foundation.errors import LinkClosed
-from sim.projectors.pjlink import PjLinkPeer, memory_link
+from sim.projectors.pjlink import PjLinkPeer
 from sim.projectors.projector import SimulatedProjector
 from tests.acquisition.run.scripted import EXPOSE_S, SETTINGS, Hurried, Lab, ScriptedCamera
 
@@ -75,7 +75,7 @@ class Disturbed:
     def connect(self) -> Link:
         if self.pulled:
             raise LinkClosed("nothing listens at 127.0.0.1:4352")
-        cable = self.cable = memory_link(PjLinkPeer(self.beamer))
+        cable = self.cable = PeerLink(PjLinkPeer(self.beamer))
         return cable
 
     def pull(self, pulled: bool = True) -> None:

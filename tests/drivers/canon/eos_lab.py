@@ -9,12 +9,11 @@ from typing import Any
 from drivers.camera import CapturedFrame, capture
 from drivers.canon.camera import CanonEos
 from drivers.links.link import UsbPipes
-from drivers.ptp.session import Transport
+from drivers.links.usb import open_usb
+from drivers.ptp.session import Responder, Transport
 from drivers.ptp.usb import UsbTransport
 from foundation.errors import DeviceError, DeviceFault, DeviceRefused
-from sim.buses.ptp import MemoryPipes
-from sim.buses.responder import Responder
-from sim.buses.usb import PtpUsbDevice
+from sim.buses.usb import PtpUsbDevice, SimulatedBus
 from sim.camera.bodies import EOS_550D, EosModel
 from sim.camera.eos import SimulatedEos
 from sim.clock import SimulatedClock
@@ -37,7 +36,8 @@ class Lab:
 
     def open(self) -> Transport:
         self.openings += 1
-        return self.cable(UsbTransport(self.pipes(MemoryPipes(PtpUsbDevice(self.device))), self.clock))
+        pipes = open_usb(backend=SimulatedBus(PtpUsbDevice(self.device)))
+        return self.cable(UsbTransport(self.pipes(pipes), self.clock))
 
     def take(self, attempts: int = 3) -> CapturedFrame:
         """Take a frame as the sequencer does, and see that it is the one that was exposed last."""

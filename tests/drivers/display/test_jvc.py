@@ -11,11 +11,11 @@ from hypothesis import strategies as st
 from drivers.display import jvc
 from drivers.display.jvc import JvcFlatField
 from drivers.links.link import PeerLink
-from drivers.links.network import TcpLink
+from drivers.links.network import TcpLink, serve_peer
 from drivers.presenter import BLACK, WHITE, Colour
 from foundation.errors import DeviceError, DeviceRefused, LinkClosed, LinkTimeout, ProtocolError
 from sim.clock import SimulatedClock
-from sim.projectors.jvc import JvcPeer, serve_jvc
+from sim.projectors.jvc import JvcPeer
 from sim.projectors.projector import Screen
 from tests.contracts.presenter import Bench, PresenterContract
 from tests.drivers.script import Script
@@ -35,7 +35,7 @@ class TestOverTcp(PresenterContract):
     @pytest.fixture
     def bench(self) -> Iterator[Bench]:
         screen = Screen(WHITE)
-        with serve_jvc(JvcPeer(screen)) as server:
+        with serve_peer(lambda: JvcPeer(screen)) as server:
             presenter = JvcFlatField(lambda: TcpLink.connect(*server.address, 5.0))
             yield Bench(presenter, lambda: screen.colour)
             presenter.close()

@@ -25,8 +25,9 @@ from drivers.display.lightcrafter import (
 from drivers.links.usb import HidDevice, open_hid
 from drivers.presenter import BLACK, WHITE, Colour
 from foundation.errors import DeviceError, DeviceRefused, InputError, LinkClosed, LinkTimeout, ProtocolError
+from sim.buses.usb import SimulatedBus
 from sim.clock import SimulatedClock
-from sim.projectors.lightcrafter import VIDEO_INPUT, Controller, HidBus, LightCrafterUsb
+from sim.projectors.lightcrafter import REPORT_OUT, VIDEO_INPUT, Controller, LightCrafterUsb
 from sim.projectors.projector import Screen
 from tests.contracts.presenter import Bench, PresenterContract
 
@@ -38,7 +39,7 @@ class Table:
         self.screen = Screen(WHITE)
         self.controller = Controller(self.screen, lag)
         self.device = LightCrafterUsb(self.controller)
-        self.bus = HidBus()
+        self.bus = SimulatedBus()
         self.bus.plug(self.device)
         self.clock = SimulatedClock()
 
@@ -211,7 +212,8 @@ def test_goes_on_after_the_cable_was_pulled(table: Table) -> None:
 
 def test_a_late_answer_is_no_answer(table: Table) -> None:
     presenter = table.presenter()
-    table.device.report_out(wire.encode_request(LightCrafterRequest(200, LightCrafterCommand.DISPLAY_MODE, reads=True)))
+    late = LightCrafterRequest(200, LightCrafterCommand.DISPLAY_MODE, reads=True)
+    table.device.write(REPORT_OUT, wire.encode_request(late))
     presenter.show(Colour(5, 6, 7))
     assert table.screen.colour == Colour(5, 6, 7)
 
@@ -220,19 +222,18 @@ def test_a_late_answer_is_no_answer(table: Table) -> None:
 def test_silence_and_foreign_answers_are_timeouts(table: Table, swallow: bool) -> None:
     presenter = table.presenter()
 
-    def report_out(report: bytes) -> None:
+    def write(endpoint: int, data: bytes) -> None:
         if not swallow:
             for _ in range(20):
-                LightCrafterUsb.report_out(
-                    table.device, wire.encode_request(LightCrafterRequest(99, 0x1A00, reads=True))
-                )
+                foreign = wire.encode_request(LightCrafterRequest(99, 0x1A00, reads=True))
+                LightCrafterUsb.write(table.device, endpoint, foreign)
 
-    table.device.report_out = report_out
+    table.device.write = write
     with pytest.raises(LinkTimeout):
         presenter.show(WHITE)
 
 
-def opening(change: Callable[[HidBus, LightCrafterUsb], None]) -> HidDevice:
+def opening(change: Callable[[SimulatedBus, LightCrafterUsb], None]) -> HidDevice:
     table = Table()
     change(table.bus, table.device)
     return table.connect()
@@ -241,14 +242,14 @@ def opening(change: Callable[[HidBus, LightCrafterUsb], None]) -> HidDevice:
 @pytest.mark.parametrize(
     ("change", "kind", "reason"),
     [
-        (HidBus.unplug, LinkClosed, r"no LightCrafter 4500 \(0451:6401\) on USB"),
-        (HidBus.hold, DeviceRefused, "held by another program"),
-        (HidBus.lock, DeviceRefused, "udev rule"),
-        (HidBus.plug, InputError, "2 devices on USB fit"),
+        (SimulatedBus.unplug, LinkClosed, r"no LightCrafter 4500 \(0451:6401\) on USB"),
+        (SimulatedBus.hold, DeviceRefused, "held by another program"),
+        (SimulatedBus.lock, DeviceRefused, "udev rule"),
+        (SimulatedBus.plug, InputError, "2 devices on USB fit"),
     ],
 )
 def test_what_cannot_be_opened_says_why(
-    change: Callable[[HidBus, LightCrafterUsb], None], kind: type[Exception], reason: str
+    change: Callable[[SimulatedBus, LightCrafterUsb], None], kind: type[Exception], reason: str
 ) -> None:
     with pytest.raises(kind, match=reason):
         opening(change)
@@ -265,7 +266,7 @@ def test_is_told_from_its_like_by_serial_number(table: Table) -> None:
 
 @pytest.mark.parametrize("controller", sorted(PRODUCTS))
 def test_either_controller_is_found(controller: str) -> None:
-    screen, bus = Screen(), HidBus()
+    screen, bus = Screen(), SimulatedBus()
     bus.plug(LightCrafterUsb(Controller(screen), PRODUCTS[controller], serial="7"))
     presenter = LightCrafter(lambda: find_lightcrafter("7", backend=bus), SimulatedClock())
     presenter.show(WHITE)

@@ -12,17 +12,16 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 
 import pytest
 
-from drivers.links.link import Link
+from drivers.links.link import Link, PeerLink
 from drivers.links.network import TcpLink
-from drivers.pjlink.projector import PjLinkProjector
-from drivers.pjlink.wire import Input, NoResolution, Resolution
+from drivers.pjlink import Input, NoResolution, PjLinkProjector, Resolution
 from drivers.projector import Fault, Lamp, Power, ProjectorIdentity, Severity
 from foundation.errors import DeviceFault, DeviceRefused, LinkClosed, LinkTimeout, ProtocolError
 from sim.buses.ptp import serve_ptpip
 from sim.camera.bodies import EOS_550D
 from sim.camera.eos import SimulatedEos
 from sim.clock import SimulatedClock
-from sim.projectors.pjlink import PjLinkPeer, memory_link, serve_pjlink
+from sim.projectors.pjlink import PjLinkPeer, serve_pjlink
 from sim.projectors.projector import ProjectorTraits, SimulatedProjector
 from tests.contracts.camera import SeededFilm
 from tests.contracts.projector import Bench, ProjectorContract
@@ -405,7 +404,7 @@ def simulated_bench(
 class TestOverMemory(ProjectorContract):
     @pytest.fixture(params=[None, PASSWORD], ids=["open", "password"])
     def bench(self, request: pytest.FixtureRequest) -> Bench:
-        return simulated_bench(lambda device: lambda: memory_link(PjLinkPeer(device, request.param)), request.param)
+        return simulated_bench(lambda device: lambda: PeerLink(PjLinkPeer(device, request.param)), request.param)
 
 
 class TestOverLoopback(ProjectorContract):
@@ -430,14 +429,14 @@ class TestOverLoopback(ProjectorContract):
 class TestByteByByte(ProjectorContract):
     @pytest.fixture
     def bench(self) -> Bench:
-        return simulated_bench(lambda device: lambda: Dribbling(memory_link(PjLinkPeer(device))))
+        return simulated_bench(lambda device: lambda: Dribbling(PeerLink(PjLinkPeer(device))))
 
 
 class TestDroppedAtEverySecondCommand(ProjectorContract):
     @pytest.fixture(params=[None, PASSWORD], ids=["open", "password"])
     def bench(self, request: pytest.FixtureRequest) -> Bench:
         return simulated_bench(
-            lambda device: lambda: DroppedAfter(memory_link(PjLinkPeer(device, request.param)), 1), request.param
+            lambda device: lambda: DroppedAfter(PeerLink(PjLinkPeer(device, request.param)), 1), request.param
         )
 
 
@@ -450,7 +449,7 @@ class TestNoisyLineEnds(ProjectorContract):
             data = data.replace(b"%1POWR=", b"%1powr=").replace(b"=OK", b"=Ok").replace(b"=ERR", b"=err")
             return b"\n%2LKUP=00:11:22:33:44:55\r\0" + data.replace(b"\r", b"\r\n\0\0")
 
-        return simulated_bench(lambda device: lambda: Garbling(memory_link(PjLinkPeer(device)), garble))
+        return simulated_bench(lambda device: lambda: Garbling(PeerLink(PjLinkPeer(device)), garble))
 
 
 class TestAnswersThatTakeTheirTime(ProjectorContract):
@@ -461,7 +460,7 @@ class TestAnswersThatTakeTheirTime(ProjectorContract):
         clock, cable_clock = SimulatedClock(), SimulatedClock()
         device = SimulatedProjector(clock)
         return Bench(
-            PjLinkProjector(lambda: Slow(memory_link(PjLinkPeer(device)), cable_clock, 4.0), clock=cable_clock),
+            PjLinkProjector(lambda: Slow(PeerLink(PjLinkPeer(device)), cable_clock, 4.0), clock=cable_clock),
             clock.sleep,
             device.break_part,
             device.repair,
@@ -474,7 +473,7 @@ class TestAnswersThatTakeTheirTime(ProjectorContract):
 def test_an_answer_that_comes_too_late_is_a_timeout() -> None:
     clock = SimulatedClock()
     peer = PjLinkPeer(SimulatedProjector(SimulatedClock()))
-    projector = PjLinkProjector(lambda: Slow(memory_link(peer), clock, 6.0), clock=clock)
+    projector = PjLinkProjector(lambda: Slow(PeerLink(peer), clock, 6.0), clock=clock)
     with pytest.raises(LinkTimeout, match="within 5 s"):
         projector.power()
 
@@ -492,7 +491,7 @@ class TestClass2:
         }
         if request.param in wrapped:
             wrap = wrapped[request.param]
-            yield PjLinkProjector(lambda: wrap(memory_link(PjLinkPeer(device, PASSWORD))), PASSWORD), device
+            yield PjLinkProjector(lambda: wrap(PeerLink(PjLinkPeer(device, PASSWORD))), PASSWORD), device
             return
         with serve_pjlink(device, password=PASSWORD) as server:
             projector = PjLinkProjector(lambda: TcpLink.connect(*server.address, 10.0), PASSWORD, 10.0)
@@ -511,7 +510,7 @@ class TestClass2:
 def test_a_garbled_answer_is_told_and_the_next_connection_is_clean() -> None:
     peer = PjLinkPeer(SimulatedProjector(SimulatedClock(), Power.ON))
     garbles: list[Callable[[bytes], bytes]] = [lambda data: data.replace(b"POWR=", b"PO\xffR="), lambda data: data]
-    projector = PjLinkProjector(lambda: Garbling(memory_link(peer), garbles.pop(0)))
+    projector = PjLinkProjector(lambda: Garbling(PeerLink(peer), garbles.pop(0)))
     with pytest.raises(ProtocolError):
         projector.power()
     assert projector.power() is Power.ON
@@ -522,7 +521,7 @@ def test_a_swallowed_answer_is_told_and_the_next_connection_is_clean() -> None:
     made: list[Link] = []
 
     def connect() -> Link:
-        good = memory_link(PjLinkPeer(device))
+        good = PeerLink(PjLinkPeer(device))
         made.append(Deaf(good, after=1) if not made else good)
         return made[-1]
 

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import TypedDict
 
 from drivers.ptp.codes import AeMode, DriveMode, Operation, Property
+from drivers.ptp.datasets import Cursor, DevicePropDesc, read_value
 from drivers.ptp.session import PtpRequest
 from sim.camera.bodies import EOS_550D
 from sim.camera.eos import SimulatedEos
@@ -150,3 +151,13 @@ def conversations() -> dict[str, Callable[[], list[Recorded]]]:
 
 def _read(path: Path) -> list[Recorded]:
     return json.loads(path.read_text())
+
+
+def read_description(data: bytes) -> DevicePropDesc:
+    """Return the property of a recorded GetDevicePropDesc; the only list in the recordings has bytes sent as words."""
+    cursor = Cursor(data, "a recorded description")
+    code, kind, writable = cursor.u16("code"), cursor.u16("type"), cursor.u8("get/set") != 0
+    default, current = read_value(cursor, kind, "default"), read_value(cursor, kind, "current")
+    listed = cursor.u8("form") == 2
+    choices = cursor.integers(cursor.u16("count"), 2, "choices") if listed else ()
+    return DevicePropDesc(code, kind, writable, default, current, choices, widened=listed)

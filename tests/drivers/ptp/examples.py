@@ -12,7 +12,7 @@ from drivers.canon import records as datasets
 from drivers.canon import records as values
 from drivers.ptp import ip as ptpip
 from drivers.ptp import usb as container
-from drivers.ptp.datasets import DeviceInfo, DevicePropDesc, ObjectInfo, StorageInfo, decode_u32_array, decode_value
+from drivers.ptp.datasets import DeviceInfo, ObjectInfo, StorageInfo, decode_u32_array, decode_value
 
 # ISO 15740, 5.5.1: version 1.00, vendor 0xb "ab", two operations, one event, no properties, one capture format,
 # two image formats, "C", "EOS", "1", "2".
@@ -30,9 +30,8 @@ OBJECT_INFO = bytes.fromhex(
 STORAGE_INFO = bytes.fromhex("0400 0300 0000 0000886d07000000 0080bf6c07000000 ffffffff 03530044000000 00 0000")
 # EOS 60D, property 0x5001: the battery at 50 %, values of one byte sent as two.
 BATTERY_DESC = bytes.fromhex("0150 0200 00 32 32 02 0500 6400 4b00 3200 1900 0000")
-# ISO 15740, 13.3.3: property 0x5003 as a string of two choices, and 0x5008 as a 32-bit range of focal lengths.
+# ISO 15740, 13.3.3: property 0x5003 as a string of two choices.
 STRING_DESC = bytes.fromhex("0350 ffff 01 0231000000 0232000000 02 0200 0231000000 0232000000")
-RANGE_DESC = bytes.fromhex("0850 0600 00 88130000 88130000 01 08070000 58980000 01000000")
 # EOS 400D, answer to 0x9116 after a shot, as gphoto2 logged it with its container's header of 12 bytes.
 EOS_400D_SHOT = bytes.fromhex(
     "50000000020016910b070000 3c000000"
@@ -113,9 +112,6 @@ READERS: tuple[tuple[str, Callable[[bytes], object], bytes], ...] = (
     ("DeviceInfo", DeviceInfo.decode, DEVICE_INFO),
     ("ObjectInfo", ObjectInfo.decode, OBJECT_INFO),
     ("StorageInfo", StorageInfo.decode, STORAGE_INFO[:-2]),
-    ("DevicePropDesc, widened", DevicePropDesc.decode, BATTERY_DESC),
-    ("DevicePropDesc, text", DevicePropDesc.decode, STRING_DESC),
-    ("DevicePropDesc, range", DevicePropDesc.decode, RANGE_DESC),
     ("array", decode_u32_array, bytes.fromhex("02000000 01000200 00000200")),
     ("text", lambda data: decode_value(0xFFFF, data), bytes.fromhex("0361006200 0000")),
     ("array of bytes", lambda data: decode_value(0x4002, data), bytes.fromhex("03000000 010203")),

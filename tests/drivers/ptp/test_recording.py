@@ -22,11 +22,10 @@ from drivers.canon.records import (
     PropertySetting,
 )
 from drivers.ptp import usb as container
-from drivers.ptp.codes import Operation, Property
+from drivers.ptp.codes import DataType, Operation, Property
 from drivers.ptp.datasets import (
     DeviceInfo,
     DevicePropDesc,
-    EnumerationForm,
     StorageInfo,
     decode_u32_array,
     encode_u32_array,
@@ -34,11 +33,11 @@ from drivers.ptp.datasets import (
 from drivers.ptp.ip import EndData, OperationRequest, PacketCutter, StartData, encode
 from drivers.ptp.session import PtpRequest, PtpResponse
 from drivers.ptp.usb import ContainerReader, DataPiece, DataStart
-from tests.drivers.ptp.conversations import EOS_60D_PROPERTIES, Recorded
+from tests.drivers.ptp.conversations import EOS_60D_PROPERTIES, Recorded, read_description
 
 REBUILT: dict[int, Callable[[bytes], bytes]] = {
     Operation.GET_DEVICE_INFO: lambda data: DeviceInfo.decode(data).encode(),
-    Operation.GET_DEVICE_PROP_DESC: lambda data: DevicePropDesc.decode(data).encode(),
+    Operation.GET_DEVICE_PROP_DESC: lambda data: read_description(data).encode(),
     Operation.EOS_GET_STORAGE_IDS: lambda data: encode_u32_array(decode_u32_array(data)),
     Operation.EOS_GET_STORAGE_INFO: lambda data: StorageInfo.decode(data).encode(),
     Operation.EOS_GET_DEVICE_INFO_EX: lambda data: DeviceInfoEx.decode(data).encode(),
@@ -99,7 +98,7 @@ def test_every_transaction_crosses_both_cables(recording: list[Recorded]) -> Non
         assert b"".join(m.data for m in messages if isinstance(m, DataPiece)) == data
         if entry["data"] is not None:
             assert messages[1] == DataStart(code, tid, len(data))
-        packets = [OperationRequest(request, entry["dir"] == "out"), StartData(tid, len(data)), EndData(tid, data)]
+        packets = [OperationRequest(entry["dir"] == "out", request), StartData(tid, len(data)), EndData(tid, data)]
         assert PacketCutter().feed(b"".join(map(encode, packets))) == packets
 
 
@@ -154,6 +153,7 @@ def test_the_state_dump(body: str, recording: list[Recorded]) -> None:
 
 
 def test_the_battery_is_told_in_words_of_16_bits(body: str, recording: list[Recorded]) -> None:
-    described = DevicePropDesc.decode(first(recording, Operation.GET_DEVICE_PROP_DESC))
-    assert described.current == FACTS[body].battery_percent
-    assert described.form == EnumerationForm((100, 75, 50, 25, 0), widened=True)
+    percent = FACTS[body].battery_percent
+    battery = Property.BATTERY_LEVEL, DataType.UINT8, False, percent, percent
+    described = DevicePropDesc(*battery, (100, 75, 50, 25, 0), widened=True)
+    assert first(recording, Operation.GET_DEVICE_PROP_DESC) == described.encode()

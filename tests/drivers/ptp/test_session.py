@@ -117,7 +117,7 @@ def test_patience_ends_by_the_clock() -> None:
 def test_no_patience_asks_once() -> None:
     session, cable, clock = opened(ResponseCode.OK, 0x2019)
     with pytest.raises(OperationDeclined):
-        session.call(Operation.EOS_REMOTE_RELEASE_ON, 3, 1, patience=0.0)
+        session.call(Operation.EOS_REMOTE_RELEASE_ON, 3, 1, retry_s=0.0)
     assert (len(cable.asked), clock.monotonic()) == (2, 0.0)
 
 

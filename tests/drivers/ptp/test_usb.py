@@ -10,13 +10,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from drivers.links.link import Pipe, PipeStalled, UsbPipes
+from drivers.links.usb import open_usb
 from drivers.ptp import usb as container
 from drivers.ptp.codes import EventCode, Operation, ResponseCode
 from drivers.ptp.session import PtpEvent, PtpRequest, PtpResponse, next_transaction
 from drivers.ptp.usb import ContainerReader, DataPiece, DataStart, DeviceStatus, Message, UsbTransport
 from foundation.errors import DeviceError, LinkClosed, LinkTimeout, ProtocolError
-from sim.buses.ptp import MemoryPipes
-from sim.buses.usb import PtpUsbDevice
+from sim.buses.usb import PtpUsbDevice, SimulatedBus
 from sim.clock import SimulatedClock
 from tests.cable_faults import CutOff, Deaf, Garbling, HeaderAlone, Joining, ShortReads, Stalling, WithoutEmptyPackets
 from tests.contracts.transport import (
@@ -80,12 +80,6 @@ def test_a_transaction_as_the_60d_sends_it() -> None:
     ]
 
 
-def test_an_event_of_the_400d() -> None:
-    (start, piece) = ContainerReader().feed(examples.EOS_400D_SHOT)
-    assert start == DataStart(Operation.EOS_GET_EVENT, 0x070B, 68)
-    assert piece == DataPiece(examples.EOS_400D_SHOT[12:], last=True)
-
-
 def test_a_header_that_travels_alone() -> None:
     reader = ContainerReader()
     assert reader.feed(container.encode_data_header(0x1009, 5, 3)) == [DataStart(0x1009, 5, 3)]
@@ -102,19 +96,6 @@ def test_empty_packets_are_passed_over() -> None:
     pieces = (phase, b"", container.encode(PtpResponse(0x2001, 5)))
     messages = [message for piece in pieces for message in reader.feed(piece)]
     assert messages == [DataStart(0x1009, 5, 500), DataPiece(bytes(500), last=True), PtpResponse(0x2001, 5)]
-
-
-def test_a_response_may_share_a_read_with_the_data() -> None:
-    reader = ContainerReader()
-    stream = container.encode_data(0x1009, 5, b"abc") + container.encode(PtpResponse(0x2001, 5, (3,)))
-    assert reader.feed(stream)[-1] == PtpResponse(0x2001, 5, (3,))
-
-
-def test_an_empty_data_phase_is_closed_at_once() -> None:
-    assert ContainerReader().feed(container.encode_data(0x9116, 1, b"")) == [
-        DataStart(0x9116, 1, 0),
-        DataPiece(b"", last=True),
-    ]
 
 
 @pytest.mark.parametrize("alone", [True, False])
@@ -247,8 +228,10 @@ class TestOverMemory(TransportContract):
     @pytest.fixture(params=WAYS)
     def bench(self, request: pytest.FixtureRequest) -> Bench:
         responder = Echo()
-        pipes = MemoryPipes(PtpUsbDevice(responder))
-        return Bench(UsbTransport(WAYS[request.param](pipes), SimulatedClock()), responder, pipes.pull)
+        device = PtpUsbDevice(responder)
+        bus = SimulatedBus(device)
+        pipes = WAYS[request.param](open_usb(backend=bus))
+        return Bench(UsbTransport(pipes, SimulatedClock()), responder, lambda: bus.unplug(device))
 
 
 class Script:
@@ -380,7 +363,7 @@ def test_a_second_stall_is_an_error() -> None:
 @pytest.mark.parametrize("transfer", [0, 1, 2])
 def test_a_stall_on_the_way_out_is_tried_again(transfer: int) -> None:
     bench = Echo()
-    pipes = Stalling(MemoryPipes(PtpUsbDevice(bench)), Pipe.BULK_OUT, {transfer})
+    pipes = Stalling(open_usb(backend=SimulatedBus(PtpUsbDevice(bench))), Pipe.BULK_OUT, {transfer})
     transport = UsbTransport(pipes, SimulatedClock())
     for _ in range(2):
         done = transport.transact(PtpRequest(TAKE, 1), send=payload(500), timeout=PATIENCE_S)
@@ -472,8 +455,8 @@ def test_a_caller_who_cannot_take_data_cancels() -> None:
     assert transport.transact(PtpRequest(0x9116, 5), timeout=PATIENCE_S).response.ok
 
 
-def camera() -> MemoryPipes:
-    return MemoryPipes(PtpUsbDevice(Echo()))
+def camera() -> UsbPipes:
+    return open_usb(backend=SimulatedBus(PtpUsbDevice(Echo())))
 
 
 def _give_twice(transport: UsbTransport, pieces: list[bytes]) -> None:

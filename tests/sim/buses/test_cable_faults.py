@@ -8,12 +8,10 @@ import pytest
 
 from drivers.links.usb import open_usb
 from drivers.ptp.codes import ResponseCode
-from drivers.ptp.session import PtpEvent, PtpRequest, Transport
+from drivers.ptp.session import PtpEvent, PtpRequest, Responder, Transport
 from drivers.ptp.usb import UsbTransport
 from foundation.errors import LinkClosed, LinkTimeout, ProtocolError
-from sim.buses.ptp import MemoryTransport
-from sim.buses.responder import Responder
-from sim.buses.usb import PtpUsbDevice, SimulatedBus
+from sim.buses.usb import MemoryTransport, PtpUsbDevice, SimulatedBus
 from sim.clock import SimulatedClock
 from tests.cable_faults import (
     Declining,

@@ -19,7 +19,7 @@ from aiopjlink import PJClass
 from pypjlink.projector import ProjectorError
 
 from drivers.links.network import TcpServer
-from drivers.pjlink.wire import NoResolution
+from drivers.pjlink import NoResolution
 from drivers.projector import Power, Severity
 from sim.clock import SimulatedClock
 from sim.projectors.pjlink import serve_pjlink

@@ -7,9 +7,8 @@ import hashlib
 import pytest
 
 from drivers.links.network import UdpSocket
-from drivers.pjlink.projector import search
-from drivers.pjlink.wire import FaultsChanged, InputChanged, LinkUp, NoResolution, PowerChanged
-from drivers.projector import Fault, Power, Severity
+from drivers.pjlink import NoResolution, PjLinkReply, search
+from drivers.projector import Power, Severity
 from foundation.errors import DeviceFault, LinkTimeout
 from sim.clock import SimulatedClock
 from sim.projectors.pjlink import Announcer, PjLinkPeer, ProjectorDatagrams
@@ -27,6 +26,10 @@ class TestSimulatedProjector(ProjectorContract):
         return Bench(
             device, clock.sleep, device.break_part, device.repair, traits.identity, traits.warm_up_s, traits.cool_down_s
         )
+
+
+def notice(command: str, value: str) -> PjLinkReply:
+    return PjLinkReply(command, value, 2)
 
 
 def test_light_follows_the_lamp_and_the_mute() -> None:
@@ -215,17 +218,17 @@ def test_announces_its_start_and_then_each_change() -> None:
     clock = SimulatedClock()
     device = SimulatedProjector(clock)
     announcer = Announcer(device)
-    assert announcer.news() == (LinkUp("02:00:00:00:00:01"),)
+    assert announcer.news() == (notice("LKUP", "02:00:00:00:00:01"),)
     assert announcer.news() == ()
     device.switch_on()
-    assert announcer.news() == (PowerChanged(Power.WARMING),)
+    assert announcer.news() == (notice("POWR", "3"),)
     clock.sleep(30)
-    assert announcer.news() == (PowerChanged(Power.ON), InputChanged("31"))
+    assert announcer.news() == (notice("POWR", "1"), notice("INPT", "31"))
     device.set_input("32")
     device.break_part("fan", Severity.WARNING)
-    assert announcer.news() == (FaultsChanged((Fault("fan", Severity.WARNING),)), InputChanged("32"))
+    assert announcer.news() == (notice("ERST", "100000"), notice("INPT", "32"))
     device.repair()
-    assert announcer.news() == (FaultsChanged(()),)
+    assert announcer.news() == (notice("ERST", "000000"),)
     assert announcer.news() == ()
 
 
@@ -266,10 +269,10 @@ def test_sends_notices_to_the_controller_in_its_menu() -> None:
         ProjectorDatagrams(device, controller=controller.address) as datagrams,
     ):
         datagrams.announce()
-        assert controller.receive(10.0) == ("127.0.0.1", LinkUp("02:00:00:00:00:01"))
+        assert controller.receive(10.0) == ("127.0.0.1", notice("LKUP", "02:00:00:00:00:01"))
         device.switch_on()
         datagrams.announce()
-        assert controller.receive(10.0) == ("127.0.0.1", PowerChanged(Power.WARMING))
+        assert controller.receive(10.0) == ("127.0.0.1", notice("POWR", "3"))
 
 
 def test_the_port_asks_for_the_password_once_a_connection() -> None:

@@ -17,13 +17,13 @@ if sys.platform == "win32":
 from benqprojector import BenQProjectorSerial
 from epson_projector import Projector
 
-from drivers.links.network import TcpLink
+from drivers.links.network import TcpLink, serve_peer
 from drivers.links.serial import SerialLink
 from drivers.projector import Power, Severity
 from drivers.serial_projectors import LANGUAGES
 from drivers.serial_projectors.benq import BenqProjector
 from drivers.serial_projectors.epson import EpsonOnNetwork, EpsonProjector
-from sim.buses.serial import PseudoTerminal, serve_network
+from sim.buses.serial import PseudoTerminal
 from sim.cli import main
 from sim.clock import SimulatedClock
 from sim.projectors.projector import ProjectorTraits, SimulatedProjector
@@ -130,7 +130,7 @@ def served(request: pytest.FixtureRequest, device: SimulatedProjector) -> Iterat
     def peer() -> BenqPeer | EpsonPeer:
         return (BenqPeer if request.param == "benq" else EpsonPeer)(device, network=True)
 
-    with serve_network(peer) as server:
+    with serve_peer(peer) as server:
 
         def connect() -> TcpLink:
             return TcpLink.connect(*server.address, 10.0)

@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from drivers.pjlink.projector import PjLinkProjector
-from drivers.pjlink.wire import Input
+from drivers.links.link import PeerLink
+from drivers.pjlink import Input, PjLinkProjector
 from drivers.projector import Power
 from foundation.errors import DeviceError, DeviceRefused, InputError, LinkClosed
 from sim.clock import SimulatedClock
-from sim.projectors.pjlink import PjLinkPeer, memory_link
+from sim.projectors.pjlink import PjLinkPeer
 from sim.projectors.projector import ProjectorTraits, SimulatedProjector
 from sim.projectors.watching import (
     FINEST_PX,
@@ -197,7 +197,7 @@ def test_what_a_projector_says_is_its_light(answers: Answers, state: LampState) 
 def test_the_question_is_understood_by_a_projector_of_either_class(pjlink_class: int) -> None:
     device = SimulatedProjector(SimulatedClock(), Power.ON, ProjectorTraits(pjlink_class=pjlink_class))
     peer = PjLinkPeer(device)
-    projector = PjLinkProjector(lambda: memory_link(peer))
+    projector = PjLinkProjector(lambda: PeerLink(peer))
     assert ask(projector) == LampState(1.0, False, "31")
     device.set_frozen(True)
     assert ask(projector).frozen == (pjlink_class == 2)

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from sim.world.rendering import View, Waviness
+from sim.world.rendering import Sheet, View, Waviness
 
 pytestmark = pytest.mark.slow
 
@@ -18,7 +18,7 @@ FRAME_PX = (2601, 1732)
 
 
 def view(waviness_mm: float = 3.0, turn: tuple[float, float, float] = (2.0, -3.0, 0.5), k1: float = -0.03) -> View:
-    surface = Waviness.random(1, waviness_mm, PAGE_MM)
+    surface = Sheet(Waviness.random(1, waviness_mm, PAGE_MM))
     distortion = (k1, 0.01, 2e-4, -3e-4)
     return View.framed(surface, FRAME_PX, fill=0.94, focal_diagonals=1.3, turn_deg=turn, distortion=distortion)
 
@@ -29,7 +29,7 @@ def corners() -> NDArray[np.float64]:
 
 
 def test_the_flat_print_face_on_fills_its_share_of_the_frame() -> None:
-    surface = Waviness.random(1, 0, PAGE_MM)
+    surface = Sheet(Waviness.random(1, 0, PAGE_MM))
     straight = View.framed(
         surface, FRAME_PX, fill=0.94, focal_diagonals=1.3, turn_deg=(0, 0, 0), distortion=(0, 0, 0, 0)
     )
