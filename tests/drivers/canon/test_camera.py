@@ -39,7 +39,6 @@ from drivers.canon.records import (
     encode_events,
     number_value,
 )
-from drivers.links.link import Pipe, UsbPipes
 from drivers.links.usb import open_usb
 from drivers.ptp.codes import AeMode, CaptureDestination, EosEvent, Operation, Property, ResponseCode
 from drivers.ptp.ip import IpTransport
@@ -426,24 +425,6 @@ def test_a_cable_pulled_at_any_byte(after: int) -> None:
     lab.pipes = lambda pipes: faults.CutOff(pipes, after) if lab.openings == 1 else pipes
     goes_on(lab)
     assert lab.openings > 1
-
-
-WAYS: dict[str, Callable[[UsbPipes], UsbPipes]] = {
-    "short reads": faults.ShortReads,
-    "header alone": faults.HeaderAlone,
-    "data and response joined": faults.Joining,
-    "no empty packets": faults.WithoutEmptyPackets,
-    "stalls in": lambda pipes: faults.Stalling(pipes, Pipe.BULK_IN, range(3, 400, 7)),
-    "stalls out": lambda pipes: faults.Stalling(pipes, Pipe.BULK_OUT, range(3, 400, 7)),
-}
-
-
-@pytest.mark.parametrize("way", WAYS)
-def test_whatever_way_the_bytes_come(way: str) -> None:
-    lab = Lab(film_bytes=40_000)
-    lab.pipes = WAYS[way]
-    goes_on(lab)
-    assert lab.openings == 1
 
 
 @pytest.mark.parametrize("change", CHANGES)

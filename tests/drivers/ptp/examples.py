@@ -5,7 +5,10 @@ The bytes are written by hand from the standard, or recorded from the cameras na
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
+from itertools import pairwise
+
+from hypothesis import strategies as st
 
 from drivers.canon import records as canon
 from drivers.canon import records as datasets
@@ -134,3 +137,13 @@ STREAMS: tuple[tuple[str, Callable[[bytes], object], bytes], ...] = (
     ("PTP/IP stream", read_ip, b"".join(IP_PACKETS)),
 )
 """What reads streams: cut short they wait for more instead of raising."""
+
+U16 = st.integers(0, 0xFFFF)
+U32 = st.integers(0, 0xFFFFFFFF)
+PARAMETERS = st.lists(U32, max_size=5).map(tuple)
+
+
+def split(data: bytes, cuts: Iterable[int]) -> list[bytes]:
+    """Return bytes cut into pieces at any places."""
+    places = sorted({0, len(data), *(cut % (len(data) + 1) for cut in cuts)})
+    return [data[start:end] for start, end in pairwise(places)]

@@ -19,9 +19,8 @@ from drivers.ptp.datasets import (
 )
 from foundation.errors import ProtocolError
 from tests.drivers.ptp import examples
+from tests.drivers.ptp.examples import U16, U32
 
-U16 = st.integers(0, 0xFFFF)
-U32 = st.integers(0, 0xFFFFFFFF)
 U64 = st.integers(0, 0xFFFFFFFFFFFFFFFF)
 TEXT = st.text(st.characters(exclude_categories=["Cs"], exclude_characters="\0"), max_size=127)
 CODES = st.lists(U16, max_size=20).map(tuple)

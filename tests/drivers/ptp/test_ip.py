@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Iterable, Iterator
-from itertools import pairwise
 
 import pytest
 from hypothesis import given
@@ -38,6 +37,7 @@ from tests.contracts.link import read_exactly
 from tests.contracts.transport import PATIENCE_S, Bench, Echo, TransportContract
 from tests.drivers.links.troubled_links import Dribbling
 from tests.drivers.ptp import examples
+from tests.drivers.ptp.examples import PARAMETERS, U16, U32, split
 from tests.joined_links import JoinedLink, joined_links
 
 CONVERSATION: tuple[Packet, ...] = (
@@ -59,9 +59,6 @@ CONVERSATION: tuple[Packet, ...] = (
 )
 """What `examples.IP_PACKETS` say."""
 
-U16 = st.integers(0, 0xFFFF)
-U32 = st.integers(0, 0xFFFFFFFF)
-PARAMETERS = st.lists(U32, max_size=5).map(tuple)
 NAMES = st.text(st.characters(exclude_categories=["Cs"], exclude_characters="\0"), max_size=40)
 GUIDS = st.binary(min_size=16, max_size=16)
 REQUESTS = st.builds(PtpRequest, U16, U32, PARAMETERS)
@@ -93,11 +90,6 @@ def joined(packets: Iterable[Packet]) -> list[Packet]:
         elif packet != Data(getattr(packet, "transaction", 0), b""):
             result.append(packet)
     return result
-
-
-def split(data: bytes, cuts: Iterable[int]) -> list[bytes]:
-    places = sorted({0, len(data), *(cut % (len(data) + 1) for cut in cuts)})
-    return [data[start:end] for start, end in pairwise(places)]
 
 
 @pytest.mark.parametrize(("octets", "packet"), list(zip(examples.IP_PACKETS, CONVERSATION, strict=True)))

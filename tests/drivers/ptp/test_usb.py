@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from itertools import pairwise
 
 import pytest
 from hypothesis import given
@@ -31,10 +30,8 @@ from tests.contracts.transport import (
     payload,
 )
 from tests.drivers.ptp import examples
+from tests.drivers.ptp.examples import PARAMETERS, U16, U32, split
 
-U16 = st.integers(0, 0xFFFF)
-U32 = st.integers(0, 0xFFFFFFFF)
-PARAMETERS = st.lists(U32, max_size=5).map(tuple)
 MESSAGES = st.one_of(
     st.builds(PtpRequest, U16, U32, PARAMETERS),
     st.builds(PtpResponse, U16, U32, PARAMETERS),
@@ -52,11 +49,6 @@ def joined(messages: Iterable[Message]) -> list[Message]:
         else:
             result.append(message)
     return result
-
-
-def split(data: bytes, cuts: Iterable[int]) -> list[bytes]:
-    places = sorted({0, len(data), *(cut % (len(data) + 1) for cut in cuts)})
-    return [data[start:end] for start, end in pairwise(places)]
 
 
 def test_commands_are_the_standards_bytes() -> None:
