@@ -134,7 +134,7 @@ def endpoint_descriptor(address: int, kind: int, packet: int, interval: int = 0)
     return struct.pack("<BBBBHB", 7, _ENDPOINT, address, kind, packet, interval)
 
 
-class UsbDevice(ABC):
+class SimulatedUsbDevice(ABC):
     """A device of one configuration and one interface: its descriptors and standard requests, and its pipes."""
 
     pipes: ClassVar[frozenset[int]]
@@ -232,7 +232,7 @@ class UsbDevice(ABC):
         return bytes([2 + len(body), _STRING]) + body
 
 
-class PtpUsbDevice(UsbDevice):
+class PtpUsbDevice(SimulatedUsbDevice):
     """A still image device, at high speed."""
 
     pipes = frozenset({BULK_IN, BULK_OUT, INTERRUPT_IN})
@@ -386,7 +386,7 @@ _FIELDS = {
 class Place:
     """Where a device is plugged in, and since when: two places of one device differ in their address."""
 
-    device: UsbDevice
+    device: SimulatedUsbDevice
     port: int
     address: int
 
@@ -402,51 +402,51 @@ class Handle:
 class SimulatedBus(IBackend):
     """A bus with devices that can be plugged in and pulled out."""
 
-    def __init__(self, *devices: UsbDevice) -> None:
+    def __init__(self, *devices: SimulatedUsbDevice) -> None:
         self._places: list[Place] = []
         self._addresses = 1
         self._claims: dict[Place, Handle] = {}
-        self._held: set[UsbDevice] = set()
-        self._locked: set[UsbDevice] = set()
-        self._kernel: set[UsbDevice] = set()
+        self._held: set[SimulatedUsbDevice] = set()
+        self._locked: set[SimulatedUsbDevice] = set()
+        self._kernel: set[SimulatedUsbDevice] = set()
         for port, device in enumerate(devices, 1):
             self.plug(device, port)
 
-    def plug(self, device: UsbDevice, port: int = 1) -> None:
+    def plug(self, device: SimulatedUsbDevice, port: int = 1) -> None:
         """Plug a device in."""
         self._addresses += 1
         self._places.append(Place(device, port, self._addresses))
 
-    def unplug(self, device: UsbDevice) -> None:
+    def unplug(self, device: SimulatedUsbDevice) -> None:
         """Pull a device out; does nothing if it is not plugged in."""
         for place in [place for place in self._places if place.device is device]:
             self._places.remove(place)
             self._claims.pop(place, None)
             device.unplugged()
 
-    def replug(self, device: UsbDevice) -> None:
+    def replug(self, device: SimulatedUsbDevice) -> None:
         """Pull a device out and plug it in again at its port, as it does itself when it restarts."""
         port = next((place.port for place in self._places if place.device is device), 1)
         self.unplug(device)
         self.plug(device, port)
 
-    def hold(self, device: UsbDevice, held: bool = True) -> None:
+    def hold(self, device: SimulatedUsbDevice, held: bool = True) -> None:
         """Have another program hold the device's interface, or let go of it."""
         (self._held.add if held else self._held.discard)(device)
 
-    def lock(self, device: UsbDevice, locked: bool = True) -> None:
+    def lock(self, device: SimulatedUsbDevice, locked: bool = True) -> None:
         """Take away the permission to open the device, or give it."""
         (self._locked.add if locked else self._locked.discard)(device)
 
-    def bind_kernel_driver(self, device: UsbDevice) -> None:
+    def bind_kernel_driver(self, device: SimulatedUsbDevice) -> None:
         """Have the system's own driver sit on the interface."""
         self._kernel.add(device)
 
-    def kernel_driver_sits_on(self, device: UsbDevice) -> bool:
+    def kernel_driver_sits_on(self, device: SimulatedUsbDevice) -> bool:
         """Return whether the system's own driver sits on the interface."""
         return device in self._kernel
 
-    def is_claimed(self, device: UsbDevice) -> bool:
+    def is_claimed(self, device: SimulatedUsbDevice) -> bool:
         """Return whether the interface is claimed on this bus."""
         return any(place.device is device for place in self._claims)
 

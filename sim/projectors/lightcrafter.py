@@ -16,7 +16,7 @@ from drivers.display import lightcrafter as wire
 from drivers.display.lightcrafter import PRODUCTS, VENDOR, LightCrafterCommand, LightCrafterReply
 from drivers.presenter import WHITE, Colour
 from foundation.errors import ProtocolError
-from sim.buses.usb import Stalled, UsbDevice, UsbIdentity, endpoint_descriptor
+from sim.buses.usb import SimulatedUsbDevice, Stalled, UsbIdentity, endpoint_descriptor
 from sim.projectors.projector import Screen
 
 REPORT_IN, REPORT_OUT = 0x81, 0x01
@@ -80,7 +80,7 @@ class Controller:
             self._screen.colour = VIDEO_INPUT
 
 
-class LightCrafterUsb(UsbDevice):
+class LightCrafterUsb(SimulatedUsbDevice):
     """A controller's USB side, at full speed."""
 
     pipes = frozenset({REPORT_IN, REPORT_OUT})
