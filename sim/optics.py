@@ -78,20 +78,6 @@ APERTURE_VARIANCE: Final = 1 / 12
 """Of a photosite's aperture, uniform over the photosite; photosites²."""
 
 
-def mtf(blur_px: float, shoulder_share: float, shoulder_px: float, lp_per_mm: float, photosite_mm: float) -> float:
-    """Return the contrast that lens and photosite leave of a sine pattern on the sensor, 0 … 1, without veiling glare.
-
-    `blur_px`: standard deviation of the core without the photosite's aperture, half-size px. `lp_per_mm`: frequency of
-    the pattern, line pairs per millimetre on the sensor. `photosite_mm`: pitch of the photosites; 0.00429 mm on an EOS
-    550D.
-    """
-    frequency = lp_per_mm * 2 * photosite_mm
-    variance = blur_px**2 + APERTURE_VARIANCE / 4
-    core = math.exp(-2 * math.pi**2 * variance * frequency**2)
-    wide = (1 + (2 * math.pi * shoulder_px / math.sqrt(3) * frequency) ** 2) ** -1.5
-    return core * (1 - shoulder_share + shoulder_share * wide)
-
-
 @dataclass(frozen=True)
 class PhotographicLens:
     """A lens before a frame; its blur's core and its vignetting are drawn with the print.

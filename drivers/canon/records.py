@@ -297,16 +297,6 @@ class PropertyChanged:
     code: int
     value: bytes
 
-    @property
-    def number(self) -> int:
-        """The value as a number; ProtocolError where it has fewer than 32 bits."""
-        return number_of(self.value)
-
-    @property
-    def text(self) -> str:
-        """The value as text."""
-        return text_of(self.value)
-
 
 @dataclass(frozen=True)
 class AvailableValues:

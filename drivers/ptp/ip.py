@@ -283,11 +283,6 @@ class PacketCutter:
         self._data_kind: int = 0
         self._transaction: int = 0
 
-    @property
-    def at_boundary(self) -> bool:
-        """Whether the stream stands between two packets."""
-        return not self._waiting and not self._data_kind
-
     def feed(self, piece: bytes) -> list[Packet]:
         """Take the next bytes and return what they complete."""
         packets: list[Packet] = []

@@ -97,11 +97,6 @@ class ContainerReader:
         self._payload_left: int | None = 0
         self._in_data = False
 
-    @property
-    def at_boundary(self) -> bool:
-        """Whether the stream stands between two containers."""
-        return not self._rest and not self._in_data
-
     def feed(self, piece: bytes) -> list[Message]:
         """Take the next bytes, an empty piece for a zero-length packet, and return what they complete."""
         if self._in_data and self._payload_left is None:
@@ -183,11 +178,6 @@ def encode_data_header(code: int, transaction: int, length: int | None) -> bytes
     total = UNKNOWN_LENGTH if length is None else min(HEADER_LENGTH + length, UNKNOWN_LENGTH)
     kind = ContainerType.DATA
     return encode_integer(total, 4) + encode_integer(kind, 2) + encode_integer(code, 2) + encode_integer(transaction, 4)
-
-
-def encode_data(code: int, transaction: int, payload: bytes) -> bytes:
-    """Return a whole data phase in one container."""
-    return encode_data_header(code, transaction, len(payload)) + payload
 
 
 def ends_with_empty_packet(total: int, packet_size: int) -> bool:

@@ -229,7 +229,8 @@ class PjLinkPeer:
 
     def _value(self, request: PjLinkRequest) -> str:
         known = request.level <= self._projector.traits.pjlink_class
-        answers = self._classes[min(request.level, 2) - 1].get(request.command) if known else None
+        offered = self._classes[0 if request.level == 1 else 1]
+        answers = offered.get(request.command) if known else None
         if answers is None:
             return ErrorCode.UNDEFINED.value
         answer = answers.get(request.parameter.upper())

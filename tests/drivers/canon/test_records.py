@@ -141,11 +141,6 @@ def test_a_state_dump() -> None:
     )
     assert canon.decode_events(examples.STATE) == records
     assert canon.encode_events(records) == examples.STATE
-    iso, serial = records[:2]
-    assert isinstance(iso, PropertyChanged)
-    assert iso.number == 0x68
-    assert isinstance(serial, PropertyChanged)
-    assert serial.text == "1286027086"
 
 
 def test_an_object_of_a_body_with_sizes_of_64_bits() -> None:

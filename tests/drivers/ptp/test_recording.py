@@ -20,6 +20,7 @@ from drivers.canon.records import (
     Notice,
     PropertyChanged,
     PropertySetting,
+    number_of,
 )
 from drivers.ptp import usb as container
 from drivers.ptp.codes import DataType, Operation, Property
@@ -89,7 +90,7 @@ def test_every_transaction_crosses_both_cables(recording: list[Recorded]) -> Non
     for entry in recording:
         code, tid, data = int(entry["code"], 16), entry["tid"], payload(entry)
         request, response = PtpRequest(code, tid, tuple(entry["params"])), PtpResponse(int(entry["rc"], 16), tid)
-        phase = container.encode_data(code, tid, data) if entry["data"] is not None else b""
+        phase = b"" if entry["data"] is None else container.encode_data_header(code, tid, len(data)) + data
         stream = container.encode(request) + phase + container.encode(response)
         pieces = (stream[at : at + 64] for at in range(0, len(stream), 64))
         reader = ContainerReader(64)
@@ -140,9 +141,9 @@ def test_the_state_dump(body: str, recording: list[Recorded]) -> None:
     }
     assert isinstance(records[facts.values], Notice)
     state = {record.code: record for record in records if isinstance(record, PropertyChanged)}
-    assert state[Property.EOS_MODEL_ID].number == facts.model_id
-    assert ISO.value(state[Property.EOS_ISO_SPEED].number) == facts.iso
-    assert APERTURE.value(state[Property.EOS_APERTURE].number) == facts.aperture
+    assert number_of(state[Property.EOS_MODEL_ID].value) == facts.model_id
+    assert ISO.value(number_of(state[Property.EOS_ISO_SPEED].value)) == facts.iso
+    assert APERTURE.value(number_of(state[Property.EOS_APERTURE].value)) == facts.aperture
     assert str(ImageFormat.decode(state[Property.EOS_IMAGE_FORMAT].value)) == facts.image_format
     lists = {record.code: record.values for record in records if isinstance(record, AvailableValues)}
     assert lists[Property.EOS_CAPTURE_DESTINATION] == (2, 4, 6)

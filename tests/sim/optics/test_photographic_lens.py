@@ -12,7 +12,7 @@ import pytest
 from numpy.typing import NDArray
 
 from drivers.presenter import BLACK, WHITE, Colour
-from sim.optics import MILD_SHOULDERS, STRONG_SHOULDERS, PhotographicLens, mtf
+from sim.optics import APERTURE_VARIANCE, MILD_SHOULDERS, STRONG_SHOULDERS, PhotographicLens
 from sim.world.disturbances import Blob, Situation
 from sim.world.rendering import Print, Sheet
 from sim.world.room import REFERENCE_EXPOSURE, Room
@@ -23,6 +23,20 @@ PAGE_MM = (180.0, 125.0)
 EOS_550D_PHOTOSITE_MM = 22.3 / 5202
 EVEN: dict[str, float] = {"vignetting": 0.0, "projector_falloff": 0.0, "response_spread": 0.0, "black_leak": 0.0}
 FLAT: Mapping[str, float] = EVEN | {"waviness_mm": 0.0, "k1": 0.0, "k2": 0.0, "p1": 0.0, "p2": 0.0}
+
+
+def mtf(blur_px: float, shoulder_share: float, shoulder_px: float, lp_per_mm: float, photosite_mm: float) -> float:
+    """Return the contrast that lens and photosite leave of a sine pattern on the sensor, 0 … 1, without veiling glare.
+
+    `blur_px`: standard deviation of the core without the photosite's aperture, half-size px. `lp_per_mm`: frequency of
+    the pattern, line pairs per millimetre on the sensor. `photosite_mm`: pitch of the photosites; 0.00429 mm on an EOS
+    550D.
+    """
+    frequency = lp_per_mm * 2 * photosite_mm
+    variance = blur_px**2 + APERTURE_VARIANCE / 4
+    core = math.exp(-2 * math.pi**2 * variance * frequency**2)
+    wide = (1 + (2 * math.pi * shoulder_px / math.sqrt(3) * frequency) ** 2) ** -1.5
+    return core * (1 - shoulder_share + shoulder_share * wide)
 
 
 def planes(signal: NDArray[np.floating]) -> dict[str, NDArray[np.float64]]:

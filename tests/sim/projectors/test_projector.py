@@ -162,6 +162,8 @@ def test_class_2_speaks_the_standards_bytes() -> None:
         (b"%2FREZ ?", b"%2FREZ=0"),
         (b"%2FREZ 1", b"%2FREZ=OK"),
         (b"%2FREZ ?", b"%2FREZ=1"),
+        (b"%2FREZ 0", b"%2FREZ=OK"),
+        (b"%2FREZ ?", b"%2FREZ=0"),
         (b"%2FREZ 2", b"%2FREZ=ERR2"),
         (b"%2SVOL 1", b"%2SVOL=OK"),
         (b"%2MVOL 0", b"%2MVOL=OK"),
