@@ -326,6 +326,7 @@ def test_the_port_hangs_up_after_thirty_idle_seconds() -> None:
     clock.sleep(29)
     assert peer.receive(b"%1POWR ?\r") == b"%1POWR=0\r"
     clock.sleep(29)
+    assert peer.receive(b"") == b"", "to ask what it has to say is no command"
     assert not peer.closed
     clock.sleep(1)
     assert peer.closed
