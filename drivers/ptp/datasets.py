@@ -215,6 +215,11 @@ class FieldKind:
 
 def of_type(data_type: int) -> FieldKind:
     """Return how a field of one of ISO 15740's types stands on the wire."""
+    if data_type in _INTEGERS:
+        size, signed = _INTEGERS[data_type]
+        return FieldKind(
+            lambda cursor, field: cursor.integer(size, field, signed), lambda value: encode_integer(value, size, signed)
+        )
     return FieldKind(
         lambda cursor, field: read_value(cursor, data_type, field), lambda value: encode_value(data_type, value)
     )
@@ -234,10 +239,11 @@ class PtpDataset:
 
     @classmethod
     @cache
-    def _layout(cls) -> tuple[tuple[str, FieldKind], ...]:
-        """Return name and kind of every field."""
-        hints = get_type_hints(cls, include_extras=True)
-        return tuple((name, hint.__metadata__[0]) for name, hint in hints.items() if get_origin(hint) is Annotated)
+    def _layout(cls) -> tuple[tuple[str, str, FieldKind], ...]:
+        """Return name, name in messages and kind of every field."""
+        hints = get_type_hints(cls, include_extras=True).items()
+        fields = [(name, hint.__metadata__[0]) for name, hint in hints if get_origin(hint) is Annotated]
+        return tuple((name, name.replace("_", " "), kind) for name, kind in fields)
 
     @classmethod
     def decode(cls, data: bytes) -> Self:
@@ -247,11 +253,11 @@ class PtpDataset:
     @classmethod
     def read(cls, cursor: Cursor) -> Self:
         """Return the value at a cursor."""
-        return cls(**{name: kind.read(cursor, name.replace("_", " ")) for name, kind in cls._layout()})
+        return cls(**{name: kind.read(cursor, words) for name, words, kind in cls._layout()})
 
     def encode(self) -> bytes:
         """Return the dataset."""
-        return b"".join(kind.encode(getattr(self, name)) for name, kind in self._layout())
+        return b"".join([kind.encode(getattr(self, name)) for name, _, kind in self._layout()])
 
 
 @dataclass(frozen=True)

@@ -542,6 +542,15 @@ def test_a_restarted_server_goes_unnoticed() -> None:
         projector.close()
 
 
+def test_a_served_projector_takes_the_time_that_it_is_given_to_answer() -> None:
+    clock = SimulatedClock()
+    with serve_pjlink(SimulatedProjector(clock), answer_s=2.0) as server:
+        projector = PjLinkProjector(lambda: TcpLink.connect(*server.address, 10.0), timeout=10.0)
+        assert projector.power() is Power.STANDBY
+        projector.close()
+    assert clock.monotonic() == 2.0
+
+
 def test_a_connection_left_idle_over_loopback_is_replaced_silently() -> None:
     clock = SimulatedClock()
     with serve_pjlink(SimulatedProjector(clock, Power.ON), password=PASSWORD) as server:
