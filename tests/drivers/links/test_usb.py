@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from array import array
 from importlib import resources
 
 import pytest
@@ -12,7 +13,7 @@ from drivers.links.usb import UDEV_RULE, UsbDevice, list_devices, open_usb
 from drivers.ptp.session import PtpRequest
 from drivers.ptp.usb import UsbTransport
 from foundation.errors import DeviceRefused, InputError, LinkClosed, LinkTimeout
-from sim.buses.usb import BULK_IN, PtpUsbDevice, Setup, SimulatedBus, UsbIdentity
+from sim.buses.usb import BULK_IN, BULK_OUT, PtpUsbDevice, Setup, SimulatedBus, UsbIdentity
 from sim.clock import SimulatedClock
 from tests.contracts.transport import ECHO, PATIENCE_S, Bench, Echo, TransportContract
 
@@ -194,3 +195,13 @@ def test_the_rule_that_messages_name_is_shipped() -> None:
     assert 'ATTR{idVendor}=="04a9"' in lines[0]
     assert 'ENV{ID_USB_INTERFACES}=="*:060101:*"' in lines[0]
     assert 'TAG+="uaccess"' in lines[0]
+
+
+def test_a_device_has_its_own_pipes_and_no_others() -> None:
+    bus = SimulatedBus(PtpUsbDevice(Echo()))
+    (place,) = bus.enumerate_devices()
+    handle = bus.open_device(place)
+    bus.claim_interface(handle, 0)
+    assert bus.bulk_write(handle, BULK_OUT, 0, array("B"), 0) == 0
+    with pytest.raises(usb.core.USBError, match="not found"):
+        bus.bulk_write(handle, BULK_OUT + 1, 0, array("B"), 0)
