@@ -22,6 +22,7 @@ from sim.world.disturbances import (
     OVERSCAN,
     AmbientStep,
     AnyDisturbance,
+    Blob,
     Bump,
     Defocus,
     Disturbances,
@@ -134,6 +135,14 @@ def test_a_person_hides_what_is_behind(bare: World) -> None:
     np.testing.assert_allclose(ratio, 0.05, atol=2e-3)
     np.testing.assert_array_equal(at(bare, 0.65, 0.5, frame), at(bare, 0.65, 0.5, white))
     np.testing.assert_array_equal(at(bare, 0.22, 0.22, frame), at(bare, 0.22, 0.22, white))
+
+
+def test_a_persons_ellipse_reaches_to_all_four_sides_of_its_place() -> None:
+    blob = Blob((0.2, 0.2, 0.6, 0.8), left=0.05)
+    inside = np.array([[0.25, 0.5], [0.55, 0.5], [0.4, 0.26], [0.4, 0.74]])
+    np.testing.assert_allclose(blob.passed(inside), 0.05)
+    outside = np.array([[0.18, 0.5], [0.62, 0.5], [0.4, 0.17], [0.4, 0.83]])
+    np.testing.assert_array_equal(blob.passed(outside), 1)
 
 
 def _centres(world: World, frame: NDArray[np.float64], *events: Bump) -> NDArray[np.float64]:
