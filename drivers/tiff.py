@@ -157,78 +157,45 @@ _INTEGERS: Final = frozenset({1, 3, 4, 7})
 _PLACES: Final = frozenset({4, 13})
 _NUMBERS: Final = frozenset(_FORMATS) - {_TEXT}
 
+_T = TiffTag
 _DECODED: Final[dict[int, frozenset[int]]] = {
-    **dict.fromkeys(
+    tag: types
+    for types, tags in (
         (
-            TiffTag.NEW_SUBFILE_TYPE,
-            TiffTag.IMAGE_WIDTH,
-            TiffTag.IMAGE_LENGTH,
-            TiffTag.BITS_PER_SAMPLE,
-            TiffTag.COMPRESSION,
-            TiffTag.PHOTOMETRIC_INTERPRETATION,
-            TiffTag.SAMPLES_PER_PIXEL,
-            TiffTag.ROWS_PER_STRIP,
-            TiffTag.STRIP_BYTE_COUNTS,
-            TiffTag.TILE_WIDTH,
-            TiffTag.TILE_LENGTH,
-            TiffTag.TILE_BYTE_COUNTS,
-            TiffTag.CFA_REPEAT_PATTERN_DIM,
-            TiffTag.CFA_PATTERN,
-            TiffTag.DNG_VERSION,
-            TiffTag.CFA_PLANE_COLOR,
-            TiffTag.CFA_LAYOUT,
-            TiffTag.LINEARIZATION_TABLE,
-            TiffTag.BLACK_LEVEL_REPEAT_DIM,
-            TiffTag.CR2_SLICES,
-            TiffTag.ACTIVE_AREA,
-            TiffTag.MASKED_AREAS,
-            TiffTag.RW2_WIDTH,
-            TiffTag.RW2_LENGTH,
-            TiffTag.RW2_BITS,
-            TiffTag.RW2_FORMAT,
-            TiffTag.RAF_WIDTH,
-            TiffTag.RAF_LENGTH,
-            TiffTag.RAF_BITS,
-            TiffTag.RAF_BYTE_COUNTS,
+            _INTEGERS,
+            (
+                _T.NEW_SUBFILE_TYPE, _T.IMAGE_WIDTH, _T.IMAGE_LENGTH, _T.BITS_PER_SAMPLE, _T.COMPRESSION,
+                _T.PHOTOMETRIC_INTERPRETATION, _T.SAMPLES_PER_PIXEL, _T.ROWS_PER_STRIP, _T.STRIP_BYTE_COUNTS,
+                _T.TILE_WIDTH, _T.TILE_LENGTH, _T.TILE_BYTE_COUNTS, _T.CFA_REPEAT_PATTERN_DIM, _T.CFA_PATTERN,
+                _T.DNG_VERSION, _T.CFA_PLANE_COLOR, _T.CFA_LAYOUT, _T.LINEARIZATION_TABLE, _T.BLACK_LEVEL_REPEAT_DIM,
+                _T.CR2_SLICES, _T.ACTIVE_AREA, _T.MASKED_AREAS, _T.RW2_WIDTH, _T.RW2_LENGTH, _T.RW2_BITS,
+                _T.RW2_FORMAT, _T.RAF_WIDTH, _T.RAF_LENGTH, _T.RAF_BITS, _T.RAF_BYTE_COUNTS,
+            ),
         ),
-        _INTEGERS,
-    ),
-    **dict.fromkeys(
         (
-            TiffTag.STRIP_OFFSETS,
-            TiffTag.TILE_OFFSETS,
-            TiffTag.SUB_IFDS,
-            TiffTag.EXIF_IFD_POINTER,
-            TiffTag.RW2_PIXELS,
-            TiffTag.RAF_IFD,
-            TiffTag.RAF_OFFSETS,
+            _PLACES,
+            (
+                _T.STRIP_OFFSETS, _T.TILE_OFFSETS, _T.SUB_IFDS, _T.EXIF_IFD_POINTER, _T.RW2_PIXELS, _T.RAF_IFD,
+                _T.RAF_OFFSETS,
+            ),
         ),
-        _PLACES,
-    ),
-    **dict.fromkeys(
         (
-            TiffTag.EXPOSURE_TIME,
-            TiffTag.F_NUMBER,
-            TiffTag.PHOTOGRAPHIC_SENSITIVITY,
-            TiffTag.BLACK_LEVEL,
-            TiffTag.BLACK_LEVEL_DELTA_H,
-            TiffTag.BLACK_LEVEL_DELTA_V,
-            TiffTag.WHITE_LEVEL,
+            _NUMBERS,
+            (
+                _T.EXPOSURE_TIME, _T.F_NUMBER, _T.PHOTOGRAPHIC_SENSITIVITY, _T.BLACK_LEVEL, _T.BLACK_LEVEL_DELTA_H,
+                _T.BLACK_LEVEL_DELTA_V, _T.WHITE_LEVEL,
+            ),
         ),
-        _NUMBERS,
-    ),
-    **dict.fromkeys(
         (
-            TiffTag.MAKE,
-            TiffTag.MODEL,
-            TiffTag.BODY_SERIAL_NUMBER,
-            TiffTag.LENS_MODEL,
-            TiffTag.CAMERA_SERIAL_NUMBER,
-            TiffTag.UNIQUE_CAMERA_MODEL,
+            frozenset({_TEXT}),
+            (
+                _T.MAKE, _T.MODEL, _T.BODY_SERIAL_NUMBER, _T.LENS_MODEL, _T.CAMERA_SERIAL_NUMBER,
+                _T.UNIQUE_CAMERA_MODEL,
+            ),
         ),
-        frozenset({_TEXT}),
-    ),
-}
+    )
+    for tag in tags
+}  # fmt: skip
 """Tags that are read, and the types that each may have; a damaged value of any other is no fault of the pixels.
 
 A name of another type is left out, as writers differ there and no pixel depends on it; a number of another type is

@@ -23,6 +23,7 @@ from collections import Counter
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import cache
 from multiprocessing.connection import Connection
 from multiprocessing.sharedctypes import Synchronized
 from pathlib import Path
@@ -88,6 +89,7 @@ def _by_tifffile(counts: Counts, tile: tuple[int, int] | None, big: bool) -> byt
     return stream.getvalue()
 
 
+@cache
 def entries(data: bytes) -> list[tuple[str, int]]:
     """Return the places of all entries of a TIFF's first directories, with the order of bytes; none of other files."""
     order = {b"II": "<", b"MM": ">"}.get(data[:2])
