@@ -57,11 +57,12 @@ class _Header:
 
 
 class JpegSize(NamedTuple):
-    """What the frame header of a JPEG states: rows, samples in each, those of all `components` together."""
+    """What the frame header of a JPEG states: rows, samples in each, those of all `components`, and their bits."""
 
     rows: int
     columns: int
     components: int
+    bits: int
     lossless: bool
 
 
@@ -71,8 +72,8 @@ def jpeg_size(stream: bytes | memoryview) -> JpegSize | None:
     while bytes(stream[:2]) == bytes((0xFF, _SOI)) and at + 10 <= len(stream) and stream[at] == 0xFF:
         marker, length = struct.unpack_from(">BH", stream, at + 1)
         if marker in (_SOF0, _SOF1, _SOF3):
-            rows, columns, components = struct.unpack_from(">HHB", stream, at + 5)
-            return JpegSize(rows, columns * components, components, marker == _SOF3)
+            bits, rows, columns, components = struct.unpack_from(">BHHB", stream, at + 4)
+            return JpegSize(rows, columns * components, components, bits, marker == _SOF3)
         if marker == _SOS:
             break
         at += 2 + length
@@ -88,7 +89,7 @@ def lossless_fault(stream: bytes | memoryview) -> str | None:
     try:
         header = _header(stream)
     except (struct.error, IndexError):
-        return "its lossless JPEG ends within its header"
+        return "its lossless JPEG has no samples behind its header"
     if header is None or not header.plain:
         return None
     unknown = [number for number in header.used if number not in header.tables]
@@ -113,7 +114,7 @@ def _header(stream: bytes | memoryview) -> _Header | None:
     found, at = _Header(), 2
     while True:
         if stream[at] != 0xFF:
-            return None
+            raise IndexError
         marker = stream[at + 1]
         (length,) = struct.unpack_from(">H", stream, at + 2)
         content = bytes(stream[at + 4 : at + 2 + length])

@@ -61,6 +61,7 @@ _PLAIN: dict[TiffTag, tuple[tuple[int, ...], ...]] = {
     TiffTag.CFA_PLANE_COLOR: ((0, 1, 2), ()),
     TiffTag.CFA_LAYOUT: ((1,), ()),
     TiffTag.LINEARIZATION_TABLE: ((),),
+    TiffTag.GRAY_RESPONSE_CURVE: ((),),
     TiffTag.TILE_OFFSETS: ((),),
 }
 """What a plain file states, or does not state."""

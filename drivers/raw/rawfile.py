@@ -43,7 +43,7 @@ from drivers.raw.plain_dng import (
     stated_areas,
     stated_black,
 )
-from drivers.raw.storage import RawDamaged, RawUnsupported, Stored, checked, ciff_entries, stored_frames
+from drivers.raw.storage import NotBayer, RawDamaged, RawUnsupported, Stored, checked, ciff_entries, stored_frames
 from drivers.raw.wholeness import levels_fault
 from drivers.tiff import CFA, Directory, Tags, TiffDamaged, TiffTag, ValueType, head, is_tiff, read_directories, text
 from foundation.errors import FormatError
@@ -404,6 +404,9 @@ def _mosaic(path: Path, raw: RawPy, data: bytes | memoryview, contents: _Content
     if sensor.base is not raw or sensor.dtype != np.uint16:
         sensor = np.array(sensor, dtype=np.uint16)
     sensor.setflags(write=False)
+    # LibRaw leaves what it does not decode as memory was before.
+    if stored.bits < 16 and int(sensor.max()) >> stored.bits:
+        raise _unreadable(path, f"its counts reach {sensor.max()}, and have {stored.bits} bits")
     camera = _camera_name(data, directories) if cr3 is None else _joined(cr3.maker, cr3.model)
     framed = Area(sizes.top_margin, sizes.left_margin, sizes.height, sizes.width)
     rows, columns = sensor.shape
@@ -487,6 +490,8 @@ def _examined(path: Path, data: bytes | memoryview, known_whole: bool) -> _Conte
         raise _unreadable(path, str(error)) from error
     except RawUnsupported as error:
         raise _unsupported(path, str(error)) from error
+    except NotBayer as error:
+        raise _not_bayer(path, str(error)) from error
     for offset, size in () if known_whole else {part for frame in frames if frame.lossless for part in frame.extents}:
         fault = lossless_fault(data[offset : offset + size])
         if fault is not None:

@@ -2,7 +2,7 @@
 
 Rules that hold inside:
 
-- Pure functions of bytes: every byte sequence whatever ends in frames, in `RawDamaged` or in `RawUnsupported`.
+- Pure functions of bytes: every byte sequence whatever ends in frames, `RawDamaged`, `RawUnsupported` or `NotBayer`.
 - LibRaw chooses by itself which picture of a file it decodes, and reads behind the end of what is stored without a
   word. So each picture of a sensor that a file describes must be whole, and what LibRaw makes must have the size of
   one of them (`Stored.holds`). A file of whose layout neither can be told is refused.
@@ -41,6 +41,9 @@ _UNSUPPORTED = {8: "Deflate", 32946: "Deflate", 9: "VC-5", 52546: "JPEG XL"}
 _MAKERS = ("nikon", "sony", "pentax", "ricoh", "olympus", "om digital", "samsung", "hasselblad")
 """Beginnings of makers' names in files of TIFF of whose raw pixels TIFF's own tags say size and place."""
 
+_TONES = (TiffTag.LINEARIZATION_TABLE, TiffTag.GRAY_RESPONSE_CURVE)
+"""Tags of tables that LibRaw applies to what is stored."""
+
 _LINEAR_RAW = 34892
 """PhotometricInterpretation of pixels that hold all colours (DNG 1.7.1)."""
 
@@ -51,6 +54,10 @@ class RawDamaged(ValueError):
 
 class RawUnsupported(ValueError):
     """It may be whole, but pixels of this kind cannot be read, or not be checked."""
+
+
+class NotBayer(ValueError):
+    """Its pixels are not those of a sensor with one colour filter each."""
 
 
 @dataclass(frozen=True)
@@ -129,7 +136,8 @@ def checked(data: bytes | memoryview, frames: Sequence[Stored]) -> Sequence[Stor
 
 def _of_tiff(data: bytes | memoryview, directories: Sequence[Directory]) -> Iterator[Stored]:
     """Yield the frames behind colour filters of a DNG, a CR2, or a maker's TIFF."""
-    dng = any(one.integers(TiffTag.DNG_VERSION) for one in directories)
+    # A version of zeros is none to LibRaw.
+    dng = any(any(one.integers(TiffTag.DNG_VERSION)) for one in directories)
     canon = bytes(data[8:10]) == b"CR" and not dng
     maker = next((name for one in directories if (name := one.text(TiffTag.MAKE))), "")
     # Olympus calls its pixels grey.
@@ -142,12 +150,15 @@ def _of_tiff(data: bytes | memoryview, directories: Sequence[Directory]) -> Iter
             continue
         interpretation = directory.first(TiffTag.PHOTOMETRIC_INTERPRETATION)
         if dng and directory.first(TiffTag.NEW_SUBFILE_TYPE) == 0 and interpretation == _LINEAR_RAW:
-            raise RawUnsupported("its pixels are no longer those of a sensor, but hold all colours (LinearRaw)")
+            raise NotBayer("its pixels hold all colours (LinearRaw)")
         if interpretation not in meant or (dng and directory.first(TiffTag.NEW_SUBFILE_TYPE)):
             continue
         if not dng and not maker.casefold().startswith(_MAKERS):
             raise RawUnsupported(f"it is of {maker or 'an unnamed maker'}, whose layout is not checked")
-        yield _of_dng(data, directory, _extents(directory)) if dng else _of_maker(directory, _extents(directory))
+        for tones in (directory.integers(tag) for tag in _TONES):
+            if tones and (list(tones) != sorted(tones) or tones[0] == tones[-1]):
+                raise RawDamaged("its table of tones does not rise")
+        yield (_of_dng if dng else _of_maker)(data, directory, _extents(directory))
 
 
 def _extents(directory: Directory) -> tuple[Extent, ...]:
@@ -174,15 +185,14 @@ def _of_dng(data: bytes | memoryview, directory: Directory, extents: tuple[Exten
         max(directory.integers(TiffTag.BITS_PER_SAMPLE), default=0),
     )
     if directory.first(TiffTag.SAMPLES_PER_PIXEL) > 1:
-        raise RawUnsupported(f"it has {directory.first(TiffTag.SAMPLES_PER_PIXEL)} samples for each photosite")
+        raise NotBayer(f"it has {directory.first(TiffTag.SAMPLES_PER_PIXEL)} samples for each pixel")
     if compression not in (_UNCOMPRESSED, _JPEG, _LOSSY_JPEG):
         name = _UNSUPPORTED.get(compression, f"number {compression}")
         raise RawUnsupported(f"its pixels are compressed by {name}, which is not supported")
     # A table of tones makes any number of what is stored.
-    tones = directory.integers(TiffTag.LINEARIZATION_TABLE)
-    largest = 16 if tones else min(bits, 16)
-    if tones and (list(tones) != sorted(tones) or tones[0] == tones[-1]):
-        raise RawDamaged("its table of tones does not rise")
+    largest = 16 if any(directory.integers(tag) for tag in _TONES) else min(bits, 16)
+    if not 8 <= bits <= 16 or directory.first(TiffTag.SAMPLE_FORMAT) > 1:
+        raise RawUnsupported(f"its photosites are of {bits} bits or no integers, 8 to 16 bits expected")
     tiled = bool(directory.integers(TiffTag.TILE_OFFSETS))
     high = directory.first(TiffTag.TILE_LENGTH if tiled else TiffTag.ROWS_PER_STRIP)
     wide = directory.first(TiffTag.TILE_WIDTH) if tiled else columns
@@ -193,8 +203,6 @@ def _of_dng(data: bytes | memoryview, directory: Directory, extents: tuple[Exten
     if len(extents) != across * down:
         raise RawDamaged(f"its pixels are in {len(extents)} parts, {across * down} expected")
     if compression == _UNCOMPRESSED:
-        if not 8 <= bits <= 16:
-            raise RawUnsupported(f"its photosites have {bits} bits, 8 to 16 expected")
         if not tiled and not _in_a_row(extents):
             raise RawUnsupported("its strips do not follow one another")
         for number, (_, size) in enumerate(extents):
@@ -228,16 +236,16 @@ def _of_cr2(data: bytes | memoryview, directory: Directory) -> Stored | None:
         if directory.integers(TiffTag.CR2_SLICES):
             raise RawDamaged(f"its pixels at byte {offset} are no lossless JPEG")
         return None
-    rows, columns, components, _ = found
+    rows, columns, components, bits, _ = found
     number, each, last = (*directory.integers(TiffTag.CR2_SLICES), 0, 0, 0)[:3]
     if components % 2 == 0 and number and number * each + last != columns:
         raise RawDamaged(f"its {number + 1} slices are {number * each + last} photosites wide, its pixels {columns}")
     if components % 2 == 0 and columns > 4 * rows:
         rows, columns = 2 * rows, columns // 2
-    return Stored(rows, columns, ((offset, size),), _LOSSLESS_BITS, lossless=True, directory=directory)
+    return Stored(rows, columns, ((offset, size),), _LOSSLESS_BITS, bits, lossless=True, directory=directory)
 
 
-def _of_maker(directory: Directory, extents: tuple[Extent, ...]) -> Stored:
+def _of_maker(data: bytes | memoryview, directory: Directory, extents: tuple[Extent, ...]) -> Stored:
     """Return the frame of a TIFF of any maker; Olympus calls compressed pixels of 16 bits uncompressed."""
     rows, columns = directory.first(TiffTag.IMAGE_LENGTH), directory.first(TiffTag.IMAGE_WIDTH)
     compression, bits = directory.first(TiffTag.COMPRESSION), directory.first(TiffTag.BITS_PER_SAMPLE)
@@ -248,10 +256,13 @@ def _of_maker(directory: Directory, extents: tuple[Extent, ...]) -> Stored:
         grey = directory.first(TiffTag.PHOTOMETRIC_INTERPRETATION) != CFA
         # LibRaw takes grey ones for compressed from 8/7 bits each on, and reads 14 bits as 16 unless they fill just
         # their rows, of whole blocks of 16 bytes.
-        in_14_bits = rows * -(-columns * 7 // 64) * 16
+        in_14_bits = rows * -(-columns * 7 // 64) * 16 if columns % 4 == 0 else 0
         least = 8 / 7 if grey and bits == 16 else 16 if bits > 12 and size != in_14_bits else bits or 12
     elif compression in (_OLD_JPEG, _JPEG):
         least = _LOSSLESS_BITS
+        headers = [jpeg_size(data[offset : offset + length]) for offset, length in extents]
+        if not all(header is not None and header.lossless for header in headers):
+            raise RawDamaged("parts of its pixels are no lossless JPEG")
     elif compression == _SONY and size not in (rows * columns, 2 * rows * columns):
         spare = 8
     return Stored(rows, columns, extents, least, spare_rows=spare, directory=directory)
@@ -262,6 +273,8 @@ def _of_rw2(data: bytes | memoryview, directories: Sequence[Directory]) -> Store
     first = next(iter(directories), Directory({}))
     form, bits = first.first(TiffTag.RW2_FORMAT), first.first(TiffTag.RW2_BITS)
     start = first.first(TiffTag.RW2_PIXELS) or first.first(TiffTag.STRIP_OFFSETS)
+    if form in (5, 6, 7) and bits not in (12, 14):
+        raise RawDamaged(f"its photosites have {bits} bits, 12 or 14 expected")
     in_block = {5: (10, 9), 6: (14, 11), 7: (10, 9)}.get(form, (14, 14))[bits > 12]
     least = _LEAST_BITS if form == 8 else 128 / in_block
     extents = ((start, len(data) - start),)

@@ -193,6 +193,21 @@ def fault_of(data: bytes, mosaic: Mosaic) -> str | None:
     return f"{len(flat)} of {counts.shape[0]} rows are flat, of {counts[flat[0], 0]}"
 
 
+_POISON = 0x5A5A
+
+
+@cache
+def _poison(rows: int, columns: int) -> bytes:
+    return dng_bytes(np.full((rows, columns), _POISON, np.uint16), {50717: longs(65535)})
+
+
+def unwritten(data: bytes, shape: tuple[int, ...]) -> str | None:
+    """Return how much of a frame LibRaw leaves as its memory was before, which is filled with one number for that."""
+    decode_raw(_poison(*shape), Path("poison"))
+    left = float((decode_raw(data, Path("case")).sensor == _POISON).mean())
+    return f"{left:.1%} of {shape} was not written" if left > 0.01 else None
+
+
 def _work(files: dict[str, bytes], seed: int, first: int, end: int, at: Synchronized[int], pipe: Connection) -> None:
     """Try cases, with `at` the number of the one that is tried, and send what became of them now and then."""
     resource.setrlimit(resource.RLIMIT_AS, (LARGEST_BYTES, LARGEST_BYTES))
@@ -205,7 +220,11 @@ def _work(files: dict[str, bytes], seed: int, first: int, end: int, at: Synchron
         name, data = case(files, seed, number)
         begun, wrong = time.process_time(), None
         try:
-            wrong, outcome = fault_of(data, decode_raw(data, Path("case"))), "accepted"
+            mosaic = decode_raw(data, Path("case"))
+            outcome, wrong, shape = "accepted", fault_of(data, mosaic), mosaic.sensor.shape
+            del mosaic
+            if wrong is None and number % 8 == 0:
+                wrong = unwritten(data, shape)
         except FormatError as error:
             outcome = "refused"
             if isinstance(error.__cause__, MemoryError) or "alloc" in str(error):

@@ -100,7 +100,12 @@ drewnoakes/metadata-extractor-images. Made up: where D200's strips and A7 IV's t
 @pytest.mark.parametrize("model", STATED)
 def test_what_real_cameras_state_is_believed(model: str) -> None:
     maker, pixels = STATED[model]
-    (found,) = stored_frames(b"II*\0".ljust(45_000_000, b"\0"), [described({T.MAKE: maker}), pixels])
+    # Where tiles begin stands a lossless JPEG's header.
+    sof = bytes.fromhex("ffd8ffc3000e0e02000200010111000000")
+    data = memoryview(bytearray(b"II*\0".ljust(45_000_000, b"\0")))
+    for place in pixels.integers(T.TILE_OFFSETS):
+        data[place : place + len(sof)] = sof
+    (found,) = stored_frames(data, [described({T.MAKE: maker}), pixels])
     assert (found.columns, found.rows) == (pixels.first(T.IMAGE_WIDTH), pixels.first(T.IMAGE_LENGTH))
 
 
@@ -130,6 +135,8 @@ def test_what_real_rw2_state_is_believed(size: tuple[int, int], start: int, leng
         ({324: longs(600, 900), 325: longs(200)}, "2 places of its pixels and 1 sizes"),
         ({278: longs(16)}, "1 parts, 8 expected"),
         ({258: shorts(0)}, "0 bits"),
+        ({339: shorts(3)}, "no integers"),
+        ({262: shorts(34892)}, "not of a Bayer sensor: its pixels hold all colours"),
         ({277: shorts(2)}, "2 samples"),
         ({50712: shorts(64)}, "table of tones does not rise"),
         ({50712: shorts(0, 9, 8)}, "table of tones does not rise"),
