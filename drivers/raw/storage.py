@@ -251,13 +251,15 @@ def _of_maker(data: bytes | memoryview, directory: Directory, extents: tuple[Ext
     compression, bits = directory.first(TiffTag.COMPRESSION), directory.first(TiffTag.BITS_PER_SAMPLE)
     size, least, spare = sum(size for _, size in extents), _LEAST_BITS, 0
     if compression == _UNCOMPRESSED:
+        if not 8 <= bits <= 16:
+            raise RawDamaged(f"its photosites are of {bits} bits, 8 to 16 expected")
         if not _in_a_row(extents):
             raise RawUnsupported("its strips do not follow one another")
         grey = directory.first(TiffTag.PHOTOMETRIC_INTERPRETATION) != CFA
         # LibRaw takes grey ones for compressed from 8/7 bits each on, and reads 14 bits as 16 unless they fill just
         # their rows, of whole blocks of 16 bytes.
         in_14_bits = rows * -(-columns * 7 // 64) * 16 if columns % 4 == 0 else 0
-        least = 8 / 7 if grey and bits == 16 else 16 if bits > 12 and size != in_14_bits else bits or 12
+        least = 8 / 7 if grey and bits == 16 else 16 if bits > 12 and size != in_14_bits else bits
     elif compression in (_OLD_JPEG, _JPEG):
         least = _LOSSLESS_BITS
         headers = [jpeg_size(data[offset : offset + length]) for offset, length in extents]

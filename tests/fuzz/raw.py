@@ -5,7 +5,8 @@
 Begun from are the tiny files of `tests.drivers.raw.maker_files`, DNG as tifffile and imagecodecs write them, and what
 lies in `--more`. Each case goes through `decode_raw` in a process of its own, since LibRaw, which sees what our checks
 accept, may crash. Wrong is: an error other than `FormatError`, more than 1 s of processor or 3 GB, a crash, and a frame
-that is accepted though rows of it hold nothing but one number, or though it has more photosites than bytes could say.
+that is accepted though rows of it hold nothing but one number, though it has more photosites than bytes could say, or
+though parts of it were never written (of every eighth case, read again into memory that holds one number).
 What was found is in tests/data/raw/found.zip, which `tests/drivers/raw/test_found.py` reads.
 """
 
