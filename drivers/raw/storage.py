@@ -314,6 +314,7 @@ def _of_raf(data: bytes | memoryview) -> Stored:
 
 _RAF_COMPRESSED = int.from_bytes(b"IS", "big")
 _RAF_BLOCK = 768
+"""Photosites across a block of a compressed RAF (fuji_compressed.cpp takes no other)."""
 
 
 def _raf_size(data: bytes | memoryview, table: int) -> tuple[int, int]:
