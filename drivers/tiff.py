@@ -4,12 +4,13 @@ Rules that hold inside:
 
 - Pure functions of bytes and numbers: every byte sequence whatever ends in a result or in `TiffDamaged`, and the same
   tags give the same head.
-- Only the tags in `_DECODED` are decoded; maker notes and previews are not touched. Makers' own magic numbers (Olympus,
-  Panasonic) pass, since what follows is TIFF all the same.
+- Only the tags in `_DECODED` are decoded, each of the types that it may have; maker notes and previews are not touched.
+  Makers' own magic numbers (Olympus, Panasonic) pass, since what follows is TIFF all the same.
 - A head has one picture in one uncompressed strip, little-endian; the pixels follow as they lie in memory.
 
 Sources: TIFF 6.0, sections 2, 8 and 15 and supplement 1 (SubIFDs); TIFF/EP (ISO 12234-2) for the colour filter array;
-Exif 2.32, section 4.6; DNG 1.7.1, chapters 2 and 4. The one tag of Canon's is known from its CR2 files alone.
+Exif 2.32, section 4.6; DNG 1.7.1, chapters 2 and 4. Tags of Canon, Panasonic and Fujifilm, of which there is no public
+standard: P. Harvey, ExifTool, lib/Image/ExifTool/{Exif,PanasonicRaw,FujiFilm}.pm.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from typing import Final
 
 
 class TiffTag(IntEnum):
-    """Tag codes of TIFF, TIFF/EP, Exif and DNG, and the one of CR2."""
+    """Tag codes of TIFF, TIFF/EP, Exif and DNG, and makers' own."""
 
     # TIFF 6.0
     NEW_SUBFILE_TYPE = 254
@@ -41,8 +42,11 @@ class TiffTag(IntEnum):
     ROWS_PER_STRIP = 278
     STRIP_BYTE_COUNTS = 279
     PLANAR_CONFIGURATION = 284
+    GRAY_RESPONSE_CURVE = 291
     SOFTWARE = 305
     DATE_TIME = 306
+    TILE_WIDTH = 322
+    TILE_LENGTH = 323
     TILE_OFFSETS = 324
     TILE_BYTE_COUNTS = 325
     SUB_IFDS = 330
@@ -85,8 +89,20 @@ class TiffTag(IntEnum):
     ACTIVE_AREA = 50829
     MASKED_AREAS = 50830
 
-    # Panasonic RW2: the byte from which on the pixels lie
+    # Panasonic RW2: the sensor's size, how its pixels are packed, and the byte from which on they lie
+    RW2_WIDTH = 2
+    RW2_LENGTH = 3
+    RW2_BITS = 10
+    RW2_FORMAT = 45
     RW2_PIXELS = 280
+
+    # Fujifilm RAF: the directory of the raw pixels, and in it size, bits and strips
+    RAF_IFD = 0xF000
+    RAF_WIDTH = 0xF001
+    RAF_LENGTH = 0xF002
+    RAF_BITS = 0xF003
+    RAF_OFFSETS = 0xF007
+    RAF_BYTE_COUNTS = 0xF008
 
     # Canon CR2: widths of the vertical slices in which the raw pixels are stored
     CR2_SLICES = 50752
@@ -109,8 +125,11 @@ class TiffDamaged(ValueError):
 _MAX_DIRECTORIES: Final = 64
 """Directories that are read: a camera's file has under ten, and a damaged chain must end."""
 
-_MAX_VALUES: Final = 1 << 20
-"""Values of one tag: a linearisation table, the longest that is read, has at most 65 536."""
+_MAX_ENTRIES: Final = 512
+"""Entries of a directory, as LibRaw allows; a camera's has under a hundred."""
+
+_MAX_VALUES: Final = 1 << 18
+"""Values of a directory's tags: a linearisation table, the longest that is read, has at most 65 536."""
 
 _LARGEST: Final = 2.0**53
 """Numbers of floating point that are believed: larger ones are not exact, and no place, size or level is one."""
@@ -135,47 +154,61 @@ _FORMATS: Final = {
 }
 """Letters of `struct` by type (TIFF 6.0, section 2; 13, IFD: TIFF technical note 1); rationals are two numbers."""
 
-_DECODED: Final = frozenset(
-    {
-        TiffTag.IMAGE_WIDTH,
-        TiffTag.IMAGE_LENGTH,
-        TiffTag.BITS_PER_SAMPLE,
-        TiffTag.COMPRESSION,
-        TiffTag.PHOTOMETRIC_INTERPRETATION,
-        TiffTag.MAKE,
-        TiffTag.MODEL,
-        TiffTag.STRIP_OFFSETS,
-        TiffTag.SAMPLES_PER_PIXEL,
-        TiffTag.STRIP_BYTE_COUNTS,
-        TiffTag.TILE_OFFSETS,
-        TiffTag.TILE_BYTE_COUNTS,
-        TiffTag.SUB_IFDS,
-        TiffTag.CFA_REPEAT_PATTERN_DIM,
-        TiffTag.CFA_PATTERN,
-        TiffTag.EXPOSURE_TIME,
-        TiffTag.F_NUMBER,
-        TiffTag.EXIF_IFD_POINTER,
-        TiffTag.PHOTOGRAPHIC_SENSITIVITY,
-        TiffTag.BODY_SERIAL_NUMBER,
-        TiffTag.LENS_MODEL,
-        TiffTag.CAMERA_SERIAL_NUMBER,
-        TiffTag.DNG_VERSION,
-        TiffTag.UNIQUE_CAMERA_MODEL,
-        TiffTag.CFA_PLANE_COLOR,
-        TiffTag.CFA_LAYOUT,
-        TiffTag.LINEARIZATION_TABLE,
-        TiffTag.BLACK_LEVEL_REPEAT_DIM,
-        TiffTag.BLACK_LEVEL,
-        TiffTag.BLACK_LEVEL_DELTA_H,
-        TiffTag.BLACK_LEVEL_DELTA_V,
-        TiffTag.WHITE_LEVEL,
-        TiffTag.CR2_SLICES,
-        TiffTag.RW2_PIXELS,
-        TiffTag.ACTIVE_AREA,
-        TiffTag.MASKED_AREAS,
-    }
-)
-"""Tags whose values are read; a damaged value of any other is no fault of the pixels."""
+_INTEGERS: Final = frozenset({1, 3, 4, 7})
+_PLACES: Final = frozenset({4, 13})
+_NUMBERS: Final = frozenset(_FORMATS) - {_TEXT}
+
+_T = TiffTag
+_DECODED: Final[dict[int, frozenset[int]]] = {
+    tag: types
+    for types, tags in (
+        (
+            _INTEGERS,
+            (
+                _T.NEW_SUBFILE_TYPE, _T.IMAGE_WIDTH, _T.IMAGE_LENGTH, _T.BITS_PER_SAMPLE, _T.COMPRESSION,
+                _T.PHOTOMETRIC_INTERPRETATION, _T.SAMPLES_PER_PIXEL, _T.ROWS_PER_STRIP, _T.STRIP_BYTE_COUNTS,
+                _T.TILE_WIDTH, _T.TILE_LENGTH, _T.TILE_BYTE_COUNTS, _T.CFA_REPEAT_PATTERN_DIM, _T.CFA_PATTERN,
+                _T.DNG_VERSION, _T.CFA_PLANE_COLOR, _T.CFA_LAYOUT, _T.LINEARIZATION_TABLE, _T.BLACK_LEVEL_REPEAT_DIM,
+                _T.CR2_SLICES, _T.ACTIVE_AREA, _T.MASKED_AREAS, _T.RW2_WIDTH, _T.RW2_LENGTH, _T.RW2_BITS,
+                _T.RW2_FORMAT, _T.RAF_WIDTH, _T.RAF_LENGTH, _T.RAF_BITS, _T.RAF_BYTE_COUNTS, _T.SAMPLE_FORMAT,
+                _T.GRAY_RESPONSE_CURVE,
+            ),
+        ),
+        (
+            _PLACES,
+            (
+                _T.STRIP_OFFSETS, _T.TILE_OFFSETS, _T.SUB_IFDS, _T.EXIF_IFD_POINTER, _T.RW2_PIXELS, _T.RAF_IFD,
+                _T.RAF_OFFSETS,
+            ),
+        ),
+        (
+            _NUMBERS,
+            (
+                _T.EXPOSURE_TIME, _T.F_NUMBER, _T.PHOTOGRAPHIC_SENSITIVITY, _T.BLACK_LEVEL, _T.BLACK_LEVEL_DELTA_H,
+                _T.BLACK_LEVEL_DELTA_V, _T.WHITE_LEVEL,
+            ),
+        ),
+        (
+            frozenset({_TEXT}),
+            (
+                _T.MAKE, _T.MODEL, _T.BODY_SERIAL_NUMBER, _T.LENS_MODEL, _T.CAMERA_SERIAL_NUMBER,
+                _T.UNIQUE_CAMERA_MODEL,
+            ),
+        ),
+    )
+    for tag in tags
+}  # fmt: skip
+"""Tags that are read, and the types that each may have; a damaged value of any other is no fault of the pixels.
+
+A name of another type is left out, as writers differ there and no pixel depends on it; a number of another type is
+damage. Integers may be UNDEFINED, as colour filters are in Exif.
+"""
+
+_EXPOSURES: Final = frozenset({TiffTag.EXPOSURE_TIME, TiffTag.F_NUMBER, TiffTag.PHOTOGRAPHIC_SENSITIVITY})
+"""Tags whose zero divided by zero means that the camera does not know."""
+
+_POINTERS: Final = (TiffTag.SUB_IFDS, TiffTag.EXIF_IFD_POINTER, TiffTag.RAF_IFD)
+"""Tags that point to further directories."""
 
 ReadValue = str | tuple[float, ...]
 
@@ -200,11 +233,9 @@ class Directory:
         value = self.values.get(tag, "")
         return value if isinstance(value, str) else ""
 
-    def extents(self) -> list[tuple[int, int]]:
-        """Return offset and size in bytes of every strip and tile."""
-        strips = zip(self.integers(TiffTag.STRIP_OFFSETS), self.integers(TiffTag.STRIP_BYTE_COUNTS), strict=False)
-        tiles = zip(self.integers(TiffTag.TILE_OFFSETS), self.integers(TiffTag.TILE_BYTE_COUNTS), strict=False)
-        return [*strips, *tiles]
+    def first(self, tag: TiffTag) -> int:
+        """Return the first number of `tag` cut to an integer; 0 where the directory has none."""
+        return next(iter(self.integers(tag)), 0)
 
 
 def is_tiff(data: bytes | memoryview) -> bool:
@@ -228,27 +259,36 @@ def read_directories(data: bytes | memoryview) -> list[Directory]:
         directory, following = _read_directory(order, data, offset)
         directories.append(directory)
         waiting.append(following)
-        waiting.extend(reversed([*directory.integers(TiffTag.SUB_IFDS), *directory.integers(TiffTag.EXIF_IFD_POINTER)]))
+        waiting.extend(reversed([place for tag in _POINTERS for place in directory.integers(tag)]))
     return directories
 
 
 def _read_directory(order: str, data: bytes | memoryview, offset: int) -> tuple[Directory, int]:
     (count,) = _unpack(order, "H", data, offset)
+    if count > _MAX_ENTRIES:
+        raise TiffDamaged(f"a directory claims {count} entries")
     values: dict[int, ReadValue] = {}
+    claimed = 0
     for number in range(count):
         entry = offset + 2 + 12 * number
         tag, kind, length = _unpack(order, "HHI", data, entry)
-        if tag in _DECODED and kind in _FORMATS:
-            values[tag] = _read_value(order, data, entry + 8, kind, length)
+        allowed = _DECODED.get(tag)
+        if allowed is None:
+            continue
+        claimed += length
+        if claimed > _MAX_VALUES:
+            raise TiffDamaged(f"a directory claims {claimed} values")
+        if kind in allowed:
+            values[tag] = _read_value(order, data, entry + 8, kind, length, exact=tag not in _EXPOSURES)
+        elif _TEXT not in allowed:
+            raise TiffDamaged(f"its tag {tag} is of type {kind}, one of {sorted(allowed)} expected")
     end = offset + 2 + 12 * count
     # Some writers leave out the link that ends the chain when the directory is the last thing in the file.
     following = _unpack(order, "I", data, end)[0] if end + 4 <= len(data) else 0
     return Directory(values), following
 
 
-def _read_value(order: str, data: bytes | memoryview, place: int, kind: int, length: int) -> ReadValue:
-    if length > _MAX_VALUES:
-        raise TiffDamaged(f"a tag claims {length} values")
+def _read_value(order: str, data: bytes | memoryview, place: int, kind: int, length: int, *, exact: bool) -> ReadValue:
     one = _FORMATS[kind]
     size = struct.calcsize(order + one) * length
     if size > 4:
@@ -259,6 +299,8 @@ def _read_value(order: str, data: bytes | memoryview, place: int, kind: int, len
         return bytes(data[place : place + length]).split(b"\0")[0].decode("utf-8", "replace").strip()
     numbers = _unpack(order, one * length if len(one) == 2 else f"{length}{one}", data, place)
     if len(one) == 2:
+        if exact and not all(numbers[1::2]):
+            raise TiffDamaged("a tag holds a number that is divided by zero")
         return tuple(top / bottom if bottom else 0.0 for top, bottom in zip(numbers[::2], numbers[1::2], strict=True))
     if one in "fd" and not all(abs(number) <= _LARGEST for number in numbers):
         raise TiffDamaged(f"a tag holds numbers beyond {_LARGEST:g}, or none")

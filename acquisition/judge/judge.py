@@ -107,7 +107,7 @@ class LiveJudge:
             mosaic = read_raw(file)
         except FormatError as error:
             return Judgement.of_reason("file", str(error))
-        fault = filled_fault(mosaic.counts, mosaic.black)
+        fault = filled_fault(mosaic.counts, mosaic.black, mosaic.white_level)
         if fault is not None:
             return Judgement.of_reason("data", f"{file}: {fault}")
         before, black = self._state, frame_black(mosaic)

@@ -685,7 +685,7 @@ def whole_frame(path: Path) -> Mosaic | str:
         mosaic = read_raw(path)
     except FormatError as error:
         return str(error)
-    fault = filled_fault(mosaic.counts, mosaic.black)
+    fault = filled_fault(mosaic.counts, mosaic.black, mosaic.white_level)
     return mosaic if fault is None else f"{path}: {fault}"
 
 

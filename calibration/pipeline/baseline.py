@@ -734,7 +734,7 @@ def decode_frame(session: Session, record: FrameRecord) -> DecodedFrame:
             f"{record.sha256[:16]}…; restore the file from a copy, {_TAKEN_AGAIN}"
         )
     mosaic = decode_raw(data, path, known_whole=session.frames_are_known_whole)
-    fault = filled_fault(mosaic.counts, mosaic.black)
+    fault = filled_fault(mosaic.counts, mosaic.black, mosaic.white_level)
     if fault is not None:
         raise FormatError(
             f"{path} is no whole frame: {fault}; restore the file from a copy, or take it again: acquire run LAB.toml "

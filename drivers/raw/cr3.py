@@ -1,4 +1,4 @@
-"""What a CR3 says of itself beside its pixels: the camera, and where its sensor is optically black.
+"""What a CR3 says of itself: the camera, where its sensor is optically black, and where its pixels are stored.
 
 A CR3 (EOS R, EOS M50, EOS 250D and later) is an ISO base media file, not TIFF: boxes in boxes, each a size of 32 bits
 (1: of 64 bits, behind the type; 0: up to the end), a type of four letters, and content; big-endian.
@@ -7,11 +7,13 @@ Rules that hold inside:
 
 - A pure function of bytes; every byte sequence whatever ends in a result or in `Cr3Damaged`. Boxes are walked, never
   searched for, and at most `MAX_BOXES` of them.
-- A file whose boxes reach beyond its end was cut. What is inside a box and makes no sense is left out: the pixels are
-  LibRaw's to read, not ours.
+- A file whose boxes reach beyond its end was cut. What is inside a box and makes no sense is left out.
+- A track of raw pixels states the size of its picture and the place of each of its samples; what they decode to is
+  LibRaw's to say.
 
-Sources: ISO/IEC 14496-12, 4.2 (boxes); for Canon's boxes, of which there is no public standard: L. Clévy, "Describing
-the Canon Raw v3 (CR3) file format" (structure), and LibRaw 0.22, src/metadata/cr3_parser.cpp (contents of CDI1).
+Sources: ISO/IEC 14496-12, 4.2 (boxes), 8.7.3 (sizes of samples) and 8.7.5 (places of chunks); for Canon's boxes, of
+which there is no public standard: L. Clévy, "Describing the Canon Raw v3 (CR3) file format" (structure), and LibRaw
+0.22, src/metadata/cr3_parser.cpp (contents of CDI1) and src/decoders/crx.cpp (contents of CMP1).
 """
 
 from __future__ import annotations
@@ -21,6 +23,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 from drivers.raw.plain_dng import Area
+from drivers.raw.storage import Stored
 from drivers.tiff import Directory, TiffDamaged, TiffTag, read_directories
 
 MAX_BOXES = 4096
@@ -30,6 +33,8 @@ _CANON = bytes.fromhex("85c0b687820f11e08111f4ce462b6a48")
 """The uuid of the box with Canon's metadata."""
 _SAMPLE_ENTRY_HEAD = 82
 """Bytes of a CRAW sample entry before the boxes in it (cr3_parser.cpp)."""
+_MOST_SAMPLES = 4096
+"""Samples of a track that are looked at; a roll of bursts has a few hundred."""
 _UUID_LENGTH = 16
 """Bytes of a uuid, which stands before the content of such a box (ISO/IEC 14496-12, 4.2)."""
 _TABLE_HEAD = 8
@@ -53,6 +58,7 @@ class Cr3:
     - `maker`, `model`: as ``Canon`` and ``Canon EOS R``; empty where the file does not say.
     - `black`: optically black areas that it states for its largest picture, on the whole sensor: left, upper; those
       that it leaves empty are left out.
+    - `frames`: the pictures of its tracks of raw pixels.
     - `exif`: directories of its Exif box, with serial number and lens; none where it has no such box.
     """
 
@@ -60,6 +66,7 @@ class Cr3:
     model: str = ""
     black: tuple[Area, ...] = ()
     exif: tuple[Directory, ...] = ()
+    frames: tuple[Stored, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -81,6 +88,7 @@ def read_cr3(data: bytes | memoryview) -> Cr3:
     maker = model = ""
     black: tuple[Area, ...] = ()
     exif: tuple[Directory, ...] = ()
+    frames: list[Stored] = []
     left = [MAX_BOXES]
     found: set[bytes] = set()
     for box in _boxes(data, 0, len(data), left, whole=True):
@@ -95,11 +103,16 @@ def read_cr3(data: bytes | memoryview) -> Cr3:
                     elif entry.kind == b"CMT2":
                         exif = _directories(data[entry.start : entry.end])
             elif part.kind == b"trak":
-                black = _black_of_track(data, part, left) or black
+                table = _inside(data, part, left, b"mdia", b"minf", b"stbl")
+                entry = table and _inside(data, table, left, b"stsd", b"CRAW")
+                if table is None or entry is None:
+                    continue
+                black = _black_areas(data, entry, left) or black
+                frames += _frames(data, table, entry, left)
     for kind, what in ((b"moov", "description of its pictures"), (b"mdat", "pictures")):
         if kind not in found:
             raise Cr3Damaged(f"it holds no {what} ({kind.decode('ascii')})")
-    return Cr3(maker, model, black, exif)
+    return Cr3(maker, model, black, exif, tuple(frames))
 
 
 def _boxes(data: bytes | memoryview, start: int, end: int, left: list[int], *, whole: bool = False) -> Iterator[_Box]:
@@ -142,22 +155,47 @@ def _directories(content: bytes | memoryview) -> tuple[Directory, ...]:
         return ()
 
 
-def _black_of_track(data: bytes | memoryview, track: _Box, left: list[int]) -> tuple[Area, ...]:
-    """Return the optically black areas that a track states; none for one that is not of the whole picture."""
-    place: _Box | None = track
-    for kind, head in (
-        (b"mdia", 0),
-        (b"minf", 0),
-        (b"stbl", 0),
-        (b"stsd", _TABLE_HEAD),
-        (b"CRAW", _SAMPLE_ENTRY_HEAD),
-        (b"CDI1", _FULL_BOX_HEAD),
-        (b"IAD1", 0),
-    ):
-        found = next((box for box in _boxes(data, place.start, place.end, left) if box.kind == kind), None)
+_HEADS = {b"stsd": _TABLE_HEAD, b"CRAW": _SAMPLE_ENTRY_HEAD, b"CDI1": _FULL_BOX_HEAD}
+"""Bytes of a box before the boxes in it."""
+
+
+def _inside(data: bytes | memoryview, box: _Box, left: list[int], *kinds: bytes) -> _Box | None:
+    """Return the first box of each of `kinds`, one within the other; None where one is missing."""
+    for kind in kinds:
+        found = next((inner for inner in _boxes(data, box.start, box.end, left) if inner.kind == kind), None)
         if found is None:
-            return ()
-        place = _Box(kind, min(found.start + head, found.end), found.end)
+            return None
+        box = _Box(kind, min(found.start + _HEADS.get(kind, 0), found.end), found.end)
+    return box
+
+
+def _frames(data: bytes | memoryview, table: _Box, entry: _Box, left: list[int]) -> list[Stored]:
+    """Return the pictures of a track of raw pixels, each a sample in a chunk of its own; none of another track."""
+    described = _inside(data, entry, left, b"CMP1")
+    sizes, places = _inside(data, table, left, b"stsz"), _inside(data, table, left, b"co64")
+    if described is None or described.end - described.start < 16:
+        return []
+    columns, rows = struct.unpack_from(">II", data, described.start + 8)
+    if sizes is None or places is None:
+        raise Cr3Damaged("a track of its pixels does not say where they are")
+    stsz, co64 = (bytes(data[box.start : box.end]) for box in (sizes, places))
+    try:
+        each, count = struct.unpack_from(">II", stsz, 4)
+        (chunks,) = struct.unpack_from(">I", co64, 4)
+        if not 0 < count == chunks <= _MOST_SAMPLES:
+            raise Cr3Damaged(f"a track of its pixels has {count} samples in {chunks} chunks")
+        lengths = (each,) * count if each else struct.unpack_from(f">{count}I", stsz, 12)
+        offsets = struct.unpack_from(f">{count}Q", co64, 8)
+    except struct.error as error:
+        raise Cr3Damaged("a track of its pixels ends within its tables") from error
+    return [Stored(rows, columns, (extent,)) for extent in zip(offsets, lengths, strict=True)]
+
+
+def _black_areas(data: bytes | memoryview, entry: _Box, left: list[int]) -> tuple[Area, ...]:
+    """Return the optically black areas that a track states; none for one that is not of the whole picture."""
+    place = _inside(data, entry, left, b"CDI1", b"IAD1")
+    if place is None:
+        return ()
     if place.end - place.start < _WHOLE_AREAS:
         return ()
     numbers = struct.unpack_from(f">{_WHOLE_AREAS // 2}H", data, place.start)

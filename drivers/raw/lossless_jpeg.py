@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import struct
 from dataclasses import dataclass, field
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -19,7 +19,7 @@ from numpy import int64, uint64
 
 from foundation.compiled import compiled
 
-_SOI, _EOI, _SOF3, _DHT, _DRI, _SOS = 0xD8, 0xD9, 0xC3, 0xC4, 0xDD, 0xDA
+_SOI, _EOI, _SOF0, _SOF1, _SOF3, _DHT, _DRI, _SOS = 0xD8, 0xD9, 0xC0, 0xC1, 0xC3, 0xC4, 0xDD, 0xDA
 """Markers (T.81, table B.1)."""
 
 _PADDING: Final = 4
@@ -51,21 +51,52 @@ class _Header:
     tables: dict[int, npt.NDArray[np.uint16]] = field(default_factory=dict[int, npt.NDArray[np.uint16]])
     used: tuple[int, ...] = ()
     predictor: int = 0
+    transform: int = 0
+    restart: bool = False
     start: int = 0
+
+
+class JpegSize(NamedTuple):
+    """What the frame header of a JPEG states: rows, samples in each, those of all `components`, and their bits."""
+
+    rows: int
+    columns: int
+    components: int
+    bits: int
+    lossless: bool
+
+
+def jpeg_size(stream: bytes | memoryview) -> JpegSize | None:
+    """Return what a JPEG states of its frame, lossless or of a sequential DCT; None for anything else."""
+    at = 2
+    while bytes(stream[:2]) == bytes((0xFF, _SOI)) and at + 10 <= len(stream) and stream[at] == 0xFF:
+        marker, length = struct.unpack_from(">BH", stream, at + 1)
+        if marker in (_SOF0, _SOF1, _SOF3):
+            bits, rows, columns, components = struct.unpack_from(">BHHB", stream, at + 4)
+            return JpegSize(rows, columns * components, components, bits, marker == _SOF3)
+        if marker == _SOS:
+            break
+        at += 2 + length
+    return None
 
 
 def lossless_fault(stream: bytes | memoryview) -> str | None:
     """Return why a strip or tile that begins as a lossless JPEG is damaged; None where it is whole, or is no such.
 
-    Not looked at: other processes than Huffman-coded lossless, components of different sizes, restart intervals, and a
-    point transform, which no maker of raw files uses but Canon's for small ones.
+    Not looked at: other processes than Huffman-coded lossless, and components of different sizes, as of Canon's small
+    raw files, which are of no Bayer sensor.
     """
     try:
         header = _header(stream)
     except (struct.error, IndexError):
-        return "its lossless JPEG ends within its header"
-    if header is None:
+        return "its lossless JPEG has no samples behind its header"
+    if header is None or not header.plain:
         return None
+    unknown = [number for number in header.used if number not in header.tables]
+    if unknown or not (1 <= header.predictor <= 7 and 2 <= header.precision <= 16 and header.used):
+        return "its lossless JPEG has a header that no encoder writes"
+    if header.transform or header.restart:
+        return "its lossless JPEG has a point transform or restart intervals, which no maker of raw files uses"
     tables = np.stack([header.tables[number] for number in header.used])
     whole = bytes(stream)
     hole = whole.find(_HOLE, header.start, max(whole.find(_END, header.start), 0) or len(whole))
@@ -83,7 +114,7 @@ def _header(stream: bytes | memoryview) -> _Header | None:
     found, at = _Header(), 2
     while True:
         if stream[at] != 0xFF:
-            return None
+            raise IndexError
         marker = stream[at + 1]
         (length,) = struct.unpack_from(">H", stream, at + 2)
         content = bytes(stream[at + 4 : at + 2 + length])
@@ -96,18 +127,16 @@ def _header(stream: bytes | memoryview) -> _Header | None:
             return None
         elif marker == _DHT:
             _read_tables(content, found.tables)
-        elif marker == _DRI and any(content[:2]):
-            return None
+        elif marker == _DRI:
+            found.restart = any(content[:2])
         elif marker == _SOS:
             count = content[0]
             chosen = {content[1 + 2 * number]: content[2 + 2 * number] >> 4 for number in range(count)}
-            found.predictor, transform = content[1 + 2 * count], content[3 + 2 * count] & 15
+            found.predictor, found.transform = content[1 + 2 * count], content[3 + 2 * count] & 15
             found.start = at
-            if set(chosen) != set(found.components) or not set(chosen.values()) <= set(found.tables):
-                return None
-            found.used = tuple(chosen[component] for component in found.components)
-            usual = found.plain and not transform and 1 <= found.predictor <= 7 and 2 <= found.precision <= 16
-            return found if usual and found.rows and found.columns else None
+            # A component that the scan leaves out has no table.
+            found.used = tuple(chosen.get(component, -1) for component in found.components)
+            return found
 
 
 def _read_tables(content: bytes, tables: dict[int, npt.NDArray[np.uint16]]) -> None:

@@ -11,11 +11,11 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
+from drivers.raw.storage import Stored
 from drivers.tiff import CFA, Directory, TiffTag
 
 BAYER_PATTERNS = ("RGGB", "BGGR", "GRBG", "GBRG")
@@ -61,33 +61,33 @@ _PLAIN: dict[TiffTag, tuple[tuple[int, ...], ...]] = {
     TiffTag.CFA_PLANE_COLOR: ((0, 1, 2), ()),
     TiffTag.CFA_LAYOUT: ((1,), ()),
     TiffTag.LINEARIZATION_TABLE: ((),),
+    TiffTag.GRAY_RESPONSE_CURVE: ((),),
     TiffTag.TILE_OFFSETS: ((),),
 }
 """What a plain file states, or does not state."""
 
 
-def read_plainly(data: bytes | memoryview, directories: Sequence[Directory]) -> PlainDng | None:
+def read_plainly(data: bytes | memoryview, directories: Sequence[Directory], stored: Stored) -> PlainDng | None:
     """Return what a plain DNG holds; None for any other file.
 
     LibRaw copies such counts one by one, which takes longer than all that is done with a frame afterwards.
 
-    `data`: the file's bytes.
+    `data`: the file's bytes; `stored`: the frame that it describes.
     """
-    pixels = raw_pixels(directories)
+    pixels = stored.directory
     if pixels is None or data[:2] != b"II" or sys.byteorder != "little":
         return None
     if any(pixels.integers(tag) not in allowed for tag, allowed in _PLAIN.items()):
         return None
-    size = (*pixels.integers(TiffTag.IMAGE_LENGTH), *pixels.integers(TiffTag.IMAGE_WIDTH))
+    size = stored.rows, stored.columns
     pattern = pixels.integers(TiffTag.CFA_PATTERN)
-    white, black, strips = pixels.integers(TiffTag.WHITE_LEVEL), stated_black(pixels), pixels.extents()
+    white, black = pixels.numbers(TiffTag.WHITE_LEVEL), stated_black(pixels)
     letters = "".join("RGB"[index] for index in pattern if 0 <= index < 3)
-    if len(size) != 2 or letters not in BAYER_PATTERNS or len(white) != 1 or black is None or not strips:
+    if letters not in BAYER_PATTERNS or len(white) != 1 or black is None:
         return None
-    active, start = active_area(pixels, size), strips[0][0]
-    in_a_row = all(offset + length == following for (offset, length), (following, _) in pairwise(strips))
-    enough = sum(length for _, length in strips) == 2 * size[0] * size[1]
-    if active is None or not in_a_row or not enough or start % 2:
+    active, start = active_area(pixels, size), stored.extents[0][0]
+    enough = sum(length for _, length in stored.extents) == 2 * size[0] * size[1]
+    if active is None or not enough or start % 2:
         return None
     sensor = np.frombuffer(data, dtype=np.uint16, count=size[0] * size[1], offset=start).reshape(size)
     black = np.array(black)
@@ -101,7 +101,7 @@ def read_plainly(data: bytes | memoryview, directories: Sequence[Directory]) -> 
         active,
         letters,
         black,
-        white[0],
+        int(white[0]),
         round(iso) if iso else None,
         (round(aperture, 4) or None) if iso else None,
         (shutter or None) if iso else None,
@@ -112,16 +112,6 @@ def _exposure(directories: Sequence[Directory], tag: TiffTag) -> float:
     """Return the first number of `tag` in any directory, 0 if none has it."""
     found = (directory.numbers(tag) for directory in directories)
     return next((numbers[0] for numbers in found if numbers), 0.0)
-
-
-def raw_pixels(directories: Sequence[Directory]) -> Directory | None:
-    """Return the directory that describes the raw pixels: the widest with a colour filter array, or CR2's own."""
-    found = [
-        directory
-        for directory in directories
-        if directory.integers(TiffTag.PHOTOMETRIC_INTERPRETATION) == (CFA,) or directory.integers(TiffTag.CR2_SLICES)
-    ]
-    return max(found, key=lambda directory: directory.integers(TiffTag.IMAGE_WIDTH), default=None)
 
 
 def stated_black(pixels: Directory | None) -> NDArray[np.float64] | None:

@@ -39,12 +39,12 @@ from drivers.raw.plain_dng import (
     Area,
     PlainDng,
     active_area,
-    raw_pixels,
     read_plainly,
     stated_areas,
     stated_black,
 )
-from drivers.raw.wholeness import extents_fault, is_deflated, size_fault
+from drivers.raw.storage import NotBayer, RawDamaged, RawUnsupported, Stored, checked, ciff_entries, stored_frames
+from drivers.raw.wholeness import levels_fault
 from drivers.tiff import CFA, Directory, Tags, TiffDamaged, TiffTag, ValueType, head, is_tiff, read_directories, text
 from foundation.errors import FormatError
 from foundation.files import read_whole
@@ -116,28 +116,9 @@ def body_and_lens(data: bytes | memoryview, directories: Sequence[Directory]) ->
 
 
 def ciff_camera(data: bytes | memoryview) -> tuple[str, str]:
-    """Return maker and model from Canon's CRW heap; two empty strings for any other file.
-
-    Source: Canon, CIFF 1.0 revision 4: a heap ends with the offset of its table; 0x300A is the heap of the
-    picture's properties, 0x2807 in it that of the camera, 0x080A in that the text of maker and model.
-    """
-    if data[6:14] != b"HEAPCCDR":
-        return "", ""
-    try:
-        start, end = struct.unpack_from("<I", data, 2)[0], len(data)
-        for wanted in (0x300A, 0x2807, 0x080A):
-            table = start + struct.unpack_from("<I", data, end - 4)[0]
-            (count,) = struct.unpack_from("<H", data, table)
-            for number in range(count):
-                kind, size, offset = struct.unpack_from("<HII", data, table + 2 + 10 * number)
-                if kind == wanted:
-                    start, end = start + offset, start + offset + size
-                    break
-            else:
-                return "", ""
-        maker, model, *_ = bytes(data[start:end]).split(b"\0")
-    except (struct.error, ValueError):
-        return "", ""
+    """Return maker and model from Canon's CRW heap (0x080A); two empty strings for any other file."""
+    start, size = ciff_entries(data).get(0x080A, (0, 0))
+    maker, model, *_ = (*bytes(data[start : start + size]).split(b"\0"), b"", b"")
     return maker.decode("ascii", "replace"), model.decode("ascii", "replace")
 
 
@@ -365,26 +346,26 @@ def decode_raw(data: bytes | memoryview, path: Path, *, known_whole: bool = Fals
     """
     if not data:
         raise _unreadable(path, "it is empty")
-    cr3 = _check_cr3(path, data)
-    directories = _check_structure(path, data, known_whole)
-    plain = read_plainly(data, directories)
+    contents = _examined(path, data, known_whole)
+    plain = read_plainly(data, contents.directories, contents.frames[0])
     if plain is not None:
-        return _plain_mosaic(data, directories, plain)
+        return _plain_mosaic(path, data, contents, plain)
     import rawpy
 
     with _libraw_silenced():
         try:
             # Not closed: the mosaic's counts lie in LibRaw's memory, which is freed with the last view of it.
-            return _mosaic(path, rawpy.imread(io.BytesIO(data)), data, directories, cr3)
+            return _mosaic(path, rawpy.imread(io.BytesIO(data)), data, contents)
         except (rawpy.LibRawError, rawpy.NotSupportedError) as error:
             raise _unreadable(path, f"LibRaw says {_reason(error)}") from error
         except (MemoryError, NotImplementedError, RuntimeError, ValueError) as error:
             raise _unreadable(path, str(error) or type(error).__name__) from error
 
 
-def _plain_mosaic(data: bytes | memoryview, directories: list[Directory], plain: PlainDng) -> Mosaic:
-    visible, camera = plain.active, _camera_name(data, directories)
-    serial, lens = body_and_lens(data, directories)
+def _plain_mosaic(path: Path, data: bytes | memoryview, contents: _Contents, plain: PlainDng) -> Mosaic:
+    visible, camera = plain.active, _camera_name(data, contents.directories)
+    serial, lens = body_and_lens(data, contents.directories)
+    _require_levels(path, plain.black, plain.white_level, 16)
     return Mosaic(
         counts=_part(plain.sensor, visible),
         pattern=plain.pattern,
@@ -393,7 +374,7 @@ def _plain_mosaic(data: bytes | memoryview, directories: list[Directory], plain:
         camera=camera,
         sensor=plain.sensor,
         visible=visible,
-        masked=_masked_areas(raw_pixels(directories), camera, visible, plain.sensor.shape),
+        masked=_masked_areas(contents.frames[0].directory, camera, visible, plain.sensor.shape),
         iso=plain.iso,
         aperture=plain.aperture,
         shutter_s=plain.shutter_s,
@@ -402,21 +383,30 @@ def _plain_mosaic(data: bytes | memoryview, directories: list[Directory], plain:
     )
 
 
-def _mosaic(path: Path, raw: RawPy, data: bytes | memoryview, directories: list[Directory], cr3: Cr3 | None) -> Mosaic:
+def _mosaic(path: Path, raw: RawPy, data: bytes | memoryview, contents: _Contents) -> Mosaic:
     import rawpy
 
+    directories, cr3 = contents.directories, contents.cr3
     pattern = raw.raw_pattern
     if raw.raw_type is not rawpy.RawType.Flat or pattern is None or pattern.shape != (2, 2):
         raise _not_bayer(path, "its pixels do not follow a 2×2 pattern of colour filters")
     sizes = raw.sizes
-    fault = size_fault(data, directories, sizes.raw_height * sizes.raw_width)
-    if fault is not None:
-        raise _unreadable(path, fault)
+    size = sizes.raw_height, sizes.raw_width
+    stored = next((frame for frame in contents.frames if frame.holds(*size)), None)
+    if stored is None:
+        raise _unsupported(
+            path,
+            f"LibRaw makes {size[1]}×{size[0]} photosites of it, and "
+            f"{contents.frames[0].columns}×{contents.frames[0].rows} are stored",
+        )
     sensor = raw.raw_image
     # A view that kept LibRaw's object alive no longer would show freed memory.
     if sensor.base is not raw or sensor.dtype != np.uint16:
         sensor = np.array(sensor, dtype=np.uint16)
     sensor.setflags(write=False)
+    # LibRaw leaves what it does not decode as memory was before.
+    if stored.bits < 16 and int(sensor.max()) >> stored.bits:
+        raise _unreadable(path, f"its counts reach {sensor.max()}, and have {stored.bits} bits")
     camera = _camera_name(data, directories) if cr3 is None else _joined(cr3.maker, cr3.model)
     framed = Area(sizes.top_margin, sizes.left_margin, sizes.height, sizes.width)
     rows, columns = sensor.shape
@@ -426,7 +416,7 @@ def _mosaic(path: Path, raw: RawPy, data: bytes | memoryview, directories: list[
         or min(framed.height, framed.width) < 2
     ):
         raise _unreadable(path, f"its visible area {framed} does not lie on its {columns}×{rows} sensor")
-    pixels = raw_pixels(directories)
+    pixels = stored.directory
     visible = active_area(pixels, (rows, columns)) or _dcraw_frame((rows, columns), framed)
     # rawpy's pattern is aligned with the sensor's corner, whatever the margins; ours with the visible one.
     colours = np.roll(pattern, (-visible.top, -visible.left), axis=(0, 1))
@@ -438,6 +428,9 @@ def _mosaic(path: Path, raw: RawPy, data: bytes | memoryview, directories: list[
     stated = stated_black(pixels)
     if stated is not None:
         black = stated
+    white = () if pixels is None else pixels.numbers(TiffTag.WHITE_LEVEL)
+    for level in (raw.white_level, *white):
+        _require_levels(path, black, level, stored.bits)
     black.setflags(write=False)
     serial, lens = body_and_lens(data, directories if cr3 is None else cr3.exif)
     exposure = raw.other
@@ -478,27 +471,38 @@ def _read_bytes(path: Path) -> memoryview:
     return data
 
 
-def _check_structure(path: Path, data: bytes | memoryview, known_whole: bool) -> list[Directory]:
-    """Return the file's TIFF directories, none for other formats; refuse a file that ends before its pixels do."""
-    if not is_tiff(data):
-        return []
+@dataclass(frozen=True)
+class _Contents:
+    """What a file says of itself: TIFF directories, the boxes of a CR3, and the frames that are stored in it."""
+
+    directories: list[Directory]
+    cr3: Cr3 | None
+    frames: Sequence[Stored]
+
+
+def _examined(path: Path, data: bytes | memoryview, known_whole: bool) -> _Contents:
+    """Return what a file says of itself; refuse one that cannot hold the frame that it claims."""
     try:
-        directories = read_directories(data)
-    except TiffDamaged as error:
+        cr3 = read_cr3(data) if is_cr3(data) else None
+        directories = read_directories(data) if is_tiff(data) else []
+        frames = stored_frames(data, directories) if cr3 is None else checked(data, cr3.frames)
+    except (TiffDamaged, Cr3Damaged, RawDamaged) as error:
         raise _unreadable(path, str(error)) from error
-    pixels = raw_pixels(directories)
-    if pixels is not None:
-        if is_deflated(pixels):
-            raise FormatError(
-                f"{path} cannot be read: its pixels are compressed by Deflate, which is not supported; convert it to a "
-                "DNG of lossless JPEG, as Adobe's DNG Converter and dnglab make it, or name the camera's own file"
-            )
-        fault = extents_fault(data, pixels, dng=any(one.integers(TiffTag.DNG_VERSION) for one in directories))
-        for offset, size in () if known_whole else pixels.extents():
-            fault = fault or lossless_fault(data[offset : offset + size])
+    except RawUnsupported as error:
+        raise _unsupported(path, str(error)) from error
+    except NotBayer as error:
+        raise _not_bayer(path, str(error)) from error
+    for offset, size in () if known_whole else {part for frame in frames if frame.lossless for part in frame.extents}:
+        fault = lossless_fault(data[offset : offset + size])
         if fault is not None:
             raise _unreadable(path, fault)
-    return directories
+    return _Contents(directories, cr3, frames)
+
+
+def _require_levels(path: Path, black: NDArray[np.float64], white_level: float, bits: int) -> None:
+    fault = levels_fault(black, white_level, bits)
+    if fault is not None:
+        raise _unreadable(path, fault)
 
 
 def _camera_name(data: bytes | memoryview, directories: list[Directory]) -> str:
@@ -558,20 +562,17 @@ def _common(first: Area, second: Area) -> Area:
     return Area(top, left, max(bottom - top, 0), max(right - left, 0))
 
 
-def _check_cr3(path: Path, data: bytes | memoryview) -> Cr3 | None:
-    """Return what a CR3 says of itself, None for other formats; refuse one that was cut."""
-    if not is_cr3(data):
-        return None
-    try:
-        return read_cr3(data)
-    except Cr3Damaged as error:
-        raise _unreadable(path, str(error)) from error
-
-
 def _unreadable(path: Path, reason: str) -> FormatError:
     return FormatError(
         f"{path} cannot be read as a raw file: {reason}; expected a camera's complete raw file such as CR2 or DNG: "
         "copy it from the camera again, or take the frame again"
+    )
+
+
+def _unsupported(path: Path, reason: str) -> FormatError:
+    return FormatError(
+        f"{path} cannot be read as a raw file: {reason}; expected a camera's own raw file such as CR2, CR3 or NEF, "
+        "or a DNG of lossless JPEG, as Adobe's DNG Converter and dnglab make it: convert it to such a DNG"
     )
 
 

@@ -24,17 +24,44 @@ def test_numbers_that_are_none_are_damage(kind: int, letter: str, number: float)
         read_directories(tiff(TAG, kind, 1, struct.pack("<" + letter, number)))
 
 
-@pytest.mark.parametrize("value", [1e300, 2.0**54])
-def test_numbers_that_are_no_place_are_damage(value: float) -> None:
-    with pytest.raises(TiffDamaged):
-        read_directories(tiff(TiffTag.SUB_IFDS, 12, 1, struct.pack("<d", value)))
+@pytest.mark.parametrize(
+    ("tag", "kind", "value"),
+    [
+        (TiffTag.SUB_IFDS, 12, struct.pack("<d", 1e300)),
+        (TiffTag.SUB_IFDS, 9, struct.pack("<i", -8)),
+        (TiffTag.STRIP_OFFSETS, 3, struct.pack("<H", 26)),
+        (TiffTag.IMAGE_WIDTH, 2, b"640\0"),
+        (TiffTag.IMAGE_WIDTH, 5, struct.pack("<II", 640, 1)),
+        (TiffTag.BLACK_LEVEL, 2, b"64\0"),
+        (TiffTag.CFA_PATTERN, 0, b"\0\1\1\2"),
+        (TiffTag.TILE_OFFSETS, 16, struct.pack("<Q", 26)),
+    ],
+)
+def test_numbers_of_another_type_are_damage(tag: TiffTag, kind: int, value: bytes) -> None:
+    with pytest.raises(TiffDamaged, match=f"its tag {int(tag)} is of type {kind}"):
+        read_directories(tiff(tag, kind, 1, value))
 
 
-@pytest.mark.parametrize("place", [-1, -8, -(1 << 31)])
-def test_a_directory_before_the_file_is_damage(place: int) -> None:
-    # Python counts negative places from the end.
-    with pytest.raises(TiffDamaged, match=f"points to byte {place}"):
-        read_directories(tiff(TiffTag.SUB_IFDS, 9, 1, struct.pack("<i", place)))
+def test_a_name_of_another_type_is_left_out() -> None:
+    (directory,) = read_directories(tiff(TiffTag.LENS_MODEL, 7, 4, b"EF\0\0"))
+    assert directory.text(TiffTag.LENS_MODEL) == ""
+
+
+def test_a_level_divided_by_zero_is_damage_and_an_unknown_aperture_is_none() -> None:
+    nothing = struct.pack("<II", 0, 0)
+    with pytest.raises(TiffDamaged, match="divided by zero"):
+        read_directories(tiff(TAG, 5, 1, nothing))
+    (directory,) = read_directories(tiff(TiffTag.F_NUMBER, 5, 1, nothing))
+    assert directory.numbers(TiffTag.F_NUMBER) == (0.0,)
+
+
+def test_directories_that_would_take_hours_are_damage() -> None:
+    # Five entries that each claim as many values as may be, and more entries than any directory has.
+    entry = struct.pack("<HHII", TiffTag.LINEARIZATION_TABLE, 1, 1 << 17, 0)
+    with pytest.raises(TiffDamaged, match="values"):
+        read_directories((b"II*\0" + struct.pack("<IH", 8, 5) + 5 * entry).ljust(1 << 18, b"\0"))
+    with pytest.raises(TiffDamaged, match="513 entries"):
+        read_directories(b"II*\0" + struct.pack("<IH", 8, 513) + bytes(12 * 513))
 
 
 def test_floating_point_within_reason_is_read() -> None:

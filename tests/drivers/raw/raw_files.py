@@ -1,4 +1,4 @@
-"""Writes raw files by hand, with any counts: CR2 as Canon lays it out, and plain DNG with any tags.
+"""Makes raw files by hand, with any counts: CR2 as Canon lays it out, DNG and other TIFF with any tags.
 
 Sources: TIFF 6.0; ITU-T T.81 annex H (lossless JPEG, predictor 1); DNG 1.4; CR2: the fourth directory holds the raw
 strip, cut in slices by tag 50752.
@@ -23,7 +23,14 @@ def write_cr2(
     iso: int = 100,
     slices: tuple[int, int, int] | None = None,
 ) -> None:
-    """Write a CR2; `counts` is (H, W) uint16 of the whole sensor, W even, below 2**14.
+    """Write a CR2, as `cr2_bytes` makes it."""
+    path.write_bytes(cr2_bytes(counts, model, iso, slices))
+
+
+def cr2_bytes(
+    counts: NDArray[np.uint16], model: str, iso: int = 100, slices: tuple[int, int, int] | None = None
+) -> bytes:
+    """Return a CR2; `counts` is (H, W) uint16 of the whole sensor, W even, below 2**14.
 
     `slices` are their number without the last, their width, and that of the last; None: one slice.
     """
@@ -50,7 +57,7 @@ def write_cr2(
     data = b"II*\0" + struct.pack("<I", 16) + b"CR\x02\0" + struct.pack("<I", starts[3])
     for tags, start, link in zip((*directories, exif), starts, links, strict=True):
         data += _directory(tags, start, link)
-    path.write_bytes(data + strip)
+    return data + strip
 
 
 def shorts(*numbers: int) -> tuple[int, int, bytes]:
@@ -74,9 +81,18 @@ def text(value: str) -> tuple[int, int, bytes]:
 
 
 def write_dng(path: Path, counts: NDArray[np.uint16], more: Tags | None = None, strip: bytes | None = None) -> None:
-    """Write a DNG of `counts` (H, W) uint16, RGGB unless `more` has it otherwise; uncompressed unless `strip` is."""
+    """Write a DNG, as `dng_bytes` makes it."""
+    path.write_bytes(dng_bytes(counts, more, strip))
+
+
+def dng_bytes(
+    counts: NDArray[np.uint16], more: Tags | None = None, strip: bytes | None = None, place: int | None = 273
+) -> bytes:
+    """Return a DNG of `counts` (H, W) uint16, RGGB unless `more` has it otherwise; uncompressed unless `strip` is.
+
+    `place`: the tag that says where the pixels begin; None where `more` says it.
+    """
     height, width = counts.shape
-    strip = strip or counts.astype("<u2").tobytes()
     tags: Tags = {
         254: longs(0),
         256: longs(width),
@@ -84,10 +100,8 @@ def write_dng(path: Path, counts: NDArray[np.uint16], more: Tags | None = None, 
         258: shorts(16),
         259: shorts(1),
         262: shorts(32803),
-        273: longs(0),
         277: shorts(1),
         278: longs(height),
-        279: longs(len(strip)),
         33421: shorts(2, 2),
         33422: (1, 4, b"\0\1\1\2"),
         50706: (1, 4, b"\1\4\0\0"),
@@ -96,9 +110,19 @@ def write_dng(path: Path, counts: NDArray[np.uint16], more: Tags | None = None, 
         50717: longs(4095),
         **(more or {}),
     }
-    start = 8 + len(_directory(tags, 0, 0))
-    tags[273] = longs(start)
-    path.write_bytes(b"II*\0" + struct.pack("<I", 8) + _directory(tags, 8, 0) + strip)
+    return tiff_bytes(tags, strip or counts.astype("<u2").tobytes(), place_tag=place)
+
+
+def tiff_bytes(
+    tags: Tags, pixels: bytes, magic: bytes = b"II*\0", place_tag: int | None = 273, through: int | None = None
+) -> bytes:
+    """Return a TIFF of one directory, its pixels behind it; `through`: a tag of a first one that points to that one."""
+    tags = {279: longs(len(pixels)), **tags, **({} if place_tag is None else {place_tag: longs(0)})}
+    first = b"" if through is None else _directory({through: longs(8 + 18)}, 8, 0)
+    start = 8 + len(first)
+    if place_tag is not None:
+        tags[place_tag] = longs(start + len(_directory(tags, 0, 0)))
+    return magic + struct.pack("<I", 8) + first + _directory(tags, start, 0) + pixels
 
 
 def lossless_jpeg(counts: NDArray[np.uint16]) -> bytes:

@@ -1,8 +1,4 @@
-"""What a CR3 says of itself; the files are built here after published descriptions, as none of a real body is at hand.
-
-Box types, sizes and their order: L. Clévy, "Describing the Canon Raw v3 (CR3) file format", the dump of a file of an
-EOS M50 (6288×4056): CRAW of 0xe4 bytes with CMP1 (0x3c), CDI1 (0x44) and IAD1 (0x38) in it.
-"""
+"""What a CR3 says of itself; the files are built after published descriptions, as none of a real body is at hand."""
 
 from __future__ import annotations
 
@@ -17,62 +13,9 @@ from drivers.raw import rawfile
 from drivers.raw.cr3 import Cr3, Cr3Damaged, is_cr3, read_cr3
 from drivers.raw.plain_dng import Area
 from drivers.raw.rawfile import read_raw
+from drivers.raw.storage import Stored
 from foundation.errors import FormatError
-
-CANON = bytes.fromhex("85c0b687820f11e08111f4ce462b6a48")
-LEFT, UPPER = (0, 0, 255, 4055), (264, 0, 6287, 27)
-"""Made up: first column, first row, last column, last row."""
-
-
-def box(kind: bytes, *content: bytes) -> bytes:
-    data = b"".join(content)
-    return struct.pack(">I4s", 8 + len(data), kind) + data
-
-
-def large_box(kind: bytes, content: bytes) -> bytes:
-    return struct.pack(">I4sQ", 1, kind, 16 + len(content)) + content
-
-
-def ifd(maker: str, model: str) -> bytes:
-    """Return a TIFF of one directory with two texts."""
-    texts = [text.encode() + b"\0" for text in (maker, model)]
-    place = 8 + 2 + 12 * 2 + 4
-    data = b"II*\0" + struct.pack("<IH", 8, 2)
-    for tag, text in zip((271, 272), texts, strict=True):
-        data += struct.pack("<HHII", tag, 2, len(text), place)
-        place += len(text)
-    return data + bytes(4) + b"".join(texts)
-
-
-def areas(left: tuple[int, ...] = LEFT, upper: tuple[int, ...] = UPPER) -> bytes:
-    crop, active = (276, 48, 6275, 4047), (264, 36, 6287, 4055)
-    return struct.pack(">24H", *(6288, 4056, 0, 0), *(0,) * 4, *crop, *left, *upper, *active)
-
-
-def track(iad1: bytes, entry: bytes = b"CRAW") -> bytes:
-    """Return a track; IAD1 stands in CDI1, behind CMP1, in a sample entry of 82 bytes and boxes."""
-    sample = box(
-        entry, bytes(82), box(b"CMP1", bytes(0x34)), box(b"CDI1", bytes(4), box(b"IAD1", iad1)), box(b"free", b"\0\0")
-    )
-    table = box(b"stbl", box(b"stsd", bytes(4), struct.pack(">I", 1), sample), box(b"stsz", bytes(12)))
-    return box(
-        b"trak",
-        box(b"tkhd", bytes(84)),
-        box(b"mdia", box(b"hdlr", bytes(24)), box(b"minf", box(b"vmhd", bytes(12)), table)),
-    )
-
-
-def cr3(model: str = "Canon EOS M50", *tracks: bytes, pixels: bytes = bytes(64)) -> bytes:
-    metadata = box(
-        b"uuid",
-        CANON,
-        box(b"CNCV", b"CanonCR3_001/00.09.00/00.00.00"),
-        box(b"CMT1", ifd("Canon", model)),
-        box(b"THMB", bytes(40)),
-    )
-    movie = box(b"moov", metadata, box(b"mvhd", bytes(100)), *(tracks or (track(areas()[:32]), track(areas()))))
-    brand = box(b"ftyp", b"crx ", struct.pack(">I", 1), b"crx ", b"isom")
-    return brand + movie + box(b"uuid", bytes(16), b"xpacket") + large_box(b"mdat", pixels)
+from tests.drivers.raw.maker_files import CANON, PIXELS, SIDES, areas, box, cr3, ifd, large_box, track
 
 
 def test_the_camera_and_where_its_sensor_is_black() -> None:
@@ -80,6 +23,35 @@ def test_the_camera_and_where_its_sensor_is_black() -> None:
     said = read_cr3(cr3())
     assert (said.maker, said.model) == ("Canon", "Canon EOS M50")
     assert said.black == (Area(0, 0, 4056, 256), Area(0, 264, 28, 6024))
+    assert said.frames == (Stored(4056, 6288, ((900, PIXELS),)),) * 2
+
+
+@pytest.mark.parametrize(
+    ("places", "frames"),
+    [
+        ((struct.pack(">III", 0, 70, 2), struct.pack(">IIQQ", 0, 2, 900, 1000)), (((900, 70),), ((1000, 70),))),
+        ((struct.pack(">5I", 0, 0, 2, 7, 8), struct.pack(">IIQQ", 0, 2, 900, 1 << 40)), (((900, 7),), ((1 << 40, 8),))),
+        ((struct.pack(">III", 0, 70, 2), struct.pack(">IIQ", 0, 1, 900)), "2 samples in 1 chunks"),
+        ((struct.pack(">III", 0, 70, 1 << 31), struct.pack(">IIQ", 0, 1 << 31, 900)), "samples in"),
+        ((struct.pack(">III", 0, 0, 0), struct.pack(">II", 0, 0)), "0 samples"),
+        ((struct.pack(">III", 0, 0, 2), struct.pack(">IIQQ", 0, 2, 900, 1000)), "ends within"),
+        ((struct.pack(">III", 0, 70, 1), b""), "ends within"),
+    ],
+)
+def test_where_the_samples_of_a_track_are(
+    places: tuple[bytes, bytes], frames: str | tuple[tuple[tuple[int, int]], ...]
+) -> None:
+    data = cr3("Canon EOS R", track(areas(), b"CRAW", SIDES, box(b"stsz", places[0]), box(b"co64", places[1])))
+    if isinstance(frames, str):
+        with pytest.raises(Cr3Damaged, match=frames):
+            read_cr3(data)
+    else:
+        assert [frame.extents for frame in read_cr3(data).frames] == list(frames)
+
+
+def test_a_track_without_places_is_damaged() -> None:
+    with pytest.raises(Cr3Damaged, match="does not say where"):
+        read_cr3(cr3("Canon EOS R", track(areas(), b"CRAW", SIDES, box(b"stsz", bytes(12)))))
 
 
 def test_areas_that_a_body_leaves_empty_are_none() -> None:
@@ -159,9 +131,13 @@ def test_a_sensor_without_columns_beside_its_picture_has_none() -> None:
     assert masked("", 264, Cr3()) == (), "of a camera without a name nothing is known"
 
 
+SMALL = box(b"stsz", struct.pack(">III", 0, 400, 1)), box(b"co64", struct.pack(">IIQ", 0, 1, 400))
+
+
 def test_a_file_that_libraw_cannot_decode_is_an_error(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     for name, data, says in (
-        ("whole.CR3", cr3(), "LibRaw says"),
+        ("whole.CR3", cr3("R", track(areas(), b"CRAW", (64, 48), *SMALL)), "LibRaw says"),
+        ("stub.CR3", cr3(), "its pixels reach from byte 900 to 5000900"),
         ("cut.CR3", cr3()[:-10], "its part 'mdat' reaches to byte"),
         ("head.CR3", cr3()[:40], "cannot be read as a raw file"),
         ("brand.CR3", b"\0\0\0\x18ftypcrx \0\0\0\1crx isom", "no description of its pictures"),

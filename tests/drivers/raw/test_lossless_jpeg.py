@@ -76,10 +76,23 @@ def test_whatever_the_header_says_is_no_traceback(at: int, words: bytes) -> None
 def test_other_jpegs_are_not_looked_at() -> None:
     assert lossless_fault(b"") is None
     assert lossless_fault(bytes(imagecodecs.jpeg8_encode(np.zeros((8, 8), np.uint8)))) is None
-    # Restart intervals are no maker's.
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "reason"),
+    [
+        (b"\xff\xd8\xff", b"\xff\xd8\xff\xdd\0\x04\0\x08\xff", "restart intervals"),
+        (b"\2\1\0\2\x10\1\0\0", b"\2\1\0\2\x10\1\0\2", "point transform"),
+        (b"\2\1\0\2\x10\1\0\0", b"\2\1\0\2\x10\x08\0\0", "no encoder writes"),
+        (b"\2\1\0\2\x10\1\0\0", b"\2\1\0\2\x30\1\0\0", "no encoder writes"),
+        (b"\2\1\0\2\x10\1\0\0", b"\1\1\0\1\0\0\0\0", "no encoder writes"),
+    ],
+    ids=["restart", "transform", "predictor", "a table that is not there", "a component that is not there"],
+)
+def test_what_no_maker_writes_is_refused(old: bytes, new: bytes, reason: str) -> None:
     stream = lossless_jpeg(NOISE)
-    restart = b"\xff\xdd\0\x04\0\x08"
-    assert lossless_fault(stream[:2] + restart + stream[2:]) is None
+    assert old in stream
+    assert reason in (lossless_fault(stream.replace(old, new, 1)) or "")
 
 
 @pytest.mark.parametrize("predictor", range(1, 8))
