@@ -171,7 +171,7 @@ _DECODED: Final[dict[int, frozenset[int]]] = {
                 _T.DNG_VERSION, _T.CFA_PLANE_COLOR, _T.CFA_LAYOUT, _T.LINEARIZATION_TABLE, _T.BLACK_LEVEL_REPEAT_DIM,
                 _T.CR2_SLICES, _T.ACTIVE_AREA, _T.MASKED_AREAS, _T.RW2_WIDTH, _T.RW2_LENGTH, _T.RW2_BITS,
                 _T.RW2_FORMAT, _T.RAF_WIDTH, _T.RAF_LENGTH, _T.RAF_BITS, _T.RAF_BYTE_COUNTS, _T.SAMPLE_FORMAT,
-                _T.GRAY_RESPONSE_CURVE,
+                _T.GRAY_RESPONSE_CURVE, _T.FOCAL_PLANE_RESOLUTION_UNIT,
             ),
         ),
         (
@@ -185,7 +185,7 @@ _DECODED: Final[dict[int, frozenset[int]]] = {
             _NUMBERS,
             (
                 _T.EXPOSURE_TIME, _T.F_NUMBER, _T.PHOTOGRAPHIC_SENSITIVITY, _T.BLACK_LEVEL, _T.BLACK_LEVEL_DELTA_H,
-                _T.BLACK_LEVEL_DELTA_V, _T.WHITE_LEVEL,
+                _T.BLACK_LEVEL_DELTA_V, _T.WHITE_LEVEL, _T.FOCAL_LENGTH, _T.FOCAL_PLANE_X_RESOLUTION,
             ),
         ),
         (

@@ -91,7 +91,7 @@ class Photographer:
             size = capture(devices.camera, stream).size
         self.timings.append((wanted, devices.clock.monotonic() - begun))
         mosaic = read_raw(self._file)
-        self.focal_px = stated_focal_px(self._file, mosaic)
+        self.focal_px = stated_focal_px(self._file, mosaic.counts.shape[1])
         self._file.unlink()
         return Shot(wanted, mosaic, size)
 
@@ -116,8 +116,8 @@ class Photographer:
             projector.set_muted(False)
 
 
-def stated_focal_px(path: Path, mosaic: Mosaic) -> float | None:
-    """Return the focal length in half-size px that a raw file states; None where it states none.
+def stated_focal_px(path: Path, columns: int) -> float | None:
+    """Return the focal length in half-size px that a raw file of `columns` columns states; None where it states none.
 
     Exif 2.32: FocalLength in mm times FocalPlaneXResolution in pixels to the unit of FocalPlaneResolutionUnit, pixels
     of a picture of the size that Exif states, which is taken to be the visible one to a hundredth.
@@ -139,7 +139,7 @@ def stated_focal_px(path: Path, mosaic: Mosaic) -> float | None:
         if focal and density and mm and focal[0] > 0 and density[0] > 0:
             pixels = focal[0] * density[0] / mm
             # A lens without contacts states 50 mm or 0; no picture is narrower than a twentieth of its focal length.
-            return pixels / 2 if 0.1 * mosaic.counts.shape[1] < pixels < 20 * mosaic.counts.shape[1] else None
+            return pixels / 2 if 0.1 * columns < pixels < 20 * columns else None
     return None
 
 

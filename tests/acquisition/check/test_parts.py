@@ -18,9 +18,11 @@ from acquisition.check.camera import (
     series_times,
     tilt_deg,
 )
+from acquisition.check.frames import stated_focal_px
 from acquisition.check.light_and_print import AREAS, area_name, areas_of, judge_flicker, judge_primaries, measure_light
 from acquisition.check.places import Levels
 from drivers.camera import CameraIdentity, CapturedFrame, ExposureSettings, Supplies
+from drivers.tiff import TiffTag, ValueType, head, rationals
 from experiment.chart.layout import design_chart
 from foundation.errors import LinkTimeout
 
@@ -36,6 +38,22 @@ def test_tilt_is_read_from_a_homography(pan: float, tilt: float) -> None:
     camera = np.array([[focal, 0, centre[0]], [0, focal, centre[1]], [0, 0, 1]])
     homography = camera @ np.column_stack([rotation[:, 0], rotation[:, 1], [-500.0, -400.0, 1800.0]])
     assert tilt_deg(homography / homography[2, 2], focal, centre) == pytest.approx((pan, tilt), abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("mm", "focal_px"),
+    [(35.0, 5728.1 * 35 / 25.4 / 2), (0.0, None), (5000.0, None)],
+    ids=["stated", "without contacts", "no lens is so long"],
+)
+def test_the_focal_length_is_read_from_exif(tmp_path: Path, mm: float, focal_px: float | None) -> None:
+    exif = {
+        TiffTag.FOCAL_LENGTH: rationals(mm),
+        TiffTag.FOCAL_PLANE_X_RESOLUTION: rationals(5728.1),
+        TiffTag.FOCAL_PLANE_RESOLUTION_UNIT: (ValueType.SHORT, [2]),
+    }
+    path = tmp_path / "frame.dng"
+    path.write_bytes(head({TiffTag.IMAGE_WIDTH: (ValueType.LONG, [5184])}, 0, exif))
+    assert stated_focal_px(path, 5184) == (None if focal_px is None else pytest.approx(focal_px))
 
 
 def test_the_transfer_of_a_sensor_is_read_from_variances() -> None:
