@@ -24,9 +24,10 @@ table: each text is that of the page, with a column in braces where a figure sta
     says = ["Gray-world lies between {min Med.: Gray-world; *}° and {max Med.: Gray-world; *}° in the median"]
 
 Without `reads` the comment stands before a fenced block of text, which is what the commands print, figures within the
-tolerance. Commands run as they stand, so recheck only a copy that you trust. Figures that cannot be run so, because
-they take hours or data that nobody may pass on, have in their section the words "taken with version", the version and
-the date; on pages of measurements (`MEASURED`) a table with neither counts as a difference.
+tolerance; on a page of cells of Python before the last, and all such blocks above are compared with it. Commands run as
+they stand, so recheck only a copy that you trust. Figures that cannot be run so, because they take hours or data that
+nobody may pass on, have in their section the words "taken with version", the version and the date; on pages of
+measurements (`MEASURED`) a table with neither counts as a difference.
 """
 
 from __future__ import annotations
@@ -66,6 +67,9 @@ NO_SOURCE = 'figures with neither a recheck comment nor, in their section, "take
 NUMBER = re.compile(r"-?(?:\d+\.?\d*|\.\d+)")
 TAKEN = re.compile(r"taken\s+with\s+version\s+(\S+),\s+(\d{4}-\d\d-\d\d)", re.IGNORECASE)
 
+
+PYTHON = "```python\n"
+"""What a cell begins with."""
 
 SLOT = re.compile(r"\{(?:(min|max) )?([^{}:]+)(?:: ([^{}]*))?\}")
 """A figure of a sentence: which of several, its column, its row."""
@@ -133,8 +137,10 @@ def checks_of(page: str, text: str) -> list[Check]:
         if mark.says:
             stated = below
         elif mark.reads is None:
-            block = re.match(r"\n*```text\n((?:.*\n)*?)```\n", below)
-            stated = block and block[1].splitlines()
+            block = re.match(r"\n*```text\n(?:.*\n)*?```\n", below)
+            # Cells run as one program, which prints what stands below each.
+            whole = (text[: comment.start()] if PYTHON in text[: comment.start()] else "") + (block[0] if block else "")
+            stated = [line for lines in re.findall(r"(?ms)^```text\n(.*?)^```\n", whole) for line in lines.splitlines()]
         else:
             stated = next((one for one in tables_of(text) if one.line >= line), None)
             line = stated.line if stated else line
@@ -299,10 +305,15 @@ def run(checks: Sequence[Check], data: Sequence[Path], most_s: float = math.inf)
     return differ, skipped
 
 
-def _run_block(command: str, block: Sequence[Check], folder: Path) -> list[str]:
+def run_commands(command: str, folder: Path) -> subprocess.CompletedProcess[str]:
+    """Run commands of a page in a folder, ours those beside this Python, up to the first that fails."""
     paths = os.pathsep.join([str(Path(sys.executable).parent), os.environ.get("PATH", "")])
     settings = os.environ | {"PATH": paths, "PYTHONPATH": str(ROOT)}
-    done = subprocess.run(["bash", "-euc", command], cwd=folder, env=settings, capture_output=True, text=True)
+    return subprocess.run(["bash", "-euc", command], cwd=folder, env=settings, capture_output=True, text=True)
+
+
+def _run_block(command: str, block: Sequence[Check], folder: Path) -> list[str]:
+    done = run_commands(command, folder)
     if done.returncode:
         said = (done.stderr or done.stdout).strip()[-500:]
         return [f"{block[0].place}: the commands ended with {done.returncode}: {said}"]
