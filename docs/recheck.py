@@ -149,7 +149,9 @@ def checks_of(page: str, text: str) -> list[Check]:
                 f"{page}:{line}: a recheck comment has neither a table below it nor, as it has no reads, text"
             )
         command = mark.command or _commands_above(text[: comment.start()])
-        found.append(Check(page, line, stated, f"{mark.first}\n{command}", mark))
+        # What comes first prints nothing that is compared.
+        before = f"{{\n{mark.first}\n}} >&2\n" if mark.first else ""
+        found.append(Check(page, line, stated, before + command, mark))
     return found
 
 

@@ -137,6 +137,7 @@ print("first:", first + 1)
 
 <!-- recheck
 seconds = 0
+first = "echo nothing of this"
 -->
 
 ```text
