@@ -37,6 +37,8 @@ myst_heading_anchors = 3
 html_theme = "furo"
 html_title = f"CroP {version}"
 html_copy_source = False
+# A search shows titles alone: a page that is opened from a disk may not read the others for their first lines.
+html_show_search_summary = False
 html_static_path = ["static"]
 html_css_files = ["site.css"]
 html_theme_options = {"navigation_with_keys": True}
