@@ -11,7 +11,13 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import skimage.data
+
+try:
+    import skimage.data
+except ModuleNotFoundError:
+    sys.exit(
+        "the photographs come with scikit-image, which is missing; pip install scikit-image, or use pictures of yours"
+    )
 
 NAMES = ("astronaut", "chelsea", "coffee", "rocket")
 
