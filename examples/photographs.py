@@ -15,9 +15,7 @@ import numpy as np
 try:
     import skimage.data
 except ModuleNotFoundError:
-    sys.exit(
-        "the photographs come with scikit-image, which is missing; pip install scikit-image, or use pictures of yours"
-    )
+    sys.exit("scikit-image, whose photographs these are, is missing; pip install scikit-image, or use your own")
 
 NAMES = ("astronaut", "chelsea", "coffee", "rocket")
 
