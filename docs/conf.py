@@ -20,6 +20,7 @@ from sphinx.domains.python import PyXRefRole
 from typer.main import get_command
 
 from croplab import COMMANDS
+from docs import gallery
 
 ROOT = Path(__file__).resolve().parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
@@ -36,6 +37,10 @@ myst_heading_anchors = 3
 html_theme = "furo"
 html_title = f"CroP {version}"
 html_copy_source = False
+# A search shows titles alone: a page that is opened from a disk may not read the others for their first lines.
+html_show_search_summary = False
+html_static_path = ["static"]
+html_css_files = ["site.css"]
 html_theme_options = {"navigation_with_keys": True}
 
 # The contents of every page stand beside it already; in the tree of all pages its objects cost minutes.
@@ -94,6 +99,11 @@ def write_commands(app: Sphinx) -> None:
         (folder / f"{command}.md").write_text("\n".join(parts), encoding="utf-8")
 
 
+def make_gallery(_: Sphinx) -> None:
+    """Make the pictures and reports of the gallery by the commands of its page."""
+    gallery.make()
+
+
 def keep_modules_out_of_the_tree(_: Sphinx, page: str, source: list[str]) -> None:
     """Let the tree of all pages name packages and rooms only; a room's page lists its modules.
 
@@ -119,4 +129,5 @@ def setup(app: Sphinx) -> None:
     """Register the role and the pages."""
     app.add_role("name", NameRole())
     app.connect("builder-inited", write_commands)
+    app.connect("builder-inited", make_gallery)
     app.connect("source-read", keep_modules_out_of_the_tree)

@@ -13,14 +13,21 @@ folders that are removed afterwards. A table of figures that commands print has 
     needs = ["thumbnails.npz"]         # files that do not come with the suite, looked for below the folders of --data
     seconds = 2                        # what the commands take
     tolerance = 0.02                   # by default a bit more than half of the last digit's unit
-    command = "evaluate …"             # by default the last block of commands above
+    command = "evaluate …"             # by default the last block of commands above, or all blocks of Python
     first = "sim table …"              # commands further up that it needs
     -->
 
-The first number of each cell is compared; figures in sentences are not. Commands run as they stand, so recheck only a
-copy that you trust. Figures that cannot be run so, because they take hours or data that nobody may pass on, have in
-their section the words "taken with version", the version and the date; on pages of measurements (`MEASURED`) a table
-with neither counts as a difference.
+The first number of each cell is compared. Where the comment has `says`, sentences below it are compared in place of a
+table: each text is that of the page, with a column in braces where a figure stands, behind a colon the row by what its
+`rows` hold, between semicolons (* for any), and before it min or max where several rows are meant:
+
+    says = ["Gray-world lies between {min Med.: Gray-world; *}° and {max Med.: Gray-world; *}° in the median"]
+
+Without `reads` the comment stands before a fenced block of text, which is what the commands print, figures within the
+tolerance; on a page of cells of Python before the last, and all such blocks above are compared with it. Commands run as
+they stand, so recheck only a copy that you trust. Figures that cannot be run so, because they take hours or data that
+nobody may pass on, have in their section the words "taken with version", the version and the date; on pages of
+measurements (`MEASURED`) a table with neither counts as a difference.
 """
 
 from __future__ import annotations
@@ -61,6 +68,13 @@ NUMBER = re.compile(r"-?(?:\d+\.?\d*|\.\d+)")
 TAKEN = re.compile(r"taken\s+with\s+version\s+(\S+),\s+(\d{4}-\d\d-\d\d)", re.IGNORECASE)
 
 
+PYTHON = "```python\n"
+"""What a cell begins with."""
+
+SLOT = re.compile(r"\{(?:(min|max) )?([^{}:]+)(?:: ([^{}]*))?\}")
+"""A figure of a sentence: which of several, its column, its row."""
+
+
 @dataclass(frozen=True)
 class Table:
     """A table of a page: the line it begins in, headings, and rows of cells."""
@@ -79,7 +93,8 @@ class Mark(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    reads: str
+    reads: str | None = None
+    says: tuple[str, ...] = ()
     rows: tuple[str, ...] = ()
     columns: str | None = None
     value: str | None = None
@@ -94,17 +109,21 @@ class Mark(BaseModel):
 
 @dataclass(frozen=True)
 class Check:
-    """A table of a page, the commands that print its figures, and how these are found."""
+    """What a page states below a comment, the commands that print its figures, and how these are found.
+
+    `stated`: a table, a text with the sentences of `mark.says`, or the lines of a block. `line` is where it begins.
+    """
 
     page: str
-    table: Table
+    line: int
+    stated: Table | str | list[str]
     command: str
     mark: Mark
 
     @property
     def place(self) -> str:
         """Return page and line."""
-        return f"{self.page}:{self.table.line}"
+        return f"{self.page}:{self.line}"
 
 
 def checks_of(page: str, text: str) -> list[Check]:
@@ -113,11 +132,26 @@ def checks_of(page: str, text: str) -> list[Check]:
     for comment in re.finditer(r"^<!-- recheck\n(.*?)^-->\n", text, re.MULTILINE | re.DOTALL):
         mark = Mark.model_validate(tomllib.loads(comment[1]))
         line = text.count("\n", 0, comment.end()) + 1
-        table = next((one for one in tables_of(text) if one.line >= line), None)
-        if table is None:
-            raise ValueError(f"{page}:{line}: a recheck comment has no table below it")
+        below = text[comment.end() :]
+        stated: Table | str | list[str] | None
+        if mark.says:
+            stated = below
+        elif mark.reads is None:
+            block = re.match(r"\n*```text\n(?:.*\n)*?```\n", below)
+            # Cells run as one program, which prints what stands below each.
+            whole = (text[: comment.start()] if PYTHON in text[: comment.start()] else "") + (block[0] if block else "")
+            stated = [line for lines in re.findall(r"(?ms)^```text\n(.*?)^```\n", whole) for line in lines.splitlines()]
+        else:
+            stated = next((one for one in tables_of(text) if one.line >= line), None)
+            line = stated.line if stated else line
+        if not stated:
+            raise ValueError(
+                f"{page}:{line}: a recheck comment has neither a table below it nor, as it has no reads, text"
+            )
         command = mark.command or _commands_above(text[: comment.start()])
-        found.append(Check(page, table, f"{mark.first}\n{command}", mark))
+        # What comes first prints nothing that is compared.
+        before = f"{{\n{mark.first}\n}} >&2\n" if mark.first else ""
+        found.append(Check(page, line, stated, before + command, mark))
     return found
 
 
@@ -133,7 +167,7 @@ def tables_of(text: str) -> list[Table]:
 
 def without_a_source(text: str) -> list[Table]:
     """Return the tables of figures that have neither commands nor, in their section, a version and a date."""
-    checked = {check.table.line for check in checks_of("", text)}
+    checked = {check.line for check in checks_of("", text)}
     starts = [1, *(n for n, line in enumerate(text.splitlines(), 1) if line.startswith("## "))]
     lines = text.splitlines()
     left: list[Table] = []
@@ -147,25 +181,76 @@ def without_a_source(text: str) -> list[Table]:
 
 
 def _commands_above(text: str) -> str:
-    """Return the last block of commands: lines with four spaces, or a fenced block."""
-    blocks = re.findall(r"(?:^    .*\n)+|^```(?:sh|console)?\n(?:.*\n)*?```\n", text, re.MULTILINE)
-    return "\n".join(line.removeprefix("    ") for line in blocks[-1].splitlines() if not line.startswith("```"))
+    """Return the last block of commands: lines with four spaces, or a fenced block; of Python all blocks, as one."""
+    text = re.sub(r"^<!--.*?-->\n", "", text, flags=re.MULTILINE | re.DOTALL)
+    found = re.finditer(r"(?:^    .*\n)+|^```(\w*)\n((?:.*\n)*?)```\n", text, re.MULTILINE)
+    blocks = [(block[1], block[2] or block[0]) for block in found if block[1] in (None, "", "sh", "console", "python")]
+    language, last = blocks[-1]
+    if language != "python":
+        return "\n".join(line.removeprefix("    ") for line in last.splitlines())
+    return "\n".join(["python - <<'END'", *(code for language, code in blocks if language == "python"), "END"])
 
 
-def differences(check: Check, folder: Path) -> list[str]:
-    """Return what the table states otherwise than the file that its commands left in `folder`, a line each."""
+def differences(check: Check, folder: Path, output: str = "") -> list[str]:
+    """Return what a page states otherwise than the file in `folder`, or the output, of its commands, a line each."""
+    if check.mark.reads is None:
+        assert isinstance(check.stated, list)
+        return list(_differences_of_lines(check, check.stated, output.splitlines()))
     with (folder / check.mark.reads).open(encoding="utf-8", newline="") as file:
         printed = [row for row in csv.DictReader(file) if all(row[k] == v for k, v in check.mark.where.items())]
-    if not any(NUMBER.search(cell) for cells in check.table.rows for cell in cells[max(len(check.mark.rows), 1) :]):
+    if isinstance(check.stated, str):
+        return [line for template in check.mark.says for line in _differences_of_sentence(check, template, printed)]
+    assert isinstance(check.stated, Table)
+    rows = check.stated.rows
+    if not any(NUMBER.search(cell) for cells in rows for cell in cells[max(len(check.mark.rows), 1) :]):
         return [f"{check.place}: the table states no figure"]
-    return [line for cells in check.table.rows for line in _differences_of_row(check, cells, printed)]
+    return [line for cells in rows for line in _differences_of_row(check, check.stated, cells, printed)]
 
 
-def _differences_of_row(check: Check, cells: Sequence[str], printed: Sequence[dict[str, str]]) -> Iterator[str]:
+def _differences_of_lines(check: Check, stated: Sequence[str], printed: Sequence[str]) -> Iterator[str]:
+    if len(stated) != len(printed):
+        yield f"{check.place}: {len(stated)} lines stated, {len(printed)} printed"
+    for line, found in zip(stated, printed, strict=False):
+        numbers, values = NUMBER.findall(line), NUMBER.findall(found)
+        words, others = (NUMBER.sub("", text).split() for text in (line, found))
+        if (words, len(numbers)) != (others, len(values)) or any(
+            abs(float(number) - float(value)) > _tolerance(check.mark, number)
+            for number, value in zip(numbers, values, strict=False)
+        ):
+            yield f"{check.place}: {line.strip()!r} stated, {found.strip()!r} printed"
+
+
+def _differences_of_sentence(check: Check, template: str, printed: Sequence[dict[str, str]]) -> Iterator[str]:
+    slots = list(SLOT.finditer(template))
+    texts = [r"\s+".join(map(re.escape, part.split(" "))) for part in SLOT.split(template)[:: SLOT.groups + 1]]
+    found = re.search(f"({NUMBER.pattern})".join(texts), str(check.stated).replace("−", "-"))
+    if not slots or found is None:
+        yield f"{check.place}: the page does not say, with figures: {template}"
+        return
+    for slot, number in zip(slots, found.groups(), strict=True):
+        which, column, row = slot.groups()
+        wanted = [part.strip() for part in (row or "").split(";")]
+        values = [
+            float(one[column])
+            for one in printed
+            if NUMBER.fullmatch(one[column])
+            and all(want in ("*", "", one[key]) for key, want in zip(check.mark.rows, wanted, strict=False))
+        ]
+        if not values or (which is None and len(values) > 1):
+            yield f"{check.place}: {slot[0]}: {number} stated, not one figure printed"
+        elif abs(float(number) - (value := max(values) if which == "max" else min(values))) > _tolerance(
+            check.mark, number
+        ):
+            yield f"{check.place}: {slot[0]}: {number} stated, {value:.6g} printed"
+
+
+def _differences_of_row(
+    check: Check, table: Table, cells: Sequence[str], printed: Sequence[dict[str, str]]
+) -> Iterator[str]:
     labels = max(len(check.mark.rows), 1)
     named = [_plain(cell) for cell in cells[: len(check.mark.rows)]]
     rows = [row for row in printed if [_label(row, names) for names in check.mark.rows] == named]
-    for heading, cell in zip(check.table.headings[labels:], cells[labels:], strict=True):
+    for heading, cell in zip(table.headings[labels:], cells[labels:], strict=True):
         stated = NUMBER.search(_plain(cell))
         if stated is None:
             continue
@@ -204,8 +289,10 @@ def run(checks: Sequence[Check], data: Sequence[Path], most_s: float = math.inf)
     """Run the commands of checks, each block once; return what differs and what was not run, a line each."""
     differ: list[str] = []
     skipped: list[str] = []
-    for command, group in itertools.groupby(checks, key=lambda check: check.command):
-        block = list(group)
+    blocks: dict[str, list[Check]] = {}
+    for check in checks:
+        blocks.setdefault(check.command, []).append(check)
+    for command, block in blocks.items():
         places = {name: _found(name, data) for check in block for name in check.mark.needs}
         missing = [name for name, place in places.items() if place is None]
         seconds = max(check.mark.seconds for check in block)
@@ -220,20 +307,25 @@ def run(checks: Sequence[Check], data: Sequence[Path], most_s: float = math.inf)
     return differ, skipped
 
 
-def _run_block(command: str, block: Sequence[Check], folder: Path) -> list[str]:
+def run_commands(command: str, folder: Path) -> subprocess.CompletedProcess[str]:
+    """Run commands of a page in a folder, ours those beside this Python, up to the first that fails."""
     paths = os.pathsep.join([str(Path(sys.executable).parent), os.environ.get("PATH", "")])
     settings = os.environ | {"PATH": paths, "PYTHONPATH": str(ROOT)}
-    done = subprocess.run(["bash", "-euc", command], cwd=folder, env=settings, capture_output=True, text=True)
+    return subprocess.run(["bash", "-euc", command], cwd=folder, env=settings, capture_output=True, text=True)
+
+
+def _run_block(command: str, block: Sequence[Check], folder: Path) -> list[str]:
+    done = run_commands(command, folder)
     if done.returncode:
         said = (done.stderr or done.stdout).strip()[-500:]
         return [f"{block[0].place}: the commands ended with {done.returncode}: {said}"]
-    return [line for check in block for line in _differences_or_why_not(check, folder)]
+    return [line for check in block for line in _differences_or_why_not(check, folder, done.stdout)]
 
 
-def _differences_or_why_not(check: Check, folder: Path) -> list[str]:
+def _differences_or_why_not(check: Check, folder: Path, output: str) -> list[str]:
     """Return what differs, or why nothing could be compared."""
     try:
-        return differences(check, folder)
+        return differences(check, folder, output)
     except OSError as error:
         return [f"{check.place}: the commands left no {check.mark.reads} ({error.strerror})"]
     except KeyError as error:
@@ -262,7 +354,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         taken = sorted(set(TAKEN.findall(text)))
         skipped += [f"{page}: taken with version {version}, {date}" for version, date in taken]
     print("\n".join([*(f"not run  {line}" for line in skipped), *(f"differs  {line}" for line in differ)]))
-    print(f"{len(checks)} tables have commands; {len(differ)} differences")
+    print(f"{len(checks)} tables, texts and outputs have commands; {len(differ)} differences")
     return int(bool(differ))
 
 

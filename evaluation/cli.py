@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from evaluation.commands import compare as compare_command
@@ -14,6 +16,7 @@ from evaluation.commands import train as train_command
 from evaluation.commands import transfer as transfer_command
 from evaluation.commands import tune as tune_command
 from foundation.console import EXIT_CODES, Quiet, Verbose, Version, common_first, is_common, new_app, run
+from foundation.errors import InputError
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -45,7 +48,29 @@ def evaluate(verbose: Verbose = 0, quiet: Quiet = False, version: Version = Fals
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command with `argv`, by default the process's own, and return one of `foundation.console.EXIT_CODES`."""
     whole = _with_command(common_first(argv))
-    return run(lambda: app(whole, prog_name="evaluate"), keeps=_keeps(whole))
+
+    def evaluate_words() -> None:
+        name, *words = [word for word in whole if not is_common(word)] or [""]
+        _require_methods_in_place(name, words)
+        app(whole, prog_name="evaluate")
+
+    return run(evaluate_words, keeps=_keeps(whole))
+
+
+def _require_methods_in_place(command: str, words: Sequence[str]) -> None:
+    """Refuse `cv --method METHOD` and `run METHOD DATA`, each of which is how the other is written."""
+    if command in ("cv", "train"):
+        for word, behind in pairwise([*words, "METHOD"]):
+            name, _, value = word.partition("=")
+            if name in ("--method", "--methods"):
+                right = f"evaluate {command} {value or behind} DATA"
+                raise InputError(f"evaluate {command} takes METHOD and DATA in this order, without {name}: {right}")
+    if command == "run" and len(words) > 1 and not any(word.startswith("-") for word in words[:2]):
+        data, method = words[:2]
+        if Path(method).exists() and not Path(data).exists():
+            data, method = method, data
+        right = f"evaluate run {data} --method {method}"
+        raise InputError(f"evaluate run takes one data set, and methods behind --method: {right}")
 
 
 def _with_command(given: Sequence[str]) -> list[str]:

@@ -11,7 +11,11 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import skimage.data
+
+try:
+    import skimage.data
+except ModuleNotFoundError:
+    sys.exit("scikit-image, whose photographs these are, is missing; pip install scikit-image, or use your own")
 
 NAMES = ("astronaut", "chelsea", "coffee", "rocket")
 

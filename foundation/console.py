@@ -133,6 +133,10 @@ def _outcome(command: Callable[[], object], keeps: bool) -> int:
     except SystemExit as error:
         if error.code == EXIT_INTERRUPTED:
             return _interrupted(keeps)
+        if isinstance(error.__context__, BrokenPipeError):
+            # Click ends with 1 there.
+            _abandon_stdout()
+            return 0
         return error.code if isinstance(error.code, int) else int(error.code is not None)
     return 0
 

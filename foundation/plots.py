@@ -94,7 +94,7 @@ def legend_label(name: str) -> str:
 
 
 def png_of(draw: Callable[..., None], *arguments: Any) -> bytes:
-    """Return the PNG of a figure that `draw(figure, *arguments)` fills and gives its size."""
+    """Return the PNG of a figure that `draw(figure, *arguments)` fills and gives its size; it has plain numbers."""
     import matplotlib
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
@@ -105,6 +105,7 @@ def png_of(draw: Callable[..., None], *arguments: Any) -> bytes:
         figure: Any = Figure(layout="constrained", dpi=_PNG_DPI)
         FigureCanvasAgg(figure)
         draw(figure, *arguments)
+        _write_plain_numbers(figure)
         stream = BytesIO()
         figure.savefig(stream, format="png")
     return stream.getvalue()

@@ -66,6 +66,15 @@ Each picture is printed, lit and photographed by the table: every pixel becomes 
 of its colour under the light. The same seed, pictures and table give the same bytes, whatever the workers. A picture
 that cannot be read is left out, and named. When it was interrupted or killed, run the same command again to go on.
 
+Examples: a first dataset, of a table that is computed; training crops under lights of any chromaticity; test images of
+two lights each, by the paper's rendering.
+
+generate demo: first/ --sources photographs/
+
+generate lut/ train/ --sources photographs/ --crop 256x256 --crops 4 --distribution uniform
+
+generate lut/ test/ --sources photographs/ --lights-per-image 2 --masks smooth --rendering codes
+
 generate explore LUT shows a table in the browser: its lights, and pictures under them.
 
 {EXIT_CODES}

@@ -86,6 +86,8 @@ def compare(
         *_guessed(runs, results),
         *_indistinct(comparisons, results),
     )
+    if out is not None:
+        comparison_report.write_comparisons(out, comparisons, notes, level)
     show_notes(told, notes)
     verdicts = [comparing.verdict(made, level) for made in comparisons]
     told.add(results=results, error=error, level=level, verdicts=verdicts)
@@ -99,7 +101,6 @@ def compare(
     elif out is None:
         print("Statistics and images of each comparison: --images prints them, --out writes them, --method chooses.")
     if out is not None:
-        comparison_report.write_comparisons(out, comparisons, notes, level)
         print(f"written to {out}: report.html, tests.csv, statistics.csv, images.csv, tables.tex")
 
 

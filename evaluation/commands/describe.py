@@ -73,6 +73,10 @@ def describe(
     other = None if against is None else _described(against, beside, cells, threads)
     if other is not None and one.name == other.name:
         one, other = (replace(made, name=f"{made.name} ({place})") for made, place in ((one, data), (other, against)))
+    if out is not None:
+        write_whole(out, statistics_to_json(one))
+    if report is not None:
+        write_whole(report, reporting.describe_page(one, other, seed))
     told.add(data_sets=[one.name] if other is None else [one.name, other.name])
     if other is None:
         show_tables(told, [reporting.figures_table(one)])
@@ -84,10 +88,6 @@ def describe(
         told.add(sentences=[sentence(made, (one.name, other.name)) for made in compared])
         for made in compared:
             print(sentence(made, (one.name, other.name)))
-    if out is not None:
-        write_whole(out, statistics_to_json(one))
-    if report is not None:
-        write_whole(report, reporting.describe_page(one, other, seed))
 
 
 def _described(place: str, reading: DataReading, cells: int, workers: int) -> DataDescription:

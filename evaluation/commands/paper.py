@@ -375,17 +375,18 @@ def _treatment(data: SceneSet) -> str:
 
 
 def _finish(report: PaperReport, conditions: Sequence[str], out: Path | None, told: JsonOutput) -> None:
-    """Print the tables and write the folder, if one was named."""
+    """Write the folder, if one was named, and print the tables."""
     from evaluation.experiments.paper.reporting import write_report
     from evaluation.reports.table_output import show_notes, show_tables
 
+    if out is not None:
+        write_report(report, out)
     show_notes(told, conditions)
     for table in report.tables:
         if not told.asked:
             print()
         show_tables(told, [table])
     if out is not None:
-        write_report(report, out)
         print(f"\n{out / 'report.html'}")
 
 

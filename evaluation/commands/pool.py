@@ -54,8 +54,8 @@ def pool(
     chosen = error or parts[0].error
     made = pool_transfers(parts)
     tables = make_tables(made, chosen, base)
+    if out is not None:
+        save_pool(made, tables, [part.place for part in parts], chosen, out)
     told.add(results=results, error=chosen, base=base)
     show_tables(told, tables.shown, "")
     show_notes(told, made.notes)
-    if out is not None:
-        save_pool(made, tables, [part.place for part in parts], chosen, out)

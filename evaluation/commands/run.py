@@ -92,14 +92,14 @@ def run(
     given = choose_estimates(estimates or [], [scene.name for scene in found.scenes])
     with orderly_end(), progress("images") as advance:
         made = run_methods(found, [*chosen, *given], out, error, workers or processor_count(), advance)
-    if told.asked:
-        _tell(made, told)
-    else:
-        _print(made, error, statistics == "all")
     if csv is not None:
         write_whole(csv, table_csv(made.results, error))
     if images is not None:
         write_whole(images, images_csv(found.scenes, made.results))
+    if told.asked:
+        _tell(made, told)
+    else:
+        _print(made, error, statistics == "all")
 
 
 def _require_free(csv: Path | None, images: Path | None, out: Path | None) -> None:

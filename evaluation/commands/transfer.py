@@ -159,11 +159,11 @@ def transfer(
         "reading": asdict(reading),
     }
     outcome = TransferOutcome(counted, tested, plan, rows, figures, drawn, settings)
+    if out is not None:
+        save_outcome(outcome, out)
     told.add(test=counted.name, error=error, settings=settings)
     show_tables(told, list(outcome.tables()), "")
     show_notes(told, plan.notes)
-    if out is not None:
-        save_outcome(outcome, out)
 
 
 def _learners(text: str) -> tuple[list[AnyLearner], list[str]]:

@@ -44,8 +44,10 @@ def print_table(table: Table) -> None:
     needed = Console(width=_WIDE).measure(grid)
     # A file or pipe has no width, but rich would take that of the terminal on stdin or stderr.
     console.width = max(console.width, needed.minimum) if console.is_terminal else needed.maximum
-    print(table.title)
-    console.print(grid)
+    # Rich ends the process where the reader of its output left; our own printing is judged by `foundation.console.run`.
+    with console.capture() as drawn:
+        console.print(grid)
+    print(f"{table.title}\n{drawn.get()}", end="")
     for note in table.notes:
         print(note)
 

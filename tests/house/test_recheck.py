@@ -76,6 +76,88 @@ def test_columns_may_be_named_and_rows_chosen() -> None:
     assert [line.split("; ")[1] for line in differ] == ["1: 2.5 stated, 0 printed"]
 
 
+SENTENCES = """
+    mkdir FOLDER
+    printf 'Method,Bits,Med.\\nA,0,1.234\\nA,1,2.5\\nB,0,3.249\\nB,1,-\\n' > FOLDER/out.csv
+
+<!-- recheck
+reads = "FOLDER/out.csv"
+rows = ["Method", "Bits"]
+says = [
+    "of A rises from {Med.: A; 0}° to {Med.: A; 1}°,",
+    "with 0 bits lies between {min Med.: *; 0}° and {max Med.: *; 0}°",
+]
+seconds = 0
+-->
+
+The median of A rises from 1.23° to
+2.5°, and with 0 bits lies between 1.2°
+and 3.25°.
+"""
+
+
+def test_figures_of_sentences_are_compared() -> None:
+    assert run(checks_of("page.md", SENTENCES), []) == ([], [])
+
+
+@pytest.mark.parametrize(
+    ("text", "instead", "said"),
+    [
+        ("2.5°", "2.6°", "{Med.: A; 1}: 2.6 stated, 2.5 printed"),
+        ("and 3.25°", "and 2.5°", "{max Med.: *; 0}: 2.5 stated, 3.249 printed"),
+        ("of A rises from 1.23", "of A grows from 1.23", "the page does not say, with figures: of A rises"),
+        ("{Med.: A; 1}", "{Med.: A; *}", "2.5 stated, not one figure printed"),
+        ("{Med.: A; 1}", "{Med.: B; 1}", "2.5 stated, not one figure printed"),
+        ("{Med.: A; 1}", "{Mean: A; 1}", "has no column 'Mean'"),
+        ("{Med.: A; 0}° to {Med.: A; 1}", "1.23° to\n2.5", "the page does not say, with figures"),
+    ],
+)
+def test_figures_of_sentences_that_differ_are_said(text: str, instead: str, said: str) -> None:
+    assert SENTENCES.count(text) == 1
+    page = SENTENCES.replace(text, instead.replace("\n", " ") if "{" in text else instead)
+    differ, skipped = run(checks_of("page.md", page), [])
+    assert skipped == []
+    assert len(differ) == 1
+    assert said in differ[0]
+
+
+CELLS = """
+```python
+first = 1.234
+print(f"one {first:.2f}, two 7 px")
+```
+
+```text
+one 1.23, two 7 px
+```
+
+```python
+print("first:", first + 1)
+```
+
+<!-- recheck
+seconds = 0
+first = "echo nothing of this"
+-->
+
+```text
+first: 2.234
+```
+"""
+
+
+def test_what_cells_print_is_compared() -> None:
+    assert run(checks_of("page.md", CELLS), []) == ([], [])
+    for text, instead in (
+        ("2.234", "2.24"),
+        ("first: ", "last: "),
+        ("7 px\n```", "7 px\nmore\n```"),
+        ("1.23, two 7", "1.23, two 8"),
+    ):
+        assert CELLS.count(text) == 1
+        assert run(checks_of("page.md", CELLS.replace(text, instead)), [])[0]
+
+
 def test_what_cannot_be_run_is_said(tmp_path: Path) -> None:
     needs = page_with("seconds = 0", 'seconds = 9\nneeds = ["a.npz"]').replace(
         "mkdir FOLDER", "cat a.npz; mkdir FOLDER"

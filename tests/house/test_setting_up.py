@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import runpy
 import tomllib
 from pathlib import Path
 
@@ -63,6 +64,17 @@ def test_no_page_leads_out_of_the_repository(page: Path) -> None:
 def test_a_path_beside_the_repository_is_seen() -> None:
     beside = f"../{ROOT.parent.name}/x ../shared/data ../examples"
     assert astray(ROOT / "docs" / "transfer.md", beside) == beside.split()[:2]
+
+
+def test_a_package_index_shows_no_link_that_leads_nowhere() -> None:
+    script = runpy.run_path(str(ROOT / "setup.py"), run_name="setup")
+    shown = script["long_description"]((ROOT / "README.md").read_text(encoding="utf-8"))
+    assert re.findall(r"\]\((?!https?:)", shown) == []
+    assert "![" not in shown
+    # What stood in the links is there, and so are whole links.
+    assert "how good and how fast" in shown
+    assert script["long_description"]("[a](https://b.org) [c](d.md)").startswith("[a](https://b.org) c\n")
+    assert 'dynamic = ["readme"]' in (ROOT / "pyproject.toml").read_text(encoding="utf-8")
 
 
 def test_readme_is_read_in_one_go() -> None:

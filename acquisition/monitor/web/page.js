@@ -62,8 +62,20 @@ let sound = null;
 let drawn = { plots: [], strip: null };
 
 const now = () => Date.now() + clockOffset;
-const timeText = (ms) => (ms ? new Date(ms).toLocaleTimeString([], { hour12: false }) : "–");
-const dayText = (ms) => (ms ? new Date(ms).toLocaleString([], { hour12: false }) : "–");
+// Local time in the form of ISO 8601, as in the report's title and in the files of a session, in whatever language.
+const joined = (numbers, sign) => numbers.map((number) => String(number).padStart(2, "0")).join(sign);
+
+function timeText(ms) {
+  if (!ms) return "–";
+  const at = new Date(ms);
+  return joined([at.getHours(), at.getMinutes(), at.getSeconds()], ":");
+}
+
+function dayText(ms) {
+  if (!ms) return "–";
+  const at = new Date(ms);
+  return `${joined([at.getFullYear(), at.getMonth() + 1, at.getDate()], "-")} ${timeText(ms)}`;
+}
 
 function durationText(seconds) {
   if (seconds === null || seconds === undefined) return "unknown";
@@ -279,7 +291,10 @@ function drawChoice(frames) {
       );
     }),
   );
-  const timings = Object.entries(frame.timings ?? {}).map(([what, seconds]) => `${what} ${short(seconds)} s`);
+  const timings = Object.entries(frame.timings ?? {}).map(
+    // Below a millisecond nothing was done.
+    ([what, seconds]) => `${what} ${seconds < 0.001 ? "0" : short(seconds)} s`,
+  );
   $("timings").textContent = timings.length ? `Time: ${timings.join(", ")}` : "";
 }
 

@@ -225,7 +225,7 @@ class Panel {
     const [side, half] = [this.loupe.width, (LOUPE - 1) / 2];
     const context = this.loupe.getContext("2d");
     context.imageSmoothingEnabled = false;
-    context.clearRect(0, 0, side, side);
+    context.fillRect(0, 0, side, side);
     context.drawImage(this.canvas, at[0] - half, at[1] - half, LOUPE, LOUPE, 0, 0, side, side);
     for (const [colour, wide] of [["#000", 4], ["#fff", 2]]) {
       [context.strokeStyle, context.lineWidth] = [colour, wide];

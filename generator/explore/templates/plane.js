@@ -56,7 +56,7 @@ class Plane {
     });
     const curve = path(table.black_bodies.map(([, r, b]) => [r, b]));
     this.svg.append(...["bodies halo", "bodies"].map((name) => shape("path", { class: name, d: curve })));
-    this.rings = ["chosen halo", "chosen"].map((name) => shape("circle", { class: name, r: 9 }));
+    this.rings = ["chosen halo", "chosen"].map((name) => shape("circle", { class: name, r: 9, cx: -99 }));
     this.svg.append(...this.rings);
     box.append(this.svg);
     this.listen(box, onPick, onStep, onMove);

@@ -97,7 +97,7 @@ class MadeUpRun:
             exposure_s=0.5,
             ended_at=self.clock,
             judgement=Judgement(checks, self.seen(step)),
-            timings={"settle": 0.2, "expose": 0.55, "download": 0.9, "save": 0.2, "judge": 0.4},
+            timings={"settle": 0.2, "expose": 0.55, "download": 0.9, "save": 0.2, "wait": 1.4e-5},
         )
         if self.previews:
             colour = step.colour.codes

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import signal
 import subprocess
 import sys
@@ -292,6 +293,11 @@ def test_the_report_shows_the_same_from_a_file(tab: Tab, run: MadeUpRun, tmp_pat
     assert marks(tab, "planned", "accepted") == sum(step.kind == "light" for step in run.steps[:28])
     tab.wait_for("document.getElementById('picture').naturalWidth === 360")
     assert tab.value("document.querySelector('.refusal img').src").startswith("data:image/jpeg")
+    times = tab.value("[...document.querySelectorAll('#events td:first-child')].map((one) => one.textContent)")
+    assert times
+    assert [time for time in times if not re.fullmatch(r"\d{4}-\d\d-\d\d \d\d:\d\d:\d\d", time)] == []
+    assert re.search(r"at \d{4}-\d\d-\d\d \d\d:\d\d:\d\d: accepted", tab.text())
+    assert tab.value("document.getElementById('timings').textContent").endswith("wait 0 s")
     assert tab.value(OUTSIDE) == []
     assert tab.value("document.getElementById('sound').hidden")
     tab.open("about:blank")

@@ -114,6 +114,25 @@ def test_data_before_the_method_is_said(dataset: Path, command: list[str], capsy
     assert "the method comes first" not in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(
+    ("words", "right"),
+    [
+        ("cv --method kernel-ridge DATA", "evaluate cv kernel-ridge DATA"),
+        ("cv DATA --methods=kernel-ridge", "evaluate cv kernel-ridge DATA"),
+        ("train DATA --method", "evaluate train METHOD DATA"),
+        ("run gray-world DATA", "evaluate run DATA --method gray-world"),
+        ("DATA gray-world --csv x.csv", "evaluate run DATA --method gray-world"),
+    ],
+)
+def test_a_method_in_the_place_of_another_command_is_answered_with_the_right_form(
+    words: str, right: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("DATA").mkdir()
+    assert main(words.split()) == 2
+    assert capsys.readouterr().err.endswith(f": {right}\n")
+
+
 def test_a_class_that_has_to_learn_before_it_estimates_is_sent_to_cv(
     dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

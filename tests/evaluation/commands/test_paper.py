@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import csv
+import os
 import re
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -178,6 +181,28 @@ def test_reduction(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     strip = np.asarray(Image.open(tmp_path / "out" / "reduction.png"))
     np.testing.assert_array_equal(strip[:20, :30], codes)
     np.testing.assert_array_equal(strip[26:46, 36:66], codes & 0b11100000)
+
+
+@pytest.mark.parametrize(
+    ("words", "made"),
+    [
+        ("paper reduction noise.png --out out", "out/report.html"),
+        ("run photos.npz --csv out.csv", "out.csv"),
+        ("describe photos.npz --out out.json", "out.json"),
+        ("cv kernel-ridge photos.npz --out out", "out/report.html"),
+    ],
+)
+def test_what_was_computed_is_kept_where_the_reader_of_the_output_left(
+    words: str, made: str, thumbnails: Path, tmp_path: Path
+) -> None:
+    Image.fromarray(np.zeros((20, 30, 3), dtype=np.uint8)).save(tmp_path / "noise.png")
+    assert thumbnails.parent == tmp_path
+    reader, writer = os.pipe()
+    os.close(reader)
+    call = [sys.executable, "-m", "evaluation.cli", *words.split()]
+    done = subprocess.run(call, cwd=tmp_path, stdout=writer, stderr=subprocess.PIPE, text=True, check=False)
+    os.close(writer)
+    assert (done.returncode, (tmp_path / made).is_file()) == (0, True), done.stderr
 
 
 def test_chromaticities(
