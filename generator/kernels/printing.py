@@ -176,8 +176,9 @@ _BLOCK: Final = LANES
 """Pixels that are planned and interpolated at a time."""
 _QUARTERS: Final = 4
 """Of a block, each of four pixels: their numbers of four channels fill a vector of 16."""
-_PLAN_ROWS: Final = 9
-"""Rows of 16 numbers that the plan of a block has: offsets of four nodes in bytes, their weights, the nearest node's."""
+_PLAN_ROWS: Final = 8
+"""Rows of 16 numbers that the plan of a block has: offsets of three nodes in bytes, weights of four, the offset of the
+nearest. The fourth node is one step farther in each channel than the first."""
 _ROW: Final = 4 * _BLOCK
 _PLAN_BYTES: Final = _ROW * _PLAN_ROWS
 _LINE_BYTES: Final = 16 * _BLOCK
@@ -237,14 +238,14 @@ def plan_block(typing: Any, picture: Any, part: Any, target: Any) -> Any:
         upper, lower = most(upper, blue), least(lower, blue)
         base, all_of = node(channels, 0), number(int(_ALL))
         far = builder.add(base, all_of)
-        nodes = base, builder.add(base, high), builder.sub(far, low), far
+        nodes = base, builder.add(base, high), builder.sub(far, low)
         one = ir.Constant(FLOATS, [1.0] * LANES)
         weights = builder.fsub(one, upper), builder.fsub(upper, middle), builder.fsub(middle, lower), lower
         for row, its in enumerate(nodes):
             store(builder, builder.shl(its, number(4)), target, _ROW * row)
         for row, its in enumerate(weights):
-            store(builder, its, target, _ROW * (4 + row))
-        store(builder, builder.shl(node(channels, int(_HALF)), number(5)), target, _ROW * 8)
+            store(builder, its, target, _ROW * (3 + row))
+        store(builder, builder.shl(node(channels, int(_HALF)), number(5)), target, _ROW * 7)
 
     return void(emit, ADDRESS, ADDRESS, ADDRESS)
 
@@ -261,28 +262,42 @@ def place_samples(typing: Any, plan: Any, cells: Any, choices: Any, bases: Any, 
         builder: Builder, plan: Value, cells: Value, choices: Value, bases: Value, samples: Value, target: Value
     ) -> None:
         for pixel in range(_BLOCK):
-            near = load(builder, plan, _ROW * 8 + 4 * pixel, I32)
+            near = load(builder, plan, _ROW * 7 + 4 * pixel, I32)
             cell = builder.zext(builder.lshr(near, ir.Constant(I32, 3)), I64)
             place = builder.add(load(builder, builder.add(cells, cell), 0, I32), load(builder, choices, 4 * pixel, I32))
             store(builder, place, target, 4 * pixel)
-            prefetching(3)(builder, builder.add(bases, builder.zext(near, I64)))
             prefetching(3)(builder, builder.add(samples, builder.zext(place, I64)))
 
     return void(emit, ADDRESS, ADDRESS, ADDRESS, ADDRESS, ADDRESS, ADDRESS)
 
 
-def _of_pixels(builder: Builder, base: Value, offsets: Value, shift: int, kind: Any) -> Value:
-    """Return four of a block's vectors as one: each stands behind `base` by an uint32, which are in a row."""
-    parts = [
-        load(builder, builder.add(base, builder.zext(load(builder, offsets, shift + 4 * pixel, I32), I64)), 0, kind)
-        for pixel in range(4)
-    ]
-    return concatenated(builder, parts)
+def _of_pixels(builder: Builder, base: Value, offsets: Sequence[Value], shift: int, kind: Any) -> Value:
+    """Return vectors of some pixels as one: each stands `shift` bytes and the pixel's offset, an int64, behind `base`."""
+    return concatenated(builder, [load(builder, builder.add(base, offset), shift, kind) for offset in offsets])
 
 
-def _each(builder: Builder, four: Value) -> Value:
-    """Return four numbers, each four times."""
-    return builder.shuffle_vector(four, four, constant(WORDS, [lane // 4 for lane in range(LANES)]))
+def _offsets(builder: Builder, plan: Value, at: int, pixels: int) -> list[Value]:
+    """Return the offsets, int64, that stand as uint32 in a row."""
+    low, half = ir.Constant(I64, 0xFFFFFFFF), ir.Constant(I64, 32)
+    offsets: list[Value] = []
+    for pixel in range(0, pixels, 2):
+        two = load(builder, plan, at + 4 * pixel, I64)
+        offsets += [builder.and_(two, low), builder.lshr(two, half)]
+    return offsets
+
+
+def _each(builder: Builder, address: Value, offset: int, first: int, count: int) -> Value:
+    """Return `count` of a block's numbers, float32 in a row, each four times."""
+    begin = first // 8 * 8
+    numbers = load(builder, address, offset + 4 * begin, ir.VectorType(F32, 8))
+    lanes = [first - begin + lane // 4 for lane in range(4 * count)]
+    return builder.shuffle_vector(numbers, numbers, constant(ir.VectorType(I32, len(lanes)), lanes))
+
+
+_TOGETHER: Final = 4
+"""Pixels whose four channels share a vector: to put four into one costs more than it saves."""
+_NUMBERS: Final = ir.VectorType(F32, 4 * _TOGETHER)
+_WHOLE: Final = ir.VectorType(I32, 4 * _TOGETHER)
 
 
 @intrinsic
@@ -291,14 +306,14 @@ def interpolate(typing: Any, plan: Any, means: Any, line: Any) -> Any:
     del typing, plan, means, line
 
     def emit(builder: Builder, plan: Value, means: Value, line: Value) -> None:
-        for quarter in range(_QUARTERS):
+        for first in range(0, _BLOCK, _TOGETHER):
             total: Value = None
-            for corner in range(4):
-                shift = _ROW * corner + 16 * quarter
-                weight = _each(builder, load(builder, plan, _ROW * 4 + shift, _FOUR))
-                part = builder.fmul(weight, _of_pixels(builder, means, plan, shift, _FOUR))
+            corners = [_offsets(builder, plan, _ROW * row + 4 * first, _TOGETHER) for row in range(3)]
+            for corner, (offsets, shift) in enumerate(zip((*corners, corners[0]), (0, 0, 0, 16 * int(_ALL)), strict=True)):
+                weights = _each(builder, plan, _ROW * (3 + corner), first, _TOGETHER)
+                part = builder.fmul(weights, _of_pixels(builder, means, offsets, shift, _FOUR))
                 total = part if total is None else builder.fadd(total, part)
-            store(builder, total, line, 64 * quarter)
+            store(builder, total, line, 16 * first)
 
     return void(emit, ADDRESS, ADDRESS, ADDRESS)
 
@@ -314,19 +329,20 @@ def add_deviations(typing: Any, plan: Any, bases: Any, samples: Any, places: Any
     def emit(
         builder: Builder, plan: Value, bases: Value, samples: Value, places: Value, factors: Value, line: Value
     ) -> None:
-        behind = builder.add(bases, ir.Constant(I64, 16))
-        for quarter in range(_QUARTERS):
-            seen = load(builder, line, 64 * quarter, FLOATS)
-            noise = builder.shuffle_vector(seen, seen, constant(WORDS, [lane | 3 for lane in range(LANES)]))
-            scale = builder.fmul(noise, _each(builder, load(builder, factors, 16 * quarter, _FOUR)))
-            base = _of_pixels(builder, bases, plan, _ROW * 8 + 16 * quarter, _FOUR)
-            spread = _of_pixels(builder, behind, plan, _ROW * 8 + 16 * quarter, _FOUR)
-            drawn = _of_pixels(builder, samples, places, 16 * quarter, ir.VectorType(I16, 4))
-            drawn = builder.sitofp(builder.zext(drawn, WORDS), FLOATS)
-            deviation = builder.fmul(builder.fsub(drawn, base), builder.fmul(spread, scale))
-            total = builder.fadd(seen, deviation)
-            lanes = [LANES + lane if lane % 4 == 3 else lane for lane in range(LANES)]
-            store(builder, builder.shuffle_vector(total, seen, constant(WORDS, lanes)), line, 64 * quarter)
+        count = 4 * _TOGETHER
+        for first in range(0, _BLOCK, _TOGETHER):
+            seen = load(builder, line, 16 * first, _NUMBERS)
+            noise = builder.shuffle_vector(seen, seen, constant(_WHOLE, [lane | 3 for lane in range(count)]))
+            factor = _each(builder, factors, 0, first, _TOGETHER)
+            near = _offsets(builder, plan, _ROW * 7 + 4 * first, _TOGETHER)
+            base, spread = (_of_pixels(builder, bases, near, shift, _FOUR) for shift in (0, 16))
+            own = _offsets(builder, places, 4 * first, _TOGETHER)
+            drawn = _of_pixels(builder, samples, own, 0, ir.VectorType(I16, 4))
+            drawn = builder.sitofp(builder.zext(drawn, _WHOLE), _NUMBERS)
+            scale = builder.fmul(spread, builder.fmul(noise, factor))
+            total = builder.fadd(seen, builder.fmul(builder.fsub(drawn, base), scale))
+            lanes = [count + lane if lane % 4 == 3 else lane for lane in range(count)]
+            store(builder, builder.shuffle_vector(total, seen, constant(_WHOLE, lanes)), line, 16 * first)
 
     return void(emit, ADDRESS, ADDRESS, ADDRESS, ADDRESS, ADDRESS, ADDRESS)
 
