@@ -24,7 +24,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import lru_cache
+from itertools import pairwise
 from typing import Any, Final
 
 import numpy as np
@@ -92,20 +93,17 @@ class PrintedLight:
 
     - `means`: (4913, 4) float32: m in red, green and blue, counts; and their noise, σ.
     - `bases`: (C, 4913, 2, 4) float32 of each of the table's lights in it: b in red, green and blue, counts, and k; the
-      fourth of each is not used.
+      fourth of each is 0.
     - `lights`: (C,) int64, numbers of these lights.
     - `roots`: (C,) float32, square roots of their weights.
+
+    Arrays are C-contiguous.
     """
 
     means: npt.NDArray[np.float32]
     bases: npt.NDArray[np.float32]
     lights: npt.NDArray[np.int64]
     roots: npt.NDArray[np.float32]
-
-    @cached_property
-    def addresses(self) -> tuple[int, int]:
-        """Addresses of `means` and `bases`, which are C-contiguous."""
-        return self.means.ctypes.data, self.bases.ctypes.data
 
 
 @lru_cache(maxsize=1)
@@ -174,8 +172,6 @@ def means_at(
 _FOUR: Final = ir.VectorType(F32, 4)
 _BLOCK: Final = LANES
 """Pixels that are planned and interpolated at a time."""
-_QUARTERS: Final = 4
-"""Of a block, each of four pixels: their numbers of four channels fill a vector of 16."""
 _PLAN_ROWS: Final = 8
 """Rows of 16 numbers that the plan of a block has: offsets of three nodes in bytes, weights of four, the offset of the
 nearest. The fourth node is one step farther in each channel than the first."""
@@ -211,13 +207,16 @@ def plan_block(typing: Any, picture: Any, part: Any, target: Any) -> Any:
                 vector = builder.insert_element(vector, its, ir.Constant(I32, pixel))
             parts.append(vector)
         red, green, blue = parts
-        strides = [number(int(stride)) for stride in (_RED, _GREEN, _BLUE)]
+        strides = [number(16 * int(stride)) for stride in (_RED, _GREEN, _BLUE)]
 
-        def node(numbers: Sequence[Value], added: int) -> Value:
-            """Return the node whose place in each channel is that of the codes 0 … 255 - `added`, with that added."""
-            places = [builder.lshr(builder.add(one, number(added)), number(4)) for one in numbers]
-            sums = [builder.mul(place, stride) for place, stride in zip(places, strides, strict=True)]
-            return builder.add(builder.add(sums[0], sums[1]), sums[2])
+        def node(added: int, size: int) -> Value:
+            """Return `size` times the node whose places in the channels are those of codes with something added."""
+            total: Value = None
+            for codes, stride in zip(channels, (_RED, _GREEN, _BLUE), strict=True):
+                place = builder.lshr(builder.add(codes, number(added)), number(4))
+                part = builder.mul(place, number(size * int(stride)))
+                total = part if total is None else builder.add(total, part)
+            return total
 
         def not_less(first: Value, second: Value) -> Value:
             return builder.fcmp_ordered(">=", first, second)
@@ -236,31 +235,28 @@ def plan_block(typing: Any, picture: Any, part: Any, target: Any) -> Any:
         upper, lower = most(red, green), least(red, green)
         middle = least(upper, most(lower, blue))
         upper, lower = most(upper, blue), least(lower, blue)
-        base, all_of = node(channels, 0), number(int(_ALL))
-        far = builder.add(base, all_of)
-        nodes = base, builder.add(base, high), builder.sub(far, low)
+        base = node(0, 16)
+        nodes = base, builder.add(base, high), builder.sub(builder.add(base, number(16 * int(_ALL))), low)
         one = ir.Constant(FLOATS, [1.0] * LANES)
         weights = builder.fsub(one, upper), builder.fsub(upper, middle), builder.fsub(middle, lower), lower
         for row, its in enumerate(nodes):
-            store(builder, builder.shl(its, number(4)), target, _ROW * row)
+            store(builder, its, target, _ROW * row)
         for row, its in enumerate(weights):
             store(builder, its, target, _ROW * (3 + row))
-        store(builder, builder.shl(node(channels, int(_HALF)), number(5)), target, _ROW * 7)
+        store(builder, node(int(_HALF), 32), target, _ROW * 7)
 
     return void(emit, ADDRESS, ADDRESS, ADDRESS)
 
 
 @intrinsic
-def place_samples(typing: Any, plan: Any, cells: Any, choices: Any, bases: Any, samples: Any, target: Any) -> Any:
-    """Write where in `samples` the samples of a block's pixels are, uint32 bytes, and prefetch what they need.
+def place_samples(typing: Any, plan: Any, cells: Any, choices: Any, samples: Any, target: Any) -> Any:
+    """Write where in `samples` those of a block's pixels are, uint32 bytes, and prefetch them.
 
     At `cells` is an uint32 for each node, where its samples begin, and at `choices` for each pixel what is added.
     """
-    del typing, plan, cells, choices, bases, samples, target
+    del typing, plan, cells, choices, samples, target
 
-    def emit(
-        builder: Builder, plan: Value, cells: Value, choices: Value, bases: Value, samples: Value, target: Value
-    ) -> None:
+    def emit(builder: Builder, plan: Value, cells: Value, choices: Value, samples: Value, target: Value) -> None:
         for pixel in range(_BLOCK):
             near = load(builder, plan, _ROW * 7 + 4 * pixel, I32)
             cell = builder.zext(builder.lshr(near, ir.Constant(I32, 3)), I64)
@@ -268,83 +264,83 @@ def place_samples(typing: Any, plan: Any, cells: Any, choices: Any, bases: Any, 
             store(builder, place, target, 4 * pixel)
             prefetching(3)(builder, builder.add(samples, builder.zext(place, I64)))
 
-    return void(emit, ADDRESS, ADDRESS, ADDRESS, ADDRESS, ADDRESS, ADDRESS)
+    return void(emit, *[ADDRESS] * 5)
 
 
 def _of_pixels(builder: Builder, base: Value, offsets: Sequence[Value], shift: int, kind: Any) -> Value:
-    """Return vectors of some pixels as one: each stands `shift` bytes and the pixel's offset, an int64, behind `base`."""
+    """Return vectors of four pixels as one: each is `shift` bytes and the pixel's offset, an int64, behind `base`."""
     return concatenated(builder, [load(builder, builder.add(base, offset), shift, kind) for offset in offsets])
 
 
-def _offsets(builder: Builder, plan: Value, at: int, pixels: int) -> list[Value]:
-    """Return the offsets, int64, that stand as uint32 in a row."""
+def _offsets(builder: Builder, address: Value, at: int) -> list[Value]:
+    """Return four offsets, int64, that stand as uint32 in a row; two come by one load."""
     low, half = ir.Constant(I64, 0xFFFFFFFF), ir.Constant(I64, 32)
-    offsets: list[Value] = []
-    for pixel in range(0, pixels, 2):
-        two = load(builder, plan, at + 4 * pixel, I64)
-        offsets += [builder.and_(two, low), builder.lshr(two, half)]
-    return offsets
+    pairs = [load(builder, address, at + shift, I64) for shift in (0, 8)]
+    return [number for two in pairs for number in (builder.and_(two, low), builder.lshr(two, half))]
 
 
-def _each(builder: Builder, address: Value, offset: int, first: int, count: int) -> Value:
-    """Return `count` of a block's numbers, float32 in a row, each four times."""
-    begin = first // 8 * 8
-    numbers = load(builder, address, offset + 4 * begin, ir.VectorType(F32, 8))
-    lanes = [first - begin + lane // 4 for lane in range(4 * count)]
-    return builder.shuffle_vector(numbers, numbers, constant(ir.VectorType(I32, len(lanes)), lanes))
+def _each(builder: Builder, address: Value, at: int) -> Value:
+    """Return four numbers, float32 in a row, each four times."""
+    numbers = load(builder, address, at, _FOUR)
+    return builder.shuffle_vector(numbers, numbers, constant(WORDS, [lane // 4 for lane in range(LANES)]))
 
 
-_TOGETHER: Final = 4
-"""Pixels whose four channels share a vector: to put four into one costs more than it saves."""
-_NUMBERS: Final = ir.VectorType(F32, 4 * _TOGETHER)
-_WHOLE: Final = ir.VectorType(I32, 4 * _TOGETHER)
+def _interpolated(builder: Builder, plan: Value, means: Value, first: int) -> Value:
+    """Return the four numbers of each of four pixels: `means` between the nodes of each."""
+    total: Value = None
+    corners = [_offsets(builder, plan, _ROW * row + 4 * first) for row in range(3)]
+    for corner, offsets in enumerate((*corners, corners[0])):
+        weights = _each(builder, plan, _ROW * (3 + corner) + 4 * first)
+        seen = _of_pixels(builder, means, offsets, 16 * int(_ALL) * (corner == 3), _FOUR)
+        part = builder.fmul(weights, seen)
+        total = part if total is None else builder.fadd(total, part)
+    return total
+
+
+def _deviating(builder: Builder, seen: Value, first: int, addresses: Sequence[Value]) -> Value:
+    """Return the numbers of four pixels with the deviations of their samples; the fourth of each stays."""
+    plan, bases, samples, places, factors = addresses
+    noise = builder.shuffle_vector(seen, seen, constant(WORDS, [lane | 3 for lane in range(LANES)]))
+    near, own = (_offsets(builder, at, 4 * first) for at in (builder.add(plan, ir.Constant(I64, 7 * _ROW)), places))
+    base, spread = (_of_pixels(builder, bases, near, shift, _FOUR) for shift in (0, 16))
+    drawn = builder.zext(_of_pixels(builder, samples, own, 0, ir.VectorType(I16, 4)), WORDS)
+    deviation = builder.fsub(builder.sitofp(drawn, FLOATS), base)
+    scale = builder.fmul(spread, builder.fmul(noise, _each(builder, factors, 4 * first)))
+    return builder.fadd(seen, builder.fmul(deviation, scale))
 
 
 @intrinsic
-def interpolate(typing: Any, plan: Any, means: Any, line: Any) -> Any:
-    """Write a block's pixels, four float32 each: `means` interpolated between the nodes of each."""
-    del typing, plan, means, line
+def draw_block(
+    typing: Any, plan: Any, bases: Any, samples: Any, places: Any, factors: Any, means: Any, line: Any
+) -> Any:
+    """Write a block's pixels, four float32 each: `means` interpolated between the nodes of each, with deviations.
 
-    def emit(builder: Builder, plan: Value, means: Value, line: Value) -> None:
-        for first in range(0, _BLOCK, _TOGETHER):
-            total: Value = None
-            corners = [_offsets(builder, plan, _ROW * row + 4 * first, _TOGETHER) for row in range(3)]
-            for corner, (offsets, shift) in enumerate(zip((*corners, corners[0]), (0, 0, 0, 16 * int(_ALL)), strict=True)):
-                weights = _each(builder, plan, _ROW * (3 + corner), first, _TOGETHER)
-                part = builder.fmul(weights, _of_pixels(builder, means, offsets, shift, _FOUR))
-                total = part if total is None else builder.fadd(total, part)
-            store(builder, total, line, 16 * first)
+    A deviation is how far a sample is from its cell's mean, which is in `bases`; it is multiplied by the pixel's
+    float32 at `factors`, by its noise, and by what stands behind the mean, whose fourth number is 0.
+    """
+    del typing, plan, bases, samples, places, factors, means, line
 
-    return void(emit, ADDRESS, ADDRESS, ADDRESS)
+    def emit(builder: Builder, *addresses: Value) -> None:
+        *those, means, line = addresses
+        for first in range(0, _BLOCK, 4):
+            seen = _interpolated(builder, those[0], means, first)
+            store(builder, _deviating(builder, seen, first, those), line, 16 * first)
+
+    return void(emit, *[ADDRESS] * 7)
 
 
 @intrinsic
 def add_deviations(typing: Any, plan: Any, bases: Any, samples: Any, places: Any, factors: Any, line: Any) -> Any:
-    """Add to the pixels at `line` how far their samples are from their cells' means, which are in `bases`.
-
-    What is added is multiplied by the pixel's float32 at `factors`, by its noise, and by what stands behind the mean.
-    """
+    """Add to the pixels at `line` the deviations of another light's samples, as `draw_block` does."""
     del typing, plan, bases, samples, places, factors, line
 
-    def emit(
-        builder: Builder, plan: Value, bases: Value, samples: Value, places: Value, factors: Value, line: Value
-    ) -> None:
-        count = 4 * _TOGETHER
-        for first in range(0, _BLOCK, _TOGETHER):
-            seen = load(builder, line, 16 * first, _NUMBERS)
-            noise = builder.shuffle_vector(seen, seen, constant(_WHOLE, [lane | 3 for lane in range(count)]))
-            factor = _each(builder, factors, 0, first, _TOGETHER)
-            near = _offsets(builder, plan, _ROW * 7 + 4 * first, _TOGETHER)
-            base, spread = (_of_pixels(builder, bases, near, shift, _FOUR) for shift in (0, 16))
-            own = _offsets(builder, places, 4 * first, _TOGETHER)
-            drawn = _of_pixels(builder, samples, own, 0, ir.VectorType(I16, 4))
-            drawn = builder.sitofp(builder.zext(drawn, _WHOLE), _NUMBERS)
-            scale = builder.fmul(spread, builder.fmul(noise, factor))
-            total = builder.fadd(seen, builder.fmul(builder.fsub(drawn, base), scale))
-            lanes = [count + lane if lane % 4 == 3 else lane for lane in range(count)]
-            store(builder, builder.shuffle_vector(total, seen, constant(_WHOLE, lanes)), line, 16 * first)
+    def emit(builder: Builder, *addresses: Value) -> None:
+        *those, line = addresses
+        for first in range(0, _BLOCK, 4):
+            seen = load(builder, line, 16 * first, FLOATS)
+            store(builder, _deviating(builder, seen, first, those), line, 16 * first)
 
-    return void(emit, ADDRESS, ADDRESS, ADDRESS, ADDRESS, ADDRESS, ADDRESS)
+    return void(emit, *[ADDRESS] * 6)
 
 
 def _writing_planes(mirrored: bool) -> Callable[..., None]:
@@ -354,7 +350,7 @@ def _writing_planes(mirrored: bool) -> Callable[..., None]:
         def number(place: int) -> Value:
             return broadcast(builder, load(builder, scales, 4 * place, F32), FLOATS)
 
-        quarters = [load(builder, line, 64 * quarter, FLOATS) for quarter in range(_QUARTERS)]
+        quarters = [load(builder, line, 64 * quarter, FLOATS) for quarter in range(4)]
         for channel, target in enumerate((red, green, blue)):
             lanes = [4 * pixel + channel for pixel in range(8)]
             lanes = lanes[::-1] if mirrored else lanes
@@ -390,7 +386,7 @@ def write_pixels(typing: Any, line: Any, most: Any, target: Any) -> Any:
         zero, half = ir.Constant(FLOATS, [0.0] * LANES), ir.Constant(FLOATS, [0.5] * LANES)
         top, shorts = broadcast(builder, most, FLOATS), ir.VectorType(I16, LANES)
         rounded: list[Value] = []
-        for quarter in range(_QUARTERS):
+        for quarter in range(4):
             value = builder.fadd(load(builder, line, 64 * quarter, FLOATS), half)
             value = builder.select(builder.fcmp_ordered(">", value, zero), value, zero)
             rounded.append(builder.trunc(builder.fptosi(minimum(builder, value, top), WORDS), shorts))
@@ -400,7 +396,6 @@ def write_pixels(typing: Any, line: Any, most: Any, target: Any) -> Any:
             store(builder, builder.shuffle_vector(*rounded[i : i + 2], constant(kind, lanes)), target, 24 * i)
 
     return void(emit, ADDRESS, "float32", ADDRESS)
-
 
 
 @inlined
@@ -428,7 +423,7 @@ def _plan_segment(
     choices: int,
 ) -> None:
     """Plan blocks `first` … `stop` - 1 of a row of which the first pixel is at address `row` and has x = x0."""
-    _, bases, cells, part, zeros = tables
+    _, _, cells, part, zeros = tables
     for line in range(3 * _BLOCK * first, 3 * _BLOCK * stop + LINE, LINE):
         prefetch(row + _ROWS_AHEAD * pitch + line)
     for block in range(first, stop):
@@ -442,28 +437,35 @@ def _plan_segment(
             chosen = choices + 4 * (x0 + _block_at(block, width) - GROUP * low)
             to = places + _ROW * (number * _SEGMENT + block - first)
             of = plans + (block - first) * _PLAN_BYTES
-            place_samples(of, cells, chosen, bases + 32 * NODES * number, samples[number], to)
+            place_samples(of, cells, chosen, samples[number], to)
 
 
 @inlined
 def _mix_block(plan: int, place: int, tables: Any, members: Any, shares: Any, factors: Any, lines: Any) -> None:
     """Write a block's pixels under lights that share them, `shares` (16, M), to the first line."""
     samples, roots, owners = members
-    at, line = factors.ctypes.data, lines.ctypes.data
+    at, own = factors.ctypes.data, lines.ctypes.data + _LINE_BYTES
+    share = factors[1]
     lines[0] = 0
     for number in range(len(samples)):
         owner = owners[number]
-        if number == 0 or owner != owners[number - 1]:
-            interpolate(plan, tables[0] + 16 * NODES * owner, line + _LINE_BYTES)
+        first, last = number == 0 or owner != owners[number - 1], number + 1 == len(owners)
+        lit = False
         for pixel in range(_BLOCK):
-            share = shares[pixel, owner]
-            factors[0, pixel] = roots[number] / np.sqrt(share) if share else np.float32(0)
-        to = place + _ROW * _SEGMENT * number
-        add_deviations(plan, tables[1] + 32 * NODES * number, samples[number], to, at, line + _LINE_BYTES)
-        if number + 1 == len(samples) or owners[number + 1] != owner:
+            share[pixel] = shares[pixel, owner]
+            lit |= share[pixel] != 0
+            factors[0, pixel] = roots[number] / np.sqrt(share[pixel]) if share[pixel] else np.float32(0)
+        if not lit:
+            continue
+        bases, to = tables[1] + 32 * NODES * number, place + _ROW * _SEGMENT * number
+        if first:
+            draw_block(plan, bases, samples[number], to, at, tables[0] + 16 * NODES * owner, own)
+        else:
+            add_deviations(plan, bases, samples[number], to, at, own)
+        if last or owners[number + 1] != owner:
             for pixel in range(_BLOCK):
                 for channel in range(3):
-                    lines[0, pixel, channel] += shares[pixel, owner] * lines[1, pixel, channel]
+                    lines[0, pixel, channel] += share[pixel] * lines[1, pixel, channel]
 
 
 @compiled
@@ -528,8 +530,8 @@ def _print(
             if masked:
                 _mix_block(plan, place, tables, members, shares[y, x : x + _BLOCK], factors, lines)
             else:
-                interpolate(plan, tables[0], line)
-                for number in range(len(samples)):
+                draw_block(plan, tables[1], samples[0], place, factors.ctypes.data, tables[0], line)
+                for number in range(1, len(samples)):
                     bases, to = tables[1] + 32 * NODES * number, place + _ROW * _SEGMENT * number
                     add_deviations(plan, bases, samples[number], to, factors.ctypes.data + _ROW * number, line)
             if scales == 0:
@@ -559,7 +561,7 @@ def _print_crops(
     pitches: Any,
     scales: int,
 ) -> None:
-    """Fill crops `first` to `end` - 1; `plan` (N, 9): source, pitch, x, y, flip, means, bases, first and last member."""
+    """Fill crops `first` to `end` - 1; `plan` (N, 9): source, pitch, x, y, flip, means, bases, members from and to."""
     samples, roots, owners = members
     for item in range(first, end):
         source, pitch, x, y, flip, means, bases, begin, stop = plan[item]
@@ -592,7 +594,7 @@ class _Memory:
             "places": 2 * _SEGMENT * _ROW * components,
             "choices": 4 * GROUP * _SEGMENT_GROUPS,
             "lines": 2 * _LINE_BYTES,
-            "factors": _ROW * components,
+            "factors": _ROW * max(components, 2),
         }
         self._bytes = np.zeros(sum(sizes.values()) + LINE, np.uint8)
         first = -self._bytes.ctypes.data % LINE
@@ -602,7 +604,7 @@ class _Memory:
         addresses = (part.ctypes.data for name, part in parts.items() if name != "factors")
         self.arrays = (
             *addresses,
-            parts["factors"].view(np.float32).reshape(components, _BLOCK),
+            parts["factors"].view(np.float32).reshape(-1, _BLOCK),
             parts["lines"].view(np.float32).reshape(2, _BLOCK, 4),
         )
 
@@ -734,25 +736,22 @@ def draw_printed_crops(
     width, height = windows[0, 2:].tolist()
     check_out(out, (len(pictures), 3, height, width), np.float32)
     count = len(pictures)
-    # Most batches show a picture or a light more than once.
-    known = {id(one): one for one in lights}
+    # Most batches show a light more than once.
+    known = {id(light): light for light in lights}
     members, rest = _Members(samples, list(known.values())), _Rest(samples, cells)
-    begin = {name: start for name, start in zip(known, members.starts.tolist(), strict=False)}
-    narrow = width < _BLOCK
-    sources = {id(one): packed_rows(one) for one in pictures}
-    if narrow:
-        cut = [_at_least_a_block(one[y:, x : x + width]) for one, (x, y) in zip(pictures, windows[:, :2].tolist(), strict=True)]
+    of_lights = {
+        name: (light.means.ctypes.data, light.bases.ctypes.data, *ends)
+        for (name, light), ends in zip(known.items(), pairwise(members.starts.tolist()), strict=True)
+    }
+    sources = [
+        _at_least_a_block(picture[y : y + height, x : x + width])
+        for picture, (x, y) in zip(pictures, windows[:, :2].tolist(), strict=True)
+    ]
     plan = np.empty((count, 9), np.int64)
-    for item, (picture, light) in enumerate(zip(pictures, lights, strict=True)):
-        source = sources[id(picture)]
-        first = begin[id(light)]
-        plan[item] = source.ctypes.data, source.strides[0], 0, 0, 0, *light.addresses, first, first + len(light.lights)
-    plan[:, 0] += windows[:, 1] * plan[:, 1] + 3 * windows[:, 0]
+    plan[:, :2] = [(source.ctypes.data, source.strides[0]) for source in sources]
     plan[:, 2:4], plan[:, 4] = windows[:, :2], flips
-    if narrow:
-        plan[:, 0] = [one.ctypes.data for one in cut]
-        plan[:, 1] = [one.strides[0] for one in cut]
-    whole = not narrow and out.strides[3] == 4
+    plan[:, 5:] = [of_lights[id(light)] for light in lights]
+    whole = width >= _BLOCK and out.strides[3] == 4
     work = out if whole else np.empty((count, 3, height, max(width, _BLOCK)), np.float32)
     unmasked = np.zeros((1, 1, 1), np.float32)
 
