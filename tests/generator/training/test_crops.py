@@ -319,7 +319,7 @@ def test_renderings_that_cannot_be_are_named(make_lut: MakeLut, gallery: Gallery
 
 
 def test_what_a_spawned_worker_loads_reads_no_charts() -> None:
-    """Each worker of a loader imports it anew; what measures noise brings half a second of OpenCV and its like."""
+    """Each worker of a loader imports it anew; what measures noise brings OpenCV and SciPy."""
     program = "import sys, generator.training.crops, generator.rendering.colorimetric; print(*sys.modules)"
     loaded = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout.split()
     assert "generator.training.crops" in loaded
