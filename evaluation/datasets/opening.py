@@ -80,7 +80,8 @@ LAYOUTS: Mapping[str, Layout] = {
         "thumbnails in a NumPy archive",
         "a file .npz",
         lambda _: False,
-        lambda place, _, __: open_thumbnails(place),
+        lambda place, options, _: open_thumbnails(place, options.saturation),
+        ("saturation",),
         takes="file",
     ),
     "cube-plus": Layout(

@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from evaluation.datasets.files import check_light
+from evaluation.datasets.options import stated
 from evaluation.scene import SceneSet
 from foundation.errors import FormatError
 
@@ -27,7 +28,7 @@ class Thumbnail:
     - `name`: the image's name.
     - `truth`: (3,) float64, linear camera RGB of the light, of any length.
     - `image`: (H, W, 3) float32 or uint16, linear camera RGB, black at zero.
-    - `saturation`: always None: averaged pixels do not show what was clipped.
+    - `saturation`: value from which a pixel is clipped; None where nobody states it: averaged pixels do not show it.
     """
 
     name: str
@@ -40,8 +41,11 @@ class Thumbnail:
         return self.image.copy(), (self.image == 0).all(axis=2)
 
 
-def open_thumbnails(path: Path | str) -> SceneSet:
-    """Return the thumbnails of an archive; they are held in memory."""
+def open_thumbnails(path: Path | str, saturation: float | None = None) -> SceneSet:
+    """Return the thumbnails of an archive; they are held in memory.
+
+    `saturation`: value from which a pixel is clipped, in the units of the archive; None if it is not known.
+    """
     try:
         with np.load(path) as content:
             images, truths, names = content["images"], content["gt"].astype(np.float64), content["names"]
@@ -78,13 +82,13 @@ def open_thumbnails(path: Path | str) -> SceneSet:
         layout="thumbnails",
         place=str(path),
         scenes=tuple(
-            Thumbnail(name, truth, np.maximum(image, 0) if below else image)
+            Thumbnail(name, truth, np.maximum(image, 0) if below else image, saturation)
             for name, truth, image in zip(titles, truths, images, strict=True)
         ),
         treatment={
             "black level": "0: subtracted when the thumbnails were made"
             + (f"; {below} values below it are taken as 0" if below else ""),
-            "saturation": "none: averaged pixels do not show what was clipped",
+            "saturation": stated(saturation, "none: averaged pixels do not show what was clipped"),
             "mask": "pixels that are zero in every channel",
             "ground truth": "gt of the archive",
         },

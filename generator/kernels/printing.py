@@ -22,9 +22,10 @@ and deviations count with the root of the light's weight, as in `kernels/mixing.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from itertools import pairwise
 from typing import Any, Final
 
 import numpy as np
@@ -34,23 +35,41 @@ from numpy import uint32
 
 from foundation.colorimetry import decode_srgb
 from foundation.compiled import compiled, inlined, intrinsic
-from generator.kernels.choice import check_out, check_picture, check_seed, readable, row_keys, run_in_threads
+from generator.kernels.choice import (
+    check_out,
+    check_picture,
+    check_seed,
+    copied_back,
+    packed_rows,
+    readable,
+    row_keys,
+    run_in_threads,
+    writable,
+)
 from generator.kernels.vector import (
     ADDRESS,
     F32,
+    FLOATS,
     GROUP,
+    I8,
     I16,
     I32,
     I64,
     LANES,
     LINE,
     SAMPLE_BYTES,
+    WORDS,
     Builder,
     Value,
     broadcast,
     choose_for_colours,
+    concatenated,
+    constant,
     load,
-    offset_at,
+    minimum,
+    pixel_codes,
+    prefetch,
+    prefetching,
     store,
     void,
 )
@@ -74,9 +93,11 @@ class PrintedLight:
 
     - `means`: (4913, 4) float32: m in red, green and blue, counts; and their noise, σ.
     - `bases`: (C, 4913, 2, 4) float32 of each of the table's lights in it: b in red, green and blue, counts, and k; the
-      fourth of each is not used.
+      fourth of each is 0.
     - `lights`: (C,) int64, numbers of these lights.
     - `roots`: (C,) float32, square roots of their weights.
+
+    Arrays are C-contiguous.
     """
 
     means: npt.NDArray[np.float32]
@@ -149,242 +170,480 @@ def means_at(
 
 
 _FOUR: Final = ir.VectorType(F32, 4)
-_PLAN_ROWS: Final = 9
-"""Rows of 32 numbers that the plan of a group has: places of four nodes in bytes, their weights, the nearest node's."""
-
-
-def _four(builder: Builder, base: Value, offset: Value) -> Value:
-    """Return the four float32 that stand `offset` bytes, an uint32, behind `base`."""
-    return load(builder, builder.add(base, builder.zext(offset, I64)), 0, _FOUR)
+_BLOCK: Final = LANES
+"""Pixels that are planned and interpolated at a time."""
+_PLAN_ROWS: Final = 8
+"""Rows of 16 numbers that the plan of a block has: offsets of three nodes in bytes, weights of four, the offset of the
+nearest. The fourth node is one step farther in each channel than the first."""
+_ROW: Final = 4 * _BLOCK
+_PLAN_BYTES: Final = _ROW * _PLAN_ROWS
+_LINE_BYTES: Final = 16 * _BLOCK
+"""Bytes of a block's pixels: red, green, blue and noise, float32 each."""
+_SEGMENT: Final = 8
+"""Blocks of a row that are planned, and their samples prefetched, while those before are interpolated."""
+_ROWS_AHEAD: Final = 2
+"""Rows by which prefetching the picture leads planning it."""
+_SEGMENT_GROUPS: Final = _SEGMENT * _BLOCK // GROUP + 2
+"""Groups of 32 pixels, whose choices are made together, that a segment may touch."""
 
 
 @intrinsic
-def mean_of(typing: Any, plan: Any, means: Any, target: Any) -> Any:
-    """Write four numbers, float32, to `target`: `means` interpolated between the nodes of the pixel at `plan`."""
-    del typing, plan, means, target
+def plan_block(typing: Any, picture: Any, part: Any, target: Any) -> Any:
+    """Write the plan of the 16 pixels at `picture`; of them 48 bytes are read, and of `part` 256 float32."""
+    del typing, picture, part, target
 
-    def emit(builder: Builder, plan: Value, means: Value, target: Value) -> None:
-        total: Value = None
-        for corner in range(4):
-            weight = broadcast(builder, load(builder, plan, 4 * GROUP * (4 + corner), F32), _FOUR)
-            part = builder.fmul(weight, _four(builder, means, load(builder, plan, 4 * GROUP * corner, I32)))
-            total = part if total is None else builder.fadd(total, part)
-        store(builder, total, target, 0)
+    def emit(builder: Builder, picture: Value, part: Value, target: Value) -> None:
+        def number(value: int) -> Value:
+            return constant(WORDS, value)
+
+        codes = pixel_codes(builder, picture)
+        channels = [builder.and_(builder.lshr(codes, number(shift)), number(255)) for shift in (16, 8, 0)]
+        parts: list[Value] = []
+        for channel in range(3):
+            vector: Value = ir.Constant(FLOATS, ir.Undefined)
+            for pixel in range(_BLOCK):
+                code = builder.zext(load(builder, picture, 3 * pixel + channel, I8), I64)
+                its = load(builder, builder.add(part, builder.shl(code, ir.Constant(I64, 2))), 0, F32)
+                vector = builder.insert_element(vector, its, ir.Constant(I32, pixel))
+            parts.append(vector)
+        red, green, blue = parts
+        strides = [number(16 * int(stride)) for stride in (_RED, _GREEN, _BLUE)]
+
+        def node(added: int, size: int) -> Value:
+            """Return `size` times the node whose places in the channels are those of codes with something added."""
+            total: Value = None
+            for codes, stride in zip(channels, (_RED, _GREEN, _BLUE), strict=True):
+                place = builder.lshr(builder.add(codes, number(added)), number(4))
+                part = builder.mul(place, number(size * int(stride)))
+                total = part if total is None else builder.add(total, part)
+            return total
+
+        def not_less(first: Value, second: Value) -> Value:
+            return builder.fcmp_ordered(">=", first, second)
+
+        def least(first: Value, second: Value) -> Value:
+            return builder.select(builder.fcmp_ordered("<", first, second), first, second)
+
+        def most(first: Value, second: Value) -> Value:
+            return builder.select(builder.fcmp_ordered(">", first, second), first, second)
+
+        red_green, red_blue, green_blue = (not_less(*two) for two in ((red, green), (red, blue), (green, blue)))
+        green_red, blue_least = not_less(red, green), builder.and_(not_less(red, blue), not_less(green, blue))
+        high = builder.select(green_blue, strides[1], strides[2])
+        high = builder.select(builder.and_(red_green, red_blue), strides[0], high)
+        low = builder.select(blue_least, strides[2], builder.select(green_red, strides[1], strides[0]))
+        upper, lower = most(red, green), least(red, green)
+        middle = least(upper, most(lower, blue))
+        upper, lower = most(upper, blue), least(lower, blue)
+        base = node(0, 16)
+        nodes = base, builder.add(base, high), builder.sub(builder.add(base, number(16 * int(_ALL))), low)
+        one = ir.Constant(FLOATS, [1.0] * LANES)
+        weights = builder.fsub(one, upper), builder.fsub(upper, middle), builder.fsub(middle, lower), lower
+        for row, its in enumerate(nodes):
+            store(builder, its, target, _ROW * row)
+        for row, its in enumerate(weights):
+            store(builder, its, target, _ROW * (3 + row))
+        store(builder, node(int(_HALF), 32), target, _ROW * 7)
 
     return void(emit, ADDRESS, ADDRESS, ADDRESS)
 
 
 @intrinsic
-def add_deviation(typing: Any, plan: Any, bases: Any, sample: Any, factor: Any, target: Any) -> Any:
-    """Add to three numbers at `target` how far the sample at `sample` is from its cell's mean, which is in `bases`.
+def place_samples(typing: Any, plan: Any, cells: Any, choices: Any, samples: Any, target: Any) -> Any:
+    """Write where in `samples` those of a block's pixels are, uint32 bytes, and prefetch them.
 
-    It is multiplied by `factor`, by the fourth number at `target`, and by what stands behind the mean.
+    At `cells` is an uint32 for each node, where its samples begin, and at `choices` for each pixel what is added.
     """
-    del typing, plan, bases, sample, factor, target
+    del typing, plan, cells, choices, samples, target
 
-    def emit(builder: Builder, plan: Value, bases: Value, sample: Value, factor: Value, target: Value) -> None:
-        place = builder.add(
-            bases, builder.zext(builder.shl(load(builder, plan, 4 * GROUP * 8, I32), ir.Constant(I32, 1)), I64)
-        )
-        base, spread = load(builder, place, 0, _FOUR), load(builder, place, 16, _FOUR)
-        seen, last = load(builder, target, 0, _FOUR), ir.Constant(I32, 3)
-        scale = builder.fmul(builder.extract_element(seen, last), factor)
-        drawn = builder.uitofp(load(builder, sample, 0, ir.VectorType(I16, 4)), _FOUR)
-        deviation = builder.fmul(builder.fsub(drawn, base), builder.fmul(spread, broadcast(builder, scale, _FOUR)))
-        total = builder.fadd(seen, deviation)
-        store(builder, builder.insert_element(total, builder.extract_element(seen, last), last), target, 0)
+    def emit(builder: Builder, plan: Value, cells: Value, choices: Value, samples: Value, target: Value) -> None:
+        for pixel in range(_BLOCK):
+            near = load(builder, plan, _ROW * 7 + 4 * pixel, I32)
+            cell = builder.zext(builder.lshr(near, ir.Constant(I32, 3)), I64)
+            place = builder.add(load(builder, builder.add(cells, cell), 0, I32), load(builder, choices, 4 * pixel, I32))
+            store(builder, place, target, 4 * pixel)
+            prefetching(3)(builder, builder.add(samples, builder.zext(place, I64)))
 
-    return void(emit, ADDRESS, ADDRESS, ADDRESS, "float32", ADDRESS)
+    return void(emit, *[ADDRESS] * 5)
 
 
-@inlined
-def _plan_group(row: Any, first: int, stop: int, part: Any, cells: Any, plan: Any, weights: Any) -> None:
-    """Write the plan of pixels `first` … `stop` - 1 of a group, and behind it the bytes at which their cells begin.
+def _of_pixels(builder: Builder, base: Value, offsets: Sequence[Value], shift: int, kind: Any) -> Value:
+    """Return vectors of four pixels as one: each is `shift` bytes and the pixel's offset, an int64, behind `base`."""
+    return concatenated(builder, [load(builder, builder.add(base, offset), shift, kind) for offset in offsets])
 
-    In three loops without a branch, of which the second becomes vectors.
+
+def _offsets(builder: Builder, address: Value, at: int) -> list[Value]:
+    """Return four offsets, int64, that stand as uint32 in a row; two come by one load."""
+    low, half = ir.Constant(I64, 0xFFFFFFFF), ir.Constant(I64, 32)
+    pairs = [load(builder, address, at + shift, I64) for shift in (0, 8)]
+    return [number for two in pairs for number in (builder.and_(two, low), builder.lshr(two, half))]
+
+
+def _each(builder: Builder, address: Value, at: int) -> Value:
+    """Return four numbers, float32 in a row, each four times."""
+    numbers = load(builder, address, at, _FOUR)
+    return builder.shuffle_vector(numbers, numbers, constant(WORDS, [lane // 4 for lane in range(LANES)]))
+
+
+def _interpolated(builder: Builder, plan: Value, means: Value, first: int) -> Value:
+    """Return the four numbers of each of four pixels: `means` between the nodes of each."""
+    total: Value = None
+    corners = [_offsets(builder, plan, _ROW * row + 4 * first) for row in range(3)]
+    for corner, offsets in enumerate((*corners, corners[0])):
+        weights = _each(builder, plan, _ROW * (3 + corner) + 4 * first)
+        seen = _of_pixels(builder, means, offsets, 16 * int(_ALL) * (corner == 3), _FOUR)
+        part = builder.fmul(weights, seen)
+        total = part if total is None else builder.fadd(total, part)
+    return total
+
+
+def _deviating(builder: Builder, seen: Value, first: int, addresses: Sequence[Value]) -> Value:
+    """Return the numbers of four pixels with the deviations of their samples; the fourth of each stays."""
+    plan, bases, samples, places, factors = addresses
+    noise = builder.shuffle_vector(seen, seen, constant(WORDS, [lane | 3 for lane in range(LANES)]))
+    near, own = (_offsets(builder, at, 4 * first) for at in (builder.add(plan, ir.Constant(I64, 7 * _ROW)), places))
+    base, spread = (_of_pixels(builder, bases, near, shift, _FOUR) for shift in (0, 16))
+    drawn = builder.zext(_of_pixels(builder, samples, own, 0, ir.VectorType(I16, 4)), WORDS)
+    deviation = builder.fsub(builder.sitofp(drawn, FLOATS), base)
+    scale = builder.fmul(spread, builder.fmul(noise, _each(builder, factors, 4 * first)))
+    return builder.fadd(seen, builder.fmul(deviation, scale))
+
+
+@intrinsic
+def draw_block(
+    typing: Any, plan: Any, bases: Any, samples: Any, places: Any, factors: Any, means: Any, line: Any
+) -> Any:
+    """Write a block's pixels, four float32 each: `means` interpolated between the nodes of each, with deviations.
+
+    A deviation is how far a sample is from its cell's mean, which is in `bases`; it is multiplied by the pixel's
+    float32 at `factors`, by its noise, and by what stands behind the mean, whose fourth number is 0.
     """
-    begin = GROUP * (first // GROUP)
-    for x in range(first, stop):
-        red, green, blue = np.int32(row[x, 0]), np.int32(row[x, 1]), np.int32(row[x, 2])
-        at = x - begin
-        weights[0, at], weights[1, at], weights[2, at] = part[red], part[green], part[blue]
-        plan[0, at] = red << 16 | green << 8 | blue
-    for at in range(GROUP):
-        codes = np.int32(plan[0, at])
-        red, green, blue = codes >> 16, codes >> 8 & 255, codes & 255
-        fr, fg, fb = weights[0, at], weights[1, at], weights[2, at]
-        base = min(red >> 4, _LAST) * _RED + min(green >> 4, _LAST) * _GREEN + min(blue >> 4, _LAST)
-        between = _GREEN if fg >= fb else _BLUE
-        high = _RED if (fr >= fg) & (fr >= fb) else between
-        between = _GREEN if fg <= fr else _RED
-        low = _BLUE if (fb <= fr) & (fb <= fg) else between
-        most, least = max(fr, fg), min(fr, fg)
-        middle = min(most, max(least, fb))
-        most, least = max(most, fb), min(least, fb)
-        plan[0, at], plan[1, at] = base << 4, base + high << 4
-        plan[2, at], plan[3, at] = base + _ALL - low << 4, base + _ALL << 4
-        weights[0, at], weights[1, at] = np.float32(1) - most, most - middle
-        weights[2, at], weights[3, at] = middle - least, least
-        plan[8, at] = (red + _HALF >> 4) * _RED + (green + _HALF >> 4) * _GREEN + (blue + _HALF >> 4)
-    for at in range(first - begin, stop - begin):
-        node = plan[8, at]
-        plan[_PLAN_ROWS, at], plan[8, at] = cells[node], node << uint32(4)
+    del typing, plan, bases, samples, places, factors, means, line
+
+    def emit(builder: Builder, *addresses: Value) -> None:
+        *those, means, line = addresses
+        for first in range(0, _BLOCK, 4):
+            seen = _interpolated(builder, those[0], means, first)
+            store(builder, _deviating(builder, seen, first, those), line, 16 * first)
+
+    return void(emit, *[ADDRESS] * 7)
+
+
+@intrinsic
+def add_deviations(typing: Any, plan: Any, bases: Any, samples: Any, places: Any, factors: Any, line: Any) -> Any:
+    """Add to the pixels at `line` the deviations of another light's samples, as `draw_block` does."""
+    del typing, plan, bases, samples, places, factors, line
+
+    def emit(builder: Builder, *addresses: Value) -> None:
+        *those, line = addresses
+        for first in range(0, _BLOCK, 4):
+            seen = load(builder, line, 16 * first, FLOATS)
+            store(builder, _deviating(builder, seen, first, those), line, 16 * first)
+
+    return void(emit, *[ADDRESS] * 6)
+
+
+def _writing_planes(mirrored: bool) -> Callable[..., None]:
+    """Return what emits the writing of a block to three planes."""
+
+    def emit(builder: Builder, line: Value, scales: Value, red: Value, green: Value, blue: Value) -> None:
+        def number(place: int) -> Value:
+            return broadcast(builder, load(builder, scales, 4 * place, F32), FLOATS)
+
+        quarters = [load(builder, line, 64 * quarter, FLOATS) for quarter in range(4)]
+        for channel, target in enumerate((red, green, blue)):
+            lanes = [4 * pixel + channel for pixel in range(8)]
+            lanes = lanes[::-1] if mirrored else lanes
+            eight = ir.VectorType(I32, 8)
+            halves = [builder.shuffle_vector(*quarters[i : i + 2], constant(eight, lanes)) for i in (0, 2)]
+            whole = concatenated(builder, halves[::-1] if mirrored else halves)
+            value = builder.fadd(builder.fmul(whole, number(channel)), number(3 + channel))
+            store(builder, minimum(builder, value, number(6)), target, 0)
+
+    return emit
+
+
+@intrinsic
+def write_planes(typing: Any, line: Any, scales: Any, red: Any, green: Any, blue: Any) -> Any:
+    """Write a block as float32 to three planes; `scales` are those of `vector.planes8`."""
+    del typing, line, scales, red, green, blue
+    return void(_writing_planes(False), ADDRESS, ADDRESS, ADDRESS, ADDRESS, ADDRESS)
+
+
+@intrinsic
+def write_mirrored(typing: Any, line: Any, scales: Any, red: Any, green: Any, blue: Any) -> Any:
+    """Do `write_planes` from right to left."""
+    del typing, line, scales, red, green, blue
+    return void(_writing_planes(True), ADDRESS, ADDRESS, ADDRESS, ADDRESS, ADDRESS)
+
+
+@intrinsic
+def write_pixels(typing: Any, line: Any, most: Any, target: Any) -> Any:
+    """Write a block as uint16, red, green and blue of each pixel in turn: rounded, from 0 to `most`; 96 bytes."""
+    del typing, line, most, target
+
+    def emit(builder: Builder, line: Value, most: Value, target: Value) -> None:
+        zero, half = ir.Constant(FLOATS, [0.0] * LANES), ir.Constant(FLOATS, [0.5] * LANES)
+        top, shorts = broadcast(builder, most, FLOATS), ir.VectorType(I16, LANES)
+        rounded: list[Value] = []
+        for quarter in range(4):
+            value = builder.fadd(load(builder, line, 64 * quarter, FLOATS), half)
+            value = builder.select(builder.fcmp_ordered(">", value, zero), value, zero)
+            rounded.append(builder.trunc(builder.fptosi(minimum(builder, value, top), WORDS), shorts))
+        lanes = [lane for lane in range(2 * LANES) if lane % 4 < 3]
+        for i in (0, 2):
+            kind = ir.VectorType(I32, len(lanes))
+            store(builder, builder.shuffle_vector(*rounded[i : i + 2], constant(kind, lanes)), target, 24 * i)
+
+    return void(emit, ADDRESS, "float32", ADDRESS)
 
 
 @inlined
-def _key_row(keys: Any, y: int, image: int, seed: Any) -> None:
-    """Write the keys of row `y` of each component, (C, 3) uint32."""
-    for number in range(len(keys)):
-        keys[number, 0], keys[number, 1], keys[number, 2] = row_keys(y, number, image, seed)
+def _block_at(block: int, width: int) -> int:
+    """Return where a block of a row begins; the last may overlap the one before."""
+    return min(_BLOCK * block, width - _BLOCK)
 
 
 @inlined
-def _print_group(
-    row: Any,
+def _plan_segment(
+    row: int,
+    pitch: int,
     first: int,
     stop: int,
-    keys: Any,
-    word: Any,
-    part: Any,
-    cells: Any,
-    addresses: Any,
-    members: Any,
-    shares: Any,
-    masked: bool,
+    width: int,
+    x0: int,
+    y: int,
+    tables: Any,
+    samples: Any,
     count: Any,
-    memory: Any,
+    seed: Any,
+    image: int,
+    plans: int,
+    places: int,
+    choices: int,
 ) -> None:
-    """Write pixels `first` … `stop` - 1 of a group of 32 of a row to the first lines of memory: four float32 each."""
-    samples, roots, owners = members
-    means, bases, at, lines = addresses
-    plan, weights, line = memory
-    begin = GROUP * (first // GROUP)
-    _plan_group(row, first, stop, part, cells, plan, weights)
+    """Plan blocks `first` … `stop` - 1 of a row of which the first pixel is at address `row` and has x = x0."""
+    _, _, cells, part, zeros = tables
+    for line in range(3 * _BLOCK * first, 3 * _BLOCK * stop + LINE, LINE):
+        prefetch(row + _ROWS_AHEAD * pitch + line)
+    for block in range(first, stop):
+        plan_block(row + 3 * _block_at(block, width), part, plans + (block - first) * _PLAN_BYTES)
+    low, high = (x0 + _block_at(first, width)) // GROUP, (x0 + _block_at(stop - 1, width) + _BLOCK - 1) // GROUP
     for number in range(len(samples)):
-        to = at + 4 * GROUP * (_PLAN_ROWS + 1 + number)
-        named = at + 4 * GROUP * _PLAN_ROWS
-        choose_for_colours(named, word, keys[number, 0], keys[number, 1], keys[number, 2], count, to)
-    for x in range(first, stop):
-        of, target = at + 4 * (x - begin), lines + 16 * (x - first)
-        if not masked:
-            mean_of(of, means, target)
-            for number in range(len(samples)):
-                sample = samples[number] + offset_at(of + 4 * GROUP * (_PLAN_ROWS + 1 + number))
-                add_deviation(of, bases + 32 * NODES * number, sample, roots[number], target)
+        k0, k1, k2 = row_keys(y, number, image, seed)
+        for group in range(low, high + 1):
+            choose_for_colours(zeros, uint32(LANES * group), k0, k1, k2, count, choices + 4 * GROUP * (group - low))
+        for block in range(first, stop):
+            chosen = choices + 4 * (x0 + _block_at(block, width) - GROUP * low)
+            to = places + _ROW * (number * _SEGMENT + block - first)
+            of = plans + (block - first) * _PLAN_BYTES
+            place_samples(of, cells, chosen, samples[number], to)
+
+
+@inlined
+def _mix_block(plan: int, place: int, tables: Any, members: Any, shares: Any, factors: Any, lines: Any) -> None:
+    """Write a block's pixels under lights that share them, `shares` (16, M), to the first line."""
+    samples, roots, owners = members
+    at, own = factors.ctypes.data, lines.ctypes.data + _LINE_BYTES
+    share = factors[1]
+    lines[0] = 0
+    for number in range(len(samples)):
+        owner = owners[number]
+        first, last = number == 0 or owner != owners[number - 1], number + 1 == len(owners)
+        lit = False
+        for pixel in range(_BLOCK):
+            share[pixel] = shares[pixel, owner]
+            lit |= share[pixel] != 0
+            factors[0, pixel] = roots[number] / np.sqrt(share[pixel]) if share[pixel] else np.float32(0)
+        if not lit:
             continue
-        for channel in range(3):
-            line[x - first, channel] = 0
-        own = lines + 16 * GROUP
-        for number in range(len(samples)):
-            share = shares[x, owners[number]]
-            if share == 0:
-                continue
-            if number == 0 or owners[number] != owners[number - 1]:
-                mean_of(of, means + 16 * NODES * owners[number], own)
-            sample = samples[number] + offset_at(of + 4 * GROUP * (_PLAN_ROWS + 1 + number))
-            add_deviation(of, bases + 32 * NODES * number, sample, roots[number] / np.sqrt(share), own)
-            if number + 1 == len(samples) or owners[number + 1] != owners[number]:
+        bases, to = tables[1] + 32 * NODES * number, place + _ROW * _SEGMENT * number
+        if first:
+            draw_block(plan, bases, samples[number], to, at, tables[0] + 16 * NODES * owner, own)
+        else:
+            add_deviations(plan, bases, samples[number], to, at, own)
+        if last or owners[number + 1] != owner:
+            for pixel in range(_BLOCK):
                 for channel in range(3):
-                    line[x - first, channel] += share * line[GROUP, channel]
+                    lines[0, pixel, channel] += share[pixel] * lines[1, pixel, channel]
 
 
 @compiled
 def _print(
-    picture: Any,
-    first_row: int,
-    part: Any,
-    cells: Any,
-    addresses: Any,
+    source: int,
+    pitch: int,
+    frame: Any,
+    flip: bool,
+    tables: Any,
     members: Any,
     shares: Any,
     masked: bool,
     count: Any,
     seed: Any,
     image: int,
-    most: float,
     memory: Any,
-    out: Any,
+    target: int,
+    pitches: Any,
+    scales: int,
+    most: Any,
 ) -> None:
-    """Fill the rows of an image (H, W, 3) uint16."""
-    keys = np.empty((len(members[0]), 3), np.uint32)
-    top, half, line = np.float32(most), np.float32(0.5), memory[2]
-    width = picture.shape[1]
-    for y in range(len(picture)):
-        _key_row(keys, first_row + y, image, seed)
-        row, shared = picture[y], shares[y if masked else 0]
-        for begin in range(0, width, GROUP):
-            stop, word = min(begin + GROUP, width), uint32(begin // GROUP * LANES)
-            _print_group(row, begin, stop, keys, word, part, cells, addresses, members, shared, masked, count, memory)
-            for x in range(begin, stop):
-                for channel in range(3):
-                    value = min(max(line[x - begin, channel] + half, np.float32(0)), top)
-                    out[y, x, channel] = np.uint16(np.int32(value))
+    """Fill an image (height, width, 3) uint16, or where there are scales a crop (3, height, width) float32.
+
+    The pixel at address `source` is at x0, y0; the width is 16 at least. `shares`: (height, width, M) where `masked`.
+    """
+    x0, y0, width, height = frame
+    plans, places, choices, line, factors, lines = memory
+    samples, roots, _ = members
+    for number in range(len(samples)):
+        factors[number] = roots[number]
+    blocks = (width + _BLOCK - 1) // _BLOCK
+    segments = (blocks + _SEGMENT - 1) // _SEGMENT
+    for segment in range(height * segments + 1):
+        if segment < height * segments:
+            y, first = segment // segments, _SEGMENT * (segment % segments)
+            slot, stop = segment & 1, min(first + _SEGMENT, blocks)
+            _plan_segment(
+                source + y * pitch,
+                pitch,
+                first,
+                stop,
+                width,
+                x0,
+                y0 + y,
+                tables,
+                samples,
+                count,
+                seed,
+                image,
+                plans + slot * _SEGMENT * _PLAN_BYTES,
+                places + slot * _SEGMENT * _ROW * len(samples),
+                choices,
+            )
+        if segment == 0:
+            continue
+        y, first = (segment - 1) // segments, _SEGMENT * ((segment - 1) % segments)
+        slot = segment - 1 & 1
+        for block in range(first, min(first + _SEGMENT, blocks)):
+            x = _block_at(block, width)
+            plan = plans + (slot * _SEGMENT + block - first) * _PLAN_BYTES
+            place = places + (slot * _SEGMENT * len(samples) + block - first) * _ROW
+            if masked:
+                _mix_block(plan, place, tables, members, shares[y, x : x + _BLOCK], factors, lines)
+            else:
+                draw_block(plan, tables[1], samples[0], place, factors.ctypes.data, tables[0], line)
+                for number in range(1, len(samples)):
+                    bases, to = tables[1] + 32 * NODES * number, place + _ROW * _SEGMENT * number
+                    add_deviations(plan, bases, samples[number], to, factors.ctypes.data + _ROW * number, line)
+            if scales == 0:
+                write_pixels(line, most, target + y * pitches[0] + SAMPLE_BYTES * x)
+                continue
+            red = target + y * pitches[1] + 4 * (width - _BLOCK - x if flip else x)
+            green, blue = red + pitches[0], red + 2 * pitches[0]
+            if flip:
+                write_mirrored(line, scales, red, green, blue)
+            else:
+                write_planes(line, scales, red, green, blue)
 
 
 @compiled
-def _print_crop(
-    picture: Any,
-    window: Any,
-    flip: bool,
-    part: Any,
-    cells: Any,
-    addresses: Any,
+def _print_crops(
+    plan: Any,
+    first: int,
+    end: int,
+    size: Any,
+    rest: Any,
     members: Any,
+    shares: Any,
     count: Any,
-    seed: Any,
-    scales: Any,
+    seeds: Any,
     memory: Any,
-    out: Any,
+    target: int,
+    pitches: Any,
+    scales: int,
 ) -> None:
-    """Fill a crop (3, height, width) float32; `scales` (7,) float32: factors and summands of channels, and a limit."""
-    keys = np.empty((len(members[0]), 3), np.uint32)
-    shares, line = np.ones((1, 1), np.float32), memory[2]
-    x0, y0, width, height = window
-    for y in range(height):
-        _key_row(keys, y0 + y, 0, seed)
-        row = picture[y0 + y]
-        for begin in range(GROUP * (x0 // GROUP), x0 + width, GROUP):
-            first, stop, word = max(begin, x0), min(begin + GROUP, x0 + width), uint32(begin // GROUP * LANES)
-            _print_group(row, first, stop, keys, word, part, cells, addresses, members, shares, False, count, memory)
-            size = stop - first
-            for channel in range(3):
-                factor, summand, limit = scales[channel], scales[3 + channel], scales[6]
-                if flip:
-                    plane = out[channel, y, x0 + width - stop : x0 + width - first]
-                    for x in range(size):
-                        plane[size - 1 - x] = min(line[x, channel] * factor + summand, limit)
-                else:
-                    plane = out[channel, y, first - x0 : stop - x0]
-                    for x in range(size):
-                        plane[x] = min(line[x, channel] * factor + summand, limit)
+    """Fill crops `first` to `end` - 1; `plan` (N, 9): source, pitch, x, y, flip, means, bases, members from and to."""
+    samples, roots, owners = members
+    for item in range(first, end):
+        source, pitch, x, y, flip, means, bases, begin, stop = plan[item]
+        _print(
+            source,
+            pitch,
+            (x, y, size[0], size[1]),
+            flip != 0,
+            (means, bases, rest[0], rest[1], rest[2]),
+            (samples[begin:stop], roots[begin:stop], owners[begin:stop]),
+            shares,
+            False,
+            count,
+            seeds[item],
+            0,
+            memory,
+            target + item * pitches[0],
+            (pitches[1], pitches[2]),
+            scales + 28 * item,
+            np.float32(0),
+        )
 
 
 class _Memory:
-    """What compiled code works in: the plan of a group, choices of each component, and lines of pixels."""
+    """What compiled code works in: plans of two segments, their samples' places and choices, and lines of pixels."""
 
     def __init__(self, components: int) -> None:
-        rows = _PLAN_ROWS + 1 + components
-        memory = np.zeros((rows * GROUP + 4 * (GROUP + 1)) + LINE // 4, np.uint32)
-        first = -memory.ctypes.data % LINE // 4
-        plan = memory[first : first + rows * GROUP].reshape(rows, GROUP)
-        line = memory[first + rows * GROUP :][: 4 * (GROUP + 1)].view(np.float32).reshape(-1, 4)
-        self.arrays = plan, plan[4:8].view(np.float32), line
-        self.addresses = plan.ctypes.data, line.ctypes.data
+        sizes = {
+            "plans": 2 * _SEGMENT * _PLAN_BYTES,
+            "places": 2 * _SEGMENT * _ROW * components,
+            "choices": 4 * GROUP * _SEGMENT_GROUPS,
+            "lines": 2 * _LINE_BYTES,
+            "factors": _ROW * max(components, 2),
+        }
+        self._bytes = np.zeros(sum(sizes.values()) + LINE, np.uint8)
+        first = -self._bytes.ctypes.data % LINE
+        parts: dict[str, npt.NDArray[np.uint8]] = {}
+        for name, size in sizes.items():
+            parts[name], first = self._bytes[first : first + size], first + size
+        addresses = (part.ctypes.data for name, part in parts.items() if name != "factors")
+        self.arrays = (
+            *addresses,
+            parts["factors"].view(np.float32).reshape(-1, _BLOCK),
+            parts["lines"].view(np.float32).reshape(2, _BLOCK, 4),
+        )
 
 
-class _Components:
-    """The lights of an image as compiled code takes them; what they point to lives as long as this."""
+_NOTHING: Final = np.zeros(GROUP, np.uint32)
+"""What is added to choices, none."""
+
+
+class _Members:
+    """The table's lights in those of an image or a batch, as compiled code takes them.
+
+    What they point to lives as long as this. `starts`: (M + 1,) int64, the first member of each light, and the end.
+    """
 
     def __init__(self, samples: npt.NDArray[np.uint16], lights: Sequence[PrintedLight]) -> None:
-        alone = len(lights) == 1
-        samples = np.asarray(samples)
-        self.means = lights[0].means if alone else np.stack([one.means for one in lights])
-        self.bases = lights[0].bases if alone else np.concatenate([one.bases for one in lights])
-        self.tables = [readable(samples[number]) for one in lights for number in one.lights]
-        owners = np.array([place for place, one in enumerate(lights) for _ in one.lights], np.int64)
-        roots = lights[0].roots if alone else np.concatenate([one.roots for one in lights])
-        self.members = np.array([table.ctypes.data for table in self.tables], np.int64), roots, owners
-        self.addresses = self.means.ctypes.data, self.bases.ctypes.data
+        self._samples = np.ascontiguousarray(samples)
+        self._last = readable(self._samples[-1])
+        sizes = [len(one.lights) for one in lights]
+        numbers = np.concatenate([one.lights for one in lights])
+        places = self._samples.ctypes.data + numbers * self._samples.strides[0]
+        places[numbers == len(samples) - 1] = self._last.ctypes.data
+        owners, roots = np.repeat(np.arange(len(lights)), sizes), np.concatenate([one.roots for one in lights])
+        self.arrays = places, roots, owners
+        self.starts = np.concatenate([[0], np.cumsum(sizes)])
+        self.most = max(sizes)
+
+
+class _Rest:
+    """What all lights share as compiled code takes it: where nodes' samples begin, parts of codes, and zeros."""
+
+    def __init__(self, samples: npt.NDArray[np.uint16], cells: npt.NDArray[np.uint32]) -> None:
+        self._kept = (cells * (SAMPLE_BYTES * samples.shape[2])).astype(np.uint32), _parts(), _NOTHING
+        self.addresses = tuple(array.ctypes.data for array in self._kept)
+
+
+def _at_least_a_block(picture: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
+    """Return a picture (H, W, 3) whose rows compiled code can read, with black pixels behind it up to a block."""
+    missing = _BLOCK - picture.shape[1]
+    return packed_rows(picture) if missing <= 0 else np.pad(picture, ((0, 0), (0, missing), (0, 0)))
 
 
 def draw_printed(
@@ -411,32 +670,44 @@ def draw_printed(
     check_picture(picture)
     target = check_out(out, picture.shape, np.uint16)
     key = check_seed(seed, image)
-    components = _Components(samples, lights)
-    count, masked = samples.shape[2], shares is not None
-    given = np.ones((1, 1, 1), np.float32) if shares is None else shares
-    offsets = (cells * (SAMPLE_BYTES * count)).astype(np.uint32)
+    count, masked, width = np.uint32(samples.shape[2]), shares is not None, picture.shape[1]
+    members, rest = _Members(samples, lights), _Rest(samples, cells)
+    means, bases = (
+        np.concatenate([getattr(one, name) for one in lights]) if masked else getattr(lights[0], name)
+        for name in ("means", "bases")
+    )
+    given = np.zeros((1, 1, 1), np.float32) if shares is None else shares
+    source = _at_least_a_block(picture)
+    if masked and width < _BLOCK:
+        given = np.pad(given, ((0, 0), (0, _BLOCK - width), (0, 0)))
+    work = writable(target) if width >= _BLOCK else np.empty(source.shape, np.uint16)
 
     def fill(top: int, bottom: int) -> None:
-        memory = _Memory(len(components.tables))
+        memory = _Memory(len(members.arrays[0]))
         _print(
-            picture[top:bottom],
-            first_row + top,
-            _parts(),
-            offsets,
-            components.addresses + memory.addresses,
-            components.members,
+            source.ctypes.data + top * source.strides[0],
+            source.strides[0],
+            (0, first_row + top, source.shape[1], bottom - top),
+            False,
+            (means.ctypes.data, bases.ctypes.data, *rest.addresses),
+            members.arrays,
             given[top:bottom] if masked else given,
             masked,
-            np.uint32(count),
+            count,
             key,
             image,
-            float(most),
             memory.arrays,
-            target[top:bottom],
+            work.ctypes.data + top * work.strides[0],
+            (work.strides[0], 0),
+            0,
+            np.float32(most),
         )
 
     run_in_threads(fill, len(picture), threads)
-    return target
+    if width < _BLOCK:
+        target[...] = work[:, :width]
+        return target
+    return copied_back(work, target)
 
 
 def draw_printed_crops(
@@ -464,28 +735,46 @@ def draw_printed_crops(
     """
     width, height = windows[0, 2:].tolist()
     check_out(out, (len(pictures), 3, height, width), np.float32)
-    count, table = samples.shape[2], np.asarray(samples)
-    offsets = (cells * (SAMPLE_BYTES * count)).astype(np.uint32)
-    most = max(len(light.lights) for light in lights)
+    count = len(pictures)
+    # Most batches show a light more than once.
+    known = {id(light): light for light in lights}
+    members, rest = _Members(samples, list(known.values())), _Rest(samples, cells)
+    of_lights = {
+        name: (light.means.ctypes.data, light.bases.ctypes.data, *ends)
+        for (name, light), ends in zip(known.items(), pairwise(members.starts.tolist()), strict=True)
+    }
+    sources = [
+        _at_least_a_block(picture[y : y + height, x : x + width])
+        for picture, (x, y) in zip(pictures, windows[:, :2].tolist(), strict=True)
+    ]
+    plan = np.empty((count, 9), np.int64)
+    plan[:, :2] = [(source.ctypes.data, source.strides[0]) for source in sources]
+    plan[:, 2:4], plan[:, 4] = windows[:, :2], flips
+    plan[:, 5:] = [of_lights[id(light)] for light in lights]
+    whole = width >= _BLOCK and out.strides[3] == 4
+    work = out if whole else np.empty((count, 3, height, max(width, _BLOCK)), np.float32)
+    unmasked = np.zeros((1, 1, 1), np.float32)
 
     def fill(first: int, end: int) -> None:
-        memory = _Memory(most)
-        for item in range(first, end):
-            components = _Components(table, lights[item : item + 1])
-            _print_crop(
-                pictures[item],
-                tuple(windows[item].tolist()),
-                bool(flips[item]),
-                _parts(),
-                offsets,
-                components.addresses + memory.addresses,
-                components.members,
-                np.uint32(count),
-                seeds[item],
-                scales[item],
-                memory.arrays,
-                out[item],
-            )
+        memory = _Memory(members.most)
+        _print_crops(
+            plan,
+            first,
+            end,
+            (work.shape[3], height),
+            rest.addresses,
+            members.arrays,
+            unmasked,
+            np.uint32(samples.shape[2]),
+            seeds,
+            memory.arrays,
+            work.ctypes.data,
+            work.strides[:3],
+            scales.ctypes.data,
+        )
 
-    run_in_threads(fill, len(pictures), threads)
+    run_in_threads(fill, count, threads)
+    if not whole:
+        for item, flip in enumerate(flips.tolist()):
+            out[item] = work[item, :, :, -width:] if flip else work[item, :, :, :width]
     return out

@@ -83,8 +83,8 @@ def concatenated(builder: Builder, parts: Sequence[Value]) -> Value:
     return parts[0]
 
 
-def _colours(builder: Builder, picture: Value, bits: Value) -> Value:
-    """Return the colour indices of the 16 pixels (48 bytes) at `picture`."""
+def pixel_codes(builder: Builder, picture: Value) -> Value:
+    """Return blue | green << 8 | red << 16 of the 16 pixels (48 bytes) at `picture`."""
     # Four pixels for each 16 bytes of the vector; the last four are loaded so that nothing behind them is.
     starts = (0, 12, 24, 32)
     loaded = concatenated(builder, [load(builder, picture, start, ir.VectorType(I8, 16)) for start in starts])
@@ -94,8 +94,13 @@ def _colours(builder: Builder, picture: Value, bits: Value) -> Value:
             first = 16 * four + 12 * four - start + 3 * pixel
             lanes += [first + 2, first + 1, first, 4 * LANES]
     nothing = constant(loaded.type, 0)
-    laid = builder.shuffle_vector(loaded, nothing, constant(ir.VectorType(I32, 4 * LANES), lanes))
-    codes = builder.bitcast(laid, WORDS)  # blue | green << 8 | red << 16
+    mask = constant(ir.VectorType(I32, 4 * LANES), lanes)
+    return builder.bitcast(builder.shuffle_vector(loaded, nothing, mask), WORDS)
+
+
+def _colours(builder: Builder, picture: Value, bits: Value) -> Value:
+    """Return the colour indices of the 16 pixels (48 bytes) at `picture`."""
+    codes = pixel_codes(builder, picture)
 
     def field(place: int) -> Value:
         shift = builder.sub(ir.Constant(I32, 8 * (place + 1)), builder.mul(bits, ir.Constant(I32, place + 1)))
@@ -387,7 +392,7 @@ def plane1(typing: Any, source: Any, factor: Any, summand: Any, limit: Any, targ
     return void(emit, ADDRESS, "float32", "float32", "float32", ADDRESS)
 
 
-def _prefetching(locality: int) -> Callable[..., None]:
+def prefetching(locality: int) -> Callable[..., None]:
     """Return an emitter of LLVM's prefetch with that locality: 3 keeps the line in every cache, 0 in none."""
 
     def emit(builder: Builder, address: Value) -> None:
@@ -404,14 +409,14 @@ def _prefetching(locality: int) -> Callable[..., None]:
 def prefetch(typing: Any, address: Any) -> Any:
     """Prefetch the line of `address` into all caches; an address without memory is ignored."""
     del typing, address
-    return void(_prefetching(3), ADDRESS)
+    return void(prefetching(3), ADDRESS)
 
 
 @intrinsic
 def prefetch_once(typing: Any, address: Any) -> Any:
     """Prefetch a line that is read once, so that it takes no place in the larger caches."""
     del typing, address
-    return void(_prefetching(0), ADDRESS)
+    return void(prefetching(0), ADDRESS)
 
 
 BLOCK: Final = 8

@@ -29,7 +29,8 @@ from __future__ import annotations
 import io
 import struct
 import warnings
-from dataclasses import dataclass
+import zlib
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
@@ -60,6 +61,9 @@ _TRANSFERS: Final = frozenset({1, 2, 6, 13, 14, 15})
 
 _ORIENTATION: Final = 0x0112
 """The tag Orientation (TIFF 6.0)."""
+
+_PNG: Final = b"\x89PNG\r\n\x1a\n"
+"""First bytes of a PNG file."""
 
 _HEAD: Final = 1 << 20
 """Bytes in which the boxes before the pixels are looked for; they are some hundred."""
@@ -482,8 +486,42 @@ def _read(path: Path, data: bytes | None, most_pixels: int) -> _Values:
     if path.suffix.lower() == ".avif":
         picture = read_avif(path, most_pixels)
         return _Values(picture.codes, picture.alpha, False, False, picture.orientation, picture.icc, False)
+    has_profile = _checked_png(path, data)
     with _named_in_text(path) as name:
-        return _read_named(path, name, data, most_pixels)
+        values = _read_named(path, name, data, most_pixels)
+    # The reader drops a profile that it cannot use without a word; no bytes are a damaged one.
+    lost = has_profile and values.icc is None and not values.adobe_rgb
+    return replace(values, icc=b"") if lost else values
+
+
+def _checked_png(path: Path, data: bytes | None) -> bool:
+    """Return whether a file is a PNG that has a colour profile (PNG, third edition, clause 5.3).
+
+    Pixels that are damaged or cut off are refused here: libpng, which finds them, too, prints lines of its own.
+    """
+    try:
+        with path.open("rb") as stream:
+            if stream.read(len(_PNG)) != _PNG:
+                return False
+            content = memoryview(_PNG + stream.read() if data is None else data)
+    except OSError:
+        # OpenImageIO names the fault.
+        return False
+    place, has_profile = len(_PNG), False
+    while place + 8 <= len(content):
+        size, kind = struct.unpack(">I4s", content[place : place + 8])
+        end = place + 12 + size
+        has_profile |= kind == b"iCCP"
+        if kind in (b"IHDR", b"PLTE", b"IDAT"):
+            cut = end > len(content)
+            if cut or zlib.crc32(content[place + 4 : end - 4]) != int.from_bytes(content[end - 4 : end]):
+                fault = "it ends within" if cut else "the checksum is not that of"
+                raise FormatError(
+                    f"cannot read {path}: {fault} its chunk {kind.decode()} at byte {place}; the file is damaged, use "
+                    "another copy"
+                )
+        place = end
+    return has_profile
 
 
 def _read_named(path: Path, name: str, data: bytes | None, most_pixels: int) -> _Values:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import logging
 import os
+import re
 import tempfile
 from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import contextmanager
@@ -33,6 +34,8 @@ SUFFIXES: Final = frozenset(
 UNREADABLE: Final = frozenset({".heic", ".heif"})
 """Ends of pictures' names that no library of a plain installation reads; those in a folder are told."""
 
+_LIKE_A_BYTE: Final = re.compile(r"\\+(?=x[89a-f][0-9a-f]|[\udc80-\udcff])")
+"""Backslashes before a byte that is no text, or before two digits that are written like one."""
 _KEPT: Final = 1 << 25
 """Most bytes of a file that is read once, to be hashed and decoded: 32 MiB are nothing beside what it unpacks to."""
 
@@ -96,8 +99,12 @@ class PictureFile:
 
     @property
     def name(self) -> str:
-        """Its name in the dataset: its path below the folder, with hexadecimal escapes for bytes that are no text."""
+        r"""Its name in the dataset: its path below the folder, with \xNN for bytes that are no text.
+
+        No two paths have one name: backslashes before such a byte, or before what reads like one, stand twice.
+        """
         name = self.below or PurePosixPath(masked(self.root).replace(os.sep, "/")).name
+        name = _LIKE_A_BYTE.sub(lambda found: 2 * found[0], name)
         text = name.encode("utf-8", "surrogateescape").decode("utf-8", "backslashreplace")
         # Many readers of CSV end a line at a carriage return, quoted or not.
         return text.replace("\r", "\\r")

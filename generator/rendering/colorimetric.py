@@ -29,6 +29,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from importlib.metadata import version
+from importlib.util import find_spec
 from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -36,8 +37,6 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 import numpy.typing as npt
 
-from calibration.radiometry import table_noise
-from calibration.radiometry.table_noise import noise_curve
 from foundation.colorimetry import angles_deg, decode_srgb
 from foundation.errors import CropError, InputError, QualityError
 from foundation.files import cache_folder, sha256_of, whole_file
@@ -202,8 +201,9 @@ def _keep(found: PrintMap, path: Path | None) -> None:
 @lru_cache(maxsize=1)
 def _code() -> str:
     """Return a hash of the code that finds maps, so that those of older code are not taken for its own."""
-    modules = (print_profiles, print_inverse, printing, table_noise)
-    files = [Path(str(module.__file__)) for module in modules] + [Path(__file__)]
+    modules = [module.__name__ for module in (print_profiles, print_inverse, printing)]
+    found = [find_spec(name) for name in (*modules, "calibration.radiometry.table_noise", __name__)]
+    files = [Path(str(one.origin)) for one in found if one is not None]
     return sha256_of(b"".join(file.read_bytes() for file in files))
 
 
@@ -322,6 +322,8 @@ def black_point(profile: PrintProfile, colours: _Array, bits: int) -> float:
 
 def _noise_of(lut: Lut) -> _Array:
     """Return what variances are of 1, y and y² at y counts, (3, 3), a column a channel; 0 where that is not known."""
+    from calibration.radiometry.table_noise import noise_curve
+
     with contextlib.suppress(InputError):
         curve = noise_curve(lut)
         if curve is not None:

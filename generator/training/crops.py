@@ -38,9 +38,6 @@ from generator.kernels.printing import PrintedLight, draw_printed_crops
 from generator.lights.lighting import Mixture
 from generator.rendering import DEFAULT, Rendering
 from generator.rendering.black_points import KEEP, BlackPoint, veil_of
-from generator.variation.exposing import add_noise
-from generator.variation.iso_speed import IsoSpeed
-from generator.variation.sensor_noise import SensorNoise
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -48,6 +45,8 @@ if TYPE_CHECKING:
     from calibration.table.lut import Lut
     from generator.rendering.matrices import ColourMatrix
     from generator.training.gallery import Gallery
+    from generator.variation.iso_speed import IsoSpeed
+    from generator.variation.sensor_noise import SensorNoise
 
 
 KEPT: Final = 2
@@ -357,6 +356,9 @@ class Crops:
                 out=out,
             )
         if self.noise is not None:
+            # What measures noise also reads charts: workers that are spawned are not to wait for it.
+            from generator.variation.exposing import add_noise
+
             ratio = 1.0 if self.iso is None else self.iso.ratio
             wanted = self.noise if self.iso is None else self.noise.at(ratio, self.iso.sensor_electrons)
             white = self.lut.provenance.white_level

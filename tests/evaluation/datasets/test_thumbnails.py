@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from evaluation.datasets import open_scenes
+from evaluation.datasets import DataOptions, open_scenes
 from foundation.errors import FormatError
 from tests.data_files import available
 from tests.evaluation.datasets import contract
@@ -27,6 +27,9 @@ def test_values(tmp_path: Path) -> None:
     assert mask[1, 1]
     assert two.truth.tolist() == [1, 2, 1]
     assert one.saturation is None
+    stated = open_scenes(tmp_path / "thumbs.npz", options=DataOptions(saturation=8000))
+    assert [scene.saturation for scene in stated.scenes] == [8000, 8000]
+    assert stated.treatment["saturation"] == "8000, as the user gave it"
 
 
 @pytest.mark.parametrize(

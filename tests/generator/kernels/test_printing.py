@@ -128,24 +128,27 @@ def test_bands_threads_and_targets_change_no_byte() -> None:
 @pytest.mark.parametrize("window", [(0, 0, 77, 31), (5, 3, 40, 20), (63, 30, 1, 1), (33, 0, 30, 2)])
 def test_a_crop_is_a_window_of_the_image(flip: bool, window: tuple[int, int, int, int]) -> None:
     picture = RNG.integers(0, 256, (31, 77, 3)).astype(np.uint8)
-    whole = spelled_out(picture, [light(2)], np.ones((31, 77, 1)), 9, 0)
     x, y, width, height = window
-    taken, stretch = np.array([[30.0, 20.0, 10.0]]), np.array([[1.1, 1.2, 1.3]])
-    out = np.empty((1, 3, height, width), np.float32)
+    taken, stretch = np.array([[30.0, 20.0, 10.0]] * 3), np.array([[1.1, 1.2, 1.3]] * 3)
+    lights, flips = [light(2), light(0, 3, weights=(0.25, 0.75)), light(2)], np.array([flip, not flip, flip])
+    out = np.empty((3, 3, height, width), np.float32)
     draw_printed_crops(
         SAMPLES,
-        [light(2)],
-        [picture],
-        np.array([window]),
+        lights,
+        [picture] * 3,
+        np.array([window] * 3),
         CELL_OF,
-        scales=scales_of(np.array([0.7]), 4000, taken, stretch),
-        flips=np.array([flip]),
-        seeds=np.array([9], np.uint64),
+        scales=scales_of(np.array([0.7] * 3), 4000, taken, stretch),
+        flips=flips,
+        seeds=np.array([9, 10, 11], np.uint64),
+        threads=2,
         out=out,
     )
-    wanted = np.minimum((whole[y : y + height, x : x + width] - taken) * stretch * 0.7 / 4000, 0.7)
-    shown = out[0].transpose(1, 2, 0)
-    np.testing.assert_allclose(shown[:, ::-1] if flip else shown, wanted, atol=2e-5)
+    for one, seed, mirrored, crop in zip(lights, (9, 10, 11), flips, out, strict=True):
+        whole = spelled_out(picture, [one], np.ones((31, 77, 1)), seed, 0)
+        wanted = np.minimum((whole[y : y + height, x : x + width] - taken[0]) * stretch[0] * 0.7 / 4000, 0.7)
+        shown = crop.transpose(1, 2, 0)
+        np.testing.assert_allclose(shown[:, ::-1] if mirrored else shown, wanted, atol=2e-5)
 
 
 def test_pixels_are_counted_by_the_nearest_node() -> None:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import io
 import struct
+import zlib
 from pathlib import Path
 
 import colour
@@ -94,6 +95,38 @@ def test_a_damaged_profile_costs_no_picture(dull: Codes, icc: bytes) -> None:
     np.testing.assert_array_equal(codes, dull)
     assert word.startswith("damaged")
     assert word.endswith("taken as sRGB")
+
+
+def png_with(path: Path, codes: Codes, profile: bytes) -> bytes:
+    """Return a PNG file whose colour profile is what is given, as it stands in the file."""
+    plain = save(path, codes, None).read_bytes()
+    chunk = b"iCCPname\0\0" + profile
+    whole = struct.pack(">I", len(chunk) - 4) + chunk + struct.pack(">I", zlib.crc32(chunk))
+    return plain[:33] + whole + plain[33:]
+
+
+@pytest.mark.parametrize("profile", [b"rubbish", zlib.compress(b"no profile" * 30), zlib.compress(ADOBE_RGB[:200])])
+def test_a_profile_that_the_reader_drops_is_noted(tmp_path: Path, dull: Codes, profile: bytes) -> None:
+    path = tmp_path / "picture.png"
+    path.write_bytes(png_with(path, dull, profile))
+    reading = open_picture(path)
+    np.testing.assert_array_equal(reading.picture, dull)
+    assert reading.profile.startswith("damaged")
+    path.write_bytes(png_with(path, dull, zlib.compress(ADOBE_RGB)))
+    assert open_picture(path).profile.endswith("converted to sRGB")
+
+
+@pytest.mark.parametrize("damage", ["checksum", "cut"])
+def test_of_a_damaged_png_nothing_reaches_the_terminal_but_our_sentence(
+    tmp_path: Path, dull: Codes, damage: str, capfd: pytest.CaptureFixture[str]
+) -> None:
+    path = save(tmp_path / "picture.png", dull, None)
+    data = bytearray(path.read_bytes())
+    data[-30] ^= 1
+    path.write_bytes(data if damage == "checksum" else data[: len(data) // 2])
+    with pytest.raises(FormatError, match=r"IDAT at byte 33; the file is damaged"):
+        open_picture(path)
+    assert capfd.readouterr() == ("", "")
 
 
 @pytest.mark.parametrize("index", ["R03", "R98"])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import hashlib
+import itertools
 import os
 import sys
 from pathlib import Path
@@ -16,7 +17,7 @@ import pytest
 from foundation.errors import FormatError, InputError, StorageError
 from generator.pictures import sources as scene
 from generator.pictures.picture import Preparation
-from generator.pictures.sources import RandomScene, find_pictures, random_scenes
+from generator.pictures.sources import PictureFile, RandomScene, find_pictures, random_scenes
 from generator.stores import filesystem
 from tests.generator.pictures.oiio_files import write
 
@@ -83,6 +84,15 @@ def test_names_that_are_no_text_are_read_and_shown_as_escapes(tmp_path: Path, co
     np.testing.assert_array_equal(whole.read().picture, colours)
     with pytest.raises(FormatError, match="damaged"):
         damaged.read()
+
+
+def test_no_two_files_have_one_name() -> None:
+    """Bytes that are no text, what reads like them, and backslashes before either."""
+    parts = [b"\xff", rb"\xff", rb"\\xff", rb"\\\xff", b"\\\xff", b"\\\\\xff", rb"\x7f", b"x", b"\\"]
+    paths = {b"".join(some) for count in range(1, 4) for some in itertools.product(parts, repeat=count)}
+    names = {PictureFile("folder", os.fsdecode(path)).name for path in paths}
+    assert len(names) == len(paths) > 500
+    assert PictureFile("folder", r"a\b\x7f.png").name == r"a\b\x7f.png"
 
 
 @pytest.mark.parametrize("url", [False, True])

@@ -316,3 +316,11 @@ def test_renderings_that_cannot_be_are_named(make_lut: MakeLut, gallery: Gallery
         Crops(lut, gallery, (5, 6), rendering="inks")  # pyright: ignore[reportArgumentType] - the fault under test
     with pytest.raises(InputError, match="a colour matrix is for colorimetric rendering"):
         Crops(lut, gallery, (5, 6), rendering="codes", matrix=MATRIX)
+
+
+def test_what_a_spawned_worker_loads_reads_no_charts() -> None:
+    """Each worker of a loader imports it anew; what measures noise brings OpenCV and SciPy."""
+    program = "import sys, generator.training.crops, generator.rendering.colorimetric; print(*sys.modules)"
+    loaded = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout.split()
+    assert "generator.training.crops" in loaded
+    assert not {"cv2", "numba", "scipy", "experiment.framing.pictures"}.intersection(loaded)
