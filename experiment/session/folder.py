@@ -31,11 +31,12 @@ from experiment.chart.model import Chart, load_chart
 from experiment.lights import Illumination, load_illuminations, save_illuminations
 from experiment.session.journal import JOURNAL_FILE, PATIENCE_S, Journal, time_text
 from experiment.session.journal_file import MOST_BYTES, restoring
-from experiment.session.ledger import ledger_path, read_ledger
+from experiment.session.ledger import ledger_path, read_ledger, require_none_lacking, settled_frames
 from experiment.session.records import AcceptedFile, FrameRecord, Judgement, SessionStep
 from experiment.session.repair import (
     BAD,
     lights_text,
+    lost_files,
     newest_report,
     parse_lights,
     require_frames_folder,
@@ -145,7 +146,7 @@ class Session:
     @classmethod
     def open(cls, folder: Path) -> Session:
         """Open a session folder to read it, also while it is being taken; nothing in it is created or changed."""
-        journal = Journal.open(journal_path(folder))
+        journal = open_journal(folder)
         try:
             return cls(folder, journal)
         except BaseException:
@@ -292,9 +293,8 @@ class Session:
 
     def done_steps(self) -> set[int]:
         """Return the numbers of the steps whose frame was taken, accepted, and is still there in full size."""
-        return {
-            frame.step for frame in self.journal.accepted_files() if _has_size(self.folder / frame.file, frame.size)
-        }
+        accepted = self.journal.accepted_files()
+        return {frame.step for frame in accepted} - {frame.step for frame in lost_files(self.folder, accepted)}
 
     def frames(self) -> list[FrameRecord]:
         """Return every frame that was taken and judged, in the order of the plan, refused ones included."""
@@ -303,8 +303,7 @@ class Session:
     def lost_files(self) -> list[AcceptedFile]:
         """Return the frames that count, one a step, whose files are not there in full size any more."""
         require_frames_folder(self.folder)
-        newest = {frame.step: frame for frame in self.journal.accepted_files()}
-        return [frame for frame in newest.values() if not _has_size(self.folder / frame.file, frame.size)]
+        return lost_files(self.folder, self.journal.accepted_files())
 
     def write_frames_csv(self) -> None:
         """Derive `frames.csv` anew from the journal."""
@@ -416,7 +415,7 @@ def session_exists(folder: Path) -> bool:
     if _is_file(folder / JOURNAL_FILE) or _is_file(ledger_path(folder)):
         return True
     if _is_file(folder / "session.toml") and (folder / "frames").is_dir():
-        raise FormatError(_without_journal(folder))
+        raise FormatError(without_journal(folder))
     _require_mounted(folder)
     require_free(folder, "the session")
     return False
@@ -432,12 +431,26 @@ def journal_path(folder: Path) -> Path:
     path = folder / JOURNAL_FILE
     if not _is_file(path):
         if _is_file(ledger_path(folder)) or (_is_file(folder / "session.toml") and (folder / "frames").is_dir()):
-            raise FormatError(_without_journal(folder))
+            raise FormatError(without_journal(folder))
         _require_mounted(folder)
         raise FormatError(
             f"{folder} is no session: it holds no {JOURNAL_FILE}; name a folder made by acquire run or import"
         )
     return path
+
+
+def open_journal(folder: Path) -> Journal:
+    """Open a session's journal to read it; refuse one that lacks what the ledger has, an older one for instance."""
+    path, ledger = journal_path(folder), ledger_path(folder)
+    # A run writes the ledger first: read in this order, the journal is behind by one transaction at most.
+    settled = settled_frames(ledger)
+    journal = Journal.open(path)
+    try:
+        require_none_lacking(ledger, journal.lacking(settled))
+    except BaseException:
+        journal.close()
+        raise
+    return journal
 
 
 def _require_mounted(folder: Path) -> None:
@@ -455,7 +468,8 @@ def _require_mounted(folder: Path) -> None:
         )
 
 
-def _without_journal(folder: Path) -> str:
+def without_journal(folder: Path) -> str:
+    """Return what is said, and what helps, where a session's journal is gone."""
     path = folder / JOURNAL_FILE
     return f"{folder} holds the frames of a session, and its journal {path.name} is gone; {restoring(path)}"
 
@@ -487,10 +501,3 @@ def _is_file(path: Path) -> bool:
 
 def _codes(colour: Colour) -> str:
     return f"{colour.red} {colour.green} {colour.blue}"
-
-
-def _has_size(path: Path, size: int) -> bool:
-    try:
-        return path.stat().st_size == size
-    except OSError:
-        return False

@@ -85,6 +85,19 @@ def require_frames_folder(folder: Path) -> None:
         )
 
 
+def lost_files(folder: Path, accepted: Sequence[AcceptedFile]) -> list[AcceptedFile]:
+    """Return, of the accepted frames that count, one a step, those whose files are not there in full size."""
+    newest = {frame.step: frame for frame in accepted}
+    return [frame for frame in newest.values() if not _has_size(folder / frame.file, frame.size)]
+
+
+def _has_size(path: Path, size: int) -> bool:
+    try:
+        return path.stat().st_size == size
+    except OSError:
+        return False
+
+
 def _require_readable(folder: Path, unread: Sequence[tuple[AcceptedFile, OSError]]) -> None:
     """Refuse files that cannot be read where they may be sound: their frames are not given up for a cable."""
     others = [(frame, error) for frame, error in unread if error.errno != errno.EIO]
@@ -94,7 +107,7 @@ def _require_readable(folder: Path, unread: Sequence[tuple[AcceptedFile, OSError
         more = f" and {len(lasting) - 1} more" if lasting[1:] else ""
         raise StorageError(
             f"cannot read {folder / frame.file}{more}: {error.strerror}; check the disk, its cable and the "
-            "permissions, or remove the files to have their frames taken again, then run the same command again"
+            "permissions, or move the files elsewhere to have their frames taken again, then run the same command again"
         ) from error
 
 
