@@ -30,7 +30,7 @@ from experiment.session.journal_file import file_system_of
 from foundation.errors import CropError
 
 RunState = Literal["running", "late", "waiting", "paused", "ended"]
-"""What a run does: takes frames, hangs at one of its steps, waits for something that comes by itself or for somebody, or
+"""What a run does: takes frames, hangs at a step, waits for something that comes by itself, waits for somebody, or
 is over."""
 
 LATE_S = 30.0
