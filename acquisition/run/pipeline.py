@@ -50,6 +50,7 @@ from experiment.session.records import (
     duration_text,
     preview_path,
 )
+from foundation.clock import SteadyClock
 from foundation.console import Ending
 from foundation.errors import CropError, DeviceError, QualityError, StorageError, counted, first_of
 from foundation.files import write_whole
@@ -272,7 +273,15 @@ class Pipeline:
         return Exposed(step, number, stem, clock.now(), checks, timings, changed)
 
     def _note_gap(self) -> float:
-        """Tell of a time in which the program stood still; return how long that was, seconds."""
+        """Tell of a time in which the program stood still; return how long that was, seconds.
+
+        A date that was set meanwhile is told, too.
+        """
+        clock = self._job.devices.clock
+        if isinstance(clock, SteadyClock) and (set_by_s := clock.set_by_s()):
+            way = "ahead" if set_by_s > 0 else "back"
+            sentence = f"the machine's clock was set {way} by {duration_text(abs(set_by_s))}; the session's time goes on"
+            self._job.retry.report("clock", sentence)
         if gap_s := self._job.watch.gap_s():
             sentence = f"the run stood still for {duration_text(gap_s)}: the machine slept, or the process was stopped"
             self._job.retry.report("gap", sentence)
@@ -468,7 +477,7 @@ class Verdicts:
         if self.is_spent:
             raise QualityError(
                 f"refused and voided frames of this run take {self._unused_bytes / 1e9:.3g} GB of the disk, "
-                f"{self._budget_bytes / 1e9:g} allowed (sequence.refused_gb); acquire status names the causes: remove "
+                f"{self._budget_bytes / 1e9:g} allowed (sequence.refused_gb); acquire status names the causes: mend "
                 "them, then run the same command again; it has the same budget anew"
             )
 
@@ -644,7 +653,7 @@ class LastingCause:
         job = self._job
         attempts = job.on_disk(job.session.journal.attempts)
         if any(attempt.kind == "light" and attempt.verdict == ACCEPTED for attempt in attempts):
-            numbers = job.on_disk(lambda: link_runs(job.session))
+            numbers = job.on_disk(lambda: link_runs(job.session, job.devices.clock.now()))
             job.queue.begin_with(step for step in job.session.steps if step.number in numbers)
             self._to_show.update(numbers)
         self.last_before = attempts[-1].id

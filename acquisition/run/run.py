@@ -33,7 +33,7 @@ from experiment.chart.model import load_chart
 from experiment.config import LabSettings
 from experiment.lights import load_illuminations
 from experiment.session.folder import Session, busy_sentence, session_exists
-from experiment.session.heartbeat import RunState, signs_of_life
+from experiment.session.heartbeat import RunState, SessionPlace, signs_of_life
 from experiment.session.journal import beat_beside
 from experiment.session.records import ACCEPTED, VOIDED, FrameJudge, FrameKind, SessionStep, duration_text
 from experiment.session.repair import secrets_warning
@@ -85,7 +85,9 @@ def run_session(
         require_same_devices(session, devices, settings)
         if note := clock_note(session, devices.clock):
             announce(note)
-        first = link_runs(session) or white_first(session)
+        if note := killed_note(session):
+            session.journal.note(devices.clock.now(), "killed", note)
+        first = link_runs(session, devices.clock.now()) or white_first(session)
         total = len(session.steps)
         observe(len(session.done_steps()), total)
         # When the screen is dark and the journal at rest.
@@ -189,6 +191,15 @@ def clock_note(session: Session, clock: Clock) -> str:
         "that was taken; the session's time goes on from there, so that its frames stay in their order; set the "
         "machine's clock right"
     )
+
+
+def killed_note(session: Session) -> str:
+    """Return what the journal is to say of the run before, if that did not end in order; else nothing."""
+    beat = session.journal.heartbeat()
+    if beat is None or beat.state == "ended" or beat.is_of(SessionPlace.of(session.journal.path)) is False:
+        return ""
+    at = f"{beat.at.astimezone():%Y-%m-%d %H:%M:%S}"
+    return f"the run before gave its last sign of life at {at}, and was killed, or power was lost"
 
 
 @dataclass(frozen=True)
