@@ -496,7 +496,7 @@ STORY: Mapping[str, tuple[str, str]] = {
     "first power dip": ("relit", "standby"),
     "clock": ("clock", "set ahead by 1 h"),
     "disk": ("paused", "the disk: .*No space left"),
-    "card": ("paused", "the camera: .*(card|full|space|store)"),
+    "card": ("paused", "the camera: .*its card is full"),
     "battery": ("paused", "the camera: .*battery"),
     "second power dip": ("killed", "power was lost"),
     "lamp lit again": ("warming up", ""),
@@ -541,7 +541,7 @@ def night(scratch: Path, grid: int, night_s: float = NIGHT_S) -> Night:
     untold = tuple(
         what
         for what, (word, said) in STORY.items()
-        if not any(event.what == word and re.search(said, event.detail) for event in events)
+        if not any(event.what == word and re.search(said, event.detail, re.IGNORECASE) for event in events)
     )
     hours = (attempts[-1].started_at - OPENING).total_seconds() / HOUR_S
     times = [attempt.started_at for attempt in attempts]
