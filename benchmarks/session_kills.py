@@ -303,6 +303,8 @@ def take_troubled(folder: Path, phase: Callable[[str], object]) -> None:
     phase("taking")
     with Session.open_for_run(folder) as session:
         session.verify()
+        if len(session.done_steps()) == len(session.steps):
+            return
         lab = TroubledLab(session, phase)
         first = link_runs(session, lab.clock.now())
         assert take_session(session, lab.devices, TROUBLED, TroubledJudge(), first=first).complete

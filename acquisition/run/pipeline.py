@@ -280,8 +280,8 @@ class Pipeline:
         clock = self._job.devices.clock
         if isinstance(clock, SteadyClock) and (set_by_s := clock.set_by_s()):
             way = "ahead" if set_by_s > 0 else "back"
-            sentence = f"the machine's clock was set {way} by {duration_text(abs(set_by_s))}; the session's time goes on"
-            self._job.retry.report("clock", sentence)
+            by = f"{way} by {duration_text(abs(set_by_s))}"
+            self._job.retry.report("clock", f"the machine's clock was set {by}; the session's time goes on as before")
         if gap_s := self._job.watch.gap_s():
             sentence = f"the run stood still for {duration_text(gap_s)}: the machine slept, or the process was stopped"
             self._job.retry.report("gap", sentence)

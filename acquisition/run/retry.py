@@ -69,7 +69,7 @@ FRAMES: Final = "the frames"
 """What is waited for where nothing fails but every frame is refused."""
 TOLD_LATER: Final = " (this was at "
 """What stands behind a sentence that the disk could not take when it was said."""
-_INSTANT_S: Final = 1e-6
+INSTANT_S: Final = 1e-6
 """Resolution of simulated time: nothing shorter can be waited for."""
 
 _Result = TypeVar("_Result")
@@ -168,7 +168,7 @@ class RetryPolicy:
     def wait(self, seconds: float, state: str, sentence: Callable[[], str], *, idle: bool = True) -> None:
         """Let `seconds` pass; what `sentence` returns is told every few of them."""
         until = self.clock.monotonic() + seconds
-        while (left := until - self.clock.monotonic()) >= _INSTANT_S:
+        while (left := until - self.clock.monotonic()) >= INSTANT_S:
             self.sign_of_life(state, sentence(), 2 * PAUSE_S + TRY_S * idle)
             self.clock.sleep(min(left, PAUSE_S))
             if idle:
@@ -226,7 +226,7 @@ class Pause:
         if not again:
             self._first, self._failed_at = fault, now
         left = self._left_s()
-        if left < _INSTANT_S:
+        if left < INSTANT_S:
             raise self._ended(first, fault) from fault
         if not again and now - self._begun_trying < SLOW_S:
             policy.report("retry", _named(self._name, fault))
