@@ -208,11 +208,14 @@ class TroubledLab:
             self.eos = _Eos(*given, **named)
             return self.eos
 
-        replaced = {
+        def presenter(screen: Screen, clock: EventfulClock) -> _Presenter:
+            return _Presenter(self, screen, clock)
+
+        replaced: dict[str, Any] = {
             "SimulatedClock": clock,
             "SimulatedProjector": projector,
             "SimulatedEos": eos,
-            "SimulatedPresenter": lambda screen, clock: _Presenter(self, screen, clock),
+            "SimulatedPresenter": presenter,
             "MemoryTransport": self._connect_camera,
             "memory_link": self._connect_projector,
         }
@@ -250,7 +253,7 @@ class TroubledLab:
 
             def close(self) -> None: ...
 
-        replaced = {"open_rig": self.opened, "Notices": Recorded}
+        replaced: dict[str, Any] = {"open_rig": self.opened, "Notices": Recorded}
         with patch.multiple(runs, **replaced), patch.object(os, "fsync", fsync):
             try:
                 outcome = run_session(load_lab(lab), folder, lambda done, total: None)

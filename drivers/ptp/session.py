@@ -54,7 +54,7 @@ class OperationDeclined(DeviceRefused):
         self.code = code
 
 
-_REMEDIES = {
+_REMEDIES: dict[int, str] = {
     ResponseCode.STORE_FULL: "; its card is full: empty it, or put another in",
     ResponseCode.STORE_READ_ONLY: "; its card is read-only: unlock it",
     ResponseCode.EOS_LOW_BATTERY: "; its battery is empty: change it, or connect a mains adapter",
