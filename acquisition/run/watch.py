@@ -23,7 +23,7 @@ GAP_S: Final = 10.0
 """A look that comes so late was held up: a busy machine lets a thread wait for a second or two."""
 
 LATE_TIMES: Final = 3.0
-"""A step is late when it takes so many times as long as it is expected to: a download that is tried again takes twice."""
+"""A step is late when it takes so many times as long as it is expected to: a download that is tried again takes two."""
 
 LATE_S: Final = 10.0
 """And so many seconds more: a disk, or a machine with other work, may stall for some."""
