@@ -10,7 +10,7 @@ import pytest
 
 from acquisition.run.queue import link_runs
 from acquisition.run.rig.lab import session_clock
-from acquisition.run.run import check_frames, clock_note, require_same_devices, take_session
+from acquisition.run.run import check_frames, clock_note, killed_note, require_same_devices, take_session
 from drivers.camera import CameraIdentity, CapturedFrame
 from drivers.presenter import Colour
 from drivers.projector import ProjectorIdentity
@@ -105,10 +105,21 @@ def test_ties_that_were_interrupted_are_taken_anew(folder: Path) -> None:
     interrupt_after(lab, 2, link_runs(lab.session, lab.clock.now()))
     again = link_runs(lab.session, lab.clock.now())
     assert again == (8, 9, 10, 11, 12, 13), "no further steps"
+    assert not lab.session.done_steps() & set(again), "no step ever has two frames that count"
     lab.camera.exposed.clear()
     interrupt_after(lab, 7, again)
     assert lab.camera.exposed[:6] == TIES, "those that were taken are taken again: the chart may have moved since"
     assert link_runs(lab.session, lab.clock.now()) == (14, 15, 16, 17, 18, 19), "behind another light they are new"
+
+
+def test_the_journal_says_that_the_run_before_was_killed(folder: Path) -> None:
+    journal = Lab(folder).session.journal
+    until = datetime.now(UTC) + timedelta(seconds=60)
+    assert killed_note(Session.open(folder)) == ""
+    journal.beat("running", "frames are taken", until)
+    assert "was killed, or power was lost" in killed_note(Session.open(folder))
+    journal.beat("ended", "interrupted", until)
+    assert killed_note(Session.open(folder)) == ""
 
 
 def test_another_camera_or_projector_is_refused(folder: Path) -> None:
