@@ -499,8 +499,8 @@ STORY: Mapping[str, tuple[str, str]] = {
     "first power dip": ("relit", "standby"),
     "clock": ("clock", "set ahead by 1 h"),
     "disk": ("paused", "the disk: .*No space left"),
-    "card": ("paused", "the camera: .*its card is full"),
-    "battery": ("paused", "the camera: .*battery"),
+    "card": ("retry", "the camera: .*its card is full"),
+    "battery": ("retry", "the camera: .*battery"),
     "second power dip": ("killed", "power was lost"),
     "lamp lit again": ("warming up", ""),
 }
@@ -576,11 +576,12 @@ def _happen(lab: TroubledLab, night_s: float, least_s: float) -> None:
     lab.at(5 * hour_s, switch("disk_is_full", True))
     lab.at(5 * hour_s + 25 * MINUTE_S, switch("disk_is_full", False))
     lab.at(6.5 * hour_s, switch("card_is_full", True))
-    lab.at(6.5 * hour_s + 20 * MINUTE_S, switch("card_is_full", False))
+    lab.at(6.5 * hour_s + max(20 * MINUTE_S, least_s), switch("card_is_full", False))
     lab.at(8 * hour_s, battery(0.0))
-    lab.at(8 * hour_s + 15 * MINUTE_S, lab.pull_camera)
-    lab.at(8 * hour_s + 16 * MINUTE_S, battery(1.0))
-    lab.at(8 * hour_s + 16 * MINUTE_S + 1, lambda: lab.pull_camera(False))
+    changed_s = 8 * hour_s + max(15 * MINUTE_S, least_s)
+    lab.at(changed_s, lab.pull_camera)
+    lab.at(changed_s + MINUTE_S, battery(1.0))
+    lab.at(changed_s + MINUTE_S + 1, lambda: lab.pull_camera(False))
 
 
 def main(argv: list[str]) -> int:
