@@ -322,7 +322,8 @@ def measure(
             parts = [details.timings for details in session.journal.details().values()]
     medians = {name: statistics.median(part[name] for part in parts) for name in parts[0]}
     # The first light settles with nothing to hide it; behind the last frame there is no light to settle.
-    waits = [max(settle_s, downloading_s) for downloading_s in camera.downloading_s]
+    *downloads, last = camera.downloading_s
+    waits = [settle_s, *(max(settle_s, downloading_s) for downloading_s in downloads), last]
     return Measured(len(steps), taken_s, machine_s, camera.exposing_s + sum(waits), medians)
 
 
