@@ -31,9 +31,8 @@ from typing import Any
 import numpy as np
 
 from acquisition.monitor.view import AttemptView, Head, SessionView, read_session
-from experiment.session.folder import without_journal
 from experiment.session.heartbeat import Process
-from experiment.session.journal import JOURNAL_FILE
+from experiment.session.journal import JOURNAL_FILE, without_journal
 from experiment.session.ledger import ledger_path
 from experiment.session.records import ACCEPTED, Check, SessionEvent, duration_text, preview_path
 from foundation.colorimetry import decode_srgb

@@ -18,9 +18,8 @@ from pathlib import Path
 from typing import Any
 
 from experiment.lights import Illumination, load_illuminations
-from experiment.session.folder import open_journal
 from experiment.session.heartbeat import AGAIN, BEAT_S, LATE_S, Heartbeat, SessionPlace
-from experiment.session.journal import JOURNAL_FILE, Journal
+from experiment.session.journal import JOURNAL_FILE, Journal, lost_files, open_journal
 from experiment.session.records import (
     ACCEPTED,
     FAILED,
@@ -35,7 +34,6 @@ from experiment.session.records import (
     TimedAttempt,
     time_left,
 )
-from experiment.session.repair import lost_files
 from foundation.errors import CropError, first_of
 
 RUN_STARTS = "start"

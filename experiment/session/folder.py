@@ -29,14 +29,21 @@ from drivers.camera import CapturedFrame
 from drivers.presenter import Colour
 from experiment.chart.model import Chart, load_chart
 from experiment.lights import Illumination, load_illuminations, save_illuminations
-from experiment.session.journal import JOURNAL_FILE, PATIENCE_S, Journal, time_text
-from experiment.session.journal_file import MOST_BYTES, restoring
-from experiment.session.ledger import ledger_path, read_ledger, require_none_lacking, settled_frames
+from experiment.session.journal import (
+    JOURNAL_FILE,
+    PATIENCE_S,
+    Journal,
+    lost_files,
+    open_journal,
+    time_text,
+    without_journal,
+)
+from experiment.session.journal_file import MOST_BYTES
+from experiment.session.ledger import ledger_path, read_ledger
 from experiment.session.records import AcceptedFile, FrameRecord, Judgement, SessionStep
 from experiment.session.repair import (
     BAD,
     lights_text,
-    lost_files,
     newest_report,
     parse_lights,
     require_frames_folder,
@@ -146,6 +153,7 @@ class Session:
     @classmethod
     def open(cls, folder: Path) -> Session:
         """Open a session folder to read it, also while it is being taken; nothing in it is created or changed."""
+        journal_path(folder)
         journal = open_journal(folder)
         try:
             return cls(folder, journal)
@@ -439,20 +447,6 @@ def journal_path(folder: Path) -> Path:
     return path
 
 
-def open_journal(folder: Path) -> Journal:
-    """Open a session's journal to read it; refuse one that lacks what the ledger has, an older one for instance."""
-    path, ledger = journal_path(folder), ledger_path(folder)
-    # A run writes the ledger first: read in this order, the journal is behind by one transaction at most.
-    settled = settled_frames(ledger)
-    journal = Journal.open(path)
-    try:
-        require_none_lacking(ledger, journal.lacking(settled))
-    except BaseException:
-        journal.close()
-        raise
-    return journal
-
-
 def _require_mounted(folder: Path) -> None:
     """Refuse a place that is not on the disk that it should be on."""
     if place := unmounted_at(folder):
@@ -466,12 +460,6 @@ def _require_mounted(folder: Path) -> None:
             f"mounted; see that the disk of the session is mounted, or name another folder; keep what is there until "
             "it is known what it is",
         )
-
-
-def without_journal(folder: Path) -> str:
-    """Return what is said, and what helps, where a session's journal is gone."""
-    path = folder / JOURNAL_FILE
-    return f"{folder} holds the frames of a session, and its journal {path.name} is gone; {restoring(path)}"
 
 
 def rebuild_journal(folder: Path) -> int:

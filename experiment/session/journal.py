@@ -35,10 +35,22 @@ from experiment.session.journal_file import (
     open_for_run,
     open_to_read,
     reading_error,
+    restoring,
     set_aside,
     writing_error,
 )
-from experiment.session.ledger import PLACE, Frames, Ledger, Row, Rows, insert_rows, rows_of
+from experiment.session.ledger import (
+    PLACE,
+    Frames,
+    Ledger,
+    Row,
+    Rows,
+    insert_rows,
+    ledger_path,
+    require_none_lacking,
+    rows_of,
+    settled_frames,
+)
 from experiment.session.records import (
     ACCEPTED,
     FAILED,
@@ -406,6 +418,38 @@ class Journal:
             # Of the file that is open: that on the disk may be gone as well.
             ledger.restore(rows_of(self._connection))
         ledger.append(rows)
+
+
+def open_journal(folder: Path) -> Journal:
+    """Open a session's journal to read it; refuse one that lacks what the ledger has, an older one for instance."""
+    # A run writes the ledger first: read in this order, the journal is behind by one transaction at most.
+    settled = settled_frames(ledger_path(folder))
+    journal = Journal.open(folder / JOURNAL_FILE)
+    try:
+        require_none_lacking(ledger_path(folder), journal.lacking(settled))
+    except BaseException:
+        journal.close()
+        raise
+    return journal
+
+
+def lost_files(folder: Path, accepted: Sequence[AcceptedFile]) -> list[AcceptedFile]:
+    """Return, of the accepted frames that count, one a step, those whose files are not there in full size."""
+    newest = {frame.step: frame for frame in accepted}
+    return [frame for frame in newest.values() if not _has_size(folder / frame.file, frame.size)]
+
+
+def _has_size(path: Path, size: int) -> bool:
+    try:
+        return path.stat().st_size == size
+    except OSError:
+        return False
+
+
+def without_journal(folder: Path) -> str:
+    """Return what is said, and what helps, where a session's journal is gone."""
+    path = folder / JOURNAL_FILE
+    return f"{folder} holds the frames of a session, and its journal {path.name} is gone; {restoring(path)}"
 
 
 def beat_beside(path: Path, state: RunState, sentence: str, until: datetime) -> None:

@@ -85,19 +85,6 @@ def require_frames_folder(folder: Path) -> None:
         )
 
 
-def lost_files(folder: Path, accepted: Sequence[AcceptedFile]) -> list[AcceptedFile]:
-    """Return, of the accepted frames that count, one a step, those whose files are not there in full size."""
-    newest = {frame.step: frame for frame in accepted}
-    return [frame for frame in newest.values() if not _has_size(folder / frame.file, frame.size)]
-
-
-def _has_size(path: Path, size: int) -> bool:
-    try:
-        return path.stat().st_size == size
-    except OSError:
-        return False
-
-
 def _require_readable(folder: Path, unread: Sequence[tuple[AcceptedFile, OSError]]) -> None:
     """Refuse files that cannot be read where they may be sound: their frames are not given up for a cable."""
     others = [(frame, error) for frame, error in unread if error.errno != errno.EIO]
