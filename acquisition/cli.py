@@ -23,7 +23,7 @@ from foundation.console import (
     orderly_end,
     with_json,
 )
-from foundation.errors import DeviceError, InputError, QualityError, first_of
+from foundation.errors import DeviceError, InputError, QualityError, StorageError, first_of
 
 if TYPE_CHECKING:
     from experiment.config import LabSettings
@@ -374,8 +374,9 @@ def status(
 ) -> None:
     """Show how far a session is, how long it will take, what was measured last, and what was refused.
 
-    Reads SESSION, also while it is being taken; writes nothing. Says so when the run was killed. Ends with 3 when it is
-    there, and a frame is late, or no sign of life came in its time.
+    Reads SESSION, also while it is being taken; writes nothing. Says so when the run was killed. Ends with 3 when a run
+    is there, and a step of it is late, no sign of life came in its time, or it is paused for a device; with 4 when it
+    is paused for its frames, with 5 when its disk is full or at fault.
     """
     from datetime import UTC, datetime
 
@@ -393,8 +394,9 @@ def status(
     if warning := secrets_warning(session):
         print(f"warning: {warning}", file=sys.stderr)
     head = view.head(now)
-    if head.state in ("late", "silent"):
-        raise DeviceError(head.sentence)
+    if head.state in ("late", "silent", "paused"):
+        kind = {"the disk": StorageError, "the frames": QualityError}.get(head.cause, DeviceError)
+        raise kind(head.sentence)
 
 
 @app.command(epilog=EXIT_CODES)

@@ -1,6 +1,6 @@
 """What the live judge sees, and what it takes for a fault that is none: `python -m benchmarks.detection`.
 
-Three tables, as Markdown. Detection: each disturbance and size, tried in several simulated rooms at several lights,
+Four tables, as Markdown. Detection: each disturbance and size, tried in several simulated rooms at several lights,
 deep blues, whites and dark frames among them: how often it was refused at its frame, at the next, or not at all, and by
 which causes. False alarms: frames refused in undisturbed sessions, a room each, some with a lamp that drifts and a
 sensor that warms up, some with projectors that do not add, remember the picture before, or with other light that
@@ -8,6 +8,7 @@ flickers. Neighbours: which of the plan's 707 lights could stand for one another
 
 Frames are simulated (`sim.world`): a small body and chart for most, an EOS 550D before the whole chart with ``--full``.
 The disturbances are those of `benchmarks.disturbance_trials`, the undisturbed sessions of `benchmarks.false_alarms`.
+The fourth table has whole runs in which causes come and go (`benchmarks.troubled_runs`).
 """
 
 from __future__ import annotations
@@ -26,6 +27,7 @@ from acquisition.judge.light import ProjectorModel
 from benchmarks.disturbance_trials import detection
 from benchmarks.false_alarms import false_alarms, odd_worlds
 from benchmarks.judged_labs import Lab, lab_of, rooms
+from benchmarks.troubled_runs import causes
 from experiment.chart.layout import design_chart
 from experiment.lights import Illumination
 from sim.world.room import Room
@@ -55,7 +57,7 @@ def neighbours(model: ProjectorModel, plan: Sequence[Illumination]) -> tuple[int
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Measure and print; 0."""
+    """Measure and print; 0, or 1 where a run did not end, or go on, as the how-to says."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.detection", description=__doc__)
     parser.add_argument("--rooms", type=int, default=4, metavar="N", help="small rooms for the detection")
     parser.add_argument(
@@ -64,6 +66,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--sessions", type=int, default=100, metavar="N", help="undisturbed sessions, a fifth drifting")
     parser.add_argument("--lights", type=int, default=36, metavar="N", help="lights of such a session")
     parser.add_argument("--full", action="store_true", help="an EOS 550D before the whole chart, too")
+    parser.add_argument("--frames-only", action="store_true", help="leave out the whole runs that go wrong")
     options = parser.parse_args(arguments)
     began = time.monotonic()
     with tempfile.TemporaryDirectory() as name:
@@ -81,10 +84,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print("| disturbance | size | tried | at the frame | at the next | missed | misnamed | causes |")
         print("|---|---|---|---|---|---|---|---|")
         for (what, size), tally in detection(labs, options.tries).items():
-            causes = ", ".join(f"{one} {count}" for one, count in tally.causes.most_common())
+            named = ", ".join(f"{one} {count}" for one, count in tally.causes.most_common())
             tried = tally.at_once + tally.next + tally.missed
             counts = f"{tried} | {tally.at_once} | {tally.next} | {tally.missed} | {tally.misnamed}"
-            print(f"| {what} | {size} | {counts} | {causes} |")
+            print(f"| {what} | {size} | {counts} | {named} |")
         if labs:
             lights, following, which = neighbours(labs[0].judge.state.model, labs[0].plan)
             scatter = labs[0].judge.state.model
@@ -94,17 +97,21 @@ def main(arguments: Sequence[str] | None = None) -> int:
             print(f"{lights} of {len(labs[0].plan)} lights have another that could stand for them unnoticed;")
             print(f"{following} of them are followed by it in the list: {'; '.join(which)}")
         if options.sessions:
-            refused, frames, causes = false_alarms(folder, options.sessions, options.lights, options.sessions // 5)
+            refused, frames, found = false_alarms(folder, options.sessions, options.lights, options.sessions // 5)
             print(
-                f"\nFalse alarms: {refused} of {options.sessions} sessions, {sum(causes.values())} of {frames} frames",
+                f"\nFalse alarms: {refused} of {options.sessions} sessions, {sum(found.values())} of {frames} frames",
                 end="",
             )
-            print(f" ({', '.join(f'{one} {count}' for one, count in causes.items())})" if causes else "")
+            print(f" ({', '.join(f'{one} {count}' for one, count in found.items())})" if found else "")
             print("\n| world | frames | refused | causes | limit of light at the end |\n|---|---|---|---|---|")
             for what, count, wrong, named, limit in odd_worlds(folder, options.lights):
                 print(f"| {what} | {count} | {wrong} | {dict(named) or ''} | {limit} |")
+    as_said = True
+    if not options.frames_only:
+        print("\nCauses that come and go, in whole runs:\n")
+        as_said = causes()
     print(f"\n{time.monotonic() - began:.0f} s")
-    return 0
+    return int(not as_said)
 
 
 if __name__ == "__main__":

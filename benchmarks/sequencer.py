@@ -293,7 +293,10 @@ class Measured:
 def measure(
     clock: Clock, latencies: Latencies, settle_s: float, lights: int, files: dict[str, bytes], live: bool = True
 ) -> Measured:
-    """Take a session of `lights` lights; files are removed when they are judged, so that the disk need not hold all."""
+    """Take a session of `lights` lights; files are emptied when they are judged, so that the disk need not hold all.
+
+    They keep their size: a run takes frames again whose files are gone or cut.
+    """
     screen = PacedScreen(clock, latencies)
     camera = PacedCamera(screen, clock, latencies, files)
     chosen = [Illumination(n, "uniform", None, LIGHTS[n].colour) for n in range(lights)]
@@ -306,17 +309,21 @@ def measure(
             def tidy(taken: Taken) -> None:
                 assert taken.judgement.accepted, taken.judgement.reason
                 for path in session.frames_folder.glob(f"{taken.step.stem}.*"):
-                    path.unlink()
+                    size = path.stat().st_size
+                    os.truncate(path, 0)
+                    os.truncate(path, size)
 
             begun, machine = clock.monotonic(), time.perf_counter()
             devices = Devices(camera, screen, PacedProjector(clock, latencies), clock)
             judge = PassingJudge() if live else ExposureJudge(settings)
             assert take_session(session, devices, settings, judge, tidy).complete
+            assert camera.frames == len(steps)
             taken_s, machine_s = clock.monotonic() - begun, time.perf_counter() - machine
             parts = [details.timings for details in session.journal.details().values()]
     medians = {name: statistics.median(part[name] for part in parts) for name in parts[0]}
     # The first light settles with nothing to hide it; behind the last frame there is no light to settle.
-    waits = [max(settle_s, downloading_s) for downloading_s in camera.downloading_s]
+    *downloads, last = camera.downloading_s
+    waits = [settle_s, *(max(settle_s, downloading_s) for downloading_s in downloads), last]
     return Measured(len(steps), taken_s, machine_s, camera.exposing_s + sum(waits), medians)
 
 

@@ -49,6 +49,10 @@ def elapsed_s() -> float:
     return time.clock_gettime(time.CLOCK_BOOTTIME) if hasattr(time, "CLOCK_BOOTTIME") else time.monotonic()
 
 
+SET_S = 10.0
+"""A date that is off by more was set: what keeps clocks right over a network moves them by less in a night."""
+
+
 class SteadyClock:
     """A clock whose date goes on as seconds pass, and never back, whatever the machine's clock is set to meanwhile.
 
@@ -75,6 +79,16 @@ class SteadyClock:
         self._origin = elapsed()
         self.behind_s = (self._start - date).total_seconds()
         """Seconds by which `clock` was behind `not_before` at the start; 0 where it was not."""
+        self._set_by_s = -self.behind_s
+
+    def set_by_s(self) -> float:
+        """Return the seconds by which the date of `clock` was set since this was asked last; 0 below `SET_S`."""
+        set_by_s = (self._clock.now() - self.now()).total_seconds()
+        moved_s = set_by_s - self._set_by_s
+        if abs(moved_s) < SET_S:
+            return 0.0
+        self._set_by_s = set_by_s
+        return moved_s
 
     def now(self) -> datetime:
         """Return the date at the start and what has passed since, timezone-aware, UTC."""

@@ -32,7 +32,8 @@ import numpy as np
 
 from acquisition.monitor.view import AttemptView, Head, SessionView, read_session
 from experiment.session.heartbeat import Process
-from experiment.session.journal import JOURNAL_FILE
+from experiment.session.journal import JOURNAL_FILE, without_journal
+from experiment.session.ledger import ledger_path
 from experiment.session.records import ACCEPTED, Check, SessionEvent, duration_text, preview_path
 from foundation.colorimetry import decode_srgb
 from foundation.errors import CropError, FormatError
@@ -152,7 +153,10 @@ class SessionWatch:
         self._unsettled = bool(signature) and time.time_ns() - newest < FRESH_S * 1e9
         self._signature = signature
         if not signature:
-            if self._known is not None:
+            if ledger_path(self.folder).exists():
+                self._trouble = Head("gone", without_journal(self.folder))
+                self._known = None
+            elif self._known is not None:
                 self._trouble = Head("gone", f"the session {self.folder} is gone; this page goes on when it is back")
                 self._known = None
             return

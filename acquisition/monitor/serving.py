@@ -9,6 +9,7 @@ from pathlib import Path
 from acquisition.monitor.feed import SessionWatch, live_page, to_bytes
 from acquisition.monitor.view import read_session
 from experiment.session.journal import JOURNAL_FILE
+from experiment.session.ledger import ledger_path
 from foundation.errors import FormatError
 from foundation.local_server import LocalServer, Refusal, Request, Response
 
@@ -17,7 +18,7 @@ _FRAME = re.compile(r"frame/([1-9][0-9]{0,8})\.jpg")
 
 def open_monitor(folder: Path, port: int, host: str = "127.0.0.1") -> MonitorServer:
     """Return a server for a session, not yet serving."""
-    if (folder / JOURNAL_FILE).exists():
+    if (folder / JOURNAL_FILE).exists() or ledger_path(folder).exists():
         read_session(folder)
     elif folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise FormatError(

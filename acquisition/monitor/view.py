@@ -8,6 +8,7 @@ when it is voided; what else is known of it is written once, so that of 800 atte
 from __future__ import annotations
 
 import shlex
+import shutil
 import statistics
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import closing
@@ -18,7 +19,7 @@ from typing import Any
 
 from experiment.lights import Illumination, load_illuminations
 from experiment.session.heartbeat import AGAIN, BEAT_S, LATE_S, Heartbeat, SessionPlace
-from experiment.session.journal import JOURNAL_FILE, Journal
+from experiment.session.journal import JOURNAL_FILE, Journal, lost_files, open_journal
 from experiment.session.records import (
     ACCEPTED,
     FAILED,
@@ -33,13 +34,22 @@ from experiment.session.records import (
     TimedAttempt,
     time_left,
 )
-from foundation.errors import CropError
+from foundation.errors import CropError, first_of
 
 RUN_STARTS = "start"
 """The event with which a run begins to take frames."""
 
 LATE_FRAMES = 3
 """Times that frames lately took, after which one is late: a download that is tried again takes twice as long."""
+
+AT_WORK = ("running", "waiting", "paused", "late")
+"""States of a run that is at work."""
+
+CAUSES = ("the camera", "the screen", "the projector", "the disk", "the frames")
+"""What a run may hang at, or wait for somebody to mend."""
+
+LEAST_FREE_BYTES = 1 << 20
+"""A disk with less is full, also before the first frame: a row of the journal with what the judge keeps has 100 kB."""
 
 LOOK = "look at the camera, its cable and the machine"
 """What helps where a run says nothing."""
@@ -82,6 +92,7 @@ class Head:
     - `seconds_per_frame`: median interval of the newest `RECENT` attempts; None before the second.
     - `remaining_s`: time left by the lab's clock, retakes and references included; None while it is unknown.
     - `eta`: when all frames are there, by the wall clock; None where that cannot be told.
+    - `cause`: of a run that is late or paused: one of `CAUSES`; empty where that is not known, or nothing is wrong.
     - `last`: when the newest frame was released, by the lab's clock.
     """
 
@@ -100,6 +111,7 @@ class Head:
     seconds_per_frame: float | None = None
     remaining_s: float | None = None
     eta: datetime | None = None
+    cause: str = ""
     last: datetime | None = None
 
     def to_plain(self) -> dict[str, Any]:
@@ -118,6 +130,8 @@ class SessionView:
     - `attempts`, `events`: all of them, oldest first.
     - `heartbeat`: the newest sign of life; None where there is none.
     - `place`: where it lies; None if that is not known.
+    - `frame_bytes`: size of its largest frame; 0 before the first.
+    - `lost`: files of frames that count and are gone or cut, by step; only looked for where all frames are there.
     """
 
     name: str
@@ -129,10 +143,19 @@ class SessionView:
     events: tuple[SessionEvent, ...]
     heartbeat: Heartbeat | None
     place: SessionPlace | None
+    frame_bytes: int = 0
+    lost: Mapping[int, str] = field(default_factory=dict[int, str])
 
     def head(self, now: datetime) -> Head:
-        """Return how it stands at the wall clock's `now`; the process that takes it is looked for."""
-        return head_of(self, now, self.heartbeat.process.is_alive() if self.heartbeat else None)
+        """Return how it stands at the wall clock's `now`; process and disk are looked at."""
+        process = self.heartbeat.process if self.heartbeat else None
+        return head_of(
+            self,
+            now,
+            process.is_alive() if process else None,
+            is_stopped=bool(process and process.is_stopped()),
+            free_bytes=free_bytes_of(Path(self.given)),
+        )
 
     def whites(self) -> dict[int, tuple[float, float, float] | None]:
         """Return by attempt what was seen of the white frame that it is compared with.
@@ -156,14 +179,17 @@ class SessionView:
 def read_session(folder: Path, before: SessionView | None = None) -> SessionView:
     """Return a session as it stands on the disk; of what was read `before` only what has changed is read again."""
     path = folder / JOURNAL_FILE
-    with closing(Journal.open(path)) as journal, journal.one_moment():
+    opened = Journal.open(path) if before else open_journal(folder)
+    with closing(opened) as journal, journal.one_moment():
         steps, rows, events = journal.steps(), journal.attempts(), journal.events()
+        accepted = journal.accepted_files()
         known = {view.id: view for view in before.attempts} if before else {}
         changed = [row for row in rows if row.id not in known or not _is_same(known[row.id], row)]
         details, nothing = journal.details([row.id for row in changed]), AttemptDetails()
         known |= {row.id: AttemptView(**vars(row), **vars(details.get(row.id, nothing))) for row in changed}
         records, heartbeat = journal.records(), journal.heartbeat()
     starts = [event.at for event in events if event.what == RUN_STARTS]
+    is_complete = {step.number for step in steps} <= {frame.step for frame in accepted}
     return SessionView(
         folder.resolve().name,
         str(folder),
@@ -174,6 +200,8 @@ def read_session(folder: Path, before: SessionView | None = None) -> SessionView
         tuple(events),
         heartbeat,
         SessionPlace.of(path),
+        max((frame.size for frame in accepted), default=0),
+        {frame.step: frame.file for frame in lost_files(folder, accepted)} if is_complete else {},
     )
 
 
@@ -205,18 +233,40 @@ def with_seconds(views: Sequence[AttemptView], starts: Iterable[datetime]) -> tu
     return tuple(timed)
 
 
-def head_of(view: SessionView, now: datetime, process_alive: bool | None) -> Head:
+def free_bytes_of(folder: Path) -> int | None:
+    """Return what a session's disk has free; None where it does not say."""
+    try:
+        return shutil.disk_usage(folder).free
+    except OSError:
+        return None
+
+
+def head_of(
+    view: SessionView,
+    now: datetime,
+    process_alive: bool | None,
+    *,
+    is_stopped: bool = False,
+    free_bytes: int | None = None,
+) -> Head:
     """Return how a session stands.
 
     `process_alive`: whether the process that gave the newest sign of life is there; None if that cannot be told.
+    `is_stopped`: whether it was stopped by a signal. `free_bytes`: of the session's disk; None if it does not say.
     """
     steps, attempts, heartbeat = view.steps, view.attempts, view.heartbeat
-    done = {one.step for one in attempts if one.verdict == ACCEPTED} & {step.number for step in steps}
+    done = {one.step for one in attempts if one.verdict == ACCEPTED} & {step.number for step in steps} - {*view.lost}
     verdicts = [one.verdict for one in attempts]
     left = len(steps) - len(done)
     intervals = [one.seconds for one in attempts[-RECENT:] if one.seconds is not None]
     frame_s = statistics.median(intervals) if intervals else None
     state, sentence = _state_of(view, now, process_alive, left, frame_s)
+    if state in AT_WORK and heartbeat is not None:
+        if is_stopped:
+            pid = heartbeat.process.pid
+            state, sentence = "silent", f"its process {pid} was stopped by a signal; kill -CONT {pid} lets it go on"
+        elif _is_full(view, free_bytes) and (state, _cause(sentence)) != ("paused", "the disk"):
+            state, sentence = "late", "the disk is full; free space, and the run goes on by itself"
     judged = (one for one in attempts if one.verdict is not None)
     remaining = time_left((TimedAttempt(one.seconds, one.verdict in (ACCEPTED, VOIDED)) for one in judged), left)
     near = (
@@ -228,7 +278,7 @@ def head_of(view: SessionView, now: datetime, process_alive: bool | None) -> Hea
     return Head(
         state,
         sentence,
-        state in ("running", "waiting", "paused", "late"),
+        state in AT_WORK,
         heartbeat.at if heartbeat else None,
         heartbeat.until if heartbeat else None,
         total=len(steps),
@@ -241,8 +291,19 @@ def head_of(view: SessionView, now: datetime, process_alive: bool | None) -> Hea
         seconds_per_frame=frame_s,
         remaining_s=remaining,
         eta=now + timedelta(seconds=remaining) if near and remaining is not None else None,
+        cause=_cause(sentence) if state in ("late", "paused") else "",
         last=next((one.taken_at for one in reversed(attempts) if one.taken_at is not None), None),
     )
+
+
+def _is_full(view: SessionView, free_bytes: int | None) -> bool:
+    return free_bytes is not None and free_bytes < max(view.frame_bytes, LEAST_FREE_BYTES)
+
+
+def _cause(sentence: str) -> str:
+    """Return what a sentence names first."""
+    named = {sentence.find(cause): cause for cause in CAUSES if cause in sentence}
+    return named[min(named)] if named else ""
 
 
 def _state_of(
@@ -253,6 +314,9 @@ def _state_of(
     over = heartbeat is None or heartbeat.state == "ended" or copied or heartbeat.is_dead(now, process_alive)
     if over and total and not left:
         return "complete", f"complete, {total} frames; next: build-lut {shlex.quote(view.given)} LUT/"
+    if over and view.lost:
+        gone = first_of(list(view.lost.values()), 3)
+        return "incomplete", f"{gone}: gone or cut since taken; restore from a copy, or {AGAIN}, which takes it again"
     if heartbeat is None:
         return "unknown", f"{left} of {total} frames are left, and the journal has no sign of life of a run"
     if copied and here is not None:

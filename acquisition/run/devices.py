@@ -30,7 +30,7 @@ from dataclasses import dataclass
 from enum import Enum
 from typing import Final
 
-from acquisition.run.retry import PAUSE_S, Pause, Report, RetryPolicy
+from acquisition.run.retry import INSTANT_S, PAUSE_S, Pause, Report, RetryPolicy
 from drivers.camera import Camera
 from drivers.presenter import BLACK, Presenter
 from drivers.projector import Power, Projector, ReportsPictureFault, Severity
@@ -243,7 +243,7 @@ def _burned(projector: Projector, sequence: SequenceSettings, retry: RetryPolicy
     def countdown() -> str:
         return f"the lamp warms up, {duration_text(max(until - retry.clock.monotonic(), 0))} left"
 
-    while (left := until - retry.clock.monotonic()) > 0:
+    while (left := until - retry.clock.monotonic()) >= INSTANT_S:
         retry.wait(min(left, PAUSE_S), "waiting", countdown)
         if health_fault(projector) is not None:
             pause = retry.pause(_NAME)

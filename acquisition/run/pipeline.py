@@ -33,9 +33,9 @@ from functools import partial
 from typing import Self, TypeVar
 
 from acquisition.run.devices import Devices, HealthWatch, await_health
-from acquisition.run.gaps import GAP_S, GapWatch
 from acquisition.run.queue import StepQueue, link_runs, step_name
 from acquisition.run.retry import FRAMES, Pause, RetryPolicy, is_curable
+from acquisition.run.watch import GAP_S, RunWatch
 from drivers.presenter import Colour, ReadsBack
 from experiment.config import JudgeSettings, LabSettings
 from experiment.session.folder import ReceivedFile, Session
@@ -50,6 +50,7 @@ from experiment.session.records import (
     duration_text,
     preview_path,
 )
+from foundation.clock import SteadyClock
 from foundation.console import Ending
 from foundation.errors import CropError, DeviceError, QualityError, StorageError, counted, first_of
 from foundation.files import write_whole
@@ -60,6 +61,11 @@ come in, several times what judging takes; more would only be lost where one is 
 
 DOWNLOADS = 2
 """Tries at fetching a frame before it is exposed again: a driver has renewed its connection several times by then."""
+
+COMMIT_S, SHOW_S, RELEASE_S, JUDGE_S, DOWNLOAD_S = 1.0, 2.0, 3.0, 5.0, 10.0
+"""What steps are expected to take, seconds, until they took longer: a write to the journal, a picture that is shown or
+read back, release and readout beside the shutter's time and as much again for the camera's own dark frame, the verdict
+of a large frame, its download over a slow cable."""
 
 PROMISE = "ending after this frame; press Ctrl-C again to end at once"
 """What somebody is told who asks a run to end."""
@@ -78,11 +84,16 @@ class Job:
     settings: LabSettings
     queue: StepQueue
     retry: RetryPolicy
-    gaps: GapWatch
+    watch: RunWatch
 
     def on_disk(self, action: Callable[[], _Result]) -> _Result:
         """Return what `action` returns; while the disk is full or gone, it is waited for."""
-        return self.retry.attempt(action, _DISK)
+
+        def watched() -> _Result:
+            with self.watch.step(_DISK, "takes what the journal says", COMMIT_S, "commit"):
+                return action()
+
+        return self.retry.attempt(watched, _DISK)
 
 
 @dataclass(frozen=True)
@@ -214,7 +225,8 @@ class Pipeline:
     def _show(self, step: SessionStep) -> ShownLight:
         clock = self._job.devices.clock
         shown_at, begun = clock.now(), clock.monotonic()
-        self._job.devices.presenter.show(step.colour)
+        with self._job.watch.step(_SCREEN, f"shows {step_name(step)}", SHOW_S, "show"):
+            self._job.devices.presenter.show(step.colour)
         since = clock.monotonic()
         replaced, self._shown = self._shown, step.colour
         return ShownLight(step, shown_at, since, since - begun, replaced)
@@ -240,6 +252,7 @@ class Pipeline:
     def _expose(self, light: ShownLight, settling_s: float) -> Exposed | None:
         """Release the shutter; None where the camera failed, and was waited for."""
         clock, step, journal = self._job.devices.clock, light.step, self._job.session.journal
+        shutter_s = self._job.settings.camera.shutter_s
         kept = journal.kept_files(step)
         stem = step.stem if kept == 0 else f"{step.stem}_try{kept + 1}"
         number = self._job.on_disk(lambda: journal.begin(step, f"frames/{stem}", light.shown_at))
@@ -249,7 +262,8 @@ class Pipeline:
         changed = step.colour not in (light.replaced, self._exposed)
         self._exposed = step.colour
         try:
-            self._job.devices.camera.expose()
+            with self._job.watch.step(_CAMERA, f"exposes {step_name(step)}", 2 * shutter_s + RELEASE_S, "expose"):
+                self._job.devices.camera.expose()
         except DeviceError as error:
             self._give_up(step, number, error)
             self._pause_for(_CAMERA, error)
@@ -259,8 +273,16 @@ class Pipeline:
         return Exposed(step, number, stem, clock.now(), checks, timings, changed)
 
     def _note_gap(self) -> float:
-        """Tell of a time in which the program stood still; return how long that was, seconds."""
-        if gap_s := self._job.gaps.taken():
+        """Tell of a time in which the program stood still; return how long that was, seconds.
+
+        A date that was set meanwhile is told, too.
+        """
+        clock = self._job.devices.clock
+        if isinstance(clock, SteadyClock) and (set_by_s := clock.set_by_s()):
+            way = "ahead" if set_by_s > 0 else "back"
+            by = f"{way} by {duration_text(abs(set_by_s))}"
+            self._job.retry.report("clock", f"the machine's clock was set {by}; the session's time goes on as before")
+        if gap_s := self._job.watch.gap_s():
             sentence = f"the run stood still for {duration_text(gap_s)}: the machine slept, or the process was stopped"
             self._job.retry.report("gap", sentence)
         return gap_s
@@ -281,7 +303,8 @@ class Pipeline:
         if not isinstance(presenter, ReadsBack):
             return ()
         try:
-            presenter.verify(step.colour)
+            with self._job.watch.step(_SCREEN, f"is asked whether it shows {step_name(step)}", SHOW_S, "verify"):
+                presenter.verify(step.colour)
         except DeviceError as error:
             return (Check("screen", reason=str(error)),)
         return (Check("screen"),)
@@ -290,7 +313,8 @@ class Pipeline:
         """Ask the projector for its health; it answers while the next light settles."""
         if self._health is None:
             return ()
-        fault = self._health.fault(thorough=step.kind == "dark")
+        with self._job.watch.step("the projector", "is asked for its health", SHOW_S, "health"):
+            fault = self._health.fault(thorough=step.kind == "dark")
         return (Check("projector", reason="" if fault is None else str(fault)),)
 
     def _hand_over(self, frame: Exposed) -> None:
@@ -312,7 +336,7 @@ class Pipeline:
 
         What a full disk cannot take stays in the camera.
         """
-        download = partial(_download, self._job, frame.stem)
+        download = partial(_download, self._job, frame)
         for _ in range(DOWNLOADS - 1):
             try:
                 return self._job.retry.attempt(download, _DISK, curable=_is_of_disk)
@@ -326,7 +350,8 @@ class Pipeline:
             frame, awaited = self._under_way.popleft()
             begun = time.perf_counter()
             try:
-                saved = awaited.result()
+                with self._job.watch.step(_DISK, f"takes {step_name(frame.step)}, which is judged", JUDGE_S, "judge"):
+                    saved = awaited.result()
             except (DeviceError, StorageError) as error:
                 self._give_up(frame.step, frame.number, error)
                 self._pause_for(_DISK, error)
@@ -369,11 +394,12 @@ def _is_of_disk(fault: CropError) -> bool:
     return isinstance(fault, StorageError) and is_curable(fault)
 
 
-def _download(job: Job, stem: str) -> Callable[[], ReceivedFile]:
+def _download(job: Job, frame: Exposed) -> Callable[[], ReceivedFile]:
     """Let the camera write the frame exposed last into `frames/`, under a hidden name; return what completes it."""
-    incoming = job.session.incoming(stem)
+    incoming = job.session.incoming(frame.stem)
     try:
-        captured = job.devices.camera.download(incoming.stream)
+        with job.watch.step(_CAMERA, f"sends {step_name(frame.step)} to the disk", DOWNLOAD_S, "download"):
+            captured = job.devices.camera.download(incoming.stream)
         size = incoming.stream.seek(0, 2)
         if size != captured.size or size == 0:
             # Found here and not when the file is completed: the body may hold the frame still.
@@ -451,7 +477,7 @@ class Verdicts:
         if self.is_spent:
             raise QualityError(
                 f"refused and voided frames of this run take {self._unused_bytes / 1e9:.3g} GB of the disk, "
-                f"{self._budget_bytes / 1e9:g} allowed (sequence.refused_gb); acquire status names the causes: remove "
+                f"{self._budget_bytes / 1e9:g} allowed (sequence.refused_gb); acquire status names the causes: mend "
                 "them, then run the same command again; it has the same budget anew"
             )
 
@@ -627,7 +653,7 @@ class LastingCause:
         job = self._job
         attempts = job.on_disk(job.session.journal.attempts)
         if any(attempt.kind == "light" and attempt.verdict == ACCEPTED for attempt in attempts):
-            numbers = job.on_disk(lambda: link_runs(job.session))
+            numbers = job.on_disk(lambda: link_runs(job.session, job.devices.clock.now()))
             job.queue.begin_with(step for step in job.session.steps if step.number in numbers)
             self._to_show.update(numbers)
         self.last_before = attempts[-1].id

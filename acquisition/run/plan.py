@@ -32,6 +32,7 @@ from experiment.config import LabSettings, parse_lab
 from experiment.lights import Illumination, load_illuminations
 from experiment.session.folder import Session, session_exists
 from experiment.session.records import KINDS, RESPONSE, SessionStep, duration_text, plan_steps
+from experiment.session.repair import require_frames_folder
 from foundation.errors import (
     ConfigurationError,
     CropError,
@@ -614,6 +615,8 @@ def dry_run(settings: LabSettings, folder: Path, retake: str | None = None) -> R
     """Return the plan of the run that `settings` and `folder` would begin; devices that cannot be opened are faults."""
     with ExitStack() as opened:
         session = opened.enter_context(Session.open(folder)) if session_exists(folder) else None
+        if session is not None:
+            require_frames_folder(folder)
         work = outline(settings, folder, session, retake)
         try:
             devices = opened.enter_context(open_rig(settings, work.chart, session))

@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Sequence
+from datetime import datetime
 
 from experiment.session.folder import Session
 from experiment.session.records import ACCEPTED, REFERENCES, Attempt, FrameKind, SessionStep, link_steps
@@ -218,21 +219,26 @@ def step_name(step: SessionStep) -> str:
     return f"light {step.illumination}" if step.illumination is not None else f"{step.kind} frame {step.number}"
 
 
-def link_runs(session: Session) -> tuple[int, ...]:
-    """Put the frames that link this run to those before into the plan; return the numbers of their steps.
+def link_runs(session: Session, at: datetime) -> tuple[int, ...]:
+    """Put the frames that link this run to those before into the plan, `at` a moment; return their steps' numbers.
 
     They are some by which the projector is known, so that a chart, a camera or a lamp that changed between the runs is
     seen before the first light is taken.
 
-    A set that an earlier run left unfinished is taken again: the chart may have been moved since. Nothing is added
-    where nothing was taken yet, or the session does not know its projector by frames of its primaries.
+    A set that an earlier run left unfinished is voided and taken again: the chart may have been moved since. Nothing is
+    added where nothing was taken yet, or the session does not know its projector by frames of its primaries.
     """
     taken = [attempt for attempt in session.journal.attempts() if attempt.verdict == ACCEPTED]
     if not taken or all(step.kind != "response" for step in session.steps):
         return ()
     links = link_steps(session.steps[-1].number + 1)
     unfinished = _unfinished(session.steps[-len(links) :], links, taken)
-    return tuple(step.number for step in unfinished) if unfinished else _added(session, links)
+    if not unfinished:
+        return _added(session, links)
+    numbers = tuple(step.number for step in unfinished)
+    again = [attempt.id for attempt in taken if attempt.step in numbers]
+    session.journal.void(again, at, "the frames that link runs are taken again, all of them")
+    return numbers
 
 
 def white_first(session: Session) -> tuple[int, ...]:

@@ -39,6 +39,7 @@ import re
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext, suppress
 from dataclasses import dataclass
+from datetime import datetime
 from typing import Final, Protocol, TypeVar
 
 from experiment.session.journal_file import HeldJournalError, LostJournalError
@@ -66,7 +67,9 @@ LONGEST_BACK_OFF_S: Final = 300.0
 """Between two such tries at most: an operator can wait for five minutes."""
 FRAMES: Final = "the frames"
 """What is waited for where nothing fails but every frame is refused."""
-_INSTANT_S: Final = 1e-6
+TOLD_LATER: Final = " (this was at "
+"""What stands behind a sentence that the disk could not take when it was said."""
+INSTANT_S: Final = 1e-6
 """Resolution of simulated time: nothing shorter can be waited for."""
 
 _Result = TypeVar("_Result")
@@ -117,7 +120,7 @@ class RetryPolicy:
         self.limit_s = limit_s
         self.breakable = breakable
         self._tell, self._idle, self._on_wait = report, idle, on_wait
-        self._untold: list[tuple[str, str]] = []
+        self._untold: list[tuple[str, str, datetime]] = []
         self._histories: dict[str, _History] = {}
 
     def accepted(self) -> None:
@@ -154,16 +157,18 @@ class RetryPolicy:
 
     def report(self, what: str, sentence: str) -> None:
         """Tell what happens; where the disk cannot take it, it is told again as soon as something else can be."""
-        self._untold.append((what, sentence))
+        self._untold.append((what, sentence, self.clock.now()))
         with suppress(StorageError):
             while self._untold:
-                self._tell(*self._untold[0])
+                what, sentence, at = self._untold[0]
+                late = (self.clock.now() - at).total_seconds() > RETRY_S
+                self._tell(what, f"{sentence}{TOLD_LATER}{at.astimezone():%H:%M:%S})" if late else sentence)
                 self._untold.pop(0)
 
     def wait(self, seconds: float, state: str, sentence: Callable[[], str], *, idle: bool = True) -> None:
         """Let `seconds` pass; what `sentence` returns is told every few of them."""
         until = self.clock.monotonic() + seconds
-        while (left := until - self.clock.monotonic()) >= _INSTANT_S:
+        while (left := until - self.clock.monotonic()) >= INSTANT_S:
             self.sign_of_life(state, sentence(), 2 * PAUSE_S + TRY_S * idle)
             self.clock.sleep(min(left, PAUSE_S))
             if idle:
@@ -221,7 +226,7 @@ class Pause:
         if not again:
             self._first, self._failed_at = fault, now
         left = self._left_s()
-        if left < _INSTANT_S:
+        if left < INSTANT_S:
             raise self._ended(first, fault) from fault
         if not again and now - self._begun_trying < SLOW_S:
             policy.report("retry", _named(self._name, fault))
@@ -276,7 +281,7 @@ class Pause:
 def pause_cause(sentence: str) -> str:
     """Return what a pause is for, of the sentence that tells it: the same at each of its times, and for all frames."""
     name, *_ = sentence.partition(": ")
-    return name if name == FRAMES else _kind(sentence.rpartition(" (")[0])
+    return name if name == FRAMES else _kind(sentence.partition(TOLD_LATER)[0].rpartition(" (")[0])
 
 
 def _named(name: str, fault: CropError) -> str:

@@ -19,7 +19,6 @@ from acquisition.judge.judge import LiveJudge
 from acquisition.judge.measure import ExposureJudge
 from acquisition.monitor.feed import write_session_report
 from acquisition.run.devices import Devices, RunEnd, leave_lab, make_ready
-from acquisition.run.gaps import GapWatch
 from acquisition.run.life import Life
 from acquisition.run.notices import Notices, PauseNotices
 from acquisition.run.pipeline import Job, Pipeline, Saver, Taken
@@ -27,19 +26,24 @@ from acquisition.run.plan import nothing_to_retake, planned_steps, require_plan,
 from acquisition.run.queue import StepQueue, link_runs, unclosed_kinds, white_first
 from acquisition.run.retry import TRY_S, RetryPolicy
 from acquisition.run.rig.opening import open_rig
+from acquisition.run.watch import RunWatch
 from drivers.camera import keep_awake
 from drivers.presenter import BLACK, WHITE
 from experiment.chart.model import load_chart
 from experiment.config import LabSettings
 from experiment.lights import load_illuminations
 from experiment.session.folder import Session, busy_sentence, session_exists
-from experiment.session.heartbeat import RunState, signs_of_life
+from experiment.session.heartbeat import RunState, SessionPlace, signs_of_life
+from experiment.session.journal import beat_beside
 from experiment.session.records import ACCEPTED, VOIDED, FrameJudge, FrameKind, SessionStep, duration_text
 from experiment.session.repair import secrets_warning
 from foundation.clock import Clock, SteadyClock
 from foundation.console import Ending
 from foundation.errors import CropError, DeviceRefused, InputError, StorageError, first_of
 from foundation.version import software
+
+CONFIGURE_S = 10.0
+"""How long a camera is expected to take for its settings: a dozen messages, each with an answer that is waited for."""
 
 
 def run_session(
@@ -81,7 +85,9 @@ def run_session(
         require_same_devices(session, devices, settings)
         if note := clock_note(session, devices.clock):
             announce(note)
-        first = link_runs(session) or white_first(session)
+        if note := killed_note(session):
+            session.journal.note(devices.clock.now(), "killed", note)
+        first = link_runs(session, devices.clock.now()) or white_first(session)
         total = len(session.steps)
         observe(len(session.done_steps()), total)
         # When the screen is dark and the journal at rest.
@@ -187,6 +193,15 @@ def clock_note(session: Session, clock: Clock) -> str:
     )
 
 
+def killed_note(session: Session) -> str:
+    """Return what the journal is to say of the run before, if that did not end in order; else nothing."""
+    beat = session.journal.heartbeat()
+    if beat is None or beat.state == "ended" or beat.is_of(SessionPlace.of(session.journal.path)) is False:
+        return ""
+    at = f"{beat.at.astimezone():%Y-%m-%d %H:%M:%S}"
+    return f"the run before gave its last sign of life at {at}, and was killed, or power was lost"
+
+
 @dataclass(frozen=True)
 class RunOutcome:
     """Why a run ended.
@@ -243,8 +258,8 @@ def take_session(
     try:
         for stray in session.set_aside_strays():
             reports.tell("stray", f"{stray.name}: complete, but not in the journal; kept, not used")
-        with GapWatch() as gaps:
-            job = Job(session, devices, settings, _open_steps(session, settings, first), retry, gaps)
+        with RunWatch(reports.late) as watch:
+            job = Job(session, devices, settings, _open_steps(session, settings, first), retry, watch)
             if len(job.queue):
                 _take_open(job, judge or ExposureJudge(settings), count, asked)
         session.journal.require_whole()
@@ -294,7 +309,8 @@ def _take_open(job: Job, judge: FrameJudge, observe: Callable[[Taken], object], 
     """Make the devices ready, and take what is open."""
     devices, settings, journal = job.devices, job.settings, job.session.journal
     journal.note(devices.clock.now(), "start", f"{len(job.queue)} of {len(job.session.steps)} frames to take")
-    devices.camera.configure(settings.camera.exposure)
+    with job.watch.step("the camera", "takes its settings", CONFIGURE_S, "configure"):
+        devices.camera.configure(settings.camera.exposure)
     for step, _, measurement, accepted in journal.measurements():
         judge.recall(step, measurement, accepted)
     if devices.projector is not None:
@@ -341,6 +357,10 @@ class _Reports:
         self._state(sentence)
         self._life.sign(f"{doing}: {sentence}")
         self._journal.beat(doing, sentence, datetime.now(UTC) + timedelta(seconds=within_s))
+
+    def late(self, sentence: str, begun: datetime) -> None:
+        """Say, from another thread, that a step takes longer than it should: the run's own thread waits for it."""
+        beat_beside(self._journal.path, "late", sentence, begun + timedelta(seconds=TRY_S))
 
     def end(self, how: str, sentence: str) -> None:
         """Note why the run is over; a disk that cannot take that is told of already."""

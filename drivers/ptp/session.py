@@ -55,6 +55,13 @@ class OperationDeclined(DeviceRefused):
         self.code = code
 
 
+_REMEDIES: dict[int, str] = {
+    ResponseCode.STORE_FULL: "; its card is full: empty it, or put another in",
+    ResponseCode.STORE_READ_ONLY: "; its card is read-only: unlock it",
+    ResponseCode.EOS_LOW_BATTERY: "; its battery is empty: change it, or connect a mains adapter",
+}
+
+
 class PtpSession:
     """The initiator's side of a session."""
 
@@ -139,7 +146,7 @@ class PtpSession:
             yield True
 
     def _declined(self, request: PtpRequest, code: int) -> OperationDeclined:
-        remedy = "; wait until it is idle, then try again" if code in PASSING else ""
+        remedy = "; wait until it is idle, then try again" if code in PASSING else _REMEDIES.get(code, "")
         return OperationDeclined(f"{self.label} answers {describe(ResponseCode, code)} to {request}{remedy}", code)
 
 

@@ -29,8 +29,16 @@ from drivers.camera import CapturedFrame
 from drivers.presenter import Colour
 from experiment.chart.model import Chart, load_chart
 from experiment.lights import Illumination, load_illuminations, save_illuminations
-from experiment.session.journal import JOURNAL_FILE, PATIENCE_S, Journal, time_text
-from experiment.session.journal_file import MOST_BYTES, restoring
+from experiment.session.journal import (
+    JOURNAL_FILE,
+    PATIENCE_S,
+    Journal,
+    lost_files,
+    open_journal,
+    time_text,
+    without_journal,
+)
+from experiment.session.journal_file import MOST_BYTES
 from experiment.session.ledger import ledger_path, read_ledger
 from experiment.session.records import AcceptedFile, FrameRecord, Judgement, SessionStep
 from experiment.session.repair import (
@@ -145,7 +153,8 @@ class Session:
     @classmethod
     def open(cls, folder: Path) -> Session:
         """Open a session folder to read it, also while it is being taken; nothing in it is created or changed."""
-        journal = Journal.open(journal_path(folder))
+        journal_path(folder)
+        journal = open_journal(folder)
         try:
             return cls(folder, journal)
         except BaseException:
@@ -292,9 +301,8 @@ class Session:
 
     def done_steps(self) -> set[int]:
         """Return the numbers of the steps whose frame was taken, accepted, and is still there in full size."""
-        return {
-            frame.step for frame in self.journal.accepted_files() if _has_size(self.folder / frame.file, frame.size)
-        }
+        accepted = self.journal.accepted_files()
+        return {frame.step for frame in accepted} - {frame.step for frame in lost_files(self.folder, accepted)}
 
     def frames(self) -> list[FrameRecord]:
         """Return every frame that was taken and judged, in the order of the plan, refused ones included."""
@@ -303,8 +311,7 @@ class Session:
     def lost_files(self) -> list[AcceptedFile]:
         """Return the frames that count, one a step, whose files are not there in full size any more."""
         require_frames_folder(self.folder)
-        newest = {frame.step: frame for frame in self.journal.accepted_files()}
-        return [frame for frame in newest.values() if not _has_size(self.folder / frame.file, frame.size)]
+        return lost_files(self.folder, self.journal.accepted_files())
 
     def write_frames_csv(self) -> None:
         """Derive `frames.csv` anew from the journal."""
@@ -416,7 +423,7 @@ def session_exists(folder: Path) -> bool:
     if _is_file(folder / JOURNAL_FILE) or _is_file(ledger_path(folder)):
         return True
     if _is_file(folder / "session.toml") and (folder / "frames").is_dir():
-        raise FormatError(_without_journal(folder))
+        raise FormatError(without_journal(folder))
     _require_mounted(folder)
     require_free(folder, "the session")
     return False
@@ -432,7 +439,7 @@ def journal_path(folder: Path) -> Path:
     path = folder / JOURNAL_FILE
     if not _is_file(path):
         if _is_file(ledger_path(folder)) or (_is_file(folder / "session.toml") and (folder / "frames").is_dir()):
-            raise FormatError(_without_journal(folder))
+            raise FormatError(without_journal(folder))
         _require_mounted(folder)
         raise FormatError(
             f"{folder} is no session: it holds no {JOURNAL_FILE}; name a folder made by acquire run or import"
@@ -453,11 +460,6 @@ def _require_mounted(folder: Path) -> None:
             f"mounted; see that the disk of the session is mounted, or name another folder; keep what is there until "
             "it is known what it is",
         )
-
-
-def _without_journal(folder: Path) -> str:
-    path = folder / JOURNAL_FILE
-    return f"{folder} holds the frames of a session, and its journal {path.name} is gone; {restoring(path)}"
 
 
 def rebuild_journal(folder: Path) -> int:
@@ -487,10 +489,3 @@ def _is_file(path: Path) -> bool:
 
 def _codes(colour: Colour) -> str:
     return f"{colour.red} {colour.green} {colour.blue}"
-
-
-def _has_size(path: Path, size: int) -> bool:
-    try:
-        return path.stat().st_size == size
-    except OSError:
-        return False

@@ -29,8 +29,9 @@ from typing import Literal
 from experiment.session.journal_file import file_system_of
 from foundation.errors import CropError
 
-RunState = Literal["running", "waiting", "paused", "ended"]
-"""What a run does: takes frames, waits for something that comes by itself, waits for somebody, or is over."""
+RunState = Literal["running", "late", "waiting", "paused", "ended"]
+"""What a run does: takes frames, hangs at a step, waits for something that comes by itself, waits for somebody, or
+is over."""
 
 LATE_S = 30.0
 """Seconds after which a sign of life that is due is missing: chosen; clocks of two machines that keep their time over
@@ -70,6 +71,10 @@ class Process:
         if not self.boot or (self.host, self.boot) != (socket.gethostname(), _boot()):
             return None
         return self.started != "" and _start_of(self.pid) == self.started
+
+    def is_stopped(self) -> bool:
+        """Return whether the process is there and was stopped by a signal; False where that cannot be told."""
+        return bool(self.is_alive()) and _fields_of(self.pid)[:1] in (["T"], ["t"])
 
 
 INVENTED_NUMBERS = ("fuse", "cifs", "smb3", "smbfs", "virtiofs")
@@ -260,12 +265,21 @@ def _boot() -> str:
 
 def _start_of(pid: int) -> str | None:
     """Return when a process began, in ticks since boot where /proc has it; None if there is none, or its remains."""
-    try:
-        # proc(5): the name stands in brackets and may hold any character; state is the third field, start the 22nd.
-        fields = Path(f"/proc/{pid}/stat").read_text(errors="replace").rpartition(")")[2].split()
-        return None if fields[0] in "ZX" else fields[19]
-    except (OSError, IndexError):
+    fields = _fields_of(pid)
+    if len(fields) < 20:
         return None if Path("/proc/self/stat").exists() else _listed_start(pid)
+    return None if fields[0] in "ZX" else fields[19]
+
+
+def _fields_of(pid: int) -> list[str]:
+    """Return what /proc says of a process behind its name, state first, start the twentieth; nothing where it does not.
+
+    proc(5): the name stands in brackets and may hold any character; state is the third field, start the 22nd.
+    """
+    try:
+        return Path(f"/proc/{pid}/stat").read_text(errors="replace").rpartition(")")[2].split()
+    except OSError:
+        return []
 
 
 def _listed_start(pid: int) -> str | None:

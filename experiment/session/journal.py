@@ -30,14 +30,27 @@ from experiment.session.journal_file import (
     LockRetry,
     LostJournalError,
     close_after_run,
+    connect_to_write,
     create_file,
     open_for_run,
     open_to_read,
     reading_error,
+    restoring,
     set_aside,
     writing_error,
 )
-from experiment.session.ledger import PLACE, Ledger, Row, Rows, insert_rows, rows_of
+from experiment.session.ledger import (
+    PLACE,
+    Frames,
+    Ledger,
+    Row,
+    Rows,
+    insert_rows,
+    ledger_path,
+    require_none_lacking,
+    rows_of,
+    settled_frames,
+)
 from experiment.session.records import (
     ACCEPTED,
     FAILED,
@@ -77,7 +90,7 @@ class Journal:
     def __init__(
         self, path: Path, connection: sqlite3.Connection, version: int, retry: LockRetry | None = None
     ) -> None:
-        self._path = path
+        self.path = path
         self._connection = connection
         self._version = version
         self._writes = retry is not None
@@ -126,9 +139,9 @@ class Journal:
         try:
             rows = self._retry.run(lambda: rows_of(self._connection))
         except sqlite3.DatabaseError as error:
-            raise reading_error(self._path, error) from error
+            raise reading_error(self.path, error) from error
         self._ledger = Ledger(ledger, rows)
-        self._guard = JournalGuard(self._path, self._ledger)
+        self._guard = JournalGuard(self.path, self._ledger)
 
     def require_whole(self) -> None:
         """Raise where the journal on the disk is not the one that is open, or does not hold what was written."""
@@ -147,7 +160,7 @@ class Journal:
 
     def retry_locked(self, patience_s: float, announce: Callable[[str], object]) -> None:
         """Change how long a write waits for other programs, and who is told that it does; see `open_for_run`."""
-        self._retry = LockRetry(self._path, patience_s, announce)
+        self._retry = LockRetry(self.path, patience_s, announce)
 
     @contextmanager
     def one_moment(self) -> Generator[None]:
@@ -229,14 +242,8 @@ class Journal:
 
     def beat(self, state: RunState, sentence: str, until: datetime) -> None:
         """Give a sign of life, in place of the one before."""
-        own, at, place = Process.own(), datetime.now(UTC), SessionPlace.of(self._path)
         with self._writing():
-            if place is not None:
-                self._connection.execute("INSERT OR REPLACE INTO records VALUES (?, ?)", (PLACE, place.to_text()))
-            self._connection.execute(
-                "INSERT OR REPLACE INTO heartbeat VALUES (1, ?, ?, ?, ?, ?, ?, ?, ?)",
-                (time_text(at), own.pid, own.started, own.host, own.boot, state, sentence, time_text(until)),
-            )
+            _put_beat(self._connection, self.path, state, sentence, until)
 
     def record(self, key: str, text: str) -> None:
         """Note what a session is taken with, such as a device's identity, in place of what stood under `key`."""
@@ -324,6 +331,10 @@ class Journal:
         )
         return [AcceptedFile(*row) for row in rows]
 
+    def lacking(self, frames: Frames) -> Frames:
+        """Return the frames among these that are not here, or have another verdict."""
+        return frames - {*self._rows("SELECT id, sha256, verdict FROM attempts WHERE sha256 IS NOT NULL")}
+
     def unused_bytes(self, after: int) -> int:
         """Return how many bytes the raw files of refused and voided attempts with numbers above `after` take."""
         query = "SELECT COALESCE(SUM(size), 0) FROM attempts WHERE id > ? AND verdict IN (?, ?)"
@@ -356,7 +367,7 @@ class Journal:
     def _kind(self, kind: str) -> FrameKind:
         if kind not in KINDS:
             raise FormatError(
-                f"{self._path} holds a frame of the kind {kind!r}, this software knows {', '.join(KINDS)}; use the "
+                f"{self.path} holds a frame of the kind {kind!r}, this software knows {', '.join(KINDS)}; use the "
                 "software that took the session"
             )
         return kind
@@ -370,7 +381,7 @@ class Journal:
         try:
             return self._retry.run(lambda: self._connection.execute(query, values).fetchall())
         except sqlite3.DatabaseError as error:
-            raise reading_error(self._path, error) from error
+            raise reading_error(self.path, error) from error
 
     @contextmanager
     def _writing(self) -> Generator[_Change]:
@@ -396,7 +407,7 @@ class Journal:
                 self._ledger.keep()
             raise
         except sqlite3.DatabaseError as error:
-            raise writing_error(self._path, error) from error
+            raise writing_error(self.path, error) from error
         finally:
             with suppress(sqlite3.Error):
                 if self._connection.in_transaction:
@@ -407,6 +418,56 @@ class Journal:
             # Of the file that is open: that on the disk may be gone as well.
             ledger.restore(rows_of(self._connection))
         ledger.append(rows)
+
+
+def open_journal(folder: Path) -> Journal:
+    """Open a session's journal to read it; refuse one that lacks what the ledger has, an older one for instance."""
+    # A run writes the ledger first: read in this order, the journal is behind by one transaction at most.
+    settled = settled_frames(ledger_path(folder))
+    journal = Journal.open(folder / JOURNAL_FILE)
+    try:
+        require_none_lacking(ledger_path(folder), journal.lacking(settled))
+    except BaseException:
+        journal.close()
+        raise
+    return journal
+
+
+def lost_files(folder: Path, accepted: Sequence[AcceptedFile]) -> list[AcceptedFile]:
+    """Return, of the accepted frames that count, one a step, those whose files are not there in full size."""
+    newest = {frame.step: frame for frame in accepted}
+    return [frame for frame in newest.values() if not _has_size(folder / frame.file, frame.size)]
+
+
+def _has_size(path: Path, size: int) -> bool:
+    try:
+        return path.stat().st_size == size
+    except OSError:
+        return False
+
+
+def without_journal(folder: Path) -> str:
+    """Return what is said, and what helps, where a session's journal is gone."""
+    path = folder / JOURNAL_FILE
+    return f"{folder} holds the frames of a session, and its journal {path.name} is gone; {restoring(path)}"
+
+
+def beat_beside(path: Path, state: RunState, sentence: str, until: datetime) -> None:
+    """Give a sign of life from another thread than the one that has the journal open; none where that fails."""
+    with suppress(sqlite3.Error), closing(connect_to_write(path)) as connection:
+        connection.execute("BEGIN IMMEDIATE")
+        _put_beat(connection, path, state, sentence, until)
+        connection.execute("COMMIT")
+
+
+def _put_beat(connection: sqlite3.Connection, path: Path, state: RunState, sentence: str, until: datetime) -> None:
+    own, at, place = Process.own(), datetime.now(UTC), SessionPlace.of(path)
+    if place is not None:
+        connection.execute("INSERT OR REPLACE INTO records VALUES (?, ?)", (PLACE, place.to_text()))
+    connection.execute(
+        "INSERT OR REPLACE INTO heartbeat VALUES (1, ?, ?, ?, ?, ?, ?, ?, ?)",
+        (time_text(at), own.pid, own.started, own.host, own.boot, state, sentence, time_text(until)),
+    )
 
 
 class _Change:

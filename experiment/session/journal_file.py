@@ -178,6 +178,11 @@ def connect_to_read(path: Path) -> sqlite3.Connection:
     return _connect(path, "ro")
 
 
+def connect_to_write(path: Path) -> sqlite3.Connection:
+    """Return one more connection to a journal that this program has open, for another thread."""
+    return _connect(path, "rw")
+
+
 def open_to_read(path: Path) -> tuple[sqlite3.Connection, int]:
     """Return a connection that cannot write, and the journal's version."""
     require_plain_folder(path.parent, MOST_BYTES)
@@ -389,6 +394,8 @@ def _checked(path: Path, connection: sqlite3.Connection) -> int:
         _require_plain_schema(path, connection)
         version = connection.execute("PRAGMA user_version").fetchone()[0]
         tables = {name for (name,) in connection.execute("SELECT name FROM sqlite_master WHERE type = 'table'")}
+        if not version and not tables:
+            raise FormatError(f"{path} is damaged: it is empty; {restoring(path)}")
         if version not in READABLE:
             raise FormatError(
                 f"{path} is of version {version}, this software reads {READABLE[0]} and {READABLE[-1]}; "
@@ -412,7 +419,8 @@ def reading_error(path: Path, error: OSError | sqlite3.DatabaseError) -> FormatE
     the disk is tried, and the file checked again.
     """
     if isinstance(error, OSError):
-        return file_reading_error(path, error, "check its permissions")
+        gone = isinstance(error, FileNotFoundError)
+        return file_reading_error(path, error, restoring(path) if gone else "check its permissions")
     if is_busy(error):
         return FormatError(f"cannot read {path}: {error}; see that no other program holds it")
     code = _primary_code(error)

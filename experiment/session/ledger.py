@@ -14,18 +14,22 @@ from __future__ import annotations
 import base64
 import json
 import os
+import shlex
 import sqlite3
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, Final, cast
 
-from foundation.errors import FormatError
+from foundation.errors import FormatError, StorageError, counted
 from foundation.files import reading_error, storage_error, write_whole
 from foundation.folders import is_inside_name
 
 LEDGER_FILE: Final = "ledger.jsonl"
 """Its name in a session's folder."""
+
+MOST_BYTES: Final = 1 << 30
+"""Of a ledger that is read: twenty times what 707 lights have, so that a stranger's fills no memory."""
 
 PLACE: Final = "place"
 """Key of the record that says for which folder signs of life are given."""
@@ -79,13 +83,16 @@ def read_ledger(path: Path) -> Rows:
     return _gathered(_read(path))
 
 
-def _read(path: Path) -> list[Mapping[str, Sequence[Row]]]:
-    """Return the transactions of a ledger."""
+def _read(path: Path, size: int = MOST_BYTES + 1) -> list[Mapping[str, Sequence[Row]]]:
+    """Return the transactions in the first `size` bytes of a ledger."""
     try:
-        lines = path.read_bytes().split(b"\n")
+        with path.open("rb") as stream:
+            content = stream.read(size)
     except OSError as error:
         raise reading_error(path, error, "restore the session from a copy") from error
-    return list(_transactions(path, lines))
+    if len(content) > MOST_BYTES:
+        raise FormatError(f"{path} has more than {MOST_BYTES} bytes; restore it from a copy")
+    return list(_transactions(path, content.split(b"\n")))
 
 
 def _gathered(transactions: Sequence[Mapping[str, Sequence[Row]]]) -> Rows:
@@ -113,6 +120,8 @@ def _checked_row(table: str, row: Row) -> Row:
     """Return a row as the journal has it; the names in it become part of statements."""
     if any(key not in row for key in _KEYS[table]) or not all(name.isidentifier() for name in row):
         raise ValueError(f"a row of {table} without its key")
+    if not all(value is None or isinstance(value, str | int | float) for value in row.values()):
+        raise ValueError(f"a row of {table} with what is no number and no text")
     if not is_inside_name(row.get("file", "frames")):
         raise ValueError(f"the file {row['file']!r}, which is none of the session")
     return row if "data" not in row else {**row, "data": base64.b64decode(row["data"], validate=True)}
@@ -206,8 +215,8 @@ class Ledger:
         self._next = self._end
 
     def rows(self) -> Rows:
-        """Return the facts in the file."""
-        return read_ledger(self._path)
+        """Return the facts in the file, without a transaction that the journal does not have yet."""
+        return _gathered(_read(self._path, self._end))
 
     def _is_of(self, rows: Rows) -> bool:
         """Return whether the file holds these facts; refuse where it knows of frames that are not among them."""
@@ -217,12 +226,7 @@ class Ledger:
             return False
         if _gathered(transactions) == rows:
             return True
-        if lacking := len(_frames(_gathered(transactions[:-1])) - _frames(rows)):
-            raise FormatError(
-                f"the journal of {self._path.parent} lacks {lacking} frames that {self._path} has: it is an older "
-                "one, or was damaged",
-                remedy=f"acquire rebuild {self._path.parent} makes it anew",
-            )
+        require_none_lacking(self._path, _frames(_gathered(transactions[:-1])) - _frames(rows))
         return False
 
     def _write_anew(self, rows: Rows) -> None:
@@ -237,6 +241,32 @@ class Ledger:
             raise storage_error(self._path, error) from error
 
 
-def _frames(rows: Rows) -> set[tuple[int, str]]:
-    """Return the frames among facts, by attempt and hash."""
-    return {(row["id"], row["sha256"]) for row in rows.get("attempts", {}).values() if row.get("sha256")}
+Frames = set[tuple[int, str, str | None]]
+"""Frames by attempt and hash, with their verdicts."""
+
+
+def settled_frames(path: Path) -> Frames:
+    """Return the frames that a journal must hold that is opened after this: all but those of the last transaction.
+
+    None where there is no ledger, or a damaged one, which says nothing against a journal that is whole.
+    """
+    with suppress(FormatError, StorageError):
+        if os.path.isfile(path):  # noqa: PTH113 - it never raises
+            return _frames(_gathered(_read(path)[:-1]))
+    return set()
+
+
+def require_none_lacking(path: Path, lacking: Frames) -> None:
+    """Refuse a journal that lacks frames of the ledger `path`, or verdicts on them."""
+    if lacking:
+        raise FormatError(
+            f"the journal of {path.parent} lacks {counted(len(lacking), 'frame')} that {path} has, or what was said of "
+            "them: it is an older one, or was damaged",
+            remedy=f"acquire rebuild {shlex.quote(str(path.parent))} makes it anew",
+        )
+
+
+def _frames(rows: Rows) -> Frames:
+    return {
+        (row["id"], row["sha256"], row["verdict"]) for row in rows.get("attempts", {}).values() if row.get("sha256")
+    }

@@ -94,7 +94,7 @@ def _require_readable(folder: Path, unread: Sequence[tuple[AcceptedFile, OSError
         more = f" and {len(lasting) - 1} more" if lasting[1:] else ""
         raise StorageError(
             f"cannot read {folder / frame.file}{more}: {error.strerror}; check the disk, its cable and the "
-            "permissions, or remove the files to have their frames taken again, then run the same command again"
+            "permissions, or move the files elsewhere to have their frames taken again, then run the same command again"
         ) from error
 
 

@@ -72,6 +72,25 @@ def test_a_run_that_hangs_is_no_success(folder: Path, capsys: pytest.CaptureFixt
     assert "then: frames are taken" in said.err
 
 
+@pytest.mark.parametrize(
+    ("sentence", "code"),
+    [
+        ("the camera: no camera on USB", 3),
+        ("the frames: light 3: another light is seen", 4),
+        ("the disk: No space left on device", 5),
+    ],
+)
+def test_a_pause_is_no_success_either(
+    folder: Path, sentence: str, code: int, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with closing(Journal.open_for_run(folder / "journal.sqlite")) as journal:
+        journal.beat("paused", sentence, datetime.now(UTC) + timedelta(minutes=5))
+        assert main(["status", str(folder)]) == code
+    said = capsys.readouterr()
+    assert f"state   paused: {sentence}" in said.out
+    assert sentence in said.err
+
+
 def test_a_killed_run_has_no_time_left(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     subprocess.run([sys.executable, "-c", ENDED, str(folder)], check=True)
     told = say(folder, capsys)

@@ -88,6 +88,9 @@ class MadeUpRun:
             for one in self._checks(step)
         )
         stem = step.stem if tries == 1 else f"{step.stem}_try{tries}"
+        raw = self.folder / "frames" / f"{stem}.cr2"
+        raw.parent.mkdir(exist_ok=True)
+        raw.write_bytes(b"raw")
         self.journal.commit(
             attempt,
             file=f"frames/{stem}.cr2",

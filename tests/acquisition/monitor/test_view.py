@@ -80,6 +80,42 @@ def test_a_run_that_hangs_is_late_and_then_silent(ago: float, state: str) -> Non
         assert stands.eta is None, "no time of arrival rolls on"
 
 
+def test_a_step_that_hangs_is_late_by_what_the_run_says_of_it_and_then_silent() -> None:
+    beat = replace(heartbeat("late", within=300.0), sentence="late since 23:00: the camera exposes light 3")
+    view = SessionView("night", "night", STEPS, (), {}, attempts(3), (), beat, None)
+    stands = head_of(view, NOW, True)
+    assert (stands.state, stands.sentence, stands.cause) == ("late", beat.sentence, "the camera")
+    after = head_of(view, NOW + timedelta(seconds=329), True)
+    assert after.state == "silent"
+    assert "then: late since 23:00: the camera exposes light 3" in after.sentence
+
+
+@pytest.mark.parametrize("state", ["running", "waiting", "paused", "late"])
+def test_a_process_that_was_stopped_is_told_at_once(state: RunState) -> None:
+    view = SessionView("night", "night", STEPS, (), {}, attempts(3), (), heartbeat(state), None)
+    stands = head_of(view, NOW, True, is_stopped=True)
+    assert (stands.state, stands.alive) == ("silent", False)
+    assert f"kill -CONT {HERE.pid}" in stands.sentence
+
+
+@pytest.mark.parametrize(
+    ("state", "sentence", "free_mb", "expected"),
+    [
+        ("running", "frames are taken", 20, ("late", "the disk")),
+        ("running", "frames are taken", 30, ("running", "")),
+        ("paused", "the projector: it is in standby", 20, ("late", "the disk")),
+        ("paused", "the disk: No space left on device", 20, ("paused", "the disk")),
+        ("paused", "the frames: light 3: the disk of the sun is seen", 30, ("paused", "the frames")),
+        ("ended", "interrupted", 20, ("incomplete", "")),
+    ],
+)
+def test_a_full_disk_is_said_as_such(state: RunState, sentence: str, free_mb: float, expected: tuple[str, str]) -> None:
+    beat = replace(heartbeat(state), sentence=sentence)
+    view = SessionView("night", "night", STEPS, (), {}, attempts(3), (), beat, None, frame_bytes=25_000_000)
+    stands = head_of(view, NOW, True, free_bytes=round(free_mb * 1e6))
+    assert (stands.state, stands.cause) == expected
+
+
 def test_a_pause_is_silent_only_after_the_sign_that_it_announced() -> None:
     assert head(attempts(3), heartbeat("paused", ago=339.0, within=310.0)).state == "paused"
     assert head(attempts(3), heartbeat("paused", ago=341.0, within=310.0)).state == "silent"

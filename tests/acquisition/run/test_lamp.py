@@ -295,6 +295,12 @@ def test_the_minutes_of_a_warm_up_are_counted_down() -> None:
     assert max(after - before for before, after in pairwise(times)) <= 2 * PAUSE_S
 
 
+def test_a_warm_up_ends_though_nothing_so_short_can_be_waited_for() -> None:
+    room = Room(Power.STANDBY)
+    make_ready(room.projector, SEQUENCE.model_copy(update={"warm_up_s": 1e-7}), room.retry)
+    assert room.words == ["warming up"]
+
+
 def test_a_lamp_that_goes_out_while_it_warms_up_gets_all_its_minutes_again() -> None:
     room = Room(Power.STANDBY)
     lit_again = 600.0

@@ -7,18 +7,20 @@ import os
 import shutil
 from collections.abc import Callable
 from contextlib import closing
+from datetime import UTC, datetime
 from pathlib import Path
 
 import pytest
 
 from acquisition.cli import main
+from acquisition.monitor.feed import SessionWatch
 from acquisition.monitor.view import read_session
 from acquisition.run.pipeline import Taken
 from acquisition.run.run import RunOutcome, take_session
 from drivers.presenter import Colour
 from experiment.lights import Illumination
 from experiment.session.folder import Session, rebuild_journal, session_exists
-from experiment.session.journal import Journal
+from experiment.session.journal import Journal, beat_beside
 from experiment.session.journal_file import LostJournalError, open_to_read
 from experiment.session.ledger import Rows, ledger_path, read_ledger, rows_of
 from experiment.session.records import ACCEPTED
@@ -234,3 +236,64 @@ def test_a_frame_that_is_deleted_or_cut_is_taken_again(lab: Lab, mishap: Callabl
     assert lab.verdicts().count("voided") == 1
     assert not lab.session.verify()
     assert (folder / "frames" / "0002_light_000_try2.dng").is_file()
+
+
+def test_a_program_that_writes_the_journal_and_leaves_its_facts_alone_ends_no_run(lab: Lab) -> None:
+    folder = lab.session.folder
+
+    def beat(folder: Path) -> None:
+        beat_beside(folder / "journal.sqlite", "late", "the camera hangs", datetime.now(UTC))
+
+    assert run(lab, 5, beat).complete
+    lab.session.close()
+    assert facts(folder) == read_ledger(ledger_path(folder))
+
+
+@pytest.fixture
+def older(lab: Lab) -> Path:
+    """Return a complete session whose journal is one of before its light 1 was taken again."""
+    folder = lab.session.folder
+    run(lab)
+    lab.session.close()
+    journal = (folder / "journal.sqlite").read_bytes()
+    lab.session = Session.open_for_run(folder)
+    lab.session.retake("1")
+    assert run(lab).complete
+    lab.session.close()
+    (folder / "journal.sqlite").write_bytes(journal)
+    return folder
+
+
+@pytest.mark.parametrize("command", [["status"], ["report"], ["run", "LAB.toml"]])
+def test_no_command_believes_a_journal_that_the_ledger_contradicts(
+    older: Path, command: list[str], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It is whole, sound, and says that the session is complete: by a frame that must not be used any more."""
+    (older.parent / "LAB.toml").write_text(SETTINGS.to_toml())
+    monkeypatch.chdir(older.parent)
+    assert main([*command, str(older)]) == 2
+    assert "acquire rebuild" in capsys.readouterr().err
+    with pytest.raises(FormatError, match="lacks 4 frames"):
+        Session.open(older)
+    watch = SessionWatch(older)
+    assert (watch.head().state, "acquire rebuild" in watch.head().sentence) == ("unreadable", True)
+
+
+def test_a_page_without_its_journal_names_what_makes_it_anew(lab: Lab) -> None:
+    watch = SessionWatch(lab.session.folder)
+    assert watch.head().total
+    deleted(lab.session.folder)
+    assert "acquire rebuild" in watch.head().sentence
+
+
+@pytest.mark.parametrize("mishap", [Path.unlink, lambda path: os.truncate(path, 9)])  # type: ignore[misc]
+def test_a_complete_session_whose_files_go_is_complete_no_more(
+    lab: Lab, mishap: Callable[[Path], object], capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = lab.session.folder
+    run(lab)
+    lab.session.close()
+    mishap(folder / "frames" / "0002_light_000.dng")
+    assert main(["status", str(folder)]) == 0
+    assert "incomplete: frames/0002_light_000.dng: gone or cut" in capsys.readouterr().out
+    assert read_session(folder).head(lab.clock.now()).done == len(lab.session.steps) - 1

@@ -12,7 +12,16 @@ from pathlib import Path
 
 import pytest
 
-from acquisition.run.retry import BACK_OFF_S, LONGEST_BACK_OFF_S, PAUSE_S, RECURS_WITHIN, RETRY_S, RetryPolicy
+from acquisition.run.retry import (
+    BACK_OFF_S,
+    LONGEST_BACK_OFF_S,
+    PAUSE_S,
+    RECURS_WITHIN,
+    RETRY_S,
+    TOLD_LATER,
+    RetryPolicy,
+    pause_cause,
+)
 from acquisition.run.rig.opening import open_rig
 from drivers.camera import keep_awake
 from drivers.presenter import WHITE
@@ -258,6 +267,9 @@ def test_a_full_disk_takes_the_notes_of_its_pause_when_there_is_space() -> None:
     retry = RetryPolicy(room.clock, 600, report, on_wait=beat)
     assert retry.attempt(room.broken(full), "the disk") == "done"
     assert room.words == ["retry", "paused", "resumed"]
+    late = [sentence for _, sentence in room.said if TOLD_LATER in sentence]
+    assert len(late) == 2, "that it was retried and paused, two minutes ago"
+    assert pause_cause(late[1]) == "the disk is full"
 
 
 def outlast(room: Room, retry: RetryPolicy, name: str = "the screen") -> None:

@@ -10,7 +10,7 @@ import pytest
 
 from acquisition.run.queue import link_runs
 from acquisition.run.rig.lab import session_clock
-from acquisition.run.run import check_frames, clock_note, require_same_devices, take_session
+from acquisition.run.run import check_frames, clock_note, killed_note, require_same_devices, take_session
 from drivers.camera import CameraIdentity, CapturedFrame
 from drivers.presenter import Colour
 from drivers.projector import ProjectorIdentity
@@ -78,20 +78,20 @@ def test_a_damaged_frame_is_said_and_taken_again(folder: Path) -> None:
 
 def test_nothing_is_tied_to_nothing(folder: Path) -> None:
     lab = lab_with_response(folder)
-    assert link_runs(lab.session) == ()
+    assert link_runs(lab.session, lab.clock.now()) == ()
     assert take_session(lab.session, lab.devices, SETTINGS).complete
 
 
 def test_a_session_that_does_not_know_its_projector_is_not_tied(folder: Path) -> None:
     lab = Lab(folder)
     interrupt_after(lab, 3)
-    assert link_runs(lab.session) == ()
+    assert link_runs(lab.session, lab.clock.now()) == ()
 
 
 def test_a_run_that_is_taken_up_shows_the_ties_first(folder: Path) -> None:
     lab = lab_with_response(folder)
     interrupt_after(lab, 5)
-    first = link_runs(lab.session)
+    first = link_runs(lab.session, lab.clock.now())
     assert first == (8, 9, 10, 11, 12, 13)
     lab.camera.exposed.clear()
     assert take_session(lab.session, lab.devices, SETTINGS, first=first).complete
@@ -102,13 +102,24 @@ def test_a_run_that_is_taken_up_shows_the_ties_first(folder: Path) -> None:
 def test_ties_that_were_interrupted_are_taken_anew(folder: Path) -> None:
     lab = lab_with_response(folder)
     interrupt_after(lab, 5)
-    interrupt_after(lab, 2, link_runs(lab.session))
-    again = link_runs(lab.session)
+    interrupt_after(lab, 2, link_runs(lab.session, lab.clock.now()))
+    again = link_runs(lab.session, lab.clock.now())
     assert again == (8, 9, 10, 11, 12, 13), "no further steps"
+    assert not lab.session.done_steps() & set(again), "no step ever has two frames that count"
     lab.camera.exposed.clear()
     interrupt_after(lab, 7, again)
     assert lab.camera.exposed[:6] == TIES, "those that were taken are taken again: the chart may have moved since"
-    assert link_runs(lab.session) == (14, 15, 16, 17, 18, 19), "behind another light they are new"
+    assert link_runs(lab.session, lab.clock.now()) == (14, 15, 16, 17, 18, 19), "behind another light they are new"
+
+
+def test_the_journal_says_that_the_run_before_was_killed(folder: Path) -> None:
+    journal = Lab(folder).session.journal
+    until = datetime.now(UTC) + timedelta(seconds=60)
+    assert killed_note(Session.open(folder)) == ""
+    journal.beat("running", "frames are taken", until)
+    assert "was killed, or power was lost" in killed_note(Session.open(folder))
+    journal.beat("ended", "interrupted", until)
+    assert killed_note(Session.open(folder)) == ""
 
 
 def test_another_camera_or_projector_is_refused(folder: Path) -> None:

@@ -1,0 +1,32 @@
+"""Runs in which causes come and go, and a night without an operator; `benchmarks.troubled_runs` has all of them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from benchmarks.troubled_runs import CAUSES, Cause, night, outcome_of
+from calibration.cli import main as build_lut
+
+pytestmark = pytest.mark.slow
+
+CHOSEN = ("one frame late, from a frame on", "a camera that hangs for four minutes", "a journal that is overwritten")
+
+
+@pytest.mark.parametrize("cause", [cause for cause in CAUSES if cause.name in CHOSEN], ids=lambda cause: cause.name)
+def test_a_run_ends_or_goes_on_as_the_how_to_says(tmp_path: Path, cause: Cause) -> None:
+    outcome = outcome_of(cause, tmp_path / "lab")
+    assert outcome.as_said, outcome
+
+
+def test_a_night_without_an_operator_becomes_a_table_and_a_story(tmp_path: Path) -> None:
+    """Power dips twice, router, disk, card, battery, and a clock that is set by an hour, between 45 frames."""
+    found = night(tmp_path / "night", grid=3)
+    assert found.untold == ()
+    assert found.doubled == 0
+    assert found.hours > 12
+    assert build_lut([str(tmp_path / "night" / "session"), str(tmp_path / "lut")]) == 0
+    said = (tmp_path / "night" / "session" / "report.html").read_text()
+    assert "battery" in said
+    assert "power was lost" in said
