@@ -41,7 +41,7 @@ from evaluation.methods.method import Learner
 from evaluation.methods.standard import standard_methods
 from evaluation.metrics import ErrorKind
 from evaluation.results.result import Result
-from evaluation.results.tables import Table
+from evaluation.results.tables import PAPER_COLUMNS, STATISTICS_COLUMNS, Table
 from evaluation.scene import Scene
 from foundation.colorimetry import angles_deg
 from foundation.errors import InputError, counted
@@ -118,9 +118,6 @@ SENSORS: Final[Mapping[str, str]] = {"Canon EOS 550D": "550D", "Canon EOS 6D Mar
 
 OWN: Final = ("Given", "Given")
 """Names of pictures and of ground truths of which nothing is said: the paper has no numbers of them."""
-
-NUMBERS: Final = ("Mean", "Med.", "Tri.", "Best 25%", "Worst 25%", "Avg.")
-"""Heads of the six numbers of a summary, as in the paper."""
 
 
 _HEAD: Final = ("scenes", "sensor", "illuminations", "images", "method", "error")
@@ -228,7 +225,7 @@ def block_table(block: Block, kind: ErrorKind) -> Table:
         for result in block.results
         if result.guessed.any()
     ]
-    return Table(block_title(block.cell), ("Algorithm", *NUMBERS), tuple(rows), notes=tuple(notes))
+    return Table(block_title(block.cell), PAPER_COLUMNS, tuple(rows), notes=tuple(notes))
 
 
 def joint_table(blocks: Sequence[Block]) -> Table:
@@ -245,7 +242,7 @@ def joint_table(blocks: Sequence[Block]) -> Table:
             rows += [(*head, name, *numbers) for name, numbers in given.items()]
     return Table(
         "Errors on generated data sets, degrees",
-        (*_HEAD, "mean", "median", "trimean", "best25", "worst25", "avg"),
+        (*_HEAD, *STATISTICS_COLUMNS[:6]),
         tuple(rows),
     )
 
@@ -370,7 +367,7 @@ def hot_table(
             rows.append((block_title(part.cell), share, len(hot.places), *result.summary(kind).as_tuple()))
     return Table(
         f"White-Patch where a table has hot photosites, {kind} error in degrees",
-        ("Data set", "Per million", "In the table", *NUMBERS),
+        ("Data set", "Per million", "In the table", *PAPER_COLUMNS[1:]),
         tuple(rows),
         notes=(
             "A model: dark signals drawn evenly up to saturation, at the same places under every light. The simulated "
@@ -437,7 +434,7 @@ def table2_tables(found: Sequence[Trained], kind: ErrorKind, name: str, with_pub
             known = published.get(LEARNERS.get(trained.learner, ""))
             if known and with_published:
                 rows.append(("paper", *known.as_tuple()))
-        tables.append(Table(title, ("Algorithm", *NUMBERS), tuple(rows)))
+        tables.append(Table(title, PAPER_COLUMNS, tuple(rows)))
     return [*tables, _ratios(found, kind, name)]
 
 
