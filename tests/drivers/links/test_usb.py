@@ -12,7 +12,7 @@ from drivers.links.usb import UDEV_RULE, UsbDevice, list_devices, open_usb
 from drivers.ptp.session import PtpRequest
 from drivers.ptp.usb import UsbTransport
 from foundation.errors import DeviceRefused, InputError, LinkClosed, LinkTimeout
-from sim.buses.usb import BULK_IN, PtpUsbDevice, Setup, SimulatedBus, UsbIdentity
+from sim.buses.usb import BULK_IN, PtpUsbDevice, Setup, SimulatedBus, Stalled, UsbIdentity
 from sim.clock import SimulatedClock
 from tests.contracts.transport import ECHO, PATIENCE_S, Bench, Echo, TransportContract
 
@@ -194,3 +194,13 @@ def test_the_rule_that_messages_name_is_shipped() -> None:
     assert 'ATTR{idVendor}=="04a9"' in lines[0]
     assert 'ENV{ID_USB_INTERFACES}=="*:060101:*"' in lines[0]
     assert 'TAG+="uaccess"' in lines[0]
+
+
+def test_a_host_halts_and_clears_a_pipe() -> None:
+    device = camera()
+    for request, halted in ((3, 1), (1, 0)):
+        device.control(Setup(0x02, request, 0, BULK_IN, 0))
+        assert device.control(Setup(0x82, 0, 0, BULK_IN, 2)) == bytes([halted, 0])
+    # Of the device and its interfaces there is nothing to be halted.
+    with pytest.raises(Stalled):
+        device.control(Setup(0x00, 3, 0, BULK_IN, 0))
