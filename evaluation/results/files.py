@@ -117,10 +117,7 @@ def _estimate(text: str | None) -> float:
 
 
 def _number(text: str | None, name: str, where: str) -> float:
-    try:
-        value = float(text or "")
-    except ValueError:
-        value = math.nan
+    value = _estimate(text)
     if not math.isfinite(value):
         raise FormatError(f"{where}: {name} is {text!r}, expected a finite number")
     return value
@@ -186,7 +183,7 @@ def _degrees(error: float) -> str:
     return f"{error:.6f}" if np.isfinite(error) else ""
 
 
-_COLUMNS = ("image", "r", "g", "b")
+_COLUMNS = ("image", *_ESTIMATE)
 
 
 @dataclass(frozen=True, eq=False)

@@ -133,7 +133,9 @@ def test_a_black_level_is_subtracted_from_planes_as_from_pixels() -> None:
     np.testing.assert_array_equal(subtract_black(np.moveaxis(planes, 0, 2), 30.0), expected)
 
 
-@pytest.mark.parametrize(("text", "why"), [(b"a,b\n\xff,1\n", "invalid start byte"), (b"a,b\n" + b"x" * 200_000, "field larger")])
+@pytest.mark.parametrize(
+    ("text", "why"), [(b"a,b\n\xff,1\n", "invalid start byte"), (b"a,b\n" + b"x" * 200_000, "field larger")]
+)
 def test_a_table_that_is_none_is_named(tmp_path: Path, text: bytes, why: str) -> None:
     (tmp_path / "gt.csv").write_bytes(text)
     with pytest.raises(FormatError, match=f"gt.csv.*{why}"):
