@@ -321,34 +321,22 @@ def hot_photosites(lut: Lut, per_million: float, seed: int = 0) -> HotPhotosites
     return HotPhotosites(places, rng.uniform(0, lut.provenance.white_level, len(places)))
 
 
-@dataclass(frozen=True, eq=False)
-class HotScene:
+@dataclass(frozen=True, eq=False, kw_only=True)
+class HotScene(RenderedScene):
     """A scene as a sensor with hot photosites would give it."""
 
-    scene: RenderedScene
     hot: HotPhotosites
 
-    @property
-    def name(self) -> str:
-        """The image's number."""
-        return self.scene.name
-
-    @property
-    def truth(self) -> npt.NDArray[np.float64]:
-        """The light (3,) float64, linear camera RGB, r + g + b = 1."""
-        return self.scene.truth
-
-    @property
-    def saturation(self) -> float:
-        """White level of the table."""
-        return self.scene.saturation
+    @classmethod
+    def of(cls, scene: RenderedScene, hot: HotPhotosites) -> HotScene:
+        """Return a scene with hot photosites."""
+        return cls(scene.lut, scene.source, scene.light, scene.number, scene.seed, hot=hot)
 
     def read(self) -> tuple[npt.NDArray[np.uint16], None]:
         """Return the image (H, W, 3) uint16, linear camera RGB, and no mask."""
-        scene = self.scene
-        samples = self.hot.raise_in(scene.lut.samples[scene.light], scene.saturation)
-        picture, _ = replace_unfit_colours(scene.source.read().picture, scene.lut.provenance)
-        return draw_samples(samples, picture, seed=scene.seed, image=scene.number), None
+        samples = self.hot.raise_in(self.lut.samples[self.light], self.saturation)
+        picture, _ = replace_unfit_colours(self.source.read().picture, self.lut.provenance)
+        return draw_samples(samples, picture, seed=self.seed, image=self.number), None
 
 
 def hot_table(
@@ -363,7 +351,7 @@ def hot_table(
     for part in chosen:
         for share in shares:
             hot = hot_photosites(part.scenes[0].lut, share, seed)
-            (result,) = evaluate([HotScene(scene, hot) for scene in thinned(part.scenes)], [method], workers)
+            (result,) = evaluate([HotScene.of(scene, hot) for scene in thinned(part.scenes)], [method], workers)
             rows.append((block_title(part.cell), share, len(hot.places), *result.summary(kind).as_tuple()))
     return Table(
         f"White-Patch where a table has hot photosites, {kind} error in degrees",

@@ -65,7 +65,7 @@ def test_without_any_a_scene_is_itself(make_table: TableMaker) -> None:
     (part, *_) = settings([lut], HOT_PICTURES, TRUTHS, side=40)
     none = hot_photosites(lut, 0)
     for scene in part.scenes:
-        np.testing.assert_array_equal(HotScene(scene, none).read()[0], scene.read()[0])
+        np.testing.assert_array_equal(HotScene.of(scene, none).read()[0], scene.read()[0])
     (block,) = table1([part])
     assert hot_table([part], [0], "recovery").rows[0][3:] == block.results[0].summary("recovery").as_tuple()
 
