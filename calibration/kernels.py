@@ -121,7 +121,7 @@ def sample_to_table(
     `values` (N, window², 3) uint16 and `peak` (N,) uint16 are filled; `dark` and `field` are (N, 3) float32, the rest
     as for `sample`.
     """
-    samples = np.empty((window * window, 3), np.float32)
+    samples = np.empty(values.shape[1:], np.float32)
     for patch in order:
         if not inside[patch]:
             values[patch] = 0

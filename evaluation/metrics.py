@@ -101,7 +101,6 @@ DOMINANT: Final = 0.5
 
 _ROWS_OF: Final = 1 << 19
 """Pixels that are worked on at a time: some 100 MB of intermediate results whatever the image's size."""
-"""What replaces 0 in a light that is divided by, over its largest channel; see `reproduction_error`."""
 
 
 @dataclass(frozen=True)

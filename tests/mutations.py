@@ -233,6 +233,7 @@ def killed_by(mutation: Mutation, folder: Path, limit_s: float, left_out: tuple[
         for which, files in stages(mutation):
             code, failed = tested(folder, ["-m", which, *deselected, *files], end_s - time.monotonic())
             if code == "no time":
+                print(f"{mutation.file}:{mutation.line}: time was over before all tests were tried", file=sys.stderr)
                 return ""
             if code not in (0, 5):
                 break

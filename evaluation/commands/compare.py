@@ -62,7 +62,6 @@ def compare(
 ) -> None:
     """Compare methods on the same images."""
     from evaluation.experiments import comparing
-    from evaluation.experiments import comparing as comparison_report
     from evaluation.reports.table_output import show_notes, show_tables
     from evaluation.results.files import read_errors
     from foundation.errors import InputError
@@ -80,24 +79,24 @@ def compare(
     pairs = _of_one(runs[0], results[0], method, error) if len(runs) == 1 else _of_two(runs, results, method, error)
     comparisons = comparing.compare(pairs, seed, level)
     notes = (
-        *comparison_report.notes_of(comparisons),
+        *comparing.notes_of(comparisons),
         *_unchecked(runs, results),
         *_unlike(results),
         *_guessed(runs, results),
         *_indistinct(comparisons, results),
     )
     if out is not None:
-        comparison_report.write_comparisons(out, comparisons, notes, level)
+        comparing.write_comparisons(out, comparisons, notes, level)
     show_notes(told, notes)
     verdicts = [comparing.verdict(made, level) for made in comparisons]
     told.add(results=results, error=error, level=level, verdicts=verdicts)
-    show_tables(told, [comparison_report.tests_table(comparisons)])
+    show_tables(told, [comparing.tests_table(comparisons)])
     for verdict in verdicts:
         print(verdict)
     if images or told.asked or len(comparisons) <= _FEW:
         for made in comparisons:
-            show_tables(told, [comparison_report.statistics_table(made, level)])
-            show_tables(told, [comparison_report.images_table(made, 5)])
+            show_tables(told, [comparing.statistics_table(made, level)])
+            show_tables(told, [comparing.images_table(made, 5)])
     elif out is None:
         print("Statistics and images of each comparison: --images prints them, --out writes them, --method chooses.")
     if out is not None:

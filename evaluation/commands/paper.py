@@ -106,7 +106,7 @@ def table1(
     from evaluation.experiments.paper.material import read_truths
     from evaluation.experiments.paper.published import cell_name
     from evaluation.experiments.paper.reporting import table1_report
-    from evaluation.experiments.paper.table1 import hot_rows, settings, size_dependence
+    from evaluation.experiments.paper.table1 import hot_table, settings, size_dependence
     from evaluation.experiments.paper.table1 import table1 as run
     from foundation.compiled import processor_count
 
@@ -121,7 +121,7 @@ def table1(
     with image_steps(sum(len(part.scenes) for part in chosen)) as step:
         blocks = run(chosen, threads, step)
     found = size_dependence(opened, scenes, truths.lights, sides, seed, threads, names)
-    raised = hot_rows(chosen, shares, seed, threads)
+    raised = hot_table(chosen, shares, error, seed, threads) if shares else None
     conditions = (
         f"Pictures: {says}. Images: longest side {side} px. Lights like those of {truths.name}. Seed {seed}.",
         f"Tables: {'; '.join(map(_says, opened))}.",

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
 
-from evaluation.datasets.files import Folder, Mask, PaintedScene, decode_image, subtract_black
+from evaluation.datasets.files import Folder, PaintedScene, decode_image
 from evaluation.datasets.options import DataOptions, stated
 from evaluation.scene import Image, SceneSet
 from foundation.errors import FormatError, first_of
@@ -28,10 +28,9 @@ _SAMPLE = 100
 class ThumbnailScene(PaintedScene):
     """A linear thumbnail; `white` is None unless the user gives it."""
 
-    def read(self) -> tuple[Image, Mask]:
-        """Return the thumbnail (H, W, 3), linear camera RGB, and (H, W) bool, True where every channel is zero."""
-        image = subtract_black(decode_image(self.path, eight_bits=True), self.black)
-        return image, self.mask(image)
+    def decoded(self) -> Image:
+        """Return the thumbnail (H, W, 3) as the file's numbers are, of 8 bits too."""
+        return decode_image(self.path, eight_bits=True)
 
 
 def is_ffcc(folder: Folder) -> bool:

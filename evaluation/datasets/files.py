@@ -285,8 +285,12 @@ class RawScene:
 
     def read(self) -> tuple[Image, Mask | None]:
         """Return the image (H, W, 3), linear camera RGB with black at 0, and its mask (H, W) bool or None."""
-        image = subtract_black(decode_image(self.path), self.black)
+        image = subtract_black(self.decoded(), self.black)
         return image, self.mask(image)
+
+    def decoded(self) -> Image:
+        """Return the image (H, W, 3) as the file's numbers are."""
+        return decode_image(self.path)
 
     def mask(self, image: Image) -> Mask | None:
         """Return (H, W) bool, True where a pixel of the image (H, W, 3) must not be used, or None if none is masked."""

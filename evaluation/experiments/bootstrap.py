@@ -15,7 +15,7 @@ nothing is sorted again, and statistics are those of `evaluation.metrics.summari
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from statistics import NormalDist
 from typing import Final, Literal
@@ -188,8 +188,6 @@ _COUNT: Final = 2000
 _LEVEL: Final = 0.95
 """Confidence of an interval: the usual one."""
 
-_Rule = Callable[[Floats, Floats], Floats]
-
 
 def intervals(
     errors: npt.ArrayLike, seed: int = 0, count: int = _COUNT, level: float = _LEVEL
@@ -246,14 +244,8 @@ def paired(
             "images in the same order: match them by name first"
         )
     drawn = [(one.statistics(some), other.statistics(some)) for some in resamples(len(one.order), seed, count)]
-    replicates = [np.concatenate(side) for side in zip(*drawn, strict=True)]
-    left_out = [one.without_each(), other.without_each()]
-
-    def spread(rule: _Rule, place: int, estimate: float) -> tuple[float, float]:
-        across = [rule(left_out[0][:, place], left_out[1][:, place])]
-        return bca(estimate, rule(replicates[0][:, place], replicates[1][:, place]), across, level)
-
-    return _compare(one, other, spread)
+    first, second = (np.concatenate(side) for side in zip(*drawn, strict=True))
+    return _compare(one, other, (first, second), [(one.without_each(), other.without_each())], level)
 
 
 def independent(
@@ -274,32 +266,39 @@ def independent(
     one, other = ErrorSample.of(errors_a), ErrorSample.of(errors_b)
     # Two streams of one seed: independent, unlike two generators of equal or neighbouring states.
     seeds = np.random.SeedSequence(seed).spawn(2)
-    replicates = [
+    first, second = (
         np.concatenate([sample.statistics(some) for some in resamples(len(sample.order), stream, count)])
         for sample, stream in zip((one, other), seeds, strict=True)
-    ]
-    left_out = [one.without_each(), other.without_each()]
-    whole = [one.estimate(), other.estimate()]
-
-    def spread(rule: _Rule, place: int, estimate: float) -> tuple[float, float]:
-        across = [
-            rule(left_out[0][:, place], whole[1][place : place + 1]),
-            rule(whole[0][place : place + 1], left_out[1][:, place]),
-        ]
-        return bca(estimate, rule(replicates[0][:, place], replicates[1][:, place]), across, level)
-
-    return _compare(one, other, spread)
+    )
+    left_out = [(one.without_each(), other.estimate()[None]), (one.estimate()[None], other.without_each())]
+    return _compare(one, other, (first, second), left_out, level)
 
 
 def _compare(
-    one: ErrorSample, other: ErrorSample, spread: Callable[[_Rule, int, float], tuple[float, float]]
+    one: ErrorSample,
+    other: ErrorSample,
+    replicates: tuple[Floats, Floats],
+    left_out: Sequence[tuple[Floats, Floats]],
+    level: float,
 ) -> tuple[Compared, ...]:
+    """Return difference and ratio of every statistic.
+
+    `replicates`: (B, 6) float64 of either. `left_out`: for each independent sample the statistics of both without one
+    of its images, (N, 6) float64, or (1, 6) of the one that has them all.
+    """
+
+    def told(rule: Callable[[Floats, Floats], Floats], place: int) -> tuple[float, float, float]:
+        a, b = one.estimate()[place], other.estimate()[place]
+        estimate = float(rule(a, b))
+        drawn = rule(replicates[0][:, place], replicates[1][:, place])
+        across = [rule(first[:, place], second[:, place]) for first, second in left_out]
+        return (estimate, *bca(estimate, drawn, across, level))
+
     compared: list[Compared] = []
     for place, name in enumerate(STATISTICS):
         a, b = float(one.estimate()[place]), float(other.estimate()[place])
-        difference = (a - b, *spread(np.subtract, place, a - b))
-        ratio = (a / b, *spread(_divide, place, a / b)) if b else (np.nan, np.nan, np.nan)
-        compared.append(Compared(name, a, b, difference, ratio))
+        ratio = told(_divide, place) if b else (np.nan, np.nan, np.nan)
+        compared.append(Compared(name, a, b, told(np.subtract, place), ratio))
     return tuple(compared)
 
 

@@ -24,13 +24,13 @@ from evaluation.learning.feature_learner import (
     require_installed,
     truths_of,
 )
-from evaluation.methods.green_stability import choose, counted, family_names, lights_of, require_enough
+from evaluation.methods.green_stability import family_names, tune
 from evaluation.methods.method import Learner, Method
 from evaluation.methods.naming import find_method
 from evaluation.methods.prepared import shrink, unit
 from evaluation.metrics import ErrorKind, Summary, recovery_error, reproduction_error, summarise
 from evaluation.results.result import NO_PIXEL, Result, SceneAnswer, read_light, results_of
-from evaluation.results.tables import Cell, Table
+from evaluation.results.tables import PAPER_COLUMNS, STATISTICS_COLUMNS, Cell, Table
 from evaluation.scene import Image, Scene
 from foundation.compiled import ordered_map
 from foundation.errors import InputError
@@ -285,37 +285,23 @@ def tune_family(
     `kind`: which errors to state beside; None reads no ground truth.
     """
     texts, methods = zip(*settings_of(family), strict=True)
-    require_enough(len(methods), len(scenes))
-    found: list[npt.NDArray[np.float64]] = []
-    for one in ordered_map(lambda scene: lights_of(methods, scene), scenes, workers):
-        found.append(one)
-        if on_scene:
-            on_scene()
-    lights = np.stack(found)
-    tuned = choose(methods, lights)
+    tuned = tune(methods, scenes, on_scene, workers)
     errors: list[Summary | None] = [None] * len(methods)
     if kind is not None:
-        which = counted(lights)
-        truths = require_truths(scenes, methods)[which]
+        truths = require_truths(scenes, methods)[tuned.counted]
         measure = recovery_error if kind == "recovery" else reproduction_error
-        errors = [summarise(measure(lights[which, place], truths)) for place in range(len(methods))]
+        errors = [summarise(measure(tuned.lights[:, place], truths)) for place in range(len(methods))]
     settings = [
         FamilySetting(text, method.name, spread, error)
         for text, method, spread, error in zip(texts, methods, tuned.spreads, errors, strict=True)
     ]
-    return Tuning(
-        family,
-        data,
-        tuple(sorted(settings, key=lambda setting: setting.spread)),
-        len(scenes),
-        tuned.images,
-        kind,
-    )
+    ordered = tuple(sorted(settings, key=lambda setting: setting.spread))
+    return Tuning(family, data, ordered, len(scenes), len(tuned.lights), kind)
 
 
 def tuning_table(tuning: Tuning) -> Table:
     """Return the table of settings for people: spreads in thousandths, errors in degrees."""
-    heads = ("Mean", "Med.", "Tri.", "Best 25%", "Worst 25%", "Avg.") if tuning.kind else ()
+    heads = PAPER_COLUMNS[1:] if tuning.kind else ()
     what = f"; {tuning.kind} angular error, degrees" if tuning.kind else ""
     notes: list[str] = []
     if tuning.counted < tuning.images:
@@ -335,7 +321,7 @@ def tuning_table(tuning: Tuning) -> Table:
 
 def tuning_rows(tuning: Tuning) -> Table:
     """Return the table of settings for programs: the chosen one has rank 1; spreads are in chromaticity, 0 … 1."""
-    heads = [f"{tuning.kind}_{name}" for name in ("mean", "median", "trimean", "best25", "worst25", "avg")]
+    heads = [f"{tuning.kind}_{name}" for name in STATISTICS_COLUMNS[:6]]
     return Table(
         tuning.family,
         ("rank", "setting", "method", "green_spread", "images", *(heads if tuning.kind else ())),

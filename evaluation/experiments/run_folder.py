@@ -13,7 +13,8 @@ from __future__ import annotations
 
 import json
 import zlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -82,22 +83,12 @@ def read_journal(path: Path, identity: dict[str, Any]) -> list[tuple[SceneAnswer
     return answers
 
 
-class AnswerJournal:
-    """The file, open to be continued."""
-
-    def __init__(self, stream: BinaryIO, count: int, folder: Path) -> None:
-        self._stream = stream
-        self._count = count
-        self._folder = folder
-
-    def append(self, answers: Sequence[SceneAnswer]) -> None:
-        """Add the answers for the next image."""
-        line = _line({"image": self._count, "answers": to_plain(tuple(answers), _Answers)})
-        try:
-            self._stream.write(line)
-        except OSError as error:
-            raise storage_error(self._folder, error) from error
-        self._count += 1
+def append_answers(stream: BinaryIO, image: int, answers: Sequence[SceneAnswer], folder: Path) -> None:
+    """Add the answers for the next image to the open file."""
+    try:
+        stream.write(_line({"image": image, "answers": to_plain(tuple(answers), _Answers)}))
+    except OSError as error:
+        raise storage_error(folder, error) from error
 
 
 _OVERHEAD = len("00000000 \n")
@@ -159,32 +150,35 @@ def run_methods(
         return replace(run, results=results, notes=(*run.notes, *odd, *indistinct(results, data.truth_uncertainty_deg)))
 
     if folder is None:
-        return finished(_answers(data.scenes, methods, [], None, workers, on_scene))
-    require_free(folder, WHAT)
-    partial = partial_path(folder)
-    make_folder(folder.parent, folder)
-    with held_folder(partial, f"another program works on {folder}; {_WAIT}", of=folder):
+        return finished(list(_answers(data.scenes, methods, [], workers, on_scene)))
+    with _held(folder) as partial:
         journal = partial / JOURNAL_FILE
-        known = read_journal(journal, _identity(run, state_of(data.scenes)))
-        if len(known) > 0:
-            _require_same(data.scenes, methods, known, partial)
+        answers = read_journal(journal, _identity(run, state_of(data.scenes)))
+        if answers:
+            _require_same(data.scenes, methods, answers, partial)
         with journal.open("ab", buffering=0) as stream:
-            answers = _answers(
-                data.scenes, methods, known, AnswerJournal(stream, len(known), folder), workers, on_scene
-            )
+            for given in _answers(data.scenes, methods, answers, workers, on_scene):
+                append_answers(stream, len(answers), given, folder)
+                answers.append(given)
         run = finished(answers)
         _publish(run, data.scenes, folder, kind, workers)
     return run
+
+
+@contextmanager
+def _held(folder: Path) -> Generator[Path]:
+    """Hold the hidden folder of a new results folder, and yield it."""
+    require_free(folder, WHAT)
+    make_folder(folder.parent, folder)
+    with held_folder(partial_path(folder), f"another program works on {folder}; {_WAIT}", of=folder):
+        yield partial_path(folder)
 
 
 def write_run(
     run: Run, scenes: Sequence[Scene], folder: Path, kind: ErrorKind = "reproduction", workers: int = 1
 ) -> None:
     """Write results that were made otherwise, such as by cross-validation, to a new results folder."""
-    require_free(folder, WHAT)
-    partial = partial_path(folder)
-    make_folder(folder.parent, folder)
-    with held_folder(partial, f"another program works on {folder}; {_WAIT}", of=folder):
+    with _held(folder):
         _publish(run, scenes, folder, kind, workers)
 
 
@@ -291,22 +285,19 @@ def _identity(run: Run, state: str) -> dict[str, Any]:
 def _answers(
     scenes: Sequence[Scene],
     methods: Sequence[Method | SceneMethod],
-    known: list[tuple[SceneAnswer, ...]],
-    journal: AnswerJournal | None,
+    known: Sequence[tuple[SceneAnswer, ...]],
     workers: int,
     on_scene: Callable[[int, int], None] | None,
-) -> list[tuple[SceneAnswer, ...]]:
-    """Return the answers for all scenes, given those for the first ones; the others go to the journal as they come."""
-    answers = list(known)
+) -> Iterator[tuple[SceneAnswer, ...]]:
+    """Yield the answers for the scenes behind the first ones, which are known; each counts when it was taken."""
+    done = len(known)
     if on_scene:
-        on_scene(len(answers), len(scenes))
-    for given in answer_scenes(scenes[len(known) :], methods, workers):
-        if journal is not None:
-            journal.append(given)
-        answers.append(given)
+        on_scene(done, len(scenes))
+    for given in answer_scenes(scenes[done:], methods, workers):
+        yield given
+        done += 1
         if on_scene:
-            on_scene(len(answers), len(scenes))
-    return answers
+            on_scene(done, len(scenes))
 
 
 def _publish(run: Run, scenes: Sequence[Scene], folder: Path, kind: ErrorKind, workers: int) -> None:

@@ -41,7 +41,6 @@ from types import ModuleType
 from typing import TYPE_CHECKING, cast
 
 from evaluation.methods.gray_edge import GrayEdge
-from evaluation.methods.green_stability import FAMILIES
 from evaluation.methods.standard import local_methods, standard_methods
 from evaluation.methods.wrapped import PATCHES, PatchwiseMethod, ResizedMethod
 from foundation.errors import InputError, nearest_names
@@ -49,6 +48,9 @@ from foundation.packages import require_own_packages
 
 if TYPE_CHECKING:
     from evaluation.methods.method import Learner, Method
+
+FAMILIES = ("shades-of-gray", "general-gray-world", "gray-edge-1", "gray-edge-2")
+"""The methods that take parameters."""
 
 _MODIFIERS = re.compile(r"(?P<size>[0-9]{1,6})|patches(=(?P<patches>[0-9]{1,6}))?")
 

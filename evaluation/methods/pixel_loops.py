@@ -299,7 +299,6 @@ def sum_powers(
 
 BINS = 4096
 """Of the histogram of projections: one that holds a limit has some thousand pixels of 18 million."""
-"""Pixels whose bins are found at a time, in the nearest cache."""
 _STRIDE = 5
 """Pixels by which the counted ones move on from row to row: no column is preferred where every 16th pixel counts."""
 

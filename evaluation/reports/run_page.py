@@ -245,12 +245,20 @@ def run_page(run: Run, kind: ErrorKind, pictures: Mapping[tuple[int, int], bytes
         *map(table_part, lights_tables(run.subject, run.results, kind)),
         pages.note(_DEFINITIONS),
         pages.heading("What was done to the images"),
-        table_part(_treatment(run)),
+        table_part(Table("Applied before a method sees an image", ("What", "How"), tuple(run.treatment.items()))),
         pages.heading("Cumulative error curves"),
-        pages.figure(error_curves(run.results, kind), _curves_caption(run.results, kind), "Cumulative error curves"),
+        pages.figure(
+            error_curves(run.results, kind),
+            f"The share of images whose {kind} error is not larger than the value below; the higher, the better. The "
+            f"axis ends at the 98th percentile of {'all methods together' if len(run.results) > 1 else 'the errors'}.",
+            "Cumulative error curves",
+        ),
         pages.heading("Errors over the chromaticity plane"),
         pages.figure(
-            error_planes(run.results, run.truths, kind), _planes_caption(run.results), "Errors over chromaticities"
+            error_planes(run.results, run.truths, kind),
+            "Each point is the true light of an image; its colour is the method's error on it."
+            + _left_out(run.results),
+            "Errors over chromaticities",
         ),
         *_images(run, kind, pictures),
         pages.heading("Methods"),
@@ -258,21 +266,6 @@ def run_page(run: Run, kind: ErrorKind, pictures: Mapping[tuple[int, int], bytes
         pages.note(f"Data set {run.data_sha256[:16]}…, {run.software}"),
     ]
     return pages.page(f"{run.subject.name}: {len(run.results)} method{'s' * (len(run.results) > 1)}", parts)
-
-
-def _treatment(run: Run) -> Table:
-    return Table("Applied before a method sees an image", ("What", "How"), tuple(run.treatment.items()))
-
-
-def _curves_caption(results: Sequence[Result], kind: ErrorKind) -> str:
-    return (
-        f"The share of images whose {kind} error is not larger than the value below; the higher, the better. The axis "
-        f"ends at the 98th percentile of {'all methods together' if len(results) > 1 else 'the errors'}."
-    )
-
-
-def _planes_caption(results: Sequence[Result]) -> str:
-    return f"Each point is the true light of an image; its colour is the method's error on it.{_left_out(results)}"
 
 
 def _left_out(results: Sequence[Result]) -> str:

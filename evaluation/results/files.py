@@ -117,10 +117,7 @@ def _estimate(text: str | None) -> float:
 
 
 def _number(text: str | None, name: str, where: str) -> float:
-    try:
-        value = float(text or "")
-    except ValueError:
-        value = math.nan
+    value = _estimate(text)
     if not math.isfinite(value):
         raise FormatError(f"{where}: {name} is {text!r}, expected a finite number")
     return value
@@ -168,16 +165,12 @@ def several_lights_csv(images: Sequence[str], results: Sequence[Result]) -> tupl
     pixels: list[tuple[object, ...]] = [("image", "method", "pixel_recovery", "pixel_reproduction", "pixel_rgb")]
     regions: list[tuple[object, ...]] = [("image", "method", "light", "share", "recovery", "reproduction")]
     for result in results:
-        maps = result.maps
-        if maps is None:
-            continue
-        for place, number in enumerate(maps.images):
-            errors = (maps.pixel["recovery"][place], maps.pixel["reproduction"][place], maps.rgb[place])
-            pixels.append((images[number], result.method, *map(_degrees, errors)))
-        for place, number in enumerate(maps.region_images):
-            errors = (maps.region["recovery"][place], maps.region["reproduction"][place])
-            light, share = int(maps.region_lights[place]), f"{maps.region_shares[place]:.6f}"
-            regions.append((images[number], result.method, light, share, *map(_degrees, errors)))
+        for number, error in (result.maps or {}).items():
+            head = (images[number], result.method)
+            pixels.append((*head, *map(_degrees, (error.recovery, error.reproduction, error.rgb))))
+            for region in error.regions:
+                errors = (_degrees(region.recovery), _degrees(region.reproduction))
+                regions.append((*head, region.light, f"{region.share:.6f}", *errors))
     return csv_text(pixels), csv_text(regions)
 
 
@@ -190,7 +183,7 @@ def _degrees(error: float) -> str:
     return f"{error:.6f}" if np.isfinite(error) else ""
 
 
-_COLUMNS = ("image", "r", "g", "b")
+_COLUMNS = ("image", *_ESTIMATE)
 
 
 @dataclass(frozen=True, eq=False)

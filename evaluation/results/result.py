@@ -33,29 +33,6 @@ COLUMNS = ("method", "mean", "median", "trimean", "best25", "worst25", "avg")
 
 
 @dataclass(frozen=True, eq=False)
-class MapErrors:
-    """The errors of one method on the images under several lights, by pixel and by region; see `metrics.MapError`.
-
-    - `images`: (M,) int64, the numbers of those images among the scenes, rising.
-    - `pixel`: kind of error to (M,) float64, degrees: the mean over each image's pixels; the recovery error is LSMI's
-      MAE_illum. NaN where no pixel of an image is judged.
-    - `rgb`: (M,) float64, degrees, LSMI's MAE_rgb; NaN likewise.
-    - `region_images`, `region_lights`: (R,) int64 each: of each region, its image among the scenes and its light's
-      number in that image.
-    - `region_shares`: (R,) float64, the region's part of the image's judged pixels.
-    - `region`: kind of error to (R,) float64, degrees: the mean over each region's pixels.
-    """
-
-    images: npt.NDArray[np.int64]
-    pixel: Mapping[ErrorKind, npt.NDArray[np.float64]]
-    rgb: npt.NDArray[np.float64]
-    region_images: npt.NDArray[np.int64]
-    region_lights: npt.NDArray[np.int64]
-    region_shares: npt.NDArray[np.float64]
-    region: Mapping[ErrorKind, npt.NDArray[np.float64]]
-
-
-@dataclass(frozen=True, eq=False)
 class Result:
     """Estimates and errors of one method on one dataset.
 
@@ -65,8 +42,8 @@ class Result:
     - `guessed`: (N,) bool, True where the method gave no light and grey stands in for it.
     - `causes`: why it gave none, or none for some pixels, by the image's number among the scenes; None where nobody
       asked.
-    - `maps`: the errors on images under several lights by pixel and region; None where no image is, or none was
-      measured.
+    - `maps`: the errors on images under several lights by pixel and region, by the image's number, rising; None where
+      no image is, or none was measured.
     """
 
     method: str
@@ -74,7 +51,7 @@ class Result:
     errors: Mapping[ErrorKind, npt.NDArray[np.float64]]
     guessed: npt.NDArray[np.bool_]
     causes: Mapping[int, str] | None = None
-    maps: MapErrors | None = None
+    maps: Mapping[int, MapError] | None = None
 
     def at(self, places: npt.NDArray[np.int64]) -> Result:
         """Return what was made of the scenes at `places` (P,) int64 alone, in that order; errors by pixel are left out.
@@ -198,29 +175,7 @@ def _result(method: str, truths: npt.NDArray[np.float64], answers: Sequence[Scen
         {"recovery": recovery_error(estimates, truths), "reproduction": reproduction_error(estimates, truths)},
         np.array([answer.light is None for answer in answers]),
         {number: answer.cause for number, answer in enumerate(answers) if answer.cause},
-        _maps(answers),
-    )
-
-
-def _maps(answers: Sequence[SceneAnswer]) -> MapErrors | None:
-    measured = [(number, answer.by_pixel) for number, answer in enumerate(answers) if answer.by_pixel is not None]
-    if not measured:
-        return None
-    regions = [(number, region) for number, error in measured for region in error.regions]
-    return MapErrors(
-        images=np.array([number for number, _ in measured], dtype=np.int64),
-        pixel={
-            "recovery": np.array([error.recovery for _, error in measured]),
-            "reproduction": np.array([error.reproduction for _, error in measured]),
-        },
-        rgb=np.array([error.rgb for _, error in measured]),
-        region_images=np.array([number for number, _ in regions], dtype=np.int64),
-        region_lights=np.array([region.light for _, region in regions], dtype=np.int64),
-        region_shares=np.array([region.share for _, region in regions], dtype=np.float64),
-        region={
-            "recovery": np.array([region.recovery for _, region in regions], dtype=np.float64),
-            "reproduction": np.array([region.reproduction for _, region in regions], dtype=np.float64),
-        },
+        {number: answer.by_pixel for number, answer in enumerate(answers) if answer.by_pixel} or None,
     )
 
 

@@ -6,13 +6,13 @@ the tables that sum up results: the paper's six columns, every statistic, and er
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
-from evaluation.metrics import ErrorKind, summarise
+from evaluation.metrics import ErrorKind, MapError, summarise
 from evaluation.results.result import NO_PIXEL, Result, Subject, csv_text
 from foundation.errors import first_of
 
@@ -160,10 +160,8 @@ def statistics_rows(subject: Subject, results: Sequence[Result]) -> Table:
                 missing = int(result.guessed[which].sum())
                 rows.append(_row(result.method, kind, lights, result.errors[kind][which], missing))
         if result.maps is not None:
-            named = [(f"pixel_{kind}", result.maps.pixel[kind]) for kind in kinds]
-            named.append(("pixel_rgb", result.maps.rgb))
-            named += [(f"region_{kind}", result.maps.region[kind]) for kind in kinds]
             missing = int(result.guessed[mixed].sum())
+            named = _by_place(result.maps).items()
             rows += [_row(result.method, name, "several", errors, missing) for name, errors in named]
     return Table(
         f"{subject.name}: errors, degrees",
@@ -172,15 +170,30 @@ def statistics_rows(subject: Subject, results: Sequence[Result]) -> Table:
     )
 
 
+def _by_place(maps: Mapping[int, MapError]) -> dict[str, npt.NDArray[np.float64]]:
+    """Return the errors by pixel and by region of images under several lights, by their names in files."""
+    regions = [region for error in maps.values() for region in error.regions]
+    found = {
+        "pixel_recovery": [error.recovery for error in maps.values()],
+        "pixel_reproduction": [error.reproduction for error in maps.values()],
+        "pixel_rgb": [error.rgb for error in maps.values()],
+        "region_recovery": [region.recovery for region in regions],
+        "region_reproduction": [region.reproduction for region in regions],
+    }
+    return {name: np.array(errors, dtype=np.float64) for name, errors in found.items()}
+
+
 def _several(subject: Subject, results: Sequence[Result]) -> Table:
     rows: list[tuple[Cell, ...]] = []
     unjudged = 0
     for result in results:
         maps = result.maps
         assert maps is not None
-        unjudged = max(unjudged, int(np.isnan(maps.rgb).sum()))
-        columns = [maps.pixel["recovery"], maps.rgb, maps.region["recovery"], result.errors["recovery"][maps.images]]
-        rows.append((result.method, *(cell for errors in columns for cell in _mean_and_median(errors))))
+        errors = _by_place(maps)
+        unjudged = max(unjudged, int(np.isnan(errors["pixel_rgb"]).sum()))
+        columns = [errors[name] for name in ("pixel_recovery", "pixel_rgb", "region_recovery")]
+        columns.append(result.errors["recovery"][list(maps)])
+        rows.append((result.method, *(cell for column in columns for cell in _mean_and_median(column))))
     none_left = (f"{unjudged} images have no pixel whose light is known and that is not masked: they are left out",)
     return Table(
         f"{subject.name}: recovery angular error of the {sum(subject.mixed)} images under several lights, degrees",

@@ -168,7 +168,7 @@ def _pose(homography: npt.NDArray[np.float64], chart: Chart, plane: Plane) -> tu
     height, width = plane.values.shape
     page_w, page_h = chart.page_mm
     corners = project(homography, [(0, 0), (page_w, 0), (page_w, page_h), (0, page_h)])
-    axis = project(homography, [(0.4 * page_w, page_h / 2), (0.6 * page_w, page_h / 2)])
+    axis = project(homography, [(0, page_h / 2), (page_w, page_h / 2)])
     spans = np.ptp(corners, axis=0) / (width, height)
     inside = bool((corners >= -0.5).all() and (corners <= (width - 0.5, height - 0.5)).all())
     return float(spans.max()), inside, float(np.degrees(np.arctan2(*(axis[1] - axis[0])[::-1])))

@@ -192,19 +192,11 @@ _EOS_6D_MARK_II = Body(
     masked=(Rectangle(0, 0, 4224, 118),),
 )
 
-_TEST = Body(
-    maker="Canon",
+_TEST = replace(
+    _EOS_550D,
     model="CroP Test",
     sensor=(609, 846),
     visible=Rectangle(51, 46, 557, 800),
-    pattern="RGGB",
-    black=2048,
-    saturation=13584,
-    bits=14,
-    electrons_per_dn=1.8,
-    read_noise_dn=6.0,
-    sensor_noise_e=2.8,
-    sensitivities="Canon_EOS_600D",
     masked=(Rectangle(0, 0, 609, 44),),
 )
 

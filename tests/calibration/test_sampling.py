@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from calibration.kernels import window_shares
 from calibration.report.plots import half_size
 from calibration.sampling import (
     WINDOWS,
@@ -158,3 +159,13 @@ def test_the_largest_windows_are_those_of_the_table_of_arrangements() -> None:
     assert [bleed(cell_px, 0.7) for cell_px in (9.35, 9.6)] == pytest.approx([0.003, 0.0017], abs=1e-4)
     assert [largest_window(cell_px, 0.7) for cell_px in (9.35, 9.6)] == [3, 5]
     assert [bleed(10.2, 0.7, window) for window in WINDOWS] == sorted(bleed(10.2, 0.7, window) for window in WINDOWS)
+
+
+def test_all_of_a_kernel_s_light_comes_from_some_part_of_the_slots() -> None:
+    pitches, offsets = np.array([9.0, 12.5]), np.array([-1.0, 0.0, 1.0])
+    shares = np.full((2, 3, 25), np.nan)
+    window_shares(2.0, pitches, offsets, 5, shares)
+    assert (shares >= 0).all()
+    np.testing.assert_allclose(shares.sum(axis=2), 1)
+    # As much from the left of one side as from the right of the other.
+    np.testing.assert_allclose(shares[:, 0], shares[:, 2, ::-1], atol=1e-12)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable
 from pathlib import Path
 
@@ -11,7 +10,6 @@ from fsspec.core import url_to_fs
 
 from evaluation.cli import main
 from evaluation.experiments import run_folder
-from evaluation.methods import standard_methods
 
 pytestmark = pytest.mark.slow
 
@@ -67,35 +65,6 @@ def test_the_table_names_the_dataset(
     monkeypatch.chdir(folder)
     assert main([place, "--methods", "gray-world"]) == 0
     assert capsys.readouterr().out.startswith("set[a-1]: reproduction angular error of 16 images, degrees\n")
-
-
-def test_a_file_gets_the_whole_table_however_narrow_the_terminal(
-    dataset: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setenv("COLUMNS", "30")
-    assert main([str(dataset), "--methods", "all"]) == 0
-    first, *table = capsys.readouterr().out.partition("black level: ")[0].splitlines()
-    assert first == "made: reproduction angular error of 16 images, degrees"
-    assert {len(line) for line in table} == {len(table[0])}
-    for method in standard_methods().values():
-        assert [line for line in table if method.name in line and len(re.findall(r"\d\.\d\d ", line)) == 6]
-
-
-def test_a_narrow_terminal_cuts_no_number(
-    dataset: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setenv("FORCE_COLOR", "1")  # By which rich takes any output for a terminal.
-    printed: dict[int, str] = {}
-    for columns in (30, 75, 120):
-        monkeypatch.setenv("COLUMNS", str(columns))
-        assert main([str(dataset), "--methods", "all"]) == 0
-        printed[columns] = re.sub(r"\x1b\[[\d;]*m", "", capsys.readouterr().out).partition("black level: ")[0]
-    numbers = {columns: re.findall(r"\d\.\d\d ", text) for columns, text in printed.items()}
-    assert len(numbers[120]) == 6 * len(standard_methods())
-    assert numbers[30] == numbers[75] == numbers[120]
-    assert max(map(len, printed[75].splitlines())) <= 75
-    for word in ("Gray-world", "2nd-order", "Worst 25%"):
-        assert all(word in text for text in printed.values())
 
 
 @pytest.mark.parametrize(

@@ -48,7 +48,6 @@ from evaluation.datasets.files import (
     present,
     read_lights,
     read_rows,
-    subtract_black,
 )
 from evaluation.datasets.options import DataOptions, choose, stated
 from evaluation.scene import Image, SceneSet
@@ -102,17 +101,16 @@ class PeakScene(RawScene):
         white = self.peaks.of(self.path) - BELOW_PEAK if self.white is None else self.white
         return white - self.black
 
-    def read(self) -> tuple[Image, Mask | None]:
-        """Return the image (H, W, 3), linear camera RGB with black at 0, and its mask (H, W) bool or None."""
+    def decoded(self) -> Image:
+        """Return the image (H, W, 3) as the file's numbers are."""
         image = decode_image(self.path)
         if self.white is None:
             self.peaks.learn(self.path, image)
-        lower = subtract_black(image, self.black)
-        return lower, self.mask(lower)
+        return image
 
 
 BLACK = 2048
-"""Black level of the 550D's files; the data set's page."""
+"""Black level of all files: the data set's page; of Cube++ "approximately 2048, not subtracted" (description.md)."""
 CUBE_ROW, CUBE_COLUMN = 1050, 2050
 """From where the calibration cube's rectangle reaches to the lower right corner, px; the data set's page."""
 
@@ -177,7 +175,6 @@ def open_cube_plus(place: str, options: DataOptions, listed: Folder | None = Non
     )
 
 
-"""Black level of both cameras' files: "approximately 2048, not subtracted" (description.md)."""
 SIZE = (1728, 2592)
 """Height and width of Cube++, px (description.md)."""
 SIMPLE_SCALE = 4

@@ -34,6 +34,7 @@ from evaluation.experiments.folds import group_of
 from evaluation.scene import Image, MixedScene, Scene, SceneSet
 from foundation.compiled import ordered_map
 from foundation.errors import FormatError, InputError
+from foundation.records import from_plain
 from foundation.version import software
 from generator.statistics import (
     CELLS,
@@ -562,7 +563,11 @@ def measure_scene(scene: Scene, side: int = CELLS) -> ImageNumbers:
     image, mask = scene.read()
     cells = reduce_scene(scene, image, mask, side)
     lights = np.asarray(scene.lights if isinstance(scene, MixedScene) else [scene.truth], dtype=np.float64)
-    values, luminance, chroma = _of_cells(cells)
+    values, luminance, chroma = numbers_of_cells(cells.colours)
+    shown = int(cells.levels.sum())
+    reached = np.searchsorted(np.cumsum(cells.levels), 0.99 * shown)
+    values["exposure"] = (int(reached) + 0.5) / LEVELS if shown else np.nan
+    values["clipped"] = cells.clipped / shown if shown else np.nan
     blocks = measure_blocks(image, scene.saturation, mask)
     bright = percentile(blocks[:, 0, 1], 99)
     values["noise"] = relative_noise(blocks, _NOISE_FROM * bright) if len(blocks) else np.nan
@@ -577,16 +582,6 @@ def measure_scene(scene: Scene, side: int = CELLS) -> ImageNumbers:
         blocks=blocks / unit if len(blocks) and unit > 0 else np.empty((0, 2, 3)),
         masked=cells.masked / cells.pixels,
     )
-
-
-def _of_cells(cells: Cells) -> tuple[dict[str, float], npt.NDArray[np.float64], npt.NDArray[np.float64]]:
-    """Return the numbers that cells give, and the histograms of their luminance and chroma."""
-    values, luminance, chroma = numbers_of_cells(cells.colours)
-    shown = int(cells.levels.sum())
-    reached = np.searchsorted(np.cumsum(cells.levels), 0.99 * shown)
-    values["exposure"] = (int(reached) + 0.5) / LEVELS if shown else np.nan
-    values["clipped"] = cells.clipped / shown if shown else np.nan
-    return values, luminance, chroma
 
 
 OF_LIGHTS: Final = {"light_red": 0, "light_blue": 1}
@@ -715,7 +710,6 @@ _CHANNELS: Final = ("red", "green", "blue")
 
 def statistics_to_json(description: DataDescription) -> str:
     """Return the text of a `STATS.json`; the same description gives the same text."""
-    distribution = asdict(light_distribution(description.lights))
     content = {
         "format": FORMAT,
         "version": VERSION,
@@ -747,7 +741,7 @@ def statistics_to_json(description: DataDescription) -> str:
             "unit": description.noise_unit,
             **{channel: asdict(curve) for channel, curve in zip(_CHANNELS, description.noise, strict=True)},
         },
-        "light_distribution": distribution,
+        "light_distribution": asdict(light_distribution(description.lights)),
         "luminance": {"log10_edges": LUMINANCE_EDGES, "shares": description.luminance},
         "chroma": {"edges": CHROMA_EDGES, "shares": description.chroma},
         "lights": description.lights,
@@ -762,14 +756,15 @@ def read_statistics(path: Path | str) -> DataDescription:
     """Return the description that a `STATS.json` holds."""
     known, _ = read_content(path)
     try:
-        return _description(known)
+        return _description(known, path)
     except (KeyError, TypeError, ValueError) as error:
-        raise FormatError(
-            f"{path} is not as its format has it: {error!r}; write it anew with evaluate describe DATA --out STATS.json"
-        ) from error
+        raise FormatError(f"{path} is not as its format has it: {error!r}; {_REMEDY}") from error
 
 
-def _description(content: Mapping[str, Any]) -> DataDescription:
+_REMEDY: Final = "write it anew with evaluate describe DATA --out STATS.json"
+
+
+def _description(content: Mapping[str, Any], path: Path | str) -> DataDescription:
     data, noise = content["data"], content["noise"]
     images = tuple(map(str, content["images"]))
     values = {name: _array(given) for name, given in content["values"].items()}
@@ -794,14 +789,9 @@ def _description(content: Mapping[str, Any]) -> DataDescription:
         luminance=luminance,
         chroma=chroma,
         noise_unit=noise["unit"],
-        noise=tuple(_curve_json(noise[channel]) for channel in _CHANNELS),
+        noise=tuple(from_plain(NoiseCurve, noise[channel], path, _REMEDY) for channel in _CHANNELS),
         groups=None if data.get("groups") is None else int(data["groups"]),
     )
-
-
-def _curve_json(given: Mapping[str, Any]) -> NoiseCurve:
-    levels = tuple(NoiseLevel(level["signal"], level["sigma"], level["blocks"]) for level in given["levels"])
-    return NoiseCurve(levels, given["read"], given["gain"], given["misfit"])
 
 
 def _array(given: Any) -> npt.NDArray[np.float64]:

@@ -138,46 +138,42 @@ _POINTS: Final = 3000
 """Lights drawn of a set at most: more make no other cloud, and a page too large to mail."""
 
 
-def luminance_figure(names: Sequence[str], shares: Sequence[npt.NDArray[np.float64]], edges: Sequence[float]) -> bytes:
-    """Return the distribution of luminance as SVG.
-
-    `shares`: for each (B,) float64, the share of cells in each bin. `edges`: (B + 1,) float, the bins' edges: decimal
-    logarithm of luminance over the 99th percentile.
-    """
+def _luminance(both: Sequence[DataDescription]) -> Markup:
+    """Return the figure of the distribution of luminance."""
 
     def draw(figure: Any) -> None:
         axes = figure.add_subplot()
-        for number, (name, share) in enumerate(zip(names, shares, strict=True)):
+        for made, colour in zip(both, SERIES, strict=False):
             # The first bin holds all that is darker.
-            axes.stairs(
-                100 * share, np.power(10.0, edges), label=legend_label(name), color=SERIES[number], linewidth=1.5
-            )
+            edges = np.power(10.0, LUMINANCE_EDGES)
+            axes.stairs(100 * made.luminance, edges, label=legend_label(made.name), color=colour, linewidth=1.5)
         axes.set(xscale="log", xlabel="luminance over its 99th percentile in the image", ylabel="cells, %")
         axes.xaxis.set_major_formatter("{x:g}")
         axes.set_ylim(bottom=0)
         axes.legend(loc="upper left")
 
-    return svg_of(draw, inches=(7.2, 3.2))
+    return pages.figure(
+        svg_of(draw, inches=(7.2, 3.2)),
+        "Luminance of the cells: the mean of the channels with the light divided out, over its 99th percentile in the "
+        "image. Every image counts the same.",
+    )
 
 
-def chroma_figure(names: Sequence[str], shares: Sequence[npt.NDArray[np.float64]], edges: Sequence[float]) -> bytes:
-    """Return the histograms of chroma in the plane of ln(R/G) and ln(B/G) as SVG, side by side.
-
-    `shares`: for each (B, B) float64, the share of cells, by ln(R/G) and ln(B/G). `edges`: (B + 1,) float, the bins'
-    edges along both.
-    """
+def _chroma(both: Sequence[DataDescription]) -> Markup:
+    """Return the figure of the histograms of chroma in the plane of ln(R/G) and ln(B/G), side by side."""
 
     def draw(figure: Any) -> None:
         from matplotlib.colors import LinearSegmentedColormap, to_rgba
 
-        top = max(float(share.max()) for share in shares) ** _FAINTEST
-        for number, (name, share) in enumerate(zip(names, shares, strict=True)):
-            axes = figure.add_subplot(1, len(shares), number + 1)
+        top = max(float(made.chroma.max()) for made in both) ** _FAINTEST
+        low, high = CHROMA_EDGES[0], CHROMA_EDGES[-1]
+        for number, made in enumerate(both):
+            axes = figure.add_subplot(1, len(both), number + 1)
             clear, full = (to_rgba(SERIES[number], alpha) for alpha in (0, 1))
             axes.imshow(
-                share.T**_FAINTEST,
+                made.chroma.T**_FAINTEST,
                 origin="lower",
-                extent=(edges[0], edges[-1], edges[0], edges[-1]),
+                extent=(low, high, low, high),
                 cmap=LinearSegmentedColormap.from_list(f"set{number}", [clear, full]),
                 vmin=0,
                 vmax=top,
@@ -185,54 +181,52 @@ def chroma_figure(names: Sequence[str], shares: Sequence[npt.NDArray[np.float64]
             )
             axes.axhline(0, color=FAINT, linewidth=0.6)
             axes.axvline(0, color=FAINT, linewidth=0.6)
-            axes.set(title=name, xlabel="ln(R/G)", ylabel="ln(B/G)")
+            axes.set(title=made.name, xlabel="ln(R/G)", ylabel="ln(B/G)")
 
-    return svg_of(draw, inches=(3.8 * len(shares), 3.8))
+    return pages.figure(
+        svg_of(draw, inches=(3.8 * len(both), 3.8)),
+        "Colours of the cells with the light divided out; grey is where the lines cross. The depth of colour grows "
+        "with the share of cells to the power of 0.4, on one scale.",
+    )
 
 
-def lights_figure(names: Sequence[str], lights: Sequence[npt.NDArray[np.float64]]) -> bytes:
-    """Return the lights of sets in the plane of the chromaticities r and b as SVG.
-
-    `lights`: for each (L, 3) float64, linear camera RGB with r + g + b = 1.
-    """
+def _lights(both: Sequence[DataDescription]) -> Markup:
+    """Return the figure of the lights in the plane of the chromaticities r and b."""
 
     def draw(figure: Any) -> None:
         axes = figure.add_subplot()
-        for number, (name, given) in enumerate(zip(names, lights, strict=True)):
-            some = given[:: -(-len(given) // _POINTS)]
-            axes.scatter(
-                some[:, 0], some[:, 2], s=9, alpha=0.5, linewidths=0, color=SERIES[number], label=legend_label(name)
-            )
+        for made, colour in zip(both, SERIES, strict=False):
+            some = made.lights[:: -(-len(made.lights) // _POINTS)]
+            label = legend_label(made.name)
+            axes.scatter(some[:, 0], some[:, 2], s=9, alpha=0.5, linewidths=0, color=colour, label=label)
         axes.set(xlabel="r = R / (R + G + B)", ylabel="b = B / (R + G + B)", aspect="equal")
         axes.legend(loc="upper right")
 
-    return svg_of(draw, inches=(5.4, 4.6))
+    return pages.figure(svg_of(draw, inches=(5.4, 4.6)), "The lights; of mixtures, each light.")
 
 
-def noise_figure(
-    names: Sequence[str],
-    measured: Sequence[npt.NDArray[np.float64]],
-    curves: Sequence[tuple[float, float] | None],
-    unit: str,
-) -> bytes:
-    """Return noise against signal as SVG, with the fitted photon-transfer curves.
-
-    `measured`: for each (N, 2) float64: signal and standard deviation of levels. `curves`: for each the read noise and
-    the gain of variance = read² + gain · signal, or None.
-    """
+def _noise(both: Sequence[DataDescription]) -> list[Markup]:
+    """Return the figure of noise of green against signal, with the fitted curves; nothing where none was measured."""
+    unit = both[0].noise_unit
+    shown = [made for made in both if made.noise_unit == unit and made.noise[1].levels]
+    if not shown:
+        return []
 
     def draw(figure: Any) -> None:
         axes = figure.add_subplot()
-        for number, (name, levels, curve) in enumerate(zip(names, measured, curves, strict=True)):
-            axes.plot(levels[:, 0], levels[:, 1], "o", markersize=4, color=SERIES[number], label=legend_label(name))
-            if curve is not None:
+        for made, colour in zip(shown, SERIES, strict=False):
+            curve = made.noise[1]
+            levels = np.array([(level.signal, level.sigma) for level in curve.levels])
+            axes.plot(levels[:, 0], levels[:, 1], "o", markersize=4, color=colour, label=legend_label(made.name))
+            if curve.read is not None and curve.gain is not None:
                 signal = np.exp(np.linspace(np.log(levels[0, 0]), np.log(levels[-1, 0]), 100, dtype=np.float64))
-                axes.plot(signal, np.sqrt(curve[0] ** 2 + curve[1] * signal), color=SERIES[number], linewidth=1)
+                axes.plot(signal, np.sqrt(curve.read**2 + curve.gain * signal), color=colour, linewidth=1)
         axes.set(xscale="log", yscale="log", xlabel=f"signal, {unit} = 1", ylabel="standard deviation")
         axes.grid(visible=True, which="major", color=GRID)
         axes.legend(loc="upper left")
 
-    return svg_of(draw, inches=(5.4, 4.0))
+    caption = "Noise of green in the flattest tenth of blocks of 8 x 8 pixels, at full size; lines: fitted curves."
+    return [pages.figure(svg_of(draw, inches=(5.4, 4.0)), caption)]
 
 
 def figures_table(description: DataDescription) -> Table:
@@ -262,15 +256,7 @@ def figures_table(description: DataDescription) -> Table:
 def lights_table(descriptions: Sequence[DataDescription]) -> Table:
     """Return the distributions of the lights of one or two data sets."""
     rows = [
-        (
-            made.name,
-            found.count,
-            *found.mean,
-            found.along,
-            found.across,
-            found.axis_deg,
-            found.hull_area,
-        )
+        (made.name, found.count, *found.mean, found.along, found.across, found.axis_deg, found.hull_area)
         for made in descriptions
         for found in [light_distribution(made.lights)]
     ]
@@ -349,7 +335,9 @@ def seen_notes(one: DataDescription, other: DataDescription) -> tuple[str, ...]:
         if made.groups is not None and made.groups < len(made.images)
     ]
     unknown = {
-        quantity.title for quantity in QUANTITIES if _is_known(one, quantity.value) != _is_known(other, quantity.value)
+        quantity.title
+        for quantity in QUANTITIES
+        if len({known_values(made, quantity.value).size > 0 for made in (one, other)}) > 1
     }
     if unknown:
         notes.append(f"Known of one of the two only, and left out: {', '.join(sorted(unknown))}.")
@@ -359,7 +347,6 @@ def seen_notes(one: DataDescription, other: DataDescription) -> tuple[str, ...]:
 def describe_page(one: DataDescription, other: DataDescription | None = None, seed: int = 0) -> str:
     """Return the HTML page of a data set, or of one beside another."""
     both = (one,) if other is None else (one, other)
-    names = [made.name for made in both]
     parts: list[Markup] = []
     if other is not None:
         pair = (one.name, other.name)
@@ -374,13 +361,13 @@ def describe_page(one: DataDescription, other: DataDescription | None = None, se
         parts += [table_part(table) for table in compared_tables(compared, pair)]
         parts.append(pages.heading("Figure by figure"))
         parts += [pages.paragraph(sentence(made, pair)) for made in compared]
-    parts += [pages.heading("Luminance"), _luminance(both, names), pages.heading("Chroma"), _chroma(both, names)]
-    parts += [pages.heading("Lights"), table_part(lights_table(both)), pages.row([_lights(both, names), *_noise(both)])]
+    parts += [pages.heading("Luminance"), _luminance(both), pages.heading("Chroma"), _chroma(both)]
+    parts += [pages.heading("Lights"), table_part(lights_table(both)), pages.row([_lights(both), *_noise(both)])]
     for made in both:
         parts += [pages.heading(made.name), table_part(figures_table(made)), table_part(sizes_table(made))]
         parts += [pages.paragraph(f"{what}: {told}") for what, told in made.treatment.items()]
     parts += [pages.heading("Definitions"), table_part(_definitions())]
-    return pages.page(" beside ".join(names), parts)
+    return pages.page(" beside ".join(made.name for made in both), parts)
 
 
 def sizes_table(description: DataDescription, count: int = 6) -> Table:
@@ -401,48 +388,8 @@ def _definitions() -> Table:
     )
 
 
-def _luminance(both: Sequence[DataDescription], names: Sequence[str]) -> Markup:
-    picture = luminance_figure(names, [made.luminance for made in both], LUMINANCE_EDGES)
-    return pages.figure(
-        picture,
-        "Luminance of the cells: the mean of the channels with the light divided out, over its 99th percentile in the "
-        "image. Every image counts the same.",
-    )
-
-
-def _chroma(both: Sequence[DataDescription], names: Sequence[str]) -> Markup:
-    picture = chroma_figure(names, [made.chroma for made in both], CHROMA_EDGES)
-    return pages.figure(
-        picture,
-        "Colours of the cells with the light divided out; grey is where the lines cross. The depth of colour grows "
-        "with the share of cells to the power of 0.4, on one scale.",
-    )
-
-
-def _lights(both: Sequence[DataDescription], names: Sequence[str]) -> Markup:
-    return pages.figure(lights_figure(names, [made.lights for made in both]), "The lights; of mixtures, each light.")
-
-
-def _noise(both: Sequence[DataDescription]) -> list[Markup]:
-    unit = both[0].noise_unit
-    shown = [made for made in both if made.noise_unit == unit and made.noise[1].levels]
-    if not shown:
-        return []
-    measured = [np.array([(level.signal, level.sigma) for level in made.noise[1].levels]) for made in shown]
-    curves = [
-        (curve.read, curve.gain) if curve.read is not None and curve.gain is not None else None
-        for curve in (made.noise[1] for made in shown)
-    ]
-    caption = "Noise of green in the flattest tenth of blocks of 8 x 8 pixels, at full size; lines: fitted curves."
-    return [pages.figure(noise_figure([made.name for made in shown], measured, curves, unit), caption)]
-
-
 def _seen_at(description: DataDescription) -> str:
     return f"{description.side} x {description.side} cells at most" if description.side else "full size"
-
-
-def _is_known(description: DataDescription, value: str) -> bool:
-    return bool(known_values(description, value).size)
 
 
 def _known(number: float) -> float | None:

@@ -35,7 +35,7 @@ from evaluation.methods.prepared import usable
 from evaluation.methods.standard import standard_methods
 from evaluation.metrics import ErrorKind
 from evaluation.results.result import Result, SceneAnswer, read_light, results_of
-from evaluation.results.tables import Table
+from evaluation.results.tables import PAPER_COLUMNS, Table
 from evaluation.scene import Image, Scene, SceneSet
 from foundation.compiled import ordered_map
 from foundation.errors import FormatError, InputError
@@ -166,7 +166,7 @@ def bits_table(found: BitsResult, kind: ErrorKind, name: str) -> Table:
     versions = {"as it is": found.raw, **{str(count): results for count, results in found.reduced.items()}}
     return Table(
         f"{name}: {kind} angular error after bits of the sRGB codes were set to zero, degrees",
-        ("Algorithm", "Bits set to zero", "Mean", "Med.", "Tri.", "Best 25%", "Worst 25%", "Avg."),
+        ("Algorithm", "Bits set to zero", *PAPER_COLUMNS[1:]),
         tuple(
             (results[place].method, label, *results[place].summary(kind).as_tuple())
             for place in range(len(found.raw))

@@ -21,17 +21,13 @@ from evaluation.experiments.paper.colour_reduction import BitsResult, bits_table
 from evaluation.experiments.paper.material import Truths
 from evaluation.experiments.paper.table1 import (
     Block,
-    HotRow,
     SizeRow,
     block_table,
     block_title,
-    hot_table,
     joint_table,
     noise_table,
-    print_colours,
     print_table,
     size_table,
-    table_noise,
 )
 from evaluation.metrics import ErrorKind
 from evaluation.reports.table_output import table_part, table_to_latex, tables_to_latex
@@ -45,20 +41,6 @@ if TYPE_CHECKING:
     from generator import Lut
 
 
-@dataclass(frozen=True, eq=False)
-class TableLights:
-    """The lights of a table.
-
-    - `camera`: of the table.
-    - `rb`: (L, 2) float64, r = R / (R + G + B) and b = B / (R + G + B) of linear camera RGB.
-    - `black_body`: (L,) bool, True for a black body of the plan.
-    """
-
-    camera: str
-    rb: npt.NDArray[np.float64]
-    black_body: npt.NDArray[np.bool_]
-
-
 def rb_of(lights: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
     """Return the rb-chromaticities (N, 2) float64 of lights (N, 3) float64, linear camera RGB of any length.
 
@@ -70,19 +52,12 @@ def rb_of(lights: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
     return (lights / lights.sum(axis=1, keepdims=True))[:, [0, 2]]
 
 
-def table_lights(lut: Lut) -> TableLights:
-    """Return the chromaticities of a table's lights."""
-    kinds = np.array([light.kind == "blackbody" for light in lut.illuminations], dtype=np.bool_)
-    return TableLights(lut.provenance.camera, rb_of(lut.white), kinds)
-
-
 def chromaticity_rows(luts: Sequence[Lut]) -> Table:
     """Return every light of tables with its kind and chromaticity, for CSV."""
     rows: list[tuple[str | float | None, ...]] = []
     for lut in luts:
-        found = table_lights(lut)
-        for light, (r, b) in zip(lut.illuminations, found.rb, strict=True):
-            rows.append((found.camera, light.index, light.kind, light.cct_k, float(r), float(b)))
+        for light, (r, b) in zip(lut.illuminations, rb_of(lut.white), strict=True):
+            rows.append((lut.provenance.camera, light.index, light.kind, light.cct_k, float(r), float(b)))
     return Table("rb-chromaticities of lights", ("camera", "light", "kind", "cct_k", "r", "b"), tuple(rows), digits=4)
 
 
@@ -171,23 +146,20 @@ def _draw_sizes(figure: Any, rows: Sequence[SizeRow], method: str) -> None:
     figure.legend(loc="outside lower center", ncols=2)
 
 
-def chromaticities_figure(
-    tables: Sequence[TableLights], sets: Mapping[str, npt.NDArray[np.float64]] | None = None
-) -> bytes:
+def chromaticities_figure(luts: Sequence[Lut], sets: Mapping[str, npt.NDArray[np.float64]] | None = None) -> bytes:
     """Return the paper's figures of lights in camera RGB side by side, over the ground truths of data sets.
 
     `sets`: name of a data set to its ground truths, (N, 3) float64, linear camera RGB of any length.
     """
-    return svg_of(_draw_chromaticities, tables, sets or {}, inches=(4.6 * len(tables), 4.7))
+    return svg_of(_draw_chromaticities, luts, sets or {}, inches=(4.6 * len(luts), 4.7))
 
 
-def _draw_chromaticities(
-    figure: Any, tables: Sequence[TableLights], sets: Mapping[str, npt.NDArray[np.float64]]
-) -> None:
-    reach = max(float(found.rb.max()) for found in tables) * 1.04
-    for place, found in enumerate(tables):
-        axes = figure.add_subplot(1, len(tables), place + 1)
-        uniform, bodies = found.rb[~found.black_body], found.rb[found.black_body]
+def _draw_chromaticities(figure: Any, luts: Sequence[Lut], sets: Mapping[str, npt.NDArray[np.float64]]) -> None:
+    reach = max(float(rb_of(lut.white).max()) for lut in luts) * 1.04
+    for place, lut in enumerate(luts):
+        axes = figure.add_subplot(1, len(luts), place + 1)
+        black_body = np.array([light.kind == "blackbody" for light in lut.illuminations], dtype=np.bool_)
+        uniform, bodies = rb_of(lut.white[~black_body]), rb_of(lut.white[black_body])
         if len(uniform):
             axes.scatter(*uniform.T, s=7, color=FAINT, linewidths=0, label=f"uniform ({len(uniform)})", zorder=2)
         for number, (name, truths) in enumerate(sets.items()):
@@ -209,7 +181,7 @@ def _draw_chromaticities(
                 label=f"black bodies ({len(bodies)})",
                 zorder=4,
             )
-        axes.set_title(found.camera)
+        axes.set_title(lut.provenance.camera)
         axes.set_xlabel("r")
         axes.set_ylabel("b")
         axes.set_xlim(0, reach)
@@ -251,24 +223,26 @@ def write_report(report: PaperReport, folder: Path) -> None:
             (partial / name).write_bytes(content)
 
 
+def _table_files(name: str, table: Table) -> dict[str, bytes]:
+    """Return a table's files by their names: CSV and LaTeX."""
+    return {f"{name}.csv": table_to_csv(table).encode(), f"{name}.tex": table_to_latex(table).encode()}
+
+
 def table1_report(
     blocks: Sequence[Block],
     luts: Sequence[Lut],
     conditions: Sequence[str],
     kind: ErrorKind,
     sizes: Sequence[SizeRow] = (),
-    hot: Sequence[HotRow] = (),
+    hot: Table | None = None,
 ) -> PaperReport:
     """Return the report of table 1, first with one kind of error, then with the other.
 
-    `sizes`: the errors for other sizes of images; may be empty. `hot`: white-Patch's errors with hot photosites; may be
-    empty.
+    `sizes`: the errors for other sizes of images; may be empty. `hot`: White-Patch's errors with hot photosites.
     """
     other: ErrorKind = "recovery" if kind == "reproduction" else "reproduction"
-    first = [block_table(block, kind) for block in blocks]
-    second = [block_table(block, other) for block in blocks]
-    noise = noise_table([table_noise(lut) for lut in luts])
-    prints = print_table([print_colours(lut) for lut in luts])
+    first, second = ([block_table(block, one) for block in blocks] for one in (kind, other))
+    noise, prints = noise_table(luts), print_table(luts)
     files = {
         "table1.csv": table_to_csv(joint_table(blocks)).encode(),
         "table1.tex": tables_to_latex(_TABLE1.format(kind=kind), first).encode(),
@@ -291,11 +265,10 @@ def table1_report(
             "White-Patch takes the largest of all values, of which a larger image has more: of noise, and of whites."
         )
         parts += [pages.heading("Images of other sizes"), pages.figure(drawn, caption), table_part(table)]
-    if hot:
-        table = hot_table(hot, kind)
-        tables.append(table)
-        files |= {"hot.csv": table_to_csv(table).encode(), "hot.tex": table_to_latex(table).encode()}
-        parts += [pages.heading("Hot photosites"), table_part(table)]
+    if hot is not None:
+        tables.append(hot)
+        files |= _table_files("hot", hot)
+        parts += [pages.heading("Hot photosites"), table_part(hot)]
     parts += [pages.heading("The tables"), table_part(noise), table_part(prints)]
     parts += [pages.heading(f"{other.capitalize()} error, degrees"), *map(table_part, second)]
     return PaperReport("Table 1: plain methods on generated data sets", tuple(tables), tuple(parts), files)
@@ -307,8 +280,7 @@ def table2_report(tables: Sequence[Table], conditions: Sequence[str]) -> PaperRe
     caption = "Comparison of performance of learning-based methods with respect to the training"
     files = {
         "table2.tex": tables_to_latex(caption, halves).encode(),
-        "ratios.tex": table_to_latex(ratios).encode(),
-        "ratios.csv": table_to_csv(ratios).encode(),
+        **_table_files("ratios", ratios),
         **{
             f"trained_on_{name}.csv": table_to_csv(half).encode()
             for name, half in zip(("real", "generated"), halves, strict=True)
@@ -322,11 +294,7 @@ def bits_report(found: BitsResult, kind: ErrorKind, name: str, conditions: Seque
     """Return the report of bits removal on a data set of that name."""
     drawn, table = bits_figure(found, kind), bits_table(found, kind, name)
     caption = "Medians against the bits of each sRGB code that were set to zero; dotted, the linear images as they are."
-    files = {
-        "bits.svg": standalone(drawn),
-        "bits.csv": table_to_csv(table).encode(),
-        "bits.tex": table_to_latex(table).encode(),
-    }
+    files = {"bits.svg": standalone(drawn), **_table_files("bits", table)}
     parts = (*map(pages.paragraph, conditions), pages.figure(drawn, caption), table_part(table))
     return PaperReport("The effect of colour reduction on illumination estimation", (table,), parts, files)
 
@@ -348,8 +316,7 @@ def reduction_report(picture: npt.NDArray[np.uint8], name: str) -> PaperReport:
 def chromaticities_report(luts: Sequence[Lut], sets: Sequence[Truths]) -> PaperReport:
     """Return the report of the lights of tables, beside the ground truths of data sets."""
     truths = {found.name: found.lights for found in sets}
-    lights = [table_lights(lut) for lut in luts]
-    drawn = chromaticities_figure(lights, truths)
+    drawn = chromaticities_figure(luts, truths)
     caption = (
         "rb-chromaticities, r = R / (R + G + B) and b = B / (R + G + B) in linear RGB of each table's camera, of the "
         "white under each light of the table; in colour the ground truths of data sets, each in its own camera's RGB."
@@ -363,8 +330,5 @@ def chromaticities_report(luts: Sequence[Lut], sets: Sequence[Truths]) -> PaperR
         coverage = coverage_table(luts, truths)
         tables.append(coverage)
         parts.append(table_part(coverage))
-        files |= {
-            "coverage.csv": table_to_csv(coverage).encode(),
-            "coverage.tex": table_to_latex(coverage).encode(),
-        }
+        files |= _table_files("coverage", coverage)
     return PaperReport("Chromaticities of the lights", tuple(tables), tuple(parts), files)

@@ -20,7 +20,7 @@ methods leave out what is clipped. All of that is a model: nobody has measured t
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final, TypeVar
 
 import numpy as np
@@ -41,7 +41,7 @@ from evaluation.methods.method import Learner
 from evaluation.methods.standard import standard_methods
 from evaluation.metrics import ErrorKind
 from evaluation.results.result import Result
-from evaluation.results.tables import Table
+from evaluation.results.tables import PAPER_COLUMNS, STATISTICS_COLUMNS, Table
 from evaluation.scene import Scene
 from foundation.colorimetry import angles_deg
 from foundation.errors import InputError, counted
@@ -57,88 +57,43 @@ DAYLIGHT_K: Final = 5600.0
 """The black body, kelvin, under which the print's colours are looked at: near what pictures are balanced for."""
 
 
-@dataclass(frozen=True)
-class TableNoise:
-    """How bright and how noisy the print's white is in a table.
+def noise_table(luts: Sequence[Lut]) -> Table:
+    """Return how bright and noisy the white of tables' prints is, percent: what White-Patch lives on.
 
-    - `camera`: the table's camera.
-    - `level`: median over the lights of the white cell's brightest channel, share of saturation.
-    - `spread`: median over the lights of the standard deviation of the white cell's samples over their mean, R, G and
-      B.
-    - `largest`: median over the lights of the largest of its samples over their mean, less 1; R, G and B.
+    Medians over the lights: of the white cell's brightest channel over saturation, of the standard deviation of its
+    samples over their mean, and of the largest of them over their mean, less 1.
     """
-
-    camera: str
-    lights: int
-    level: float
-    spread: tuple[float, float, float]
-    largest: tuple[float, float, float]
-
-
-def table_noise(lut: Lut) -> TableNoise:
-    """Return how bright and noisy the white of a table's print is: what White-Patch lives on."""
-    white = np.asarray(lut.samples[:, -1], dtype=np.float64)
-    mean = np.maximum(white.mean(axis=1), 1.0)
-    spread = np.median(white.std(axis=1, ddof=1) / mean, axis=0)
-    largest = np.median(white.max(axis=1) / mean - 1, axis=0)
-    return TableNoise(
-        lut.provenance.camera,
-        len(white),
-        float(np.median(mean.max(axis=1)) / lut.provenance.white_level),
-        (float(spread[0]), float(spread[1]), float(spread[2])),
-        (float(largest[0]), float(largest[1]), float(largest[2])),
-    )
-
-
-def noise_table(found: Sequence[TableNoise]) -> Table:
-    """Return the noise of tables' white as a table, percent."""
+    rows: list[tuple[str | float | None, ...]] = []
+    for lut in luts:
+        white = np.asarray(lut.samples[:, -1], dtype=np.float64)
+        mean = np.maximum(white.mean(axis=1), 1.0)
+        level = np.median(mean.max(axis=1)) / lut.provenance.white_level
+        spread = np.median(white.std(axis=1, ddof=1) / mean, axis=0)
+        largest = np.median(white.max(axis=1) / mean - 1, axis=0)
+        rows.append((lut.provenance.camera, len(white), *(100 * float(part) for part in (level, *spread, *largest))))
     columns = ("Camera", "Lights", "White, % of saturation", "Spread of its samples R, %", "G, %", "B, %")
     return Table(
         "The print's white in the tables: medians over the lights",
         (*columns, "Largest sample above the mean R, %", "G, %", "B, %"),
-        tuple(
-            (noise.camera, noise.lights, *(100 * part for part in (noise.level, *noise.spread, *noise.largest)))
-            for noise in found
-        ),
+        tuple(rows),
     )
 
 
-@dataclass(frozen=True)
-class PrintColours:
-    """What all colours of a table's print are together: the scene in which every code is as likely.
+def print_table(luts: Sequence[Lut]) -> Table:
+    """Return the mean and root mean square of all colours of tables' prints: what Gray-world and its like see.
 
-    - `camera`: the table's camera.
-    - `light`: the light they are looked at under: the black body nearest to `DAYLIGHT_K`, or the table's first light.
-    - `mean`, `rms`: mean and root mean square of all colours over the light's white, R, G and B.
+    Percent of the white of the black body nearest to `DAYLIGHT_K`, or of the table's first light; with the angle from
+    grey.
     """
-
-    camera: str
-    light: int
-    mean: tuple[float, float, float]
-    rms: tuple[float, float, float]
-
-
-def print_colours(lut: Lut) -> PrintColours:
-    """Return the mean and root mean square of all colours of a table's print: what Gray-world and its like see."""
-    away = [abs(light.cct_k - DAYLIGHT_K) if light.cct_k else np.inf for light in lut.illuminations]
-    light = int(np.argmin(away))
-    reflected = np.asarray(lut.samples[light], dtype=np.float64).reshape(-1, 3) / lut.white[light]
-    mean, rms = reflected.mean(axis=0), np.sqrt((reflected**2).mean(axis=0))
-    return PrintColours(
-        lut.provenance.camera,
-        light,
-        (float(mean[0]), float(mean[1]), float(mean[2])),
-        (float(rms[0]), float(rms[1]), float(rms[2])),
-    )
-
-
-def print_table(found: Sequence[PrintColours]) -> Table:
-    """Return the prints' mean colours as a table, percent of white, with their angles from grey."""
     rows: list[tuple[str | float | None, ...]] = []
-    for colours in found:
-        for name, values in (("mean", colours.mean), ("root mean square", colours.rms)):
+    for lut in luts:
+        away = [abs(light.cct_k - DAYLIGHT_K) if light.cct_k else np.inf for light in lut.illuminations]
+        light = int(np.argmin(away))
+        reflected = np.asarray(lut.samples[light], dtype=np.float64).reshape(-1, 3) / lut.white[light]
+        means = {"mean": reflected.mean(axis=0), "root mean square": np.sqrt((reflected**2).mean(axis=0))}
+        for name, values in means.items():
             angle = float(angles_deg(values, (1.0, 1.0, 1.0)))
-            rows.append((colours.camera, colours.light, name, *(100 * part for part in values), angle))
+            rows.append((lut.provenance.camera, light, name, *(100 * float(part) for part in values), angle))
     return Table(
         "All colours of the print together, % of the light's white",
         ("Camera", "Light", "Of all colours", "R, %", "G, %", "B, %", "From grey, degrees"),
@@ -164,9 +119,6 @@ SENSORS: Final[Mapping[str, str]] = {"Canon EOS 550D": "550D", "Canon EOS 6D Mar
 OWN: Final = ("Given", "Given")
 """Names of pictures and of ground truths of which nothing is said: the paper has no numbers of them."""
 
-NUMBERS: Final = ("Mean", "Med.", "Tri.", "Best 25%", "Worst 25%", "Avg.")
-"""Heads of the six numbers of a summary, as in the paper."""
-
 
 _HEAD: Final = ("scenes", "sensor", "illuminations", "images", "method", "error")
 """What a row of numbers is about, in CSV."""
@@ -178,24 +130,14 @@ class Block:
 
     - `cell`: scenes, sensor and illuminations, as the paper names them: ``("C1", "6D", "Random")``; the paper's numbers
       are found by it, so other scenes and lights have names of their own.
-    - `images`: number of images.
     - `lights`: how their lights were chosen, in words.
-    - `results`: one a method, in the order of `METHODS`.
+    - `results`: one a method, in the order of `METHODS`; empty before it is evaluated.
     """
-
-    cell: Cell
-    images: int
-    lights: str
-    results: tuple[Result, ...]
-
-
-@dataclass(frozen=True, eq=False)
-class Setting:
-    """One of the eight data sets before it is evaluated."""
 
     cell: Cell
     scenes: tuple[RenderedScene, ...]
     lights: str
+    results: tuple[Result, ...] = ()
 
 
 def sensor_of(lut: Lut) -> str:
@@ -210,7 +152,7 @@ def settings(
     side: int = SIDE,
     seed: int = 0,
     names: tuple[str, str] = OWN,
-) -> tuple[Setting, ...]:
+) -> tuple[Block, ...]:
     """Return the data sets of the table in the paper's order: scenes, then tables, then lights.
 
     `truths`: (N, 3) float64 ≥ 0, the ground truths that the first choice of lights is to be like; linear camera RGB of
@@ -224,7 +166,7 @@ def settings(
         names[0]: [ScaledSource(picture, side) for picture in pictures],
         "Random": random_scenes(count, side, side, seed),
     }
-    found: list[Setting] = []
+    found: list[Block] = []
     for scenes, sources in sets.items():
         for lut in luts:
             choices: dict[str, ChosenLights] = {
@@ -232,7 +174,7 @@ def settings(
                 "Random": lights_at_random(lut, count, seed),
             }
             found += [
-                Setting((scenes, sensor_of(lut), lights), rendered(lut, sources, chosen, seed), chosen.how)
+                Block((scenes, sensor_of(lut), lights), rendered(lut, sources, chosen, seed), chosen.how)
                 for lights, chosen in choices.items()
             ]
     return tuple(found)
@@ -250,15 +192,10 @@ def thinned(things: Sequence[_Thing], most: int = STUDIED) -> Sequence[_Thing]:
     return [things[place * len(things) // count] for place in range(count)]
 
 
-def table1(
-    chosen: Sequence[Setting], workers: int = 1, on_scene: Callable[[], None] | None = None
-) -> tuple[Block, ...]:
-    """Return what the methods make of each data set."""
+def table1(chosen: Sequence[Block], workers: int = 1, on_scene: Callable[[], None] | None = None) -> tuple[Block, ...]:
+    """Return the data sets with what the methods make of each."""
     methods = [standard_methods()[name] for name in METHODS]
-    return tuple(
-        Block(part.cell, len(part.scenes), part.lights, evaluate(part.scenes, methods, workers, on_scene))
-        for part in chosen
-    )
+    return tuple(replace(part, results=evaluate(part.scenes, methods, workers, on_scene)) for part in chosen)
 
 
 def block_title(cell: Cell) -> str:
@@ -281,14 +218,14 @@ def block_table(block: Block, kind: ErrorKind) -> Table:
         rows.append((result.method, *result.summary(kind).as_tuple()))
         if result.method in published:
             rows.append(("paper", *published[result.method].as_tuple()))
-    notes = [f"{counted(block.images, 'image')}; lights {block.lights}."]
+    notes = [f"{counted(len(block.scenes), 'image')}; lights {block.lights}."]
     notes += [
         f"{result.method}: no usable pixel in {counted(int(result.guessed.sum()), 'image')}, whose light "
         "was taken to be grey."
         for result in block.results
         if result.guessed.any()
     ]
-    return Table(block_title(block.cell), ("Algorithm", *NUMBERS), tuple(rows), notes=tuple(notes))
+    return Table(block_title(block.cell), PAPER_COLUMNS, tuple(rows), notes=tuple(notes))
 
 
 def joint_table(blocks: Sequence[Block]) -> Table:
@@ -298,14 +235,14 @@ def joint_table(blocks: Sequence[Block]) -> Table:
     for block in blocks:
         published = TABLE1.get(block.cell, {})
         for result in block.results:
-            head = (*block.cell, block.images, result.method)
+            head = (*block.cell, len(block.scenes), result.method)
             given = {str(kind): result.summary(kind).as_tuple() for kind in kinds}
             if result.method in published:
                 given["paper"] = published[result.method].as_tuple()
             rows += [(*head, name, *numbers) for name, numbers in given.items()]
     return Table(
         "Errors on generated data sets, degrees",
-        (*_HEAD, "mean", "median", "trimean", "best25", "worst25", "avg"),
+        (*_HEAD, *STATISTICS_COLUMNS[:6]),
         tuple(rows),
     )
 
@@ -384,74 +321,42 @@ def hot_photosites(lut: Lut, per_million: float, seed: int = 0) -> HotPhotosites
     return HotPhotosites(places, rng.uniform(0, lut.provenance.white_level, len(places)))
 
 
-@dataclass(frozen=True, eq=False)
-class HotScene:
+@dataclass(frozen=True, eq=False, kw_only=True)
+class HotScene(RenderedScene):
     """A scene as a sensor with hot photosites would give it."""
 
-    scene: RenderedScene
     hot: HotPhotosites
 
-    @property
-    def name(self) -> str:
-        """The image's number."""
-        return self.scene.name
-
-    @property
-    def truth(self) -> npt.NDArray[np.float64]:
-        """The light (3,) float64, linear camera RGB, r + g + b = 1."""
-        return self.scene.truth
-
-    @property
-    def saturation(self) -> float:
-        """White level of the table."""
-        return self.scene.saturation
+    @classmethod
+    def of(cls, scene: RenderedScene, hot: HotPhotosites) -> HotScene:
+        """Return a scene with hot photosites."""
+        return cls(scene.lut, scene.source, scene.light, scene.number, scene.seed, hot=hot)
 
     def read(self) -> tuple[npt.NDArray[np.uint16], None]:
         """Return the image (H, W, 3) uint16, linear camera RGB, and no mask."""
-        scene = self.scene
-        samples = self.hot.raise_in(scene.lut.samples[scene.light], scene.saturation)
-        picture, _ = replace_unfit_colours(scene.source.read().picture, scene.lut.provenance)
-        return draw_samples(samples, picture, seed=scene.seed, image=scene.number), None
+        samples = self.hot.raise_in(self.lut.samples[self.light], self.saturation)
+        picture, _ = replace_unfit_colours(self.source.read().picture, self.lut.provenance)
+        return draw_samples(samples, picture, seed=self.seed, image=self.number), None
 
 
-@dataclass(frozen=True, eq=False)
-class HotRow:
-    """White-Patch on one data set with one share of hot photosites.
-
-    - `title`: the data set's.
-    - `per_million`: hot photosites in a million.
-    - `count`: how many that are in the table.
-    - `result`: white-Patch's.
-    """
-
-    title: str
-    per_million: float
-    count: int
-    result: Result
-
-
-def hot_rows(chosen: Sequence[Setting], shares: Sequence[float], seed: int = 0, workers: int = 1) -> tuple[HotRow, ...]:
-    """Return White-Patch's results on data sets whose tables have hot photosites.
+def hot_table(
+    chosen: Sequence[Block], shares: Sequence[float], kind: ErrorKind, seed: int = 0, workers: int = 1
+) -> Table:
+    """Return White-Patch's six numbers on data sets whose tables have hot photosites.
 
     `shares`: hot photosites in a million of a light's values.
     """
     method = standard_methods()["white-patch"]
-    rows: list[HotRow] = []
+    rows: list[tuple[str | float | None, ...]] = []
     for part in chosen:
-        scenes = thinned(part.scenes)
         for share in shares:
             hot = hot_photosites(part.scenes[0].lut, share, seed)
-            (result,) = evaluate([HotScene(scene, hot) for scene in scenes], [method], workers)
-            rows.append(HotRow(block_title(part.cell), share, len(hot.places), result))
-    return tuple(rows)
-
-
-def hot_table(rows: Sequence[HotRow], kind: ErrorKind) -> Table:
-    """Return the six numbers of White-Patch for each data set and share of hot photosites."""
+            (result,) = evaluate([HotScene.of(scene, hot) for scene in thinned(part.scenes)], [method], workers)
+            rows.append((block_title(part.cell), share, len(hot.places), *result.summary(kind).as_tuple()))
     return Table(
         f"White-Patch where a table has hot photosites, {kind} error in degrees",
-        ("Data set", "Per million", "In the table", *NUMBERS),
-        tuple((row.title, row.per_million, row.count, *row.result.summary(kind).as_tuple()) for row in rows),
+        ("Data set", "Per million", "In the table", *PAPER_COLUMNS[1:]),
+        tuple(rows),
         notes=(
             "A model: dark signals drawn evenly up to saturation, at the same places under every light. The simulated "
             "sensors have none unless their room asks for some.",
@@ -517,7 +422,7 @@ def table2_tables(found: Sequence[Trained], kind: ErrorKind, name: str, with_pub
             known = published.get(LEARNERS.get(trained.learner, ""))
             if known and with_published:
                 rows.append(("paper", *known.as_tuple()))
-        tables.append(Table(title, ("Algorithm", *NUMBERS), tuple(rows)))
+        tables.append(Table(title, PAPER_COLUMNS, tuple(rows)))
     return [*tables, _ratios(found, kind, name)]
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from acquisition.judge import limits
+from acquisition.judge import light, limits
 from acquisition.judge.checks import (
     MOST_RESTARTS,
     judge_dark,
@@ -16,7 +16,7 @@ from acquisition.judge.checks import (
     judge_first_primary,
     judge_white,
 )
-from acquisition.judge.light import Basis, Codes
+from acquisition.judge.light import Basis, Codes, ProjectorModel
 from acquisition.judge.measure import SEGMENTS, TILE_COLUMNS, TILE_ROWS, Frame, FramePlaces, Measured, Noise
 from acquisition.judge.state import JudgeState, Seen
 from drivers.presenter import Colour
@@ -275,3 +275,17 @@ def test_first_frames_are_taken_again_as_often_as_a_passer_by_needs_and_then_som
     ]
     asked = ["do not agree" in found.reason for found in said if found is not None]
     assert asked == [False] * MOST_RESTARTS + [True, True]
+
+
+def test_of_a_curve_a_small_part_is_the_primary_s_own() -> None:
+    nodes = len(light._NODES)  # pyright: ignore[reportPrivateUsage]
+    covariance = ProjectorModel.unknown().covariance
+    own, shared = covariance[:nodes, :nodes], covariance[:nodes, nodes : 2 * nodes]
+    np.testing.assert_allclose(own, covariance[nodes : 2 * nodes, nodes : 2 * nodes])
+    np.testing.assert_allclose(shared, own * (1 - 0.15**2))
+
+
+def test_tiles_begin_at_the_frame_s_first_block_and_end_at_its_last() -> None:
+    places = FramePlaces(160, 240)
+    assert places.x_edges.tolist() == list(range(0, 241, 10))
+    assert places.y_edges.tolist() == list(range(0, 161, 10))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import pytest
 
 from acquisition.run.devices import (
@@ -47,6 +49,8 @@ def test_a_projector_without_a_wheel_needs_whole_pictures() -> None:
 def test_the_times_that_are_named_before_a_camera_is_asked_are_engraved() -> None:
     engraved = {step.value for step in SHUTTER.steps}
     assert set(ENGRAVED_S) <= engraved
+    # Thirds of a stop, as engraved: 1/20 after 1/25, 1/13 after 1/15.
+    assert all(1.1 < longer / shorter < 1.4 for shorter, longer in pairwise(ENGRAVED_S))
 
 
 @pytest.mark.parametrize(("shutter_s", "whole"), [(1 / 60, True), (1 / 125, False), (0.0, False), (0.508, False)])

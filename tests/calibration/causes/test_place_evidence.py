@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+from typing import Any
+
 import numpy as np
 import pytest
 
+from calibration.causes import gathering
 from calibration.causes.gathering import covered_deviation
 
 
@@ -22,3 +26,18 @@ from calibration.causes.gathering import covered_deviation
 )
 def test_covered_cells_are_darker_all_or_far_off(off: list[float], expected: float) -> None:
     assert covered_deviation(np.array(off)) == pytest.approx(expected, nan_ok=True)
+
+
+def test_cells_about_a_place_that_hold_a_hot_photosite() -> None:
+    places = np.array([[0.0, 0], [1, 0], [2, 0], [9, 9]])
+    cells = SimpleNamespace(stains=SimpleNamespace(places_mm=places))
+
+    def share(hottest: list[float], size_mm: float) -> float:
+        table: Any = SimpleNamespace(dark_frames=SimpleNamespace(hottest=np.array(hottest)), cells=cells)
+        return gathering._hot_share(table, places[0], size_mm)  # pyright: ignore[reportPrivateUsage]
+
+    assert share([5, 0, 0, 7], 3.0) == 0.5
+    assert share([5, 0, 0, 7], 5.0) == pytest.approx(1 / 3)
+    # Nothing is known without dark frames of these cells, or where no cell lies.
+    assert np.isnan(share([], 3.0))
+    assert np.isnan(share([5, 0, 0, 7], 0.0))

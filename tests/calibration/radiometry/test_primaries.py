@@ -129,6 +129,7 @@ def test_the_brightest_pure_lights_are_chosen() -> None:
     assert pure_lights([light for light in lights if light.kind == "cct"]) is None
 
 
+@pytest.mark.slow
 def test_a_session_of_unlike_primaries_is_told_true(tmp_path: Path) -> None:
     room = Room(waviness_mm=0.5, projector_falloff=0.3, primary_difference=0.4, response_spread=0.0)
     lab = hang(room=room)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 from pathlib import Path
 
+import cv2
 import numpy as np
 import numpy.typing as npt
 import pytest
@@ -280,3 +281,13 @@ def test_none_is_found_where_there_is_none(lab: Lab, tmp_path: Path) -> None:
     lateral = register(lab.mosaic(tmp_path), lab.chart).lateral
     for channel in ("R", "B"):
         assert abs(lateral.corner_px(channel)) < 4 * lateral.corner_error_px(channel) < 0.5
+
+
+def test_a_lens_bends_as_opencv_s_model_does() -> None:
+    radius, centre, terms = 1500.0, np.array([1300.0, 866.0]), np.array([-0.04, 0.02, 3e-3, -2e-3])
+    points = np.random.default_rng(2).uniform(-0.8, 0.8, (20, 2))
+    camera = np.array([[radius, 0, centre[0]], [0, radius, centre[1]], [0, 0, 1]])
+    lens = Lens(camera, centre, radius, terms)
+    rays = np.column_stack([points, np.ones(len(points))])
+    seen, _ = cv2.projectPoints(rays, np.zeros(3), np.zeros(3), camera, terms)
+    np.testing.assert_allclose(lens.to_pixels(points), seen.reshape(-1, 2), atol=1e-9)

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+from typing import Any
+
 import numpy as np
+import numpy.typing as npt
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -10,6 +14,7 @@ from matplotlib.figure import Figure
 
 from calibration.comparison.comparing import CellDifferences
 from calibration.comparison.report import draw_map
+from calibration.report import plots
 from calibration.report.plots import draw_chromaticities, draw_print, half_size
 from drivers.raw.plain_dng import Area
 from drivers.raw.rawfile import Mosaic
@@ -108,3 +113,24 @@ def test_lights_are_drawn_at_their_chromaticities_in_the_triangle_of_all() -> No
         # Black bodies come second; a light without light has no chromaticity.
         drawn = np.concatenate([np.asarray(dots.get_offsets()) for dots in axes.collections])
         np.testing.assert_allclose(drawn, places, atol=1e-9)
+
+
+def test_a_cell_is_outlined_at_its_corners_and_its_samples_about_its_middle() -> None:
+    drawn: list[list[tuple[float, float]]] = []
+
+    def plot(x: npt.ArrayLike, y: npt.ArrayLike, **_: object) -> None:
+        drawn.append([(float(one), float(other)) for one, other in zip(np.asarray(x), np.asarray(y), strict=True)])
+
+    def seen(points_mm: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+        return 10 * points_mm
+
+    axes: Any = Figure().add_subplot()
+    axes.plot = plot
+    chart: Any = SimpleNamespace(cell_mm=(4, 2), centres_mm=np.array([[6.0, 5.0], [40.0, 5.0]]))
+    registration: Any = SimpleNamespace(cell_px=20, to_pixels=seen)
+    picture, places = np.zeros((100, 500, 3), np.float32), np.array([[60.0, 50.0], [400.0, 50.0]])
+    magnified = plots._magnified  # pyright: ignore[reportPrivateUsage]
+    magnified(axes, picture, places[0], 30.0, chart, registration, places, 5)
+    cell, samples = drawn
+    assert cell == [(40, 40), (80, 40), (80, 60), (40, 60), (40, 40)]
+    assert samples == [(57.5, 47.5), (62.5, 47.5), (62.5, 52.5), (57.5, 52.5), (57.5, 47.5)]

@@ -13,7 +13,7 @@ from drivers.links.usb import UDEV_RULE, UsbDevice, list_devices, open_usb
 from drivers.ptp.session import PtpRequest
 from drivers.ptp.usb import UsbTransport
 from foundation.errors import DeviceRefused, InputError, LinkClosed, LinkTimeout
-from sim.buses.usb import BULK_IN, BULK_OUT, PtpUsbDevice, Setup, SimulatedBus, UsbIdentity
+from sim.buses.usb import BULK_IN, BULK_OUT, PtpUsbDevice, Setup, SimulatedBus, Stalled, UsbIdentity
 from sim.clock import SimulatedClock
 from tests.contracts.transport import ECHO, PATIENCE_S, Bench, Echo, TransportContract
 
@@ -205,3 +205,13 @@ def test_a_device_has_its_own_pipes_and_no_others() -> None:
     assert bus.bulk_write(handle, BULK_OUT, 0, array("B"), 0) == 0
     with pytest.raises(usb.core.USBError, match="not found"):
         bus.bulk_write(handle, BULK_OUT + 1, 0, array("B"), 0)
+
+
+def test_a_host_halts_and_clears_a_pipe() -> None:
+    device = camera()
+    for request, halted in ((3, 1), (1, 0)):
+        device.control(Setup(0x02, request, 0, BULK_IN, 0))
+        assert device.control(Setup(0x82, 0, 0, BULK_IN, 2)) == bytes([halted, 0])
+    # Of the device and its interfaces there is nothing to be halted.
+    with pytest.raises(Stalled):
+        device.control(Setup(0x00, 3, 0, BULK_IN, 0))

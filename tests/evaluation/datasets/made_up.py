@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -31,9 +32,16 @@ def image_of(height: int, width: int, colour: Sequence[int] = COLOUR) -> npt.NDA
 def write_png(path: Path, image: Image) -> None:
     """Write an image (H, W, 3) uint16 or uint8, red first, by another library than reads it."""
     path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(_png(image.tobytes(), image.shape, image.dtype.name))
+
+
+@lru_cache(maxsize=8)
+def _png(values: bytes, shape: tuple[int, ...], kind: str) -> bytes:
+    """Return the file of an image; copies of a data set have the same large images in every test."""
+    image = np.frombuffer(values, kind).reshape(shape)
     done, data = cv2.imencode(".png", image[..., ::-1], [cv2.IMWRITE_PNG_COMPRESSION, 1])
     assert done
-    path.write_bytes(data.tobytes())
+    return data.tobytes()
 
 
 def write_tiff(path: Path, image: npt.NDArray[Any]) -> None:

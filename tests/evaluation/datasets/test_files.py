@@ -15,7 +15,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from evaluation.datasets.files import Folder, decode_image, natural, polygon_mask, present, subtract_black
+from evaluation.datasets.files import Folder, decode_image, natural, polygon_mask, present, read_rows, subtract_black
 from foundation.errors import FormatError
 from tests.data_files import shipped
 from tests.evaluation.datasets.made_up import image_of, write_png, write_tiff
@@ -131,3 +131,14 @@ def test_a_black_level_is_subtracted_from_planes_as_from_pixels() -> None:
     planes = np.arange(60, dtype=np.uint16).reshape(3, 4, 5)
     expected = np.maximum(np.moveaxis(planes.astype(np.int64), 0, 2) - 30, 0)
     np.testing.assert_array_equal(subtract_black(np.moveaxis(planes, 0, 2), 30.0), expected)
+
+
+@pytest.mark.parametrize(
+    ("text", "why"), [(b"a,b\n\xff,1\n", "invalid start byte"), (b"a,b\n" + b"x" * 200_000, "field larger")]
+)
+def test_a_table_that_is_none_is_named(tmp_path: Path, text: bytes, why: str) -> None:
+    (tmp_path / "gt.csv").write_bytes(text)
+    with pytest.raises(FormatError, match=f"gt.csv.*{why}"):
+        assert not list(read_rows(tmp_path / "gt.csv", ["a", "b"]))
+    with pytest.raises(FormatError, match="No such file or directory; restore it"):
+        next(read_rows(tmp_path / "none.csv", ["a"]))

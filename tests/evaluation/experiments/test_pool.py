@@ -174,6 +174,7 @@ def test_the_report_has_the_pool_the_test_sets_and_what_was_told(tmp_path: Path)
     text = made("cross-validation", "generated", "naive with matrix", tests=("A<b", "C"))
     assert "<h1>Transfer to A&lt;b + C</h1>" in text
     assert "20 images of A&lt;b (10 images), C (10 images)" in text
+    assert "errors in parts of the same method&#39;s real cross-validation" in text
     assert "A note &amp; more" in text
     assert text.count("<svg") == 2
     assert text.count("Squares: each test set by itself.") == 2

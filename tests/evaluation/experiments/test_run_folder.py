@@ -17,7 +17,7 @@ import pytest
 
 from evaluation.datasets import open_scenes
 from evaluation.experiments import run_folder
-from evaluation.experiments.run_folder import AnswerJournal, describe_run, read_journal, run_methods, write_run
+from evaluation.experiments.run_folder import append_answers, describe_run, read_journal, run_methods, write_run
 from evaluation.experiments.running import evaluate
 from evaluation.learning.model_files import StoredMethod, provenance_of
 from evaluation.learning.standard import standard_learners
@@ -44,9 +44,8 @@ def written(path: Path) -> bytes:
     """Return the bytes of the journal of all answers."""
     assert read_journal(path, IDENTITY) == []
     with path.open("ab", buffering=0) as stream:
-        journal = AnswerJournal(stream, 0, path.parent)
-        for answers in ANSWERS:
-            journal.append(answers)
+        for image, answers in enumerate(ANSWERS):
+            append_answers(stream, image, answers, path.parent)
     return path.read_bytes()
 
 
@@ -68,9 +67,8 @@ def test_a_journal_cut_anywhere_goes_on_where_it_was_whole(tmp_path: Path) -> No
         known = read_journal(path, IDENTITY)
         assert known == ANSWERS[: max(0, sum(end <= cut for end in ends) - 1)]
         with path.open("ab", buffering=0) as stream:
-            journal = AnswerJournal(stream, len(known), tmp_path)
-            for answers in ANSWERS[len(known) :]:
-                journal.append(answers)
+            for image in range(len(known), len(ANSWERS)):
+                append_answers(stream, image, ANSWERS[image], tmp_path)
         assert path.read_bytes() == whole
 
 

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 import numpy.typing as npt
 import pytest
 
 from evaluation.methods.gray_edge import GrayEdge
-from evaluation.methods.green_stability import FAMILIES, family, tune
+from evaluation.methods.green_stability import family, tune
+from evaluation.methods.naming import FAMILIES
 from evaluation.scene import Image
 from foundation.errors import InputError
 
@@ -44,7 +46,7 @@ def test_the_norm_whose_estimates_stay_green_is_chosen() -> None:
     tuned = tune(family("shades-of-gray"), SCENES)
     assert tuned.best.name == "Shades-of-Gray (p=15)"
     assert list(tuned.spreads) == sorted(tuned.spreads, reverse=True)
-    assert tuned.images == 8
+    assert len(tuned.lights) == 8
 
 
 def test_images_without_a_light_do_not_count() -> None:
@@ -63,6 +65,10 @@ def test_too_little_to_tune_with_is_refused() -> None:
 
 
 @pytest.mark.parametrize("name", FAMILIES)
-def test_names_of_a_family_tell_its_members_apart(name: str) -> None:
+def test_members_of_a_family_are_methods_of_the_framework(name: str) -> None:
     members = family(name)
-    assert len({member.name for member in members}) == len(members)
+    order, scales = {"gray-edge-1": 1, "gray-edge-2": 2}.get(name, 0), (1, 2, 4, 6, 9)
+    grid = [(p, 0) for p in range(1, 16)] if name == "shades-of-gray" else product((1, 2, 4, 6, 9, 13), scales)
+    expected = {(order, p, sigma) for p, sigma in grid}
+    assert {(one.order, one.p, one.sigma) for one in members if isinstance(one, GrayEdge)} == expected
+    assert len({member.name for member in members}) == len(members) == len(expected)

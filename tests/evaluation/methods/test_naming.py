@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from evaluation.methods.gray_edge import GrayEdge
-from evaluation.methods.green_stability import FAMILIES, family, family_names
 from evaluation.methods.method import Learner
 from evaluation.methods.naming import find_method
 from evaluation.methods.standard import standard_methods
@@ -62,11 +61,6 @@ def test_a_value_a_learner_and_a_neighbour_of_the_file(tmp_path: Path) -> None:
 
 def test_a_class_of_a_module() -> None:
     assert find_method("evaluation.methods.pca:BrightDark").name == "PCA bright and dark"
-
-
-@pytest.mark.parametrize("name", FAMILIES)
-def test_settings_of_a_family_are_found_by_their_names(name: str) -> None:
-    assert [find_method(text) for text in family_names(name)] == list(family(name))
 
 
 def test_parameters_in_a_name() -> None:

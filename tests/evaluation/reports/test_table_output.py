@@ -40,6 +40,17 @@ def test_a_narrow_terminal_folds_names_and_cuts_no_number(
         assert word in text
 
 
+def test_a_file_gets_the_whole_table_however_narrow_the_terminal(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("COLUMNS", "30")
+    print_table(TABLE)
+    lines = capsys.readouterr().out.splitlines()[1:-1]
+    assert len({len(line) for line in lines}) == 1
+    (row,) = [line for line in lines if TABLE.texts()[0][0] in line]
+    assert re.findall(r"\d+\.\d\d ", row) == ["123.46 ", "7.00 "]
+
+
 HEADS = ("Algorithm", "Mean", "Best 25%")
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from functools import cache
+from itertools import pairwise
 
 import numpy as np
 import numpy.typing as npt
@@ -292,3 +293,10 @@ def test_the_paper_s_references_are_bare_margin() -> None:
     for bits, page, expected in ((5, "A5", "256 × 128 cells"), (6, "A0", "1 to 5 bits")):
         with pytest.raises(InputError, match=expected):
             paper_chart(page, bits)
+
+
+def test_each_sheet_is_half_of_the_one_before() -> None:
+    sheets = list(A_SERIES_MM.values())
+    for (wide, high), (half_wide, half_high) in pairwise(sheets):
+        assert half_wide == high
+        assert half_high == wide // 2

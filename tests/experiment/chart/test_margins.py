@@ -12,7 +12,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from experiment.chart.layout import design_chart, paper_chart
-from experiment.chart.margins import Margins, bar_boxes, edge_boxes, margin_marks, star_boxes, text_boxes, whole_px
+from experiment.chart.margins import (
+    GAP_PX,
+    Margins,
+    bar_boxes,
+    edge_boxes,
+    margin_marks,
+    star_boxes,
+    target_boxes,
+    text_boxes,
+    whole_px,
+)
 from experiment.chart.model import Chart
 from experiment.chart.printing import drawing, field_drawing
 
@@ -159,3 +169,11 @@ def test_a_chart_of_another_maker_without_margins_is_drawn(a7: Chart) -> None:
     high = a7.tags[-1].corners_mm[2] + 50 * PX_MM
     tight = replace(a7, page_mm=(float(high[0]) + 0.5, float(high[1]) + 0.5))
     clear_of_the_field(tight)
+
+
+def test_targets_begin_at_the_corner_that_they_are_put_to() -> None:
+    for boxes in (star_boxes(), edge_boxes(), bar_boxes()):
+        assert boxes[:, :2].min(axis=0).tolist() == [0, 0]
+    (left, top, _, _), (right, _) = (target_boxes().min(axis=0), target_boxes().max(axis=0)[2:])
+    assert (left, top) == (0, GAP_PX)
+    assert right / 600 * 25.4 == pytest.approx(52, abs=1)

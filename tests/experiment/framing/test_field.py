@@ -14,11 +14,13 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 import pytest
+from scipy.special import ndtr
 
 from drivers.presenter import BLACK, WHITE, Colour
 from drivers.raw.rawfile import Mosaic, read_raw
 from experiment.chart.layout import design_chart, paper_chart
 from experiment.chart.model import Chart
+from experiment.framing import field
 from experiment.framing.field import FoundField, corners_text, field_mm, find_field, parse_corners, refine_edges
 from experiment.framing.finding import find_chart
 from experiment.framing.pictures import blur_px
@@ -267,3 +269,12 @@ def test_raw_pixels_become_half_size_ones() -> None:
 def test_what_cannot_be_corners_is_refused(given: Sequence[str], message: str) -> None:
     with pytest.raises(InputError, match=message):
         parse_corners(given)
+
+
+@pytest.mark.parametrize("off_px", [-1.2, -0.3, 0.0, 0.4, 0.9])
+def test_a_blurred_step_is_found_where_it_is(off_px: float) -> None:
+    across = field._REFINE_ACROSS_PX  # pyright: ignore[reportPrivateUsage]
+    profile = 0.2 + 0.5 * ndtr((across - off_px) / 0.8)
+    off, rise = field._fitted_step(profile[None], 0.8)  # pyright: ignore[reportPrivateUsage]
+    assert off[0] == pytest.approx(off_px, abs=0.01)
+    assert rise[0] == pytest.approx(0.5, abs=0.01)

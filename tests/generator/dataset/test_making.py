@@ -151,6 +151,7 @@ def test_replaced_pixels_are_counted(make_lut: Callable[..., Lut], pictures: Pat
     count = int(((top == 0).all(axis=2) | (top == 1).all(axis=2)).sum())  # colour 21 is (1, 1, 1)
     assert count > 0
     assert made.description.replaced_pixels == count
+    assert made.description.pixels == top.size // 3
     assert [source.replaced_pixels for source in made.sources] == [count]
     assert made.read_preview(made.entries[0]) is None
     assert not (tmp_path / "out" / "previews").exists()

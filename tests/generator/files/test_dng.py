@@ -17,6 +17,7 @@ from hypothesis import strategies as st
 
 from drivers.raw.rawfile import camera_matrix, decode_raw
 from foundation.errors import InputError
+from generator import files
 from generator.files import ImageMetadata, decode_image, encode_image
 
 WHITES = {
@@ -132,3 +133,9 @@ def test_sizes_that_raw_programs_do_not_open_are_refused() -> None:
         encode_image(np.zeros((21, 40, 3), np.uint16), "dng", ImageMetadata(12000, (1.0, 1.0, 1.0), "Canon EOS 550D"))
     with pytest.raises(InputError, match="white level is 0"):
         encode_image(np.zeros((30, 40, 3), np.uint16), "dng", ImageMetadata(0, (1.0, 1.0, 1.0), "Canon EOS 550D"))
+
+
+def test_the_matrix_of_srgb_takes_daylight_to_white() -> None:
+    # D65 of IEC 61966-2-1, whose matrix has four decimals.
+    white = np.array(files._SRGB) @ [0.9505, 1.0, 1.0890]  # pyright: ignore[reportPrivateUsage]
+    np.testing.assert_allclose(white, 1, atol=3e-4)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import mmap
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
@@ -13,7 +14,7 @@ from hypothesis import strategies as st
 
 from foundation.errors import InputError
 from generator.kernels import vector as streaming
-from generator.kernels.choice import bits_of
+from generator.kernels.choice import bits_of, readable
 from generator.kernels.rendering import PATTERNS, draw_mosaic, draw_samples
 from generator.rendering.render import render
 
@@ -244,3 +245,15 @@ def test_a_mosaic_has_each_site_s_own_channel(make_lut: Callable[..., Lut], pict
         np.testing.assert_array_equal(np.concatenate(bands), mosaic)
     with pytest.raises(InputError, match="'XTRANS' is no Bayer pattern; expected RGGB"):
         draw_mosaic(samples, picture, pattern="XTRANS")
+
+
+@pytest.mark.parametrize("left", [0, 2, 1000])
+def test_two_bytes_behind_samples_can_be_read(left: int) -> None:
+    page = mmap.PAGESIZE
+    memory = np.frombuffer(mmap.mmap(-1, 2 * page), np.uint8)
+    size = 8 * 4 * 3
+    end = page - left  # Where the samples end: at the end of a page, or within one.
+    samples = memory[end - 2 * size : end].view(np.uint16).reshape(8, 4, 3)
+    found = readable(samples)
+    assert (found is samples) is (left >= 2)
+    np.testing.assert_array_equal(found, samples)

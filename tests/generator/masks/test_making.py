@@ -339,6 +339,8 @@ def test_texts_of_masks() -> None:
     [
         ("", "'' is neither a folder of masks nor a kind of them: half-plane, soft-edge, spots, smooth, window"),
         ("stripes", "'stripes' is neither a folder"),
+        ("half-plane:angle=361", "expected a number from -360 to 360"),
+        ("soft-edge:angle=-361", "expected a number from -360 to 360"),
         ("spots:count=0", "'count=0' of the masks spots: expected a number from 1 to 20"),
         ("spots:count=1.5", "count=1.5 of the masks spots: expected a whole number"),
         ("spots:size=1", "'size=1' is no option of the masks spots; known are count, radius, softness"),

@@ -15,6 +15,7 @@ from generator.dataset.plan import DatasetOptions
 from generator.dataset.shards import photograph
 from generator.kernels.printing import NODES, SIDE
 from generator.lights.lighting import Lighting, Mixture, plain
+from generator.rendering import print_inverse
 from generator.rendering.black_points import BlackPoint
 from generator.rendering.colorimetric import (
     BLACK_WITHIN_DEG,
@@ -261,3 +262,9 @@ def test_a_black_that_is_spoilt_is_named_and_makes_no_flat_image(make_table: Mak
 
     with pytest.raises(QualityError, match=r"under light 1 the table .* has a black as bright as 0\.6\d* of white"):
         ColorimetricRendering(make_table(change=spoil), MINE).seen(plain(1))
+
+
+def test_brightness_and_chromaticity_are_axes_of_a_right_angle() -> None:
+    axes = print_inverse._AXES  # pyright: ignore[reportPrivateUsage]
+    np.testing.assert_allclose(axes @ axes.T, np.eye(3), atol=1e-12)
+    assert np.ptp(axes[0]) == 0
