@@ -197,7 +197,7 @@ def random_troubles(seed: int) -> Troubles:
         return round(x - width, 3), round(y - height, 3), round(x + width, 3), round(y + height, 3)
 
     nothing = 0.0, 0.0, 0.0
-    return Troubles(
+    found = Troubles(
         tail=by_channel(0.07) if there() else nothing,
         power=2.0 if random.random() < 0.5 else 3.0,
         veil=by_channel(0.016) if there() else nothing,
@@ -210,6 +210,7 @@ def random_troubles(seed: int) -> Troubles:
         spot=spot(),
         wheel=round(random.uniform(0.001, 0.02), 4) if random.random() < 1 / 6 else 0.0,
     )
+    return found if found.mirrored else replace(found, spot=Troubles().spot)
 
 
 def random_room(seed: int) -> Room:

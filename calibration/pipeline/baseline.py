@@ -28,6 +28,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 from pydantic import ValidationError
+from threadpoolctl import threadpool_limits
 
 from calibration.checks.frame_consistency import ConsistencyCheck
 from calibration.citation import Rig, StatedOrigin
@@ -384,7 +385,8 @@ class Baseline:
         white = np.maximum(paper.white, 1e-9)
         noise = self.transfer.variance(self.levels * white) / self.options.samples / white**2
         usable = _compared(self.chart, self.first)
-        return added_light(self.levels, noise, usable, self.points.cells_mm, self.chart.page_mm, self.chart.bits)
+        with threadpool_limits(limits=1, user_api="blas"):
+            return added_light(self.levels, noise, usable, self.points.cells_mm, self.chart.page_mm, self.chart.bits)
 
     def dark_light_estimate(self) -> DarkLightEstimate:
         """Return the estimate of the dark light before any dark frame, with the reflectances of the first frame."""
@@ -434,7 +436,9 @@ def with_lens(
         # Few cells show so little of the lens that their noise matters.
         frames += [frame for frame in (_spread_frame(baseline, chain([first], whites), view, True),) if frame]
     left_out = "" if baseline.options.lens_correction else "left out by --no-lens-correction"
-    found = measure_spread(frames, around, chart.page_mm, chart.bits, LEAST_COUNTS, left_out)
+    # Threads of linear algebra wait for one another on a busy machine for longer than it takes.
+    with threadpool_limits(limits=1, user_api="blas"):
+        found = measure_spread(frames, around, chart.page_mm, chart.bits, LEAST_COUNTS, left_out)
     if found is None:
         return baseline
     lens = LensCorrection(view, *found)

@@ -434,7 +434,7 @@ class _Lenses:
         matrices: list[_Array] = []
         covariances: list[_Array] = []
         evidence: list[float] = []
-        for lens in _supposed_lenses():
+        for lens in _supposed_lenses(few=bits < VARYING_BITS):
             prior = np.linalg.inv(_usual_shares(bits, lens))
             covariance = np.asarray(misfit * np.linalg.inv(inflated + misfit * (prior - usual)), dtype=np.float64)
             gain = float(vector @ covariance @ vector) / misfit**2
@@ -470,12 +470,15 @@ class _Lens:
     odds: float = 1.0
 
 
-def _supposed_lenses() -> list[_Lens]:
-    """Return all that is supposed of lenses."""
-    apart = [(one, (1 - _CLEAN_ODDS) * odds) for one, odds in zip(_APART, _APART_ODDS, strict=True)]
-    clean = (_CLEAN, CHANNELS_APART, _CLEAN_ODDS)
-    far = [clean, *((size, one, odds / len(_FAR_SIZES)) for size, (one, odds) in product(_FAR_SIZES, apart))]
-    veils = [clean, *((size, one, odds / len(_VEIL_SIZES)) for size, (one, odds) in product(_VEIL_SIZES, apart))]
+def _supposed_lenses(few: bool) -> list[_Lens]:
+    """Return all that is supposed of lenses; `few`: where cells are so few that they may see nothing of a usual one."""
+    apart = list(zip(_APART, _APART_ODDS, strict=True))
+    far = [(size, one, odds / len(_FAR_SIZES)) for size, (one, odds) in product(_FAR_SIZES, apart)]
+    veils = [(1.0, one, odds) for one, odds in apart]
+    if few:
+        clean = _CLEAN, CHANNELS_APART, _CLEAN_ODDS / (1 - _CLEAN_ODDS)
+        veils = [(size, one, odds / len(_VEIL_SIZES)) for size, (one, odds) in product(_VEIL_SIZES, apart)]
+        far, veils = [clean, *far], [clean, *veils]
     return [_Lens(*one[:2], *two[:2], one[2] * two[2]) for one, two in product(far, veils)]
 
 
