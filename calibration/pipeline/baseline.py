@@ -537,6 +537,7 @@ def _spread_frame(baseline: Baseline, same: Iterable[DecodedFrame], view: PrintV
     whites = slice(len(points.cells_mm), len(points.cells_mm) + len(points.whites_mm))
     paper, _ = baseline.paper.read(np.where(usable[whites, None], means[whites], np.nan), file)
     bends = baseline.superposition or Superposition.usual(full)
+    red, green, blue = np.sqrt(bends.errors(_DARK_LEVEL * paper.white, paper.white)).tolist()
     return SpreadFrame(
         levels=FrameLevels(means, beyond / count),
         field=paper.field.at(view.grid.points_mm),
@@ -544,7 +545,7 @@ def _spread_frame(baseline: Baseline, same: Iterable[DecodedFrame], view: PrintV
         usable=usable,
         unevenness=LOOSE_UNEVENNESS if mixed else USUAL_UNEVENNESS,
         frames=count,
-        bend=np.sqrt(bends.errors(_DARK_LEVEL * paper.white, paper.white)),
+        bend=(red, green, blue),
         printed=np.concatenate(
             [np.full(chart.colour_count, -1), np.zeros(len(points.whites_mm), dtype=np.int64), 1 + points.levels.level]
         ),

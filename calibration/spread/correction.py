@@ -9,7 +9,7 @@ P patches as in `PrintedGrid`; counts above black; half-size pixels.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, fields
 from itertools import pairwise
 from typing import Any
 
@@ -181,7 +181,7 @@ class SpreadFrame:
     - `printed`: (P,) int64, which references have one colour: a number for each, −1 of cells; None where they are not
       used.
     - `frames`: of how many frames it is the mean.
-    - `bend`: (3,) float64, as in `SpreadData`.
+    - `bend`: of each channel, as in `SpreadData`.
     """
 
     levels: FrameLevels
@@ -191,7 +191,7 @@ class SpreadFrame:
     unevenness: float
     printed: npt.NDArray[np.int64] | None = None
     frames: int = 1
-    bend: _Array = field(default_factory=lambda: np.zeros(3))
+    bend: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -362,7 +362,7 @@ def measure_spread(
             data.append(
                 SpreadData(
                     channel, level, changes[:, :count].T, even[channel] / relative, frame.field[:count, channel],
-                    usable, frame.unevenness, float(frame.bend[channel]),
+                    usable, frame.unevenness, frame.bend[channel],
                 )
             )  # fmt: skip
             if bits < VARYING_BITS:

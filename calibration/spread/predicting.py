@@ -170,7 +170,7 @@ def _likeliest(function: _Array, noise: _Array, root: _Array, *shares: float) ->
     """Return the inverse (C, C) of the covariance whose noise has the likeliest share of the function, and that."""
     found: list[tuple[float, float, _Array]] = []
     for share in shares or _NOISES:
-        factor = np.linalg.cholesky(function + np.diag(share**2 * noise))
+        factor = np.asarray(np.linalg.cholesky(function + np.diag(share**2 * noise)), dtype=np.float64)
         inner = np.linalg.solve(factor, root)
         size = float(inner @ inner) / len(root)
         found.append((0.5 * len(root) * np.log(size) + float(np.log(np.diag(factor)).sum()), share, factor))

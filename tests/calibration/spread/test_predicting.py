@@ -46,7 +46,8 @@ def test_few_cells_leave_little_but_their_noise_where_black_replaces_inks(bend: 
 
 
 def test_what_codes_predict_has_nothing_to_do_with_the_noise_that_is_left() -> None:
-    level, products = printed(0.1), []
+    level = printed(0.1)
+    products: list[float] = []
     for seed in range(8):
         seen = level + 0.002 * np.random.default_rng(seed).standard_normal(len(CODES))
         model = LevelModel.of(seen, ALL, 3)
