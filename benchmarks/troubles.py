@@ -7,9 +7,11 @@ made. A third of the rooms has no trouble; in the others each is there with a pr
 
 The optics share no form with the correction: each channel's light is spread by a power law of the distance, r^-2 or
 r^-3, by Fourier transforms of the whole frame, and has a veil of its own. Sensors compress near white or lose counts
-near black; dark frames hold light that the lights' frames lack; photosites differ and rows have offsets.
+near black; dark frames hold light that the lights' frames lack; photosites differ and rows have offsets; the print
+mirrors light; a colour wheel turns a broken number of times in an exposure.
 
-A light's truth is the mean over the cells of what bare paper sends there, which the flat field divides out. A table is
+A light's truth is the mean over the cells of what bare paper sends there, which the flat field divides out, in the
+light that the wheel let through in its exposure. A table is
 asked for: its true errors lie within the stated expanded uncertainty for 95 of 100 lights and cells, no light beyond
 twice it, and the median of stated over true error is below 3.
 """
@@ -21,7 +23,7 @@ import json
 import sys
 import tempfile
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +31,7 @@ import numpy as np
 import numpy.typing as npt
 
 from benchmarks.cases import chart_of
-from benchmarks.sessions import SETTINGS, compare, short_session
+from benchmarks.sessions import SETTINGS, FrameChange, compare, short_plan, short_session
 from calibration.pipeline.baseline import BuildOptions
 from calibration.pipeline.build import build
 from calibration.table.lut import open_lut
@@ -37,9 +39,10 @@ from calibration.verdict import BuildResult
 from drivers.camera import ExposureSettings
 from drivers.presenter import BLACK, WHITE, Colour
 from experiment.chart.printing import drawing
+from experiment.session.records import SessionStep, plan_steps
 from foundation.colorimetry import angles_deg
 from foundation.errors import CropError
-from sim.world.disturbances import UNDISTURBED, Situation
+from sim.world.disturbances import UNDISTURBED, Glare, Situation
 from sim.world.rendering import Print
 from sim.world.room import Room
 from sim.world.sensors import BODIES
@@ -62,6 +65,10 @@ class Troubles:
     - `in_darks`: light of the dark frames that the lights lack, over white's; dark light is subtracted where it is not
       None.
     - `banding`: standard deviation of a row's offset, counts.
+    - `prnu`: standard deviation of the photosites' response; 0 for what the room has.
+    - `mirrored`: share of paper's light that the print mirrors in a spot of an eighth of its size to half of it,
+      `spot`, (left, top, right, bottom) in shares of the page.
+    - `wheel`: standard deviation of a primary's light in an exposure that cuts a turn of the wheel.
     """
 
     tail: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -71,6 +78,16 @@ class Troubles:
     lost: float = 0.0
     in_darks: tuple[float, float, float] | None = None
     banding: float = 0.0
+    prnu: float = 0.0
+    mirrored: float = 0.0
+    spot: tuple[float, float, float, float] = (0.0, 0.0, 1.0, 1.0)
+    wheel: float = 0.0
+
+    def situation(self, seed: int, number: int) -> Situation:
+        """Return what is otherwise in the frame of a step."""
+        cut = np.random.default_rng((seed, 37, number)).standard_normal(3)
+        red, green, blue = (1 + self.wheel * (cut - cut.mean())).tolist()
+        return Situation(lamp=(red, green, blue), glares=(Glare(self.spot, self.mirrored),) if self.mirrored else ())
 
     def to_json(self) -> dict[str, Any]:
         """Return what is there."""
@@ -84,6 +101,17 @@ class TroubledWorld(World):
     def __init__(self, world: World, troubles: Troubles) -> None:
         super().__init__(world.sheet, world.body, world.room)
         self._troubles = troubles
+        self.let_through: dict[Colour, tuple[float, float, float]] = {}
+
+    def drive(
+        self,
+        colour: Colour,
+        settings: ExposureSettings,
+        lamp: float | _Array = 1.0,
+        ambient: float | _Array = 0.0,
+    ) -> _Array:
+        """Return how much of each primary's light a light's frame collects, as `World.drive`, the wheel included."""
+        return super().drive(colour, settings, lamp * np.array(self.let_through.get(colour, (1.0,) * 3)), ambient)
 
     def signal(
         self,
@@ -164,8 +192,12 @@ def random_troubles(seed: int) -> Troubles:
         red, green, blue = np.round(most * random.uniform(0.2, 1, 3), 4).tolist()
         return red, green, blue
 
+    def spot() -> tuple[float, float, float, float]:
+        (x, y), (width, height) = random.uniform(0.2, 0.8, 2).tolist(), random.uniform(0.125, 0.5, 2).tolist()
+        return round(x - width, 3), round(y - height, 3), round(x + width, 3), round(y + height, 3)
+
     nothing = 0.0, 0.0, 0.0
-    return Troubles(
+    found = Troubles(
         tail=by_channel(0.07) if there() else nothing,
         power=2.0 if random.random() < 0.5 else 3.0,
         veil=by_channel(0.016) if there() else nothing,
@@ -173,7 +205,12 @@ def random_troubles(seed: int) -> Troubles:
         lost=round(random.uniform(2, 12), 1) if there() else 0.0,
         in_darks=by_channel(0.008) if there() else None,
         banding=round(random.uniform(0.2, 1.0), 2) if there() else 0.0,
+        prnu=round(random.uniform(0.01, 0.03), 4) if there() else 0.0,
+        mirrored=round(random.uniform(0.002, 0.03), 4) if there() else 0.0,
+        spot=spot(),
+        wheel=round(random.uniform(0.001, 0.02), 4) if random.random() < 1 / 6 else 0.0,
     )
+    return found if found.mirrored else replace(found, spot=Troubles().spot)
 
 
 def random_room(seed: int) -> Room:
@@ -210,9 +247,18 @@ def tried(seed: int, troubles: Troubles, small: bool) -> tuple[str, list[str], S
     chart = chart_of(small)
     picture = drawing(chart)
     sheet = Print(picture.page_mm, picture.rectangles_mm, picture.rgb)
-    world = TroubledWorld(World(sheet, BODIES["Test" if small else "EOS 550D"], random_room(seed)), troubles)
+    room = random_room(seed)
+    room = replace(room, response_spread=troubles.prnu or room.response_spread)
+    world = TroubledWorld(World(sheet, BODIES["Test" if small else "EOS 550D"], room), troubles)
+
+    def changes(step: SessionStep) -> FrameChange:
+        return FrameChange(situation=troubles.situation(seed, step.number))
+
+    for step in plan_steps(short_plan(), 3):
+        if step.kind == "light":
+            world.let_through[step.colour] = troubles.situation(seed, step.number).lamp
     with tempfile.TemporaryDirectory() as folder:
-        session = short_session(Path(folder) / "session", chart, world, every=3)
+        session = short_session(Path(folder) / "session", chart, world, changes, every=3)
         try:
             options = BuildOptions(subtract_dark=troubles.in_darks is not None)
             result = build(session, Path(folder) / "lut", options=options)
@@ -225,7 +271,7 @@ def tried(seed: int, troubles: Troubles, small: bool) -> tuple[str, list[str], S
         white = np.array(
             [world.seen(paper, cells_mm, light.colour, SETTINGS).mean(axis=0) - dark for light in lut.illuminations]
         )
-        truth = compare(result, lut, world, chart, session, every=3)
+        truth = compare(result, lut, world, chart, session, changes, every=3)
         stated_cells, stated_lights = lut.cell_uncertainty, lut.truth_uncertainty_deg
         assert stated_cells is not None
         assert stated_lights is not None

@@ -17,17 +17,18 @@ from __future__ import annotations
 
 import hashlib
 import tomllib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from datetime import timedelta
 from functools import cached_property
-from itertools import pairwise
+from itertools import chain, pairwise
 from statistics import median
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 from pydantic import ValidationError
+from threadpoolctl import threadpool_limits
 
 from calibration.checks.frame_consistency import ConsistencyCheck
 from calibration.citation import Rig, StatedOrigin
@@ -47,6 +48,7 @@ from calibration.spread.correction import (
     measure_spread,
 )
 from calibration.spread.fitting import LEAST_COUNTS, LOOSE_UNEVENNESS, USUAL_UNEVENNESS
+from calibration.spread.predicting import VARYING_BITS
 from calibration.spread.surroundings import FrameLevels, photosite_offsets_px, printed_grid, unsuitable
 from calibration.table.lut import Lut, SourceFrame
 from drivers.raw.plain_dng import Area
@@ -88,6 +90,12 @@ _PAPER_WORTH = 10.0
 
 _LEAST_BITS = 3
 """Bits of a channel from which on neighbours in colour predict a cell."""
+
+_DARK_LEVEL = 0.1
+"""Of cells that show light added to them: what counts of paper lack beside theirs looks like such light."""
+
+_MORE_WHITES = 3
+"""White frames beside the first that a lens is measured on, where the noise of few cells matters."""
 
 _ROUNDS = 5
 """Reweighted solutions in a row; Huber's weights, squared, have settled by then."""
@@ -377,7 +385,8 @@ class Baseline:
         white = np.maximum(paper.white, 1e-9)
         noise = self.transfer.variance(self.levels * white) / self.options.samples / white**2
         usable = _compared(self.chart, self.first)
-        return added_light(self.levels, noise, usable, self.points.cells_mm, self.chart.page_mm, self.chart.bits)
+        with threadpool_limits(limits=1, user_api="blas"):
+            return added_light(self.levels, noise, usable, self.points.cells_mm, self.chart.page_mm, self.chart.bits)
 
     def dark_light_estimate(self) -> DarkLightEstimate:
         """Return the estimate of the dark light before any dark frame, with the reflectances of the first frame."""
@@ -397,8 +406,16 @@ def baseline_of(chart: Chart, first: DecodedFrame, options: BuildOptions = PAPER
     return _baseline(chart, points, options, first, register_frame(first, chart, points, options))
 
 
-def with_lens(baseline: Baseline, first: DecodedFrame, primaries: Sequence[DecodedFrame] = ()) -> Baseline:
-    """Return the baseline with the lens measured, and corrected where the print proves that it spreads light."""
+def with_lens(
+    baseline: Baseline,
+    first: DecodedFrame,
+    primaries: Sequence[DecodedFrame] = (),
+    whites: Iterable[DecodedFrame] = (),
+) -> Baseline:
+    """Return the baseline with the lens measured, and corrected where the print proves that it spreads light.
+
+    `whites`: more frames of the first one's light, which show the same with other noise.
+    """
     chart, points = baseline.chart, baseline.points
     if unsuitable(chart):
         return baseline
@@ -414,11 +431,14 @@ def with_lens(baseline: Baseline, first: DecodedFrame, primaries: Sequence[Decod
         baseline.options.window,
     )
     around = view.around(registered.registration, registered.cells, registered.references)
-    frames = [frame for decoded in primaries if (frame := _spread_frame(baseline, decoded, view, False))]
-    if not frames:
-        frames = [frame for frame in (_spread_frame(baseline, first, view, True),) if frame]
+    frames = [frame for decoded in primaries if (frame := _spread_frame(baseline, [decoded], view, False))]
+    if not frames or chart.bits < VARYING_BITS:
+        # Few cells show so little of the lens that their noise matters.
+        frames += [frame for frame in (_spread_frame(baseline, chain([first], whites), view, True),) if frame]
     left_out = "" if baseline.options.lens_correction else "left out by --no-lens-correction"
-    found = measure_spread(frames, around, chart.page_mm, chart.bits, LEAST_COUNTS, left_out)
+    # Threads of linear algebra wait for one another on a busy machine for longer than it takes.
+    with threadpool_limits(limits=1, user_api="blas"):
+        found = measure_spread(frames, around, chart.page_mm, chart.bits, LEAST_COUNTS, left_out)
     if found is None:
         return baseline
     lens = LensCorrection(view, *found)
@@ -489,26 +509,43 @@ def _is_still(baseline: Baseline, decoded: DecodedFrame) -> bool:
     return shift.gauges > 0 and shift.length_px <= STILL_PX and shift.largest_px <= 2 * STILL_PX
 
 
-def _spread_frame(baseline: Baseline, decoded: DecodedFrame, view: PrintView, mixed: bool) -> SpreadFrame | None:
-    """Return a frame as the lens is measured on it; None where the chart has moved in it.
+def _spread_frame(baseline: Baseline, same: Iterable[DecodedFrame], view: PrintView, mixed: bool) -> SpreadFrame | None:
+    """Return the mean of frames of one light as the lens is measured on it; None where the chart has moved in all.
 
     `mixed` is whether several primaries light it.
     """
-    if not _is_still(baseline, decoded):
-        return None
-    means, highest = baseline.patches(decoded.mosaic, decoded.black)
-    inside = np.isfinite(means).all(axis=1)
-    usable = inside & (highest < CLIPPING_SHARE * decoded.saturation)
     chart, points = baseline.chart, baseline.points
-    usable[: chart.colour_count] &= ~baseline.first.registration.mismatched_cells[chart.cell_of_colour]
+    usable = ~np.concatenate(
+        [
+            baseline.first.registration.mismatched_cells[chart.cell_of_colour],
+            np.zeros(len(points.whites_mm) + len(points.greys_mm), dtype=np.bool_),
+        ]
+    )
+    total, beyond, count, file, full = np.zeros((len(usable), 3)), np.zeros(3), 0, "", 0.0
+    for decoded in same:
+        if not _is_still(baseline, decoded):
+            continue
+        means, highest = baseline.patches(decoded.mosaic, decoded.black)
+        usable &= np.isfinite(means).all(axis=1) & (highest < CLIPPING_SHARE * decoded.saturation)
+        total += np.nan_to_num(means)
+        beyond += beyond_print(decoded, view.beyond)
+        count, file = count + 1, file or decoded.record.file
+        full = decoded.saturation - float(decoded.black.mean())
+    if not count:
+        return None
+    means = total / count
     whites = slice(len(points.cells_mm), len(points.cells_mm) + len(points.whites_mm))
-    paper, _ = baseline.paper.read(np.where(usable[whites, None], means[whites], np.nan), decoded.record.file)
+    paper, _ = baseline.paper.read(np.where(usable[whites, None], means[whites], np.nan), file)
+    bends = baseline.superposition or Superposition.usual(full)
+    red, green, blue = np.sqrt(bends.errors(_DARK_LEVEL * paper.white, paper.white)).tolist()
     return SpreadFrame(
-        levels=FrameLevels(np.nan_to_num(means), beyond_print(decoded, view.beyond)),
+        levels=FrameLevels(means, beyond / count),
         field=paper.field.at(view.grid.points_mm),
         white=paper.white,
         usable=usable,
         unevenness=LOOSE_UNEVENNESS if mixed else USUAL_UNEVENNESS,
+        frames=count,
+        bend=(red, green, blue),
         printed=np.concatenate(
             [np.full(chart.colour_count, -1), np.zeros(len(points.whites_mm), dtype=np.int64), 1 + points.levels.level]
         ),
@@ -626,12 +663,14 @@ class SelectedFrames:
     - `lights_without`: lights that have no accepted frame.
     - `registered`: the frame in which the chart is registered first.
     - `primaries`: the frames of red, green and blue alone; () where one of the three is lacking.
+    - `more_whites`: of a chart of few colours, further frames of the light in which it is registered.
     """
 
     records: tuple[FrameRecord, ...]
     lights_without: tuple[int, ...]
     registered: FrameRecord
     primaries: tuple[FrameRecord, ...]
+    more_whites: tuple[FrameRecord, ...]
 
     @cached_property
     def first_lit(self) -> FrameRecord:
@@ -658,12 +697,14 @@ def select_frames(session: Session) -> SelectedFrames:
         )
     last = _last_of_each_light(session, accepted)
     others = [record for record in accepted if record.kind in ("white", "dark")]
+    whites = [record for record in others if record.kind == "white"]
     pure = pure_lights(session.illuminations) or ()
     return SelectedFrames(
         records=_in_order_taken(session, [*last.values(), *others]),
         lights_without=tuple(light.index for light in session.illuminations if light.index not in last),
         registered=_frame_to_register(session, accepted),
         primaries=tuple(last[light] for light in pure) if all(light in last for light in pure) else (),
+        more_whites=tuple(whites[1 : 1 + _MORE_WHITES]) if session.chart.bits < VARYING_BITS else (),
     )
 
 

@@ -23,7 +23,7 @@ import json
 import shutil
 import zipfile
 from collections import deque
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -41,6 +41,7 @@ from calibration.pipeline.baseline import (
     PAPER_OPTIONS,
     BuildOptions,
     ChangedFrame,
+    DecodedFrame,
     ReportProgress,
     SelectedFrames,
     baseline_of,
@@ -80,7 +81,7 @@ from experiment.framing.pictures import annotated_png
 from experiment.session.folder import Session
 from experiment.session.records import FrameRecord
 from foundation.compiled import processor_count
-from foundation.errors import FormatError, QualityError, RegistrationError, counted, first_of
+from foundation.errors import CropError, FormatError, QualityError, RegistrationError, counted, first_of
 from foundation.files import partial_path, publish_folder, require_free, storage_error, sync_folder, write_whole
 from foundation.folders import clear_folder, held_folder
 from foundation.records import to_plain
@@ -92,7 +93,7 @@ REPORT_FILES = (REPORT_PAGE, REPORT_JSON)
 CHECKPOINT_EVERY = 16
 """Frames from one checkpoint to the next: what a build that is killed has to do again."""
 
-METHOD = 13
+METHOD = 14
 """Raised when samples, ground truth or unfit cells come out otherwise, so that no table is made by two methods."""
 
 CHECKPOINT = "checkpoint.npz"
@@ -274,11 +275,18 @@ def _begin(session: Session, selected: SelectedFrames, options: BuildOptions) ->
     first = decode_frame(session, selected.registered)
     pure = [decode_frame(session, record) for record in selected.primaries]
     plain = with_superposition(baseline_of(session.chart, first, options), first, pure)
-    baseline = with_lens(plain, first, pure)
+    baseline = with_lens(plain, first, pure, _whole_frames(session, selected.more_whites))
     # The first frame's counts are not held any longer: it is read again in its turn.
     return Accumulator.empty(
         session, selected, with_primaries(baseline, measure_primaries(baseline, pure)), first.saturation
     )
+
+
+def _whole_frames(session: Session, records: Sequence[FrameRecord]) -> Iterator[DecodedFrame]:
+    """Yield frames; what is wrong with one is said when its turn comes."""
+    for record in records:
+        with contextlib.suppress(CropError):
+            yield decode_frame(session, record)
 
 
 def _stopped_by(
@@ -419,6 +427,7 @@ def _identity(session: Session, selected: SelectedFrames, options: BuildOptions)
         "lights": hashlib.sha256(repr(session.illuminations).encode()).hexdigest(),
         "registered": selected.registered.sha256,
         "primaries": [record.sha256 for record in selected.primaries],
+        "more_whites": [record.sha256 for record in selected.more_whites],
     }
 
 

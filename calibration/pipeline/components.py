@@ -21,6 +21,9 @@ _BLACK_COUNTS = 0.1
 """Standard uncertainty of a frame's black level, counts, beyond what its frames' scatter shows (judgement: masked
 photosites give .03)."""
 
+_RESPONSE = 0.003
+"""Standard deviation of photosites' response that is not seen beside their noise (usual of cameras: 0.3 to 1 %)."""
+
 _SINGLE_DARK = 0.2
 """Relative change of dark light over a session, where one dark frame does not show it (judgement)."""
 
@@ -62,11 +65,18 @@ def _diagonal(squares: _Array) -> _Array:
 
 
 def _noise(table: TableMeasurements, white: _Array, cells: _Array) -> Component:
+    """Return the noise of white and, of cells, that of the field there and their own photosites' response.
+
+    The field has as much of the references' noise as it has terms, white that of one.
+    """
     square = (table.lights.white_error / white) ** 2
+    field = max(len(factor) for frame in table.frames for factor in frame.paper.field.coefficients[0])
+    response = (table.sensor.transfer.response**2 + _RESPONSE**2) / table.cells.window**2
     return Component(
         "noise", "noise of the white references", False,
-        "scatter of the white references about each frame's field; a cell's own noise is the camera's and no error",
-        _diagonal(square), np.broadcast_to(square.min(axis=0), cells.shape),
+        "scatter of the white references about each frame's field, and the photosites' response within a cell; its "
+        "noise from frame to frame is the camera's and no error",
+        _diagonal(square), np.broadcast_to(field * square.min(axis=0) + response, cells.shape),
     )  # fmt: skip
 
 

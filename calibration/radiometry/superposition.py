@@ -39,7 +39,7 @@ _LOSS_SCALES = (0.0005, 0.002)
 _USUAL_REST = 0.0003
 """The same of what is neither, of each level."""
 
-_SCALES = (0.3, 1.0, 3.0, 10.0)
+_SCALES = (0.03, 0.3, 1.0, 3.0, 10.0)
 """By how much a camera may deviate otherwise than usual."""
 
 _LEAST_PATCHES = 100

@@ -1,7 +1,7 @@
 """Light that lies on part of the print and adds as much to dark cells as to bright ones, such as a reflection.
 
 The colours of a chart lie in random order, so that what a cell's neighbours in colour have, elsewhere on the print,
-predicts its own level (`calibration.spread.fitting.colour_residual`). What is left of it where cells are dark, and
+predicts its own level (`calibration.spread.predicting`). What is left of it where cells are dark, and
 changes smoothly over the page, was added. How much of it is usual is found from the print itself: the size for which
 what is seen is likeliest (empirical Bayes, C. E. Rasmussen, C. K. I. Williams, "Gaussian Processes for Machine
 Learning", 2006, 5.4.1). Light that is the same all over the page is not seen here; it is the veil of the lens.
@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from calibration.spread.fitting import colour_residual, predicted_levels
+from calibration.spread.predicting import LevelModel
 from experiment.measures.least_squares import page_polynomial
 from foundation.robust import biweight, sigma_of
 
@@ -95,12 +95,13 @@ def added_light(
     for channel in range(3):
         known = np.where(usable, level[:, channel], np.nan)
         known = np.where(usable, known, np.nanmedian(known))
-        expected = predicted_levels(known[:, None], bits)[:, 0]
-        columns = np.column_stack([known, bumps, factor * expected[:, None]])
-        residual, told = colour_residual(columns, bits)
-        rows = told & usable
-        sigma = np.sqrt(_scatter(residual[rows, 0], expected[rows]) ** 2 + variance[rows, channel])
-        value, design = residual[rows, 0] / sigma, residual[rows, 1:] / sigma[:, None]
+        model = LevelModel.of(known, usable, bits)
+        left = model.residual_of(known)
+        expected = model.predicted
+        rows = model.known & usable
+        sigma = np.sqrt(_scatter(left[rows], expected[rows]) ** 2 + variance[rows, channel])
+        value = left[rows] / sigma
+        design = model.residual(np.column_stack([bumps, factor * expected[:, None]]))[rows] / sigma[:, None]
         solution, covariance = _likeliest(value, design, bumps.shape[1])
         # Dust, a fold or a clipped cell is no light that lies on the cells around it, too.
         trust = biweight(np.abs(value - design[:, : bumps.shape[1]] @ solution), 1.0)

@@ -24,7 +24,6 @@ from calibration.spread.fitting import (
     PLACES,
     TERMS,
     USUAL_VEIL,
-    VARYING_BITS,
     PointSpread,
     ReferenceData,
     SpreadData,
@@ -33,9 +32,9 @@ from calibration.spread.fitting import (
     fit_spread,
     kernel_of_terms,
     place_terms,
-    predicted_levels,
     terms_of,
 )
+from calibration.spread.predicting import VARYING_BITS, LevelModel
 from calibration.spread.surroundings import (
     FrameLevels,
     NearLight,
@@ -181,6 +180,8 @@ class SpreadFrame:
     - `unevenness`: as in `SpreadData`.
     - `printed`: (P,) int64, which references have one colour: a number for each, −1 of cells; None where they are not
       used.
+    - `frames`: of how many frames it is the mean.
+    - `bend`: of each channel, as in `SpreadData`.
     """
 
     levels: FrameLevels
@@ -189,6 +190,8 @@ class SpreadFrame:
     usable: npt.NDArray[np.bool_]
     unevenness: float
     printed: npt.NDArray[np.int64] | None = None
+    frames: int = 1
+    bend: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -343,8 +346,8 @@ def measure_spread(
     of_paper: dict[int, _Array] = {}
     references: list[ReferenceData] = []
     near = [around.near(_whole(kernel)) for kernel in range(len(NEAR_PX))]
-    # Of each channel the frame in which it has most light.
-    best = np.argmax([frame.white for frame in frames], axis=0)
+    # Of each channel the frame in which it has most light, of all frames that it is the mean of.
+    best = np.argmax([frame.white * frame.frames for frame in frames], axis=0)
     for number, frame in enumerate(frames):
         bright = np.flatnonzero((best == number) & (frame.white >= least_counts))
         if not len(bright):
@@ -357,8 +360,11 @@ def measure_spread(
             level = frame.levels.patches[:count, channel] / relative
             usable = frame.usable[:count]
             data.append(
-                SpreadData(channel, level, changes[:, :count].T, even[channel] / relative, usable, frame.unevenness)
-            )
+                SpreadData(
+                    channel, level, changes[:, :count].T, even[channel] / relative, frame.field[:count, channel],
+                    usable, frame.unevenness, frame.bend[channel],
+                )
+            )  # fmt: skip
             if bits < VARYING_BITS:
                 references += _references(frame, around, channel, changes.T)
             scales.append(np.append(gains, frame.white[channel]))
@@ -390,7 +396,8 @@ def _references(frame: SpreadFrame, around: Surroundings, channel: int, changes:
         order = _white_order(len(chosen)) if whites[chosen].any() else 1
         if len(chosen) >= _LEAST_REFERENCES * len(page_powers(order)):
             places = around.grid.points_mm[chosen]
-            found.append(ReferenceData(channel, level[chosen], changes[chosen], places, order))
+            field = frame.field[chosen, channel]
+            found.append(ReferenceData(channel, level[chosen], changes[chosen], field, places, order))
     return found
 
 
@@ -417,7 +424,7 @@ def _changes(
     seen_levels = frame.levels.patches[:, channel]
     relative = np.maximum(frame.field[:, channel] * frame.white[channel], 1e-6)
     expected = seen_levels / relative
-    expected[:count] = predicted_levels(expected[:count, None], bits)[:, 0]
+    expected[:count] = LevelModel.of(expected[:count], frame.usable[:count], bits).predicted
     if frame.printed is not None:
         for number in range(int(frame.printed.max()) + 1):
             expected[frame.printed == number] = np.median(expected[frame.printed == number])
@@ -475,7 +482,7 @@ def _figures(
     off_by = spread.off_by(np.zeros(TERMS)) if left_out else mean_square
     cells: dict[int, _Array] = {}
     for one, scale in zip(data, scales, strict=True):
-        expected = predicted_levels(one.level[:, None], bits)[:, 0]
+        expected = LevelModel.of(one.level, one.usable, bits).predicted
         lit = one.usable & (one.level * scale[-1] > least_counts)
         # All of the change: with white's mean, by which a level over paper's changes too.
         change = (one.changes[lit] - np.outer(expected[lit], scale[:-1])) / one.level[lit, None]

@@ -31,6 +31,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from calibration.spread.predicting import VARYING_BITS, LevelModel
 from experiment.measures.least_squares import page_polynomial, page_powers
 from foundation.robust import MAD_TO_SIGMA
 
@@ -83,6 +84,9 @@ _SHAPE_ORDER, _FACTOR_ORDER, _INK_ORDER = 4, 6, 2
 """Orders over the page of light that is no kernel's, of smooth factors of a level, as high as a field's, and of a
 density of ink (its level times its logarithm)."""
 
+_LEAST_BEND = 1e-4
+"""Standard deviation of the sensor's bend, at least."""
+
 _PRIOR_SHARE = 0.1
 """Standard deviation that a share is expected to have at most: keeps kernels solvable that the windows hardly see."""
 
@@ -94,7 +98,18 @@ _FAR_STEPS = (0.01, 0.01, 0.004, 0.003)
 """Standard deviation of each far kernel's share before it is measured, beside what the one before lets expect."""
 
 _FAR_SIZES = (0.3, 1.0, 3.0)
-"""How much more than that lenses may have. Each is as likely beforehand, and is weighed by what the print shows."""
+"""How much more than that lenses may have that scatter. Each is as likely beforehand, and is weighed by what the print
+shows."""
+
+_CLEAN = 0.03
+"""The same of a lens that does not scatter, and of one without a veil: coated glass without dust."""
+
+_CLEAN_ODDS = 0.3
+"""How likely either is beforehand (chosen): a chart of few colours that shows neither would else state what it has not
+seen. With 0.6, veils on prints that codes predict to 3 % only turned white by up to 1.4 times what was stated."""
+
+_VEIL_SIZES = (0.3, 1.0)
+"""How large a veil of lenses that have one may be over the usual, each as likely."""
 
 _FAR_FALL = 0.5
 """Part of a far kernel's share that the next is expected to have: of r⁻² all, of r⁻³ a quarter, of an exponential none.
@@ -128,21 +143,12 @@ _ROUNDING = 1e-7
 """Step of a stored share: far below its error, far above what another order of sums changes, so that a table's bytes
 do not depend on the machine's linear algebra."""
 
-VARYING_BITS = 4
-"""Bits of a channel from which on cells are enough for shares that change over the frame."""
-
 _SMALL_SHARE = 0.002
 """Standard deviation of how a share changes over the frame that is allowed for where cells are too few to see it: half
 of what mild shoulders of 1 % have (chosen)."""
 
 _EVEN_TERMS = 3
 """Unknowns of a kernel that is the same all over the frame, at most: one for each channel."""
-
-FULL_BITS = 5
-"""Bits of a full chart, whose codes stand so near each other that their curvature is less than the noise of a cell."""
-
-_BESIDE = 5
-"""Codes along each side of the square in which the usual curvature across an axis is taken."""
 
 
 def kernel_names() -> list[str]:
@@ -191,6 +197,11 @@ def groups_of_terms() -> list[npt.NDArray[np.int64]]:
 def far_groups() -> list[npt.NDArray[np.int64]]:
     """Return the unknowns (3,) int64 in R, G and B of each far kernel, and last of the veil."""
     return groups_of_terms()[-len(FAR_PX) - 1 :]
+
+
+def _bend_of(channel: int) -> int:
+    """Return the unknown of the sensor's bend in a channel, behind those of light that is no kernel's."""
+    return TERMS + len(page_powers(_SHAPE_ORDER)) - 1 + channel
 
 
 def free_terms() -> npt.NDArray[np.bool_]:
@@ -275,16 +286,20 @@ class SpreadData:
     - `changes`: (C, T) float64, change of `level` for a whole share of each unknown of the channel, by the light that
       comes in.
     - `even`: (C,) float64, change of `level` for light that lies evenly over all of the frame.
+    - `field`: (C,) float64, the frame's light there, about 1.
     - `usable`: (C,) bool.
     - `unevenness`: standard deviation of the coefficients of smooth factors.
+    - `bend`: standard deviation of what counts of bare paper may lack beside those of dark cells, relative.
     """
 
     channel: int
     level: _Array
     changes: _Array
     even: _Array
+    field: _Array
     usable: npt.NDArray[np.bool_]
     unevenness: float
+    bend: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -294,6 +309,7 @@ class ReferenceData:
     - `channel`: 0, 1 or 2.
     - `level`: (N,) float64, bare paper 1, the field divided out.
     - `changes`: (N, T) float64, as in `SpreadData`.
+    - `field`: (N,) float64, as in `SpreadData`.
     - `places_mm`: (N, 2) float64.
     - `order`: order over the page of what the field's fit takes out of them, or may leave.
     """
@@ -301,6 +317,7 @@ class ReferenceData:
     channel: int
     level: _Array
     changes: _Array
+    field: _Array
     places_mm: _Array
     order: int
 
@@ -309,7 +326,8 @@ class ReferenceData:
 class _Rows:
     """Rows of the regression, fold by fold.
 
-    (N,) values, (N, T + M) design, (N,) levels, where each fold's rows are, and the columns' unknowns.
+    (N,) values, (N, T + M) design, (N,) levels, where each fold's rows are, the columns' unknowns, and what share of
+    the noise's squares is left in the values.
     """
 
     value: _Array
@@ -317,52 +335,7 @@ class _Rows:
     level: _Array
     folds: tuple[slice, ...]
     unknowns: npt.NDArray[np.int64]
-
-
-def colour_residual(columns: npt.NDArray[np.floating], bits: int) -> tuple[_Array, npt.NDArray[np.bool_]]:
-    """Return how values of cells differ from what their neighbours in colour predict.
-
-    Linear in the values. The mean of both neighbours along each axis of the code predicts a cell's. Where codes stand
-    further apart than the 32 levels of a full chart, it is corrected for the curvature: the mean over the codes beside
-    it across that axis.
-
-    `columns`: (C, M) float, values of C = 8**bits cells in the order of colour indices. Returns (C, M) float64, and
-    (C,) bool, whether a cell has two neighbours along any axis.
-    """
-    from calibration import kernels
-
-    side = 1 << bits
-    codes = np.arange(side**3)
-    inner = [(codes // side**axis % side > 0) & (codes // side**axis % side < side - 1) for axis in range(3)]
-    known = np.any(inner, axis=0)
-    if bits < FULL_BITS:
-        return _less_curvature(columns, side), known
-    residual = np.empty(columns.shape)
-    kernels.colour_differences(np.ascontiguousarray(columns, dtype=np.float64), side, residual)
-    return residual, known
-
-
-def _less_curvature(columns: npt.NDArray[np.floating], side: int) -> _Array:
-    """Return the residuals (C, M) of a chart of fewer codes."""
-    from scipy.ndimage import uniform_filter
-
-    cube = np.asarray(columns, dtype=np.float64).reshape(side, side, side, -1)
-    total, count = np.zeros_like(cube), np.zeros((side, side, side, 1))
-    for axis in range(3):
-        inner, before, after = (
-            (*(slice(None),) * axis, part) for part in (slice(1, side - 1), slice(0, side - 2), slice(2, side))
-        )
-        second = cube[inner] - 0.5 * (cube[before] + cube[after])
-        size = [1 if other == axis else _BESIDE for other in range(3)]
-        # The mean is that of the codes beside, without the cell's own.
-        total[inner] += (second - uniform_filter(second, [*size, 1], mode="nearest")) / (1 - 1 / _BESIDE**2)
-        count[inner] += 1
-    return (total / np.maximum(count, 1)).reshape(columns.shape)
-
-
-def predicted_levels(level: _Array, bits: int) -> _Array:
-    """Return levels (C, M) float64 as the neighbours in colour have them; a cell's own where it has none."""
-    return level - colour_residual(level, bits)[0]
+    freedom: float = 1.0
 
 
 def fit_spread(
@@ -384,17 +357,22 @@ def fit_spread(
     factors = np.full(size, 1 / _PRIOR_SHARE**2)
     for one, row in zip(data, rows, strict=True):
         factors[row.unknowns[len(terms_of(0)) + shapes :]] = 1 / one.unevenness**2
+        factors[_bend_of(one.channel)] = 1 / max(one.bend, _LEAST_BEND) ** 2
+        factors[row.unknowns[-(len(page_powers(_INK_ORDER)) - 1) :]] = 1 / USUAL_UNEVENNESS**2
     prior = np.diag(factors)
-    usually = _usual_shares(bits, 1.0, CHANNELS_APART, CHANNELS_APART)
+    usually = _usual_shares(bits, _Lens(1.0, CHANNELS_APART, 1.0, CHANNELS_APART))
     usual = np.asarray(np.linalg.inv(usually), dtype=np.float64)
     prior[:TERMS, :TERMS] = usual
     shape = np.arange(TERMS, TERMS + shapes)
     everything = np.delete(np.arange(size), shape)
     solution = np.zeros(size)
     normal, right = np.zeros((FOLDS, size, size)), np.zeros((FOLDS, size))
-    rows += [_reference_rows(one, page_mm) for one in references]
-    for _ in range(_ROUNDS):
-        normal, right = _normal_equations(rows, solution)
+    at_references = [_reference_rows(one, page_mm) for one in references]
+    for again in range(_ROUNDS):
+        if again and bits < VARYING_BITS:
+            lens = [solution[terms_of(one.channel)] for one in data]
+            rows = [_rows(one, n, cells_mm, page_mm, bits, lens[n]) for n, one in enumerate(data)]
+        normal, right = _normal_equations([*rows, *at_references], solution)
         solution[everything] = _solved(*_of(normal.sum(axis=0), right.sum(axis=0), prior, everything), np.arange(TERMS))
     misfit = _misfit(normal.sum(axis=0), right.sum(axis=0), prior, shapes)
     normal, right = normal[:, everything][:, :, everything], right[:, everything]
@@ -456,14 +434,13 @@ class _Lenses:
         matrices: list[_Array] = []
         covariances: list[_Array] = []
         evidence: list[float] = []
-        apart = list(zip(_APART, _APART_ODDS, strict=True))
-        for size, (far_apart, far_odds), (veil_apart, veil_odds) in product(_FAR_SIZES, apart, apart):
-            prior = np.linalg.inv(_usual_shares(bits, size, far_apart, veil_apart))
+        for lens in _supposed_lenses(few=bits < VARYING_BITS):
+            prior = np.linalg.inv(_usual_shares(bits, lens))
             covariance = np.asarray(misfit * np.linalg.inv(inflated + misfit * (prior - usual)), dtype=np.float64)
             gain = float(vector @ covariance @ vector) / misfit**2
             # The logarithm of the integral over all shares (D. MacKay, Bayesian interpolation, 1992).
             fits = 0.5 * (gain + float(np.linalg.slogdet(covariance)[1]) + float(np.linalg.slogdet(prior)[1]))
-            evidence.append(fits + math.log(far_odds * veil_odds))
+            evidence.append(fits + math.log(lens.odds))
             matrices.append(matrix + prior - usual)
             covariances.append(covariance)
         weights = np.exp(np.array(evidence) - max(evidence))
@@ -477,12 +454,36 @@ class _Lenses:
         return mean, np.tensordot(self.weights, self.covariances, axes=1) + apart.T @ apart
 
 
-def _usual_shares(bits: int, size: float, far_apart: float, veil_apart: float) -> _Array:
-    """Return the covariance (TERMS, TERMS) of shares before they are measured.
+@dataclass(frozen=True)
+class _Lens:
+    """What may be supposed of a lens: scatter and reflections have little to do with each other.
 
-    `size`: of far kernels over the usual one. `far_apart`, `veil_apart`: as `CHANNELS_APART`, since scatter and
-    reflections have little to do with each other.
+    - `far`, `veil`: size of far kernels' shares and of the veil over the usual ones.
+    - `far_apart`, `veil_apart`: as `CHANNELS_APART`.
+    - `odds`: how likely it is beforehand.
     """
+
+    far: float
+    far_apart: float
+    veil: float
+    veil_apart: float
+    odds: float = 1.0
+
+
+def _supposed_lenses(few: bool) -> list[_Lens]:
+    """Return all that is supposed of lenses; `few`: where cells are so few that they may see nothing of a usual one."""
+    apart = list(zip(_APART, _APART_ODDS, strict=True))
+    far = [(size, one, odds / len(_FAR_SIZES)) for size, (one, odds) in product(_FAR_SIZES, apart)]
+    veils = [(1.0, one, odds) for one, odds in apart]
+    if few:
+        clean = _CLEAN, CHANNELS_APART, _CLEAN_ODDS / (1 - _CLEAN_ODDS)
+        veils = [(size, one, odds / len(_VEIL_SIZES)) for size, (one, odds) in product(_VEIL_SIZES, apart)]
+        far, veils = [clean, *far], [clean, *veils]
+    return [_Lens(*one[:2], *two[:2], one[2] * two[2]) for one, two in product(far, veils)]
+
+
+def _usual_shares(bits: int, lens: _Lens) -> _Array:
+    """Return the covariance (TERMS, TERMS) of shares before they are measured."""
     usual = np.diag(np.full(TERMS, _PRIOR_SHARE**2))
     if bits < VARYING_BITS:
         varying = _varying_terms()
@@ -491,13 +492,13 @@ def _usual_shares(bits: int, size: float, far_apart: float, veil_apart: float) -
     # The first of them is as much a near one, and the veil is of other origin.
     for kernel in range(2, len(FAR_PX)):
         handed_on[kernel] += _FAR_FALL * handed_on[kernel - 1]
-    steps = np.array([*(size * step for step in _FAR_STEPS), USUAL_VEIL])
+    steps = np.array([*(lens.far * step for step in _FAR_STEPS), lens.veil * USUAL_VEIL])
     sizes = (handed_on * steps**2) @ handed_on.T
     groups = far_groups()
     for one, row in zip(groups, sizes, strict=True):
         for other, both in zip(groups, row, strict=True):
-            usual[np.ix_(one, other)] = both * channels_alike(far_apart)
-    usual[np.ix_(groups[-1], groups[-1])] = USUAL_VEIL**2 * channels_alike(veil_apart)
+            usual[np.ix_(one, other)] = both * channels_alike(lens.far_apart)
+    usual[np.ix_(groups[-1], groups[-1])] = (lens.veil * USUAL_VEIL) ** 2 * channels_alike(lens.veil_apart)
     return usual
 
 
@@ -529,33 +530,52 @@ def _misfit(normal: _Array, right: _Array, prior: _Array, shapes: int) -> float:
     return max(1.0, (gains[0] - gains[1]) / shapes)
 
 
-def _rows(one: SpreadData, number: int, cells_mm: _Array, page_mm: tuple[float, float], bits: int) -> _Rows:
-    """Return the rows of a channel of a frame, whose smooth factors are the `number`-th."""
+def _rows(
+    one: SpreadData, number: int, cells_mm: _Array, page_mm: tuple[float, float], bits: int, lens: _Array | None = None
+) -> _Rows:
+    """Return the rows of a channel of a frame, whose smooth factors are the `number`-th.
+
+    `lens`: (T,), shares of the channel by which levels are corrected before others are predicted by them.
+    """
     level = np.where(one.usable, one.level, np.nan)
     # A cell that cannot be used gets its neighbour's value, so that it does no more harm than one outlier.
     there = np.flatnonzero(one.usable)
     nearest = there[np.clip(np.searchsorted(there, np.arange(len(level))), 0, len(there) - 1)]
     level = np.where(one.usable, level, one.level[nearest])
-    expected = predicted_levels(level[:, None], bits)[:, 0]
+    model = LevelModel.of(level if lens is None else level - one.changes @ lens, one.usable, bits)
+    left = model.residual_of(level)
+    expected = model.predicted
     factor = page_polynomial(cells_mm, page_mm, _FACTOR_ORDER)[:, 1:]
     shape = page_polynomial(cells_mm, page_mm, _SHAPE_ORDER)[:, 1:]
     ink = factor[:, : len(page_powers(_INK_ORDER)) - 1]
     dense = expected * np.log(np.clip(expected, 0.01, None))
     even = shape * one.even[:, None]
-    columns = np.column_stack([level, one.changes, even, factor * expected[:, None], ink * dense[:, None]])
-    residual, known = colour_residual(columns, bits)
-    chosen, folds = _by_fold(np.flatnonzero(known & one.usable), cells_mm, page_mm)
-    common = TERMS + even.shape[1]
-    own = factor.shape[1] + ink.shape[1]
-    smooth: npt.NDArray[np.int64] = np.arange(own, dtype=np.int64) + common + number * own
-    shapes: npt.NDArray[np.int64] = np.arange(TERMS, common, dtype=np.int64)
+    smooth = np.column_stack([factor * expected[:, None], ink * dense[:, None]])
+    columns = np.column_stack([one.changes, even, bent(expected, one.field), smooth])
+    chosen, folds = _by_fold(np.flatnonzero(model.known & one.usable), cells_mm, page_mm)
+    common = TERMS + even.shape[1] + 3
+    own = smooth.shape[1]
+    shapes: npt.NDArray[np.int64] = np.arange(TERMS, common - 3, dtype=np.int64)
     return _Rows(
-        value=residual[chosen, 0],
-        design=residual[chosen, 1:],
+        value=left[chosen],
+        design=model.residual(columns)[chosen],
         level=expected[chosen],
         folds=folds,
-        unknowns=np.concatenate([terms_of(one.channel), shapes, smooth]),
+        unknowns=np.concatenate(
+            [
+                terms_of(one.channel),
+                shapes,
+                np.array([common - 3 + one.channel]),
+                np.arange(own, dtype=np.int64) + common + number * own,
+            ]
+        ),
+        freedom=model.freedom,
     )
+
+
+def bent(level: _Array, field: _Array) -> _Array:
+    """Return how levels (N,) change where counts fall short in proportion to the light, whites setting the field."""
+    return level * (1 - level) * field
 
 
 def _by_fold(
@@ -572,7 +592,7 @@ def _by_fold(
 def _reference_rows(one: ReferenceData, page_mm: tuple[float, float]) -> _Rows:
     """Return the rows of references of one colour: what is not smooth over the page, of values and changes alike."""
     smooth = page_polynomial(one.places_mm, page_mm, one.order)
-    columns = np.column_stack([one.level, one.changes])
+    columns = np.column_stack([one.level, one.changes, bent(one.level, one.field)])
     rough = columns - smooth @ np.linalg.lstsq(smooth, columns, rcond=None)[0]
     chosen, folds = _by_fold(np.arange(len(rough)), one.places_mm, page_mm)
     return _Rows(
@@ -580,7 +600,7 @@ def _reference_rows(one: ReferenceData, page_mm: tuple[float, float]) -> _Rows:
         design=rough[chosen, 1:],
         level=np.full(len(one.level), float(one.level.mean())),
         folds=folds,
-        unknowns=terms_of(one.channel),
+        unknowns=np.append(terms_of(one.channel), _bend_of(one.channel)),
     )
 
 
@@ -601,7 +621,7 @@ def _normal_equations(rows: Sequence[_Rows], solution: _Array) -> tuple[_Array, 
     size = len(solution)
     normal, right = np.zeros((FOLDS, size, size)), np.zeros((FOLDS, size))
     for one in rows:
-        root = np.sqrt(_weights(one.value - one.design @ solution[one.unknowns], one.level))
+        root = np.sqrt(one.freedom * _weights(one.value - one.design @ solution[one.unknowns], one.level))
         weighted, value = one.design * root[:, None], one.value * root
         for fold, there in enumerate(one.folds):
             normal[fold][np.ix_(one.unknowns, one.unknowns)] += weighted[there].T @ weighted[there]

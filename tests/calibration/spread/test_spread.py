@@ -27,7 +27,6 @@ from calibration.spread.fitting import (
     TERMS,
     USUAL_UNEVENNESS,
     PointSpread,
-    colour_residual,
     far_groups,
 )
 from calibration.spread.surroundings import (
@@ -450,17 +449,6 @@ def test_a_lens_that_is_not_measured_has_a_usual_veil(sharp: Photograph) -> None
     assert np.isfinite(figures.cells_error).all()
     dark, bright = np.argmin(np.nan_to_num(levels, nan=1)[:, 1]), np.argmax(np.nan_to_num(levels)[:, 1])
     assert figures.cells_error[dark, 1] > 0.02 > figures.cells_error[bright, 1]
-
-
-def test_residuals_of_colour_are_blind_to_smooth_colours_and_linear() -> None:
-    codes = np.stack(np.meshgrid(*[np.arange(8.0)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
-    smooth = (3 + codes @ [1.0, 0.5, 0.25])[:, None] ** 2
-    residual, known = colour_residual(smooth, 3)
-    assert residual[known] == pytest.approx(0, abs=1e-9)
-    assert known.sum() == 8**3 - 8
-    random = np.random.default_rng(1).normal(size=(2, 512, 1))
-    both = colour_residual(random.sum(axis=0), 3)[0]
-    assert both == pytest.approx(sum(colour_residual(part, 3)[0] for part in random))
 
 
 def test_charts_that_show_no_lens_are_named() -> None:
