@@ -37,10 +37,11 @@ from acquisition.run.rig import simulated
 from acquisition.run.rig.opening import open_rig
 from acquisition.run.run import run_session
 from benchmarks.session_kills import in_child
-from drivers.links.link import Link
+from drivers.links.link import Link, PeerLink
+from drivers.links.usb import open_usb
 from drivers.presenter import BLACK, Colour
 from drivers.projector import Power
-from drivers.ptp.session import PtpRequest, Transport
+from drivers.ptp.session import Answer, NoAnswer, PtpRequest, Transport
 from drivers.ptp.usb import UsbTransport
 from experiment.chart.layout import design_chart
 from experiment.chart.model import Chart
@@ -50,12 +51,10 @@ from experiment.session.folder import Session
 from experiment.session.records import ACCEPTED, REFUSED, VOIDED
 from foundation.clock import SteadyClock
 from foundation.errors import CropError, LinkClosed, QualityError
-from sim.buses.ptp import MemoryPipes
-from sim.buses.responder import Answer, NoAnswer
-from sim.buses.usb import PtpUsbDevice
+from sim.buses.usb import PtpUsbDevice, SimulatedBus
 from sim.camera.eos import SimulatedEos
 from sim.clock import OPENING, SimulatedClock
-from sim.projectors.pjlink import PjLinkPeer, memory_link
+from sim.projectors.pjlink import PjLinkPeer
 from sim.projectors.projector import Screen, SimulatedPresenter, SimulatedProjector
 
 SETTINGS: Mapping[str, object] = {
@@ -159,7 +158,8 @@ class TroubledLab:
         self.is_late = self.camera_hangs = self.card_is_full = self.disk_is_full = False
         self._camera_is_there = self._projector_is_there = True
         self._after_power_cut = after_power_cut
-        self._pipes: MemoryPipes | None = None
+        self._bus: SimulatedBus | None = None
+        self._device: PtpUsbDevice | None = None
         self._line: Link | None = None
         self.clock = EventfulClock(self, OPENING)
         self.projector = SimulatedProjector(self.clock)
@@ -172,8 +172,9 @@ class TroubledLab:
     def pull_camera(self, pulled: bool = True) -> None:
         """Pull the camera's cable, or put it back."""
         self._camera_is_there = not pulled
-        if pulled and self._pipes is not None:
-            self._pipes.pull()
+        if pulled and self._bus is not None and self._device is not None:
+            self._bus.unplug(self._device)
+            self._bus = None
 
     def restart_router(self, off: bool = True) -> None:
         """Let the projector be out of reach, or be back."""
@@ -217,7 +218,7 @@ class TroubledLab:
             "SimulatedEos": eos,
             "SimulatedPresenter": presenter,
             "MemoryTransport": self._connect_camera,
-            "memory_link": self._connect_projector,
+            "PeerLink": self._connect_projector,
         }
         with patch.multiple(simulated, **replaced), open_rig(settings, chart, session) as devices:
             yield devices
@@ -225,13 +226,14 @@ class TroubledLab:
     def _connect_camera(self, eos: SimulatedEos) -> Transport:
         if not self._camera_is_there:
             raise LinkClosed("no camera on USB; connect it and switch it on")
-        self._pipes = MemoryPipes(PtpUsbDevice(eos))
-        return UsbTransport(self._pipes, self.clock)
+        self._device = PtpUsbDevice(eos)
+        self._bus = SimulatedBus(self._device)
+        return UsbTransport(open_usb(backend=self._bus), self.clock)
 
     def _connect_projector(self, peer: PjLinkPeer) -> Link:
         if not self._projector_is_there:
             raise LinkClosed("nothing listens at the projector's address")
-        self._line = memory_link(peer)
+        self._line = PeerLink(peer)
         return self._line
 
     def take(self, lab: Path, folder: Path) -> CropError | None:
