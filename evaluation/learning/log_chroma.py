@@ -33,7 +33,7 @@ from typing import Any, ClassVar
 import numpy as np
 import numpy.typing as npt
 
-from evaluation.learning.feature_learner import FeatureLearner, Features, LightModel
+from evaluation.learning.feature_learner import FeatureLearner, Features
 from evaluation.learning.working_size import reduce
 from evaluation.scene import Image
 from foundation.errors import InputError
@@ -153,14 +153,11 @@ def train(
     places: npt.NDArray[np.float64],
     penalties: Penalties,
     stages: Sequence[tuple[int, float, float]],
-    known: tuple[npt.NDArray[np.complex128], npt.NDArray[np.float64]] | None = None,
-    worth: float = 0.0,
 ) -> tuple[npt.NDArray[np.complex128], npt.NDArray[np.float64]]:
     """Return the fitted filters (2, 64, 33) complex128, in Fourier space, and the bias (64, 64) float64.
 
     `histograms`: (N, 2, 64, 64) float64, each of sum 1. `places`: (N, 2) float64, the true lights in bins; they may lie
-    outside 0 … 64. `known`: filters and bias to begin with, from which every departure is penalised as often as an
-    image's own penalty, `worth` times; None begins with none.
+    outside 0 … 64.
     """
     import scipy.fft
     import scipy.optimize
@@ -179,8 +176,7 @@ def train(
     def loss(scaled: npt.NDArray[np.float64], entropy_weight: float, likelihood_weight: float) -> tuple[float, Any]:
         filters, bias = spread_out(scaled)
         single, level = filters.astype(np.complex64), bias.astype(np.float32)
-        away = scaled - origin
-        total = 0.5 * count * float(scaled @ scaled) + 0.5 * worth * float(away @ away)
+        total = 0.5 * count * float(scaled @ scaled)
         gradient = np.zeros((3, BINS, BINS // 2 + 1), np.complex128)
         for start in range(0, count, _BATCH):
             batch, aim = spectra[start : start + _BATCH], wanted[start : start + _BATCH]
@@ -199,14 +195,9 @@ def train(
             gradient[:2] += weight * (batch.conj() * back[:, None]).sum(axis=0)
             gradient[2] += weight * back.sum(axis=0)
         scaled_gradient: Any = fft.irfft2(whiten * gradient, s=_SHAPE)
-        return total, scaled_gradient.ravel() + count * scaled + worth * away
+        return total, scaled_gradient.ravel() + count * scaled
 
-    origin: npt.NDArray[np.float64] = np.zeros(3 * BINS * BINS)
-    if known is not None:
-        spectrum = np.concatenate([known[0], fft.rfft2(known[1])[None]])
-        back: Any = fft.irfft2(np.divide(spectrum, whiten, out=np.zeros_like(spectrum), where=whiten > 0), s=_SHAPE)
-        origin = back.ravel()
-    scaled = origin
+    scaled = np.zeros(3 * BINS * BINS)
     for iterations, *weights in stages:
         options = {"maxiter": iterations, "maxcor": iterations, "maxfun": 4 + 2 * iterations, "ftol": 0, "gtol": 0}
         found: Any = minimize(loss, scaled, tuple(weights), "L-BFGS-B", jac=True, options=options)
@@ -236,8 +227,6 @@ _CHANNELS = 2
 """Histograms: of pixels and of edges."""
 _SPREAD = 0.75
 """Share of the torus that the lights may span: the rest tells one turn of it from the next."""
-_KNOWN_WORTH = 60.0
-"""How often a departure from what was learned elsewhere is penalised: as the penalties of so many images are."""
 _LARGEST = 255
 """Working size up to which the counts of a histogram fit in 16 bits."""
 
@@ -310,42 +299,21 @@ class LogChroma(FeatureLearner):
                 f"tells {_SPREAD * _FINE_BINS * _FINE_SIZE:g}: leave out saturated lights, or take another method"
             )
         grid = (2 * _FINE_SIZE, _FINE_SIZE / 2) if wide else (_FINE_SIZE, 0.0)
-        stages = (self.pretraining, self.crossentropy, 0.0), (self.training, 0.0, self.likelihood)
-        filters, bias = train(fold(features, wide), (chromas - grid[1]) / grid[0], self._penalties(), stages)
-        # Half-way between the outermost lights: their median lies so near one end where tungsten is rare that the torus
-        # would be cut through the other.
-        centre = (chromas.min(axis=0) + chromas.max(axis=0)) / 2
-        return LogChromaModel(filters, bias, centre, np.array(grid))
-
-    def _penalties(self) -> Penalties:
-        return Penalties(
+        penalties = Penalties(
             smoothness=(self.pixel_smoothness, self.edge_smoothness, self.bias_smoothness),
             size=(self.pixel_size, self.edge_size, self.bias_size),
             spread=self.spread,
         )
-
-    def tune(
-        self, model: LightModel, features: Features, truths: npt.NDArray[np.float64], seed: int = 0
-    ) -> LogChromaModel:
-        """Return the model with filters and bias trained on, each departure from what they were penalised.
-
-        It keeps its torus; where a light, (N, 3) float64, lies on another turn of it, the model stays as it is.
-        """
-        if not isinstance(model, LogChromaModel):
-            raise TypeError(f"{type(model).__name__} is no model of {self.key}")
-        (size, first), logs = model.grid, np.log(truths)
-        chromas = logs[:, 1:2] - logs[:, [0, 2]]
-        if (np.abs(chromas - model.centre) >= BINS * size / 2).any():
-            return model
         filters, bias = train(
-            fold(features, bool(size > _FINE_SIZE)),
-            (chromas - first) / size,
-            self._penalties(),
-            ((self.training, 0.0, self.likelihood),),
-            (model.filters, model.bias),
-            _KNOWN_WORTH,
+            fold(features, wide),
+            (chromas - grid[1]) / grid[0],
+            penalties,
+            ((self.pretraining, self.crossentropy, 0.0), (self.training, 0.0, self.likelihood)),
         )
-        return LogChromaModel(filters, bias, model.centre, model.grid)
+        # Half-way between the outermost lights: their median lies so near one end where tungsten is rare that the torus
+        # would be cut through the other.
+        centre = (chromas.min(axis=0) + chromas.max(axis=0)) / 2
+        return LogChromaModel(filters, bias, centre, np.array(grid))
 
     def restore(self, arrays: Mapping[str, npt.NDArray[np.generic]]) -> LogChromaModel:
         """Return the model whose arrays are given: filters (2, 64, 33) complex128 and the others float64."""
