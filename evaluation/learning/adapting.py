@@ -4,11 +4,13 @@ Two models answer together. One was learned elsewhere, on generated images as a 
 method does that (`FeatureLearner.tune`). The other is what the same method learns of the N alone. The light is their
 mean in logarithms, the first with the weight w.
 
-w is found by stacking (L. Breiman, "Stacked regressions", Machine Learning 24, 1996) under a prior. Least squares on
-the N, each estimated by models that have not seen it, would choose it, and on twenty images choose badly; so the
-squares of `STRENGTH` images more are added that say w = `WORTH` / (`WORTH` + N): what was learned elsewhere is taken
-to be worth as much as that many images. The more images, the less the prior says, and the more they decide. No image
-that is tested on has a part in it.
+w begins with stacking (L. Breiman, "Stacked regressions", Machine Learning 24, 1996) under a prior. The least sum of
+errors on the N, each estimated by models that have not seen it, would choose it, and on twenty images choose badly;
+so that much is added for a w other than `WORTH` / (`WORTH` + N) as `STRENGTH` images would: what was learned
+elsewhere is taken to be worth as much as `WORTH` images. Held-out models learn of fewer than N and are worse than
+what they stand for, and what was learned elsewhere does not grow better with N: so w is multiplied by `WORTH`² /
+(`WORTH`² + N²), and from many images on little is left of it whatever stacking says. No image that is tested on has a
+part in it.
 
 `WORTH`, `STRENGTH` and how each method tunes were chosen by docs/transfer.md#what-was-chosen-and-on-what.
 """
@@ -23,11 +25,14 @@ import numpy as np
 import numpy.typing as npt
 
 from evaluation.learning.feature_learner import FeatureLearner, Features, LearnedMethod, LightModel, fit_extracted
+from evaluation.metrics import recovery_error
 
 WORTH: Final = 200.0
 """Images that what was learned elsewhere is taken to be worth before any is seen."""
-STRENGTH: Final = 50.0
+STRENGTH: Final = 25.0
 """Images that this opinion weighs as much as."""
+_SHARES: Final = np.linspace(0, 1, 101)
+"""Weights to choose among."""
 _PARTS: Final = 3
 """Parts of the N images, each estimated by models that learned of the others; so few since each is a training."""
 
@@ -80,7 +85,8 @@ def adapt(taught: LearnedMethod, alone: LearnedAlone, worth: float = WORTH) -> L
         return alone.method
     learner, elsewhere = taught.learner, taught.model
     tuned = _tuned(learner, elsewhere, alone.features, alone.truths, alone.seed)
-    share = worth / (worth + len(alone.features))
+    count = len(alone.features)
+    share = worth / (worth + count)
     if alone.held_out is not None:
         seen = np.empty_like(alone.truths)
         for part in range(_PARTS):
@@ -88,6 +94,7 @@ def adapt(taught: LearnedMethod, alone: LearnedAlone, worth: float = WORTH) -> L
             model = _tuned(learner, elsewhere, alone.features[~held], alone.truths[~held], alone.seed)
             seen[held] = model.lights(alone.features[held])
         share = stacked_share(seen, alone.held_out, alone.truths, share)
+    share *= worth**2 / (worth**2 + count**2)
     return replace(taught, model=BlendedModel(tuned, alone.method.model, np.array(share)))
 
 
@@ -109,26 +116,23 @@ def stacked_share(
 
     Examples
     --------
-    Where the first is right, the images outweigh an opinion against it, the more of them the more:
+    Where the first is right and the second wrong, images outweigh an opinion against the first, enough of them wholly:
 
     >>> truths, wrong = np.tile([0.3, 0.4, 0.3], (450, 1)), np.tile([0.2, 0.4, 0.4], (450, 1))
-    >>> [round(stacked_share(truths[:n], wrong[:n], truths[:n], 0.0), 2) for n in (50, 450)]
-    [0.5, 0.9]
+    >>> [round(stacked_share(truths[:n], wrong[:n], truths[:n], 0.0), 1) for n in (0, 25, 450)]
+    [0.0, 0.5, 1.0]
     """
-    first, second, wanted = (_logs(lights) for lights in (one, other, truths))
-    apart = first - second
-    squares = float((apart**2).sum())
-    if squares == 0:
+    if not len(truths):
         return expected
-    prior = STRENGTH * squares / len(apart)
-    share = (float(((wanted - second) * apart).sum()) + prior * expected) / (squares + prior)
-    return float(np.clip(share, 0, 1))
+    errors = np.array([recovery_error(_mean(one, other, share), truths).sum() for share in _SHARES])
+    opinion = STRENGTH * recovery_error(one, other).mean() * (_SHARES - expected) ** 2
+    return float(_SHARES[np.argmin(errors + opinion)]) if opinion.any() else expected
 
 
-def _logs(lights: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
-    """Return ln r/g and ln b/g, (N, 2) float64, of lights (N, 3)."""
-    logs = np.log(lights)
-    return logs[:, [0, 2]] - logs[:, 1:2]
+def _mean(one: npt.NDArray[np.float64], other: npt.NDArray[np.float64], share: float) -> npt.NDArray[np.float64]:
+    """Return the lights (N, 3) between lights (N, 3), r + g + b = 1: their mean in logarithms, with a share of one."""
+    lights = np.exp(share * np.log(one) + (1 - share) * np.log(other))
+    return lights / lights.sum(axis=1, keepdims=True)
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,10 +149,7 @@ class BlendedModel:
 
     def lights(self, features: Features) -> npt.NDArray[np.float64]:
         """Return the lights (N, 3) float64, r + g + b = 1, of features (N, ...) of the learner's dtype."""
-        share = float(self.share)
-        mean = share * np.log(self.elsewhere.lights(features)) + (1 - share) * np.log(self.here.lights(features))
-        lights = np.exp(mean)
-        return lights / lights.sum(axis=1, keepdims=True)
+        return _mean(self.elsewhere.lights(features), self.here.lights(features), float(self.share))
 
     def arrays(self) -> Mapping[str, npt.NDArray[np.generic]]:
         """Return the arrays of both, of any shape and dtype, under `elsewhere.` and `here.`, and the `share`."""
