@@ -418,8 +418,8 @@ class RelitScene:
         image, mask = self.scene.read()
         own = self.scene.truth / self.scene.truth.sum()
         if self.scene.saturation is not None:
-            usable = (image < self.scene.saturation).all(axis=2)
-            mask = ~usable if mask is None else np.logical_or(mask, ~usable)
+            clipped: npt.NDArray[np.bool_] = np.asarray((image >= self.scene.saturation).any(axis=2))
+            mask = clipped if mask is None else mask | clipped
         return (image * (self.light / self.light.sum() / own)).astype(np.float32), mask
 
 

@@ -275,8 +275,8 @@ def test_training_images_that_are_blue_first_are_told(
 def test_beside_real_images(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
     wish = ("--methods", "own.py:Map,kernel-ridge", "--statistics", "none", "--relit", "other.npz", "--out", "out")
     with np.load(place / "real.npz") as content:
-        other = {name: content[name] for name in content.files} | {"names": np.array([f"o_{n}" for n in range(30)])}
-    np.savez(place / "other.npz", **{**other, "images": other["images"][:, ::-1]})
+        images, lights = content["images"][:, ::-1], content["gt"]
+    np.savez(place / "other.npz", images=images, gt=lights, names=np.array([f"other_{number}" for number in range(30)]))
     assert main([*BASIC[:5], *wish, "--real", "0,5,50,all"]) == 0
     printed = " ".join(capsys.readouterr().out.split())
     assert "real: mean reproduction error beside N real images, degrees" in printed

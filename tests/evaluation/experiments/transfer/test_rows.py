@@ -183,7 +183,7 @@ def test_beside_real_images() -> None:
     mean = {key: np.mean([result.errors["recovery"].mean() for result in row.results]) for key, row in found.items()}
     # The set is of another world and 80 real images know it: they have the word.
     assert mean["real", "alone", "all"] < 0.7 * mean["generated", "", ""]
-    assert mean["generated", "adapted", "all"] < 1.02 * mean["real", "alone", "all"]
+    assert mean["generated", "adapted", "all"] < 1.1 * mean["real", "alone", "all"]
     assert mean["generated", "adapted", "10"] < mean["generated", "", ""]
 
 
