@@ -32,6 +32,9 @@ _LARGEST = 255
 _IMAGES = 900
 """Training images of which `penalty` is the λ: the number of the measurement in which 1 was found to be robust."""
 
+_TUNED_IMAGES = 450
+"""Training images whose penalty the remainder has at least, see docs/transfer.md#what-was-chosen-and-on-what."""
+
 
 @dataclass(frozen=True)
 class KernelRidge(FeatureLearner):
@@ -82,13 +85,13 @@ class KernelRidge(FeatureLearner):
     ) -> KernelRidgeModel:
         """Return the model plus a kernel ridge of what it leaves of the lights, (N, 3) float64; features as in the fit.
 
-        The penalty of the remainder is that of 900 images at least: a smaller one, of fewer images, follows each.
+        The penalty of the remainder is that of 450 images at least: a smaller one, of fewer images, follows each.
         """
         if not isinstance(model, KernelRidgeModel):
             raise TypeError(f"{type(model).__name__} is no model of {self.key}")
         roots = _roots(features)
         remainder = truths[:, :2] - model.centre - _kernel(roots, _roots(model.counts)) @ model.weights
-        penalty = self.penalty * max(1, len(roots) / _IMAGES)
+        penalty = self.penalty * max(_TUNED_IMAGES, len(roots)) / _IMAGES
         solve: Any = np.linalg.solve
         weights = solve(_kernel(roots, roots) + penalty * np.eye(len(roots)), remainder)
         counts = np.concatenate([model.counts, features.reshape(len(features), -1)])
