@@ -83,7 +83,7 @@ class KernelRidge(FeatureLearner):
     def tune(
         self, model: LightModel, features: Features, truths: npt.NDArray[np.float64], seed: int = 0
     ) -> KernelRidgeModel:
-        """Return the model plus a kernel ridge of what it leaves of the lights, (N, 3) float64; features as in the fit.
+        """Return the model plus a kernel ridge of what it leaves of lights (N, 3) float64, counts (N, 64, 64) uint16.
 
         The penalty of the remainder is that of 450 images at least: a smaller one, of fewer images, follows each.
         """

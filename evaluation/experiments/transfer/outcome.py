@@ -541,14 +541,13 @@ def round_numbers(low: float, high: float) -> list[float]:
 
 def beside_plot(found: TransferFigures) -> bytes:
     """Return the mean error against N real images as SVG: a panel for each method, with 95 % intervals."""
-    panels: dict[str, dict[str, dict[int, BoundedFigure]]] = {}
+    panels: dict[str, dict[str, dict[float, BoundedFigure]]] = {}
     for each in found.rows:
-        row, figure = each.row, each.statistics[0]
-        whole = next((one.row.images for one in found.rows if one.row.real == "all" and one.row.way == "alone"), 0)
-        place = whole if row.real == "all" else int(row.real or 0)
-        label = {"alone": "real alone", "": row.material}.get(row.way, f"{row.material}, {row.way}")
+        row = each.row
+        label = "real alone" if row.way == "alone" else f"{row.material}, {row.way}"
         if row.way:
-            panels.setdefault(row.method, {}).setdefault(label, {})[place] = figure
+            place = math.inf if row.real == "all" else int(row.real)
+            panels.setdefault(row.method, {}).setdefault(label, {})[place] = each.statistics[0]
     for each in found.rows:
         for label, points in panels.get(each.row.method, {}).items():
             if not each.row.way and label.startswith(f"{each.row.material}, "):
@@ -556,7 +555,7 @@ def beside_plot(found: TransferFigures) -> bytes:
     return svg_of(_draw_beside, panels, found.error, inches=(3.1 * max(1, len(panels)) + 0.4, 4.4))
 
 
-def _draw_beside(figure: Any, panels: Mapping[str, Mapping[str, Mapping[int, BoundedFigure]]], error: str) -> None:
+def _draw_beside(figure: Any, panels: Mapping[str, Mapping[str, Mapping[float, BoundedFigure]]], error: str) -> None:
     grid = figure.subplots(1, len(panels), squeeze=False)[0]
     labels = list(dict.fromkeys(label for curves in panels.values() for label in curves))
     for axes, (method, curves) in zip(grid, panels.items(), strict=True):
@@ -568,7 +567,7 @@ def _draw_beside(figure: Any, panels: Mapping[str, Mapping[str, Mapping[int, Bou
             axes.errorbar(
                 places, values, [values - lows, highs - values], marker="o", markersize=3, label=label, **style
             )
-        axes.set_xticks(range(len(counts)), [str(count) for count in counts])
+        axes.set_xticks(range(len(counts)), ["all" if math.isinf(count) else f"{count:g}" for count in counts])
         axes.set(title=method, xlabel="real images")
     grid[0].set_ylabel(f"mean {error} error, degrees")
     handles, named = grid[0].get_legend_handles_labels()
