@@ -61,7 +61,7 @@ class LearnedAlone:
 def learn_alone(
     learner: FeatureLearner, features: Sequence[Features | None], truths: npt.NDArray[np.float64], seed: int = 0
 ) -> LearnedAlone:
-    """Return what N images teach: features, N entries, each (...) of the learner's dtype or None; truths (N, 3) float64."""
+    """Return what N images teach, of features, (...) of the learner's dtype or None, and truths (N, 3) float64."""
     method = fit_extracted(learner, features, truths, seed)
     usable = [place for place, given in enumerate(features) if given is not None]
     stacked: Any = np.stack([given for given in features if given is not None])

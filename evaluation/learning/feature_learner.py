@@ -77,7 +77,7 @@ class FeatureLearner(ABC):
     def tune(self, model: LightModel, features: Features, truths: npt.NDArray[np.float64], seed: int = 0) -> LightModel:
         """Return a model of this learner, learned elsewhere, tuned to few images; most have nothing to tune.
 
-        `features`: (N, ...) of the learner's dtype. `truths`: (N, 3) float64. The fewer, the nearer it stays to what it was.
+        `features`: (N, ...) of the learner's dtype. `truths`: (N, 3) float64. The fewer, the nearer it stays.
         """
         del features, truths, seed
         return model
