@@ -12,7 +12,7 @@
 # LEVERS (environment) chooses some of the renderings below, by default all. Naive rows are made for each of them, of the same
 # pictures under the same lights; NAIVE=no leaves them out, which are half of the work. DRAW=900 draws so many pictures
 # for the sets that are drawn to be like the real ones, by default as many as there are. LEARNERS names the methods; most
-# of the time is log-chroma's.
+# of the time is log-chroma's. REAL=0,20,100,400,all also trains beside so many real images of the other folds.
 set -euo pipefail
 pictures=$(realpath "$1") archives=$(realpath "$2") out=$3 seeds=${4:-5}
 here=$(realpath "$(dirname "$0")")
@@ -58,7 +58,7 @@ for camera in 600d 1ds 5dsr; do
         [ "${NAIVE:-yes}" = no ] && naive=()
         once "results/$camera$test" evaluate transfer "${sets[@]}" --test "$half/$camera.npz" \
             --only "$half/images_$test.csv" --side 64 --images 900 --seeds "$seeds" --error recovery --statistics none \
-            --methods "$learners" "${naive[@]}" --out "results/$camera$test"
+            --methods "$learners" "${naive[@]}" ${REAL:+--real "$REAL"} --out "results/$camera$test"
     done
 done
 once pool evaluate pool results/* --error recovery --out pool

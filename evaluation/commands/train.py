@@ -26,7 +26,8 @@ METHOD is {LEARNERS_HELP}.
 Reads DATA, a data set of any layout that evaluate run reads. Writes MODEL.npz, a new file of plain arrays with the
 story of their training: data set, number of images and a hash of their names and lights, what was done to the images,
 settings, seed, software and date. evaluate run DATA --method MODEL.npz estimates with it, on the same camera or
-another; the tables say what it was trained on.
+another; the tables say what it was trained on. --adapt begins with such a file of the same method, trained elsewhere,
+as on generated images, and adapts it to DATA, few images of the camera at hand.
 
 {EXIT_CODES}
 """
@@ -39,14 +40,18 @@ def train(
     data: Data,
     *,
     out: Annotated[Path, option("MODEL.npz", "The new file to write the model to.")],
+    adapt: Annotated[
+        Path | None, option("MODEL.npz", "Adapt this model of the same method to DATA, in place of training anew.")
+    ] = None,
     seed: Annotated[int, option("N", "Of all that is random in the training.", min=0)] = 0,
     workers: Annotated[int | None, thread_option(" that read images; the model does not depend on it")] = None,
     reading: DataReading,
     told: JsonOutput,
 ) -> None:
     """Train a method on a data set."""
+    from evaluation.learning import adapting
     from evaluation.learning.feature_learner import FeatureLearner, extract, fit_extracted, require_installed, truths_of
-    from evaluation.learning.model_files import provenance_of, save_model
+    from evaluation.learning.model_files import load_model, provenance_of, save_model
     from evaluation.reports.table_output import show_notes
     from foundation.clock import SystemClock
     from foundation.compiled import processor_count
@@ -67,16 +72,29 @@ def train(
         raise InputError(f"--out is {out}, expected a name that ends in .npz, by which evaluate run knows a model")
     require_free_file(out, "the model")
     require_installed(learner)
+    known = None if adapt is None else load_model(adapt)
+    if known is not None and known.learner != learner:
+        raise InputError(
+            f"{adapt} is of {known.learner.key}, {'other settings' if known.learner.key == learner.key else method} "
+            f"was asked for; name a model of the same method and settings"
+        )
     found = reading.open(data)
     truths = truths_of(found.scenes)
     count = len(found.scenes)
     with image_steps(count) as step:
         (features,) = extract(found.scenes, [learner], workers or processor_count(), step)
-        fitted = fit_extracted(learner, features, truths, seed)
-        record = provenance_of(found, seed, SystemClock())
+        if known is None:
+            fitted = fit_extracted(learner, features, truths, seed)
+        else:
+            fitted = adapting.adapt(known, adapting.learn_alone(learner, features, truths, seed))
+        record = provenance_of(found, seed, SystemClock(), adapted_from=known and known.provenance)
         save_model(out, fitted, record)
     unused = sum(given is None for given in features)
     notes = [f"{unused} of {count} images have no usable pixel and were left out of the training"] if unused else []
     told.add(model=out, method=learner.name, data_set=found.name, images=count, unused=unused, seed=seed)
+    if isinstance(fitted.model, adapting.BlendedModel):
+        share = float(fitted.model.share)
+        told.add(adapted_from=adapt, share=share)
+        notes.append(f"{adapt} answers with a share of {share:.2f}, what these images teach alone with {1 - share:.2f}")
     print(f"{out}: {learner.name}, {record.sentence()}")
     show_notes(told, notes, found.treatment)

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
     from evaluation.experiments.cross_validation import AnyLearner
     from evaluation.experiments.transfer.plan import TransferPlan
-    from evaluation.experiments.transfer.rows import TransferRow
+    from evaluation.experiments.transfer.rows import BesideReal, TransferRow, Way
     from evaluation.methods.method import Method
     from evaluation.scene import SceneSet
 
@@ -34,13 +34,14 @@ _ALIKE = 2.0
 
 HELP = f"""Train learned methods on generated images and test them on real ones.
 
-Reads data sets of any layout that evaluate run reads; trains each method on each one of --train and tests it on --test,
-beside real cross-validation of the same method, the constant light (median of the training lights), and statistics
-methods. With --naive also trained without a table: the same pictures, linear sRGB times the same lights, with and
-without the camera's colour matrix. Prints mean, median, trimean, best and worst quarter, their bootstrap intervals, and
-their ratios to real cross-validation, paired by image. Training sets that share pictures with the test set, by name or
-content, are refused. Writes nothing unless asked with --out: results.csv, errors.csv (each image), folds, tables.tex,
-report.html and run.json.
+Reads data sets of any layout that evaluate run reads; trains each method on each one of --train and tests it on
+--test, beside real cross-validation of the same method, the constant light (median of the training lights), and
+statistics methods. With --naive also trained without a table: the same pictures, linear sRGB times the same lights,
+with and without the camera's colour matrix. With --real also beside N real images of the other folds: on them alone,
+on them pooled with each set, and on each set first and then adapted to them. Prints mean, median, trimean, best and
+worst quarter, their bootstrap intervals, and their ratios to real cross-validation, paired by image. Training sets
+that share pictures with the test set, by name or content, are refused. Writes nothing unless asked with --out:
+results.csv, errors.csv (each image), folds, tables.tex, report.html and run.json.
 
 {EXIT_CODES}
 """
@@ -82,6 +83,23 @@ def transfer(
         Path | None,
         option(
             "FILE", "CSV file with a column image: only these are tested; cross-validation still trains on all others."
+        ),
+    ] = None,
+    real: Annotated[
+        str | None,
+        option(
+            "LIST",
+            "Numbers of real images to train beside, between commas, as 0,20,100,400,all; drawn from the folds that "
+            "are not tested.",
+        ),
+    ] = None,
+    beside: Annotated[
+        str, option("LIST", "What is done with a set and N real images: pooled, adapted or both.")
+    ] = "pooled,adapted",
+    relit: Annotated[
+        str | None,
+        option(
+            "DATA", "Real images of another camera, to train on under the lights of each generated set, as a yardstick."
         ),
     ] = None,
     images: Annotated[
@@ -126,13 +144,17 @@ def transfer(
     threads = workers or processor_count()
     learners, left_out = _learners(methods)
     references = _references(statistics)
+    wished = _beside(real, beside)
     tested = reading.open(test)
-    plan = plan_transfer(tested, [open_scenes(place) for place in train], naive, matrix, shared)
+    others = None if relit is None else open_scenes(relit)
+    plan = plan_transfer(tested, [open_scenes(place) for place in train], naive, matrix, shared, others)
     unlike = _sizes(tested, plan, side)
     plan = replace(plan, notes=(*plan.notes, *([unlike] if unlike else []), *left_out))
     counted, places, partly = _only(only, tested)
     plan = replace(plan, notes=(*plan.notes, *partly))
     drawn = tuple(choose_folds(tested, folds, seed)[0] for seed in range(seeds))
+    wished, too_many = _within(wished, drawn)
+    plan = replace(plan, notes=(*plan.notes, *too_many, *_not_adapted(learners, wished)))
     smallest = min(len(some.scenes) for some in plan.training)
     wanted = smallest if images is None else images
     count = count_images(tested.scenes, plan.training, len(drawn), wanted)
@@ -141,8 +163,9 @@ def transfer(
             *(tested.scenes, plan.training, learners, drawn, wanted, references),
             *(side, threads, step),
             generated=tested.name if is_generated(tested) else "",
+            beside=wished,
+            counted=places,
         )
-    rows = tuple(replace(row, results=tuple(result.at(places) for result in row.results)) for row in rows)
     plan = replace(plan, notes=(*plan.notes, *_suspicions(counted, rows)))
     figures = figures_of(rows, error)
     settings: dict[str, Any] = {
@@ -153,6 +176,9 @@ def transfer(
         "matrix": matrix,
         "images": wanted,
         "seeds": list(range(seeds)),
+        "real": real,
+        "beside": None if real is None else list(wished.ways),
+        "relit": None if others is None else others.name,
         "side": side,
         "shared": shared,
         "error": error,
@@ -177,6 +203,52 @@ def _learners(text: str) -> tuple[list[AnyLearner], list[str]]:
         if titles.count(title) > 1:
             raise InputError(f"two methods are called {title}; give one another name: names head the rows")
     return [*chosen, ConstantLight()], left_out
+
+
+def _beside(real: str | None, ways: str) -> BesideReal:
+    """Return what --real and --beside ask for."""
+    from evaluation.experiments.transfer.rows import BesideReal
+    from foundation.errors import InputError
+
+    words = [] if real is None else [word.strip().lower() for word in real.split(",")]
+    if not all(word == "all" or (word.isascii() and word.isdigit()) for word in words):
+        raise InputError(
+            f"--real is {real!r}, expected numbers of real images between commas, or all: 0,20,100,400,all"
+        )
+    counts = [None if word == "all" else int(word) for word in dict.fromkeys(words)]
+    known: dict[str, Way] = {"pooled": "pooled", "adapted": "adapted"}
+    asked = [word.strip().lower() for word in ways.split(",")]
+    if not all(word in known for word in asked):
+        raise InputError(f"--beside is {ways!r}, expected pooled, adapted, or both between commas")
+    # Of no real images there are rows in any case: those of the sets alone.
+    return BesideReal(
+        tuple(count for count in counts if count != 0), tuple(known[word] for word in dict.fromkeys(asked))
+    )
+
+
+def _within(beside: BesideReal, folds: Sequence[npt.NDArray[np.int64]]) -> tuple[BesideReal, list[str]]:
+    """Return the numbers of real images that every fold (N,) int64 leaves, and why others are left out."""
+    from dataclasses import replace
+
+    import numpy as np
+
+    least = min(len(each) - int(np.bincount(each).max()) for each in folds)
+    left_out = [count for count in beside.counts if count is not None and count > least]
+    told = ", ".join(map(str, left_out))
+    notes = [f"No rows beside {told} real images: a fold leaves {least}; all are those"] if left_out else []
+    return replace(beside, counts=tuple(count for count in beside.counts if count not in left_out)), notes
+
+
+def _not_adapted(learners: Sequence[AnyLearner], beside: BesideReal) -> list[str]:
+    from evaluation.learning.feature_learner import FeatureLearner
+
+    if not beside.counts or "adapted" not in beside.ways:
+        return []
+    return [
+        f"{learner.name} is a class of your own, which is not adapted: it has rows alone and pooled"
+        for learner in learners
+        if not isinstance(learner, FeatureLearner)
+    ]
 
 
 def _references(text: str) -> list[Method]:

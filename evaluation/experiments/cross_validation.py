@@ -174,10 +174,10 @@ def estimate_on(method: Method, number: int, material: Material, places: Places)
     features, chosen = material.features[number], [int(place) for place in places.tolist()]
     if not isinstance(method, LearnedMethod) or features is None:
         return [answer for (answer,) in answer_scenes([material.scenes[place] for place in chosen], [method])]
-    model = method.model
+    usable = [given for given in (features[place] for place in chosen) if given is not None]
+    lights = iter(method.model.lights(np.stack(usable)) if usable else ())
     return [
-        SceneAnswer(None, NO_PIXEL) if given is None else read_light(unit(model.lights(given[None])[0]))
-        for given in (features[place] for place in chosen)
+        SceneAnswer(None, NO_PIXEL) if features[place] is None else read_light(unit(next(lights))) for place in chosen
     ]
 
 

@@ -22,6 +22,7 @@ import numpy.typing as npt
 from markupsafe import Markup
 
 from evaluation.experiments.transfer.outcome import (
+    BESIDE_CAPTION,
     HEADS,
     LEVEL,
     SHOWN,
@@ -29,17 +30,20 @@ from evaluation.experiments.transfer.outcome import (
     RowRatio,
     TransferFigures,
     base_ratios_table,
+    beside_plot,
+    beside_table,
     errors_table,
     figures_of,
     forest_plot,
     intervals_table,
     labelled_results,
     long_table,
+    naive_adapted_table,
     naive_ratios_table,
     real_ratios_table,
     shown_ratios,
 )
-from evaluation.experiments.transfer.rows import Kind, TransferRow
+from evaluation.experiments.transfer.rows import Kind, TransferRow, Way
 from evaluation.metrics import ErrorKind
 from evaluation.reports.table_output import table_part, table_to_latex
 from evaluation.results.files import MethodErrors, errors_csv, read_errors
@@ -48,6 +52,7 @@ from evaluation.results.tables import Cell, Table, table_to_csv
 from foundation import pages
 from foundation.errors import FormatError, InputError, counted, first_of
 from foundation.files import read_csv, whole_folder, write_whole
+from foundation.plots import standalone
 from foundation.version import software
 
 _KINDS: tuple[Kind, ...] = get_args(Kind)
@@ -146,17 +151,20 @@ def _listed(path: Path) -> list[tuple[TransferRow, int]]:
     lines = read_csv(path, "name a folder that evaluate transfer --out has written")[1]
     try:
         found = {
-            (line["method"], line["training"], line["data"]): (int(line["images"]), int(line["seeds"]))
+            (line["method"], line["training"], line["data"], line.get("way", ""), line.get("real", "")): (
+                int(line["images"]),
+                int(line["seeds"]),
+            )
             for line in lines
         }
     except (KeyError, ValueError) as error:
         raise FormatError(f"{path} is no table of a transfer: {error}; run the transfer again") from error
-    strange = [kind for _, kind, _ in found if kind not in _KINDS]
+    strange = [kind for _, kind, *_ in found if kind not in _KINDS]
     if strange:
         raise FormatError(f"{path} has the training {first_of(strange)}; expected one of {', '.join(_KINDS)}")
     return [
-        (TransferRow(method, cast("Kind", kind), data, images, ()), seeds)
-        for (method, kind, data), (images, seeds) in found.items()
+        (TransferRow(method, cast("Kind", kind), data, images, (), cast("Way", way), real), seeds)
+        for (method, kind, data, way, real), (images, seeds) in found.items()
     ]
 
 
@@ -248,6 +256,8 @@ def _joined(rows: Sequence[TransferRow], places: Sequence[str], single: bool) ->
         data="each camera's own" if single and len(names) > 1 else names[0],
         images=min(row.images for row in rows),
         results=tuple(results),
+        way=rows[0].way,
+        real=rows[0].real,
     )
 
 
@@ -260,8 +270,8 @@ def _concatenated(results: Sequence[Result]) -> Result:
     )
 
 
-def _key(row: TransferRow, single: bool) -> tuple[str, Kind, str]:
-    return row.method, row.kind, "" if single else row.data
+def _key(row: TransferRow, single: bool) -> tuple[str, Kind, str, Way, str]:
+    return row.method, row.kind, "" if single else row.data, row.way, row.real
 
 
 def _require_apart(parts: Sequence[TransferResults]) -> None:
@@ -329,6 +339,7 @@ def pool_page(
             "Errors in parts of those of the same method with that training (the line at 1). To the left of it is "
             "better; where pictures or lights are others, the choice of them is held against it, too.",
         ),
+        *([pages.figure(beside_plot(whole), BESIDE_CAPTION)] if whole.to_better else []),
         pages.heading("Tables"),
         *map(table_part, shown),
         pages.heading("Conditions"),
@@ -419,6 +430,8 @@ def make_tables(pool: Pool, error: ErrorKind, base: str | None = None) -> PoolTa
         real_ratios_table(every, name),
         naive_ratios_table(every, name),
         base_ratios_table(every, name),
+        beside_table(every, name),
+        naive_adapted_table(every, name),
         _by_test_set(single, {test: len(places) for test, places in members.items()}),
     )
     listed = [(test, long_table(figures)) for test, figures in single.items()]
@@ -452,6 +465,8 @@ def save_pool(pool: Pool, tables: PoolTables, places: Sequence[str], error: Erro
         write_whole(partial / "tables.tex", "\n".join(table_to_latex(table) for table in tables.shown))
         report = pool_page(pool, tables.shown, tables.figures, tables.figures_of_tests, places)
         write_whole(partial / "report.html", report)
+        if tables.figures.to_better:
+            write_whole(partial / "beside_real.svg", standalone(beside_plot(tables.figures)))
         write_whole(partial / "run.json", json.dumps(about, indent=2, ensure_ascii=False) + "\n")
 
 

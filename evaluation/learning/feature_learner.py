@@ -74,6 +74,14 @@ class FeatureLearner(ABC):
         + b = 1.
         """
 
+    def tune(self, model: LightModel, features: Features, truths: npt.NDArray[np.float64], seed: int = 0) -> LightModel:
+        """Return a model of this learner, learned elsewhere, tuned to few images; most have nothing to tune.
+
+        `features`: (N, ...) of the learner's dtype. `truths`: (N, 3) float64. The fewer, the nearer it stays.
+        """
+        del features, truths, seed
+        return model
+
     @abstractmethod
     def restore(self, arrays: Mapping[str, npt.NDArray[np.generic]]) -> LightModel:
         """Return the model whose `arrays` (of any shape and dtype, see there) are given."""

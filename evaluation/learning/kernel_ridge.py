@@ -21,7 +21,7 @@ from typing import Any, ClassVar
 import numpy as np
 import numpy.typing as npt
 
-from evaluation.learning.feature_learner import FeatureLearner, Features
+from evaluation.learning.feature_learner import FeatureLearner, Features, LightModel
 from evaluation.learning.working_size import chromaticities, lights_from_chromaticities, reduce
 from evaluation.scene import Image
 
@@ -31,6 +31,9 @@ _LARGEST = 255
 """Working size up to which the counts of a histogram fit in 16 bits."""
 _IMAGES = 900
 """Training images of which `penalty` is the λ: the number of the measurement in which 1 was found to be robust."""
+
+_TUNED_IMAGES = 450
+"""Training images whose penalty the remainder has at least, see docs/transfer.md#what-was-chosen-and-on-what."""
 
 
 @dataclass(frozen=True)
@@ -76,6 +79,23 @@ class KernelRidge(FeatureLearner):
         solve: Any = np.linalg.solve
         weights = solve(_kernel(roots, roots) + penalty * np.eye(len(roots)), truths[:, :2] - centre)
         return KernelRidgeModel(features.reshape(len(features), -1), weights, centre)
+
+    def tune(
+        self, model: LightModel, features: Features, truths: npt.NDArray[np.float64], seed: int = 0
+    ) -> KernelRidgeModel:
+        """Return the model plus a kernel ridge of what it leaves of lights (N, 3) float64, counts (N, 64, 64) uint16.
+
+        The penalty of the remainder is that of 450 images at least: a smaller one, of fewer images, follows each.
+        """
+        if not isinstance(model, KernelRidgeModel):
+            raise TypeError(f"{type(model).__name__} is no model of {self.key}")
+        roots = _roots(features)
+        remainder = truths[:, :2] - model.centre - _kernel(roots, _roots(model.counts)) @ model.weights
+        penalty = self.penalty * max(_TUNED_IMAGES, len(roots)) / _IMAGES
+        solve: Any = np.linalg.solve
+        weights = solve(_kernel(roots, roots) + penalty * np.eye(len(roots)), remainder)
+        counts = np.concatenate([model.counts, features.reshape(len(features), -1)])
+        return KernelRidgeModel(counts, np.concatenate([model.weights, weights]), model.centre)
 
     def restore(self, arrays: Mapping[str, npt.NDArray[np.generic]]) -> KernelRidgeModel:
         """Return the model whose arrays are given: counts (N, 4096) uint16, weights (N, 2) and centre (2,) float64."""

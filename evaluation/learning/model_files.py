@@ -21,6 +21,7 @@ import numpy.typing as npt
 from pydantic import Field, PlainValidator
 
 from evaluation.datasets.identity import identities
+from evaluation.learning.adapting import restore
 from evaluation.learning.feature_learner import FeatureLearner, LearnedMethod
 from evaluation.learning.standard import standard_learners
 from evaluation.methods.method import Method
@@ -67,6 +68,8 @@ class TrainingRecord:
         Name and version of what trained it.
     date
         ISO 8601, UTC.
+    adapted_from
+        Of a model that was adapted: what the one that it was adapted from was trained on, in a sentence; else empty.
     images
         (N, 2) uint64, by what each image is known again, see `datasets.identity`; no row in a file that was made
         before model files had them.
@@ -82,6 +85,7 @@ class TrainingRecord:
     seed: int
     software: str
     date: str
+    adapted_from: str = ""
     images: _Images = field(default_factory=_unknown, compare=False)
 
     def sentence(self) -> str:
@@ -89,6 +93,7 @@ class TrainingRecord:
         return (
             f"trained on {self.part} of {self.data_name} ({self.data_layout}, {self.scenes} images, seed {self.seed}) "
             f"by {self.software} on {self.date[:10]}"
+            + (f", adapted from a model {self.adapted_from}" if self.adapted_from else "")
         )
 
 
@@ -105,8 +110,14 @@ class StoredMethod(LearnedMethod):
     provenance: TrainingRecord | None = None
 
 
-def provenance_of(data: SceneSet, seed: int, clock: Clock, part: str = "all") -> TrainingRecord:
-    """Return the provenance of a model that is trained on a data set now."""
+def provenance_of(
+    data: SceneSet, seed: int, clock: Clock, part: str = "all", adapted_from: TrainingRecord | None = None
+) -> TrainingRecord:
+    """Return the provenance of a model that is trained on a data set now.
+
+    `adapted_from`: that of the model that is adapted; its images count among those that this one was trained on.
+    """
+    images = identities(data.scenes)
     return TrainingRecord(
         data_name=data.name,
         data_place=data.place,
@@ -118,7 +129,8 @@ def provenance_of(data: SceneSet, seed: int, clock: Clock, part: str = "all") ->
         seed=seed,
         software=software(),
         date=clock.now().isoformat(timespec="seconds"),
-        images=identities(data.scenes),
+        adapted_from=adapted_from.sentence() if adapted_from else "",
+        images=np.concatenate([images, adapted_from.images]) if adapted_from else images,
     )
 
 
@@ -183,11 +195,14 @@ def load_model(path: Path) -> StoredMethod:
         learner = _with_settings(known[about["method"]], about["settings"])
         images = arrays.pop(_TRAINED, _unknown())
         provenance = from_plain(TrainingRecord, about["provenance"] | {"images": images}, path, _REMEDY)
-        if images.dtype != np.uint64 or images.shape not in ((0, 2), (provenance.scenes, 2)):
+        # Of an adapted model they are those of both trainings.
+        whole = images.ndim == 2 and images.shape[1] == 2 and len(images) in (0, provenance.scenes)
+        both = images.ndim == 2 and images.shape[1] == 2 and provenance.adapted_from and len(images) > provenance.scenes
+        if images.dtype != np.uint64 or not (whole or both):
             raise ValueError(
                 f"its {_TRAINED} is {images.dtype} of the shape {images.shape}, expected uint64, (images, 2)"
             )
-        model = learner.restore(arrays)
+        model = restore(learner, arrays)
     except (FileNotFoundError, IsADirectoryError) as error:
         what = "a folder" if path.is_dir() else "not there"
         raise FormatError(f"{path} is {what}, expected a model file; {_REMEDY}") from error

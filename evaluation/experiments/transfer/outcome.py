@@ -23,7 +23,7 @@ from evaluation.experiments.bootstrap import STATISTICS, ErrorSample, bca, resam
 from evaluation.experiments.folds import folds_to_csv
 from evaluation.experiments.paper.published import TABLE2
 from evaluation.experiments.transfer.plan import TransferPlan, is_generated
-from evaluation.experiments.transfer.rows import NAIVE, TransferRow
+from evaluation.experiments.transfer.rows import NAIVE, TransferRow, Way
 from evaluation.metrics import ErrorKind
 from evaluation.reports.table_output import table_part, table_to_latex
 from evaluation.results.files import errors_csv
@@ -33,7 +33,7 @@ from evaluation.scene import SceneSet
 from foundation import pages
 from foundation.errors import InputError
 from foundation.files import whole_folder, write_whole
-from foundation.plots import FAINT, INK, series_style, svg_of
+from foundation.plots import FAINT, INK, legend_label, series_style, standalone, svg_of
 from foundation.version import software
 
 COUNT: Final = 2000
@@ -87,6 +87,9 @@ class TransferFigures:
     - `to_real`: every row that was trained elsewhere against the same method's real cross-validation.
     - `to_naive`: every generated row against the naive rows of the same pictures and lights.
     - `to_base`: every other row against those that were asked for, of the same method.
+    - `to_better`: every row adapted to N real images against the better in the mean of real images alone and of its set
+      alone.
+    - `to_naive_adapted`: every adapted generated row against its naive ones, adapted to the same images.
     """
 
     error: ErrorKind
@@ -94,6 +97,8 @@ class TransferFigures:
     to_real: tuple[RowRatio, ...]
     to_naive: tuple[RowRatio, ...]
     to_base: tuple[RowRatio, ...] = ()
+    to_better: tuple[RowRatio, ...] = ()
+    to_naive_adapted: tuple[RowRatio, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -150,12 +155,26 @@ def figures_of(
         if other.kind == "cross-validation"
         and other.method == row.method
         and row.kind not in ("cross-validation", "none")
+        and not row.way
     ]
     to_naive = [
         ratio(number, base)
         for number, row in enumerate(rows)
         for base, other in enumerate(rows)
         if row.kind == "generated" and other.kind in NAIVE and (other.method, other.data) == (row.method, row.data)
+        if not row.way and not other.way
+    ]
+    to_better = [
+        ratio(number, min(_alone(rows, row), key=lambda place: known[place].estimate[0]))
+        for number, row in enumerate(rows)
+        if row.way == "adapted"
+    ]
+    to_naive_adapted = [
+        ratio(number, base)
+        for number, row in enumerate(rows)
+        for base, other in enumerate(rows)
+        if (row.kind, row.way) == ("generated", "adapted") and other.kind in NAIVE
+        if (other.method, other.data, other.way, other.real) == (row.method, row.data, row.way, row.real)
     ]
     to_base = [
         ratio(number, other)
@@ -163,7 +182,19 @@ def figures_of(
         for other in bases
         if number not in bases and rows[other].method == row.method
     ]
-    return TransferFigures(error, listed, tuple(to_real), tuple(to_naive), tuple(to_base))
+    ratios = (to_real, to_naive, to_base, to_better, to_naive_adapted)
+    return TransferFigures(error, listed, *(tuple(each) for each in ratios))
+
+
+def _alone(rows: Sequence[TransferRow], adapted: TransferRow) -> list[int]:
+    """Return the places of the rows of what an adapted row was made of: real images alone, and its set alone."""
+    wanted = {("alone", adapted.real, "real", ""), ("", "", adapted.kind, adapted.data)}
+    return [
+        number
+        for number, row in enumerate(rows)
+        if row.method == adapted.method
+        and (row.way, row.real, row.kind, "" if row.kind == "real" else row.data) in wanted
+    ]
 
 
 def _named(rows: Sequence[TransferRow], base: str | None) -> list[int]:
@@ -211,6 +242,7 @@ SHOWN: Final = (1, 0, 4)
 
 def errors_table(found: TransferFigures, name: str, images: int) -> Table:
     """Return the statistics of every row; of several seeds their means."""
+    without = [row for row in found.rows if not row.row.way]
     notes = [
         f"{row.row.method}, {row.row.training}: no light in {guessed.sum()} images; grey stands in for it"
         for row in found.rows
@@ -224,7 +256,7 @@ def errors_table(found: TransferFigures, name: str, images: int) -> Table:
     return Table(
         f"{name}: {found.error} angular error of {images} images, degrees",
         ("Method", "Trained on", "Images", *HEADS),
-        tuple((*_heads(row.row), *(figure.value for figure in row.statistics)) for row in found.rows),
+        tuple((*_heads(row.row), *(figure.value for figure in row.statistics)) for row in without),
         notes=tuple(notes),
     )
 
@@ -237,6 +269,7 @@ def intervals_table(found: TransferFigures, name: str) -> Table:
         tuple(
             (*_heads(row.row), *(f"{figure.low:.2f} – {figure.high:.2f}" for figure in row.statistics))
             for row in found.rows
+            if not row.row.way
         ),
         notes=("BCa bootstrap over the test images: what other images of the same kind would have given.",),
     )
@@ -285,14 +318,68 @@ def _ratios_table(
         (
             one.row.method,
             said,
-            *(
-                f"{figure.value:.2f} ({figure.low:.2f} – {figure.high:.2f})" if math.isfinite(figure.value) else "–"
-                for figure in one.ratios
-            ),
+            one.row.images or None,
+            one.base.images or None,
+            *map(_written, one.ratios),
         )
         for one, said in ratios
     )
-    return Table(title, ("Method", second_head, *HEADS), rows, notes=(note,))
+    return Table(title, ("Method", second_head, "Images", "Base", *HEADS), rows, notes=(note, _BASE))
+
+
+_BASE: Final = "Images and Base: training images of the row, and of what it is held to."
+
+
+def _written(figure: BoundedFigure) -> str:
+    return f"{figure.value:.2f} ({figure.low:.2f} – {figure.high:.2f})" if math.isfinite(figure.value) else "–"
+
+
+def beside_table(found: TransferFigures, name: str) -> Table | None:
+    """Return the mean errors beside N real images; None if there were none."""
+    known = {(row.row.method, row.row.training): row.statistics[0].value for row in found.rows}
+    better = {(one.row.method, one.row.training): one for one in found.to_better}
+    rows: list[tuple[str | float | None, ...]] = []
+    for row in (each.row for each in found.rows):
+        if row.way not in ("pooled", "adapted") or (row.way == "pooled" and _as(row, "adapted") in better):
+            continue
+        ratio = better.get(_as(row, "adapted"))
+        alone = known.get((row.method, replace(row, kind="real", data=_data_of_real(found), way="alone").training))
+        listed = (known.get((row.method, row.material)), known.get(_as(row, "pooled")), known.get(_as(row, "adapted")))
+        rows.append((row.method, row.material, row.real, alone, *listed, _written(ratio.ratios[0]) if ratio else None))
+    if not rows:
+        return None
+    return Table(
+        f"{name}: mean {found.error} error beside N real images, degrees",
+        ("Method", "Set", "N", "N alone", "Set alone", "Pooled", "Adapted", "Adapted in parts of the better alone"),
+        tuple(rows),
+        notes=(
+            "The N are drawn from the other folds. Pooled: trained on both, N repeated to weigh as much as the set. "
+            "Adapted: trained on the set, then adapted to N. All statistics are in results.csv.",
+        ),
+    )
+
+
+def _as(row: TransferRow, way: Way) -> tuple[str, str]:
+    return row.method, replace(row, way=way).training
+
+
+def _data_of_real(found: TransferFigures) -> str:
+    return next((one.row.data for one in found.rows if one.row.kind == "real"), "")
+
+
+def naive_adapted_table(found: TransferFigures, name: str) -> Table | None:
+    """Return adapted generated rows in parts of adapted naive ones; None if there are none."""
+    if not found.to_naive_adapted:
+        return None
+    rows = tuple(
+        (one.row.method, one.base.material, one.row.real, *map(_written, one.ratios)) for one in found.to_naive_adapted
+    )
+    return Table(
+        f"{name}: errors with generated images in parts of those with naive ones, both adapted to N real images",
+        ("Method", "In parts of", "N", *HEADS),
+        rows,
+        notes=("Paired by test image. Below 1: beside N real images the table is still worth something.",),
+    )
 
 
 def paper_ratios_table() -> Table:
@@ -326,13 +413,15 @@ def long_table(found: TransferFigures) -> Table:
             spread = row.spread[place] if row.spread else None
             parts = _three(ratio.ratios[place]) if ratio else (None, None, None)
             who = (row.row.method, row.row.kind, row.row.data, row.row.images, len(row.row.results))
-            rows.append((*who, found.error, statistic, *_three(row.statistics[place]), spread, *parts))
+            beside = row.row.way, row.row.real
+            rows.append((*who, found.error, statistic, *_three(row.statistics[place]), spread, *parts, *beside))
     return Table("All numbers", _LONG, tuple(rows))
 
 
 _LONG: Final = (
     *("method", "training", "data", "images", "seeds", "error", "statistic"),
     *("degrees", "low", "high", "seed_sd", "ratio_to_real", "ratio_low", "ratio_high"),
+    *("way", "real"),
 )
 """Columns of the file for other programs; empty where a row has no such number."""
 
@@ -450,6 +539,41 @@ def round_numbers(low: float, high: float) -> list[float]:
     return ticks
 
 
+def beside_plot(found: TransferFigures) -> bytes:
+    """Return the mean error against N real images as SVG: a panel for each method, with 95 % intervals."""
+    panels: dict[str, dict[str, dict[float, BoundedFigure]]] = {}
+    for each in found.rows:
+        row = each.row
+        label = "real alone" if row.way == "alone" else f"{row.material}, {row.way}"
+        if row.way:
+            place = math.inf if row.real == "all" else int(row.real)
+            panels.setdefault(row.method, {}).setdefault(label, {})[place] = each.statistics[0]
+    for each in found.rows:
+        for label, points in panels.get(each.row.method, {}).items():
+            if not each.row.way and label.startswith(f"{each.row.material}, "):
+                points[0] = each.statistics[0]
+    return svg_of(_draw_beside, panels, found.error, inches=(3.1 * max(1, len(panels)) + 0.4, 4.4))
+
+
+def _draw_beside(figure: Any, panels: Mapping[str, Mapping[str, Mapping[float, BoundedFigure]]], error: str) -> None:
+    grid = figure.subplots(1, len(panels), squeeze=False)[0]
+    labels = list(dict.fromkeys(label for curves in panels.values() for label in curves))
+    for axes, (method, curves) in zip(grid, panels.items(), strict=True):
+        counts = sorted({count for points in curves.values() for count in points})
+        for label, points in curves.items():
+            style = series_style(labels.index(label))
+            places = np.array([counts.index(count) for count in sorted(points)]) + 0.06 * (labels.index(label) - 2)
+            values, lows, highs = (np.array(part) for part in zip(*(points[n] for n in sorted(points)), strict=True))
+            axes.errorbar(
+                places, values, [values - lows, highs - values], marker="o", markersize=3, label=label, **style
+            )
+        axes.set_xticks(range(len(counts)), ["all" if math.isinf(count) else f"{count:g}" for count in counts])
+        axes.set(title=method, xlabel="real images")
+    grid[0].set_ylabel(f"mean {error} error, degrees")
+    handles, named = grid[0].get_legend_handles_labels()
+    figure.legend(handles, [legend_label(name) for name in named], loc="outside lower center", ncols=2, fontsize=8)
+
+
 def _positive(number: float) -> bool:
     return math.isfinite(number) and number > 0
 
@@ -487,6 +611,8 @@ class TransferOutcome:
             intervals_table(self.figures, name),
             real_ratios_table(self.figures, name),
             naive_ratios_table(self.figures, name),
+            beside_table(self.figures, name),
+            naive_adapted_table(self.figures, name),
         )
         return tuple(table for table in made if table is not None)
 
@@ -501,7 +627,10 @@ def labelled_results(rows: Sequence[TransferRow]) -> tuple[Result, ...]:
 
 
 def save_outcome(outcome: TransferOutcome, folder: Path) -> None:
-    """Write the result folder: `results.csv`, `errors.csv`, `folds.csv`, `tables.tex`, `report.html`, `run.json`."""
+    """Write the result folder: `results.csv`, `errors.csv`, `folds.csv`, `tables.tex`, `report.html`, `run.json`.
+
+    Beside N real images `beside_real.svg`, too.
+    """
     names = [scene.name for scene in outcome.test.scenes]
     every = [scene.name for scene in outcome.crossed.scenes]
     truths = np.stack([scene.truth for scene in outcome.test.scenes])
@@ -512,6 +641,8 @@ def save_outcome(outcome: TransferOutcome, folder: Path) -> None:
             write_whole(partial / f"folds_{seed}.csv", folds_to_csv(every, folds))
         write_whole(partial / "tables.tex", "\n".join(table_to_latex(table) for table in outcome.tables()))
         write_whole(partial / "report.html", report_page(outcome))
+        if outcome.figures.to_better:
+            write_whole(partial / "beside_real.svg", standalone(beside_plot(outcome.figures)))
         write_whole(partial / "run.json", json.dumps(_provenance(outcome), indent=2, ensure_ascii=False) + "\n")
 
 
@@ -541,11 +672,18 @@ def report_page(outcome: TransferOutcome) -> str:
                 "own do.",
             )
         )
+    if outcome.figures.to_better:
+        parts.append(pages.figure(beside_plot(outcome.figures), BESIDE_CAPTION))
     parts += [table_part(paper_ratios_table()), pages.heading("Conditions")]
     parts += [pages.paragraph(note) for note in outcome.plan.notes]
     parts += [pages.paragraph(f"{test.name}, {what}: {sentence}.") for what, sentence in test.treatment.items()]
     parts.append(pages.paragraph(f"Settings: {json.dumps(dict(outcome.settings), ensure_ascii=False)}. {software()}."))
     return pages.page(f"Transfer to {test.name}", parts)
+
+
+BESIDE_CAPTION: Final = (
+    "Mean error against the number of real images, with 95 % intervals over test images; 0: the set alone."
+)
 
 
 def _training_sets(outcome: TransferOutcome) -> str:

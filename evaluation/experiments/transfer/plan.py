@@ -391,6 +391,50 @@ def naive_scenes(
 
 
 @dataclass(frozen=True, eq=False)
+class RelitScene:
+    """A real scene of another camera under a light of a generated image, by von Kries: over its own light, times that.
+
+    - `scene`: the real scene.
+    - `light`: (3,) float64, the generated image's ground truth.
+    - `name`: a name of its own, since a scene may be lit several times.
+    """
+
+    scene: Scene
+    light: npt.NDArray[np.float64]
+    name: str
+
+    @property
+    def truth(self) -> npt.NDArray[np.float64]:
+        """The light (3,) float64, linear camera RGB."""
+        return self.light
+
+    @property
+    def saturation(self) -> None:
+        """None: what was clipped is masked, since channels were scaled apart."""
+        return None
+
+    def read(self) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.bool_] | None]:
+        """Return the image (H, W, 3) float32, and its mask (H, W) bool."""
+        image, mask = self.scene.read()
+        own = self.scene.truth / self.scene.truth.sum()
+        if self.scene.saturation is not None:
+            clipped: npt.NDArray[np.bool_] = np.asarray((image >= self.scene.saturation).any(axis=2))
+            mask = clipped if mask is None else mask | clipped
+        return (image * (self.light / self.light.sum() / own)).astype(np.float32), mask
+
+
+def relit_scenes(scenes: Sequence[Scene], lights: Sequence[npt.NDArray[np.float64]]) -> tuple[RelitScene, ...]:
+    """Return a scene for each light (3,) float64, in the lights' order; each scene is lit about equally often."""
+    random = np.random.default_rng(0)
+    rounds = [random.permutation(len(scenes)) for _ in range(-(-len(lights) // len(scenes)))]
+    places: list[int] = np.concatenate(rounds)[: len(lights)].tolist()
+    return tuple(
+        RelitScene(scenes[place], light, f"{number}_{scenes[place].name}")
+        for number, (place, light) in enumerate(zip(places, lights, strict=True))
+    )
+
+
+@dataclass(frozen=True, eq=False)
 class TransferPlan:
     """Training sets that may be trained on, and what was done to make them so.
 
@@ -416,8 +460,11 @@ def plan_transfer(
     pictures: Path | str | None = None,
     matrix: str | None = None,
     shared: Shared = "refuse",
+    relit: SceneSet | None = None,
 ) -> TransferPlan:
     """Return the training sets of a transfer.
+
+    `relit`: real scenes of another camera, to be lit by the lights of each generated set; None for no such yardstick.
 
     `pictures`: folder of the source pictures of the generated sets, for the naive baseline; None for no such baseline.
     `matrix`: A camera, a file or `none`, see `matrices.choose_matrix`; None for the matrix of the camera of each
@@ -445,6 +492,14 @@ def plan_transfer(
             training.append(TrainingSet(some.name, "generated", made))
         else:
             training += _with_naive(some.name, made, pictures, matrix, notes)
+        if made and relit is not None:
+            others, told = trainable_images(relit, test, shared)
+            notes += [told] if told else []
+            lights = [scene.truth for scene in training[-1].scenes]
+            training.append(TrainingSet(some.name, "relit", relit_scenes(others, lights)))
+            notes.append(
+                f"{some.name}: {len(others)} scenes of {relit.name}, relit to the lights of its {len(lights)} images"
+            )
     if pictures is not None and all(each.kind == "other" for each in training):
         raise InputError("--naive is for sets made by generate, and --train names none; leave it out")
     return TransferPlan(tuple(training), tuple(sets), tuple(notes))

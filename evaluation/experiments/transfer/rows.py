@@ -1,9 +1,16 @@
-"""Train on one data set, test on another: a row of results for each method and each way of training it."""
+"""Train on one data set, test on another: a row of results for each method and each way of training it.
+
+Beside N real images a method is trained on them alone, on them pooled with the images of a set, and on that set first
+and then adapted to them. The N are drawn from the training part of each fold of real cross-validation, so that every
+test image is unseen by what estimates it; those of a smaller N are among those of a larger one.
+"""
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Final, Literal
 
 import numpy as np
@@ -21,15 +28,22 @@ from evaluation.experiments.cross_validation import (
 )
 from evaluation.experiments.folds import require_apart
 from evaluation.experiments.running import evaluate
+from evaluation.learning.adapting import LearnedAlone, adapt, learn_alone
 from evaluation.learning.constant_light import ConstantLight
+from evaluation.learning.feature_learner import FeatureLearner, LearnedMethod
 from evaluation.methods.method import Method
-from evaluation.results.result import Result
+from evaluation.results.result import Result, SceneAnswer
 from evaluation.scene import Scene
 from foundation.errors import InputError
 
-Kind = Literal["cross-validation", "generated", "naive", "naive with matrix", "other", "none"]
-"""How a method was trained: on other folds of the test set, on generated images, on their naive counterparts, on a data
-set that was not generated, or not at all."""
+Kind = Literal["cross-validation", "generated", "naive", "naive with matrix", "relit", "other", "real", "none"]
+"""How a method was trained: on other folds of the test set, on generated images, on their naive counterparts, on real
+scenes of another camera under their lights, on a data set that was not generated, on N images of the test set's other
+folds alone, or not at all."""
+
+Way = Literal["", "alone", "pooled", "adapted"]
+"""What was done with N real images: nothing; trained on them alone; on them and a set's together, both weighing alike;
+on a set, and then adapted to them."""
 
 NAIVE: Final[tuple[Kind, ...]] = ("naive", "naive with matrix")
 """The kinds of the naive baseline."""
@@ -58,6 +72,8 @@ class TransferRow:
     - `data`: name of the data set that it was trained on; of cross-validation only where the test set was generated.
     - `images`: training images: of cross-validation those of the smallest training part; 0 where nothing is learned.
     - `results`: one a seed, or one where nothing depends on it; rows in the order of the test images.
+    - `way`, `real`: what was done with how many images of the test set's other folds: a number, or "all"; empty where
+      there were none. They are not among `images` but where they were alone.
     """
 
     method: str
@@ -65,10 +81,25 @@ class TransferRow:
     data: str
     images: int
     results: tuple[Result, ...]
+    way: Way = ""
+    real: str = ""
 
     @property
     def training(self) -> str:
         """How the method was trained, for a column of tables."""
+        match self.way:
+            case "alone":
+                return f"{self.real} of {self.data} (generated)" if self.data else f"{self.real} real"
+            case "pooled":
+                return f"{self.material}, pooled with {self.real} real"
+            case "adapted":
+                return f"{self.material}, adapted to {self.real} real"
+            case "":
+                return self.material
+
+    @property
+    def material(self) -> str:
+        """What else than N real images the method was trained on."""
         match self.kind:
             case "cross-validation":
                 return f"cross-validated on {self.data} (generated)" if self.data else "real, cross-validated"
@@ -78,8 +109,12 @@ class TransferRow:
                 return f"{self.data}: linear sRGB × light"
             case "naive with matrix":
                 return f"{self.data}: matrix × linear sRGB × light"
+            case "relit":
+                return f"{self.data}: real scenes of another camera, relit"
             case "other":
                 return f"{self.data}: as it is"
+            case "real":
+                return "real images"
             case "none":
                 return "none"
 
@@ -116,6 +151,18 @@ def count_images(test: Sequence[Scene], training: Sequence[TrainingSet], seeds: 
     return len(test) + sum(len(_used(_drawn(some, seeds, images))) for some in training)
 
 
+@dataclass(frozen=True)
+class BesideReal:
+    """Real images to train beside.
+
+    - `counts`: numbers of them; None for all that a fold leaves.
+    - `ways`: what is done with a set and them; they are tried alone in any case.
+    """
+
+    counts: tuple[int | None, ...] = ()
+    ways: tuple[Way, ...] = ("pooled", "adapted")
+
+
 def transfer(
     test: Sequence[Scene],
     training: Sequence[TrainingSet],
@@ -127,14 +174,18 @@ def transfer(
     workers: int = 1,
     on_scene: Callable[[], None] | None = None,
     generated: str = "",
+    beside: BesideReal | None = None,
+    counted: Places | None = None,
 ) -> tuple[TransferRow, ...]:
-    """Return the rows of every learner: cross-validated on the test set, and trained on each training set.
+    """Return the rows of every learner: cross-validated on the test set, trained on each training set, and beside N.
 
-    Of the learner `ConstantLight` no row is made for naive counterparts, whose lights are those of the generated set.
+    Of the learner `ConstantLight` no row is made for naive counterparts, whose lights are those of the generated set,
+    and none beside N real images: it looks at none.
 
     `folds`: one entry for each seed, (N,) int64: the folds of the test images. Seed k is k, from 0: it is handed to
     every fit and draws the training images. `side`: longest side that images are made small to first, px; None leaves
     all as they are. `generated`: name of the test set if it was generated, so that no row calls it real; else empty.
+    `counted`: places of the test images, (P,) int64, that results are of; None for all.
     """
     if not learners or not folds:
         raise InputError(f"{len(learners)} learned methods and {len(folds)} seeds: expected at least one of each")
@@ -142,31 +193,138 @@ def transfer(
         require_apart(test, each)
     # All that may be refused is, before the first image is read.
     drawn = [_drawn(some, len(folds), images) for some in training]
+    beside = beside or BesideReal()
     trials = gather(test, learners, side, workers, on_scene)
-    parts = [
-        TransferRow(
-            *(learner.name, "cross-validation", generated, _least(folds)),
-            tuple(cross_fit(learner, number, trials, each, seed) for seed, each in enumerate(folds)),
-        )
-        for number, learner in enumerate(learners)
-    ]
+    tested = trials.everything if counted is None else counted
+    bench = _Bench(trials, folds, tested, "adapted" in beside.ways)
+    parts: list[TransferRow] = []
+    for number, learner in enumerate(learners):
+        whole = tuple(cross_fit(learner, number, trials, each, seed) for seed, each in enumerate(folds))
+        real = tuple(result.at(tested) for result in whole)
+        parts.append(TransferRow(learner.name, "cross-validation", generated, bench.least, real))
+        for count in () if isinstance(learner, ConstantLight) else beside.counts:
+            # All that a fold leaves is what cross-validation trains on.
+            results = real if count is None else bench.results(number, learner, count, bench.alone)
+            known = TransferRow(learner.name, "real", generated, count or bench.least, results, "alone", _told(count))
+            parts.append(known)
     for some, wanted in zip(training, drawn, strict=True):
         # Of a large set only what some seed wants is read.
         used = _used(wanted)
         lessons = gather([some.scenes[int(place)] for place in used.tolist()], learners, side, workers, on_scene)
+        places = [np.searchsorted(used, each).astype(np.int64) for each in wanted]
         for number, learner in enumerate(learners):
             if isinstance(learner, ConstantLight) and some.kind in NAIVE:
                 continue
+            taught = [fit_on(learner, number, lessons, each, seed) for seed, each in enumerate(places)]
             results = tuple(
-                _tested(learner, number, lessons, np.searchsorted(used, places), trials, seed)
-                for seed, places in enumerate(wanted)
+                result_of(learner.name, estimate_on(method, number, trials, tested), trials.truths[tested])
+                for method in taught
             )
-            parts.append(TransferRow(learner.name, some.kind, some.data, images, results))
+            row = TransferRow(learner.name, some.kind, some.data, images, results)
+            parts.append(row)
+            if isinstance(learner, ConstantLight):
+                continue
+            fits = {"pooled": partial(_pooled, lessons, places, trials), "adapted": partial(bench.adapted, taught)}
+            for count, way in itertools.product(beside.counts, beside.ways):
+                if way == "adapted" and not isinstance(learner, FeatureLearner):
+                    continue
+                results = bench.results(number, learner, count, fits[way])
+                parts.append(replace(row, results=results, way=way, real=_told(count)))
     rows = [part for learner in learners for part in parts if part.method == learner.name]
     if methods:
-        found = evaluate(trials.scenes, methods, workers)
+        found = evaluate([trials.scenes[int(place)] for place in tested], methods, workers)
         rows += [TransferRow(result.method, "none", "", 0, (result,)) for result in found]
     return tuple(rows)
+
+
+_Fit = Callable[[AnyLearner, int, Places, int], Method]
+"""From learner, its number, places of N real images (N,) int64 and seed to a method."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Bench:
+    """The test images, and how N of them are drawn that others are tested by.
+
+    - `trials`: their material.
+    - `folds`: for each seed the fold of each, (M,) int64.
+    - `tested`: places of those that count, (P,) int64.
+    - `adapts`: whether methods will be adapted to what N teach alone.
+    - `known`: what N teach alone, by learner, seed and images: the same for every set.
+    """
+
+    trials: Material
+    folds: Sequence[npt.NDArray[np.int64]]
+    tested: Places
+    adapts: bool
+    known: dict[tuple[int, int, bytes], LearnedAlone] = field(default_factory=dict)
+
+    @property
+    def least(self) -> int:
+        """The images of the smallest part that is trained on."""
+        return min(len(each) - int(np.bincount(each).max()) for each in self.folds)
+
+    def results(self, number: int, learner: AnyLearner, real: int | None, fit: _Fit) -> tuple[Result, ...]:
+        """Return for each seed what a learner makes of the images that count, each fold by `real` images of others."""
+        made: list[Result] = []
+        for seed, folds in enumerate(self.folds):
+            order = np.random.default_rng(seed).permutation(len(folds))
+            answers: dict[int, SceneAnswer] = {}
+            for fold in np.unique(folds[self.tested]):
+                held = self.tested[folds[self.tested] == fold]
+                drawn = np.sort(order[folds[order] != fold][:real])
+                method = fit(learner, number, drawn, seed)
+                answers |= zip(held.tolist(), estimate_on(method, number, self.trials, held), strict=True)
+            listed = [answers[place] for place in self.tested.tolist()]
+            made.append(result_of(learner.name, listed, self.trials.truths[self.tested]))
+        return tuple(made)
+
+    def alone(self, learner: AnyLearner, number: int, drawn: Places, seed: int) -> Method:
+        """Return what a learner learns of real images alone, at `drawn` (N,) int64."""
+        if isinstance(learner, FeatureLearner) and self.adapts:
+            return self._learned(learner, number, drawn, seed).method
+        return fit_on(learner, number, self.trials, drawn, seed)
+
+    def adapted(
+        self, taught: Sequence[Method], learner: AnyLearner, number: int, drawn: Places, seed: int
+    ) -> LearnedMethod:
+        """Return what was learned elsewhere, for each seed, adapted to real images at `drawn` (N,) int64."""
+        method = taught[seed]
+        if not isinstance(learner, FeatureLearner) or not isinstance(method, LearnedMethod):
+            raise TypeError(f"{learner.name} has no features to adapt by")
+        return adapt(method, self._learned(learner, number, drawn, seed))
+
+    def _learned(self, learner: FeatureLearner, number: int, drawn: Places, seed: int) -> LearnedAlone:
+        key = number, seed, drawn.tobytes()
+        if key not in self.known:
+            features = self.trials.features[number]
+            given = [] if features is None else [features[int(place)] for place in drawn]
+            self.known[key] = learn_alone(learner, given, self.trials.truths[drawn], seed)
+        return self.known[key]
+
+
+def _pooled(
+    lessons: Material,
+    places: Sequence[Places],
+    trials: Material,
+    learner: AnyLearner,
+    number: int,
+    drawn: Places,
+    seed: int,
+) -> Method:
+    """Return what a learner learns of a set and of real images that are repeated to weigh about as much."""
+    times = max(1, round(len(places[seed]) / len(drawn)))
+    given = lessons.features[number], trials.features[number]
+    features = None if given[0] is None or given[1] is None else [*given[0], *given[1]]
+    both = Material(
+        (*lessons.scenes, *trials.scenes),
+        np.concatenate([lessons.truths, trials.truths]),
+        tuple(features if place == number else None for place in range(len(lessons.features))),
+    )
+    return fit_on(learner, number, both, np.concatenate([places[seed], *[len(lessons.scenes) + drawn] * times]), seed)
+
+
+def _told(count: int | None) -> str:
+    return "all" if count is None else str(count)
 
 
 def _drawn(some: TrainingSet, seeds: int, images: int) -> list[Places]:
@@ -175,13 +333,3 @@ def _drawn(some: TrainingSet, seeds: int, images: int) -> list[Places]:
 
 def _used(drawn: Sequence[Places]) -> Places:
     return np.unique(np.concatenate(drawn))
-
-
-def _least(folds: Sequence[npt.NDArray[np.int64]]) -> int:
-    """Return the images of the smallest part that is trained on."""
-    return min(len(each) - int(np.bincount(each).max()) for each in folds)
-
-
-def _tested(learner: AnyLearner, number: int, lessons: Material, places: Places, trials: Material, seed: int) -> Result:
-    method = fit_on(learner, number, lessons, places.astype(np.int64), seed)
-    return result_of(learner.name, estimate_on(method, number, trials, trials.everything), trials.truths)

@@ -49,6 +49,25 @@ def test_a_model_is_trained_saved_and_used(data: Path, tmp_path: Path, capsys: p
     assert model.read_bytes() == before
 
 
+def test_a_model_is_adapted(data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    before, after = tmp_path / "before.npz", tmp_path / "after.npz"
+    with np.load(data) as content:
+        few = {name: content[name][:6] for name in content.files}
+    np.savez(tmp_path / "few.npz", **{**few, "names": np.array([f"few {number}" for number in range(6)])})
+    assert main(["train", "kernel-ridge", str(data), "--out", str(before)]) == 0
+    capsys.readouterr()
+    assert main(["train", "kernel-ridge", str(tmp_path / "few.npz"), "--adapt", str(before), "--out", str(after)]) == 0
+    printed = " ".join(capsys.readouterr().out.split())
+    assert "6 images, seed 0" in printed
+    assert "adapted from a model trained on all of world (thumbnails, 30 images, seed 0)" in printed
+    assert "before.npz answers with a share of" in printed
+    # What either of both trainings has seen is no test.
+    assert main(["run", str(data), "--method", str(after)]) == 0
+    assert ": 30 of 30 images were trained on" in " ".join(capsys.readouterr().out.split())
+    assert main(["train", "smart-color-cat", str(data), "--adapt", str(before), "--out", str(tmp_path / "no.npz")]) == 2
+    assert "is of kernel-ridge, smart-color-cat was asked for" in " ".join(capsys.readouterr().err.split())
+
+
 def test_a_model_is_tested_on_a_part_of_what_it_was_trained_on(
     data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -270,3 +270,43 @@ def test_training_images_that_are_blue_first_are_told(
     wish = ("transfer", "--train", "train.npz", "--test", "test.npz", "--methods", "own.py:Map", "--statistics", "none")
     assert main(wish) == 0
     assert ("Map of the mean, train: as it is: with red and blue exchanged" in capsys.readouterr().out) == told
+
+
+def test_beside_real_images(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    wish = ("--methods", "own.py:Map,kernel-ridge", "--statistics", "none", "--relit", "other.npz", "--out", "out")
+    with np.load(place / "real.npz") as content:
+        images, lights = content["images"][:, ::-1], content["gt"]
+    np.savez(place / "other.npz", images=images, gt=lights, names=np.array([f"other_{number}" for number in range(30)]))
+    assert main([*BASIC[:5], *wish, "--real", "0,5,50,all"]) == 0
+    printed = " ".join(capsys.readouterr().out.split())
+    assert "real: mean reproduction error beside N real images, degrees" in printed
+    assert "No rows beside 50 real images: a fold leaves 20; all are those" in printed
+    assert "Map of the mean is a class of your own, which is not adapted" in printed
+    lines = list(csv.DictReader((place / "out/results.csv").read_text().splitlines()))
+    rows = {(line["method"], line["training"], line["way"], line["real"]) for line in lines}
+    ridge = {row[1:] for row in rows if row[0].startswith("Kernel ridge")}
+    ways = {(way, real) for way in ("pooled", "adapted") for real in ("5", "all")}
+    for kind in ("generated", "relit"):
+        assert {row[1:] for row in ridge if row[0] == kind} == {("", ""), *ways}
+    assert {row[1:] for row in ridge if row[0] == "real"} == {("alone", "5"), ("alone", "all")}
+    assert not any(row[2] == "adapted" for row in rows if row[0] == "Map of the mean")
+    assert b"<svg" in (place / "out/beside_real.svg").read_bytes()
+    assert main(["pool", "out", "--out", "pooled"]) == 0
+    pooled = csv.DictReader((place / "pooled/results.csv").read_text().splitlines())
+    assert {(line["method"], line["training"], line["way"], line["real"]) for line in pooled} == rows
+
+
+@pytest.mark.parametrize(
+    ("wish", "told"),
+    [
+        (("--real", "20,many"), "--real is '20,many', expected numbers of real images between commas, or all"),
+        (("--real", "-5"), "--real is '-5', expected numbers"),
+        (("--real", ""), "--real is '', expected numbers"),
+        (("--real", "5", "--beside", "blended"), "--beside is 'blended', expected pooled, adapted"),
+    ],
+)
+def test_what_is_no_number_of_real_images_is_refused(
+    place: Path, capsys: pytest.CaptureFixture[str], wish: tuple[str, ...], told: str
+) -> None:
+    assert main([*BASIC, *wish]) == 2
+    assert told in " ".join(capsys.readouterr().err.split())

@@ -20,6 +20,8 @@ from evaluation.experiments.transfer.outcome import (
     HEADS,
     BoundedFigure,
     ForestLine,
+    beside_plot,
+    beside_table,
     errors_table,
     figures_of,
     forest_plot,
@@ -30,7 +32,7 @@ from evaluation.experiments.transfer.outcome import (
     real_ratios_table,
     round_numbers,
 )
-from evaluation.experiments.transfer.rows import Kind, TransferRow
+from evaluation.experiments.transfer.rows import Kind, TransferRow, Way
 from evaluation.metrics import summarise
 from evaluation.results.result import Result
 from evaluation.results.tables import table_to_csv
@@ -62,9 +64,49 @@ def test_all_statistics_stand_in_every_table() -> None:
         assert table.columns[-6:] == HEADS
     assert errors_table(found, "Real", 40).texts()[1][:5] == ("Trees", "made: generated", "9", "41.00", "41.00")
     # Twice the errors on every image: the interval of the ratio has no width.
-    assert real_ratios_table(found, "Real").texts()[0][2:] == ("2.00 (2.00 – 2.00)",) * 6
-    assert naive.texts()[0][1:3] == ("made: linear sRGB × light", "0.50 (0.50 – 0.50)")
+    ratios = real_ratios_table(found, "Real")
+    assert ratios.columns[2:4] == ("Images", "Base")
+    assert ratios.texts()[0][2:] == ("9", "9", *("2.00 (2.00 – 2.00)",) * 6)
+    assert naive.texts()[0][1:5] == ("made: linear sRGB × light", "9", "9", "0.50 (0.50 – 0.50)")
     assert naive_ratios_table(figures_of([_plain_row("generated", 1.0)], "recovery"), "Real") is None
+
+
+def _beside(kind: Kind, way: Way, gain: float, real: str = "20") -> TransferRow:
+    data = "" if kind == "real" else "made"
+    return replace(_plain_row(kind, gain), data=data, way=way, real=real)
+
+
+def test_beside_real_images_a_row_is_held_to_the_better_of_what_it_was_made_of() -> None:
+    rows = [
+        _plain_row("cross-validation", 1.0),
+        _beside("real", "alone", 4.0),
+        _beside("real", "alone", 1.5, "all"),
+        _plain_row("generated", 2.0),
+        _plain_row("naive", 3.0),
+        _beside("generated", "pooled", 1.9),
+        _beside("generated", "adapted", 1.8),
+        _beside("generated", "adapted", 1.2, "all"),
+        _beside("naive", "adapted", 3.6),
+    ]
+    found = figures_of(rows, "recovery")
+    held = {(one.row.kind, one.row.real): (one.base.kind, one.ratios[0].value) for one in found.to_better}
+    assert held["generated", "20"] == ("generated", pytest.approx(0.9))
+    assert held["generated", "all"] == ("real", pytest.approx(0.8))
+    assert held["naive", "20"] == ("naive", pytest.approx(1.2))
+    (naive,) = found.to_naive_adapted
+    assert (naive.row.real, naive.ratios[0].value) == ("20", pytest.approx(0.5))
+    # They are neither among the rows without real images nor in ratios of those.
+    assert len(errors_table(found, "Real", 40).rows) == len(intervals_table(found, "Real").rows) == 3
+    assert len(found.to_real) == 2
+    table = beside_table(found, "Real")
+    assert table is not None
+    assert table.texts()[0] == (
+        *("Trees", "made: generated", "20", "82.00", "41.00", "38.95", "36.90", "0.90 (0.90 – 0.90)"),
+    )
+    assert beside_table(figures_of([_plain_row("generated", 1.0)], "recovery"), "Real") is None
+    drawn = beside_plot(found).decode()
+    for label in ("real alone", "made: generated, adapted", "made: generated, pooled", "real images"):
+        assert f">{label}<" in drawn
 
 
 def test_what_a_number_hides_is_noted() -> None:
@@ -85,7 +127,7 @@ def test_all_numbers_for_other_programs() -> None:
     lines = table_to_csv(long_table(found)).splitlines()
     assert lines[0].split(",") == [
         *("method", "training", "data", "images", "seeds", "error", "statistic", "degrees", "low", "high"),
-        *("seed_sd", "ratio_to_real", "ratio_low", "ratio_high"),
+        *("seed_sd", "ratio_to_real", "ratio_low", "ratio_high", "way", "real"),
     ]
     assert len(lines) == 13
     fields = dict(zip(lines[0].split(","), lines[8].split(","), strict=True))

@@ -21,6 +21,7 @@ from evaluation.experiments.transfer.plan import (
     naive_image,
     naive_scenes,
     plan_transfer,
+    relit_scenes,
     shared_images,
     trainable_images,
 )
@@ -385,3 +386,20 @@ def test_what_cannot_be_planned_is_said(maker: Maker) -> None:
         plan_transfer(_real("x"), [_real("y", place="y.npz", seed=1)], maker.pictures)
     with pytest.raises(InputError, match="made has no image left"):
         plan_transfer(_real("a", "b", "c"), [made], shared="leave-out")
+
+
+def test_relit_scenes_have_the_lights_of_the_generated_images(maker: Maker) -> None:
+    made = maker.make()
+    other = Thumbnail("other", np.array([0.5, 0.25, 0.25]), np.full((2, 2, 3), [80, 20, 20], np.float32), 60.0)
+    scenes = relit_scenes([other], [scene.truth for scene in made.scenes])
+    assert [scene.truth.tolist() for scene in scenes] == [scene.truth.tolist() for scene in made.scenes]
+    image, mask = scenes[0].read()
+    light = scenes[0].truth / scenes[0].truth.sum()
+    np.testing.assert_allclose(
+        image[0, 0], [80 * light[0] / 0.5, 20 * light[1] / 0.25, 20 * light[2] / 0.25], rtol=1e-6
+    )
+    # What was clipped is known by its own values, not by those under the other light.
+    assert mask is not None
+    assert mask.all()
+    assert scenes[0].saturation is None
+    assert len({scene.name for scene in scenes}) == len(scenes)

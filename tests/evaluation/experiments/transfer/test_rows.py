@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -12,7 +12,7 @@ import pytest
 from evaluation.experiments.cross_validation import cross_validate
 from evaluation.experiments.folds import draw_folds
 from evaluation.experiments.transfer.outcome import TransferFigures, figures_of
-from evaluation.experiments.transfer.rows import TrainingSet, TransferRow, draw_images, transfer
+from evaluation.experiments.transfer.rows import BesideReal, TrainingSet, TransferRow, draw_images, transfer
 from evaluation.learning.constant_light import ConstantLight
 from evaluation.methods.gray_edge import GrayEdge
 from evaluation.methods.method import Method
@@ -159,3 +159,54 @@ def test_images_are_drawn_without_repeats() -> None:
 def test_nothing_to_learn_with_is_said() -> None:
     with pytest.raises(InputError, match="0 learned methods and 2 seeds"):
         transfer(TEST, [], [], FOLDS, 1)
+
+
+def test_beside_real_images() -> None:
+    tinted = TrainingSet("tinted", "generated", world(90, seed=2, cast=(1.0, 1.0, 0.7)))
+    rows = transfer(TEST, [tinted], LEARNERS, FOLDS, 80, beside=BesideReal((10, None)), counted=np.arange(0, 120, 2))
+    listed = [(row.method, row.kind, row.way, row.real, row.images) for row in rows if row.method == "Mean colour"]
+    assert listed == [
+        ("Mean colour", "cross-validation", "", "", 80),
+        ("Mean colour", "real", "alone", "10", 10),
+        ("Mean colour", "real", "alone", "all", 80),
+        ("Mean colour", "generated", "", "", 80),
+        ("Mean colour", "generated", "pooled", "10", 80),
+        ("Mean colour", "generated", "adapted", "10", 80),
+        ("Mean colour", "generated", "pooled", "all", 80),
+        ("Mean colour", "generated", "adapted", "all", 80),
+    ]
+    assert [row.way for row in rows if row.method == "Constant light"] == ["", ""]
+    found = {(row.kind, row.way, row.real): row for row in rows if row.method == "Mean colour"}
+    assert all(len(result.errors["recovery"]) == 60 for row in rows for result in row.results)
+    for one, other in zip(found["real", "alone", "all"].results, rows[0].results, strict=True):
+        np.testing.assert_array_equal(one.estimates, other.estimates)
+    mean = {key: np.mean([result.errors["recovery"].mean() for result in row.results]) for key, row in found.items()}
+    # The set is of another world and 80 real images know it: they have the word.
+    assert mean["real", "alone", "all"] < 0.7 * mean["generated", "", ""]
+    assert mean["generated", "adapted", "all"] < 1.1 * mean["real", "alone", "all"]
+    assert mean["generated", "adapted", "10"] < mean["generated", "", ""]
+
+
+@dataclass(frozen=True)
+class Remembering(MeanLearner):
+    """Writes down what it was trained on."""
+
+    seen: list[frozenset[str]] = field(default_factory=list)
+
+    def __deepcopy__(self, memory: object) -> Remembering:
+        return self
+
+    def fit(self, scenes: Sequence[Scene], seed: int = 0) -> Method:
+        self.seen.append(frozenset(scene.name for scene in scenes))
+        return super().fit(scenes, seed)
+
+
+def test_real_images_are_drawn_from_other_folds_fewer_among_more() -> None:
+    learner = Remembering()
+    transfer(TEST, [], [learner], FOLDS[:1], 1, beside=BesideReal((5, 20)))
+    folds = {scene.name: int(fold) for scene, fold in zip(TEST, FOLDS[0], strict=True)}
+    alone = learner.seen[3:]
+    assert [len(seen) for seen in alone] == [5] * 3 + [20] * 3
+    for fold, (few, many) in enumerate(zip(alone[:3], alone[3:], strict=True)):
+        assert few < many
+        assert fold not in {folds[name] for name in many}

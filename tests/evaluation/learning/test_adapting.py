@@ -1,0 +1,96 @@
+"""The contract of adapting, which every learned method keeps, and the rule by itself."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+
+from evaluation.learning.adapting import BlendedModel, adapt, learn_alone, stacked_share
+from evaluation.learning.feature_learner import FeatureLearner, LearnedMethod, extract, truths_of
+from evaluation.learning.model_files import load_model, save_model
+from evaluation.learning.standard import standard_learners
+from evaluation.metrics import recovery_error
+from foundation.errors import FormatError
+from tests.evaluation.learning.made_up_world import MadeUp, world
+from tests.evaluation.learning.stories import story
+
+ELSEWHERE, HERE, TEST = world(60, cast=0.4), world(12, seed=2), world(12, seed=1)
+
+
+def of(scenes: list[MadeUp], method: LearnedMethod) -> npt.NDArray[np.float64]:
+    return np.stack([method.estimate(scene.image) for scene in scenes])
+
+
+@pytest.fixture(scope="module", params=standard_learners())
+def learner(request: pytest.FixtureRequest) -> FeatureLearner:
+    if request.param == "convnet":
+        pytest.importorskip("torch", reason="PyTorch is not installed: pip install torch")
+    return standard_learners()[request.param]
+
+
+@pytest.fixture(scope="module")
+def taught(learner: FeatureLearner) -> LearnedMethod:
+    return learner.fit(ELSEWHERE)
+
+
+def adapted(taught: LearnedMethod, scenes: list[MadeUp], worth: float | None = None) -> LearnedMethod:
+    (features,) = extract(scenes, [taught.learner])
+    alone = learn_alone(taught.learner, features, truths_of(scenes))
+    return adapt(taught, alone) if worth is None else adapt(taught, alone, worth)
+
+
+@pytest.mark.slow
+def test_worth_nothing_it_is_what_the_images_teach_alone(taught: LearnedMethod) -> None:
+    alone = of(TEST, taught.learner.fit(HERE))
+    np.testing.assert_array_equal(of(TEST, adapted(taught, HERE, worth=0)), alone)
+
+
+@pytest.mark.slow
+def test_it_is_repeated_and_kept_to_the_bit_and_adapted_again(taught: LearnedMethod, tmp_path: Path) -> None:
+    once = adapted(taught, HERE)
+    found = of(TEST, once)
+    np.testing.assert_array_equal(of(TEST, adapted(taught, HERE)), found)
+    save_model(tmp_path / "model.npz", once, story(HERE))
+    loaded = load_model(tmp_path / "model.npz")
+    np.testing.assert_array_equal(of(TEST, loaded), found)
+    again = adapted(loaded, HERE[:4])
+    assert np.isfinite(of(TEST[:3], again)).all()
+
+
+@pytest.mark.slow
+def test_one_image_leaves_it_near_what_it_was(taught: LearnedMethod) -> None:
+    moved = recovery_error(of(TEST, adapted(taught, HERE[:1])), of(TEST, taught))
+    alone = recovery_error(of(TEST, taught.learner.fit(HERE[:1])), of(TEST, taught))
+    assert np.mean(moved) <= 0.5 * np.mean(alone) + 1e-9
+
+
+def test_many_images_overrule_what_was_learned_wrongly() -> None:
+    learner = standard_learners()["kernel-ridge"]
+    wrong = learner.fit([MadeUp(one.name, one.truth[::-1].copy(), one.image) for one in world(60)])
+    many = world(200, seed=3)
+    truths = np.stack([scene.truth for scene in TEST])
+    found = np.mean(recovery_error(of(TEST, adapted(wrong, many)), truths))
+    alone = np.mean(recovery_error(of(TEST, learner.fit(many)), truths))
+    before = np.mean(recovery_error(of(TEST, wrong), truths))
+    assert found < 1.15 * alone < 0.5 * before
+
+
+def test_the_share_is_the_prior_where_the_two_agree_and_within_0_and_1() -> None:
+    truths = np.tile([0.3, 0.4, 0.3], (9, 1))
+    beyond, far = np.tile([0.25, 0.4, 0.35], (9, 1)), np.tile([0.2, 0.4, 0.4], (9, 1))
+    assert stacked_share(far, far, truths, 0.7) == 0.7
+    assert stacked_share(beyond, far, truths, 1.0) == 1
+    assert stacked_share(far, beyond, truths, 0.0) == 0
+
+
+def test_a_damaged_share_is_refused(tmp_path: Path) -> None:
+    learner = standard_learners()["kernel-ridge"]
+    method = adapted(learner.fit(ELSEWHERE[:5]), HERE)
+    assert isinstance(method.model, BlendedModel)
+    broken = LearnedMethod(learner, BlendedModel(method.model.elsewhere, method.model.here, np.array(1.5)))
+    save_model(tmp_path / "model.npz", broken, story(HERE))
+    with pytest.raises(FormatError, match=r"a share of 1.5"):
+        load_model(tmp_path / "model.npz")
