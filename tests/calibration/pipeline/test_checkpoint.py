@@ -183,7 +183,8 @@ def test_a_table_follows_its_session(session_under_way: Session, undisturbed: di
         assert not out.exists()
         with pytest.raises(FormatError, match="in the making"):
             open_lut(out)
-    assert seen == [(0, 1), (3, 4), (3, 0), (lights - 1, every - 8)]
+    # Of few colours the lens is measured on the white frames that came since, too, so all are taken in again.
+    assert seen == [(0, 1), (3, 4), (3, 0), (lights - 1, every - 3)]
     with np.load(tmp_path / ".lut.partial" / CHECKPOINT) as stored:
         arrays = {name.rpartition(".")[2] for name in stored.files} - {"text"}
     assert arrays <= {name.partition(".")[2] for name in stored_names()}, "a checkpoint with other names is not used"
