@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 import sys
 from collections.abc import Sequence
 from enum import Enum
@@ -84,7 +85,7 @@ def init(
         illuminations(lights)
     write_whole(settings, files("acquisition").joinpath("data", f"{rig.value}.toml").read_text("utf-8"))
     then = "name your devices in it" if rig is Rig.LAB else "change it as you like"
-    print(f"{settings}: {then}, then: acquire check {settings}")
+    print(f"{settings}: {then}, then: acquire check {shlex.quote(str(settings))}")
 
 
 @app.command(epilog=EXIT_CODES)
@@ -341,7 +342,7 @@ def run(
         raise QualityError(
             f"{outcome.left} of {outcome.total} frames are without an accepted frame; " + "; ".join(outcome.refused)
         )
-    print(f"{session}: complete, {outcome.total} frames; next: build-lut {session} LUT/")
+    print(f"{session}: complete, {outcome.total} frames; next: build-lut {shlex.quote(str(session))} LUT/")
 
 
 def _print_plan(settings: LabSettings, session: Path, retake: str | None, told: JsonOutput) -> None:

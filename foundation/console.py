@@ -28,8 +28,8 @@ import sys
 import threading
 from collections.abc import Callable, Generator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, redirect_stdout, suppress
-from io import TextIOWrapper
-from typing import Annotated, Any, TextIO, cast, get_type_hints
+from io import BufferedWriter, FileIO, TextIOWrapper
+from typing import TYPE_CHECKING, Annotated, Any, TextIO, cast, get_type_hints
 
 import typer
 from typer.core import TyperCommand, TyperGroup
@@ -37,6 +37,9 @@ from typer.core import TyperCommand, TyperGroup
 from foundation.errors import EXIT_INTERRUPTED, CropError, InputError, StorageError
 from foundation.files import disk_remedy_of, remedy_of
 from foundation.secret_texts import masked, printable
+
+if TYPE_CHECKING:
+    from _typeshed import ReadableBuffer
 
 EXIT_CODES = (
     "Exit codes: 0 done; 2 something given cannot be used; 3 a device failed; 4 the data are not good enough; "
@@ -88,8 +91,41 @@ def _make_printable() -> None:
         if stream is None:
             # The interpreter found the descriptor closed; what is opened now lives as long as the process.
             setattr(sys, name, os.fdopen(os.open(os.devnull, os.O_WRONLY), "w", encoding="utf-8"))
-        elif isinstance(stream, TextIOWrapper) and stream.errors == "strict":
-            stream.reconfigure(errors="replace")
+        elif isinstance(stream, TextIOWrapper):
+            if stream.errors == "strict":
+                stream.reconfigure(errors="replace")
+            # Unbuffered (python -u), its buffer is the descriptor's own.
+            buffer: Any = cast("Any", stream).buffer
+            if type(getattr(buffer, "raw", buffer)) is FileIO:
+                setattr(sys, name, _patient(stream))
+
+
+class _Output(FileIO):
+    """A descriptor that takes what is printed also when the reader has left (head, a closed pager).
+
+    That is no fault, and no reason to leave a job half done that ends with 0.
+    """
+
+    def write(self, data: ReadableBuffer) -> int:
+        """Write bytes; return their number."""
+        try:
+            return super().write(data)
+        except BrokenPipeError:
+            os.dup2(os.open(os.devnull, os.O_WRONLY), self.fileno())
+            return super().write(data)
+
+
+def _patient(stream: Any) -> TextIOWrapper:
+    """Return a stream to the same descriptor whose reader may leave."""
+    stream.flush()
+    output = _Output(stream.fileno(), "w", closefd=False)
+    return TextIOWrapper(
+        cast("Any", output) if type(stream.buffer) is FileIO else BufferedWriter(output),
+        encoding=stream.encoding,
+        errors=stream.errors,
+        line_buffering=stream.line_buffering,
+        write_through=stream.write_through,
+    )
 
 
 def loaded() -> None:

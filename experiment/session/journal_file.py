@@ -257,7 +257,7 @@ def _connect(path: Path, mode: str) -> sqlite3.Connection:
 
 def _connect_with(path: Path, parameters: str) -> sqlite3.Connection:
     connection = sqlite3.connect(
-        f"file:{quote(str(path.absolute()))}?mode={parameters}",
+        f"file:{quote(os.fsencode(path.absolute()))}?mode={parameters}",
         uri=True,
         timeout=READING_LIMIT_S if parameters.startswith("ro") else TRY_S,
         isolation_level=None,
