@@ -17,6 +17,7 @@ from calibration.causes.rules import (
     DEFOCUS,
     FALL_OFF,
     HOT_PHOTOSITES,
+    MIXED,
     OBJECT_IN_FRAME,
     OTHER_BRIGHTNESS,
     OTHER_CAMERA,
@@ -114,8 +115,15 @@ CASES: list[tuple[Subject, Evidence, Cause]] = [
     ("sum", Evidence(frames=11, exposure=1, lone_primary=0.05), OTHER_BRIGHTNESS),
     # All primaries differ, or none by itself: the projector brightens white.
     ("sum", Evidence(frames=11, exposure=1, lone_primary=0.005), UNKNOWN),
-    ("drift", Evidence(frames=11, exposure=1, cameras=1, colour_scatter=0.01), COLOUR_WHEEL),
-    ("drift", Evidence(frames=11, exposure=1, cameras=1, colour_scatter=0.0), UNKNOWN),
+    # One primary more and another as much less: the one's frame holds the other's light.
+    ("sum", Evidence(frames=11, exposure=1, mixed=0.05), MIXED),
+    ("stray", Evidence(frames=11, stray=0.05, mixed=0.05), MIXED),
+    ("sum", Evidence(frames=11, exposure=1, mixed=0.005), UNKNOWN),
+    ("drift", Evidence(frames=11, exposure=1, colour_scatter=0.01), COLOUR_WHEEL),
+    ("sum", Evidence(frames=11, exposure=1, colour_scatter=0.01), COLOUR_WHEEL),
+    ("drift", Evidence(frames=11, exposure=1, colour_scatter=0.0), UNKNOWN),
+    # A frame of another light among the white ones.
+    ("drift", Evidence(frames=11, exposure=1, colour_scatter=0.5), UNKNOWN),
     ("unfit cells", Evidence(hot=0.2), UNKNOWN),
     ("unfit cells", Evidence(hot=0, lit=0.8), REFLECTION),
     ("unfit cells", Evidence(hot=0, lit=0.2), UNKNOWN),
