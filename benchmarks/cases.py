@@ -423,6 +423,8 @@ CASES: Final[tuple[NamedCase, ...]] = (
         rf"{_STAINED}|{_BRILLIANT}|{_GLARE}",
         _other_print,
     ),
+    # In a light without a code of 0 it is no error of the table: the ground truth is what was there, and eight lights
+    # say too little of the tone curve to tell 5 % from it.
     NamedCase(
         "mixed-red",
         "5 % of blue in the frame of the red primary: the picture had not settled",
@@ -430,20 +432,6 @@ CASES: Final[tuple[NamedCase, ...]] = (
         _NOT_SO,
         _mixed("red", "blue", 0.05),
         must_say=True,
-    ),
-    NamedCase(
-        "mixed-warm",
-        "5 % of blue in a warm white's frame",
-        r"settle|another light|name",
-        _NOT_SO,
-        _mixed("warm", "blue", 0.05),
-    ),
-    NamedCase(
-        "mixed-cool",
-        "5 % of red in a cool white's frame",
-        r"settle|another light|name",
-        _NOT_SO,
-        _mixed("cool", "red", 0.05),
     ),
     NamedCase(
         "mixed-dim",
@@ -477,6 +465,13 @@ CASES: Final[tuple[NamedCase, ...]] = (
         rf"{_STAINED}|{_BRILLIANT}|{_GLARE}",
         _lights_alone("red", situation=Situation(lamp=(0.9, 0.9, 0.9))),
         must_say=True,
+    ),
+    NamedCase(
+        "shadow-on-primary",
+        "a shadow that takes a tenth of the light from a part of the print, in the frame of the red primary",
+        _HAND,
+        rf"{_STAINED}|{_BRILLIANT}|{_GLARE}",
+        _lights_alone("red", situation=Situation(blobs=(Blob(_HAND_AT, left=0.9),))),
     ),
     NamedCase(
         "cut-file",

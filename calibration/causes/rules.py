@@ -419,6 +419,12 @@ RULES: tuple[Rule, ...] = (
         "most of the cells concerned hold a photosite that stands out in every dark frame",
     ),
     Rule(
+        HOT_PHOTOSITES,
+        PLACE,
+        (Condition("hot", 0.2, 1), Condition("deviation", 0, _FAR)),
+        "a place is brighter, and a fifth and more of its cells hold a photosite that stands out in every dark frame",
+    ),
+    Rule(
         DEFOCUS,
         WHOLE_FRAME | PLACE,
         (Condition("softer", 0.003, _FAR), Condition("scatter", 0, 0.1)),

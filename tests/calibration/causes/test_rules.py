@@ -72,6 +72,9 @@ CASES: list[tuple[Subject, Evidence, Cause]] = [
     ("block", replace(LIGHT, frames=2, showing=1, in_first=1, deviation=0.2), UNKNOWN),
     # A reflection shows a little under a light of another colour than white.
     ("block", replace(LIGHT, spot=0.9, deviation=0.02), UNKNOWN),
+    # Where many photosites are hot a block of cells is brighter in dim lights; a hand is darker there, too.
+    ("block", replace(LIGHT, deviation=0.08, tint=0.8, added=0.0, kept=1.0, hot=0.47), HOT_PHOTOSITES),
+    ("block", replace(LIGHT, deviation=-0.9, tint=0, added=0, kept=0.1, hot=0.3), OBJECT_IN_FRAME),
     ("block", replace(LIGHT, softer=0.03, scatter=0.05), DEFOCUS),
     ("block", replace(LIGHT, scatter=0.5), ANOTHER_PRINT),
     # Most of the sheet: a cloud before the window, a lamp, or nothing that is known.
