@@ -99,6 +99,7 @@ class FrameChange:
     - `counts_added`: photosites of the sensor, (row, column) from its corner, and what is added to their counts.
     - `serial`: of the body, in the file.
     - `reason`: why the frame was refused; None: it is accepted.
+    - `number`: the step whose frame it is, by noise and time; None: its own.
     """
 
     colour: Colour | None = None
@@ -109,6 +110,7 @@ class FrameChange:
     counts_added: Mapping[tuple[int, int], int] = field(default_factory=dict[tuple[int, int], int])
     serial: str = "000000000000"
     reason: str | None = None
+    number: int | None = None
 
 
 AS_PLANNED = FrameChange()
@@ -129,11 +131,15 @@ def light_named(lights: Sequence[Illumination], step: SessionStep) -> str | None
 
 def counts_of(world: World, step: SessionStep, change: FrameChange = AS_PLANNED) -> _Counts:
     """Return the whole sensor's counts of a step's frame; its noise depends on the room and the step's number alone."""
-    seen = change.world or world
-    counts = seen.expose(change.colour or step.colour, change.settings, key=(step.number,), situation=change.situation)
+    seen, number = change.world or world, _number_of(step, change)
+    counts = seen.expose(change.colour or step.colour, change.settings, key=(number,), situation=change.situation)
     for place, added in change.counts_added.items():
         counts[place] = min(int(counts[place]) + added, seen.body.saturation)
     return counts
+
+
+def _number_of(step: SessionStep, change: FrameChange) -> int:
+    return step.number if change.number is None else change.number
 
 
 def expected_counts(world: World, step: SessionStep, change: FrameChange = AS_PLANNED) -> npt.NDArray[np.float32]:
@@ -158,7 +164,7 @@ def frame_file(world: World, step: SessionStep, change: FrameChange = AS_PLANNED
         counts_of(world, step, change),
         body,
         settings=change.tagged or change.settings,
-        taken_at=TAKEN_AT + timedelta(seconds=SECONDS_A_FRAME * step.number),
+        taken_at=TAKEN_AT + timedelta(seconds=SECONDS_A_FRAME * _number_of(step, change)),
         serial=change.serial,
     )
     return stream.getvalue()
@@ -172,12 +178,13 @@ def record_session(
     *,
     every: int = 25,
     reason: Callable[[SessionStep], str | None] | None = None,
+    settings: str = "rig = 'simulated'\n",
 ) -> Session:
     """Return an open session with a frame for every step of its plan.
 
-    `reason`: why a step's frame is refused; None where it is accepted.
+    `settings`: as `session.toml` has them. `reason`: why a step's frame is refused; None where it is accepted.
     """
-    with Session.create(folder, "rig = 'simulated'\n", chart, lights) as session:
+    with Session.create(folder, settings, chart, lights) as session:
         for step in plan_steps(lights, every):
             data = frame(step)
             at = TAKEN_AT + timedelta(seconds=SECONDS_A_FRAME * step.number)
@@ -199,6 +206,7 @@ def short_session(
     changes: Changes = as_planned,
     lights: Sequence[Illumination] | None = None,
     every: int = 25,
+    settings: str = "rig = 'simulated'\n",
 ) -> Session:
     """Return an open session of a few lights whose frames differ from the plan as they are said to.
 
@@ -211,6 +219,7 @@ def short_session(
         lambda step: frame_file(world, step, changes(step)),
         every=every,
         reason=lambda step: changes(step).reason,
+        settings=settings,
     )
 
 

@@ -169,8 +169,9 @@ def retake_command(records: Sequence[FrameRecord]) -> str:
 
 def retaken_frames(verdict: Verdict, table: TableMeasurements) -> tuple[FrameRecord, ...]:
     """Return the frames to be taken again, in the order taken."""
-    named = {frame.sha256 for row in verdict.refused for frame in _frames_of(row, table) or ()}
-    for finding in findings(verdict, table).values():
+    found = findings(verdict, table)
+    named = {frame.sha256 for row in verdict.refused for frame in _frames_of(row, table, found) or ()}
+    for finding in found.values():
         if finding.is_of_frames:
             named |= {frame.sha256 for frame in finding.frames}
     # Dark frames have no figures among the others; only where they come from can be refused.
@@ -183,7 +184,7 @@ def is_mended_by_retaking(verdict: Verdict, table: TableMeasurements) -> bool:
     """Return whether each refusal is of single frames, so that a table could be made once these are taken again."""
     found = findings(verdict, table)
     return bool(verdict.refused) and all(
-        _frames_of(row, table) or (row.figure.name in found and found[row.figure.name].is_of_frames)
+        _frames_of(row, table, found) or (row.figure.name in found and found[row.figure.name].is_of_frames)
         for row in verdict.refused
     )
 
@@ -198,9 +199,16 @@ def retake_json(records: tuple[FrameRecord, ...], registered_sha256: str, newest
     }
 
 
-def _frames_of(row: JudgedValue, table: TableMeasurements) -> list[FrameRecord] | None:
-    """Return the frames that are beyond a row's refusing limit; None where its value is not of single frames."""
-    figure = row.figure
+def _frames_of(
+    row: JudgedValue, table: TableMeasurements, found: Mapping[str, ProbableCause]
+) -> list[FrameRecord] | None:
+    """Return the frames that are beyond a row's refusing limit.
+
+    None where its value is not of single frames, or has a cause that would be in them again.
+    """
+    figure, finding = row.figure, found.get(row.figure.name)
+    if finding is not None and finding.is_known and finding.decision.cause.mends != "frames":
+        return None
     return None if figure.refuse is None or figure.retake is None else figure.retake(table, figure.refuse)
 
 

@@ -467,7 +467,7 @@ def _of_frames(table: TableMeasurements, worst: FrameMeasurements, beyond: list[
 def light_evidence(table: TableMeasurements, limit: float) -> Gathered:
     """Return what is known of whites that do not add up, drift, or are not what their codes give."""
     frames = table.frames
-    evidence = Evidence(frames=float(len(frames)))
+    evidence = Evidence(frames=float(len(frames)), colour_scatter=_colour_scatter(table))
     stated = np.array([frame.exposure for frame in frames])
     if len(frames) < 2 or not (stated > 0).all():
         return Gathered(evidence, (), ())
@@ -483,8 +483,6 @@ def light_evidence(table: TableMeasurements, limit: float) -> Gathered:
 def drift_evidence(table: TableMeasurements, limit: float) -> Gathered:
     """Return what is known of white frames that differ: their exposures, or what lies on the print in one."""
     light = light_evidence(table, limit)
-    scatter = _colour_scatter(table)
-    light = replace(light, evidence=replace(light.evidence, colour_scatter=scatter, cameras=1.0))
     worst = max(table.white_frames, key=lambda frame: frame.consistency.block, default=None)
     if worst is None or light.frames or not worst.consistency.block > _DISTURBED:
         return light
@@ -498,14 +496,34 @@ def sum_evidence(table: TableMeasurements, limit: float) -> Gathered:
     light, off = light_evidence(table, limit), table.lights.of_primaries
     if light.frames or off is None:
         return light
-    middle = float(np.median(off))
-    one = int(np.argmax(np.abs(off - middle)))
-    others = float(np.ptp(np.delete(off, one)))
-    lone = abs(float(off[one]) - middle)
-    if not lone > 3 * others:
+    low, middle, high = np.argsort(off).tolist()
+    under, over = (float(step) for step in (off[middle] - off[low], off[high] - off[middle]))
+    lone, other = max(under, over), min(under, over)
+    # What white itself differs by, from one white frame to the next, each primary's frame may have, too.
+    if not lone > _MORE * _colour_range(table):
+        return light
+    if lone > _MORE * other:
+        one, known = low if under > over else high, replace(light.evidence, lone_primary=lone)
+    elif other > _EQUALLY * lone:
+        one, known = high, replace(light.evidence, mixed=lone)
+    else:
         return light
     frames = tuple(frame.record for frame in table.frames if frame.record.illumination == table.primary_lights[one])
-    return Gathered(replace(light.evidence, lone_primary=lone), frames, ())
+    return Gathered(known, frames, ())
+
+
+_MORE = 3.0
+"""How much further one primary lies from the nearer of the others than these from each other, to be alone (chosen)."""
+
+_EQUALLY = 0.7
+"""Share of what white has more of one primary that it lacks of another at least, where the first's frame holds the
+other's light (chosen)."""
+
+
+def _colour_range(table: TableMeasurements) -> float:
+    """Return by how much white's colour differs between white frames, relative; 0 of one."""
+    white = np.log([frame.paper.white for frame in table.white_frames]).reshape(-1, 3)
+    return float(np.ptp(white - white.mean(axis=1, keepdims=True), axis=0).max(initial=0.0)) if len(white) else 0.0
 
 
 def _colour_scatter(table: TableMeasurements) -> float:
@@ -576,6 +594,9 @@ def stray_evidence(table: TableMeasurements, limit: float) -> Gathered:
     stray = table.lights.stray
     if stray is None:
         return Gathered(Evidence(), (), ())
+    mixed = sum_evidence(table, limit)
+    if mixed.evidence.mixed > limit:
+        return mixed
     by_light = {frame.record.illumination: frame.record for frame in table.frames if frame.record.kind == "light"}
     frames = tuple(by_light[light] for light in stray.lights_beyond(limit) if light in by_light)
     certain = float(stray.certain.max(initial=0.0))

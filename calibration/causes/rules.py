@@ -125,7 +125,7 @@ OTHER_CAMERA = Cause(
 )
 OTHER_EXPOSURE = Cause(
     "other exposure",
-    "frames of another exposure than the rest, by their files",
+    "frames of another exposure than the rest, or than the session's settings, by their files",
     "expose all frames alike, manually: shutter, aperture and ISO speed",
     "frames",
 )
@@ -146,9 +146,16 @@ COLOUR_WHEEL = Cause(
     "colour wheel",
     "the projector's colour wheel: exposures end within a turn, so that frames hold more of one primary than of "
     "another",
-    "expose whole turns of the wheel, half a second and more (camera.shutter_s a multiple of 1 / colour_wheel_hz), or "
-    "take a projector without a wheel",
+    "expose whole turns of the wheel, half a second and more (camera.shutter_s a multiple of 1 / "
+    "lab.projector.colour_wheel_hz: 0.5 s are 30 turns of 60 a second), or take a projector without a wheel",
     "session",
+)
+MIXED = Cause(
+    "another light in one frame",
+    "part of another light in the frame of one primary, as where its picture had not settled: white has more of that "
+    "primary than its frame says, and as much less of another",
+    "take that frame again, and let the picture settle for longer (sequence.settle_s)",
+    "frames",
 )
 UNKNOWN = Cause("unknown", "", "", "nothing")
 """What was measured does not decide; the remedy is then that of the limit."""
@@ -156,7 +163,7 @@ UNKNOWN = Cause("unknown", "", "", "nothing")
 CAUSES = (
     HOT_PHOTOSITES, OBJECT_IN_FRAME, REFLECTION, REFLECTION_IN_FRAME, STAIN, SHADOW, CURL, FALL_OFF, SPREAD, BUMP,
     DEFOCUS, ANOTHER_PRINT, WRONG_NAME,
-    OTHER_CAMERA, OTHER_EXPOSURE, ROOM_LIGHT, OTHER_BRIGHTNESS, COLOUR_WHEEL, UNKNOWN,
+    OTHER_CAMERA, OTHER_EXPOSURE, ROOM_LIGHT, OTHER_BRIGHTNESS, MIXED, COLOUR_WHEEL, UNKNOWN,
 )  # fmt: skip
 """All of them."""
 
@@ -200,8 +207,9 @@ class Evidence:
     - `stray`: light of a primary under a code of 0 that no dark frame shows, of that primary, the worst light.
     - `stray_primaries`: light of the primaries' frames together beyond white's, alike in each, of white.
     - `lone_primary`: how differently much of one primary white has than of the other two, which are alike, relative.
+    - `mixed`: how much more of one primary white has than of the third, and less of another, relative.
     - `colour_scatter`: scatter of white's colour from one white frame to the next, relative, over what its drift makes.
-    - `other_iso`: frames of another ISO speed than most, by their files.
+    - `other_iso`: frames of another ISO speed than the session's settings, or than most, by their files.
     - `lit`: share of the unfit cells of whose level light that lies on the print there is too much.
     - `misplaced`: share of the unfit cells whose place is not known well enough.
     - `uneven`: share of the unfit cells whose rim and middle differ.
@@ -239,6 +247,7 @@ class Evidence:
     stray: float = NAN
     stray_primaries: float = NAN
     lone_primary: float = NAN
+    mixed: float = NAN
     colour_scatter: float = NAN
     other_iso: float = NAN
     lit: float = NAN
@@ -352,13 +361,19 @@ RULES: tuple[Rule, ...] = (
         OTHER_EXPOSURE,
         _about("iso"),
         (Condition("other_iso", 1, _FAR),),
-        "the file states another ISO speed than the others'",
+        "the file states another ISO speed than the settings, or the others'",
     ),
     Rule(
         COLOUR_WHEEL,
-        DRIFT,
-        (Condition("colour_scatter", 0.002, _FAR), Condition("cameras", 1, 1)),
+        _about("drift", "sum", "brightness"),
+        (Condition("colour_scatter", 0.002, 0.15),),
         "white's colour goes to and fro from one white frame to the next, as no lamp drifts",
+    ),
+    Rule(
+        MIXED,
+        _about("sum", "brightness", "stray"),
+        (Condition("mixed", 0.01, 0.5),),
+        "white has more of one primary than of the third, and as much less of another",
     ),
     Rule(
         OTHER_BRIGHTNESS,
@@ -402,6 +417,12 @@ RULES: tuple[Rule, ...] = (
         PLACE | SHEET,
         (Condition("hot", 0.5, 1),),
         "most of the cells concerned hold a photosite that stands out in every dark frame",
+    ),
+    Rule(
+        HOT_PHOTOSITES,
+        PLACE,
+        (Condition("hot", 0.2, 1), Condition("deviation", 0, _FAR)),
+        "a place is brighter, and a fifth and more of its cells hold a photosite that stands out in every dark frame",
     ),
     Rule(
         DEFOCUS,

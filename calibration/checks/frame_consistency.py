@@ -545,7 +545,7 @@ class OriginFigures:
     - `other_camera`: frames of another model or body.
     - `other_lens`: frames through another lens.
     - `other_exposure`: frames exposed otherwise by a hundredth or more.
-    - `other_iso`: frames of another ISO speed.
+    - `other_iso`: frames of another ISO speed, or than the session's settings have.
     """
 
     other_camera: tuple[ForeignFrame, ...] = ()
@@ -563,15 +563,20 @@ _SAME_EXPOSURE = 1.01
 """Ratio below which two exposures count as one: shutter speeds differ by 1.26 at least, and are written rounded."""
 
 
-def origin_figures(frames: Sequence[tuple[FrameRecord, FrameOrigin]]) -> OriginFigures:
-    """Return which frames are of another camera, lens or exposure than most, in the order given."""
+def origin_figures(frames: Sequence[tuple[FrameRecord, FrameOrigin]], iso: int | None = None) -> OriginFigures:
+    """Return which frames are of another camera, lens or exposure than most, in the order given.
+
+    `iso`: the ISO speed of the session's settings, which stands for that of most; None where it is not known.
+    """
     bodies = [(record, _body(origin)) for record, origin in frames if origin.camera or origin.serial]
     lenses = [(record, origin.lens) for record, origin in frames if origin.lens]
     return OriginFigures(
         other_camera=_others(_stated_alike(bodies)),
         other_lens=_others(lenses),
         other_exposure=_other_exposures(frames),
-        other_iso=_others([(record, f"ISO {origin.iso}") for record, origin in frames if origin.iso]),
+        other_iso=_others(
+            [(record, f"ISO {origin.iso}") for record, origin in frames if origin.iso], f"ISO {iso}" if iso else None
+        ),
     )
 
 
@@ -585,10 +590,11 @@ def _stated_alike(bodies: Sequence[tuple[FrameRecord, str]]) -> Sequence[tuple[F
     return [(record, body.split(" no. ")[0] if body.split(" no. ")[0] in models else body) for record, body in bodies]
 
 
-def _others(stated: Sequence[tuple[FrameRecord, str]]) -> tuple[ForeignFrame, ...]:
+def _others(stated: Sequence[tuple[FrameRecord, str]], asked: str | None = None) -> tuple[ForeignFrame, ...]:
+    """Return the frames that state another thing than was asked for, or than most where nothing was."""
     if not stated:
         return ()
-    usual = Counter(value for _, value in stated).most_common(1)[0][0]
+    usual = asked or Counter(value for _, value in stated).most_common(1)[0][0]
     return tuple(ForeignFrame(record, value, usual) for record, value in stated if value != usual)
 
 

@@ -684,8 +684,12 @@ class SelectedFrames:
         return max(lit, key=lambda record: record.attempt)
 
     def is_even(self, record: FrameRecord) -> bool:
-        """Return whether a frame's samples show how even cells are: the white ones, or the first with any light."""
-        return record.kind == "white" or record is self.first_lit
+        """Return whether a frame's samples show how even cells are: the white ones, or the first with any light.
+
+        A file counts once, whatever it stands for: its noise is the same each time, and would not average out.
+        """
+        first = next((one for one in self.records if one.kind == "white" and one.sha256 == record.sha256), None)
+        return record == first or record is self.first_lit
 
 
 def select_frames(session: Session) -> SelectedFrames:
@@ -697,7 +701,7 @@ def select_frames(session: Session) -> SelectedFrames:
         )
     last = _last_of_each_light(session, accepted)
     others = [record for record in accepted if record.kind in ("white", "dark")]
-    whites = [record for record in others if record.kind == "white"]
+    whites = list({record.sha256: record for record in others if record.kind == "white"}.values())
     pure = pure_lights(session.illuminations) or ()
     return SelectedFrames(
         records=_in_order_taken(session, [*last.values(), *others]),

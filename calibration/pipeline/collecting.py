@@ -118,7 +118,9 @@ def _figures(
         cells=CellMeasurements(
             baseline.options.window, done.unfit(stains, frames, added), stains, baseline.levels, added
         ),
-        origins=origin_figures(list(zip(done.records, published, strict=True))),
+        origins=origin_figures(
+            list(zip(done.records, published, strict=True)), None if stated.camera is None else stated.camera.iso
+        ),
         origin=origin_record(stated, done.records, origins),
         primaries=baseline.primaries,
         lens=lens_figures(baseline),

@@ -10,9 +10,10 @@ from typing import Any
 import pytest
 
 from calibration import verdict as module
+from calibration.causes.rules import DEFOCUS, HOT_PHOTOSITES, RULES, Cause, Decision, Evidence
 from calibration.figures.figure import Figure, Sense, format_value
 from calibration.figures.radiometry import FRAME_SCATTER, OTHER_EXPOSURE
-from calibration.verdict import JudgedValue, Verdict, is_mended_by_retaking, judge, retaken_frames
+from calibration.verdict import JudgedValue, ProbableCause, Verdict, is_mended_by_retaking, judge, retaken_frames
 
 LIMIT = replace(
     FRAME_SCATTER, name="x", title="A figure", unit="px", accept=1.0, refuse=2.0, why="why", source="s", remedy="r"
@@ -110,3 +111,17 @@ def test_a_frame_of_less_exposure_is_as_wrong_as_one_of_more() -> None:
     # Dark frames are not among those with figures, and are taken again all the same.
     again = retaken_frames(refused(OTHER_EXPOSURE, 0.1), found)
     assert [frame.attempt for frame in again] == [0, 1, 3]
+
+
+@pytest.mark.parametrize(("cause", "again"), [(HOT_PHOTOSITES, []), (DEFOCUS, [1])])
+def test_frames_are_not_taken_again_for_what_would_be_in_them_again(
+    cause: Cause, again: list[int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def findings(*_: object) -> dict[str, ProbableCause]:
+        decision = Decision(cause, RULES[0])
+        return {FRAME_SCATTER.name: ProbableCause(FRAME_SCATTER.name, decision, Evidence(), (), ())}
+
+    monkeypatch.setattr(module, "findings", findings)
+    verdict, found = refused(FRAME_SCATTER, 2.0), measured((1, 3, 1))
+    assert [frame.attempt for frame in retaken_frames(verdict, found)] == again
+    assert is_mended_by_retaking(verdict, found) is bool(again)

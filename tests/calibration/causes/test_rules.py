@@ -17,6 +17,7 @@ from calibration.causes.rules import (
     DEFOCUS,
     FALL_OFF,
     HOT_PHOTOSITES,
+    MIXED,
     OBJECT_IN_FRAME,
     OTHER_BRIGHTNESS,
     OTHER_CAMERA,
@@ -71,6 +72,9 @@ CASES: list[tuple[Subject, Evidence, Cause]] = [
     ("block", replace(LIGHT, frames=2, showing=1, in_first=1, deviation=0.2), UNKNOWN),
     # A reflection shows a little under a light of another colour than white.
     ("block", replace(LIGHT, spot=0.9, deviation=0.02), UNKNOWN),
+    # Where many photosites are hot a block of cells is brighter in dim lights; a hand is darker there, too.
+    ("block", replace(LIGHT, deviation=0.08, tint=0.8, added=0.0, kept=1.0, hot=0.47), HOT_PHOTOSITES),
+    ("block", replace(LIGHT, deviation=-0.9, tint=0, added=0, kept=0.1, hot=0.3), OBJECT_IN_FRAME),
     ("block", replace(LIGHT, softer=0.03, scatter=0.05), DEFOCUS),
     ("block", replace(LIGHT, scatter=0.5), ANOTHER_PRINT),
     # Most of the sheet: a cloud before the window, a lamp, or nothing that is known.
@@ -114,8 +118,15 @@ CASES: list[tuple[Subject, Evidence, Cause]] = [
     ("sum", Evidence(frames=11, exposure=1, lone_primary=0.05), OTHER_BRIGHTNESS),
     # All primaries differ, or none by itself: the projector brightens white.
     ("sum", Evidence(frames=11, exposure=1, lone_primary=0.005), UNKNOWN),
-    ("drift", Evidence(frames=11, exposure=1, cameras=1, colour_scatter=0.01), COLOUR_WHEEL),
-    ("drift", Evidence(frames=11, exposure=1, cameras=1, colour_scatter=0.0), UNKNOWN),
+    # One primary more and another as much less: the one's frame holds the other's light.
+    ("sum", Evidence(frames=11, exposure=1, mixed=0.05), MIXED),
+    ("stray", Evidence(frames=11, stray=0.05, mixed=0.05), MIXED),
+    ("sum", Evidence(frames=11, exposure=1, mixed=0.005), UNKNOWN),
+    ("drift", Evidence(frames=11, exposure=1, colour_scatter=0.01), COLOUR_WHEEL),
+    ("sum", Evidence(frames=11, exposure=1, colour_scatter=0.01), COLOUR_WHEEL),
+    ("drift", Evidence(frames=11, exposure=1, colour_scatter=0.0), UNKNOWN),
+    # A frame of another light among the white ones.
+    ("drift", Evidence(frames=11, exposure=1, colour_scatter=0.5), UNKNOWN),
     ("unfit cells", Evidence(hot=0.2), UNKNOWN),
     ("unfit cells", Evidence(hot=0, lit=0.8), REFLECTION),
     ("unfit cells", Evidence(hot=0, lit=0.2), UNKNOWN),
