@@ -130,7 +130,7 @@ def transfer(
 
     from evaluation.datasets import open_scenes
     from evaluation.experiments.folds import FOLDS, choose_folds
-    from evaluation.experiments.transfer.outcome import TransferOutcome, figures_of, save_outcome
+    from evaluation.experiments.transfer.outcome import TransferOutcome, figures_of, harm_notes, save_outcome
     from evaluation.experiments.transfer.plan import is_generated, plan_transfer
     from evaluation.experiments.transfer.rows import count_images
     from evaluation.experiments.transfer.rows import transfer as run_transfer
@@ -168,6 +168,7 @@ def transfer(
         )
     plan = replace(plan, notes=(*plan.notes, *_suspicions(counted, rows)))
     figures = figures_of(rows, error)
+    plan = replace(plan, notes=(*plan.notes, *harm_notes(figures)))
     settings: dict[str, Any] = {
         "methods": [describe_method(learner) for learner in learners],
         "statistics": [describe_method(method) for method in references],

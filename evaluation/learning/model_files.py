@@ -213,7 +213,8 @@ def load_model(path: Path) -> StoredMethod:
         *(RuntimeError, NotImplementedError),  # What is encrypted, or packed in a way that Python does not know.
     ) as error:
         raise _refused(path, _reason(error)) from error
-    return StoredMethod(learner, model, provenance.data_name, provenance)
+    taught = f"{provenance.data_name}, adapted from another model" if provenance.adapted_from else provenance.data_name
+    return StoredMethod(learner, model, taught, provenance)
 
 
 def _reason(error: Exception) -> str:

@@ -46,6 +46,7 @@ from experiment.session.ledger import (
     Row,
     Rows,
     insert_rows,
+    lacking_frames,
     ledger_path,
     require_none_lacking,
     rows_of,
@@ -333,7 +334,9 @@ class Journal:
 
     def lacking(self, frames: Frames) -> Frames:
         """Return the frames among these that are not here, or have another verdict."""
-        return frames - {*self._rows("SELECT id, sha256, verdict FROM attempts WHERE sha256 IS NOT NULL")}
+        return lacking_frames(
+            frames, {*self._rows("SELECT id, sha256, verdict FROM attempts WHERE sha256 IS NOT NULL")}
+        )
 
     def unused_bytes(self, after: int) -> int:
         """Return how many bytes the raw files of refused and voided attempts with numbers above `after` take."""

@@ -21,9 +21,10 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any, Final, cast
 
+from experiment.session.records import VOIDED
 from foundation.errors import FormatError, StorageError, counted
 from foundation.files import reading_error, storage_error, write_whole
-from foundation.folders import is_inside_name
+from foundation.folders import is_inside_name, open_inside
 
 LEDGER_FILE: Final = "ledger.jsonl"
 """Its name in a session's folder."""
@@ -86,7 +87,7 @@ def read_ledger(path: Path) -> Rows:
 def _read(path: Path, size: int = MOST_BYTES + 1) -> list[Mapping[str, Sequence[Row]]]:
     """Return the transactions in the first `size` bytes of a ledger."""
     try:
-        with path.open("rb") as stream:
+        with open_inside(path.parent, path.name) as stream:
             content = stream.read(size)
     except OSError as error:
         raise reading_error(path, error, "restore the session from a copy") from error
@@ -226,7 +227,7 @@ class Ledger:
             return False
         if _gathered(transactions) == rows:
             return True
-        require_none_lacking(self._path, _frames(_gathered(transactions[:-1])) - _frames(rows))
+        require_none_lacking(self._path, lacking_frames(_frames(_gathered(transactions[:-1])), _frames(rows)))
         return False
 
     def _write_anew(self, rows: Rows) -> None:
@@ -254,6 +255,15 @@ def settled_frames(path: Path) -> Frames:
         if os.path.isfile(path):  # noqa: PTH113 - it never raises
             return _frames(_gathered(_read(path)[:-1]))
     return set()
+
+
+def lacking_frames(settled: Frames, known: Frames) -> Frames:
+    """Return the settled frames that are not among those known, or have another verdict there.
+
+    A frame that is known to be voided is no older state of it, since no verdict follows that one.
+    """
+    voided = {(attempt, sha256) for attempt, sha256, verdict in known if verdict == VOIDED}
+    return {frame for frame in settled - known if frame[:2] not in voided}
 
 
 def require_none_lacking(path: Path, lacking: Frames) -> None:

@@ -176,6 +176,7 @@ _PLAN_ROWS: Final = 8
 """Rows of 16 numbers that the plan of a block has: offsets of three nodes in bytes, weights of four, the offset of the
 nearest. The fourth node is one step farther in each channel than the first."""
 _ROW: Final = 4 * _BLOCK
+"""Bytes of a row: one number of 32 bits a pixel."""
 _PLAN_BYTES: Final = _ROW * _PLAN_ROWS
 _LINE_BYTES: Final = 16 * _BLOCK
 """Bytes of a block's pixels: red, green, blue and noise, float32 each."""

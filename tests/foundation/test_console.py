@@ -479,3 +479,18 @@ def test_closed_streams_are_no_fault(closed: str) -> None:
     done = subprocess.run(words, capture_output=True, check=False)
     assert done.returncode == 0
     assert b"Traceback" not in done.stderr
+
+
+@pytest.mark.parametrize("unbuffered", ["", "1"])
+def test_a_job_is_done_though_the_reader_of_its_output_left(tmp_path: Path, unbuffered: str) -> None:
+    """Ending with 0 and half of the work would be believed."""
+    job = "import pathlib; [print('x' * 9999, flush=True) for _ in range(9)]; pathlib.Path('done').touch()"
+    program = f"import sys; from foundation.console import run; sys.exit(run(lambda: exec({job!r})))"
+    reader, writer = os.pipe()
+    os.close(reader)
+    environment = {**os.environ, "PYTHONUNBUFFERED": unbuffered, "PYTHONPATH": str(Path(__file__).parents[2])}
+    words = [sys.executable, "-c", program]
+    ended = subprocess.run(words, stdout=writer, stderr=subprocess.PIPE, cwd=tmp_path, env=environment, check=False)
+    os.close(writer)
+    assert (ended.returncode, ended.stderr) == (0, b"")
+    assert (tmp_path / "done").exists()

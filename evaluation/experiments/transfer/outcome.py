@@ -359,6 +359,16 @@ def beside_table(found: TransferFigures, name: str) -> Table | None:
     )
 
 
+def harm_notes(found: TransferFigures) -> list[str]:
+    """Return what the reader is told of rows whose adapting made the mean error larger, beyond chance."""
+    return [
+        f"{one.row.method}, {one.row.training}: adapting does harm, {_written(one.ratios[0])} of the mean error of "
+        f"{one.base.training} alone; use that"
+        for one in found.to_better
+        if one.ratios[0].low > 1
+    ]
+
+
 def _as(row: TransferRow, way: Way) -> tuple[str, str]:
     return row.method, replace(row, way=way).training
 
@@ -552,7 +562,9 @@ def beside_plot(found: TransferFigures) -> bytes:
         for label, points in panels.get(each.row.method, {}).items():
             if not each.row.way and label.startswith(f"{each.row.material}, "):
                 points[0] = each.statistics[0]
-    return svg_of(_draw_beside, panels, found.error, inches=(3.1 * max(1, len(panels)) + 0.4, 4.4))
+    return svg_of(
+        _draw_beside, panels, found.error, inches=(max(4.6, 3.1 * len(panels) + 0.4), 5.2 if len(panels) == 1 else 4.4)
+    )
 
 
 def _draw_beside(figure: Any, panels: Mapping[str, Mapping[str, Mapping[float, BoundedFigure]]], error: str) -> None:
@@ -571,7 +583,10 @@ def _draw_beside(figure: Any, panels: Mapping[str, Mapping[str, Mapping[float, B
         axes.set(title=method, xlabel="real images")
     grid[0].set_ylabel(f"mean {error} error, degrees")
     handles, named = grid[0].get_legend_handles_labels()
-    figure.legend(handles, [legend_label(name) for name in named], loc="outside lower center", ncols=2, fontsize=8)
+    # Names are long: beside one another they need the width of two panels.
+    columns = min(2, len(panels))
+    labelled = [legend_label(name) for name in named]
+    figure.legend(handles, labelled, loc="outside lower center", ncols=columns, fontsize=8)
 
 
 def _positive(number: float) -> bool:

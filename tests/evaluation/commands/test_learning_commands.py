@@ -6,6 +6,7 @@ import csv
 import json
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -52,7 +53,7 @@ def test_a_model_is_trained_saved_and_used(data: Path, tmp_path: Path, capsys: p
 def test_a_model_is_adapted(data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     before, after = tmp_path / "before.npz", tmp_path / "after.npz"
     with np.load(data) as content:
-        few = {name: content[name][:6] for name in content.files}
+        few: dict[str, Any] = {name: content[name][:6] for name in content.files}
     np.savez(tmp_path / "few.npz", **{**few, "names": np.array([f"few {number}" for number in range(6)])})
     assert main(["train", "kernel-ridge", str(data), "--out", str(before)]) == 0
     capsys.readouterr()
