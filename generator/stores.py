@@ -158,6 +158,17 @@ class LocalStore:
             for piece in (data,) if isinstance(data, bytes) else data:
                 stream.write(piece)
 
+    def append(self, name: str, data: bytes) -> None:
+        """Add to the end of a file, made where it is missing; a kill or a full disk may cut what is added."""
+        path = self.root / name
+        try:
+            if not path.parent.is_dir():
+                self._make_folder(path.parent)
+            with path.open("ab", 0) as stream:
+                stream.write(data)
+        except OSError as error:
+            raise storage_error(path, error) from error
+
     @contextmanager
     def create(self, name: str) -> Generator[BinaryIO]:
         """Open a file to be written; it appears when the block ends well, and is on the disk once synchronised."""

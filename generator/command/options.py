@@ -394,7 +394,10 @@ class WorkOptions:
             "local, dask (a cluster on this machine), or dask://HOST:PORT of a scheduler; docs/clusters.md.",
         ),
     ] = "local"
-    shard_images: Annotated[int, _work_option("N", "Images of a shard: what a kill may cost.", min=1)] = 256
+    shard_images: Annotated[
+        int,
+        _work_option("N", "Images of a shard: what a kill may cost of tar and Parquet files, and on a store.", min=1),
+    ] = 256
     shard: Annotated[
         str | None,
         _work_option("I/N", "Make share I of N only, I from 0, beside other programs that make theirs; then --finish."),

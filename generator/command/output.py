@@ -54,15 +54,16 @@ class _Images:
     def __init__(self, total: int, shown: ExitStack) -> None:
         self._total = total
         self._shown = shown
-        self._made = 0
+        self._made = self._found = 0
         self._began = time.monotonic()
         self._bar: Progress | None = None
 
     def leave_out(self, images: int) -> None:
-        """Show that images were made by an earlier run."""
-        if images:
-            self._total -= images
-            self._print(f"{images} images were made by an earlier run")
+        """Show that more images are found finished; less than 0 takes some back."""
+        self._total -= images
+        if images > 0:
+            self._print(f"{images}{' more' if self._found else ''} images were found finished")
+        self._found += images
 
     def advance(self) -> None:
         """Show that one more image is made, and the mean rate: a cluster reports the images of a shard at once."""

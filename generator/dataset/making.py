@@ -178,6 +178,7 @@ def _by_threads(plan: Plan, shards: Sequence[int], place: Workplace, workers: in
     at_once = min(2, len(shards), workers)
     depth = -(-workers // at_once)
     queued = Callbacks(
+        on_done=lambda images: events.put(partial(callbacks.on_done, images)),
         on_image=lambda: events.put(callbacks.on_image),
         on_skip=lambda name, reason, images: events.put(partial(callbacks.on_skip, name, reason, images)),
     )
@@ -260,7 +261,9 @@ def _by_dask(
                 raise
             for skipped in done.skipped:
                 callbacks.on_skip(*skipped)
-            for _ in range(done.images):
+            if done.found:
+                callbacks.on_done(done.found)
+            for _ in range(done.images - done.found):
                 callbacks.on_image()
             following = next(waiting, None)
             if following is not None:
@@ -365,7 +368,7 @@ def generate_dataset(
     FormatError
         None of the sources can be read.
     StorageError
-        The disk is full, read-only or gone; the shards that are done are kept for the next call.
+        The disk is full, read-only or gone; the images that are finished are kept for the next call.
 
     Examples
     --------

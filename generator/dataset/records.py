@@ -156,6 +156,14 @@ class FileSum(Record):
     sha256: str
 
 
+class FinishedImage(Record):
+    """An image of a shard that is not done; `files` are all of it, which were written before this was."""
+
+    image: ImageRecord
+    source: SourceRecord
+    files: list[FileSum]
+
+
 class RenderingSummary(Record):
     """How the images of a dataset were rendered, where that is not by codes with the print's black kept.
 

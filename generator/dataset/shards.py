@@ -5,6 +5,8 @@ Rules that hold inside:
 - A shard's bytes depend on its job alone: not on the workers, on other shards, or on how often it is made.
 - Its record is written last, when all else has been synchronised with the disk: a shard with a record is whole. The
   program may be killed at any instruction, and any number of programs may make the same shard at once.
+- Of a shard without a record, an image counts whose files are there with the hashes that were noted when they were
+  written, and whose source is as it was. The bytes of the others do not depend on it.
 - At most about three pictures are in memory for each worker.
 
 An image under one light has that light's ground truth, however its intensity falls off. Where it falls off with a tint
@@ -17,7 +19,7 @@ from __future__ import annotations
 import math
 import threading
 from collections import deque
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Generator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -31,11 +33,20 @@ import numpy.typing as npt
 from foundation.errors import FormatError, InputError
 from generator.dataset.layouts import Beside, Sample, ShardWriter, open_writer
 from generator.dataset.plan import DatasetOptions, ShardJob, light_of, split_of, versions
-from generator.dataset.records import Details, ImageRecord, LightRow, ShardRecord, Skipped, SourceRecord, Triple
+from generator.dataset.records import (
+    Details,
+    FinishedImage,
+    ImageRecord,
+    LightRow,
+    ShardRecord,
+    Skipped,
+    SourceRecord,
+    Triple,
+)
 from generator.dataset.workplace import Workplace
 from generator.lights.lighting import Lighting, Mixture
 from generator.pictures.picture import Cut, Picture, keep_bits
-from generator.pictures.sources import Source
+from generator.pictures.sources import Source, hash_since
 from generator.stores import Pieces
 from generator.variation.variation import Varied
 
@@ -197,7 +208,9 @@ class Callbacks:
     Attributes
     ----------
     on_done
-        Takes how many of the planned images were made by an earlier call; called once, before the first is made.
+        Takes how many more of the planned images are found finished: of the shards that are done before the first image
+        is made, and of a shard that was begun when it is taken up; less than 0 for images whose source proves to have
+        changed since, which are made again.
     on_image
         Called after each image.
     on_skip
@@ -226,7 +239,7 @@ SILENT: Final = Callbacks()
 
 @dataclass(frozen=True)
 class _ReadSource:
-    """The crops of a source, or all of it, and what is recorded of it.
+    """The crops of a source, or all of it, and what is recorded of it; no crops where all its images are finished.
 
     Where sRGB codes are those of the print, they are codes that the table has samples of.
     """
@@ -256,31 +269,48 @@ def make_shard(
     used: set[int] = set()
     pending: deque[Future[Sample]] = deque()
     reading: deque[Future[_ReadSource]] = deque()
+    finished = _finished_images(job, place, pool)
+    if finished:
+        callbacks.on_done(len(finished))
 
     def finish_one(writer: ShardWriter) -> None:
         sample = pending.popleft().result()
         writer.append(sample)
         images.append(sample.record)
-        callbacks.on_image()
+        if sample.record.number not in finished:
+            callbacks.on_image()
+
+    def forget_changed(wanted: list[tuple[int, int, Lighting]], source: SourceRecord | None) -> None:
+        changed = [number for number, _, _ in wanted if number in finished and finished[number].source != source]
+        for number in changed:
+            del finished[number]
+        if changed:
+            callbacks.on_done(-len(changed))
 
     with _writer_of(job, place) as writer, _cancelling(pending, reading):
         for row, source in enumerate(job.sources):
             while len(reading) <= workers and row + len(reading) < len(job.sources):
-                reading.append(pool.submit(_read, job, lut, row + len(reading)))
+                reading.append(pool.submit(_read, job, lut, row + len(reading), finished))
+            wanted = _wanted(job, job.position + row)
             try:
                 read = reading.popleft().result()
             except FormatError as error:
+                forget_changed(wanted, None)
                 skipped.append(Skipped(position=job.position + row, name=source.name))
-                callbacks.on_skip(source.name, str(error), len(_wanted(job, job.position + row)))
+                callbacks.on_skip(source.name, str(error), len(wanted))
                 continue
+            forget_changed(wanted, read.record)
             sources.append(read.record)
-            for number, crop, lighting in _wanted(job, job.position + row):
+            for number, crop, lighting in wanted:
                 while len(pending) >= 2 * workers:
                     finish_one(writer)
                 if cancelled is not None and cancelled.is_set():
                     raise ShardCancelled
                 used.update(light for mixture in lighting.mixtures for light in mixture.lights)
-                pending.append(pool.submit(_make, job, lut, writer, number, read, crop, lighting))
+                if number in finished:
+                    pending.append(pool.submit(_taken_up, finished[number]))
+                else:
+                    pending.append(pool.submit(_make, job, lut, place, writer, number, read, crop, lighting))
         while pending:
             finish_one(writer)
         files = writer.close()
@@ -294,6 +324,19 @@ def make_shard(
     )
     place.commit(record)
     return record
+
+
+def _finished_images(job: ShardJob, place: Workplace, pool: ThreadPoolExecutor) -> dict[int, FinishedImage]:
+    """Return by number the images of a shard that whoever was at it before has finished."""
+    noted = place.noted(job.shard)
+    whole = pool.map(place.is_whole, noted)
+    return {image.image.number: image for image, is_whole in zip(noted, whole, strict=True) if is_whole}
+
+
+def _taken_up(image: FinishedImage) -> Sample:
+    """Return a finished image for `ShardWriter.append`."""
+    source = image.source
+    return Sample(image.image, source.name, source.split, source.width, source.height, (), tuple(image.files))
 
 
 def _writer_of(job: ShardJob, place: Workplace) -> ShardWriter:
@@ -317,10 +360,14 @@ def _cancelling(*queues: deque[Future[Any]]) -> Generator[None]:
 
 @dataclass(frozen=True)
 class ShardDone:
-    """Result of a task: how many images its shard has, and of each source that cannot be read name, reason, images."""
+    """Result of a task: how many images its shard has, and of each source that cannot be read name, reason, images.
+
+    `found`: how many of the images whoever was at the shard before had finished.
+    """
 
     images: int
     skipped: tuple[tuple[str, str, int], ...]
+    found: int = 0
 
 
 def make_elsewhere(job: ShardJob, place: Workplace) -> ShardDone:
@@ -339,14 +386,15 @@ def make_elsewhere(job: ShardJob, place: Workplace) -> ShardDone:
             + "; install the same on every machine"
         )
     skipped: list[tuple[str, str, int]] = []
+    taken_up: list[int] = []
 
     def skip(name: str, reason: str, images: int) -> None:
         skipped.append((name, reason, images))
 
     lut = _table_of(job.table, job.table_sha256)
     with ThreadPoolExecutor(1) as pool:
-        record = make_shard(job, lut, place, pool, 1, Callbacks(on_skip=skip))
-    return ShardDone(len(record.images), tuple(skipped))
+        record = make_shard(job, lut, place, pool, 1, Callbacks(on_done=taken_up.append, on_skip=skip))
+    return ShardDone(len(record.images), tuple(skipped), sum(taken_up))
 
 
 @lru_cache(maxsize=2)
@@ -372,10 +420,13 @@ def _wanted(job: ShardJob, position: int) -> list[tuple[int, int, Lighting]]:
     return [wanted for wanted in numbered if job.first <= wanted[0] < job.stop]
 
 
-def _read(job: ShardJob, lut: Lut, place: int) -> _ReadSource:
+def _read(job: ShardJob, lut: Lut, place: int, finished: Mapping[int, FinishedImage]) -> _ReadSource:
     from generator.files import smallest_side
     from generator.kernels.choice import replace_unfit_colours
 
+    known = _known_source(job, job.position + place, finished) if finished else None
+    if known is not None:
+        return _ReadSource((), known, None)
     source: Source = job.sources[place]
     scene = source.read()
     whole = (Cut(0, 0, scene.picture),) if job.options.crops == 1 else scene.cuts
@@ -412,8 +463,25 @@ def _read(job: ShardJob, lut: Lut, place: int) -> _ReadSource:
     return _ReadSource(cuts, record, scene.black_taken)
 
 
+def _known_source(job: ShardJob, position: int, finished: Mapping[int, FinishedImage]) -> SourceRecord | None:
+    """Return the record of a source that is as it was when every image of it was finished; else None."""
+    known = [finished[number].source if number in finished else None for number, _, _ in _wanted(job, position)]
+    first = known[0] if known else None
+    if first is None or any(source != first for source in known):
+        return None
+    # Of a file on a store no hash is known before it is read.
+    return first if hash_since(job.sources[position - job.position], -math.inf) == first.sha256 else None
+
+
 def _make(
-    job: ShardJob, lut: Lut, writer: ShardWriter, number: int, source: _ReadSource, crop: int, lighting: Lighting
+    job: ShardJob,
+    lut: Lut,
+    place: Workplace,
+    writer: ShardWriter,
+    number: int,
+    source: _ReadSource,
+    crop: int,
+    lighting: Lighting,
 ) -> Sample:
     from generator.files import (
         FULL,
@@ -452,4 +520,7 @@ def _make(
         lights=light.rows,
         details=details | rendered | varied.details,
     )
-    return writer.store(Sample(record, source.record.name, source.record.split, width, height, tuple(files)))
+    sample = writer.store(Sample(record, source.record.name, source.record.split, width, height, tuple(files)))
+    if sample.stored:
+        place.note(job.shard, FinishedImage(image=record, source=source.record, files=list(sample.stored)))
+    return sample

@@ -1,16 +1,20 @@
 """The place where a dataset is made: work that was interrupted is continued there, and the dataset appears whole.
 
 On a disk everything happens in the hidden folder `.OUT.partial`: `dataset-ID/`, with the plan's identifier, fills with
-files, and `plan/` has the plan and the records of the shards that are done. At the end `dataset-ID/` gets its name by
-one rename, then the rest is removed. An object store has no rename: the files are written where they stay, plan and
-records below `OUT/.plan/`, and `dataset.json`, written last, makes a dataset of them.
+files, and `plan/` has the plan, the records of the shards that are done, and of those that are not a line for each
+image whose files are written. At the end `dataset-ID/` gets its name by one rename, then the rest is removed. An object
+store has no rename: the files are written where they stay, plan and records below `OUT/.plan/`, and `dataset.json`,
+written last, makes a dataset of them.
 
 Rules that hold inside:
 
 - A place belongs to one plan. Another plan is refused with a message that says how the two differ. A worker of a plan
   that was removed may still be alive: its records bear the identifier of its plan, so they are never taken for ours.
 - A program that makes the whole dataset locks the folder alone; programs that make shares of it share the lock.
-- A place without a finished shard is of no use later and is removed when the work fails.
+- A place without a finished image is of no use later and is removed when the work fails; so is one without a finished
+  shard where the command is at fault, which has to be another then.
+- The lines of images are not synchronised with the disk and may be cut: each bears its own hash and those of its files,
+  and what does not agree with them is made again. An object store cannot add to a file, and has no such lines.
 """
 
 from __future__ import annotations
@@ -25,16 +29,18 @@ from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Any, Final, cast
 
-from foundation.errors import FormatError, InputError
-from foundation.files import partial_path, publish_folder, require_free, storage_error
+from foundation.errors import CropError, FormatError, InputError
+from foundation.files import partial_path, publish_folder, require_free, sha256_of, storage_error, stream_sha256
 from foundation.folders import clear_folder, held_folder
 from foundation.records import from_json
-from generator.dataset.records import ShardRecord, shard_key
+from generator.dataset.records import FinishedImage, ShardRecord, shard_key
 from generator.stores import DESCRIPTION, LocalStore, RemoteStore, Store, is_remote, local_path, open_store
 
 PLAN: Final = "plan.json"
 RECORDS: Final = "shards"
 _NOTES: Final = ".plan"
+_DONE: Final = ".json"
+_IMAGES: Final = ".images"
 PlanIdentity = Mapping[str, Any]
 
 
@@ -55,7 +61,7 @@ class Workplace:
 
     def done(self) -> set[int]:
         """Return the shards that are done."""
-        ending = f".{self.plan_id}.json"
+        ending = f".{self.plan_id}{_DONE}"
         found = (PurePosixPath(name).name for name in self.notes.names(RECORDS))
         return {int(name.removesuffix(ending)) for name in found if name.endswith(ending)}
 
@@ -74,6 +80,42 @@ class Workplace:
         name = self._record_name(record.shard)
         self.notes.put(name, record.model_dump_json().encode())
         self.notes.sync([name])
+        if isinstance(self.notes, LocalStore):
+            # Whoever makes the shard at the same time may have it open, and no later reader asks for it.
+            with contextlib.suppress(OSError):
+                (self.notes.root / self._images_name(record.shard)).unlink(missing_ok=True)
+
+    def note(self, shard: int, image: FinishedImage) -> None:
+        """Note that all files of an image of a shard are written; any thread may do so."""
+        if isinstance(self.notes, LocalStore):
+            line = image.model_dump_json().encode()
+            # It begins anew behind a line that was cut.
+            self.notes.append(self._images_name(shard), b"\n%s %s\n" % (sha256_of(line).encode(), line))
+
+    def noted(self, shard: int) -> list[FinishedImage]:
+        """Return what was noted of the images of a shard, but for what cannot be read; see `is_whole`."""
+        name = self._images_name(shard)
+        if not isinstance(self.notes, LocalStore) or not self.notes.has(name):
+            return []
+        found: list[FinishedImage] = []
+        # Whoever makes the shard at the same time may be done, and have removed them.
+        with contextlib.suppress(FormatError):
+            for noted in self.notes.get(name).splitlines():
+                sha256, _, line = noted.partition(b" ")
+                if sha256 == sha256_of(line).encode():
+                    found.append(from_json(FinishedImage, line, f"{self.notes.place}/{name}", "remove it"))
+        return found
+
+    def is_whole(self, image: FinishedImage) -> bool:
+        """Return whether all files of an image are there as they were written."""
+        try:
+            for file in image.files:
+                with self.files.open(file.name) as stream:
+                    if stream_sha256(stream) != file.sha256:
+                        return False
+        except (CropError, OSError):
+            return False
+        return True
 
     def discard(self) -> None:
         """Remove the records of the shards that are done, since to continue would end the same."""
@@ -89,7 +131,10 @@ class Workplace:
         _remove_notes(self.notes)
 
     def _record_name(self, shard: int) -> str:
-        return f"{RECORDS}/{shard_key(shard)}.{self.plan_id}.json"
+        return f"{RECORDS}/{shard_key(shard)}.{self.plan_id}{_DONE}"
+
+    def _images_name(self, shard: int) -> str:
+        return f"{RECORDS}/{shard_key(shard)}.{self.plan_id}{_IMAGES}"
 
 
 def finished(out: str | Path, identity: PlanIdentity) -> bool:
@@ -165,8 +210,10 @@ def workplace(out: str | Path, identity: PlanIdentity, alone: bool = True) -> Ge
             if not alone:
                 lock.share()
             yield place
-        except BaseException:
-            if alone and folder.is_dir() and not any(notes.names(RECORDS)):
+        except BaseException as error:
+            # An InputError asks for another command, which could not go on with images of this one.
+            useful = _DONE if isinstance(error, InputError) else (_DONE, _IMAGES)
+            if alone and folder.is_dir() and not any(name.endswith(useful) for name in notes.names(RECORDS)):
                 shutil.rmtree(folder, ignore_errors=True)
             raise
 

@@ -160,7 +160,7 @@ def test_a_share_is_gone_on_with_by_the_whole(generate: Generate, capsys: pytest
     assert generate("lut", "out", *wish, "--seed", "1") == 2
     assert "out was begun with another plan (seed 0, now 1)" in " ".join(capsys.readouterr().err.split())
     assert generate("lut", "out", *wish) == 0
-    assert "5 images were made by an earlier run" in capsys.readouterr().err
+    assert "5 images were found finished" in capsys.readouterr().err
     assert [path.name for path in Path().iterdir() if path.name.startswith(".")] == []
 
 

@@ -35,7 +35,7 @@ def _told() -> None:
 def test_a_file_gets_lines(capsys: pytest.CaptureFixture[str]) -> None:
     _told()
     lines = capsys.readouterr().err.splitlines()
-    assert lines[:2] == ["1 images were made by an earlier run", "left out bad\\x1b[2J.png: it is no picture"]
+    assert lines[:2] == ["1 images were found finished", "left out bad\\x1b[2J.png: it is no picture"]
     assert lines[2].startswith("images 2/2 ")
     assert len(lines) == 3
 

@@ -54,7 +54,8 @@ def test_a_model_is_adapted(data: Path, tmp_path: Path, capsys: pytest.CaptureFi
     before, after = tmp_path / "before.npz", tmp_path / "after.npz"
     with np.load(data) as content:
         few: dict[str, Any] = {name: content[name][:6] for name in content.files}
-    np.savez(tmp_path / "few.npz", **{**few, "names": np.array([f"few {number}" for number in range(6)])})
+    few["names"] = np.array([f"few {number}" for number in range(6)])
+    np.savez(tmp_path / "few.npz", **few)
     assert main(["train", "kernel-ridge", str(data), "--out", str(before)]) == 0
     capsys.readouterr()
     assert main(["train", "kernel-ridge", str(tmp_path / "few.npz"), "--adapt", str(before), "--out", str(after)]) == 0

@@ -4,20 +4,25 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
+import json
 import os
 import shutil
 import signal
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args
 
+import cv2
+import numpy as np
 import pytest
 
 from foundation.errors import FormatError, InputError
 from foundation.folders import FolderLock, held_folder
 from generator.dataset import layouts as plain_files
+from generator.dataset import shards
 from generator.dataset.making import (
+    Callbacks,
     DatasetOptions,
     Plan,
     Workers,
@@ -26,11 +31,14 @@ from generator.dataset.making import (
     make_dataset,
     make_share,
 )
-from generator.dataset.reader import Dataset
-from generator.dataset.records import Layout, ShardRecord
+from generator.dataset.reader import Dataset, open_dataset
+from generator.dataset.records import FinishedImage, Layout, ShardRecord
+from generator.dataset.shards import SILENT
 from generator.dataset.workplace import Workplace, workplace
-from generator.lights.choices import ListedLights, RandomLights
-from generator.pictures.sources import random_scenes
+from generator.lights.choices import ListedLights, RandomLights, SimultaneousLights
+from generator.masks.making import parse_masks
+from generator.pictures.sources import Source, find_pictures, random_scenes
+from generator.rendering.black_points import BlackPoint
 from tests.generator.groups import grouped
 
 pytestmark = pytest.mark.slow
@@ -85,6 +93,183 @@ def test_going_on_gives_the_same_bytes(make_lut: Callable[..., Lut], tmp_path: P
     assert not list(tmp_path.glob(".out*"))
 
 
+Made = tuple[int, int, list[int]]
+"""Images that were found finished, images that were reported one by one, and the numbers of those rendered."""
+
+
+def made_after(monkeypatch: pytest.MonkeyPatch, call: Callable[[Callbacks], object]) -> Made:
+    """Call something that makes images, and return what it did."""
+    found: list[int] = []
+    reported: list[None] = []
+    rendered: list[int] = []
+    photograph = shards.photograph
+
+    def noted(*arguments: Any) -> Any:
+        rendered.append(arguments[5])
+        return photograph(*arguments)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(shards, "photograph", noted)
+        call(Callbacks(on_done=found.append, on_image=lambda: reported.append(None)))
+    return sum(found), len(reported), sorted(rendered)
+
+
+def killed_after(images: int, action: Callable[[], object]) -> None:
+    """Call something that makes images in a process that is killed as soon as so many are finished."""
+    child = os.fork()
+    if not child:
+        counted = iter(range(images - 1))
+        note = Workplace.note
+
+        def noted(self: Workplace, shard: int, image: FinishedImage) -> None:
+            note(self, shard, image)
+            if next(counted, None) is None:
+                os.kill(os.getpid(), signal.SIGKILL)
+
+        Workplace.note = noted
+        try:
+            action()
+        finally:
+            os._exit(0)
+    assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == -signal.SIGKILL
+
+
+def one_shard(
+    lut: Lut,
+    out: Path,
+    callbacks: Callbacks = SILENT,
+    workers: Workers | None = None,
+    sources: Sequence[Source] = SCENES,
+) -> Dataset:
+    """Make eight images under two lights each, with previews, masks and what was done to each, in one shard."""
+    choice = SimultaneousLights(ListedLights((2, 0, 1, 3)), 2, parse_masks("half-plane", 2, 5))
+    options = DatasetOptions(black_point=BlackPoint("random"), split=(0.5, 0.0, 0.5))
+    plan = Plan(lut, sources, choice, 3, options)
+    return make_dataset(plan, out, workers, callbacks)
+
+
+def noted_images(out: Path) -> list[int]:
+    """Return the numbers of the images that whole lines are there of."""
+    lines = filter(None, notes_of(out).read_bytes().splitlines())
+    return [json.loads(line[65:])["image"]["number"] for line in lines if line.endswith(b"}")]
+
+
+def notes_of(out: Path) -> Path:
+    (notes,) = (out.with_name(f".{out.name}.partial") / "plan" / "shards").iterdir()
+    return notes
+
+
+@pytest.mark.parametrize("workers", [Workers(), Workers(count=3), Workers("dask", 1)])
+def test_finished_images_of_a_killed_shard_count(
+    make_lut: Callable[..., Lut], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, workers: Workers
+) -> None:
+    lut, out = make_lut(), tmp_path / "out"
+    one_shard(lut, tmp_path / "whole")
+    killed_after(3, lambda: one_shard(lut, out, workers=Workers(count=workers.count)))
+    noted = noted_images(out)
+    assert 3 <= len(noted) < 8
+    assert workers.count > 1 or noted == [0, 1, 2]
+    found, reported, rendered = made_after(monkeypatch, lambda seen: one_shard(lut, out, seen, workers))
+    assert (found, reported) == (len(noted), 8 - len(noted))
+    if workers.engine == "local":
+        assert rendered == sorted(set(range(8)) - set(noted))
+    assert contents(out) == contents(tmp_path / "whole")
+    assert not list(tmp_path.glob(".out*"))
+
+
+def cut_file(files: Path, notes: Path) -> None:
+    del notes
+    image = files / "images" / "000001.png"
+    image.write_bytes(image.read_bytes()[:-7])
+
+
+def changed_mask(files: Path, notes: Path) -> None:
+    del notes
+    mask = files / "masks" / "000001_1.png"
+    data = bytearray(mask.read_bytes())
+    data[len(data) // 2] ^= 1
+    mask.write_bytes(data)
+
+
+def lost_preview(files: Path, notes: Path) -> None:
+    del notes
+    (files / "previews" / "000001.jpg").unlink()
+
+
+def cut_line(files: Path, notes: Path) -> None:
+    del files
+    lines = notes.read_bytes().split(b"\n\n")
+    lines[1] = lines[1][: len(lines[1]) // 2]
+    notes.write_bytes(b"\n\n".join(lines))
+
+
+def cut_end(files: Path, notes: Path) -> None:
+    del files
+    notes.write_bytes(notes.read_bytes()[:-30])
+
+
+def other_truth(files: Path, notes: Path) -> None:
+    del files
+    text = notes.read_text()
+    start = text.index('"truth":[', text.index('"number":1,'))
+    notes.write_text(text[: start + 11] + ("1" if text[start + 11] != "1" else "2") + text[start + 12 :])
+
+
+@pytest.mark.parametrize("disturb", [cut_file, changed_mask, lost_preview, cut_line, cut_end, other_truth])
+def test_a_cut_or_changed_image_is_made_again(
+    make_lut: Callable[..., Lut],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    disturb: Callable[[Path, Path], None],
+) -> None:
+    lut, out = make_lut(), tmp_path / "out"
+    one_shard(lut, tmp_path / "whole")
+    killed_after(3, lambda: one_shard(lut, out))
+    (files,) = (tmp_path / ".out.partial").glob("dataset-*")
+    disturb(files, notes_of(out))
+    # Killed once more, so that lines follow one that was cut.
+    killed_after(1, lambda: one_shard(lut, out))
+    assert noted_images(out)[-1] == (2 if disturb is cut_end else 1)
+    assert made_after(monkeypatch, lambda seen: one_shard(lut, out, seen)) == (3, 5, [3, 4, 5, 6, 7])
+    assert contents(out) == contents(tmp_path / "whole")
+
+
+def test_images_of_a_picture_that_changed_are_made_again(
+    make_lut: Callable[..., Lut], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    lut, out, folder = make_lut(), tmp_path / "out", tmp_path / "pictures"
+    folder.mkdir()
+
+    def draw(name: str, code: int) -> None:
+        assert cv2.imwrite(str(folder / f"{name}.png"), np.full((16, 24, 3), code, np.uint8))
+
+    for place, name in enumerate("abcd"):
+        draw(name, 50 * place)
+    sources = find_pictures(folder)
+    killed_after(7, lambda: one_shard(lut, out, sources=sources))
+    draw("a", 9)
+    draw("d", 10)
+    done = made_after(monkeypatch, lambda seen: one_shard(lut, out, seen, sources=sources))
+    assert done == (4, 4, [0, 1, 6, 7]), "of d one image was finished"
+    one_shard(lut, tmp_path / "whole", sources=sources)
+    assert contents(out) == contents(tmp_path / "whole")
+
+
+def test_images_of_a_picture_that_is_gone_do_not_count(
+    make_lut: Callable[..., Lut], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    lut, out, folder = make_lut(), tmp_path / "out", tmp_path / "pictures"
+    folder.mkdir()
+    for name in "abcd":
+        assert cv2.imwrite(str(folder / f"{name}.png"), np.full((16, 24, 3), ord(name), np.uint8))
+    sources = find_pictures(folder)
+    killed_after(5, lambda: one_shard(lut, out, sources=sources))
+    (folder / "a.png").unlink()
+    done = made_after(monkeypatch, lambda seen: one_shard(lut, out, seen, sources=sources))
+    assert done == (3, 3, [5, 6, 7])
+    assert len(open_dataset(out).entries) == 6
+
+
 def dies_at(step: int, below: Path, action: Callable[[], object]) -> bool:
     """Call `action` in a process that is killed right before its file operation number `step` below a folder.
 
@@ -128,10 +313,13 @@ def test_a_kill_at_any_file_operation_is_gone_on_from(make_lut: Callable[..., Lu
     assert step > 40
 
 
-@pytest.mark.parametrize("layout", get_args(Layout))
+@pytest.mark.parametrize(("layout", "begun"), [*((layout, False) for layout in get_args(Layout)), ("folder", True)])
 def test_a_record_is_written_when_its_files_are_on_the_disk(
-    make_lut: Callable[..., Lut], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, layout: str
+    make_lut: Callable[..., Lut], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, layout: str, begun: bool
 ) -> None:
+    lut = make_lut()
+    if begun:
+        killed_after(3, lambda: make(lut, tmp_path / "out", layout=layout, shard_images=5))
     synced: set[int] = set()
     checked: list[str] = []
     fsync, commit = os.fsync, Workplace.commit
@@ -150,7 +338,7 @@ def test_a_record_is_written_when_its_files_are_on_the_disk(
     monkeypatch.setattr(plain_files, "_SYNCED_IMAGES", 2)
     monkeypatch.setattr(os, "fsync", noted)
     monkeypatch.setattr(Workplace, "commit", checking)
-    make(make_lut(), tmp_path / "out", layout=layout, workers=2, shard_images=5)
+    make(lut, tmp_path / "out", layout=layout, workers=2, shard_images=5)
     assert len(checked) >= 2
 
 

@@ -24,6 +24,7 @@ from evaluation.experiments.transfer.outcome import (
     beside_table,
     errors_table,
     figures_of,
+    harm_notes,
     forest_plot,
     intervals_table,
     long_table,
@@ -93,6 +94,9 @@ def test_beside_real_images_a_row_is_held_to_the_better_of_what_it_was_made_of()
     assert held["generated", "20"] == ("generated", pytest.approx(0.9))
     assert held["generated", "all"] == ("real", pytest.approx(0.8))
     assert held["naive", "20"] == ("naive", pytest.approx(1.2))
+    (harmful,) = harm_notes(found)
+    assert "naive" in harmful
+    assert "1.20" in harmful
     (naive,) = found.to_naive_adapted
     assert (naive.row.real, naive.ratios[0].value) == ("20", pytest.approx(0.5))
     # They are neither among the rows without real images nor in ratios of those.
