@@ -24,8 +24,8 @@ from evaluation.experiments.transfer.outcome import (
     beside_table,
     errors_table,
     figures_of,
-    harm_notes,
     forest_plot,
+    harm_notes,
     intervals_table,
     long_table,
     naive_ratios_table,
@@ -95,7 +95,7 @@ def test_beside_real_images_a_row_is_held_to_the_better_of_what_it_was_made_of()
     assert held["generated", "all"] == ("real", pytest.approx(0.8))
     assert held["naive", "20"] == ("naive", pytest.approx(1.2))
     (harmful,) = harm_notes(found)
-    assert "naive" in harmful
+    assert "linear sRGB" in harmful
     assert "1.20" in harmful
     (naive,) = found.to_naive_adapted
     assert (naive.row.real, naive.ratios[0].value) == ("20", pytest.approx(0.5))
