@@ -6,10 +6,10 @@ mean in logarithms, the first with the weight w.
 
 w begins with stacking (L. Breiman, "Stacked regressions", Machine Learning 24, 1996) under a prior. The least sum of
 errors on the N, each estimated by models that have not seen it, would choose it, and on twenty images choose badly;
-so that much is added for a w other than `WORTH` / (`WORTH` + N) as `STRENGTH` images would: what was learned
-elsewhere is taken to be worth as much as `WORTH` images. Held-out models learn of fewer than N and are worse than
-what they stand for, and what was learned elsewhere does not grow better with N: so w is multiplied by `WORTH`² /
-(`WORTH`² + N²), and from many images on little is left of it whatever stacking says. No image that is tested on has a
+so that much is added for a w other than W / (W + N) as `STRENGTH` images would: what was learned elsewhere is taken
+to be worth as much as W images, `WORTH`. Held-out models learn of fewer than N and are worse than
+what they stand for, and what was learned elsewhere does not grow better with N: so w is multiplied by W² /
+(W² + N²), and from many images on little is left of it whatever stacking says. No image that is tested on has a
 part in it.
 
 `WORTH`, `STRENGTH` and how each method tunes were chosen by docs/transfer.md#what-was-chosen-and-on-what.
