@@ -75,11 +75,9 @@ def run(command: Callable[[], object], *, keeps: bool = True, loads: bool = Fals
     try:
         # What is still to be printed fails here, where it can be judged, and not while the interpreter ends.
         sys.stdout.flush()
-    except BrokenPipeError:
-        _abandon_stdout()
     except OSError as error:
         say_error(f"cannot print: {error.strerror}; give the output another place and run again")
-        _abandon_stdout()
+        _abandon(sys.stdout.fileno())
         return code or StorageError.exit_code
     return code
 
@@ -111,7 +109,7 @@ class _Output(FileIO):
         try:
             return super().write(data)
         except BrokenPipeError:
-            os.dup2(os.open(os.devnull, os.O_WRONLY), self.fileno())
+            _abandon(self.fileno())
             return super().write(data)
 
 
@@ -143,9 +141,6 @@ def _outcome(command: Callable[[], object], keeps: bool) -> int:
         return error.exit_code
     except KeyboardInterrupt:
         return _interrupted(keeps)
-    except BrokenPipeError:
-        _abandon_stdout()
-        return 0
     except OSError as error:
         named = isinstance(error.filename, str | bytes)
         remedy = disk_remedy_of(error)
@@ -169,10 +164,6 @@ def _outcome(command: Callable[[], object], keeps: bool) -> int:
     except SystemExit as error:
         if error.code == EXIT_INTERRUPTED:
             return _interrupted(keeps)
-        if isinstance(error.__context__, BrokenPipeError):
-            # Click ends with 1 there.
-            _abandon_stdout()
-            return 0
         return error.code if isinstance(error.code, int) else int(error.code is not None)
     return 0
 
@@ -186,9 +177,9 @@ def _has_lost_its_folder() -> bool:
     return False
 
 
-def _abandon_stdout() -> None:
-    """Print into nothing from now on: the reader of our output left (head, a closed pager), which is no fault."""
-    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+def _abandon(descriptor: int) -> None:
+    """Print into nothing from now on: what is printed there cannot be written."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), descriptor)
 
 
 def _interrupted(keeps: bool) -> int:
