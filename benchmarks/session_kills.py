@@ -34,6 +34,7 @@ from collections import Counter
 from collections.abc import Callable
 from contextlib import suppress
 from datetime import datetime
+from functools import partial
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -324,6 +325,22 @@ def telling(phase: Callable[[str], object], owner: Any, name: str, what: str) ->
     setattr(owner, name, told)
 
 
+def counted_run(blank: Path, scratch: Path, take_it: Callable[[Path], object]) -> tuple[int, float]:
+    """Return how many operations an undisturbed run of a copy of `blank` has, and how many seconds it takes."""
+    folder, count = scratch / "counted", scratch / "count"
+    shutil.copytree(blank, folder)
+    most = [0]
+
+    def work() -> None:
+        counting(lambda number: most.__setitem__(0, number))
+        take_it(folder)
+        count.write_text(str(most[0]))
+
+    begun = time.perf_counter()
+    assert in_child(work) == 0
+    return int(count.read_text()), time.perf_counter() - begun
+
+
 class TroubledSessions:
     """Sessions in trouble that are killed by chance and then taken to their end.
 
@@ -340,22 +357,8 @@ class TroubledSessions:
         self.blank = scratch / "blank"
         steps = plan_steps(LIGHTS, 3, response=RESPONSES)
         Session.create(self.blank, TROUBLED.to_toml(), design_chart(bits=1), LIGHTS, steps).close()
-        self.operations = self._operations()
-
-    def _operations(self) -> int:
-        folder, told = self.scratch / "counted", self.scratch / "count"
-        shutil.copytree(self.blank, folder)
-        most = [0]
-
-        def work() -> None:
-            counting(lambda number: most.__setitem__(0, number))
-            take_troubled(folder, self._tell)
-            told.write_text(str(most[0]))
-
-        begun = time.perf_counter()
-        assert in_child(work) == 0
-        self.seconds = time.perf_counter() - begun
-        return int(told.read_text())
+        taken = partial(take_troubled, phase=self._tell)
+        self.operations, self.seconds = counted_run(self.blank, scratch, taken)
 
     def _tell(self, what: str) -> None:
         self.phase[0] = PHASES.index(what)
@@ -445,21 +448,7 @@ class KilledSessions:
         assert in_child(lambda: take(undisturbed)) == 0
         self.seconds = time.perf_counter() - begun
         self.expected = contents(undisturbed)
-        self.operations = self._operations()
-
-    def _operations(self) -> int:
-        """Return how many operations an undisturbed run has."""
-        folder, told = self.scratch / "counted", self.scratch / "count"
-        shutil.copytree(self.blank, folder)
-        most = [0]
-
-        def work() -> None:
-            counting(lambda number: most.__setitem__(0, number))
-            take(folder)
-            told.write_text(str(most[0]))
-
-        assert in_child(work) == 0
-        return int(told.read_text())
+        self.operations, _ = counted_run(self.blank, scratch, take)
 
     def session(self) -> None:
         """Kill a session some times, take it to its end, and compare."""
