@@ -75,7 +75,7 @@ from drivers.ptp.codes import (
     ResponseCode,
     WhiteBalance,
 )
-from drivers.ptp.datasets import Cursor, DeviceInfo, StorageInfo, decode_u32_array
+from drivers.ptp.datasets import Cursor, DeviceInfo, StorageInfo, decode_u32_array, describe
 from drivers.ptp.session import (
     PASSING,
     PASSING_LIMIT_S,
@@ -664,7 +664,7 @@ class EosBody:
             return
         came = self.state.values.get(code)
         raise DeviceRefused(
-            f"{self.label} was given {value.hex()} for property 0x{code:04x} and reports "
+            f"{self.label} was given {value.hex()} for property {describe(Property, code)} and reports "
             f"{came.hex() if came is not None else 'nothing'}; set it by hand, or switch the camera off and on"
         )
 

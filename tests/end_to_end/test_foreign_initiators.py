@@ -5,6 +5,10 @@ both connections and a session; tmshort/pjlink-go (Go) asks a projector and ligh
 index: their tests run where clones of them lie in the folder that CROP_FOREIGN names (libpict, ptpip, pjlink-go), and a
 compiler is there; tried with libpict a2babff7a, ptpip 13101e37b and pjlink-go bc14387d4.
 
+vcam (petabyt/vcam, C) holds what an EOS 1300D answered when first asked for events, and what its author's own
+reader made of it; ours is held against that (tried with 47260ba). As a responder it takes no frame and tells no change:
+it is no peer beyond being refused.
+
 ptpy 0.3.2 asks for construct 2.8.8, with which its PTP/IP does not work; with 2.8.12 it does. So it is in no extra:
 continuous integration installs both (`.ci/run`). Its Canon extension divides record sizes by `/`, as Python 2 did, and
 reads no events on Python 3; so it is used as any still camera's initiator.
@@ -15,6 +19,7 @@ from __future__ import annotations
 import hashlib
 import importlib.util
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -23,7 +28,12 @@ from pathlib import Path
 
 import pytest
 
+from drivers.camera import ExposureSettings
+from drivers.canon.camera import EosState, plan, shutter_speeds
+from drivers.canon.records import decode_events
 from drivers.projector import Power
+from drivers.ptp.codes import Property
+from foundation.errors import DeviceRefused
 from sim.buses.ptp import serve_ptpip
 from sim.camera.bodies import TEST_BODY
 from sim.camera.eos import SimulatedEos
@@ -197,6 +207,29 @@ int main(int argc, char **argv) {
 	return 0;
 }
 """
+
+
+def test_the_recording_of_a_1300d_is_read_as_another_reader_reads_it() -> None:
+    source = source_of("vcam", sys.executable)
+    state = EosState()
+    state.take(decode_events((source / "bin/eos/eos_events.bin").read_bytes()))
+    theirs = {
+        int(code, 16): tuple(int(value, 16) for value in re.findall(r"0x[0-9A-F]+", values))
+        for values, code in re.findall(
+            r"uint32_t avail_list_\w+\[\] = \{(.*?)\};\s+vcam_set_prop_avail\(cam, (0x\w+)",
+            (source / "src/canon/props.c").read_text(),
+        )
+    }
+    for code in (Property.EOS_SHUTTER_SPEED, Property.EOS_ISO_SPEED, Property.EOS_DRIVE_MODE):
+        assert len(theirs[code]) > 4
+        assert state.lists[code] == theirs[code]
+    assert len(shutter_speeds(state)) == len(theirs[Property.EOS_SHUTTER_SPEED]) - 1  # of which the first is bulb
+    assert (min(shutter_speeds(state)), max(shutter_speeds(state))) == (1 / 4000, 30)
+    # It stood on a self-timer, without a lens: both are said before a frame is taken.
+    with pytest.raises(DeviceRefused) as refused:
+        plan(state, ExposureSettings(400, 5.6, 1 / 30))
+    assert "timer" in str(refused.value)
+    assert 'aperture = "none"' in str(refused.value)
 
 
 @pytest.fixture
