@@ -58,6 +58,9 @@ SIMULATED: Final = "measured on simulated frames"
 Range = tuple[float | None, float | None]
 """Lowest and highest value; None where open."""
 
+_SMALL = 1e-7
+"""Below it a figure is nothing: every limit that is not 0 is a thousand times as high and more (rounding of sums)."""
+
 _LARGE = 1000.0
 """From here on three significant digits would be written with an exponent."""
 
@@ -250,8 +253,10 @@ def worst_outcome(outcomes: Iterable[Outcome]) -> Outcome:
 def format_value(value: float, unit: str) -> str:
     """Return a value for people: shares as per cent, three significant digits, two of an angle.
 
-    `unit` is that of `Figure.unit`.
+    `unit` is that of `Figure.unit`. What no limit tells from nothing is 0.
     """
+    if abs(value) < _SMALL:
+        value = 0.0
     if unit == "share":
         return f"{100 * value:.3g} %"
     if unit == "°":

@@ -307,9 +307,23 @@ _BARS_APART = 40
 
 
 def _ring(axes: Any, x: float, y: float, text: str) -> None:
-    """Ring a point of a plot and name it."""
+    """Ring a point of a plot and name it; at the plot's edges the name is turned inwards."""
     axes.plot([x], [y], "o", markersize=11, markerfacecolor="none", markeredgecolor=MARK, markeredgewidth=1.4)
-    axes.annotate(text, (x, y), xytext=(8, 8), textcoords="offset points", color=MARK, fontsize=8)
+    (left, right), (low, high) = axes.get_xlim(), axes.get_ylim()
+    across, up = (x - left) / (right - left), (y - low) / (high - low)
+    axes.annotate(
+        text,
+        (x, y),
+        xytext=(-8 if across > _EDGE else 8, -14 if up > _EDGE else 8),
+        textcoords="offset points",
+        ha="right" if across > _EDGE else "left",
+        color=MARK,
+        fontsize=8,
+    )
+
+
+_EDGE = 0.7
+"""Share of a plot's width and height beyond which a name would leave it."""
 
 
 def _ring_largest(axes: Any, values: Any, table: TableMeasurements, least: bool = False) -> None:
@@ -500,6 +514,8 @@ def draw_noise(figure: Any, noise: tuple[_Array, _Array], transfer: PhotonTransf
         model = transfer.variance(np.repeat(grid[:, None], 3, axis=1))[:, channel]
         gain = transfer.gain_e[channel]
         name = f"{'RGB'[channel]}: {gain:.2f} e⁻ a count, read {transfer.read_noise[channel]:.1f} counts"
+        if lit.sum() < _LEAST_LEVELS:
+            name = f"{'RGB'[channel]}: too few levels for the camera's gain"
         left.loglog(at[lit], seen[lit], ".", color=CHANNEL_INK[channel], markersize=4)
         left.loglog(grid, model, "-", color=CHANNEL_INK[channel], linewidth=0.9, label=name)
         right.semilogx(at[lit], at[lit] / np.sqrt(seen[lit]), ".", color=CHANNEL_INK[channel], markersize=4)
@@ -513,6 +529,9 @@ def draw_noise(figure: Any, noise: tuple[_Array, _Array], transfer: PhotonTransf
         axes.minorticks_off()
         axes.grid(color=FAINT, alpha=0.25, linewidth=0.5)
 
+
+_LEAST_LEVELS = 6
+"""Levels from which on the curve's three parameters are told as the camera's (chosen: twice as many)."""
 
 _LEAST_CIRCLE = 0.012
 """Radius of a circle at least, as a share of the page's width: one about a single cell is not seen in a thumbnail."""
@@ -555,7 +574,10 @@ def draw_places(figure: Any, picture: _Image, chart: Chart, registration: Regist
         axes.plot(ring[:, 0], ring[:, 1], color=MARK, linewidth=1.8)
         if tuple(here) not in named:
             named.add(tuple(here))
-            x, y = ring[np.argmin(ring[:, 0] + ring[:, 1])]
+            # Of a circle that reaches beyond the frame the number stands at what is seen of it.
+            seen = ring[((ring > (0.02 * width, 0.03 * height)) & (ring < (width, height))).all(axis=1)]
+            corners = seen if len(seen) else ring
+            x, y = corners[np.argmin(corners.sum(axis=1))]
             box = {"facecolor": MARK, "edgecolor": "white", "boxstyle": "round,pad=0.25"}
             axes.text(x, y, ", ".join(map(str, here)), color="white", weight="bold", ha="right", va="bottom", bbox=box)
     axes.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5), xticks=[], yticks=[])

@@ -57,6 +57,7 @@ def test_the_worst_row_is_the_verdict() -> None:
         (0.0034, "px RMS", "0.0034 px RMS"),
         (12345.6, "counts", "12346 counts"),
         (2.0, "", "2"),
+        (3.86e-29, "share", "0 %"),
     ],
 )
 def test_a_value_is_shown_with_its_unit(value: float, unit: str, text: str) -> None:
