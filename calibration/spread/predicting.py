@@ -168,12 +168,17 @@ def _left_by_others(root: _Array, usable: _Mask, bits: int) -> tuple[_Array, _Ar
 
 def _likeliest(function: _Array, noise: _Array, root: _Array, *shares: float) -> tuple[_Array, float]:
     """Return the inverse (C, C) of the covariance whose noise has the likeliest share of the function, and that."""
+    from scipy.linalg import cholesky, lapack, solve_triangular
+
     found: list[tuple[float, float, _Array]] = []
     for share in shares or _NOISES:
-        factor = np.asarray(np.linalg.cholesky(function + np.diag(share**2 * noise)), dtype=np.float64)
-        inner = np.linalg.solve(factor, root)
+        # Symmetric, and so in LAPACK's order as well.
+        covariance = (function + np.diag(share**2 * noise)).T
+        factor: _Array = cholesky(covariance, lower=True, overwrite_a=True, check_finite=False)
+        inner = solve_triangular(factor, root, lower=True, check_finite=False)
         size = float(inner @ inner) / len(root)
         found.append((0.5 * len(root) * np.log(size) + float(np.log(np.diag(factor)).sum()), share, factor))
     _, share, factor = min(found, key=lambda one: one[:2])
-    half = np.linalg.solve(factor, np.eye(len(root)))
-    return half.T @ half, share
+    # LAPACK inverts what it factored in a fourth of the time of a general solution, one triangle of it.
+    lower = np.tril(lapack.dpotri(factor, lower=1)[0])
+    return lower + np.tril(lower, -1).T, share

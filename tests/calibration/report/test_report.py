@@ -32,8 +32,8 @@ def test_the_report_names_and_circles_a_hand(lab: Lab, tmp_path: Path) -> None:
         build(session, out, report=write_report, judged_by=limits)
     page = (tmp_path / "lut.refused" / "report.html").read_text()
     assert "<b>hand or object in one frame</b>" in page
-    assert "<h2>Where it is: 0004_white</h2><img" in page
-    assert "<h2>What the field leaves</h2><img" in page
+    assert "<h2>Where it is: 0004_white</h2><div class='scroll'><img" in page
+    assert "<h2>What the field leaves</h2><div class='scroll'><img" in page
     assert re.search(r"<details id='radiometry' open>.*worst: frames/0004_white\.dng, \d+, \d+ mm", page, re.DOTALL)
     assert page.index("To be taken again") < page.index("<h2>Probable causes</h2>") < page.index("<details")
     (found,) = json.loads((tmp_path / "lut.refused" / "report.json").read_text())["causes"]
