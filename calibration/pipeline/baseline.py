@@ -35,7 +35,7 @@ from calibration.citation import Rig, StatedOrigin
 from calibration.radiometry.dark_frames import DarkLightEstimate, reflectances
 from calibration.radiometry.greys import GreyLevels, PhotonTransfer, photon_transfer
 from calibration.radiometry.primaries import Primaries, pure_lights
-from calibration.radiometry.superposition import Superposition, printed_predictors, superposition
+from calibration.radiometry.superposition import MOVED, NO_PRIMARIES, Superposition, printed_predictors, superposition
 from calibration.registration.register import Registration, register
 from calibration.sampling import WINDOW, WINDOWS, Sites, gather, gather_means, sites_at
 from calibration.spread.added_light import AddedLight, added_light
@@ -467,10 +467,10 @@ def with_primaries(baseline: Baseline, primaries: Primaries | None) -> Baseline:
 
 
 def with_superposition(baseline: Baseline, first: DecodedFrame, primaries: Sequence[DecodedFrame]) -> Baseline:
-    """Return the baseline with what the first frame shows of linearity beside the primaries; as it is without them."""
-    frames = [first, *primaries]
+    """Return the baseline with what the first frame shows of linearity beside the primaries."""
+    frames, full = [first, *primaries], float(first.saturation - first.black.mean())
     if not primaries or not all(_is_still(baseline, decoded) for decoded in frames):
-        return baseline
+        return replace(baseline, superposition=Superposition.usual(full, MOVED if primaries else NO_PRIMARIES))
     seen, peaks = zip(*(baseline.patches(one.mosaic, one.black) for one in frames), strict=True)
     clipped = [peak >= CLIPPING_SHARE * one.saturation for peak, one in zip(peaks, frames, strict=True)]
     usable = np.isfinite(seen).all(axis=(0, 2)) & ~np.any(clipped, axis=0)
@@ -480,7 +480,7 @@ def with_superposition(baseline: Baseline, first: DecodedFrame, primaries: Seque
     found = superposition(
         seen[1:],
         seen[0],
-        float(first.saturation - first.black.mean()),
+        full,
         usable,
         printed_predictors(chart.rgb[chart.cell_of_colour], printed),
         white=first.record.kind == "white",
