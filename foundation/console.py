@@ -146,7 +146,7 @@ def _outcome(command: Callable[[], object], keeps: bool) -> int:
         remedy = disk_remedy_of(error)
         # A file that is not there, and a socket that is not connected, are no fault of a disk.
         if remedy is not None and error.errno not in (errno.ENOENT, errno.ENOTCONN):
-            about = os.fsdecode(error.filename) if named else "the disk"
+            about = os.fsdecode(error.filename) if named else _full_output() or "the disk"
             doing = "write" if error.errno in _WRITING_FAULTS else "use"
             say_error(f"cannot {doing} {about}: {error.strerror}; {remedy}")
             return StorageError.exit_code
@@ -166,6 +166,17 @@ def _outcome(command: Callable[[], object], keeps: bool) -> int:
             return _interrupted(keeps)
         return error.code if isinstance(error.code, int) else int(error.code is not None)
     return 0
+
+
+def _full_output() -> str:
+    """Return the output that cannot take what is still to be printed, in words; "" where both can."""
+    for stream, name in ((sys.stdout, "standard output"), (sys.stderr, "standard error")):
+        try:
+            stream.flush()
+        except OSError:
+            _abandon(stream.fileno())
+            return name
+    return ""
 
 
 def _has_lost_its_folder() -> bool:

@@ -139,9 +139,8 @@ def reading_error(path: Path, error: OSError, remedy: str, what: str = "") -> Fo
     """Return why `path` cannot be read: the disk's fault with its own remedy, else the file's with `remedy`."""
     of_disk = disk_remedy_of(error) if error.errno != errno.ENOENT else None
     named = f"{what} {path}" if what else str(path)
-    return (StorageError if of_disk else FormatError)(
-        f"cannot read {named}: {error.strerror or error}; {of_disk or remedy}"
-    )
+    kind = StorageError if of_disk else FormatError
+    return kind(f"cannot read {named}: {error.strerror or error}", remedy=of_disk or remedy)
 
 
 def read_text(path: Path, remedy: str, what: str = "") -> str:

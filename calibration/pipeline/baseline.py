@@ -16,6 +16,7 @@ C cells, W white references, N grey references; places on the print in millimetr
 from __future__ import annotations
 
 import hashlib
+import logging
 import tomllib
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
@@ -67,6 +68,8 @@ from experiment.session.records import FrameRecord
 from foundation.errors import CropError, FormatError, InputError
 from foundation.files import file_sha256, read_whole
 from foundation.robust import huber_weights, sigma_of
+
+_log = logging.getLogger(__name__)
 
 _Array = npt.NDArray[np.float64]
 
@@ -796,7 +799,10 @@ def stated_origin(session: Session) -> StatedOrigin:
         rig: Rig | None = next((known for known in _RIGS if known == document.get("rig")), None)
         citation = CitationSettings.model_validate(document.get("citation", {}))
         set_by = CameraSettings.model_validate(document["camera"]) if rig in _SETTING_RIGS else None
-    except (CropError, ValidationError, ValueError, KeyError, RecursionError):
+    except (CropError, ValidationError, ValueError, KeyError, RecursionError) as error:
+        if isinstance(error, CropError | tomllib.TOMLDecodeError):
+            why = error if isinstance(error, CropError) else f"{session.folder / 'session.toml'} is not TOML: {error}"
+            _log.warning("%s; the table states neither its origin nor its authors, exposure and licence", why)
         return StatedOrigin(CitationSettings(), None, None, session.journal.records())
     return StatedOrigin(citation, rig, set_by, session.journal.records())
 
