@@ -98,10 +98,14 @@ def _make_printable() -> None:
                 setattr(sys, name, _patient(stream))
 
 
+_OUTPUTS = {1: "standard output", 2: "standard error"}
+"""What the descriptors are called where they cannot take what is printed."""
+
+
 class _Output(FileIO):
     """A descriptor that takes what is printed also when the reader has left (head, a closed pager).
 
-    That is no fault, and no reason to leave a job half done that ends with 0.
+    That is no fault, and no reason to leave a job half done that ends with 0. Where it is full the error names it.
     """
 
     def write(self, data: ReadableBuffer) -> int:
@@ -111,6 +115,8 @@ class _Output(FileIO):
         except BrokenPipeError:
             _abandon(self.fileno())
             return super().write(data)
+        except OSError as error:
+            raise OSError(error.errno, error.strerror, _OUTPUTS.get(self.fileno())) from error
 
 
 def _patient(stream: Any) -> TextIOWrapper:
@@ -146,7 +152,9 @@ def _outcome(command: Callable[[], object], keeps: bool) -> int:
         remedy = disk_remedy_of(error)
         # A file that is not there, and a socket that is not connected, are no fault of a disk.
         if remedy is not None and error.errno not in (errno.ENOENT, errno.ENOTCONN):
-            about = os.fsdecode(error.filename) if named else _full_output() or "the disk"
+            about = os.fsdecode(error.filename) if named else "the disk"
+            if about in _OUTPUTS.values():
+                _abandon(next(number for number, name in _OUTPUTS.items() if name == about))
             doing = "write" if error.errno in _WRITING_FAULTS else "use"
             say_error(f"cannot {doing} {about}: {error.strerror}; {remedy}")
             return StorageError.exit_code
@@ -166,17 +174,6 @@ def _outcome(command: Callable[[], object], keeps: bool) -> int:
             return _interrupted(keeps)
         return error.code if isinstance(error.code, int) else int(error.code is not None)
     return 0
-
-
-def _full_output() -> str:
-    """Return the output that cannot take what is still to be printed, in words; "" where both can."""
-    for stream, name in ((sys.stdout, "standard output"), (sys.stderr, "standard error")):
-        try:
-            stream.flush()
-        except OSError:
-            _abandon(stream.fileno())
-            return name
-    return ""
 
 
 def _has_lost_its_folder() -> bool:

@@ -322,7 +322,7 @@ class Terminal:
 
     def announce(self, sentence: str) -> None:
         """Print a line that stays."""
-        print(sentence, file=sys.stderr)
+        _print(sentence)
 
     def state(self, sentence: str) -> None:
         """Show what the run waits for, until the next frame."""
@@ -335,4 +335,10 @@ class Terminal:
         now = self._clock()
         if self._plain and (at_once or now >= self._plain_due):
             self._plain_due = now + PLAIN_S
-            print(f"{datetime.now().astimezone():%H:%M:%S} {line}", file=sys.stderr)
+            _print(f"{datetime.now().astimezone():%H:%M:%S} {line}")
+
+
+def _print(line: str) -> None:
+    # A log on a disk that is full for a while ends no run: the journal has what counts.
+    with suppress(OSError):
+        print(line, file=sys.stderr)

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import errno
+import io
+
 import pytest
 
 from acquisition.run.notices import PLAIN_S, Terminal, TimeLeft, verdict_line
@@ -64,3 +67,17 @@ def test_a_run_into_a_file_has_a_line_now_and_then(capsys: pytest.CaptureFixture
     assert "90 of 200 frames, left 3 min 40 s, light 5 accepted, light 0.2°" in lines[6]
     assert "200 of 200 frames, light 5 accepted" in lines[-1]
     assert "━" not in "".join(lines)
+
+
+class FullOutput(io.StringIO):
+    """An output whose disk is full."""
+
+    def write(self, text: str) -> int:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+
+def test_a_log_on_a_full_disk_ends_no_run(monkeypatch: pytest.MonkeyPatch) -> None:
+    with Terminal() as terminal:
+        monkeypatch.setattr("sys.stderr", FullOutput())
+        terminal.announce("refused: light 5: too dark")
+        terminal.progress(0, 2)
