@@ -413,6 +413,14 @@ class StyledCommand(TyperCommand):
         super().__init__(*arguments, **named)
         _in_one_style(self)
 
+    def make_context(self, *arguments: Any, **named: Any) -> Any:
+        """Return the context of parsed arguments; what is wrong with a value is said without a library's words."""
+        try:
+            return super().make_context(*arguments, **named)
+        except typer.BadParameter as error:
+            error.message = error.message.removeprefix("Value error, ")
+            raise
+
     def get_help_option(self, ctx: Any) -> Any:
         """Return the option ``--help`` without a type."""
         return _untyped(super().get_help_option(ctx))
