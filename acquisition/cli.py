@@ -451,6 +451,8 @@ def monitor(
     from acquisition.monitor.serving import open_monitor
 
     with open_monitor(session, port, host) as server:
+        if not server.has_session:
+            print(f"{session} holds no session yet; the page waits until acquire run begins one there")
         server.serve(str(session), "can look at the session")
 
 

@@ -23,6 +23,26 @@ BEYOND = " (beyond; it follows from another cause, or is followed)"
 """What marks a value outside its limits that refused no frame."""
 
 
+MEANINGS = {
+    "data": "photosites without counts",
+    "clipping": "photosites that are clipped",
+    "exposure": "brightest photosites, of saturation",
+    "chart": "tags found, or references on a chart without",
+    "repeated": "noise of the difference to earlier frames, of that of independent ones",
+    "movement": "of the chart, from where it lies at rest",
+    "blur": "of the print, softer than in the first white frame",
+    "rows": "strips of rows that show what belongs elsewhere",
+    "uniformity": "the tile that deviates most from the frame's light",
+    "light": "from the light ordered to the one seen",
+    "lamp": "brighter than foretold from the frames before",
+    "ambient": "light from elsewhere, of white",
+    "dark": "light in the dark frame, of white",
+    "white drift": "brightness of white since the first white frame",
+    "additivity": "white beyond the sum of the primaries",
+}
+"""What the numbers of the checks are, for who has not read docs/how-to/night-run.md."""
+
+
 def status_lines(view: SessionView, now: datetime) -> list[str]:
     """Return a session's state for people, line by line."""
     head = view.head(now)
@@ -35,7 +55,7 @@ def status_lines(view: SessionView, now: datetime) -> list[str]:
     ]
     if (drift := _white_drift(view)) is not None:
         lines.append(f"white   {drift:+.2%} since the first white frame")
-    lines += [f"  {_check_text(check)}" for check in _newest_checks(view).values()]
+    lines += _block("last measured", [check_text(check) for check in _newest_checks(view).values()])
     judged = [attempt for attempt in view.attempts if attempt.verdict is not None]
     lines += _block("last verdicts", [_verdict_text(attempt) for attempt in judged[-LAST:]])
     lines += _block("without an accepted frame", list(_open_reasons(view).values()))
@@ -109,16 +129,22 @@ def _verdict_text(attempt: AttemptView) -> str:
     return f"{attempt.file}: {attempt.verdict}{': ' if attempt.reason else ''}{attempt.reason}"
 
 
-def _check_text(check: Check) -> str:
-    """Return what was found and what is allowed."""
+def check_text(check: Check) -> str:
+    """Return what was found, what is allowed, and what the number is."""
     unit = f" {check.unit}" if check.unit else ""
-    limits = {
-        (False, False): "",
-        (False, True): f", at most {check.high}",
-        (True, False): f", at least {check.low}",
-        (True, True): f", {check.low} to {check.high}",
-    }[check.low is not None, check.high is not None]
-    return f"{check.name} {check.value:.4g}{unit}{limits}{BEYOND if check.is_beyond and check.passed else ''}"
+    sign = "+" if check.low is not None and check.low < 0 else ""
+    match check.low, check.high:
+        case None, None:
+            allowed = "; no limits before more frames tell how it scatters" if check.name == "lamp" else ""
+        case None, high:
+            allowed = f", at most {high:.4g}{unit}"
+        case low, None:
+            allowed = f", at least {low:.4g}{unit}"
+        case low, high:
+            allowed = f", {low:+.4g} to {high:+.4g}{unit} allowed"
+    meaning = f" ({MEANINGS[check.name]})" if check.name in MEANINGS else ""
+    beyond = BEYOND if check.is_beyond and check.passed else ""
+    return f"{check.name} {check.value:{sign}.4g}{unit}{allowed}{beyond}{meaning}"
 
 
 def _block(title: str, lines: list[str]) -> list[str]:

@@ -220,7 +220,7 @@ def refusal(verdict: Verdict, table: TableMeasurements, *, reported: bool = Fals
     foremost = [row for row in verdict.refused if row.figure.foremost]
     worst = (*foremost, *known, *verdict.refused)[0]
     more = f" (and {len(verdict.refused) - 1} more)" if len(verdict.refused) > 1 else ""
-    detail, remedy = _found(worst.figure, table)
+    detail, remedy = detail_and_remedy(worst.figure, table)
     finding = found.get(worst.figure.name)
     if finding is not None and finding.is_known:
         remedy = finding.decision.cause.remedy
@@ -236,16 +236,16 @@ def refusal(verdict: Verdict, table: TableMeasurements, *, reported: bool = Fals
 def remark(row: JudgedValue, table: TableMeasurements) -> str:
     """Return a row that is remarked on: value, expectation, place, cause, remedy and command, in a line."""
     finding, again = explain(row.figure, table), ""
-    _, remedy = _found(row.figure, table)
+    detail, remedy = detail_and_remedy(row.figure, table)
     if finding is not None and finding.is_known:
         remedy = finding.decision.cause.remedy
         if finding.is_of_frames:
             again = f", and take {counted(len(finding.frames), 'frame')} again: {retake_command(finding.frames)}"
-    return f"{_with_place(row, table)}; {_cause_text(finding)}{remedy}{again}"
+    return f"{_with_place(row, table)}{detail}; {_cause_text(finding)}{remedy}{again}"
 
 
-def _found(figure: Figure, table: TableMeasurements) -> tuple[str, str]:
-    """Return what a refusal adds to a figure's value, and its remedy."""
+def detail_and_remedy(figure: Figure, table: TableMeasurements) -> tuple[str, str]:
+    """Return what is added to a figure's value beyond a limit, "" where nothing is, and its remedy."""
     found = None if figure.found is None else figure.found(table)
     return ("", figure.remedy) if found is None else found
 

@@ -58,7 +58,14 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _require_methods_in_place(command: str, words: Sequence[str]) -> None:
-    """Refuse `cv --method METHOD` and `run METHOD DATA`, each of which is how the other is written."""
+    """Refuse `cv --method METHOD` and `run METHOD DATA`, each of which is how the other is written, and `--model`."""
+    for word, behind in pairwise([*words, "MODEL.npz"]):
+        name, _, value = word.partition("=")
+        if name == "--model":
+            model = value or behind
+            right = f"evaluate run DATA --method {model}"
+            right += f", or evaluate train METHOD DATA --adapt {model}" if command == "train" else ""
+            raise InputError(f"there is no --model: a model that evaluate train has made is a method: {right}")
     if command in ("cv", "train"):
         for word, behind in pairwise([*words, "METHOD"]):
             name, _, value = word.partition("=")

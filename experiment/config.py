@@ -5,13 +5,15 @@ Nothing here opens anything: paths are resolved against the file's folder, value
 
 from __future__ import annotations
 
+import json
 import math
 import os
+import re
 import shlex
 import tomllib
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar, cast
+from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, TypeVar, cast
 from urllib.parse import urlsplit
 
 import tomli_w
@@ -32,11 +34,17 @@ from foundation.files import read_text
 from foundation.records import unknown_key
 from foundation.secret_texts import MASK, is_webhook, target_label
 
+if TYPE_CHECKING:
+    from pydantic_core import ErrorDetails
+
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 
 _SECRETS = ("sequence.notify", "notify.alive", "lab.projector.password")
 """Keys whose values are in no message, nor in `session.toml`: a session is copied, shown and published."""
+
+NOT_TO_CHOOSE: Final = "imported"
+"""The rig of a session of which nothing more can be taken: no one writes it into LAB.toml."""
 
 _SECRET_BYTES = 4096
 """A file that is named for a secret is read as far as this: passwords and addresses are shorter, and a file that is
@@ -90,6 +98,20 @@ def _f_number(value: object) -> float | Literal["none"]:
     if isinstance(value, int | float) and not isinstance(value, bool) and 0 < value < math.inf:
         return float(value)
     raise ValueError('an f-number above 0 was expected, or "none" for a lens without contacts')
+
+
+def _address(host: str) -> str:
+    """Return a name or an address of the network as it is; a ValueError says what something else is."""
+    if host.startswith("/dev/") or re.fullmatch(r"COM\d+", host, re.IGNORECASE):
+        raise ValueError("a serial port, which is given as device; an address was expected, such as 192.168.1.30")
+    if "/" in host:
+        raise ValueError("an address alone was expected, such as 192.168.1.30, without http:// or a path")
+    if (parts := re.fullmatch(r"([^:\[\]]+):(\d+)", host)) is not None:
+        raise ValueError(f'an address alone was expected: write host = "{parts[1]}" and port = {parts[2]}')
+    return host
+
+
+Host = Annotated[str, AfterValidator(_address)]
 
 
 class Settings(BaseModel):
@@ -259,7 +281,7 @@ class CameraCable(Settings):
     """USB: serial number of the body, where several hang on the machine."""
     usb_port: str | None = None
     """USB: the port it is plugged into, such as 1-2.4, for bodies without a serial number on USB."""
-    host: str | None = None
+    host: Host | None = None
     """PTP/IP: address of the camera."""
     port: Annotated[int, Field(ge=1, le=65535)] = 15740
     """PTP/IP: TCP port."""
@@ -276,7 +298,7 @@ class ProjectorCable(Settings):
 
     control: Literal["none", "pjlink", "epson", "benq", "optoma", "nec"] = "none"
     """Language of its control port; none: someone switches it by hand."""
-    host: str | None = None
+    host: Host | None = None
     """Address, for PJLink and for languages over TCP."""
     port: Annotated[int, Field(ge=1, le=65535)] | None = None
     """TCP port where it is not the language's own."""
@@ -299,7 +321,7 @@ class LightSource(Settings):
     """A display of this machine that the projector mirrors, or the projector itself by command."""
     display: str | int | None = None
     """Name, position or number of the display; acquire devices lists them."""
-    host: str | None = None
+    host: Host | None = None
     """JVC: address."""
     port: Annotated[int, Field(ge=1, le=65535)] | None = None
     """JVC: TCP port."""
@@ -388,26 +410,85 @@ def parse_toml(text: str, where: str) -> dict[str, Any]:
     try:
         return tomllib.loads(text)
     except (ValueError, RecursionError) as error:
-        raise ConfigurationError(f"{where} is not TOML: {error}") from error
+        raise ConfigurationError(f"{where} is not TOML: {error}{_toml_hint(text, str(error))}") from error
+
+
+def _toml_hint(text: str, message: str) -> str:
+    """Return what helps against the mistake in a line of a TOML text, "" where nothing is known; no value of it."""
+    if message.startswith("Cannot declare"):
+        return "; a table stands in a file once: put its keys together"
+    number = re.search(r"at line (\d+)", message)
+    line = text.splitlines()[int(number[1]) - 1] if number else ""
+    _, _, value = line.partition("=")
+    if re.match(r"\s*[-+]?\d+,\d", value):
+        return "; a number has a decimal point: 8.0 and not 8,0"
+    if re.match(r"\s*[^\W\d]|\s*[/~.\u2018-\u201f]", value):
+        return '; text stands in straight quotation marks: "like this"'
+    return ""
 
 
 def checked(kind: type[_AnySettings], document: dict[str, Any], where: str) -> _AnySettings:
-    """Return the settings in a document; a ConfigurationError names the first key that cannot be used, no secret."""
+    """Return the settings in a document; a ConfigurationError names every key that cannot be used, no secret."""
     try:
         return kind.model_validate(document)
     except ValidationError as error:
-        first = error.errors()[0]
-        key = ".".join(str(part) for part in first["loc"])
-        if first["type"] == "extra_forbidden":
-            raise unknown_key(key, _known_keys(kind, first["loc"][:-1]), where) from error
-        if first["type"] == "missing":
-            raise ConfigurationError(f"{where}: {key} is missing; add it") from error
-        # What is above a secret holds it, and so does what is below it.
-        secret = any(f"{known}.".startswith(f"{key}.") or key.startswith(f"{known}.") for known in _SECRETS)
-        given = MASK if secret else repr(first["input"])
-        # The cause has the value, too.
-        reason = first["msg"].removeprefix("Value error, ")
-        raise ConfigurationError(f"{where}: {key} = {given}: {reason}") from (None if secret else error)
+        found = [_mistake(kind, one) for one in error.errors()]
+        listed = (
+            f" {found[0]}"
+            if len(found) == 1
+            else "".join([f" {len(found)} mistakes:", *(f"\n  {one}" for one in found)])
+        )
+        # The cause has the values, too.
+        secret = any(_is_secret(_key_of(one)) for one in error.errors())
+        raise ConfigurationError(f"{where}:{listed}") from (None if secret else error)
+
+
+def _key_of(error: ErrorDetails) -> str:
+    return ".".join(str(part) for part in error["loc"])
+
+
+def _is_secret(key: str) -> bool:
+    """Return whether the value of a key holds a secret: what is above one does, and so does what is below it."""
+    return any(f"{known}.".startswith(f"{key}.") or key.startswith(f"{known}.") for known in _SECRETS)
+
+
+def _mistake(kind: type[Settings], error: ErrorDetails) -> str:
+    """Return what is wrong with one key: its value, and what was expected."""
+    key, place = _key_of(error), error["loc"]
+    match error["type"]:
+        case "extra_forbidden":
+            is_table = isinstance(error["input"], dict)
+            elsewhere = _places(kind, str(place[-1]), str(place[-2]) if len(place) > 1 else "", is_table)
+            if elsewhere:
+                return f"unknown key {key!r}; did you mean {' or '.join(elsewhere)}?"
+            return unknown_key(key, _known_keys(kind, place[:-1]))
+        case "missing":
+            return f"{key} is missing; add it"
+        case "literal_error":
+            known = [name for name in re.findall(r"'([^']+)'", error["msg"]) if name != NOT_TO_CHOOSE]
+            reason = f"expected one of {', '.join(map(repr, known))}" if known else error["msg"]
+        case "tuple_type":
+            reason = "a list was expected, in square brackets"
+            if isinstance(error["input"], str):
+                reason += f": [{json.dumps(error['input'], ensure_ascii=False)}]"
+        case _:
+            reason = error["msg"].removeprefix("Value error, ")
+    return f"{key} = {MASK if _is_secret(key) else repr(error['input'])}: {reason}"
+
+
+def _places(kind: type[BaseModel], name: str, table: str, is_table: bool, above: str = "") -> list[str]:
+    """Return where a key, or table, of this name may stand; [name.table] alone for one written as [table.name]."""
+    found: list[str] = []
+    for key, field in kind.model_fields.items():
+        place, below = f"{above}{key}", field.annotation
+        if not (isinstance(below, type) and issubclass(below, BaseModel)):
+            found += [place] if key == name and not is_table else []
+            continue
+        if key == name and is_table and table in below.model_fields:
+            return [f"[{place}.{table}]"]
+        found += [f"[{place}]"] if key == name and is_table else []
+        found += _places(below, name, table, is_table, f"{place}.")
+    return found
 
 
 def _look_up_secrets(document: dict[str, Any], folder: Path, where: str) -> None:

@@ -98,10 +98,14 @@ def _make_printable() -> None:
                 setattr(sys, name, _patient(stream))
 
 
+_OUTPUTS = {1: "standard output", 2: "standard error"}
+"""What the descriptors are called where they cannot take what is printed."""
+
+
 class _Output(FileIO):
     """A descriptor that takes what is printed also when the reader has left (head, a closed pager).
 
-    That is no fault, and no reason to leave a job half done that ends with 0.
+    That is no fault, and no reason to leave a job half done that ends with 0. Where it is full the error names it.
     """
 
     def write(self, data: ReadableBuffer) -> int:
@@ -111,6 +115,8 @@ class _Output(FileIO):
         except BrokenPipeError:
             _abandon(self.fileno())
             return super().write(data)
+        except OSError as error:
+            raise OSError(error.errno, error.strerror, _OUTPUTS.get(self.fileno())) from error
 
 
 def _patient(stream: Any) -> TextIOWrapper:
@@ -147,6 +153,8 @@ def _outcome(command: Callable[[], object], keeps: bool) -> int:
         # A file that is not there, and a socket that is not connected, are no fault of a disk.
         if remedy is not None and error.errno not in (errno.ENOENT, errno.ENOTCONN):
             about = os.fsdecode(error.filename) if named else "the disk"
+            if about in _OUTPUTS.values():
+                _abandon(next(number for number, name in _OUTPUTS.items() if name == about))
             doing = "write" if error.errno in _WRITING_FAULTS else "use"
             say_error(f"cannot {doing} {about}: {error.strerror}; {remedy}")
             return StorageError.exit_code
@@ -404,6 +412,14 @@ class StyledCommand(TyperCommand):
     def __init__(self, *arguments: Any, **named: Any) -> None:
         super().__init__(*arguments, **named)
         _in_one_style(self)
+
+    def make_context(self, *arguments: Any, **named: Any) -> Any:
+        """Return the context of parsed arguments; what is wrong with a value is said without a library's words."""
+        try:
+            return super().make_context(*arguments, **named)
+        except typer.BadParameter as error:
+            error.message = error.message.removeprefix("Value error, ")
+            raise
 
     def get_help_option(self, ctx: Any) -> Any:
         """Return the option ``--help`` without a type."""

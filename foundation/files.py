@@ -7,6 +7,7 @@ that the caller did not mean to replace.
 
 from __future__ import annotations
 
+import codecs
 import contextlib
 import csv
 import errno
@@ -138,9 +139,8 @@ def reading_error(path: Path, error: OSError, remedy: str, what: str = "") -> Fo
     """Return why `path` cannot be read: the disk's fault with its own remedy, else the file's with `remedy`."""
     of_disk = disk_remedy_of(error) if error.errno != errno.ENOENT else None
     named = f"{what} {path}" if what else str(path)
-    return (StorageError if of_disk else FormatError)(
-        f"cannot read {named}: {error.strerror or error}; {of_disk or remedy}"
-    )
+    kind = StorageError if of_disk else FormatError
+    return kind(f"cannot read {named}: {error.strerror or error}", remedy=of_disk or remedy)
 
 
 def read_text(path: Path, remedy: str, what: str = "") -> str:
@@ -150,7 +150,22 @@ def read_text(path: Path, remedy: str, what: str = "") -> str:
     except OSError as error:
         raise reading_error(path, error, remedy, what) from error
     except UnicodeDecodeError as error:
-        raise FormatError(f"no text in UTF-8: {error}", about=path, remedy=remedy) from error
+        raise _not_utf_8(path, error, remedy) from error
+
+
+def _not_utf_8(path: Path, error: UnicodeDecodeError, remedy: str) -> FormatError:
+    """Return what to tell of a file that is a text in another encoding, or none."""
+    begin, before = error.object[:4], error.object[: error.start]
+    if begin.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+        problem = "a text in UTF-16, UTF-8 was expected"
+    elif b"\0" in error.object:
+        return FormatError("no text", about=path, remedy=remedy)
+    else:
+        problem = (
+            f"no text in UTF-8: line {before.count(10) + 1} has the byte 0x{error.object[error.start]:02x}, as letters "
+            "with accents have in Latin-1 (Windows-1252)"
+        )
+    return FormatError(problem, about=path, remedy="save it as UTF-8, which editors offer at Save as")
 
 
 def read_csv(path: Path, remedy: str, what: str = "") -> tuple[list[str], list[dict[str, str]]]:

@@ -118,11 +118,11 @@ def damaged(error: ValidationError, about: object, remedy: str) -> FormatError:
     )
 
 
-def unknown_key(key: str, known: Iterable[str], where: str) -> ConfigurationError:
-    """Return the error for an unknown key, naming the nearest one that is known."""
+def unknown_key(key: str, known: Iterable[str]) -> str:
+    """Return that a key is unknown, and the nearest one that is known."""
     names = sorted(known)
     hint = nearest_names(key.rsplit(".", 1)[-1], names) or f"known are {', '.join(names)}"
-    return ConfigurationError(f"{where}: unknown key {key!r}; {hint}")
+    return f"unknown key {key!r}; {hint}"
 
 
 def from_settings(
@@ -134,7 +134,7 @@ def from_settings(
     """
     for name in given:
         if name not in known:
-            raise unknown_key(f"{key}.{name}", known, where)
+            raise ConfigurationError(f"{where}: {unknown_key(f'{key}.{name}', known)}")
     try:
         return _adapter(kind).validate_python({**fixed, **given})
     except ValidationError as error:

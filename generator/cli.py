@@ -43,7 +43,7 @@ from generator.command.options import (
     VariationOptions,
     WorkOptions,
 )
-from generator.command.output import matrix_sentence, table_folder
+from generator.command.output import DEMO, matrix_sentence, table_folder
 
 if TYPE_CHECKING:
     from generator.dataset.making import Workers
@@ -134,9 +134,11 @@ def generate(
             _draw_sheet(dataset, work.finish, sheet)
         else:
             if places.lut is None or places.out is None:
+                raise InputError(_missing_place(places.lut))
+            if _is_table(places.out) and not _is_table(str(places.lut)):
                 raise InputError(
-                    "the table and the place of the dataset are missing; write generate LUT OUT --sources DIR, with "
-                    "demo: for LUT where you have no table yet"
+                    f"{places.out} is a table and {places.lut} none: the table comes first, then the place of the "
+                    f"dataset: generate {places.out} {places.lut}"
                 )
             from generator.dataset.making import made_before
 
@@ -199,6 +201,22 @@ def explore(
     found = find_pictures(sources or [str(sample_folder())], Preparation(max_side=max_side))
     with ExploreServer(Explorer(str(lut), table, found, max_side), host, port) as server:
         server.serve(str(lut), "can look at the table and the pictures, and send pictures of their own")
+
+
+def _is_table(place: str) -> bool:
+    return place == DEMO or (Path(place) / "lut.json").is_file()
+
+
+def _missing_place(given: Path | None) -> str:
+    """Return which of table and dataset is missing where one place at most is given, and how both are written."""
+    if given is None:
+        what, lut, out = "the table and the place of the dataset are", "LUT", "OUT"
+    elif _is_table(str(given)):
+        what, lut, out = f"{given} is the table, and the place of the dataset is", str(given), "OUT"
+    else:
+        what, lut, out = f"{given} is no table, and it, or the place of the dataset, is", "LUT", str(given)
+    help_for = "" if lut != "LUT" else ", with demo: for LUT where you have no table yet"
+    return f"{what} missing; write generate {lut} {out} --sources DIR{help_for}"
 
 
 def _require_alone(commands: dict[str, str | None], more: Path | None) -> None:

@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from importlib import resources
@@ -30,7 +30,7 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import ValidationError
 
-from foundation.errors import FormatError, InputError
+from foundation.errors import FormatError, InputError, nearest_names
 from foundation.files import sha256_of
 from foundation.records import Record
 
@@ -230,8 +230,8 @@ def known_sensitivities() -> tuple[str, ...]:
     return tuple(sorted(name.removesuffix(SUFFIX) for name in files if name.endswith(SUFFIX)))
 
 
-def read_sensitivities(name: str) -> Sensitivities:
-    """Return the sensitivities that a name or a path stands for."""
+def read_sensitivities(name: str, more: Sequence[str] = ()) -> Sensitivities:
+    """Return the sensitivities that a name or a path stands for; `more` are names that an error lists, too."""
     if name in known_sensitivities():
         data = resources.files("sim").joinpath("data", name + SUFFIX).read_bytes()
         return parse_sensitivities(data, name, name)
@@ -239,9 +239,11 @@ def read_sensitivities(name: str) -> Sensitivities:
     try:
         data = path.read_bytes()
     except OSError as error:
+        known = [*known_sensitivities(), *more]
+        near = f"{nearest_names(name, known)} ".lstrip()
         raise InputError(
-            f"no camera {name!r}: cannot read such a file ({error.strerror}), and those known by name are "
-            f"{', '.join(known_sensitivities())}; name one of them, or a file of spectral sensitivities"
+            f"no camera {name!r}: cannot read such a file ({error.strerror}); {near}known by name are "
+            f"{', '.join(known)}; name one of them, or a file of spectral sensitivities"
         ) from error
     return parse_sensitivities(data, path.name.removesuffix(SUFFIX).removesuffix(".json"), str(path))
 

@@ -211,7 +211,10 @@ def _named(name: str, known: list[str], given: str) -> list[str]:
         return [key for key in known if re.fullmatch(pattern, key)]
     if name in known:
         return [name]
-    hint = nearest_names(name, [*known, *SETS], 3) or "name such as D65, A, FL2, LED-B3, cie-led"
+    if re.fullmatch(r"[\d.:]+", name):
+        hint = f"temperatures in kelvin end in K: {name}K for a black body, daylight:{name} for daylight"
+    else:
+        hint = nearest_names(name, [*known, *SETS], 3) or "name such as D65, A, FL2, LED-B3, cie-led"
     raise InputError(f"--lights {given}: there is no file and no published light {name!r}; {hint}")
 
 

@@ -16,7 +16,7 @@ import numpy.typing as npt
 
 from acquisition.judge import limits
 from acquisition.judge.light import BLACK_DN
-from acquisition.judge.light_checks import same_light
+from acquisition.judge.light_checks import lamp_check, same_light
 from acquisition.judge.measure import TILE_COLUMNS, TILE_ROWS, Anchor, Exposure, Frame, Measured, disagreement, refusal
 from acquisition.judge.state import JudgeState, is_brightest_grey
 from drivers.raw.rawfile import Mosaic
@@ -366,7 +366,7 @@ def _odd_white(state: JudgeState, judge: JudgeSettings) -> Check | None:
     if abs(fit.brightness) > room:
         percent = 100 * float(np.expm1(fit.brightness))
         said = f"the first white frame is {percent:+.1f} % as bright as greys and primaries foretell"
-        return Check("lamp", round(percent, 2), round(-100 * room, 2), round(100 * room, 2), "%", said)
+        return lamp_check(fit.brightness, room, said)
     return None
 
 

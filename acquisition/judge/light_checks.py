@@ -71,7 +71,6 @@ def judge_light(
         # Shown twice alike, and small: the lamp has another level now, and each light has a ground truth of its own.
         stepped = abs(fit.brightness) <= limits.LAMP_FOLLOWED and abs(fit.brightness - level) <= room / 2
         lamp = "" if stepped else _brightness_reason(fit.brightness)
-    percent = 100 * float(np.expm1(fit.brightness))
     leaning = Leaning(((fit.brightness, fit.brightness_sd),), (seen.neutral_light(),))
     if not reason and not lamp and not stepped and not state.rested:
         lamp, added = crept(state.leaning.then(leaning), drift_percent / 100)
@@ -81,9 +80,20 @@ def judge_light(
     checks = (
         *ambient,
         Check("light", round(fit.angle_deg, 3), None, round(limit, 3), "°", "" if added else reason),
-        Check("lamp", round(percent, 2), round(-100 * room, 2), round(100 * room, 2), "%", lamp),
+        lamp_check(fit.brightness, room, lamp),
     )
     return checks, LampSeen(fit.brightness, stepped, leaning)
+
+
+def lamp_check(brightness: float, room: float, reason: str) -> Check:
+    """Return a frame's brightness against the one foretold, as logarithms, and how far it may be off.
+
+    No limits are stated where the first frames do not yet tell how the lamp scatters: they would allow what no session
+    may have.
+    """
+    allowed = round(100 * room, 2) if 100 * room < limits.LAMP_TOTAL else None
+    low = None if allowed is None else -allowed
+    return Check("lamp", round(100 * float(np.expm1(brightness)), 2), low, allowed, "%", reason)
 
 
 def crept(leaning: Leaning, drift: float) -> tuple[str, float]:

@@ -38,6 +38,11 @@ class MonitorServer(LocalServer):
         self.page = live_page(watch.folder.resolve().name)
         super().__init__(host, port)
 
+    @property
+    def has_session(self) -> bool:
+        """Whether there is a session to show; else one is waited for."""
+        return self.watch.head().state != "absent"
+
     def answer(self, request: Request) -> Response | Refusal:
         """Return the page, the session's state since a cursor, the old summary, or the picture of an attempt."""
         match request.path:

@@ -43,6 +43,7 @@ from acquisition.run.queue import step_name
 from acquisition.run.retry import pause_cause
 from experiment.session.records import RECENT, Check, Judgement, TimedAttempt, duration_text, time_left
 from foundation.clock import Clock
+from foundation.console import shows_progress
 from foundation.secret_texts import is_webhook, target_label
 
 LIMIT_S: Final = 20.0
@@ -257,15 +258,28 @@ def _of_name(judgement: Judgement, name: str) -> list[Check]:
     return [check for check in judgement.checks if check.name == name and check.value is not None]
 
 
-class Terminal:
-    """Shows a run; use it in a `with` block."""
+PLAIN_S: Final = 30.0
+"""Between two lines on how far a run is, where they go into a file: enough to see that it lives, and a night's thousand
+lines can still be read."""
 
-    def __init__(self) -> None:
+
+class Terminal:
+    """Shows a run: as a bar on a terminal, else as a line now and then; use it in a `with` block.
+
+    `clock`: returns seconds; the machine's own unless a test has another.
+    """
+
+    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         from rich.console import Console
         from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
-        self._time = TimeLeft()
+        console = Console(stderr=True)
+        self._clock = clock
+        self._time = TimeLeft(clock)
         self._left = self._total = 0
+        self._said = ""
+        self._plain = shows_progress() and not console.is_terminal
+        self._plain_due = -math.inf
         self._bar = Progress(
             BarColumn(),
             MofNCompleteColumn(),
@@ -273,8 +287,9 @@ class Terminal:
             TimeElapsedColumn(),
             TextColumn("{task.fields[left]}"),
             TextColumn("{task.fields[said]}"),
-            console=Console(stderr=True),
+            console=console,
             redirect_stdout=sys.stdout.isatty(),
+            disable=not shows_progress() or self._plain,
         )
         self._task = self._bar.add_task("frames", total=None, left="", said="")
 
@@ -297,17 +312,33 @@ class Terminal:
         left_s = self._time.left_s(self._left)
         left = "" if left_s is None or not self._left else f"left {duration_text(left_s)}"
         self._bar.update(self._task, completed=done, total=total, left=left)
+        self._say_plainly(", ".join(filter(None, [f"{done} of {total} frames", left, self._said])), done == total)
 
     def taken(self, taken: Taken) -> None:
         """Show the verdict of a frame, and take its time for that of those to come."""
         self._time.taken(taken.judgement.accepted)
-        self._bar.update(self._task, said=verdict_line(taken))
+        self._said = verdict_line(taken)
+        self._bar.update(self._task, said=self._said)
 
     def announce(self, sentence: str) -> None:
         """Print a line that stays."""
-        print(sentence, file=sys.stderr)
+        _print(sentence)
 
     def state(self, sentence: str) -> None:
         """Show what the run waits for, until the next frame."""
         self._time.paused()
         self._bar.update(self._task, said=sentence, left="")
+        self._say_plainly(sentence)
+
+    def _say_plainly(self, line: str, at_once: bool = False) -> None:
+        """Print a line with the time of day where there is no bar, not more often than each `PLAIN_S`."""
+        now = self._clock()
+        if self._plain and (at_once or now >= self._plain_due):
+            self._plain_due = now + PLAIN_S
+            _print(f"{datetime.now().astimezone():%H:%M:%S} {line}")
+
+
+def _print(line: str) -> None:
+    # A log on a disk that is full for a while ends no run: the journal has what counts.
+    with suppress(OSError):
+        print(line, file=sys.stderr)

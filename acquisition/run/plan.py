@@ -190,10 +190,11 @@ SPARE_BYTES: Final = 500_000_000
 BYTES_PER_PIXEL: Final = 1.5
 """Of lossless raw files of 14 bits: 1.34 at ISO 100 (EOS 550D, 25 MB; EOS 6D Mark II, 36 MB), more with noise."""
 LOOSE_BYTES_PER_PIXEL: Final = 2.0
-"""Of bodies that may write every photosite in 16 bits (Sony)."""
+"""Of bodies that may write every photosite in 16 bits (Sony), and of those of the simulated lab, which do."""
 UNKNOWN_BYTES: Final = 60_000_000
 """Assumed of a body that is not known: 40 million photosites."""
 _MODELS: Final = (
+    (0.52, "CroP Test"),
     (18.7, "EOS 550D, EOS REBEL T2i, EOS Kiss X4, EOS 650D, EOS 700D, EOS REBEL T4i, EOS REBEL T5i, "
            "EOS 100D"),
     (19.0, "EOS 600D, EOS REBEL T3i, EOS Kiss X5, EOS 60D, EOS 7D, EOS 1300D, EOS REBEL T6"),
@@ -238,9 +239,9 @@ def frame_bytes(largest: int | None, model: str, given: int | None = None) -> Es
         return Estimate(given, "as the simulated camera writes them", True)
     known = MEGAPIXELS.get(model.removeprefix("Canon ").removeprefix("NIKON "))
     if known is None:
-        whom = f"the size of {model} is not known" if model else "the camera is not known"
-        return Estimate(UNKNOWN_BYTES, f"assumed: {whom}", False)
-    each = LOOSE_BYTES_PER_PIXEL if model.startswith("ILCE") else BYTES_PER_PIXEL
+        whom = f"how large a frame of {model} is, is not known" if model else "the camera could not be asked"
+        return Estimate(UNKNOWN_BYTES, f"assumed: {whom}; acquire check measures it", False)
+    each = LOOSE_BYTES_PER_PIXEL if model.startswith(("ILCE", "CroP ")) else BYTES_PER_PIXEL
     return Estimate(known * 1e6 * each, f"{known:.1f} million photosites, {each:g} bytes each", True)
 
 
@@ -289,7 +290,7 @@ class Answers:
     - `camera`: who it is; None if it could not be asked.
     - `offered_s`: shutter times that it offers, seconds; empty if it lists none.
     - `supplies`: its battery and card; None if it does not tell.
-    - `projector`: its name and state, in words; empty where there is none under control.
+    - `projector`: its name and state, in words; empty where it could not be asked, or there is none under control.
     - `lit`: whether its lamp burns; None if that is not known.
     - `warnings`: what changes the light behind the codes, each with its remedy.
     - `unasked`: what could not be asked, and why.
@@ -381,7 +382,7 @@ class RunPlan:
     - `answers`: what the devices said.
     - `frame_bytes`: A raw file, bytes.
     - `frame_s`: A frame's time, seconds.
-    - `warm_up_s`: of the lamp before the first frame, seconds.
+    - `warm_up_s`: of the lamp before the first frame, seconds; of one that is known to burn, none.
     - `free_bytes`: on the disk of the session.
     - `faults`: what would end the run, each with its remedy.
     - `doubts`: what may; a sentence each.
@@ -419,8 +420,9 @@ def make_plan(
 ) -> RunPlan:
     """Return the plan of a run, with all that would end it."""
     size = frame_bytes(work.frame_bytes, answers.camera.model if answers.camera is not None else "", given_bytes)
-    cold = answers.lit is False and settings.sequence.warm_up_s > 0
-    warm_up_s = LIGHTING_S + settings.sequence.warm_up_s if cold else 0.0
+    # A lamp that could not be asked about is taken as cold.
+    cold = answers.lit is False or (answers.lit is None and has_lamp_control(settings))
+    warm_up_s = LIGHTING_S + settings.sequence.warm_up_s if cold and settings.sequence.warm_up_s > 0 else 0.0
     found = (
         *answers.faults,
         *answers.warnings,
@@ -441,6 +443,11 @@ def make_plan(
         tuple(one for one in found if isinstance(one, CropError)),
         tuple(one for one in found if isinstance(one, str)),
     )
+
+
+def has_lamp_control(settings: LabSettings) -> bool:
+    """Return whether a run switches the projector's lamp, and waits until it is warm."""
+    return settings.rig != "lab" or settings.lab.projector.control != "none"
 
 
 def is_offered(shutter_s: float, offered_s: Sequence[float]) -> bool | None:
@@ -533,7 +540,10 @@ def plan_lines(plan: RunPlan) -> tuple[str, ...]:
         ("time", _time(plan, count)),
         ("disk", _disk(plan, count)),
         ("camera", _camera(answers)),
-        ("projector", answers.projector or "not under control, or not asked"),
+        (
+            "projector",
+            answers.projector or ("could not be asked" if has_lamp_control(settings) else "not under control"),
+        ),
     ]
     if settings.sequence.notify:
         lines.append(("notices", f"to {target_label(settings.sequence.notify)}"))
@@ -557,7 +567,8 @@ def _exposure(plan: RunPlan) -> str:
 def _time(plan: RunPlan, count: str) -> str:
     if not plan.work.left:
         return "nothing is left to take"
-    warm_up = f", after {duration_text(plan.warm_up_s)} until the lamp is warm" if plan.warm_up_s else ""
+    known = "" if plan.answers.lit is not None else ", if it does not burn yet"
+    warm_up = f", after {duration_text(plan.warm_up_s)} until the lamp is warm{known}" if plan.warm_up_s else ""
     each = f"{plan.frame_s.value:.2f} s each ({plan.frame_s.basis})"
     return f"{duration_text(plan.time_s)}: {count}, {each}{warm_up}"
 

@@ -9,8 +9,8 @@ Rules that hold inside for a session that is taken up:
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from contextlib import ExitStack, suppress
+from collections.abc import Callable, Generator, Sequence
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -33,9 +33,9 @@ from experiment.chart.model import load_chart
 from experiment.config import LabSettings
 from experiment.lights import load_illuminations
 from experiment.session.folder import Session, busy_sentence, session_exists
-from experiment.session.heartbeat import RunState, SessionPlace, signs_of_life
+from experiment.session.heartbeat import BEGINS, RunState, SessionPlace, SignOfLife, signs_of_life
 from experiment.session.journal import beat_beside
-from experiment.session.records import ACCEPTED, VOIDED, FrameJudge, FrameKind, SessionStep, duration_text
+from experiment.session.records import ACCEPTED, VOIDED, FrameJudge, FrameKind, SessionStep, duration_text, last_moment
 from experiment.session.repair import secrets_warning
 from foundation.clock import Clock, SteadyClock
 from foundation.console import Ending
@@ -60,17 +60,19 @@ def run_session(
 
     `retake`: what to take again (`Session.retake`); nothing if None.
     """
-
-    def checking(done: int, total: int) -> None:
-        state(f"checking frame {done} of {total}")
-
     with ExitStack() as at_last, ExitStack() as opened:
         session = opened.enter_context(_taken_up(settings, folder, announce)) if session_exists(folder) else None
         if session is None and retake is not None:
             raise nothing_to_retake(folder)
-        if session is not None:
+        alive = None if session is None else opened.enter_context(_signs_of(session))
+        if session is not None and alive is not None:
             if retake is not None:
                 session.retake(retake)
+
+            def checking(done: int, total: int) -> None:
+                state(f"checking frame {done} of {total}")
+                alive(f"{BEGINS}; frame {done} of {total}")
+
             check_frames(session, checking, announce)
             total = len(session.steps)
             if len(session.done_steps()) == total:
@@ -85,17 +87,16 @@ def run_session(
         require_same_devices(session, devices, settings)
         if note := clock_note(session, devices.clock):
             announce(note)
-        if note := killed_note(session):
-            session.journal.note(devices.clock.now(), "killed", note)
         first = link_runs(session, devices.clock.now()) or white_first(session)
         total = len(session.steps)
         observe(len(session.done_steps()), total)
         # When the screen is dark and the journal at rest.
         at_last.callback(_report, session, announce)
-        alive = opened.enter_context(signs_of_life(session.journal.beat, session.journal.heartbeat, TRY_S))
+        sign = alive or opened.enter_context(_signs_of(session))
+        sign()
 
         def count(frame: Taken) -> None:
-            alive()
+            sign()
             taken(frame)
             # A reference may have been put behind the plan.
             total = len(session.steps)
@@ -103,6 +104,17 @@ def run_session(
 
         judge = LiveJudge(settings, session.chart, session.illuminations)
         return take_session(session, devices, settings, judge, count, announce, state, ending, first)
+
+
+@contextmanager
+def _signs_of(session: Session) -> Generator[SignOfLife]:
+    """Note how the run before ended, if it was killed, and say from now on that this one is there."""
+    journal = session.journal
+    if note := killed_note(session):
+        # The lab's clock is not open yet, and may be another than the wall's.
+        journal.note(last_moment(journal.attempts()) or datetime.now(UTC), "killed", note)
+    with signs_of_life(journal.beat, journal.heartbeat, TRY_S) as alive:
+        yield alive
 
 
 def _report(session: Session, announce: Callable[[str], object]) -> None:

@@ -191,7 +191,7 @@ class Figure:
     - `drawing`: the picture that shows it; else `NOT_DRAWN`.
     - `lines`: its lines in the summary; else `NO_LINES`.
     - `foremost`: whether a refusal speaks of it before others, which may follow from it.
-    - `found`: what a refusal adds, and the remedy, where that depends on what was found.
+    - `found`: what a refusal or remark adds, and the remedy, where that depends on what was found.
     """
 
     name: str

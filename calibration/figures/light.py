@@ -261,7 +261,8 @@ def _linearity_row(table: TableMeasurements) -> SummaryRow:
         note = f"{len(linearity.files)} exposures, {low:.0%} to {high:.0%} of saturation; 1 % is usual"
         return SummaryRow("Linearity", f"{percent(linearity.worst)} from a straight line at most", note)
     if bend is None:
-        note = "plan red, green and blue each alone, or give a series of exposures of the chart with --linearity"
+        unmeasured = table.sensor.superposition.unmeasured
+        note = "lights bear wrong names" if unmeasured is None else f"{unmeasured.why}; {unmeasured.remedy}"
         return SummaryRow("Linearity", "not measured", note)
     note = "for certain, over the levels of paper; red, green and blue alone against white, cell by cell"
     return SummaryRow("Linearity", f"{percent(bend)} from proportion", note)
@@ -283,14 +284,19 @@ def _linearity_known(table: TableMeasurements) -> float:
     return float(table.sensor.linearity is not None or table.sensor.superposition.measured)
 
 
+def _linearity_lacks(table: TableMeasurements) -> tuple[str, str] | None:
+    unmeasured = table.sensor.superposition.unmeasured
+    return None if unmeasured is None else (f" ({unmeasured.why})", unmeasured.remedy)
+
+
 LINEARITY_KNOWN = Figure(
     "linearity_known", "Linearity measured", "radiometry", "", "at least", 1.0, None,
     why="nothing shows whether counts are proportional to light; the uncertainty of the ground truth assumes what is "
     "usual of cameras",
     source="uncertainty budget",
-    remedy="plan red, green and blue each alone (acquire illuminations does), or give a series of exposures of the "
-    "chart with --linearity",
-    measure=_linearity_known, forecast=ONLY_OF_A_SESSION,
+    remedy="plan red, green and blue each alone (acquire illuminations does) for a chart of 512 colours or more, or "
+    "give a series of exposures of the chart with --linearity",
+    found=_linearity_lacks, measure=_linearity_known, forecast=ONLY_OF_A_SESSION,
     worst=NO_PLACE, where=OF_ITS_CAUSE, retake=NO_FRAMES, cause=NO_CAUSE,
     drawing=NOT_DRAWN, lines=NO_LINES,
 )  # fmt: skip

@@ -16,6 +16,7 @@ C cells, W white references, N grey references; places on the print in millimetr
 from __future__ import annotations
 
 import hashlib
+import logging
 import tomllib
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
@@ -35,7 +36,7 @@ from calibration.citation import Rig, StatedOrigin
 from calibration.radiometry.dark_frames import DarkLightEstimate, reflectances
 from calibration.radiometry.greys import GreyLevels, PhotonTransfer, photon_transfer
 from calibration.radiometry.primaries import Primaries, pure_lights
-from calibration.radiometry.superposition import Superposition, printed_predictors, superposition
+from calibration.radiometry.superposition import MOVED, NO_PRIMARIES, Superposition, printed_predictors, superposition
 from calibration.registration.register import Registration, register
 from calibration.sampling import WINDOW, WINDOWS, Sites, gather, gather_means, sites_at
 from calibration.spread.added_light import AddedLight, added_light
@@ -67,6 +68,8 @@ from experiment.session.records import FrameRecord
 from foundation.errors import CropError, FormatError, InputError
 from foundation.files import file_sha256, read_whole
 from foundation.robust import huber_weights, sigma_of
+
+_log = logging.getLogger(__name__)
 
 _Array = npt.NDArray[np.float64]
 
@@ -467,10 +470,10 @@ def with_primaries(baseline: Baseline, primaries: Primaries | None) -> Baseline:
 
 
 def with_superposition(baseline: Baseline, first: DecodedFrame, primaries: Sequence[DecodedFrame]) -> Baseline:
-    """Return the baseline with what the first frame shows of linearity beside the primaries; as it is without them."""
-    frames = [first, *primaries]
+    """Return the baseline with what the first frame shows of linearity beside the primaries."""
+    frames, full = [first, *primaries], float(first.saturation - first.black.mean())
     if not primaries or not all(_is_still(baseline, decoded) for decoded in frames):
-        return baseline
+        return replace(baseline, superposition=Superposition.usual(full, MOVED if primaries else NO_PRIMARIES))
     seen, peaks = zip(*(baseline.patches(one.mosaic, one.black) for one in frames), strict=True)
     clipped = [peak >= CLIPPING_SHARE * one.saturation for peak, one in zip(peaks, frames, strict=True)]
     usable = np.isfinite(seen).all(axis=(0, 2)) & ~np.any(clipped, axis=0)
@@ -480,7 +483,7 @@ def with_superposition(baseline: Baseline, first: DecodedFrame, primaries: Seque
     found = superposition(
         seen[1:],
         seen[0],
-        float(first.saturation - first.black.mean()),
+        full,
         usable,
         printed_predictors(chart.rgb[chart.cell_of_colour], printed),
         white=first.record.kind == "white",
@@ -796,7 +799,10 @@ def stated_origin(session: Session) -> StatedOrigin:
         rig: Rig | None = next((known for known in _RIGS if known == document.get("rig")), None)
         citation = CitationSettings.model_validate(document.get("citation", {}))
         set_by = CameraSettings.model_validate(document["camera"]) if rig in _SETTING_RIGS else None
-    except (CropError, ValidationError, ValueError, KeyError, RecursionError):
+    except (CropError, ValidationError, ValueError, KeyError, RecursionError) as error:
+        if isinstance(error, CropError | tomllib.TOMLDecodeError):
+            why = error if isinstance(error, CropError) else f"{session.folder / 'session.toml'} is not TOML: {error}"
+            _log.warning("%s; the table states neither its origin nor its authors, exposure and licence", why)
         return StatedOrigin(CitationSettings(), None, None, session.journal.records())
     return StatedOrigin(citation, rig, set_by, session.journal.records())
 

@@ -118,8 +118,8 @@ def _linearity(table: TableMeasurements, white: _Array, cells: _Array) -> Compon
     level = np.maximum(cells, LEAST_LEVEL) * paper
     source = (
         "red, green and blue alone against a light that is made of them"
-        if found.measured
-        else "usual of cameras: 1 % at saturation, 0.05 % of it near black; no lights of each primary alone show it"
+        if found.unmeasured is None
+        else f"usual of cameras: 1 % at saturation, 0.05 % of it near black; {found.unmeasured.why}"
     )
     return Component(
         "linearity", "deviation of counts from proportion", not found.measured, source,

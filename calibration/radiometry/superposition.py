@@ -73,6 +73,35 @@ _AMOUNTS = 12
 _Array = npt.NDArray[np.float64]
 
 
+_SERIES = "give a series of exposures of the chart with --linearity"
+
+
+@dataclass(frozen=True)
+class Unmeasured:
+    """Why superposition shows nothing in a session, and what would."""
+
+    why: str
+    remedy: str
+
+    @staticmethod
+    def for_few(patches: int, needed: int) -> Unmeasured:
+        """Return it for a chart of which too few patches can be used."""
+        return Unmeasured(
+            f"{patches} patches of the chart can be used for it and {needed} are needed, whichever lights are planned",
+            f"use a chart of more colours, or {_SERIES}",
+        )
+
+
+NO_PRIMARIES = Unmeasured(
+    "no lights of each primary alone show it",
+    f"plan red, green and blue each alone (acquire illuminations does), or {_SERIES}",
+)
+MOVED = Unmeasured(
+    "the chart moved between the frames of the primaries and the one that is registered first",
+    f"see that print and camera stay where they are, or {_SERIES}",
+)
+
+
 @dataclass(frozen=True, eq=False)
 class Superposition:
     """How counts deviate from proportion to light, and how well that is known.
@@ -80,18 +109,23 @@ class Superposition:
     - `full`: counts above black of saturation.
     - `deviation`: (K,) float64 counts at `NODES`, what is measured less what a proportional sensor would have.
     - `covariance`: (K, K) float64 counts².
-    - `measured`: whether frames show it; else it is what is usual of cameras.
+    - `unmeasured`: why frames do not show it, where it is what is usual of cameras; None where they do.
     """
 
     full: float
     deviation: _Array
     covariance: _Array
-    measured: bool
+    unmeasured: Unmeasured | None
 
     @staticmethod
-    def usual(full: float) -> Superposition:
+    def usual(full: float, unmeasured: Unmeasured = NO_PRIMARIES) -> Superposition:
         """Return what is usual of cameras, where a session shows nothing of it."""
-        return Superposition(full, np.zeros(len(NODES)), _usual(full), measured=False)
+        return Superposition(full, np.zeros(len(NODES)), _usual(full), unmeasured)
+
+    @property
+    def measured(self) -> bool:
+        """Whether frames show it."""
+        return self.unmeasured is None
 
     def relative(self, level: _Array) -> tuple[_Array, _Array]:
         """Return the relative deviation (...) at levels (...), counts above black, and its weights (..., K)."""
@@ -136,8 +170,9 @@ def superposition(
     bool, patches that are inside the frames, not clipped and not covered. `known`: (P, M) float64, what patches are
     printed with, which predicts their levels without noise. `white`: whether the light is all of each primary.
     """
-    if int(usable.sum()) < max(_LEAST_PATCHES, 2 * known.shape[1]):
-        return Superposition.usual(full)
+    patches, needed = int(usable.sum()), max(_LEAST_PATCHES, 2 * known.shape[1])
+    if patches < needed:
+        return Superposition.usual(full, Unmeasured.for_few(patches, needed))
     seen, known = np.stack([together, *alone])[:, usable], known[usable]
     hats, size = _hats(seen / full), _AMOUNTS + len(NODES)
     priors = [_prior(full, scale, white and _adds(seen)) for scale in _SCALES]
@@ -162,7 +197,7 @@ def superposition(
             right += clean.T @ (root * value)
             misfit = max(misfit, _misfit(rows, root * left))
         solution, covariance = _posterior(matrix / misfit, right / misfit, priors)
-    return Superposition(full, solution[_AMOUNTS:], covariance[_AMOUNTS:, _AMOUNTS:], measured=True)
+    return Superposition(full, solution[_AMOUNTS:], covariance[_AMOUNTS:, _AMOUNTS:], None)
 
 
 def _posterior(matrix: _Array, right: _Array, priors: Sequence[_Array]) -> tuple[_Array, _Array]:

@@ -18,6 +18,7 @@ from calibration.verdict import (
     BuildResult,
     JudgedValue,
     ProbableCause,
+    detail_and_remedy,
     findings,
     is_mended_by_retaking,
     places_text,
@@ -72,7 +73,7 @@ def page(
     table, verdict = result.figures, result.verdict
     found, beyond = findings(verdict, table), len(verdict.refused) + len(verdict.remarks)
     rows = [
-        _Row(row, _remedy(row, found.get(row.figure.name)), "" if worst is None else worst.where)
+        _Row(row, _remedy(row, found.get(row.figure.name), table), "" if worst is None else worst.where)
         for row in sorted(verdict.rows, key=lambda row: _ORDER.index(row.outcome))
         for worst in [(worsts or {}).get(row.figure.name)]
     ]
@@ -146,13 +147,14 @@ def _again(result: BuildResult) -> dict[str, Any] | None:
     }
 
 
-def _remedy(row: JudgedValue, found: ProbableCause | None) -> str:
+def _remedy(row: JudgedValue, found: ProbableCause | None, table: TableMeasurements) -> str:
     """Return what helps against what is beyond a limit; "" where nothing is."""
-    if row.outcome == "accept" or not row.figure.remedy:
+    if row.outcome == "accept":
         return ""
-    if found is None:
-        return row.figure.remedy
-    return found.decision.cause.remedy if found.is_known else f"it may help to {row.figure.remedy}"
+    _, remedy = detail_and_remedy(row.figure, table)
+    if found is None or not remedy:
+        return remedy
+    return found.decision.cause.remedy if found.is_known else f"it may help to {remedy}"
 
 
 def _cause(found: ProbableCause) -> dict[str, Any]:

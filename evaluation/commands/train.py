@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 from evaluation.commands.options import (
     Data,
@@ -15,6 +16,9 @@ from evaluation.commands.options import (
     thread_option,
 )
 from foundation.console import EXIT_CODES, JsonOutput, grouped, option, with_json
+
+if TYPE_CHECKING:
+    from evaluation.learning.model_files import StoredMethod
 
 LEARNERS_HELP = "regression-trees, smart-color-cat, color-beaver, log-chroma, kernel-ridge, convnet or constant-light"
 """The suite's own, for the help of commands."""
@@ -51,7 +55,7 @@ def train(
     """Train a method on a data set."""
     from evaluation.learning import adapting
     from evaluation.learning.feature_learner import FeatureLearner, extract, fit_extracted, require_installed, truths_of
-    from evaluation.learning.model_files import load_model, provenance_of, save_model
+    from evaluation.learning.model_files import provenance_of, save_model
     from evaluation.reports.table_output import show_notes
     from foundation.clock import SystemClock
     from foundation.compiled import processor_count
@@ -72,7 +76,7 @@ def train(
         raise InputError(f"--out is {out}, expected a name that ends in .npz, by which evaluate run knows a model")
     require_free_file(out, "the model")
     require_installed(learner)
-    known = None if adapt is None else load_model(adapt)
+    known = None if adapt is None else _model_to_adapt(adapt, method, data)
     if known is not None and known.learner != learner:
         raise InputError(
             f"{adapt} is of {known.learner.key}, {'other settings' if known.learner.key == learner.key else method} "
@@ -98,3 +102,23 @@ def train(
         notes.append(f"{adapt} answers with a share of {share:.2f}, what these images teach alone with {1 - share:.2f}")
     print(f"{out}: {learner.name}, {record.sentence()}")
     show_notes(told, notes, found.treatment)
+
+
+def _model_to_adapt(adapt: Path, method: str, data: str) -> StoredMethod:
+    """Return the model behind --adapt; where that is a data set instead, an error has the command as it is written."""
+    from evaluation.learning.model_files import load_model
+    from foundation.errors import FormatError, InputError
+
+    try:
+        return load_model(adapt)
+    except FormatError as error:
+        if not adapt.exists():
+            raise
+        images, model = data, "MODEL.npz"
+        with suppress(FormatError):
+            load_model(Path(data))
+            images, model = str(adapt), data
+        raise InputError(
+            f"{error}; behind --adapt stands the model, and DATA are the images that it is adapted to: "
+            f"evaluate train {method} {images} --adapt {model}"
+        ) from error

@@ -236,7 +236,10 @@ def _within(beside: BesideReal, folds: Sequence[npt.NDArray[np.int64]]) -> tuple
     least = min(len(each) - int(np.bincount(each).max()) for each in folds)
     left_out = [count for count in beside.counts if count is not None and count > least]
     told = ", ".join(map(str, left_out))
-    notes = [f"No rows beside {told} real images: a fold leaves {least}; all are those"] if left_out else []
+    all_of_them = "all are those" if None in beside.counts else "--real all has a row beside those"
+    notes = (
+        [f"No rows beside {told} real images: a fold that is tested leaves {least}; {all_of_them}"] if left_out else []
+    )
     return replace(beside, counts=tuple(count for count in beside.counts if count not in left_out)), notes
 
 

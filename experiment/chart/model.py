@@ -197,9 +197,13 @@ class _Document(_Strict):
 def load_chart(path: Path) -> Chart:
     """Read `chart.json`."""
     try:
-        document = from_json(_Document, path.read_bytes(), path, "restore it from a copy")
+        text = path.read_bytes()
     except OSError as error:
         raise reading_error(path, error, "name the chart.json of the print", "chart") from error
+    if path.suffix.lower() != ".json" and not text.lstrip().startswith(b"{"):
+        remedy = "name chart.json, which acquire chart writes beside what is printed"
+        raise FormatError("no description of a chart, but another file", about=path, remedy=remedy)
+    document = from_json(_Document, text, path, "restore it from a copy")
     count = 8**document.bits
     colours = np.asarray(document.cells.colour, dtype=np.int64)
     if len(document.cells.centre_mm) != len(colours) or not np.array_equal(

@@ -23,7 +23,7 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from functools import cached_property
 from pathlib import Path
-from typing import Any, BinaryIO, Final
+from typing import Any, BinaryIO, Final, TypeVar
 
 from drivers.camera import CapturedFrame
 from drivers.presenter import Colour
@@ -87,6 +87,9 @@ class Retake:
     text: str = ""
 
 
+_Loaded = TypeVar("_Loaded")
+
+
 class Session:
     """An open session folder; close it, or use it in a `with` block.
 
@@ -98,8 +101,10 @@ class Session:
         self.journal = journal
         self._hold = hold
         require_plain_folder(folder, MOST_BYTES, ("frames", "previews"))
-        self.chart: Chart = load_chart(folder / "chart.json")
-        self.illuminations: tuple[Illumination, ...] = load_illuminations(folder / "illuminations.csv")
+        self.chart: Chart = _own_copy(load_chart, folder / "chart.json", "chart")
+        self.illuminations: tuple[Illumination, ...] = _own_copy(
+            load_illuminations, folder / "illuminations.csv", "lights"
+        )
         self.steps: tuple[SessionStep, ...] = journal.steps()
         self._require_planned_lights()
 
@@ -202,8 +207,14 @@ class Session:
             self._hold.close()
 
     def settings_text(self) -> str:
-        """Return the text of `session.toml`."""
-        return read_text(self.folder / "session.toml", "restore it from a copy", "the session's settings")
+        """Return the text of `session.toml`; one that says nothing is damaged."""
+        path, remedy = self.folder / "session.toml", "restore it from a copy"
+        text = read_text(path, remedy, "the session's settings")
+        if not text.strip():
+            raise FormatError(
+                "empty; the settings with which a session was begun stand in it", about=path, remedy=remedy
+            )
+        return text
 
     def receive(self, stem: str, fill: Callable[[BinaryIO], CapturedFrame]) -> ReceivedFile:
         """Let a raw file be written into `frames/`; it is complete and on the disk when this returns."""
@@ -427,6 +438,18 @@ def session_exists(folder: Path) -> bool:
     _require_mounted(folder)
     require_free(folder, "the session")
     return False
+
+
+def _own_copy(load: Callable[[Path], _Loaded], path: Path, what: str) -> _Loaded:
+    """Return what a session's own copy of a file holds that LAB.toml named; one that is lost is had there again."""
+    try:
+        return load(path)
+    except FormatError as error:
+        remedy = (
+            f"restore it from a copy of the session, or copy the {what} there with which it was begun, as its "
+            "session.toml names them"
+        )
+        raise FormatError(error.problem, about=error.about, remedy=remedy, value=error.value) from error
 
 
 def busy_sentence(folder: Path) -> str:

@@ -24,7 +24,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
-from typing import Literal
+from typing import Literal, Protocol
 
 from experiment.session.journal_file import file_system_of
 from foundation.errors import CropError
@@ -40,6 +40,9 @@ a network differ by less than one, and a disk may stall for seconds."""
 BEAT_S = 5.0
 """Seconds between two signs of life of a run that takes frames: each is a write to the disk, and "5 s ago" frightens
 nobody."""
+
+BEGINS = "a run begins: it looks at its frames and opens its devices"
+"""What a run says before it takes frames."""
 
 AGAIN = "run the same command again"
 """What helps after a run was killed."""
@@ -200,32 +203,40 @@ class Heartbeat:
         )
 
 
+class SignOfLife(Protocol):
+    """A run's way to say that it is there."""
+
+    def __call__(self, waits_for: str = "", /) -> None:
+        """Say what is waited for, or, with nothing, that frames are taken."""
+
+
 @contextmanager
 def signs_of_life(
     beat: Callable[[RunState, str, datetime], None], newest: Callable[[], Heartbeat | None], within_s: float
-) -> Generator[Callable[[], None]]:
-    """Say that a run is at work while the block runs, and in the end that it is over, and why."""
-    last = -math.inf
+) -> Generator[SignOfLife]:
+    """Say that a run is there while the block runs, and in the end that it is over, and why."""
+    last, said = -math.inf, ""
 
     def say(state: RunState, sentence: str) -> None:
         with suppress(CropError):
             beat(state, sentence, datetime.now(UTC) + timedelta(seconds=within_s))
 
-    def waits() -> bool:
+    def changes(state: RunState) -> bool:
         with suppress(CropError):
             heartbeat = newest()
-            return heartbeat is not None and heartbeat.state != "running"
+            return heartbeat is not None and heartbeat.state != state
         return False
 
-    def alive() -> None:
-        nonlocal last
-        if time.monotonic() - last >= BEAT_S or waits():
-            last = time.monotonic()
-            say("running", "frames are taken")
+    def alive(waits_for: str = "", /) -> None:
+        nonlocal last, said
+        state: RunState = "waiting" if waits_for else "running"
+        if time.monotonic() - last >= BEAT_S or state != said or changes(state):
+            last, said = time.monotonic(), state
+            say(state, waits_for or "frames are taken")
 
     cause = f"ended by a mistake of the program; {AGAIN}"
     try:
-        alive()
+        alive(BEGINS)
         yield alive
         cause = ""
     except KeyboardInterrupt:

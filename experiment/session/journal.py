@@ -98,6 +98,7 @@ class Journal:
         self._retry = retry or LockRetry(path, 0, lambda sentence: None)
         self._ledger: Ledger | None = None
         self._guard: JournalGuard | None = None
+        self._gives_signs = False
 
     @staticmethod
     def create(path: Path, steps: Sequence[SessionStep]) -> None:
@@ -245,6 +246,7 @@ class Journal:
         """Give a sign of life, in place of the one before."""
         with self._writing():
             _put_beat(self._connection, self.path, state, sentence, until)
+        self._gives_signs = state != "ended"
 
     def record(self, key: str, text: str) -> None:
         """Note what a session is taken with, such as a device's identity, in place of what stood under `key`."""
@@ -398,6 +400,9 @@ class Journal:
             yield change
             if self._ledger is not None and change.rows:
                 self._append(self._ledger, change.rows)
+            if self._gives_signs and change.rows:
+                # A frame is a sign of life, too: a run that is killed was there when its last one was written.
+                self._connection.execute("UPDATE heartbeat SET at = ?", (time_text(datetime.now(UTC)),))
             if self._guard is not None:
                 self._guard.require_same()
             self._retry.run(lambda: self._connection.execute("COMMIT"))

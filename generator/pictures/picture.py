@@ -342,7 +342,7 @@ class Preparation:
         if self.crops < 1:
             raise InputError(f"{self.crops} crops of a picture were asked for, expected 1 or more")
         if self.crops > 1 and self.crop is None:
-            raise InputError(f"{self.crops} crops of a picture have no size; give that of a crop, such as 512x512")
+            raise InputError(f"{self.crops} crops of a picture have no size; give that of a crop: --crop 512x512")
 
     @property
     def place(self) -> Literal["centre", "random"]:

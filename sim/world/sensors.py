@@ -247,7 +247,7 @@ def find_body(
     camera: str, changes: Mapping[str, Any] = MappingProxyType({}), where: str = "--settings", key: str = "camera"
 ) -> Body:
     """Return the body that a name or a file of sensitivities stands for."""
-    body = BODIES.get(camera) or _of_sensitivities(camera, read_sensitivities(camera))
+    body = BODIES.get(camera) or _of_sensitivities(camera, read_sensitivities(camera, tuple(BODIES)))
     given = dict(changes)
     pixels = given.pop("pixels", None)
     if pixels is not None:

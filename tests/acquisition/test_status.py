@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 import subprocess
 import sys
@@ -13,6 +14,8 @@ from pathlib import Path
 import pytest
 
 from acquisition.cli import main
+from acquisition.judge.light_checks import lamp_check
+from acquisition.status import MEANINGS, check_text
 from experiment.session.journal import Journal
 from experiment.session.records import Check
 from tests.acquisition.monitor.made_up import MadeUpRun
@@ -57,7 +60,7 @@ def test_a_run_at_work(folder: Path, capsys: pytest.CaptureFixture[str]) -> None
     # Six attempts, 5 s each, gave four frames, so that the four that are left take six more.
     assert "left    30 s" in told
     assert "refused 2, failed 0, voided 0\n" in told
-    assert "  movement 3.1 px, at most 0.5\n" in told
+    assert "  movement 3.1 px, at most 0.5 px (of the chart, from where it lies at rest)\n" in told
     assert "frames/0004_light" in told.split("without an accepted frame:")[1].split("last events:")[0]
     assert "refused: the light is 8.2 % off" in told.split("last verdicts:")[1]
     assert "8.2 %" not in told.split("without an accepted frame:")[1], "that light was taken again"
@@ -135,3 +138,16 @@ def test_status_changes_nothing(folder: Path, capsys: pytest.CaptureFixture[str]
 def test_what_is_no_session(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["status", str(tmp_path)]) == 2
     assert "journal.sqlite" in capsys.readouterr().err
+
+
+def test_every_number_of_the_judge_says_what_it_is() -> None:
+    page = (Path(__file__).parents[2] / "docs" / "how-to" / "night-run.md").read_text("utf-8")
+    table = page.partition("| check | question | limit |")[2].partition("\n\n")[0]
+    named = {name for row in table.splitlines()[2:] for name in re.findall(r"`([a-z ]+)`", row.split("|")[1])}
+    assert named - {"camera", "settings"} == set(MEANINGS)
+
+
+def test_a_limit_that_allows_everything_is_none() -> None:
+    assert lamp_check(0.0001, 0.8, "").high is None
+    assert "no limits before" in check_text(lamp_check(0.0001, 0.8, ""))
+    assert "lamp +0.01 %, -9 to +9 % allowed" in check_text(lamp_check(0.0001, 0.09, ""))

@@ -57,9 +57,20 @@ def test_a_lens_without_an_aperture_stays_one_in_what_is_written() -> None:
         (MINIMAL + "[sequence]\norder = 'random'\n", "sequence.order = 'random'"),
         (MINIMAL + "[sequence]\nlamp_if_unfinished = 'dim'\n", "sequence.lamp_if_unfinished = 'dim'"),
         (MINIMAL + "[judge]\nmoved = 1\n", "unknown key 'judge.moved'; did you mean 'moved_px'?"),
-        ('rig = "simulated"\n', "chart is missing"),
+        (MINIMAL.replace('chart = "c/chart.json"\n', ""), "chart is missing"),
         (MINIMAL.replace("simulated", "lightsaber"), "rig = 'lightsaber'"),
+        (MINIMAL.replace("simulated", "labor"), "expected one of 'lab', 'simulated', 'replay'"),
+        (MINIMAL + "[camera.lab]\nconnection = 'usb'\n", "unknown key 'camera.lab'; did you mean [lab.camera]?"),
+        (MINIMAL + "[projector]\ncontrol = 'none'\n", "unknown key 'projector'; did you mean [lab.projector]?"),
+        (MINIMAL + "[camera]\nsettle_s = 1\n", "unknown key 'camera.settle_s'; did you mean sequence.settle_s?"),
+        (MINIMAL + "[citation]\nauthors = 'Ban, N.'\n", 'in square brackets: ["Ban, N."]'),
+        (MINIMAL + "[lab.projector]\nhost = '/dev/ttyUSB0'\n", "a serial port, which is given as device"),
+        (MINIMAL + "[lab.camera]\nhost = 'http://1.2.3.4/'\n", "without http://"),
+        (MINIMAL + "[lab.camera]\nhost = '1.2.3.4:80'\n", 'host = "1.2.3.4" and port = 80'),
         ("rig = ", "is not TOML"),
+        (MINIMAL + "[camera]\naperture = 8,0\n", "a number has a decimal point"),
+        (MINIMAL + "[citation]\nnote = glossy paper\n", "straight quotation marks"),
+        (MINIMAL + "[camera]\n[sequence]\n[camera]\n", "a table stands in a file once"),
     ],
 )
 def test_a_mistake_is_named(text: str, expected: str) -> None:
@@ -67,6 +78,32 @@ def test_a_mistake_is_named(text: str, expected: str) -> None:
         parse_lab(text, "LAB.toml")
     assert expected in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+def test_all_mistakes_are_told_at_once() -> None:
+    with pytest.raises(ConfigurationError) as caught:
+        parse_lab('rig = "labor"\n[camera]\niso = "a"\nshuter_s = 1\n[lab.projector]\npassword = 7\n', "LAB.toml")
+    head, *mistakes = str(caught.value).splitlines()
+    assert "6 mistakes" in head
+    for key in ("rig", "chart", "illuminations", "camera.iso", "camera.shuter_s", "lab.projector.password = …"):
+        assert sum(key in one for one in mistakes) == 1
+    assert caught.value.__cause__ is None
+
+
+def test_a_wrong_line_that_holds_a_secret_is_not_shown() -> None:
+    for line in ("password = s3cret", "password = 12,5s3cret"):
+        with pytest.raises(ConfigurationError) as caught:
+            parse_lab(MINIMAL + f"[lab.projector]\n{line}\n", "LAB.toml")
+        assert "s3cret" not in str(caught.value)
+
+
+@pytest.mark.parametrize(("encoding", "told"), [("latin-1", "line 2 has the byte 0xe9"), ("utf-16", "in UTF-16")])
+def test_another_encoding_is_named_with_what_helps(tmp_path: Path, encoding: str, told: str) -> None:
+    lab = tmp_path / "LAB.toml"
+    lab.write_bytes(f"\n# papier glacé\n{MINIMAL}".encode(encoding))
+    with pytest.raises(FormatError, match=told) as caught:
+        load_lab(lab)
+    assert "UTF-8" in caught.value.remedy
 
 
 OLDER = """rig = "simulated"

@@ -198,7 +198,7 @@ def test_a_bad_file_is_refused_in_one_sentence(text: str, message: str, tmp_path
 
 def test_what_is_missing_or_no_text_is_refused(tmp_path: Path) -> None:
     binary = tmp_path / "picture.csv"
-    binary.write_bytes(b"\x89PNG\xff\xfe")
+    binary.write_bytes(b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR")
     for path in (tmp_path / "none.csv", tmp_path, binary):
         with pytest.raises(FormatError, match="acquire illuminations"):
             load_illuminations(path)

@@ -231,6 +231,8 @@ def test_a_full_device_under_stdout_is_5(lines: int) -> None:
     assert code == 5
     assert error.startswith("error: cannot ")
     assert "No space left" in error
+    assert error.count("\n") == 1
+    assert "cannot write standard output: " in error or "cannot print: " in error
 
 
 MEANWHILE = """

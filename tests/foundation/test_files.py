@@ -384,10 +384,22 @@ def test_a_table_is_read_whatever_its_mark_and_its_short_lines(tmp_path: Path) -
     assert read_csv(path, "mend it") == ([], [])
 
 
-@pytest.mark.parametrize("content", [b"image\n\xff\n", b"image\n" + b"a" * 200_000 + b"\n", None])
+@pytest.mark.parametrize("content", [b"image\n\xff\0\n", b"image\n" + b"a" * 200_000 + b"\n", None])
 def test_what_is_no_table_is_refused_with_what_helps(tmp_path: Path, content: bytes | None) -> None:
     path = tmp_path / "some.csv"
     if content is not None:
         path.write_bytes(content)
     with pytest.raises(FormatError, match=r"some\.csv: .*; mend it"):
         read_csv(path, "mend it")
+
+
+@pytest.mark.parametrize(
+    ("content", "told"),
+    [("a\nglacé".encode("latin-1"), "line 2 has the byte 0xe9"), ("glacé".encode("utf-16"), "UTF-16")],
+)
+def test_a_text_in_another_encoding_is_to_be_saved_anew(tmp_path: Path, content: bytes, told: str) -> None:
+    path = tmp_path / "some.csv"
+    path.write_bytes(content)
+    with pytest.raises(FormatError, match=told) as caught:
+        read_csv(path, "mend it")
+    assert "UTF-8" in caught.value.remedy

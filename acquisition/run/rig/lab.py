@@ -85,6 +85,12 @@ def _lab_camera(cable: CameraCable, clock: Clock, file: str) -> Camera:
     match cable.connection:
         case "usb":
             usb = partial(open_usb, vendor=VENDOR_CANON_USB, serial=cable.serial, port=cable.usb_port)
+            if cable.host is not None:
+                raise ConfigurationError(
+                    'lab.camera.host is given, and the camera\'s connection is "usb"',
+                    about=file,
+                    remedy='write connection = "ptpip" for a camera on the network, or leave host out',
+                )
             return CanonEos(lambda: UsbTransport(usb(), clock), clock)
         case "ptpip":
             host = _required(cable.host, "lab.camera.host", "the camera's address", file)
@@ -103,6 +109,18 @@ def _lab_camera(cable: CameraCable, clock: Clock, file: str) -> Camera:
 def _lab_projector(cable: ProjectorCable, clock: Clock, file: str) -> Projector | None:
     if cable.control == "none":
         return None
+    if cable.host is not None and cable.device is not None:
+        raise ConfigurationError(
+            "lab.projector.host and lab.projector.device are both given, and one line controls the projector",
+            about=file,
+            remedy="leave out the one that is not connected",
+        )
+    if cable.control == "pjlink" and cable.device is not None:
+        raise ConfigurationError(
+            "lab.projector.device is a serial port, and PJLink goes by the network",
+            about=file,
+            remedy="give the projector's address as host, or name the language of its serial port as control",
+        )
     if cable.control == "pjlink":
         host = _required(cable.host, "lab.projector.host", "the projector's address", file)
         port = cable.port or PJLINK_PORT

@@ -313,3 +313,19 @@ def test_the_address_for_a_phone_is_printed_with_a_warning_and_as_a_code(
     assert "http://192.168.1.7:" in printed.out
     assert "▀" in printed.out
     assert "not encrypted" in printed.err
+
+
+def test_an_empty_folder_is_told_to_be_none_yet(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def serve(server: MonitorServer, *shown: str) -> None:
+        """Serve nobody."""
+
+    monkeypatch.setattr(MonitorServer, "serve", serve)
+    (tmp_path / "night").mkdir()
+    assert main(["monitor", str(tmp_path / "night"), "--port", "0"]) == 0
+    assert "holds no session yet" in capsys.readouterr().out
+    run = MadeUpRun.begin(tmp_path / "begun")
+    run.journal.close()
+    assert main(["monitor", str(run.folder), "--port", "0"]) == 0
+    assert "no session" not in capsys.readouterr().out

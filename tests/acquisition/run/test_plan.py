@@ -41,6 +41,7 @@ from experiment.session.records import plan_steps
 from foundation.errors import ConfigurationError, CropError, DeviceError, DeviceFault, DeviceRefused, StorageError
 from sim.clock import SimulatedClock
 from sim.projectors.projector import SimulatedProjector
+from sim.world.sensors import BODIES
 from tests.json_of import json_of
 
 pytestmark = pytest.mark.slow
@@ -106,10 +107,15 @@ class TestDisk:
         assert bytes_per_frame <= planned(answers=answers).frame_bytes.value <= 1.2 * bytes_per_frame
         assert f"{MEGAPIXELS[model]:.1f} million photosites" in planned(answers=answers).frame_bytes.basis
 
+    def test_a_frame_of_the_rehearsal_has_the_size_that_a_check_measures(self) -> None:
+        rows, columns = BODIES["Test"].sensor
+        answers = Answers(camera=replace(EOS, model=BODIES["Test"].model))
+        assert planned(answers=answers).frame_bytes.value == pytest.approx(2 * rows * columns, rel=0.02)
+
     def test_a_guess_is_a_doubt_and_no_fault(self) -> None:
         plan = planned(1 * GB, Answers(camera=CameraIdentity("Acme", "Unknown 9", "")))
         assert plan.faults == ()
-        assert any("are missing" in doubt and "the size of Unknown 9 is not known" in doubt for doubt in plan.doubts)
+        assert any("are missing" in doubt and "a frame of Unknown 9" in doubt for doubt in plan.doubts)
 
     def test_free_space_is_that_of_the_nearest_folder_that_is_there(
         self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -175,6 +181,18 @@ class TestTime:
         assert plan.warm_up_s >= SETTINGS.sequence.warm_up_s
         assert "assumed" in plan.frame_s.basis
         assert plan.time_s == pytest.approx(110 * plan.frame_s.value + plan.warm_up_s)
+
+    def test_a_lamp_that_could_not_be_asked_about_is_taken_as_cold(self) -> None:
+        settings = settings_with(lab={"projector": {"control": "pjlink", "host": "h"}})
+        plan = planned(answers=Answers(), settings=settings)
+        assert plan.warm_up_s >= settings.sequence.warm_up_s
+        assert plan.time_s == pytest.approx(110 * plan.frame_s.value + plan.warm_up_s)
+        told = "\n".join(plan_lines(plan))
+        assert "until the lamp is warm, if it does not burn yet" in told
+        assert "not under control" not in told
+        by_hand = planned(answers=Answers())
+        assert by_hand.warm_up_s == 0
+        assert any("not under control" in line for line in plan_lines(by_hand))
 
     def test_a_lamp_that_burns_needs_no_warm_up(self) -> None:
         assert planned(answers=Answers(camera=EOS, lit=True)).warm_up_s == 0

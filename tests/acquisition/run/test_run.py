@@ -8,19 +8,30 @@ from pathlib import Path
 
 import pytest
 
+from acquisition.monitor.view import read_session
+from acquisition.run import run
+from acquisition.run.devices import Devices
 from acquisition.run.queue import link_runs
 from acquisition.run.rig.lab import session_clock
-from acquisition.run.run import check_frames, clock_note, killed_note, require_same_devices, take_session
+from acquisition.run.run import (
+    check_frames,
+    clock_note,
+    killed_note,
+    require_same_devices,
+    run_session,
+    take_session,
+)
 from drivers.camera import CameraIdentity, CapturedFrame
 from drivers.presenter import Colour
 from drivers.projector import ProjectorIdentity
 from experiment.config import LabSettings
 from experiment.lights import Illumination
 from experiment.session.folder import Session
+from experiment.session.heartbeat import BEGINS
 from experiment.session.journal import Journal
 from experiment.session.records import Judgement, link_steps, plan_steps
 from foundation.console import Ending
-from foundation.errors import DeviceRefused
+from foundation.errors import DeviceError, DeviceRefused
 from tests.acquisition.run.scripted import LIGHTS, SETTINGS, Lab
 
 RESPONSE = (Colour(250, 0, 0), Colour(0, 250, 0))
@@ -120,6 +131,31 @@ def test_the_journal_says_that_the_run_before_was_killed(folder: Path) -> None:
     assert "was killed, or power was lost" in killed_note(Session.open(folder))
     journal.beat("ended", "interrupted", until)
     assert killed_note(Session.open(folder)) == ""
+
+
+def test_a_run_that_begins_again_says_so_before_its_devices_are_open(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    lab = Lab(folder)
+    lab.session.journal.beat("running", "frames are taken", datetime.now(UTC) + timedelta(seconds=60))
+    lab.session.close()
+    seen: list[str] = []
+
+    def opening(*given: object) -> Devices:
+        seen.append(read_session(folder).head(datetime.now(UTC)).sentence)
+        raise DeviceError("no camera on USB; plug it in")
+
+    def same(session: Session, settings: LabSettings) -> None:
+        """Accept any settings."""
+
+    monkeypatch.setattr(run, "open_rig", opening)
+    monkeypatch.setattr(run, "require_same", same)
+    with pytest.raises(DeviceError):
+        run_session(SETTINGS, folder, lambda done, total: None)
+    assert seen == [BEGINS]
+    view = read_session(folder)
+    assert view.head(datetime.now(UTC)).sentence == "no camera on USB; plug it in"
+    assert [event.what for event in view.events].count("killed") == 1
 
 
 def test_another_camera_or_projector_is_refused(folder: Path) -> None:

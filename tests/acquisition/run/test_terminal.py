@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import errno
+import io
+
 import pytest
 
-from acquisition.run.notices import Terminal, TimeLeft, verdict_line
+from acquisition.run.notices import PLAIN_S, Terminal, TimeLeft, verdict_line
 from acquisition.run.pipeline import Taken
 from drivers.presenter import Colour
 from experiment.session.records import Check, Judgement, SessionStep
@@ -48,3 +51,33 @@ def test_lines_stay_where_there_is_no_terminal(capsys: pytest.CaptureFixture[str
         terminal.announce("refused: light 5: too dark")
         terminal.state("the lamp warms up, 3 min 00 s left")
     assert "refused: light 5: too dark\n" in capsys.readouterr().err
+
+
+def test_a_run_into_a_file_has_a_line_now_and_then(capsys: pytest.CaptureFixture[str]) -> None:
+    now = [0.0]
+    with Terminal(lambda: now[0]) as terminal:
+        terminal.progress(0, 200)
+        for done in range(1, 201):
+            now[0] += 2.0
+            terminal.taken(Taken(STEP, Judgement((Check("light", 0.2, None, 0.5, "°"),)), 200 - done))
+            terminal.progress(done, 200)
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) == 1 + int(400 // PLAIN_S) + 1
+    assert "0 of 200 frames" in lines[0]
+    assert "90 of 200 frames, left 3 min 40 s, light 5 accepted, light 0.2°" in lines[6]
+    assert "200 of 200 frames, light 5 accepted" in lines[-1]
+    assert "━" not in "".join(lines)
+
+
+class FullOutput(io.StringIO):
+    """An output whose disk is full."""
+
+    def write(self, text: str) -> int:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+
+def test_a_log_on_a_full_disk_ends_no_run(monkeypatch: pytest.MonkeyPatch) -> None:
+    with Terminal() as terminal:
+        monkeypatch.setattr("sys.stderr", FullOutput())
+        terminal.announce("refused: light 5: too dark")
+        terminal.progress(0, 2)

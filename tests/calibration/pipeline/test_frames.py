@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from calibration.pipeline.baseline import select_frames
+from calibration.pipeline.baseline import select_frames, stated_origin
 from drivers.camera import CapturedFrame
 from drivers.presenter import Colour
 from experiment.chart.layout import design_chart
@@ -69,3 +69,14 @@ def test_frames_taken_by_other_means_have_their_times_alone(taken: Callable[[Seq
         session.journal.note(AT, "import", "13 frames from frames.csv")
         records = select_frames(session).records
     assert [(record.taken_at - AT).total_seconds() for record in records] == sorted(listed)
+
+
+@pytest.mark.parametrize("text", ["", "rig = ["])
+def test_damaged_settings_are_told_where_a_table_is_made(
+    taken: Callable[[Sequence[float]], Session], text: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    with taken([float(number) for number in range(len(STEPS))]) as session:
+        (session.folder / "session.toml").write_text(text)
+        assert stated_origin(session).rig is None
+    assert "session.toml" in caplog.text
+    assert "neither its origin" in caplog.text

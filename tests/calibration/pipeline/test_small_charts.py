@@ -11,8 +11,9 @@ from calibration.pipeline.build import build
 from calibration.registration.register import register
 from calibration.report.report import write_report
 from calibration.table.lut import open_lut
-from calibration.verdict import judged_values
+from calibration.verdict import judged_values, remark
 from experiment.chart.layout import design_chart
+from experiment.lights import plan_illuminations
 from sim.world.room import Room
 from tests.calibration.lab import LIGHTS, SETTINGS, hang_chart, renumbered, take
 
@@ -52,3 +53,16 @@ def test_cells_of_a_hundred_pixels_are_found_well_enough(tmp_path: Path) -> None
     assert found.cell_px > 100
     assert found.clearance > 20
     assert np.linalg.norm(error, axis=1).max() < 0.05 * found.cell_px
+
+
+def test_a_small_chart_is_not_told_to_plan_lights_that_were_planned(tmp_path: Path) -> None:
+    lab = hang_chart(design_chart(2), "Test", Room())
+    with take(lab, tmp_path / "session", plan_illuminations(1, ())) as session:
+        result = build(session, tmp_path / "lut")
+    unknown = next(row for row in result.verdict.remarks if row.figure.name == "linearity_known")
+    said = remark(unknown, result.figures)
+    assert "are needed" in said
+    assert "plan red" not in said
+    (source,) = (one.source for one in result.figures.budget.components if one.name == "linearity")
+    assert "are needed" in source
+    assert "no lights" not in source

@@ -97,11 +97,14 @@ def test_too_few_patches_say_what_is_usual() -> None:
     known = printed_predictors(np.zeros((20, 3)), np.zeros(0, dtype=np.int64))
     found = superposition([patches] * 3, patches, FULL, np.ones(20, dtype=np.bool_), known, white=True)
     assert not found.measured
+    assert found.unmeasured is not None
+    assert "20 patches" in found.unmeasured.why
+    assert "more colours" in found.unmeasured.remedy
     assert not found.deviation.any()
     assert np.all(np.diag(found.covariance) > 0)
 
 
 def test_a_factor_common_to_all_counts_is_no_error_of_a_direction() -> None:
     level = np.array(NODES) * FULL
-    found = Superposition(FULL, 0.02 * level, np.zeros((len(NODES), len(NODES))), measured=True)
+    found = Superposition(FULL, 0.02 * level, np.zeros((len(NODES), len(NODES))), None)
     assert found.white_covariance(np.array([[500.0, 3000.0, 9000.0]])) == pytest.approx(0, abs=1e-12)

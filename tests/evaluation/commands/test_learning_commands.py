@@ -139,11 +139,14 @@ def test_all_leaves_out_what_is_not_installed_and_says_why(
     ("arguments", "why"),
     [
         (["cv", "oracle", "DATA"], "'oracle' is no method that learns"),
-        (["cv", "smart-color-cat", "DATA", "--folds", "31"], "31 folds of 30 images: expected 2 to 30"),
+        (["cv", "smart-color-cat", "DATA", "--folds", "31"], "each fold holds an image of its own; 2 to 30"),
         (["cv", "smart-color-cat", "DATA", "--folds", "0.5"], "'0.5', expected a number from 2, or a CSV file"),
         (["cv", "smart-color-cat", "DATA", "--folds", "three"], "'three', expected a number from 2, or a CSV file"),
         (["cv", "smart-color-cat", "DATA", "--folds", "none.csv"], "none.csv"),
         (["train", "all", "DATA", "--out", "x.npz"], "a model file holds one"),
+        (["train", "smart-color-cat", "DATA", "--adapt", "DATA", "--out", "x.npz"], "behind --adapt stands the model"),
+        (["run", "DATA", "--model", "m.npz"], "evaluate run DATA --method m.npz"),
+        (["DATA", "--model=m.npz"], "evaluate run DATA --method m.npz"),
         (["train", "smart-color-cat", "DATA", "--out", "model.txt"], "ends in .npz"),
     ],
 )

@@ -280,7 +280,7 @@ def test_beside_real_images(place: Path, capsys: pytest.CaptureFixture[str]) -> 
     assert main([*BASIC[:5], *wish, "--real", "0,5,50,all"]) == 0
     printed = " ".join(capsys.readouterr().out.split())
     assert "real: mean reproduction error beside N real images, degrees" in printed
-    assert "No rows beside 50 real images: a fold leaves 20; all are those" in printed
+    assert "No rows beside 50 real images: a fold that is tested leaves 20; all are those" in printed
     assert "Map of the mean is a class of your own, which is not adapted" in printed
     lines = list(csv.DictReader((place / "out/results.csv").read_text().splitlines()))
     rows = {(line["method"], line["training"], line["way"], line["real"]) for line in lines}

@@ -55,8 +55,15 @@ def test_groups_stay_together() -> None:
 
 @pytest.mark.parametrize(("count", "folds", "groups"), [(5, 1, None), (5, 6, None), (4, 3, ["a", "a", "b", "b"])])
 def test_impossible_folds_are_refused(count: int, folds: int, groups: list[str] | None) -> None:
-    with pytest.raises(InputError, match="expected 2 to"):
+    with pytest.raises(InputError, match="folds are possible here"):
         draw_folds(count, folds, groups=groups)
+
+
+def test_what_is_too_few_for_folds_is_said() -> None:
+    with pytest.raises(InputError, match="; 2 folds are possible"):
+        draw_folds(2, 3)
+    with pytest.raises(InputError, match="give more images"):
+        draw_folds(1, 2)
 
 
 def test_folds_are_the_authors_unless_others_are_asked_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -79,8 +86,8 @@ def test_folds_are_the_authors_unless_others_are_asked_for(tmp_path: Path, monke
 @pytest.mark.parametrize(
     ("text", "why"),
     [
-        ("1", "expected 2 to 4"),
-        ("-2", "expected 2 to 4"),
+        ("1", "2 to 4 folds are possible"),
+        ("-2", "2 to 4 folds are possible"),
         ("+-2", "'[+]-2', expected a number from 2"),
         ("2.0", "'2.0', expected a number from 2"),
         ("²", "'²', expected a number from 2"),

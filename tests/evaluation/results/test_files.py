@@ -81,7 +81,7 @@ def test_other_files(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"cannot read .*errors.csv.*name a results folder"):
         read_errors(tmp_path)
     (tmp_path / "errors.csv").write_bytes(b"\xff\xfe\x80")
-    with pytest.raises(FormatError, match="no text in UTF-8"):
+    with pytest.raises(FormatError, match="UTF-8 was expected"):
         read_errors(tmp_path)
 
 

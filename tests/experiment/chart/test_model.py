@@ -180,3 +180,11 @@ def test_a_missing_chart_or_a_folder_is_refused(tmp_path: Path) -> None:
     for path in (tmp_path / "none.json", tmp_path):
         with pytest.raises(FormatError, match=r"chart\.json"):
             load_chart(path)
+
+
+def test_the_print_is_no_description_of_it(tmp_path: Path) -> None:
+    pdf = tmp_path / "chart.pdf"
+    pdf.write_bytes(b"%PDF-1.6\n\xff")
+    with pytest.raises(FormatError) as caught:
+        load_chart(pdf)
+    assert "chart.json" in caught.value.remedy

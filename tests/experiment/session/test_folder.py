@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+from collections.abc import Callable
 from dataclasses import replace
 from datetime import UTC, datetime
 from functools import partial
@@ -109,6 +110,29 @@ def test_lights_edited_since_are_refused(session: Session, lights: tuple[Illumin
 def test_a_session_without_its_settings(session: Session) -> None:
     (session.folder / "session.toml").unlink()
     with pytest.raises(FormatError, match=r"session\.toml: No such file"):
+        session.settings_text()
+
+
+def _empty(path: Path) -> None:
+    path.write_text("")
+
+
+@pytest.mark.parametrize("name", ["chart.json", "illuminations.csv"])
+@pytest.mark.parametrize("damage", [Path.unlink, _empty])
+def test_a_lost_copy_is_restored_and_not_made_anew(
+    session: Session, name: str, damage: Callable[[Path], object]
+) -> None:
+    session.close()
+    damage(session.folder / name)
+    with pytest.raises(FormatError, match=name.replace(".", r"\.")) as caught:
+        Session.open(session.folder)
+    assert "restore it from a copy of the session" in caught.value.remedy
+    assert "acquire illuminations" not in str(caught.value)
+
+
+def test_settings_that_were_emptied_are_damaged(session: Session) -> None:
+    (session.folder / "session.toml").write_text("\n")
+    with pytest.raises(FormatError, match=r"session\.toml: empty"):
         session.settings_text()
 
 

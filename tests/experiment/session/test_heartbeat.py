@@ -244,7 +244,11 @@ class TestSignsOfLife:
         return said
 
     def test_a_run_that_comes_to_its_end_gives_no_cause(self) -> None:
-        assert self.told(lambda alive: alive()) == [("running", "frames are taken"), ("ended", "")]
+        assert self.told(lambda alive: alive()) == [
+            ("waiting", heartbeat.BEGINS),
+            ("running", "frames are taken"),
+            ("ended", ""),
+        ]
 
     def test_what_ended_it_is_told(self) -> None:
         def interrupted(alive: Callable[[], None]) -> None:
@@ -271,6 +275,22 @@ class TestSignsOfLife:
                 alive()
 
         assert len(self.told(twelve_frames)) < 8
+
+    def test_a_frame_is_a_sign_of_life(self, tmp_path: Path) -> None:
+        Journal.create(tmp_path / "journal.sqlite", ())
+        with closing(Journal.open_for_run(tmp_path / "journal.sqlite")) as journal:
+            journal.beat("running", "frames are taken", NOW)
+            before = journal.heartbeat()
+            journal.note(NOW, "refused", "a frame")
+            after = journal.heartbeat()
+            assert before is not None
+            assert after is not None
+            assert after.at > before.at
+            assert replace(after, at=before.at) == before
+            journal.beat("ended", "", NOW)
+            last = journal.heartbeat()
+            journal.note(NOW, "complete", "what is written behind the end is none")
+            assert journal.heartbeat() == last
 
     def test_after_a_wait_the_first_frame_says_that_it_is_over(self, tmp_path: Path) -> None:
         Journal.create(tmp_path / "journal.sqlite", ())

@@ -74,7 +74,7 @@ def test_every_place_is_found_where_all_are_wanted(path: Path) -> None:
 def test_what_is_refused() -> None:
     with pytest.raises(InputError, match="0 crops of a picture were asked for, expected 1 or more"):
         Preparation(crop=(8, 8), crops=0)
-    with pytest.raises(InputError, match="2 crops of a picture have no size; give that of a crop, such as 512x512"):
+    with pytest.raises(InputError, match="2 crops of a picture have no size; give that of a crop: --crop 512x512"):
         Preparation(crops=2)
 
 
