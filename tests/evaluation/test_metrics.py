@@ -7,7 +7,7 @@ import math
 import numpy as np
 import numpy.typing as npt
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from evaluation import metrics as maps
@@ -30,7 +30,6 @@ def test_reproduction_is_the_angle_of_the_corrected_white() -> None:
     assert reproduction_error([0, 1, 1], [1, 1, 1]) == pytest.approx(math.degrees(math.acos(1 / math.sqrt(3))))
 
 
-@settings(deadline=None)
 @given(lights, lights, st.floats(0.001, 1000))
 def test_brightness_does_not_matter(estimate: tuple[float, ...], truth: tuple[float, ...], scale: float) -> None:
     for error in (recovery_error, reproduction_error):
@@ -40,7 +39,6 @@ def test_brightness_does_not_matter(estimate: tuple[float, ...], truth: tuple[fl
         assert error(estimate, estimate) == pytest.approx(0, abs=1e-6)
 
 
-@settings(deadline=None)
 @given(lights, lights)
 def test_reproduction_does_not_change_with_the_light(estimate: tuple[float, ...], truth: tuple[float, ...]) -> None:
     # Finlayson's argument for it: a change of light scales estimate and truth alike.

@@ -7,7 +7,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from acquisition.cli import main
@@ -141,7 +141,6 @@ ccts_k = st.none() | st.floats(1, 1e6)
 colours = st.builds(Colour, st.integers(0, 255), st.integers(0, 255), st.integers(0, 255))
 
 
-@settings(deadline=None)
 @given(st.lists(st.tuples(ccts_k, colours), min_size=1, max_size=8))
 def test_any_lights_are_read_again(
     tmp_path_factory: pytest.TempPathFactory, drawn: list[tuple[float | None, Colour]]

@@ -51,7 +51,7 @@ def rows_of(image: Image16, filters: npt.NDArray[np.uint8]) -> bytes:
     return np.hstack([filters[:, None], filtered]).astype(np.uint8).tobytes()
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150)
 @given(
     image=hnp.arrays(
         np.uint16,
@@ -139,7 +139,7 @@ def test_distances_count_the_filters_between_rows() -> None:
     np.testing.assert_array_equal(distances_of(image), expected)
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 @given(st.integers(0, 1 << 32), st.integers(1, 40), st.integers(1, 40), st.integers(2, 40))
 def test_what_is_found_is_equal(seed: int, height: int, width: int, colours: int) -> None:
     image = drawn(height, width, colours, seed)
@@ -177,7 +177,7 @@ def test_images_that_no_png_holds_are_refused() -> None:
 frequencies = st.lists(st.integers(0, 1 << 40) | st.just(0), min_size=1, max_size=286)
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=200)
 @given(frequencies)
 def test_codes_are_complete_and_begin_no_other(counts: list[int]) -> None:
     lengths = code_lengths(np.array(counts), LONGEST)
@@ -191,7 +191,7 @@ def test_codes_are_complete_and_begin_no_other(counts: list[int]) -> None:
     assert not any(after.startswith(before) for before, after in pairwise(ordered))
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 @given(st.lists(st.integers(1, 60), min_size=2, max_size=40))
 def test_codes_are_the_shortest(counts: list[int]) -> None:
     """Against Huffman's own construction by a heap, where no code reaches the limit."""

@@ -39,7 +39,7 @@ def test_the_field_is_found_and_its_mean_over_the_cells_is_one() -> None:
     assert paper.white == pytest.approx(level * falloff(CENTRES).mean(axis=0), rel=1e-3)
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=15)
 @given(st.integers(0, 10_000), st.sampled_from([20.0, 300.0, 9000.0]))
 def test_noise_is_not_taken_for_shape(seed: int, level: float) -> None:
     random = np.random.default_rng(seed)

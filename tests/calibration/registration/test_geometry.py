@@ -95,7 +95,7 @@ def test_parallax_is_the_way_in_which_heights_are_seen(tilt_deg: float, pan_deg:
     assert lens.parallax(points[7]) == pytest.approx(lens.parallax(points)[7:8])
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 @given(st.floats(-3, 3), st.floats(-0.05, 0.05), st.floats(-0.05, 0.05))
 def test_a_displacement_without_bend_is_followed_exactly(level: float, slope_x: float, slope_y: float) -> None:
     low, high = np.array([10.0, 20.0]), np.array([110.0, 90.0])

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from drivers.links.link import Pipe, PipeStalled, UsbPipes
@@ -453,7 +453,6 @@ def _give_twice(transport: UsbTransport, pieces: list[bytes]) -> None:
         transport.transact(PtpRequest(GIVE, number, (2000,)), receive=pieces.append, timeout=PATIENCE_S)
 
 
-@settings(deadline=None)
 @given(after=st.integers(0, 3100))
 def test_pulled_out_at_any_byte_is_closed(after: int) -> None:
     pieces: list[bytes] = []
@@ -463,7 +462,6 @@ def test_pulled_out_at_any_byte_is_closed(after: int) -> None:
     assert (payload(2000) * 2).startswith(b"".join(pieces))
 
 
-@settings(deadline=None)
 @given(reads=st.integers(0, 3))
 def test_silence_at_any_read_is_a_timeout(reads: int) -> None:
     transport = UsbTransport(Deaf(camera(), reads), SimulatedClock())
@@ -471,7 +469,6 @@ def test_silence_at_any_read_is_a_timeout(reads: int) -> None:
         transport.transact(PtpRequest(GIVE, 1, (3000,)), timeout=PATIENCE_S)
 
 
-@settings(deadline=None)
 @given(at=st.integers(0, 11), value=st.integers(0, 255))
 def test_a_garbled_byte_in_a_response_is_never_taken_for_another_message(at: int, value: int) -> None:
     def change(read: bytes) -> bytes:

@@ -195,7 +195,7 @@ def plainly(data: bytes) -> dng_reading.PlainDng | None:
 _CODES = [b"\0\1\1\2", b"\1\0\2\1", b"\1\2\0\1", b"\2\1\1\0"]
 
 
-@settings(max_examples=100, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=100, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(
     size=st.tuples(st.integers(40, 70), st.integers(40, 70)),
     code=st.sampled_from(_CODES),

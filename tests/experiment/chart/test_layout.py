@@ -51,7 +51,7 @@ def slots_px(chart: Chart) -> npt.NDArray[np.int64]:
     return np.rint(exact).astype(np.int64)
 
 
-@settings(deadline=None, max_examples=40)
+@settings(max_examples=40)
 @given(charts)
 def test_slots_tile_the_field_without_overlap_or_gap_inside_the_margin(chart: Chart) -> None:
     boxes = slots_px(chart)
@@ -68,7 +68,7 @@ def test_slots_tile_the_field_without_overlap_or_gap_inside_the_margin(chart: Ch
     assert np.abs(centre - page / 2).max() <= PX_MM, "the field is centred to a pixel"
 
 
-@settings(deadline=None, max_examples=40)
+@settings(max_examples=40)
 @given(charts)
 def test_every_colour_stands_once_and_every_quarter_has_every_level(chart: Chart) -> None:
     """But where there are fewer than four of a grey."""
@@ -87,7 +87,7 @@ def test_every_colour_stands_once_and_every_quarter_has_every_level(chart: Chart
     assert not scarce or chart.bits == 2
 
 
-@settings(deadline=None, max_examples=40)
+@settings(max_examples=40)
 @given(charts)
 def test_tags_are_numbered_row_by_row_reach_the_edges_and_stand_close_enough(chart: Chart) -> None:
     corners = np.array([tag.corners_mm for tag in chart.tags])
@@ -197,7 +197,7 @@ def test_what_cannot_be_designed_says_what_can(
         design_chart(bits, page, seed)
 
 
-@settings(deadline=None, max_examples=40)
+@settings(max_examples=40)
 @given(st.integers(2, 20), st.integers(2, 20), st.floats(0, 1), st.floats(0.1, 1), st.integers(0, 99))
 def test_spread_chooses_as_many_as_asked_among_the_allowed(
     rows: int, columns: int, share: float, density: float, seed: int

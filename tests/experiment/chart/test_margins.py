@@ -59,7 +59,7 @@ def clear_of_the_field(chart: Chart) -> npt.NDArray[np.int64]:
     return marks
 
 
-@settings(deadline=None, max_examples=12)
+@settings(max_examples=12)
 @given(charts)
 def test_marks_never_touch_the_field_or_leave_the_sheet(chart: Chart) -> None:
     assert len(clear_of_the_field(chart)) > 500

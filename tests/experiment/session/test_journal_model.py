@@ -148,7 +148,7 @@ def check(journal: Journal, model: Model) -> None:
     assert (None if beat is None else beat.state) == model.state
 
 
-@settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@settings(max_examples=25, suppress_health_check=[HealthCheck.too_slow])
 @given(st.lists(OPERATION, max_size=14))
 def test_a_journal_is_what_was_written(operations: list[tuple[str, Any]]) -> None:
     with tempfile.TemporaryDirectory() as place:

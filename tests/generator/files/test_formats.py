@@ -86,7 +86,7 @@ def test_opencv_reads_the_same(form: Format) -> None:
 
 
 @pytest.mark.parametrize("form", WHOLE)
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(image=images)
 def test_any_image_comes_back(form: Format, image: Image16) -> None:
     np.testing.assert_array_equal(decode_image(encode_image(image, form, METADATA), form, "image"), image)

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     pass
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(st.integers(1, 5), st.integers(1, 30), st.integers(1, 30), st.integers(0, 2**32 - 1), st.booleans())
 def test_every_unfit_colour_and_no_other_is_replaced(bits: int, height: int, width: int, seed: int, few: bool) -> None:
     rng = np.random.default_rng(seed)

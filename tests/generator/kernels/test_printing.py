@@ -89,7 +89,7 @@ def spelled_out(
     return out
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(st.integers(1, 70), st.integers(1, 9), st.integers(0, 2**64 - 1), st.integers(0, 2**32 - 1))
 def test_an_image_is_what_the_rule_says(width: int, height: int, seed: int, image: int) -> None:
     picture = np.random.default_rng(width).integers(0, 256, (height, width, 3)).astype(np.uint8)

@@ -61,7 +61,7 @@ def test_first_choices_of_seed_0_are_fixed_for_ever() -> None:
     assert row == [22, 24, 3, 14, 11, 8, 22, 6, 3, 7, 7, 19]
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(
     st.integers(1, 5),
     st.integers(1, 30),
@@ -95,7 +95,7 @@ def test_bands_threads_memory_order_and_a_given_target_change_nothing(
     np.testing.assert_array_equal(target, whole)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(st.one_of(st.integers(1, 40), st.integers(480, 1100)), st.integers(1, 4), st.integers(0, 100), st.booleans())
 def test_an_image_too_large_for_the_caches_is_the_same_and_nothing_beside_it_is_written(
     width: int, height: int, margin: int, odd: bool

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from foundation.colorimetry import angles_deg
@@ -44,7 +44,6 @@ _drives = st.tuples(*[st.floats(0.001, 1.0)] * 3)
 
 
 @given(_drives)
-@settings(deadline=None)
 def test_any_light_within_is_matched_by_three_neighbours_at_most(drives: tuple[float, float, float]) -> None:
     wanted = np.array(drives) @ PRIMARIES
     match = GRID.match(wanted)
@@ -101,7 +100,6 @@ def test_a_light_outside_is_refused_with_how_far_and_what_is_nearest() -> None:
 
 
 @given(st.floats(0.0, 1.0), st.floats(0.0, 1.0))
-@settings(deadline=None)
 def test_what_is_contained_is_matched_and_what_is_not_is_refused(r: float, b: float) -> None:
     if r + b > 1:
         r, b = 1 - r, 1 - b

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from foundation.errors import InputError
@@ -34,7 +34,6 @@ class Halves:
 
 
 @given(_parts)
-@settings(deadline=None)
 def test_a_label_gives_back_the_mixture(parts: dict[int, float]) -> None:
     mixture = mixture_of(parts)
     assert parse_mixture(mixture.label) == mixture

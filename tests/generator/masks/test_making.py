@@ -165,7 +165,7 @@ def shrunk(fine: Map, height: int, width: int) -> Map:
     st.integers(0, 2**64 - 1),
     st.integers(0, 2**32 - 1),
 )
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 def test_weights_are_whole_parts_that_sum_to_one(
     kind: str, height: int, width: int, lights: int, seed: int, number: int
 ) -> None:

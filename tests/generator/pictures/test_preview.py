@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
@@ -70,7 +70,6 @@ def test_impossible_parameters_are_refused(a: float, gamma: float) -> None:
         fit_flash(np.ones((1, 1, 3)), a, gamma)
 
 
-@settings(deadline=None)
 @given(
     hnp.arrays(np.uint16, (3, 4, 3), elements=st.integers(0, 65535) | st.integers(0, 3)),
     st.sampled_from([255, 12000, 65535]),
@@ -87,7 +86,6 @@ def test_previews_are_small() -> None:
     assert preview_of(image, 12000, side=400).shape == (300, 200, 3)
 
 
-@settings(deadline=None)
 @given(
     hnp.arrays(np.uint16, st.tuples(st.integers(1, 12), st.integers(1, 12), st.just(3))),
     st.integers(1, 12),

@@ -122,7 +122,7 @@ def test_every_value_is_a_sample_of_its_colour_under_its_light(make_lut: MakeLut
     np.testing.assert_allclose(batch.illuminants, lut.ground_truth[batch.lights], rtol=1e-6)
 
 
-@settings(deadline=None, max_examples=25, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=25, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(order=st.permutations(list(range(24))), cut=st.integers(1, 23))
 def test_items_do_not_depend_on_who_asks_when(
     made: tuple[Crops, np.ndarray[tuple[int, ...], np.dtype[np.float32]]], order: list[int], cut: int

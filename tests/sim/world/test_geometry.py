@@ -5,7 +5,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
@@ -61,7 +61,6 @@ def test_a_point_nearer_to_the_camera_lies_farther_from_the_axis() -> None:
     np.testing.assert_array_equal(grows, wavy.surface.height(points) > 0)
 
 
-@settings(deadline=None)
 @given(
     x=st.floats(-100, 2700),
     y=st.floats(-100, 1832),
