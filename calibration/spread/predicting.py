@@ -16,6 +16,7 @@ C cells in the order of colour indices; levels are those of bare paper 1.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 import numpy.typing as npt
@@ -146,8 +147,9 @@ def _less_curvature(columns: npt.NDArray[np.floating], side: int) -> _Array:
     return (total / np.maximum(count, 1)).reshape(columns.shape)
 
 
-def _left_by_others(root: _Array, usable: _Mask, bits: int) -> tuple[_Array, _Array]:
-    """Return the matrix (C, C) by which roots of levels (C,) become what the function leaves, and their variance."""
+@lru_cache(maxsize=2)
+def _covariance(bits: int) -> _Array:
+    """Return the covariance (C, C) of the roots of levels of a chart's codes, without noise; not to be written."""
     side = 1 << bits
     codes = np.stack(np.unravel_index(np.arange(side**3), (side,) * 3), axis=1).astype(np.float64)
     # Bends where another ink becomes the least.
@@ -155,7 +157,14 @@ def _left_by_others(root: _Array, usable: _Mask, bits: int) -> tuple[_Array, _Ar
     apart = np.sqrt(5 * ((places[:, None] - places) ** 2).sum(axis=-1)) / _REACH
     linear = np.column_stack([np.ones(len(places)), places - (side - 1) / 2])
     # Matérn's covariance, 5/2 (Rasmussen and Williams, 4.2.1).
-    function = (1 + apart + apart**2 / 3) * np.exp(-apart) + _UNKNOWN * linear @ linear.T
+    covariance: _Array = (1 + apart + apart**2 / 3) * np.exp(-apart) + _UNKNOWN * linear @ linear.T
+    covariance.flags.writeable = False
+    return covariance
+
+
+def _left_by_others(root: _Array, usable: _Mask, bits: int) -> tuple[_Array, _Array]:
+    """Return the matrix (C, C) by which roots of levels (C,) become what the function leaves, and their variance."""
+    function = _covariance(bits)
     noise = (1 + _DARK / np.maximum(root, 0.1) ** 2) * np.where(usable, 1.0, _UNKNOWN)
     inverse, share = _likeliest(function, noise, root)
     own = np.diag(inverse)
