@@ -30,7 +30,7 @@ from evaluation.metrics import recovery_error
 
 WORTH: Final = 200.0
 """Images that what was learned elsewhere is taken to be worth before any is seen."""
-STRENGTH: Final = 50.0
+STRENGTH: Final = 25.0
 """Images that this opinion weighs as much as."""
 _SHARES: Final = np.linspace(0, 1, 101)
 """Weights to choose among."""

@@ -12,7 +12,7 @@ import pytest
 from evaluation.learning.log_chroma import BINS, LogChroma, crossentropy, fold, likelihood, moments
 from evaluation.metrics import recovery_error
 from foundation.errors import InputError
-from tests.evaluation.learning.made_up_world import world
+from tests.evaluation.learning.made_up_world import MadeUp, world
 
 pytestmark = pytest.mark.slow
 
@@ -23,6 +23,11 @@ def extracted(image: npt.NDArray[np.float32]) -> npt.NDArray[np.uint16]:
     found = LEARNER.features(image)
     assert found is not None
     return found
+
+
+def taught_by(scenes: list[MadeUp]) -> tuple[npt.NDArray[np.uint16], npt.NDArray[np.float64]]:
+    lights = np.stack([scene.truth for scene in scenes])
+    return np.stack([extracted(scene.image) for scene in scenes]), lights / lights.sum(axis=1, keepdims=True)
 
 
 def test_a_light_shifts_both_histograms() -> None:
@@ -140,24 +145,17 @@ def test_the_likelihood_is_least_at_the_truth() -> None:
 
 
 def test_an_image_that_stands_for_three_is_as_three() -> None:
-    first, second = (
-        (np.stack([extracted(one.image) for one in scenes]), np.stack([one.truth / one.truth.sum() for one in scenes]))
-        for scenes in (world(12), world(2, seed=5))
-    )
+    known, lights = taught_by(world(12))
+    few, their_lights = taught_by(world(2, seed=5))
     # Of 12 images worth 4, each of the two stands for three.
-    tuned = LEARNER.tune(LEARNER.fit_features(*first), *second, worth=4)
-    both = LEARNER.fit_features(
-        *(np.concatenate([one, *[other] * 3]) for one, other in zip(first, second, strict=True))
-    )
-    assert recovery_error(tuned.lights(first[0]), both.lights(first[0])).max() < 0.1
+    tuned = LEARNER.tune(LEARNER.fit_features(known, lights), few, their_lights, worth=4)
+    both = LEARNER.fit_features(np.concatenate([known, *[few] * 3]), np.concatenate([lights, *[their_lights] * 3]))
+    assert recovery_error(tuned.lights(known), both.lights(known)).max() < 0.1
 
 
 def test_images_of_a_file_that_cannot_be_are_refused() -> None:
     scenes = world(3)
-    model = LEARNER.fit_features(
-        np.stack([extracted(one.image) for one in scenes]), np.stack([one.truth / one.truth.sum() for one in scenes])
-    )
-    arrays: dict[str, Any] = dict(model.arrays())
+    arrays: dict[str, Any] = dict(LEARNER.fit_features(*taught_by(scenes)).arrays())
     shown = LEARNER.restore(arrays).lessons
     assert shown is not None
     np.testing.assert_array_equal(shown.histograms()[0], extracted(scenes[0].image))
