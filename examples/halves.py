@@ -1,10 +1,15 @@
-"""Halve an archive of thumbnails at random: the lights of one half to generate under, the other half to test on.
+"""Divide an archive of thumbnails at random: the lights of one part to generate under, the rest to test on.
 
-`python examples/halves.py nus_canon_600d_64x64.npz [FOLDER] [--names PART]` writes for each half H, 0 and 1, into the
-folder (the working folder by default): `half_H.npz`, the images, for `evaluate describe` and `generate --like`;
-`lights_H.csv` (r,g,b a line, of sum 1) for `generate --match`; and `images_H.csv` (column image) for `evaluate transfer
---only`. A set that was made by half 0 is tested on the images of half 1 and the reverse, so that every image is tested
-once and no test light was looked at. `all.npz` holds both halves; with `--names` only images whose names contain PART.
+`python examples/halves.py nus_canon_600d_64x64.npz [FOLDER] [--names PART] [--parts N]` writes for each half H, 0 and
+1, into the folder (the working folder by default): `half_H.npz`, the images, for `evaluate describe` and `generate
+--like`; `lights_H.csv` (r,g,b a line, of sum 1) for `generate --match`; and `images_H.csv` (column image) for `evaluate
+transfer --only`. A set that was made by half 0 is tested on the images of half 1 and the reverse, so that every image
+is tested once and no test light was looked at. `all.npz` holds both halves; with `--names` only images whose names
+contain PART.
+
+Of N parts, `others_P.npz` and `others_P.csv` are images and lights of all but part P, whose images `images_P.csv`
+names; `folds.csv` (image,fold) is for `evaluate transfer --folds`: real images beside a set are then drawn of those
+under whose lights it was made.
 """
 
 from __future__ import annotations
@@ -26,6 +31,7 @@ def main() -> None:
     parser.add_argument("archive", type=Path)
     parser.add_argument("folder", type=Path, nargs="?", default=Path())
     parser.add_argument("--names", help="take images alone whose names contain this")
+    parser.add_argument("--parts", type=int, default=2)
     given = parser.parse_args()
     save: Any = np.savez
     with np.load(given.archive) as content:
@@ -37,13 +43,19 @@ def main() -> None:
     save(given.folder / "all.npz", **data)
     order = np.random.default_rng(SEED).permutation(len(data["gt"]))
     chromaticities = data["gt"] / data["gt"].sum(axis=1, keepdims=True)
-    for half, places in enumerate(np.array_split(order, [len(order) // 2])):
-        kept = np.sort(places)
-        save(given.folder / f"half_{half}.npz", **{name: values[kept] for name, values in data.items()})
-        lights = "".join("{:.6f},{:.6f},{:.6f}\n".format(*row) for row in chromaticities[kept])
-        (given.folder / f"lights_{half}.csv").write_text(f"r,g,b\n{lights}")
-        (given.folder / f"images_{half}.csv").write_text("image\n" + "\n".join(data["names"][kept].tolist()) + "\n")
-    print(f"{given.folder}: {len(order) // 2} and {len(order) - len(order) // 2} images")
+    folds = np.empty(len(order), np.int64)
+    for part, places in enumerate(np.array_split(order, given.parts)):
+        folds[places] = part
+    for part in range(given.parts):
+        for name, kept in ((f"half_{part}", folds == part), (f"others_{part}", folds != part)):
+            save(given.folder / f"{name}.npz", **{key: values[kept] for key, values in data.items()})
+            lights = "".join("{:.6f},{:.6f},{:.6f}\n".format(*row) for row in chromaticities[kept])
+            (given.folder / f"{name.replace('half', 'lights')}.csv").write_text(f"r,g,b\n{lights}")
+        listed = "\n".join(data["names"][folds == part].tolist())
+        (given.folder / f"images_{part}.csv").write_text(f"image\n{listed}\n")
+    rows = "".join(f"{name},{fold}\n" for name, fold in zip(data["names"].tolist(), folds, strict=True))
+    (given.folder / "folds.csv").write_text(f"image,fold\n{rows}")
+    print(f"{given.folder}: {' and '.join(map(str, np.bincount(folds)))} images")
 
 
 if __name__ == "__main__":

@@ -12,7 +12,8 @@
 # LEVERS (environment) chooses some of the renderings below, by default all. Naive rows are made for each of them, of the same
 # pictures under the same lights; NAIVE=no leaves them out, which are half of the work. DRAW=900 draws so many pictures
 # for the sets that are drawn to be like the real ones, by default as many as there are. LEARNERS names the methods; most
-# of the time is log-chroma's. REAL=0,20,100,400,all also trains beside so many real images of the other folds.
+# of the time is log-chroma's. REAL=0,20,100,400,all also trains beside so many real images of the other parts, in the
+# ways that BESIDE names (adapted; pooled doubles the time).
 set -euo pipefail
 pictures=$(realpath "$1") archives=$(realpath "$2") out=$3 seeds=${4:-5}
 here=$(realpath "$(dirname "$0")")
@@ -21,7 +22,10 @@ mkdir -p "$out" && cd "$out"
 declare -A archive=([600d]=nus_canon_600d_64x64 [1ds]=nus_canon_1ds_mk3_64x64 [5dsr]=intel_tau_5dsr_64x64)
 declare -A part=([600d]=Canon [1ds]=Canon [5dsr]=field)
 declare -A sensitivities=([600d]=Canon_EOS_600D [1ds]=Canon_EOS-1Ds_Mark_III [5dsr]=Canon_EOS_5DS)
+# Parts that are tested one by one: of the 5DS R three, so that the others hold 400 images.
+declare -A parts=([600d]=2 [1ds]=2 [5dsr]=3)
 declare -A matrix=([600d]="Canon EOS 600D" [1ds]="Canon EOS-1Ds Mark III" [5dsr]="Canon EOS 5DS R")
+declare -A relit=([600d]=1ds [1ds]=600d [5dsr]=1ds)
 learners=${LEARNERS:-regression-trees,kernel-ridge,log-chroma}
 
 once() { # RESULT COMMAND...: run the command unless its result is there
@@ -30,14 +34,15 @@ once() { # RESULT COMMAND...: run the command unless its result is there
 
 for camera in 600d 1ds 5dsr; do
     half=halves/$camera
-    once "$half" python "$here/halves.py" "$archives/${archive[$camera]}.npz" "$half" --names "${part[$camera]}"
+    once "$half" python "$here/halves.py" "$archives/${archive[$camera]}.npz" "$half" \
+        --names "${part[$camera]}" --parts "${parts[$camera]}"
     [ -e "$half/$camera.npz" ] || mv "$half/all.npz" "$half/$camera.npz"
     once "tables/$camera" sim table --camera "${sensitivities[$camera]}" "tables/$camera"
-    for test in 0 1; do
-        other=$((1 - test))
-        once "$half/stats_$other.json" evaluate describe "$half/half_$other.npz" --out "$half/stats_$other.json"
+    for ((test = 0; test < parts[$camera]; test++)); do
+        stats=$half/stats_$test.json
+        once "$stats" evaluate describe "$half/others_$test.npz" --out "$stats"
         colorimetric=(--rendering colorimetric --matrix "${matrix[$camera]}")
-        like=(--like "$half/stats_$other.json" --like-in pictures ${DRAW:+--draw "$DRAW"})
+        like=(--like "$stats" --like-in pictures ${DRAW:+--draw "$DRAW"})
         sets=()
         for lever in ${LEVERS:-codes colorimetric compensate random random-like like}; do
             case $lever in
@@ -51,14 +56,16 @@ for camera in 600d 1ds 5dsr; do
             esac
             set=sets/$camera$test/$lever
             once "$set" generate "tables/$camera" "$set" --sources "$pictures" --max-side 160 --no-preview \
-                --match "$half/lights_$other.csv" --outside nearest --seed 1 "${options[@]}"
+                --match "$half/others_$test.csv" --outside nearest --seed 1 "${options[@]}"
             sets+=(--train "$set")
         done
         naive=(--naive "$pictures" --matrix "${matrix[$camera]}")
         [ "${NAIVE:-yes}" = no ] && naive=()
         once "results/$camera$test" evaluate transfer "${sets[@]}" --test "$half/$camera.npz" \
             --only "$half/images_$test.csv" --side 64 --images 900 --seeds "$seeds" --error recovery --statistics none \
-            --methods "$learners" "${naive[@]}" ${REAL:+--real "$REAL"} --out "results/$camera$test"
+            --methods "$learners" "${naive[@]}" --folds "$half/folds.csv" \
+            --relit "$archives/${archive[${relit[$camera]}]}.npz" \
+            ${REAL:+--real "$REAL" --beside "${BESIDE:-adapted}"} --out "results/$camera$test"
     done
 done
 once pool evaluate pool results/* --error recovery --out pool

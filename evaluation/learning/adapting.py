@@ -4,13 +4,14 @@ Two models answer together. One was learned elsewhere, on generated images as a 
 method does that (`FeatureLearner.tune`). The other is what the same method learns of the N alone. The light is their
 mean in logarithms, the first with the weight w.
 
-w begins with stacking (L. Breiman, "Stacked regressions", Machine Learning 24, 1996) under a prior. The least sum of
-errors on the N, each estimated by models that have not seen it, would choose it, and on twenty images choose badly;
-so that much is added for a w other than W / (W + N) as `STRENGTH` images would: what was learned elsewhere is taken
-to be worth as much as W images, `WORTH`. Held-out models learn of fewer than N and are worse than
-what they stand for, and what was learned elsewhere does not grow better with N: so w is multiplied by W² /
-(W² + N²), and from many images on little is left of it whatever stacking says. No image that is tested on has a
-part in it.
+What was learned elsewhere is taken to be worth as much as W images, `WORTH`, however many it was learned of. Methods
+that learn of both together let each of the N weigh by that; and w begins with stacking (L. Breiman, "Stacked
+regressions", Machine Learning 24, 1996) under a prior. The least sum of errors on the N, each estimated by models that
+have not seen it, would choose it, and on twenty images choose badly; so that much is added for a w other than
+W / (W + N) as `STRENGTH` images would. The models that are compared are both worse than what they stand for: the one
+is not yet tuned, the other has learned of fewer than N. What was learned elsewhere does not grow better with N: so w is
+multiplied by W⁴ / (W⁴ + N⁴), and from twice W on little is left of it whatever stacking says. No image that is tested
+on has a part in it.
 
 `WORTH`, `STRENGTH` and how each method tunes were chosen by docs/transfer.md#what-was-chosen-and-on-what.
 """
@@ -34,7 +35,7 @@ STRENGTH: Final = 25.0
 _SHARES: Final = np.linspace(0, 1, 101)
 """Weights to choose among."""
 _PARTS: Final = 3
-"""Parts of the N images, each estimated by models that learned of the others; so few since each is a training."""
+"""Parts of the N images, each estimated by a model that learned of the others; so few since each is a training."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,7 +45,6 @@ class LearnedAlone:
     - `method`: what it learned of all N.
     - `features`: (N, ...), of those with a usable pixel.
     - `truths`: (N, 3) float64, r + g + b = 1.
-    - `parts`: (N,) int64, the part of each.
     - `held_out`: (N, 3) float64, the light of each by what was learned of the other parts; None of fewer images than
       parts.
     - `seed`: of the fits.
@@ -53,7 +53,6 @@ class LearnedAlone:
     method: LearnedMethod
     features: Features
     truths: npt.NDArray[np.float64]
-    parts: npt.NDArray[np.int64]
     held_out: npt.NDArray[np.float64] | None
     seed: int
 
@@ -66,14 +65,14 @@ def learn_alone(
     usable = [place for place, given in enumerate(features) if given is not None]
     stacked: Any = np.stack([given for given in features if given is not None])
     lights = truths[usable] / truths[usable].sum(axis=1, keepdims=True)
-    parts = np.random.default_rng(seed).permutation(len(usable)).astype(np.int64) % _PARTS
     held_out = None
     if len(usable) >= _PARTS:
         held_out = np.empty_like(lights)
+        parts = np.random.default_rng(seed).permutation(len(usable)) % _PARTS
         for part in range(_PARTS):
             held = parts == part
             held_out[held] = learner.fit_features(stacked[~held], lights[~held], seed).lights(stacked[held])
-    return LearnedAlone(method, stacked, lights, parts, held_out, seed)
+    return LearnedAlone(method, stacked, lights, held_out, seed)
 
 
 def adapt(taught: LearnedMethod, alone: LearnedAlone, worth: float = WORTH) -> LearnedMethod:
@@ -83,30 +82,15 @@ def adapt(taught: LearnedMethod, alone: LearnedAlone, worth: float = WORTH) -> L
     """
     if not worth > 0:
         return alone.method
-    learner, elsewhere = taught.learner, taught.model
-    tuned = _tuned(learner, elsewhere, alone.features, alone.truths, alone.seed)
-    count = len(alone.features)
+    elsewhere, count = taught.model, len(alone.features)
     share = worth / (worth + count)
     if alone.held_out is not None:
-        seen = np.empty_like(alone.truths)
-        for part in range(_PARTS):
-            held = alone.parts == part
-            model = _tuned(learner, elsewhere, alone.features[~held], alone.truths[~held], alone.seed)
-            seen[held] = model.lights(alone.features[held])
-        share = stacked_share(seen, alone.held_out, alone.truths, share)
-    share *= worth**2 / (worth**2 + count**2)
-    return replace(taught, model=BlendedModel(tuned, alone.method.model, np.array(share)))
-
-
-def _tuned(
-    learner: FeatureLearner,
-    elsewhere: LightModel,
-    features: Features,
-    truths: npt.NDArray[np.float64],
-    seed: int,
-) -> LightModel:
+        share = stacked_share(elsewhere.lights(alone.features), alone.held_out, alone.truths, share)
+    share *= worth**4 / (worth**4 + count**4)
     # What was adapted before has two models, each of another camera: it is taken as it is.
-    return elsewhere if isinstance(elsewhere, BlendedModel) else learner.tune(elsewhere, features, truths, seed)
+    if not isinstance(elsewhere, BlendedModel):
+        elsewhere = taught.learner.tune(elsewhere, alone.features, alone.truths, worth, alone.seed)
+    return replace(taught, model=BlendedModel(elsewhere, alone.method.model, np.array(share)))
 
 
 def stacked_share(

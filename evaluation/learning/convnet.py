@@ -83,12 +83,13 @@ class ConvNet(FeatureLearner):
         )
 
     def tune(
-        self, model: LightModel, features: Features, truths: npt.NDArray[np.float64], seed: int = 0
+        self, model: LightModel, features: Features, truths: npt.NDArray[np.float64], worth: float, seed: int = 0
     ) -> ConvNetModel:
         """Return the network trained on, in smaller steps and fewer epochs, so that it stays near what it was.
 
         `features`: images (N, 64, 64, 4) float16. `truths`: lights (N, 3) float64.
         """
+        del worth
         if not isinstance(model, ConvNetModel):
             raise TypeError(f"{type(model).__name__} is no model of {self.key}")
         require_installed(self)

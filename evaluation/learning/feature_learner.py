@@ -74,12 +74,15 @@ class FeatureLearner(ABC):
         + b = 1.
         """
 
-    def tune(self, model: LightModel, features: Features, truths: npt.NDArray[np.float64], seed: int = 0) -> LightModel:
-        """Return a model of this learner, learned elsewhere, tuned to few images; most have nothing to tune.
+    def tune(
+        self, model: LightModel, features: Features, truths: npt.NDArray[np.float64], worth: float, seed: int = 0
+    ) -> LightModel:
+        """Return a model that `fit_features` made elsewhere, tuned to few images; most have nothing to tune.
 
-        `features`: (N, ...) of the learner's dtype. `truths`: (N, 3) float64. The fewer, the nearer it stays.
+        `features`: (N, ...) of the learner's dtype. `truths`: (N, 3) float64. `worth`: images of the few that what was
+        learned elsewhere is worth together.
         """
-        del features, truths, seed
+        del features, truths, worth, seed
         return model
 
     @abstractmethod

@@ -31,9 +31,9 @@ _LARGEST = 255
 """Working size up to which the counts of a histogram fit in 16 bits."""
 _IMAGES = 900
 """Training images of which `penalty` is the λ: the number of the measurement in which 1 was found to be robust."""
-
-_TUNED_IMAGES = 450
-"""Training images whose penalty the remainder has at least, see docs/transfer.md#what-was-chosen-and-on-what."""
+_TUNED = 0.3
+"""Share of the penalty of images learned elsewhere that is left once images of the camera at hand stand beside them:
+they hold what the penalty guarded against. See docs/transfer.md#what-was-chosen-and-on-what."""
 
 
 @dataclass(frozen=True)
@@ -81,21 +81,26 @@ class KernelRidge(FeatureLearner):
         return KernelRidgeModel(features.reshape(len(features), -1), weights, centre)
 
     def tune(
-        self, model: LightModel, features: Features, truths: npt.NDArray[np.float64], seed: int = 0
+        self, model: LightModel, features: Features, truths: npt.NDArray[np.float64], worth: float, seed: int = 0
     ) -> KernelRidgeModel:
-        """Return the model plus a kernel ridge of what it leaves of lights (N, 3) float64, counts (N, 64, 64) uint16.
+        """Return the kernel ridge of the model's M images and of counts (N, 64, 64) uint16, lights (N, 3) float64.
 
-        The penalty of the remainder is that of 450 images at least: a smaller one, of fewer images, follows each.
+        Each of the N weighs as much as M / worth of the others: its penalty is so many times smaller.
         """
         if not isinstance(model, KernelRidgeModel):
             raise TypeError(f"{type(model).__name__} is no model of {self.key}")
-        roots = _roots(features)
-        remainder = truths[:, :2] - model.centre - _kernel(roots, _roots(model.counts)) @ model.weights
-        penalty = self.penalty * max(_TUNED_IMAGES, len(roots)) / _IMAGES
+        known, new = _roots(model.counts), _roots(features)
+        number, kernel = len(known), _kernel(known, known)
+        penalty = self.penalty * number / _IMAGES
+        # What the weights solve: (K + λ I) a is what was learned of each image.
+        learned = kernel @ model.weights + penalty * model.weights
+        across = _kernel(known, new)
+        both: npt.NDArray[np.float64] = np.block([[kernel, across], [across.T, _kernel(new, new)]])
+        penalties = _TUNED * penalty * np.concatenate([np.ones(number), np.full(len(new), worth / max(worth, number))])
         solve: Any = np.linalg.solve
-        weights = solve(_kernel(roots, roots) + penalty * np.eye(len(roots)), remainder)
+        weights = solve(both + np.diag(penalties), np.concatenate([learned, truths[:, :2] - model.centre]))
         counts = np.concatenate([model.counts, features.reshape(len(features), -1)])
-        return KernelRidgeModel(counts, np.concatenate([model.weights, weights]), model.centre)
+        return KernelRidgeModel(counts, weights, model.centre)
 
     def restore(self, arrays: Mapping[str, npt.NDArray[np.generic]]) -> KernelRidgeModel:
         """Return the model whose arrays are given: counts (N, 4096) uint16, weights (N, 2) and centre (2,) float64."""

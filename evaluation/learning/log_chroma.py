@@ -27,13 +27,13 @@ are in single precision, which is what makes the processor's cache hold a batch.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 import numpy as np
 import numpy.typing as npt
 
-from evaluation.learning.feature_learner import FeatureLearner, Features
+from evaluation.learning.feature_learner import FeatureLearner, Features, LightModel
 from evaluation.learning.working_size import reduce
 from evaluation.scene import Image
 from foundation.errors import InputError
@@ -101,8 +101,8 @@ def moments(likely: npt.NDArray[np.floating]) -> Moments:
 
 def likelihood(
     likely: npt.NDArray[np.floating], found: Moments, places: npt.NDArray[np.floating], spread: float
-) -> tuple[float, npt.NDArray[Any]]:
-    """Return the summed loss of true places (N, 2) and its derivative by the response, (N, 64, 64) of a float dtype.
+) -> tuple[npt.NDArray[Any], npt.NDArray[Any]]:
+    """Return the losses (N,) of true places (N, 2), and their derivatives by the responses, (N, 64, 64), float dtypes.
 
     The loss of an image is the negative log-likelihood less the least it can be, that of a hit with no spread but
     `spread`.
@@ -129,13 +129,13 @@ def likelihood(
     right = np.stack([ones, along_v, step_v], axis=1)
     slope = np.matmul(left, right)
     mean = (likely * slope).sum(axis=(1, 2), keepdims=True)
-    return float(loss.sum(dtype=np.float64)), likely * (slope - mean)
+    return loss, likely * (slope - mean)
 
 
 def crossentropy(
     response: npt.NDArray[np.floating], likely: npt.NDArray[np.floating], places: npt.NDArray[np.floating]
-) -> tuple[float, npt.NDArray[Any]]:
-    """Return the summed cross-entropy with the bins of true places, and its derivative (N, 64, 64), a float dtype.
+) -> tuple[npt.NDArray[np.float64], npt.NDArray[Any]]:
+    """Return the cross-entropies (N,) with the bins of true places, and their derivatives (N, 64, 64), a float dtype.
 
     `response`: (N, 64, 64) of a float dtype, logarithms of the distributions up to a constant. `likely`: (N, 64, 64) of
     a float dtype, the distributions. `places`: (N, 2) of a float dtype, the true lights, bins.
@@ -145,19 +145,20 @@ def crossentropy(
     totals = np.log(np.exp(response.astype(np.float64)).sum(axis=(1, 2)))
     slope = likely.copy()
     slope[image, u, v] -= 1
-    return float((totals - response[image, u, v]).sum()), slope
+    return totals - response[image, u, v], slope
 
 
 def train(
     histograms: npt.NDArray[np.float64],
     places: npt.NDArray[np.float64],
+    repeats: npt.NDArray[np.float64],
     penalties: Penalties,
     stages: Sequence[tuple[int, float, float]],
 ) -> tuple[npt.NDArray[np.complex128], npt.NDArray[np.float64]]:
     """Return the fitted filters (2, 64, 33) complex128, in Fourier space, and the bias (64, 64) float64.
 
     `histograms`: (N, 2, 64, 64) float64, each of sum 1. `places`: (N, 2) float64, the true lights in bins; they may lie
-    outside 0 … 64.
+    outside 0 … 64. `repeats`: (N,) float64, how many images each stands for.
     """
     import scipy.fft
     import scipy.optimize
@@ -167,7 +168,7 @@ def train(
     whiten = np.stack([_scale(*weights) for weights in zip(penalties.smoothness, penalties.size, strict=True)])
     spectra: Any = fft.rfft2(histograms.astype(np.float32))
     wanted = places.astype(np.float32)
-    count = len(histograms)
+    count, times = float(repeats.sum()), repeats.astype(np.float32)
 
     def spread_out(scaled: npt.NDArray[np.float64]) -> tuple[Any, Any]:
         spectrum: Any = whiten * fft.rfft2(scaled.reshape(3, *_SHAPE))
@@ -178,20 +179,20 @@ def train(
         single, level = filters.astype(np.complex64), bias.astype(np.float32)
         total = 0.5 * count * float(scaled @ scaled)
         gradient = np.zeros((3, BINS, BINS // 2 + 1), np.complex128)
-        for start in range(0, count, _BATCH):
-            batch, aim = spectra[start : start + _BATCH], wanted[start : start + _BATCH]
+        for start in range(0, len(spectra), _BATCH):
+            batch, aim, each = (some[start : start + _BATCH] for some in (spectra, wanted, times))
             response: Any = fft.irfft2((batch * single).sum(axis=1), s=_SHAPE) + level
             response -= response.max(axis=(1, 2), keepdims=True)
             likely = np.exp(response)
             likely /= likely.sum(axis=(1, 2), keepdims=True)
             if entropy_weight:
-                value, slope = crossentropy(response, likely, aim)
+                values, slopes = crossentropy(response, likely, aim)
                 weight = entropy_weight
             else:
-                value, slope = likelihood(likely, moments(likely), aim, penalties.spread)
+                values, slopes = likelihood(likely, moments(likely), aim, penalties.spread)
                 weight = likelihood_weight
-            total += weight * value
-            back: Any = fft.rfft2(slope)
+            total += weight * float(values.astype(np.float64) @ each)
+            back: Any = fft.rfft2(slopes * each[:, None, None])
             gradient[:2] += weight * (batch.conj() * back[:, None]).sum(axis=0)
             gradient[2] += weight * back.sum(axis=0)
         scaled_gradient: Any = fft.irfft2(whiten * gradient, s=_SHAPE)
@@ -225,6 +226,8 @@ _FINE_SIZE = 1 / 32
 """Width of a bin, natural logarithm (section 5 of the paper)."""
 _CHANNELS = 2
 """Histograms: of pixels and of edges."""
+_IMAGE = _CHANNELS * _FINE_BINS**2
+"""Bins of an image."""
 _SPREAD = 0.75
 """Share of the torus that the lights may span: the rest tells one turn of it from the next."""
 _LARGEST = 255
@@ -289,6 +292,27 @@ class LogChroma(FeatureLearner):
 
         Nothing in the fit is random.
         """
+        model = self._fitted(features, truths, np.ones(len(features)))
+        return replace(model, lessons=Lessons.of(features, truths))
+
+    def tune(
+        self, model: LightModel, features: Features, truths: npt.NDArray[np.float64], worth: float, seed: int = 0
+    ) -> LogChromaModel:
+        """Return the model fitted anew to its own M images, and to histograms (N, 2, 128, 128) uint16, lights (N, 3).
+
+        Each of the N stands for M / worth of the others. A model whose file does not hold its images stays as it is.
+        """
+        if not isinstance(model, LogChromaModel):
+            raise TypeError(f"{type(model).__name__} is no model of {self.key}")
+        if model.lessons is None:
+            return model
+        known, lights = model.lessons.histograms(), model.lessons.lights
+        repeats = np.concatenate([np.ones(len(known)), np.full(len(features), max(1.0, len(known) / worth))])
+        return self._fitted(np.concatenate([known, features]), np.concatenate([lights, truths]), repeats)
+
+    def _fitted(
+        self, features: Features, truths: npt.NDArray[np.float64], repeats: npt.NDArray[np.float64]
+    ) -> LogChromaModel:
         logs = np.log(truths)
         chromas = logs[:, 1:2] - logs[:, [0, 2]]
         span = float(np.ptp(chromas, axis=0).max())
@@ -307,6 +331,7 @@ class LogChroma(FeatureLearner):
         filters, bias = train(
             fold(features, wide),
             (chromas - grid[1]) / grid[0],
+            repeats,
             penalties,
             ((self.pretraining, self.crossentropy, 0.0), (self.training, 0.0, self.likelihood)),
         )
@@ -316,7 +341,7 @@ class LogChroma(FeatureLearner):
         return LogChromaModel(filters, bias, centre, np.array(grid))
 
     def restore(self, arrays: Mapping[str, npt.NDArray[np.generic]]) -> LogChromaModel:
-        """Return the model whose arrays are given: filters (2, 64, 33) complex128 and the others float64."""
+        """Return the model whose arrays are given: filters (2, 64, 33) complex128 and others, see there."""
         shapes = {"filters": (_CHANNELS, BINS, BINS // 2 + 1), "bias": (BINS, BINS), "centre": (2,), "grid": (2,)}
         found: dict[str, Any] = {name: arrays[name] for name in shapes}
         for name, shape in shapes.items():
@@ -324,7 +349,46 @@ class LogChroma(FeatureLearner):
                 raise ValueError(f"{name} of the shape {found[name].shape}; expected {shape}, all finite")
         if tuple(found["grid"]) not in ((_FINE_SIZE, 0.0), (2 * _FINE_SIZE, _FINE_SIZE / 2)):
             raise ValueError(f"bins of {found['grid']}")
-        return LogChromaModel(**found)
+        return LogChromaModel(**found, lessons=Lessons.restored(arrays) if "learned_lights" in arrays else None)
+
+
+@dataclass(frozen=True, eq=False)
+class Lessons:
+    """The images that a model learned of, as tuning needs them: few of their bins are filled.
+
+    - `places`: (K,) int64, the filled bins in ascending order, of histograms (M, 2, 128, 128) laid end to end.
+    - `counts`: (K,) uint16.
+    - `lights`: (M, 3) float64, r + g + b = 1.
+    """
+
+    places: npt.NDArray[np.int64]
+    counts: npt.NDArray[np.uint16]
+    lights: npt.NDArray[np.float64]
+
+    @classmethod
+    def of(cls, features: Features, lights: npt.NDArray[np.float64]) -> Lessons:
+        """Return those of histograms (M, 2, 128, 128) uint16 and lights (M, 3) float64."""
+        places = np.flatnonzero(features)
+        return cls(places, features.ravel()[places], lights)
+
+    @classmethod
+    def restored(cls, arrays: Mapping[str, npt.NDArray[np.generic]]) -> Lessons:
+        """Return those that `arrays` holds, of the shapes and dtypes above."""
+        found: list[Any] = [arrays[name] for name in ("learned_places", "learned_counts", "learned_lights")]
+        places, counts, lights = found
+        if places.ndim != 1 or places.shape != counts.shape or lights.ndim != 2 or lights.shape[1] != 3:
+            raise ValueError(f"images of the shapes {[one.shape for one in found]}")
+        if places.dtype != np.int64 or counts.dtype != np.uint16 or not (np.isfinite(lights) & (lights > 0)).all():
+            raise ValueError("images whose numbers are not counts and lights")
+        if len(places) and (places[0] < 0 or (np.diff(places) <= 0).any() or places[-1] >= len(lights) * _IMAGE):
+            raise ValueError("images with bins that they do not have")
+        return cls(places, counts, lights)
+
+    def histograms(self) -> npt.NDArray[np.uint16]:
+        """Return the histograms (M, 2, 128, 128)."""
+        full = np.zeros(len(self.lights) * _IMAGE, np.uint16)
+        full[self.places] = self.counts
+        return full.reshape(-1, _CHANNELS, _FINE_BINS, _FINE_BINS)
 
 
 @dataclass(frozen=True, eq=False)
@@ -335,16 +399,20 @@ class LogChromaModel:
     - `bias`: (64, 64) float64.
     - `centre`: (2,) float64, u and v about which the torus is cut: the middle of the training lights' range.
     - `grid`: (2,) float64, the width of a bin and the chroma of the first one's centre.
+    - `lessons`: what it learned of; None where it was tuned, or is of a file that does not say.
     """
 
     filters: npt.NDArray[np.complex128]
     bias: npt.NDArray[np.float64]
     centre: npt.NDArray[np.float64]
     grid: npt.NDArray[np.float64]
+    lessons: Lessons | None = None
 
     def arrays(self) -> Mapping[str, npt.NDArray[np.generic]]:
-        """Return the arrays by their names, filters (2, 64, 33) complex128 and the others float64."""
-        return {"filters": self.filters, "bias": self.bias, "centre": self.centre, "grid": self.grid}
+        """Return the arrays by their names, filters (2, 64, 33) complex128, and what it learned of if that is known."""
+        own = {"filters": self.filters, "bias": self.bias, "centre": self.centre, "grid": self.grid}
+        held = {} if self.lessons is None else {f"learned_{name}": array for name, array in vars(self.lessons).items()}
+        return {**own, **held}
 
     def lights(self, features: Features) -> npt.NDArray[np.float64]:
         """Return the lights (N, 3) float64, r + g + b = 1, of histograms (N, 2, 128, 128) uint16."""

@@ -61,6 +61,25 @@ def test_it_is_repeated_and_kept_to_the_bit_and_adapted_again(taught: LearnedMet
 
 
 @pytest.mark.slow
+def test_a_model_from_a_file_is_adapted_as_the_one_that_was_saved(taught: LearnedMethod, tmp_path: Path) -> None:
+    save_model(tmp_path / "model.npz", taught, story(ELSEWHERE))
+    loaded = load_model(tmp_path / "model.npz")
+    np.testing.assert_array_equal(of(TEST, adapted(loaded, HERE)), of(TEST, adapted(taught, HERE)))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["kernel-ridge", "log-chroma"])
+def test_what_learns_of_both_follows_the_images_more_the_less_the_other_is_worth(name: str) -> None:
+    learner = standard_learners()[name]
+    (features,) = extract(HERE, [learner])
+    given, truths = np.stack([one for one in features if one is not None]), truths_of(HERE)
+    model = learner.fit(ELSEWHERE).model
+    tuned = [learner.tune(model, given, truths, worth) for worth in (60, 6, 1)]
+    before, *after = (np.mean(recovery_error(one.lights(given), truths)) for one in (model, *tuned))
+    assert before > after[0] > after[1] > after[2]
+
+
+@pytest.mark.slow
 def test_one_image_leaves_it_near_what_it_was(taught: LearnedMethod) -> None:
     moved = recovery_error(of(TEST, adapted(taught, HERE[:1])), of(TEST, taught))
     alone = recovery_error(of(TEST, taught.learner.fit(HERE[:1])), of(TEST, taught))

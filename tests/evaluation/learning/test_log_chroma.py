@@ -12,7 +12,7 @@ import pytest
 from evaluation.learning.log_chroma import BINS, LogChroma, crossentropy, fold, likelihood, moments
 from evaluation.metrics import recovery_error
 from foundation.errors import InputError
-from tests.evaluation.learning.made_up_world import world
+from tests.evaluation.learning.made_up_world import MadeUp, world
 
 pytestmark = pytest.mark.slow
 
@@ -23,6 +23,11 @@ def extracted(image: npt.NDArray[np.float32]) -> npt.NDArray[np.uint16]:
     found = LEARNER.features(image)
     assert found is not None
     return found
+
+
+def taught_by(scenes: list[MadeUp]) -> tuple[npt.NDArray[np.uint16], npt.NDArray[np.float64]]:
+    lights = np.stack([scene.truth for scene in scenes])
+    return np.stack([extracted(scene.image) for scene in scenes]), lights / lights.sum(axis=1, keepdims=True)
 
 
 def test_a_light_shifts_both_histograms() -> None:
@@ -119,8 +124,10 @@ def test_derivatives_are_what_finite_differences_say(loss: str) -> None:
     def value(given: npt.NDArray[np.float64]) -> tuple[float, npt.NDArray[np.float64]]:
         likely = softmax(given)
         if loss == "cross-entropy":
-            return crossentropy(np.log(likely), likely, place)
-        return likelihood(likely, moments(likely), place, 1.0)
+            losses, slopes = crossentropy(np.log(likely), likely, place)
+        else:
+            losses, slopes = likelihood(likely, moments(likely), place, 1.0)
+        return float(losses.sum()), slopes
 
     _, slope = value(response)
     for _ in range(5):
@@ -131,7 +138,32 @@ def test_derivatives_are_what_finite_differences_say(loss: str) -> None:
 
 def test_the_likelihood_is_least_at_the_truth() -> None:
     likely = hat((20.0, 30.0), np.eye(2) * 1e-3)
-    hit, _ = likelihood(likely, moments(likely), np.array([[20.0, 30.0 + BINS]]), 1.0)
-    miss, _ = likelihood(likely, moments(likely), np.array([[24.0, 30.0]]), 1.0)
+    (hit,), _ = likelihood(likely, moments(likely), np.array([[20.0, 30.0 + BINS]]), 1.0)
+    (miss,), _ = likelihood(likely, moments(likely), np.array([[24.0, 30.0]]), 1.0)
     assert hit == pytest.approx(0, abs=1e-3)
     assert miss == pytest.approx(8, rel=1e-2)
+
+
+def test_an_image_that_stands_for_three_is_as_three() -> None:
+    known, lights = taught_by(world(12))
+    few, their_lights = taught_by(world(2, seed=5))
+    # Of 12 images worth 4, each of the two stands for three.
+    tuned = LEARNER.tune(LEARNER.fit_features(known, lights), few, their_lights, worth=4)
+    both = LEARNER.fit_features(np.concatenate([known, *[few] * 3]), np.concatenate([lights, *[their_lights] * 3]))
+    assert recovery_error(tuned.lights(known), both.lights(known)).max() < 0.1
+
+
+def test_images_of_a_file_that_cannot_be_are_refused() -> None:
+    scenes = world(3)
+    arrays: dict[str, Any] = dict(LEARNER.fit_features(*taught_by(scenes)).arrays())
+    shown = LEARNER.restore(arrays).lessons
+    assert shown is not None
+    np.testing.assert_array_equal(shown.histograms()[0], extracted(scenes[0].image))
+    for name, damage in (
+        ("learned_places", arrays["learned_places"][::-1]),
+        ("learned_counts", arrays["learned_counts"][1:]),
+        ("learned_lights", -arrays["learned_lights"]),
+        ("learned_lights", arrays["learned_lights"][:1]),
+    ):
+        with pytest.raises(ValueError, match="images"):
+            LEARNER.restore({**arrays, name: damage})
