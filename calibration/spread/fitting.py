@@ -107,10 +107,12 @@ _CLEAN = 0.001
 """The same, and of near kernels, too, of a lens that does not scatter, and of the veil of one without: coated glass
 without dust."""
 
-_CLEAN_ODDS, _CLEAR_ODDS = 0.7, 0.3
-"""How likely a lens is beforehand that does not scatter, and of these one without a veil; and of those that scatter one
-without a veil (chosen). A chart of few colours that shows neither would else state what it has not seen, several times
-the error that there is."""
+_CLEAN_ODDS, _CLEAN_ODDS_OF_FEW = 0.3, 0.7
+"""How likely a lens is beforehand that does not scatter, and of these one without a veil (chosen): charts of few
+colours would else state what they have not seen, several times the error that there is."""
+
+_CLEAR_ODDS_OF_FEW = 0.3
+"""How likely one that scatters is without a veil, on charts of few colours; others see it (chosen)."""
 
 _LAWS = ((2.0, 1.0), (3.0, 1.0), (3.0, _CLEAN))
 """Powers of the distance by which scattered light falls, and how much of the law there is far away: polish, scratches
@@ -504,25 +506,20 @@ class _Lens:
 
 def _supposed_lenses(few: bool) -> list[_Lens]:
     """Return all that is supposed of lenses; `few`: where cells are so few that they may see nothing of a usual one."""
+    clean, clear = (_CLEAN_ODDS_OF_FEW, _CLEAR_ODDS_OF_FEW) if few else (_CLEAN_ODDS, 0.0)
     apart = list(zip(_APART, _APART_ODDS, strict=True))
-    scatter = [
-        _Lens(power=power, far=far, far_apart=_SCATTER_APART, odds=_POWER_ODDS / len(_LAWS)) for power, far in _LAWS
-    ]
+    scatter = [(_Lens(near=_CLEAN, far=_CLEAN, odds=clean), clean)]
+    law = (1 - clean) * _POWER_ODDS / len(_LAWS)
+    scatter += [(_Lens(power=power, far=far, far_apart=_SCATTER_APART, odds=law), clear) for power, far in _LAWS]
+    other = (1 - clean) * (1 - _POWER_ODDS) / len(_FAR_SIZES)
     scatter += [
-        _Lens(far=size, far_apart=one, odds=odds * (1 - _POWER_ODDS) / len(_FAR_SIZES))
-        for size, (one, odds) in product(_FAR_SIZES, apart)
+        (_Lens(far=size, far_apart=one, odds=other * odds), clear) for size, (one, odds) in product(_FAR_SIZES, apart)
     ]
-    found = [
-        replace(one, veil_apart=alike, odds=one.odds * odds * (1 - _CLEAR_ODDS if few else 1))
-        for one, (alike, odds) in product(scatter, apart)
+    found = [replace(one, veil=_CLEAN, odds=one.odds * without) for one, without in scatter if without]
+    return found + [
+        replace(one, veil_apart=alike, odds=one.odds * (1 - without) * odds)
+        for (one, without), (alike, odds) in product(scatter, apart)
     ]
-    if not few:
-        return found
-    found = [replace(one, odds=one.odds * (1 - _CLEAN_ODDS)) for one in found]
-    found += [replace(one, veil=_CLEAN, odds=one.odds * _CLEAR_ODDS * (1 - _CLEAN_ODDS)) for one in scatter]
-    clean = _Lens(near=_CLEAN, far=_CLEAN, odds=_CLEAN_ODDS)
-    found += [replace(clean, veil_apart=alike, odds=clean.odds * odds * (1 - _CLEAN_ODDS)) for alike, odds in apart]
-    return [*found, replace(clean, veil=_CLEAN, odds=clean.odds * _CLEAN_ODDS)]
 
 
 def _usual_shares(bits: int, lens: _Lens) -> _Array:
