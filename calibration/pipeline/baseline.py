@@ -48,7 +48,7 @@ from calibration.spread.correction import (
     SpreadFrame,
     measure_spread,
 )
-from calibration.spread.fitting import LEAST_COUNTS, LOOSE_UNEVENNESS, USUAL_UNEVENNESS
+from calibration.spread.fitting import DARK_LEVEL, LEAST_COUNTS, LOOSE_UNEVENNESS, USUAL_UNEVENNESS
 from calibration.spread.predicting import VARYING_BITS
 from calibration.spread.surroundings import FrameLevels, photosite_offsets_px, printed_grid, unsuitable
 from calibration.table.lut import Lut, SourceFrame
@@ -93,9 +93,6 @@ _PAPER_WORTH = 10.0
 
 _LEAST_BITS = 3
 """Bits of a channel from which on neighbours in colour predict a cell."""
-
-_DARK_LEVEL = 0.1
-"""Of cells that show light added to them: what counts of paper lack beside theirs looks like such light."""
 
 _MORE_WHITES = 3
 """White frames beside the first that a lens is measured on, where the noise of few cells matters."""
@@ -540,7 +537,7 @@ def _spread_frame(baseline: Baseline, same: Iterable[DecodedFrame], view: PrintV
     whites = slice(len(points.cells_mm), len(points.cells_mm) + len(points.whites_mm))
     paper, _ = baseline.paper.read(np.where(usable[whites, None], means[whites], np.nan), file)
     bends = baseline.superposition or Superposition.usual(full)
-    red, green, blue = np.sqrt(bends.errors(_DARK_LEVEL * paper.white, paper.white)).tolist()
+    red, green, blue = np.sqrt(bends.errors(DARK_LEVEL * paper.white, paper.white)).tolist()
     return SpreadFrame(
         levels=FrameLevels(means, beyond / count),
         field=paper.field.at(view.grid.points_mm),

@@ -61,10 +61,6 @@ _FIELD_ORDER = 6
 _LEAST_LEVEL = 1e-3
 """Level, bare paper 1, below which a cell's relative error is that of such a cell."""
 
-_LOST = 0.5
-"""Standard deviation of the light that is lost beyond the frame, in parts of what the widest kernel has in it: r⁻² may
-have half as much again there, which darkens a channel and shows nowhere."""
-
 _Array = npt.NDArray[np.float64]
 
 
@@ -208,8 +204,8 @@ class LensFigures:
       by channel the largest.
     - `left_in_worst`: the same beyond that of the window's mean, which is what is corrected.
     - `white_covariance`: (3, 3) float64, of the relative error that the lens leaves in the white of bare paper, the
-      ground truth, in R, G and B: by the shares' covariance, by all of what is likely but not subtracted, and by what
-      may be lost beyond the frame. An assumed one, of a usual veil, where the lens is not measured.
+      ground truth, in R, G and B: by the shares' covariance, and by all of what is likely but not subtracted. An
+      assumed one, of a usual veil, where the lens is not measured.
     - `cells_error`: (C, 3) float64, relative standard error that it leaves in the means of cells, in the order of
       colour indices, against that white, under the light that is brightest in the channel; by the same covariance.
     - `measured`, `corrected`: whether the lens could be measured on the print, and whether samples and ground truth are
@@ -513,20 +509,20 @@ def _figures(
         veil_error=float(veil_error[largest]),
         beyond_cell=float((near @ worst + wide).max()),
         left_in_worst=float((near @ (worst - mean)).max()),
-        white_covariance=_of_white(spread, off_by, [of_paper.get(channel, of_paper[other]) for channel in range(3)]),
+        white_covariance=_of_white(off_by, [of_paper.get(channel, of_paper[other]) for channel in range(3)]),
         cells_error=np.stack([cells.get(channel, cells[other]) for channel in range(3)], axis=1),
         corrected=subtracted,
         why_not="" if subtracted else left_out if spread.proven else "no spread beside the sharp core is proven",
     )
 
 
-def _of_white(spread: PointSpread, off_by: _Array, of_paper: list[_Array]) -> _Array:
+def _of_white(off_by: _Array, of_paper: list[_Array]) -> _Array:
     """Return the covariance (3, 3) of paper white's relative errors, by its change (T,) for whole shares by channel."""
     change = np.zeros((3, TERMS))
     for channel in range(3):
         change[channel, terms_of(channel)] = of_paper[channel]
-    lost = _LOST * spread.likeliest[far_groups()[-2]]
-    return change @ off_by @ change.T + np.outer(lost, lost)
+    # What leaves the frame is no error: it dims all that a channel sees alike, as the glass does.
+    return change @ off_by @ change.T
 
 
 def _beyond_cell(around: Surroundings) -> tuple[_Array, _Array]:

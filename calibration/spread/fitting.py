@@ -22,7 +22,6 @@ C cells in the order of colour indices; T unknowns of a channel.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise, product
@@ -84,6 +83,9 @@ _SHAPE_ORDER, _FACTOR_ORDER, _INK_ORDER = 4, 6, 2
 """Orders over the page of light that is no kernel's, of smooth factors of a level, as high as a field's, and of a
 density of ink (its level times its logarithm)."""
 
+DARK_LEVEL = 0.1
+"""Level, bare paper 1, of cells whose counts a sensor's bend is held against paper's."""
+
 _LEAST_BEND = 1e-4
 """Standard deviation of the sensor's bend, at least."""
 
@@ -101,15 +103,33 @@ _FAR_SIZES = (0.3, 1.0, 3.0)
 """How much more than that lenses may have that scatter. Each is as likely beforehand, and is weighed by what the print
 shows."""
 
-_CLEAN = 0.03
-"""The same of a lens that does not scatter, and of one without a veil: coated glass without dust."""
+_CLEAN = 0.001
+"""The same, and of near kernels, too, of a lens that does not scatter, and of the veil of one without: coated glass
+without dust."""
 
-_CLEAN_ODDS = 0.3
-"""How likely either is beforehand (chosen): a chart of few colours that shows neither would else state what it has not
-seen. With 0.6, veils on prints that codes predict to 3 % only turned white by up to 1.4 times what was stated."""
+_CLEAN_ODDS, _CLEAN_ODDS_OF_FEW = 0.3, 0.7
+"""How likely a lens is beforehand that does not scatter, and of these one without a veil (chosen): charts of few
+colours would else state what they have not seen, several times the error that there is."""
 
-_VEIL_SIZES = (0.3, 1.0)
-"""How large a veil of lenses that have one may be over the usual, each as likely."""
+_CLEAR_ODDS_OF_FEW = 0.3
+"""How likely one that scatters is without a veil, on charts of few colours; others see it (chosen)."""
+
+_LAWS = ((2.0, 1.0), (3.0, 1.0), (3.0, _CLEAN))
+"""Powers of the distance by which scattered light falls, and how much of the law there is far away: polish, scratches
+and dust (J. E. Harvey, "Light-scattering characteristics of optical surfaces", 1976; I. R. King, "The profile of a star
+image", 1971), and aberrations, which end within a slot."""
+
+_POWER_ODDS = 0.5
+"""How likely it is that what a lens scatters falls by one of these from its core on (chosen)."""
+
+_SCATTERED = 0.04
+"""Standard deviation of all that such a lens scatters, and `_OFF_LAW` of a kernel's share against the law's, relative:
+of what is seen beside cells follows then what lies over all of the frame, channel by channel (chosen)."""
+
+_OFF_LAW = 0.35
+
+_SCATTER_APART = 0.5
+"""The same as `CHANNELS_APART` of such a lens."""
 
 _FAR_FALL = 0.5
 """Part of a far kernel's share that the next is expected to have: of r⁻² all, of r⁻³ a quarter, of an exponential none.
@@ -122,13 +142,17 @@ reflections at coated glass change that much over the visible spectrum (chosen).
 _APART = (0.03, CHANNELS_APART, 0.7)
 """The same of lenses whose channels are alike, that differ, and whose coatings suit one channel."""
 
-_APART_ODDS = (0.5, 0.35, 0.15)
+_APART_ODDS = (0.4, 0.4, 0.2)
 """How likely these are beforehand (chosen); weighed as `_FAR_SIZES` are, so that where the print shows no difference,
 hardly any is put into it."""
 
 MOST_VEIL = 0.02
 """Veil beyond which it is none where shares cannot change over the frame: the worst lens by ISO 9358, and half a
 standard error. Shoulders that grow threefold to the corners were taken for one of 4.6 %, and cells were 11 % off."""
+
+_LEAST_MISFIT = 3.0
+"""Misfit of charts of few colours, at least: what was taken for a veil common to the channels, in 46 rooms of
+`benchmarks.troubles` without one, was 1.6 standard errors without it, RMS; cells' errors are alike in all channels."""
 
 _LEVELS = 40
 """Groups of like levels, in each of which the scatter is measured."""
@@ -360,8 +384,7 @@ def fit_spread(
         factors[_bend_of(one.channel)] = 1 / max(one.bend, _LEAST_BEND) ** 2
         factors[row.unknowns[-(len(page_powers(_INK_ORDER)) - 1) :]] = 1 / USUAL_UNEVENNESS**2
     prior = np.diag(factors)
-    usually = _usual_shares(bits, _Lens(1.0, CHANNELS_APART, 1.0, CHANNELS_APART))
-    usual = np.asarray(np.linalg.inv(usually), dtype=np.float64)
+    usual = np.asarray(np.linalg.inv(_usual_shares(bits, _Lens())), dtype=np.float64)
     prior[:TERMS, :TERMS] = usual
     shape = np.arange(TERMS, TERMS + shapes)
     everything = np.delete(np.arange(size), shape)
@@ -374,81 +397,89 @@ def fit_spread(
             rows = [_rows(one, n, cells_mm, page_mm, bits, lens[n]) for n, one in enumerate(data)]
         normal, right = _normal_equations([*rows, *at_references], solution)
         solution[everything] = _solved(*_of(normal.sum(axis=0), right.sum(axis=0), prior, everything), np.arange(TERMS))
+    few = bits < VARYING_BITS
     misfit = _misfit(normal.sum(axis=0), right.sum(axis=0), prior, shapes)
     normal, right = normal[:, everything][:, :, everything], right[:, everything]
     prior = prior[np.ix_(everything, everything)]
     matrix, vector = _without_factors(normal.sum(axis=0), right.sum(axis=0), prior)
     # What is known beforehand does not become less by what the print shows of other light.
-    inflated = _without_factors(normal.sum(axis=0), right.sum(axis=0), misfit * prior)[0]
-    lenses = _Lenses.of(matrix, vector, inflated, misfit, bits, usual)
-    matrix = lenses.matrices[int(np.argmax(lenses.weights))]
+    variance = max(misfit, _LEAST_MISFIT) if few else misfit
+    inflated = _without_factors(normal.sum(axis=0), right.sum(axis=0), variance * prior)
+    known = inflated[0] / variance - usual, inflated[1] / variance
+    lenses = _Lenses.of((matrix - usual, vector), known, bits)
+    matrix = matrix + lenses.likeliest_prior - usual
     candidates = groups_of_terms()
-    if bits < VARYING_BITS:
+    if few:
         candidates = [group for group in candidates if len(group) <= _EVEN_TERMS]
     far = far_groups()
     veil = far[-1]
     unknown = np.zeros((TERMS, TERMS))
+    for one in data:
+        # Counts that are lost near black, as many as the bend may be there, hide as much of a veil.
+        hidden = DARK_LEVEL * one.bend / float(np.median(one.even * one.field))
+        unknown[veil[one.channel], veil[one.channel]] += hidden**2
     even = _positive(matrix, vector, _terms(candidates))[0][veil]
-    if misfit > MOST_MISFIT or (bits < VARYING_BITS and even.mean() > MOST_VEIL):
+    if misfit > MOST_MISFIT or (few and even.mean() > MOST_VEIL):
         # Other light lies smoothly over the frame, or shares grow towards the corners where cells are too few to see
         # it; what an even veil would have been taken for is not known.
-        unknown[np.ix_(veil, veil)] = np.outer(even, even)
+        unknown[np.ix_(veil, veil)] += np.outer(even, even)
         candidates.pop()
         far.pop()
     kept = _selected(matrix, vector, misfit, candidates)
     _, gain = _positive(matrix, vector, kept)
-    # No lens is without far light: to leave out what is not certain is to be wrong by all of it. But few cells show so
-    # little of it that what is taken for several kernels' is more than what there is: there it is the veil's alone.
-    likeliest, covariance = lenses.shares(vector, np.union1d(kept, _terms(far)))
+    # No lens is without far light: to leave out what is not certain is to be wrong by all of it.
+    shares, covariance = lenses.shares(np.union1d(kept, _terms(far)))
     covariance += unknown
-    shares = likeliest
-    if bits < VARYING_BITS:
-        shares, _ = lenses.shares(vector, np.union1d(kept, _terms(far[len(FAR_PX) :])))
     held_out = 0.0
     for fold in range(FOLDS):
         others = normal.sum(axis=0) - normal[fold], right.sum(axis=0) - right[fold]
         with_kernels, without = (_solved(*others, prior, chosen) for chosen in (kept, kept[:0]))
         held_out += _explained(normal[fold], right[fold], with_kernels) - _explained(normal[fold], right[fold], without)
-    found = PointSpread(shares, covariance, gain, held_out, misfit, likeliest)
+    found = PointSpread(shares, covariance, gain, held_out, misfit, likeliest=shares)
     return found if found.proven else replace(found, shares=np.zeros(TERMS))
 
 
 @dataclass(frozen=True, eq=False)
 class _Lenses:
-    """The equations under each thing that is supposed of a lens: how much far light it has, how alike its channels are.
+    """The equations under each thing that is supposed of a lens: how much it scatters, how alike its channels are.
 
-    - `matrices`, `covariances`: (L, TERMS, TERMS), of the equations, and of all shares.
+    - `matrices`, `vector`: (L, TERMS, TERMS), and (TERMS,) of all: the equations.
+    - `covariances`: (L, TERMS, TERMS), of all shares.
     - `weights`: (L,), how likely each is by what the print shows, of sum 1.
+    - `likeliest_prior`: (TERMS, TERMS), inverse of the shares' covariance beforehand, of the likeliest.
     """
 
     matrices: _Array
+    vector: _Array
     covariances: _Array
     weights: _Array
+    likeliest_prior: _Array
 
     @staticmethod
-    def of(matrix: _Array, vector: _Array, inflated: _Array, misfit: float, bits: int, usual: _Array) -> _Lenses:
-        """Return what becomes of equations that have the `usual` inverse (TERMS, TERMS) of the shares' covariance.
+    def of(shown: tuple[_Array, _Array], known: tuple[_Array, _Array], bits: int) -> _Lenses:
+        """Return what becomes of equations (TERMS, TERMS), (TERMS,) of what the print shows.
 
-        `inflated` is as `matrix`, the inverse in it `misfit` times as large.
+        `known`: the same, as much of it as is certain in spite of what fits no lens.
         """
-        matrices: list[_Array] = []
-        covariances: list[_Array] = []
-        evidence: list[float] = []
-        for lens in _supposed_lenses(few=bits < VARYING_BITS):
-            prior = np.linalg.inv(_usual_shares(bits, lens))
-            covariance = np.asarray(misfit * np.linalg.inv(inflated + misfit * (prior - usual)), dtype=np.float64)
-            gain = float(vector @ covariance @ vector) / misfit**2
-            # The logarithm of the integral over all shares (D. MacKay, Bayesian interpolation, 1992).
-            fits = 0.5 * (gain + float(np.linalg.slogdet(covariance)[1]) + float(np.linalg.slogdet(prior)[1]))
-            evidence.append(fits + math.log(lens.odds))
-            matrices.append(matrix + prior - usual)
-            covariances.append(covariance)
-        weights = np.exp(np.array(evidence) - max(evidence))
-        return _Lenses(np.array(matrices), np.array(covariances), weights / weights.sum())
+        matrix, vector = known
+        priors = np.array([np.linalg.inv(_usual_shares(bits, lens)) for lens in _supposed_lenses(bits < VARYING_BITS)])
+        # The logarithm of the integral over all shares (D. MacKay, Bayesian interpolation, 1992), about the likeliest
+        # of those that a lens can have: a veil below 0 is no reason to suppose one.
+        gains = np.array([_positive(matrix + prior, vector, np.arange(TERMS))[1] for prior in priors])
+        evidence = gains + np.linalg.slogdet(priors)[1] - np.linalg.slogdet(matrix + priors)[1]
+        odds = np.array([lens.odds for lens in _supposed_lenses(bits < VARYING_BITS)])
+        weights = odds * np.exp(0.5 * (evidence - evidence.max()))
+        return _Lenses(
+            shown[0] + priors,
+            shown[1],
+            np.asarray(np.linalg.inv(matrix + priors), dtype=np.float64),
+            weights / weights.sum(),
+            priors[int(np.argmax(weights))],
+        )
 
-    def shares(self, vector: _Array, kept: npt.NDArray[np.int64]) -> tuple[_Array, _Array]:
+    def shares(self, kept: npt.NDArray[np.int64]) -> tuple[_Array, _Array]:
         """Return the mean shares (TERMS,), others than the kept ones 0, and the covariance about them."""
-        each = np.array([_positive(matrix, vector, kept)[0] for matrix in self.matrices])
+        each = np.array([_positive(matrix, self.vector, kept)[0] for matrix in self.matrices])
         mean = np.round(self.weights @ each / _ROUNDING) * _ROUNDING
         apart = (each - mean) * np.sqrt(self.weights)[:, None]
         return mean, np.tensordot(self.weights, self.covariances, axes=1) + apart.T @ apart
@@ -458,48 +489,78 @@ class _Lenses:
 class _Lens:
     """What may be supposed of a lens: scatter and reflections have little to do with each other.
 
-    - `far`, `veil`: size of far kernels' shares and of the veil over the usual ones.
+    - `near`, `far`, `veil`: size of near and far kernels' shares and of the veil over the usual ones.
     - `far_apart`, `veil_apart`: as `CHANNELS_APART`.
+    - `power`: of the distance, by which what it scatters falls; 0 where no kernel's share follows from another's.
     - `odds`: how likely it is beforehand.
     """
 
-    far: float
-    far_apart: float
-    veil: float
-    veil_apart: float
+    near: float = 1.0
+    far: float = 1.0
+    far_apart: float = CHANNELS_APART
+    power: float = 0.0
+    veil: float = 1.0
+    veil_apart: float = CHANNELS_APART
     odds: float = 1.0
 
 
 def _supposed_lenses(few: bool) -> list[_Lens]:
     """Return all that is supposed of lenses; `few`: where cells are so few that they may see nothing of a usual one."""
+    clean, clear = (_CLEAN_ODDS_OF_FEW, _CLEAR_ODDS_OF_FEW) if few else (_CLEAN_ODDS, 0.0)
     apart = list(zip(_APART, _APART_ODDS, strict=True))
-    far = [(size, one, odds / len(_FAR_SIZES)) for size, (one, odds) in product(_FAR_SIZES, apart)]
-    veils = [(1.0, one, odds) for one, odds in apart]
-    if few:
-        clean = _CLEAN, CHANNELS_APART, _CLEAN_ODDS / (1 - _CLEAN_ODDS)
-        veils = [(size, one, odds / len(_VEIL_SIZES)) for size, (one, odds) in product(_VEIL_SIZES, apart)]
-        far, veils = [clean, *far], [clean, *veils]
-    return [_Lens(*one[:2], *two[:2], one[2] * two[2]) for one, two in product(far, veils)]
+    scatter = [(_Lens(near=_CLEAN, far=_CLEAN, odds=clean), clean)]
+    law = (1 - clean) * _POWER_ODDS / len(_LAWS)
+    scatter += [(_Lens(power=power, far=far, far_apart=_SCATTER_APART, odds=law), clear) for power, far in _LAWS]
+    other = (1 - clean) * (1 - _POWER_ODDS) / len(_FAR_SIZES)
+    scatter += [
+        (_Lens(far=size, far_apart=one, odds=other * odds), clear) for size, (one, odds) in product(_FAR_SIZES, apart)
+    ]
+    found = [replace(one, veil=_CLEAN, odds=one.odds * without) for one, without in scatter if without]
+    return found + [
+        replace(one, veil_apart=alike, odds=one.odds * (1 - without) * odds)
+        for (one, without), (alike, odds) in product(scatter, apart)
+    ]
 
 
 def _usual_shares(bits: int, lens: _Lens) -> _Array:
     """Return the covariance (TERMS, TERMS) of shares before they are measured."""
-    usual = np.diag(np.full(TERMS, _PRIOR_SHARE**2))
+    usual = np.diag(np.full(TERMS, (lens.near * _PRIOR_SHARE) ** 2))
     if bits < VARYING_BITS:
         varying = _varying_terms()
-        usual[varying, varying] = _SMALL_SHARE**2
-    handed_on = np.eye(len(FAR_PX) + 1)
-    # The first of them is as much a near one, and the veil is of other origin.
-    for kernel in range(2, len(FAR_PX)):
-        handed_on[kernel] += _FAR_FALL * handed_on[kernel - 1]
-    steps = np.array([*(lens.far * step for step in _FAR_STEPS), lens.veil * USUAL_VEIL])
-    sizes = (handed_on * steps**2) @ handed_on.T
-    groups = far_groups()
-    for one, row in zip(groups, sizes, strict=True):
-        for other, both in zip(groups, row, strict=True):
-            usual[np.ix_(one, other)] = both * channels_alike(lens.far_apart)
-    usual[np.ix_(groups[-1], groups[-1])] = (lens.veil * USUAL_VEIL) ** 2 * channels_alike(lens.veil_apart)
+        usual[varying, varying] = (lens.near * _SMALL_SHARE) ** 2
+    *kernels, veil = (group for group in groups_of_terms() if len(group) <= _EVEN_TERMS)
+    if lens.power:
+        law = _law(lens.power)
+        law[len(NEAR_PX) :] *= lens.far
+        sizes = _SCATTERED**2 * np.outer(law, law)
+        off_law = np.diag(_OFF_LAW**2 * np.diag(sizes))
+    else:
+        kernels = kernels[len(NEAR_PX) :]
+        handed_on = np.eye(len(FAR_PX))
+        # The first of them is as much a near one.
+        for kernel in range(2, len(FAR_PX)):
+            handed_on[kernel] += _FAR_FALL * handed_on[kernel - 1]
+        sizes = (handed_on * (lens.far * np.array(_FAR_STEPS)) ** 2) @ handed_on.T
+        off_law = np.zeros_like(sizes)
+    for one, row, own in zip(kernels, sizes, off_law, strict=True):
+        for other, both, alone in zip(kernels, row, own, strict=True):
+            usual[np.ix_(one, other)] = both * channels_alike(lens.far_apart) + alone * np.eye(3)
+    usual[np.ix_(veil, veil)] = (lens.veil * USUAL_VEIL) ** 2 * channels_alike(lens.veil_apart)
     return usual
+
+
+def _law(power: float) -> _Array:
+    """Return the share (K,) of each kernel, near and far, in light that falls by a power of the distance.
+
+    Such a law is a mixture of Gaussians of all sizes, σ^(1 − power) dσ of each; a kernel stands for those nearer to it
+    than to others by the ratio of sizes.
+    """
+    scale = np.array(NEAR_PX + FAR_PX)
+    between = np.sqrt(scale[1:] * scale[:-1])
+    edges = np.array([scale[0] ** 2 / between[0], *between, scale[-1] ** 2 / between[-1]])
+    amount = np.log(edges) if power == 2 else edges ** (2 - power) / (2 - power)
+    share: _Array = np.diff(amount) / (amount[-1] - amount[0])
+    return share
 
 
 def channels_alike(apart: float = CHANNELS_APART) -> _Array:

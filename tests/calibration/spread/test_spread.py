@@ -235,7 +235,7 @@ def test_a_sharp_lens_is_left_alone(sharp: Photograph) -> None:
 @pytest.mark.parametrize(
     ("lens", "least", "most"),
     [
-        ({"shoulder": 0.03, "veil": 0.015}, 0.015, 0.005),
+        ({"shoulder": 0.03, "veil": 0.015}, 0.015, 0.0055),
         ({"shoulder": 0.08}, 0.05, 0.01),
         ({"veil": 0.01}, 0.008, 0.005),
         ({"shoulder": 0.06, "veil": 0.003, "growing": True}, 0.02, 0.01),
@@ -417,6 +417,16 @@ def test_a_chart_of_many_colours_shows_the_lens_channel_by_channel(lens: dict[st
     seen = shot.true[cells] > LEAST_COUNTS
     assert figures.cells_error.shape == seen.shape
     assert np.mean(np.abs(relative)[seen] < 2 * figures.cells_error[seen]) > 0.95
+
+
+def test_what_lies_beside_cells_tells_what_far_light_turns_white() -> None:
+    """512 cells hardly show it themselves: here it falls by the square of the distance, of other size by channel."""
+    shot = photograph(tails=(2.0, 1.5, (0.016, 0.067, 0.07)), chart=SMALL)
+    spread, figures = shot.measured()
+    before, _ = white_angles(shot.white_error(replace(spread, shares=np.zeros(TERMS))), figures.white_covariance)
+    tint, stated = white_angles(shot.white_error(spread), figures.white_covariance)
+    assert tint < 0.4 * before
+    assert tint < 2 * stated
 
 
 def test_what_is_left_in_on_purpose_counts_in_full() -> None:
