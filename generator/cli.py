@@ -62,9 +62,10 @@ Reads the table LUT (made by build-lut) and the source pictures. Writes the data
 that fsspec knows, which appears when it is complete: images/ (linear camera RGB), previews/, ground_truth.csv, gt.txt,
 sources.csv, dataset.json and SHA256SUMS.
 
-Each picture is printed, lit and photographed by the table: every pixel becomes one of the samples that the camera took
-of its colour under the light. The same seed, pictures and table give the same bytes, whatever the workers. A picture
-that cannot be read is left out, and named. When it was interrupted or killed, run the same command again to go on.
+Each picture is printed, lit and photographed by the table: a pixel becomes what the camera sees of its colour under the
+light, interpolated between cells, plus the deviation of one of the samples that it took; with --rendering codes, one of
+these samples itself. The same seed, pictures and table give the same bytes, whatever the workers. A picture that cannot
+be read is left out, and named. When it was interrupted or killed, run the same command again to go on.
 
 Examples: a first dataset, of a table that is computed; training crops under lights of any chromaticity; test images of
 two lights each, by the paper's rendering.
