@@ -126,8 +126,9 @@ class DataReading:
     def open(self, place: str) -> SceneSet:
         """Return the data set at a place; see `evaluation.datasets.opening.open_scenes`."""
         from evaluation.datasets import open_scenes
+        from evaluation.datasets.opening import with_black_judged
 
-        return open_scenes(place, self.layout, self.options)
+        return with_black_judged(open_scenes(place, self.layout, self.options), self.black)
 
     @property
     def options(self) -> DataOptions:
