@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final
 import typer
 from typer.main import get_command
 
+from calibration.table.demo_table import DEMO, table_folder
 from foundation.compiled import processor_count
 from foundation.console import (
     EXIT_CODES,
@@ -43,7 +44,7 @@ from generator.command.options import (
     VariationOptions,
     WorkOptions,
 )
-from generator.command.output import DEMO, matrix_sentence, table_folder
+from generator.command.output import matrix_sentence
 
 if TYPE_CHECKING:
     from generator.dataset.making import Workers
