@@ -21,6 +21,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from benchmarks import words_given
 from benchmarks.generator import noisy_table, photograph, report
 from evaluation.methods.gaussian import gaussian_kernel
 from evaluation.methods.gray_edge import GrayEdge
@@ -35,6 +36,7 @@ Image = npt.NDArray[np.uint16]
 
 
 def main() -> None:
+    words_given(__doc__)
     cv2.setNumThreads(1)
     for size, (width, height) in SIZES.items():
         report_methods(size, test_image(width, height))

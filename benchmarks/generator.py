@@ -33,6 +33,7 @@ import numpy as np
 import numpy.typing as npt
 import skimage.data
 
+from benchmarks import words_given
 from calibration.table.lut import Lut, LutWriter, Provenance, open_lut
 from drivers.presenter import Colour
 from foundation.compiled import compiled
@@ -291,6 +292,7 @@ def measure_start() -> None:
 
 
 def main() -> None:
+    words_given(__doc__)
     with tempfile.TemporaryDirectory() as scratch:
         tables = np.array(noisy_table(Path(scratch) / "lut", 2).samples)
     measure_start()

@@ -16,6 +16,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from benchmarks import words_given
 from benchmarks.encode import METADATA, photograph
 from benchmarks.generator import SAMPLES, WHITE, in_turns, mask_weights, noisy_table, report
 from calibration.table.lut import Lut
@@ -72,6 +73,7 @@ def measure(name: str, lut: Lut, picture: npt.NDArray[np.uint8], repeats: int) -
 
 
 def main() -> None:
+    words_given(__doc__)
     with tempfile.TemporaryDirectory() as scratch:
         lut = noisy_table(Path(scratch) / "lut", 2)
         measure("18 Mpx", lut, photograph(5184, 3456), 3)
