@@ -4,6 +4,8 @@ The limit is a streaming copy of the same picture, 3 bytes in and 6 out, in as m
 the whole picture, which no cache holds; the fastest turn counts. With one thread the time is the processor's, else the
 clock's. So ratios hold on a machine with other work to do, the clock's less so.
 
+Takes some minutes.
+
 Two lights are mixed by random weights in each pixel, which is the most work, and by masks of two kinds. Their weights,
 8 bytes a pixel, are read beside what the copy reads and writes.
 

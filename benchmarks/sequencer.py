@@ -7,9 +7,9 @@
 - in real time on the machine at hand, frames of 25 MB at 30 MB/s, exposure 0.5 s, settling 0.2 s, decoded and judged;
 - a frame saved, hashed and judged against the same bytes written, flushed and hashed by a few lines.
 
-``python -m benchmarks.sequencer quick`` takes a tenth of the frames in simulated time. Frames are judged as in a
-session (`acquisition.judge.judge.LiveJudge`); with ``exposure`` among the words by their exposure alone, as it was
-before.
+``python -m benchmarks.sequencer quick`` takes a tenth of the frames in simulated time, and some minutes. Frames are
+judged as in a session (`acquisition.judge.judge.LiveJudge`); with ``exposure`` among the words by their exposure alone,
+as it was before.
 
 The unavoidable time of a frame is release, exposure and readout, and then the longer of settling and download: a body
 does not expose while it sends, and the light may change when it has announced the frame. What is flattered: files are
