@@ -23,6 +23,7 @@ import numpy.typing as npt
 
 from acquisition.run.rig.simulated import sheet, simulated_body, simulated_room
 from acquisition.run.run import run_session
+from benchmarks import words_given
 from calibration.pipeline.build import build
 from calibration.table.lut import Lut, open_lut
 from drivers.camera import ExposureSettings
@@ -247,6 +248,7 @@ def measure(case: str, body: str, room: Changes, folder: Path) -> None:
 
 def main() -> int:
     """Measure both full-size bodies in the default room, and one where light is uneven and fades."""
+    words_given(__doc__)
     cases: list[tuple[str, str, Changes]] = [(body, body, {}) for body in BODIES if body != "Test"]
     cases.append(("EOS 550D, uneven and fading light", "EOS 550D", UNEVEN))
     cases.append(("EOS 550D, unlike primaries", "EOS 550D", UNLIKE))

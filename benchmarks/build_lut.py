@@ -34,6 +34,7 @@ from unittest.mock import patch
 import numpy as np
 import rawpy
 
+from benchmarks import words_given
 from calibration.checks.frame_consistency import ConsistencyCheck
 from calibration.pipeline.baseline import (
     PAPER_OPTIONS,
@@ -254,9 +255,7 @@ PARTS = ("memory", "chart", "DNG", "CR2")
 
 def main() -> None:
     """Measure and print the parts named on the command line, or all."""
-    parts = sys.argv[1:] or PARTS
-    if unknown := set(parts) - set(PARTS):
-        raise SystemExit(f"{', '.join(sorted(unknown))}: one of {', '.join(PARTS)} expected")
+    parts = words_given(__doc__, PARTS) or PARTS
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         for lights in (4, 12) if "memory" in parts else ():

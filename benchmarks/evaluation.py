@@ -6,7 +6,8 @@ pixels saturated in a channel are left out with their neighbours (0.1 % of the i
 OpenCV is fastest; sums by `cv2.mean`, which is faster than NumPy's.
 
 From files to results is the mean rate of `evaluate` over PNG files of a generated dataset, in as many threads as there
-are processors, over that of reading the same files the same way and nothing else; again in turns.
+are processors, over that of reading the same files the same way and nothing else; again in turns. Takes
+three to four minutes.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from benchmarks import words_given
 from benchmarks.generator import noisy_table, photograph, report
 from evaluation.methods.gaussian import gaussian_kernel
 from evaluation.methods.gray_edge import GrayEdge
@@ -35,6 +37,7 @@ Image = npt.NDArray[np.uint16]
 
 
 def main() -> None:
+    words_given(__doc__)
     cv2.setNumThreads(1)
     for size, (width, height) in SIZES.items():
         report_methods(size, test_image(width, height))

@@ -23,8 +23,8 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from calibration.table.demo_table import table_folder
 from calibration.table.lut import open_lut
-from generator.command.output import table_folder
 from generator.explore.explorer import MAX_SIDE, Explorer
 from generator.explore.server import ExploreServer
 from generator.lights.gamut import Gamut

@@ -4,6 +4,8 @@ The limit is a streaming copy of the same picture, 3 bytes in and 6 out, in as m
 the whole picture, which no cache holds; the fastest turn counts. With one thread the time is the processor's, else the
 clock's. So ratios hold on a machine with other work to do, the clock's less so.
 
+Takes some minutes.
+
 Two lights are mixed by random weights in each pixel, which is the most work, and by masks of two kinds. Their weights,
 8 bytes a pixel, are read beside what the copy reads and writes.
 
@@ -33,6 +35,7 @@ import numpy as np
 import numpy.typing as npt
 import skimage.data
 
+from benchmarks import words_given
 from calibration.table.lut import Lut, LutWriter, Provenance, open_lut
 from drivers.presenter import Colour
 from foundation.compiled import compiled
@@ -291,6 +294,7 @@ def measure_start() -> None:
 
 
 def main() -> None:
+    words_given(__doc__)
     with tempfile.TemporaryDirectory() as scratch:
         tables = np.array(noisy_table(Path(scratch) / "lut", 2).samples)
     measure_start()

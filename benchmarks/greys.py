@@ -2,7 +2,8 @@
 
 Under each light of a table all 256 greys are rendered by colour, each 4096 times. Printed are how far their means are
 off the light, what their noise is in parts of what the table's photon-transfer curve says of that level, and how even
-the ramp is: the least rise from one code to the next, over the standard error of that difference.
+the ramp is: the least rise from one code to the next, over the standard error of that difference; and how many of all
+4913 source colours the print cannot show. Takes a few seconds a table.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ import numpy.typing as npt
 
 from benchmarks.generator import report
 from calibration.radiometry.table_noise import noise_curve
+from calibration.table.demo_table import table_folder
 from calibration.table.lut import Lut, open_lut
 from foundation.colorimetry import angles_deg
 from foundation.errors import InputError
@@ -63,6 +65,7 @@ def measure(lut: Lut, name: str, black_taken: float) -> None:
         every = np.concatenate(ratios)
         for word, value in (("mean", every.mean()), ("least", every.min()), ("most", every.max())):
             report(f"noise of greys 20 to 230, {word}", float(value), "ratio", f"photon transfer, {what}")
+        report("source colours that the print cannot show", float(rendering.map.outside.mean()), "share", name)
     report("least rise from a grey to the next", least, "standard errors", what)
     report("bends beyond three standard errors, most of a light", bends, "share", what)
 
@@ -70,10 +73,10 @@ def measure(lut: Lut, name: str, black_taken: float) -> None:
 def main(arguments: Sequence[str] | None = None) -> None:
     """Measure."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("luts", nargs="+", type=Path, help="folders of tables")
+    parser.add_argument("luts", nargs="+", type=Path, help="folders of tables; demo: for a small one")
     for folder in parser.parse_args(arguments).luts:
         for black_taken in (0.0, 1.0):
-            measure(open_lut(folder), folder.name, black_taken)
+            measure(open_lut(table_folder(folder)), folder.name, black_taken)
 
 
 if __name__ == "__main__":

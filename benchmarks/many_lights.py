@@ -3,6 +3,7 @@
 Prints one JSON object a line. The usual program makes the same of the same picture: a soft edge, samples of both lights
 mixed with their noise, the light of each pixel, and four PNG files in memory, with numpy and OpenCV. Calls take turns,
 the fastest counts, and the time is the processor's with one thread. The time of each step is reported as its share.
+Takes about two minutes.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from benchmarks import words_given
 from benchmarks.encode import METADATA, photograph
 from benchmarks.generator import SAMPLES, WHITE, in_turns, mask_weights, noisy_table, report
 from calibration.table.lut import Lut
@@ -72,6 +74,7 @@ def measure(name: str, lut: Lut, picture: npt.NDArray[np.uint8], repeats: int) -
 
 
 def main() -> None:
+    words_given(__doc__)
     with tempfile.TemporaryDirectory() as scratch:
         lut = noisy_table(Path(scratch) / "lut", 2)
         measure("18 Mpx", lut, photograph(5184, 3456), 3)

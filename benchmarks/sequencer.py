@@ -7,9 +7,9 @@
 - in real time on the machine at hand, frames of 25 MB at 30 MB/s, exposure 0.5 s, settling 0.2 s, decoded and judged;
 - a frame saved, hashed and judged against the same bytes written, flushed and hashed by a few lines.
 
-``python -m benchmarks.sequencer quick`` takes a tenth of the frames in simulated time. Frames are judged as in a
-session (`acquisition.judge.judge.LiveJudge`); with ``exposure`` among the words by their exposure alone, as it was
-before.
+``python -m benchmarks.sequencer quick`` takes a tenth of the frames in simulated time, and some minutes. Frames are
+judged as in a session (`acquisition.judge.judge.LiveJudge`); with ``exposure`` among the words by their exposure alone,
+as it was before.
 
 The unavoidable time of a frame is release, exposure and readout, and then the longer of settling and download: a body
 does not expose while it sends, and the light may change when it has announced the frame. What is flattered: files are
@@ -25,7 +25,6 @@ import hashlib
 import json
 import os
 import statistics
-import sys
 import tempfile
 import time
 from collections.abc import Generator
@@ -42,6 +41,7 @@ from acquisition.judge.measure import ExposureJudge
 from acquisition.run.devices import Devices
 from acquisition.run.pipeline import Taken
 from acquisition.run.run import take_session
+from benchmarks import words_given
 from drivers.camera import CameraIdentity, CapturedFrame, ExposureSettings
 from drivers.presenter import BLACK, Colour
 from drivers.projector import Fault, Lamp, Power, ProjectorIdentity
@@ -394,12 +394,13 @@ def _save(path: Path, content: bytes) -> None:
     hashlib.sha256(content).hexdigest()
 
 
-def main(argv: list[str]) -> int:
+def main() -> int:
     """Measure sessions of prepared frames."""
+    words = words_given(__doc__, ("quick", "exposure"))
     files = prepared_files()
     report("size of a frame", len(files["lit"]) / 1e6, "MB")
     report("load of the machine when begun", os.getloadavg()[0], "processes", f"{os.cpu_count()} processors")
-    live = "exposure" not in argv
+    live = "exposure" not in words
     report("judged", float(live), "", "1: by the live judge, 0: by exposure alone")
     compare_saving(files, live)
     real = Latencies(0, 0, 30e6, 0, 0, 0)
@@ -407,7 +408,7 @@ def main(argv: list[str]) -> int:
         measured = measure(SystemClock(), real, 0.2, REAL_LIGHTS, files, live)
     report_session("real time", measured)
     report("real time: journal's writes a frame", sum(spent) / measured.frames, "s")
-    lights = len(LIGHTS) // 10 if "quick" in argv else len(LIGHTS)
+    lights = len(LIGHTS) // 10 if "quick" in words else len(LIGHTS)
     report_session("simulated time", measure(SimulatedClock(), Latencies(), 0.5, lights, files, live))
     slow = measure(SimulatedClock(), Latencies(question_s=0.02), 0.5, len(LIGHTS) // 10, files, live)
     report_session("simulated time, a projector that takes 20 ms an answer", slow)
@@ -415,4 +416,4 @@ def main(argv: list[str]) -> int:
 
 
 if __name__ == "__main__":
-    raise SystemExit(main(sys.argv[1:]))
+    raise SystemExit(main())

@@ -240,17 +240,19 @@ def build_lut(
         raise InputError(f"{next(name for name, value in beside.items() if value)} goes with --compare; leave it out")
     if (lut if verify else session if compare or any(reading.values()) else None) is not None:
         raise InputError(f"{given[0]} does not expect {lut or session}; leave it out")
+    from calibration.table.demo_table import table_folder
+
     with json_output("build-lut", as_json) as output:
         if info is not None:
-            _print_table(info, output)
+            _print_table(table_folder(info), output)
         elif cite is not None:
-            _print_citation(cite, output)
+            _print_citation(table_folder(cite), output)
         elif verify is not None:
-            _verify_table(verify, session, output)
+            _verify_table(table_folder(verify), session, output)
         elif match is not None:
-            _match_tables(*match, output)
+            _match_tables(table_folder(match[0]), table_folder(match[1]), output)
         elif publish is not None:
-            _publish_table(*publish, output)
+            _publish_table(table_folder(publish[0]), publish[1], output)
         elif fetch is not None:
             _fetch_table(*fetch, expect, output)
         else:
@@ -269,7 +271,7 @@ def build_lut(
                 unfit = [name for name in ("--linearity", "--note", "--licence", "--author", "--serial") if made[name]]
                 if unfit:
                     raise InputError(f"{unfit[0]} is for the report of one table; leave it out of --compare")
-                _compare(*compare, options, output, out, chart)
+                _compare(table_folder(compare[0]), table_folder(compare[1]), options, output, out, chart)
                 return
             _make(session, lut, check, append, options, linearity, picture, changes, output)
 

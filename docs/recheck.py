@@ -343,18 +343,24 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--data", type=Path, action="append", default=[], help="where files lie that commands need")
     parser.add_argument("--seconds", type=float, default=math.inf, help="leave out commands that take longer")
     given = parser.parse_args(arguments)
+    for folder in given.data:
+        if not folder.is_dir():
+            parser.error(f"--data {folder} is no folder; name one in which the files lie that commands need")
     named = [Path(page).resolve() for page in given.pages]
     pages = named or [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
     texts = {page.relative_to(ROOT).as_posix(): page.read_text(encoding="utf-8") for page in pages}
     checks = [check for page, text in texts.items() for check in checks_of(page, text)]
     differ, skipped = run(checks, given.data, given.seconds)
+    done = len(checks) - len(skipped)
+    skipped += [f"{page}: nothing on it is run" for page, text in texts.items() if named and not checks_of(page, text)]
     for page in set(texts).intersection(MEASURED):
         differ += [f"{page}:{table.line}: {NO_SOURCE}" for table in without_a_source(texts[page])]
     for page, text in texts.items():
         taken = sorted(set(TAKEN.findall(text)))
         skipped += [f"{page}: taken with version {version}, {date}" for version, date in taken]
-    print("\n".join([*(f"not run  {line}" for line in skipped), *(f"differs  {line}" for line in differ)]))
-    print(f"{len(checks)} tables, texts and outputs have commands; {len(differ)} differences")
+    for line in (*(f"not run  {line}" for line in skipped), *(f"differs  {line}" for line in differ)):
+        print(line)
+    print(f"{done} of {len(checks)} tables, texts and outputs with commands were run; {len(differ)} differences")
     return int(bool(differ))
 
 

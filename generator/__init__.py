@@ -67,7 +67,7 @@ _HOMES = {
 
 
 def open_lut(folder: Path | str) -> Lut:
-    """Return the table in a folder; see `calibration.table.lut.open_lut`.
+    """Return the table in a folder, or the small computed one of ``demo:``; see `calibration.table.lut.open_lut`.
 
     Examples
     --------
@@ -75,9 +75,10 @@ def open_lut(folder: Path | str) -> Lut:
     >>> lut.samples.shape, lut.samples.dtype, lut.ground_truth.shape
     ((4, 64, 25, 3), dtype('uint16'), (4, 3))
     """
+    from calibration.table.demo_table import table_folder
     from calibration.table.lut import open_lut
 
-    return open_lut(Path(folder))
+    return open_lut(table_folder(Path(folder)))
 
 
 def __getattr__(name: str) -> object:

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final
 import typer
 from typer.main import get_command
 
+from calibration.table.demo_table import DEMO, table_folder
 from foundation.compiled import processor_count
 from foundation.console import (
     EXIT_CODES,
@@ -43,7 +44,7 @@ from generator.command.options import (
     VariationOptions,
     WorkOptions,
 )
-from generator.command.output import DEMO, matrix_sentence, table_folder
+from generator.command.output import matrix_sentence
 
 if TYPE_CHECKING:
     from generator.dataset.making import Workers
@@ -62,9 +63,10 @@ Reads the table LUT (made by build-lut) and the source pictures. Writes the data
 that fsspec knows, which appears when it is complete: images/ (linear camera RGB), previews/, ground_truth.csv, gt.txt,
 sources.csv, dataset.json and SHA256SUMS.
 
-Each picture is printed, lit and photographed by the table: every pixel becomes one of the samples that the camera took
-of its colour under the light. The same seed, pictures and table give the same bytes, whatever the workers. A picture
-that cannot be read is left out, and named. When it was interrupted or killed, run the same command again to go on.
+Each picture is printed, lit and photographed by the table: a pixel becomes what the camera sees of its colour under the
+light, interpolated between cells, plus the deviation of one of the samples that it took; with --rendering codes, one of
+these samples itself. The same seed, pictures and table give the same bytes, whatever the workers. A picture that cannot
+be read is left out, and named. When it was interrupted or killed, run the same command again to go on.
 
 Examples: a first dataset, of a table that is computed; training crops under lights of any chromaticity; test images of
 two lights each, by the paper's rendering.

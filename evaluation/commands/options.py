@@ -126,8 +126,9 @@ class DataReading:
     def open(self, place: str) -> SceneSet:
         """Return the data set at a place; see `evaluation.datasets.opening.open_scenes`."""
         from evaluation.datasets import open_scenes
+        from evaluation.datasets.opening import with_black_judged
 
-        return open_scenes(place, self.layout, self.options)
+        return with_black_judged(open_scenes(place, self.layout, self.options), self.black)
 
     @property
     def options(self) -> DataOptions:
@@ -148,19 +149,26 @@ METHOD_HELP = (
 def choose_methods(texts: Iterable[str]) -> list[Method]:
     """Return the methods that texts name, each once, in their order.
 
-    `standard` are the seven of `STANDARD`, `all` every one of `standard_methods`.
+    `standard` are the seven of `STANDARD`, `all` every one of `standard_methods`; what stands beside them and is one of
+    them comes once, but a text that is given twice is refused.
 
     Examples
     --------
-    >>> [method.name for method in choose_methods(["gray-world", "white-patch", "gray-world"])]
-    ['Gray-world', 'White-Patch']
+    >>> [method.name for method in choose_methods(["white-patch", "gray-world"])]
+    ['White-Patch', 'Gray-world']
+    >>> len(choose_methods(["standard", "gray-world"]))
+    7
+    >>> choose_methods(["gray-world", "gray-world"])
+    Traceback (most recent call last):
+        ...
+    foundation.errors.InputError: the method gray-world is named twice; name it once
     """
     from evaluation.methods.standard import STANDARD, standard_methods
 
     groups = {"standard": STANDARD, "all": tuple(standard_methods())}
     wanted: list[str] = []
-    for text in texts:
-        wanted += groups.get(text.strip().lower(), (text.strip(),))
+    for text in _each_once(texts):
+        wanted += groups.get(text.lower(), (text,))
     return [_method(text) for text in dict.fromkeys(wanted)]
 
 
@@ -175,9 +183,20 @@ def choose_learners(texts: Iterable[str]) -> list[Learner]:
     from evaluation.learning.standard import standard_learners
 
     wanted: list[str] = []
-    for text in texts:
-        wanted += standard_learners() if text.strip().lower() == "all" else [text.strip()]
+    for text in _each_once(texts):
+        wanted += standard_learners() if text.lower() == "all" else [text]
     return [_learner(text) for text in dict.fromkeys(wanted)]
+
+
+def _each_once(texts: Iterable[str]) -> list[str]:
+    """Return texts without blanks around them; one that comes twice is refused."""
+    from foundation.errors import InputError
+
+    given = [text.strip() for text in texts]
+    twice = next((text for number, text in enumerate(given) if text in given[:number]), None)
+    if twice is not None:
+        raise InputError(f"the method {twice} is named twice; name it once")
+    return given
 
 
 def choose_beside_constant(text: str) -> tuple[list[Learner], list[str]]:

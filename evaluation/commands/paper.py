@@ -35,7 +35,7 @@ all of them as made with full tables of both cameras.
 
 app = new_app(no_args_is_help=True)
 
-Luts = Annotated[list[Path], argument("LUT", "Tables made by build-lut, a folder each.")]
+Luts = Annotated[list[Path], argument("LUT", "Folders of tables; demo: for a small computed one.")]
 Kind = Annotated[AngularError, typer.Option(help="Angular error to print.")]
 Out = Annotated[Path | None, option("FOLDER", "Write page, tables and figures here.")]
 Seed = Annotated[int, typer.Option(metavar="N", help="Of all that is drawn at random.", min=0)]

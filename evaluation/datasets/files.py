@@ -23,7 +23,7 @@ import numpy.typing as npt
 
 from evaluation.scene import Image
 from foundation import files
-from foundation.errors import FormatError, first_of
+from foundation.errors import FormatError, InputError, first_of
 from generator.files import decode_array
 
 IMAGE_ENDINGS = (".png", ".tif", ".tiff", ".npy")
@@ -169,12 +169,12 @@ Light = tuple[float, float, float]
 """Linear camera RGB of a light, of any length."""
 
 
-def check_light(values: Sequence[float], where: str) -> Light:
+def check_light(values: Sequence[float], where: str, remedy: str = "restore the file") -> Light:
     """Return a light, after checking that it is one."""
     if len(values) != 3 or not all(map(math.isfinite, values)) or min(values) < 0 or not any(values):
         raise FormatError(
             f"{where}: {' '.join(f'{value:g}' for value in values) or 'nothing'} is no light, expected red, green and "
-            "blue, none below 0 and not all 0; restore the file"
+            f"blue, none below 0 and not all 0; {remedy}"
         )
     red, green, blue = values
     return float(red), float(green), float(blue)
@@ -240,9 +240,9 @@ def read_rows(path: Path, needed: Sequence[str]) -> Iterator[tuple[str, Mapping[
         raise FormatError(f"{path} cannot be read: {reason}; restore it") from error
 
 
-def light_of(row: Mapping[str, str], columns: Sequence[str], where: str) -> Light:
-    """Return the light in three columns of a row."""
-    return check_light([number_of(row[column], where, column) for column in columns], where)
+def light_of(row: Mapping[str, str], columns: Sequence[str], where: str, remedy: str = "restore the file") -> Light:
+    """Return the light in three columns of a row; `remedy` is what to do where it is none."""
+    return check_light([number_of(row[column], where, column) for column in columns], where, remedy)
 
 
 def number_of(text: str, where: str, column: str) -> float:
@@ -296,6 +296,48 @@ class RawScene:
         """Return (H, W) bool, True where a pixel of the image (H, W, 3) must not be used, or None if none is masked."""
         del image
         return None
+
+
+def require_above_black(scenes: Iterable[RawScene]) -> None:
+    """Refuse black levels that no pixel of any image is above; of levels that fit, one image is read as a rule."""
+    highest: list[tuple[float, RawScene]] = []
+    for scene in scenes:
+        try:
+            highest.append((float(scene.decoded().max()), scene))
+        except FormatError:
+            return  # An image that cannot be read is told where it is used.
+        if highest[-1][0] > scene.black:
+            return
+    if highest:
+        value, scene = max(highest, key=lambda one: one[0])
+        raise InputError(
+            f"black level {scene.black:g} is above every pixel of all {len(highest)} images, whose largest value is "
+            f"{value:g} ({scene.path}); give the level in the units of the files, by --black or the column black"
+        )
+
+
+_LOOKED_AT = 16
+"""Images that are looked at for a black level that was not subtracted."""
+
+_NEAR_BLACK = 0.01
+"""Share of an image's largest value that some pixel of it is below; pedestals of cameras are 3 % of saturation or more,
+and of usual exposures a larger share."""
+
+
+def pedestal_note(scenes: Sequence[RawScene]) -> str:
+    """Return what is said where no pixel comes near 0, as if black were in it; "" where one does."""
+    least: list[float] = []
+    for scene in scenes[:: -(-len(scenes) // _LOOKED_AT)]:
+        try:
+            image, mask = scene.read()
+        except FormatError:
+            return ""
+        used = image if mask is None else image[~mask]
+        if not used.size or used.min() <= _NEAR_BLACK * used.max():
+            return ""
+        least.append(float(used.min()))
+    looked = "the image" if len(least) == 1 else f"{len(least)} images looked at"
+    return f"; but no pixel of {looked} is below {min(least):g}: a black level may be missing, give it with --black"
 
 
 @dataclass(frozen=True, slots=True)

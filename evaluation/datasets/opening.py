@@ -7,10 +7,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from evaluation.datasets.ffcc import is_ffcc, open_ffcc
-from evaluation.datasets.files import Folder
+from evaluation.datasets.files import Folder, RawScene, pedestal_note, require_above_black
 from evaluation.datasets.generated import open_generated
 from evaluation.datasets.options import DataOptions
-from evaluation.datasets.plain_folder import is_plain_folder, open_plain_folder
+from evaluation.datasets.plain_folder import ASSUMED_BLACK, is_plain_folder, open_plain_folder, require_no_other_table
 from evaluation.datasets.published.cube import (
     is_cube_plus,
     is_cube_plus_plus,
@@ -194,6 +194,31 @@ def open_scenes(place: Path | str, layout: str | None = None, options: DataOptio
     return replace(data, treatment={**data.treatment, "reader": _UNVERIFIED}) if known.unverified else data
 
 
+def with_black_judged(data: SceneSet, black: float | None) -> SceneSet:
+    """Return a data set, stated that a black level may be missing where images look so.
+
+    Reads images, mostly one: until one says that nothing is wrong.
+
+    Parameters
+    ----------
+    data
+        What was opened.
+    black
+        The level that the user gave.
+
+    Raises
+    ------
+    InputError
+        The level of the user, or of a table of theirs, is above every pixel of all images.
+    """
+    scenes = [scene for scene in data.scenes if isinstance(scene, RawScene)]
+    if black is not None or data.layout == "folder":
+        require_above_black(scenes)
+    stated = data.treatment.get("black level", "")
+    note = pedestal_note(scenes) if stated == ASSUMED_BLACK else ""
+    return replace(data, treatment={**data.treatment, "black level": f"{stated}{note}"}) if note else data
+
+
 def layout_of(place: str) -> str:
     """Return the name of the layout that a place looks like.
 
@@ -247,6 +272,7 @@ def _recognise(place: str) -> tuple[str, Folder | None]:
     found = [name for name, known in LAYOUTS.items() if not known.general and known.matches(folder)]
     found = found or [name for name, known in LAYOUTS.items() if known.general and known.matches(folder)]
     if not found:
+        require_no_other_table(folder)
         signs = "; ".join(f"{known.signs} ({name})" for name, known in LAYOUTS.items())
         raise FormatError(f"{place} is no dataset of a layout that is known. Looked for: {signs}. Name its folder")
     if len(found) > 1:

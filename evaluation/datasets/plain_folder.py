@@ -24,13 +24,25 @@ from pathlib import Path
 
 import numpy as np
 
-from evaluation.datasets.files import IMAGE_ENDINGS, Folder, Light, Mask, RawScene, light_of, number_of, read_rows
+from evaluation.datasets.files import (
+    IMAGE_ENDINGS,
+    Folder,
+    Light,
+    Mask,
+    RawScene,
+    light_of,
+    number_of,
+    read_rows,
+)
 from evaluation.datasets.options import DataOptions, stated
 from evaluation.scene import Image, SceneSet
 from foundation.errors import FormatError, InputError, first_of
 
 COLUMNS = ("image", "r", "g", "b")
 """What the table must have."""
+
+ASSUMED_BLACK = "0: assumed, as neither a column black nor --black gives it"
+"""What is stated where nothing says what black is."""
 
 _PICTURES = (".jpg", ".jpeg", ".webp", ".heic", ".gif", ".bmp")
 _RAWS = (".cr2", ".cr3", ".nef", ".arw", ".dng", ".raf", ".orf", ".rw2", ".pef", ".srw", ".crw")
@@ -94,7 +106,7 @@ def open_plain_folder(place: str, options: DataOptions, listed: Folder | None = 
             raise FormatError(f"{where}: the image {name!r} is {'named twice' if name else 'no name'}; correct it")
         seen.add(name)
         image = _find(folder, name, where, listings)
-        light = light_of(row, COLUMNS[1:], where)
+        light = light_of(row, COLUMNS[1:], where, "correct the line")
         if image is None:
             missing.append(name)
             refused = refused or _unusable(folder, name, where, listings)
@@ -130,8 +142,7 @@ def open_plain_folder(place: str, options: DataOptions, listed: Folder | None = 
             "images": str(len(scenes))
             + (f"; {len(missing)} more of {path.name} are not there" if missing else "")
             + (f"; {left_out}" if left_out else ""),
-            "black level": _stated("black", given, path, options.black, "0: assumed, as neither a column black nor "
-            "--black gives it"),
+            "black level": _stated("black", given, path, options.black, ASSUMED_BLACK),
             "saturation": _stated("saturation", given, path, options.saturation, "none: neither a column saturation "
             "nor --saturation gives it, so clipped pixels are used"),
             "mask": _mask_stated(given, path, len(masks), len(scenes)),
@@ -164,18 +175,38 @@ def _table_of(place: Path, listed: Folder | None) -> Path:
     return place / tables[0]
 
 
+def require_no_other_table(folder: Folder) -> None:
+    """Refuse, by its columns, the one table of a folder beside images that is none of images and lights."""
+    heads = _heads(folder)
+    if len(heads) == 1 and folder.images(IMAGE_ENDINGS):
+        ((name, head),) = heads.items()
+        lacking = [column for column in COLUMNS if column not in _columns(head)]
+        raise FormatError(
+            f"{folder.path} is no dataset of a layout that is known: for images of your own {name} lacks the columns "
+            f"{','.join(lacking)} (found: {head.strip()[:80] or 'nothing'}), expected {','.join(COLUMNS)} between "
+            "commas in its first line; correct it, or name another folder"
+        )
+
+
 def _tables(folder: Folder) -> list[str]:
     """Return the names of the .csv files of a folder that have the columns of such a table."""
-    found: list[str] = []
+    return [name for name, head in _heads(folder).items() if all(column in _columns(head) for column in COLUMNS)]
+
+
+def _heads(folder: Folder) -> dict[str, str]:
+    """Return the first lines of the .csv files of a folder by their names."""
+    found: dict[str, str] = {}
     for name in [name for name in folder.files if name.lower().endswith(".csv")][:_MOST]:
         try:
             with (folder.path / name).open(encoding="utf-8-sig") as file:
-                head = [column.strip().strip('"') for column in file.readline().split(",")]
+                found[name] = file.readline()
         except (OSError, UnicodeDecodeError):
             continue
-        if all(column in head for column in COLUMNS):
-            found.append(name)
     return found
+
+
+def _columns(head: str) -> list[str]:
+    return [column.strip().strip('"') for column in head.split(",")]
 
 
 @dataclass(frozen=True)

@@ -44,7 +44,7 @@ from evaluation.methods.gray_edge import GrayEdge
 from evaluation.methods.standard import local_methods, standard_methods
 from evaluation.methods.wrapped import PATCHES, PatchwiseMethod, ResizedMethod
 from foundation.errors import InputError, nearest_names
-from foundation.packages import require_own_packages
+from foundation.packages import PACKAGES, require_own_packages
 
 if TYPE_CHECKING:
     from evaluation.methods.method import Learner, Method
@@ -104,6 +104,11 @@ def find_method(text: str) -> Method | Learner:
     is_file = place.endswith(".py")
     module = _module_of_file(Path(place)) if is_file else _module_by_name(place)
     found = getattr(module, name, None)
+    if found is None and place in PACKAGES and Path(f"{place}.py").is_file():
+        raise InputError(
+            f"{wanted}: {place} is a package of this suite, which has no {name!r}; for the file of that name write "
+            f"{place}.py:{name}"
+        )
     if found is None:
         others = ", ".join(sorted(one for one in vars(module) if _looks_like_method(module, one))) or "none"
         raise InputError(f"{place} has no {name!r}; its classes with estimate or fit: {others}")
@@ -167,7 +172,7 @@ def checked_method(found: object, place: str) -> Method | Learner:
             )
         raise InputError(
             f"{place} is no method: it has neither estimate(image, saturation, mask) nor fit(scenes, seed); add the "
-            "one that it is to have, see evaluation/methods/method.py"
+            "one that it is to have, see docs/how-to/evaluate.md"
         )
     try:
         name = getattr(found, "name", None)

@@ -213,13 +213,13 @@ def read_estimates(path: Path, images: Sequence[str], name: str | None = None) -
     known = set(images)
     found: dict[str, npt.NDArray[np.float64]] = {}
     unknown: list[str] = []
-    twice: list[str] = []
+    twice: dict[str, None] = {}
     for given, light in _rows(path, text):
         image = given if given in known else by_stem.get(given, by_stem.get(_stem(given)))
         if image is None:
             unknown.append(given)
         elif image in found:
-            twice.append(given)
+            twice[image] = None
         else:
             found[image] = light
     missing = [image for image in images if image not in found]
@@ -228,7 +228,7 @@ def read_estimates(path: Path, images: Sequence[str], name: str | None = None) -
         for those, one, several in (
             (missing, "image of the data set is missing", "images of the data set are missing"),
             (unknown, "line is of no image of the data set", "lines are of no image of the data set"),
-            (twice, "image stands there twice", "images stand there twice"),
+            (list(twice), "image stands there more than once", "images stand there more than once"),
         )
         if those
     ]

@@ -29,7 +29,7 @@ def csv_text(rows: Iterable[Sequence[object]]) -> str:
     return text.getvalue()
 
 
-COLUMNS = ("method", "mean", "median", "trimean", "best25", "worst25", "avg")
+COLUMNS = ("method", "mean", "median", "trimean", "best25", "worst25", "avg", "no_estimate")
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,22 +72,39 @@ class Result:
             None if causes is None else {new: causes[old] for new, old in enumerate(places.tolist()) if old in causes},
         )
 
+    @property
+    def marked_name(self) -> str:
+        """The method's name as tables for people have it: with how often grey stands in, so that a row says it alone.
+
+        Examples
+        --------
+        >>> Result("Mine", np.eye(3), {}, np.array([True, False, True])).marked_name
+        'Mine (no light: 2 of 3)'
+        """
+        missing = int(self.guessed.sum())
+        return f"{self.method} (no light: {missing} of {len(self.guessed)})" if missing else self.method
+
     def summary(self, kind: ErrorKind) -> Summary:
         """Return the numbers that sum up one kind of error, the six of the paper's tables among them."""
         return summarise(self.errors[kind])
 
 
 def table_csv(results: Sequence[Result], kind: ErrorKind) -> str:
-    """Return the table of one dataset as CSV text: `method,mean,median,trimean,best25,worst25,avg`, degrees.
+    """Return the table of one dataset as CSV text: `method,mean,median,trimean,best25,worst25,avg,no_estimate`.
+
+    Errors are degrees; `no_estimate` are the images for which the method gave no light and grey stands in.
 
     Examples
     --------
     >>> errors = {"reproduction": np.array([1.0, 2.0, 3.0, 4.0])}
     >>> print(table_csv([Result("Gray-world", np.ones((4, 3)), errors, np.zeros(4, bool))], "reproduction"), end="")
-    method,mean,median,trimean,best25,worst25,avg
-    Gray-world,2.500000,2.500000,2.500000,1.000000,4.000000,2.286525
+    method,mean,median,trimean,best25,worst25,avg,no_estimate
+    Gray-world,2.500000,2.500000,2.500000,1.000000,4.000000,2.286525,0
     """
-    rows = [(result.method, *(f"{number:.6f}" for number in result.summary(kind).as_tuple())) for result in results]
+    rows = [
+        (result.method, *(f"{number:.6f}" for number in result.summary(kind).as_tuple()), int(result.guessed.sum()))
+        for result in results
+    ]
     return csv_text([COLUMNS, *rows])
 
 
@@ -141,13 +158,17 @@ def read_light(given: object, grey: npt.NDArray[np.float64] = GREY) -> SceneAnsw
         return SceneAnswer(None, NO_PIXEL)
     if given is None:
         return SceneAnswer(None, "returned None")
+    kind = ""
     try:
         plain = np.asarray(given)  # Of complex, boolean and masked numbers nothing is to be lost silently.
+        kind = f" of {plain.dtype}" if plain.dtype.kind in "bc" else ""
         if plain.dtype.kind not in "iufO" or hasattr(given, "mask"):
             raise TypeError(plain.dtype)
         light = plain.astype(np.float64)
     except (TypeError, ValueError) as error:
-        raise ValueError(f"returned {type(given).__name__}, expected three real numbers: red, green, blue") from error
+        raise ValueError(
+            f"returned {type(given).__name__}{kind}, expected three real numbers: red, green, blue"
+        ) from error
     if light.shape != (3,):
         raise ValueError(f"returned an array of shape {light.shape}, expected (3,): red, green, blue")
     length = math.hypot(*light)

@@ -119,7 +119,7 @@ def summary_table(subject: Subject, results: Sequence[Result], kind: ErrorKind, 
     return Table(
         f"{subject.name}: {kind} angular error of {len(subject.images)} images{held}, degrees",
         (*PAPER_COLUMNS, *(FURTHER_COLUMNS if further else ())),
-        tuple((result.method, *_statistics(result.errors[kind], further)) for result in results),
+        tuple((result.marked_name, *_statistics(result.errors[kind], further)) for result in results),
         notes=tuple(note for result in results for note in _notes(subject, result)),
     )
 
@@ -136,7 +136,8 @@ def lights_tables(subject: Subject, results: Sequence[Result], kind: ErrorKind) 
     tables = [_several(subject, results)]
     if single.any():
         title = f"{subject.name}: {kind} angular error of the {int(single.sum())} images under one light, degrees"
-        rows = tuple((result.method, *_statistics(result.errors[kind][single], False)) for result in results)
+        alone = [result.at(np.flatnonzero(single)) for result in results]
+        rows = tuple((result.marked_name, *_statistics(result.errors[kind], False)) for result in alone)
         tables.append(Table(title, PAPER_COLUMNS, rows))
     return tuple(tables)
 
@@ -192,8 +193,9 @@ def _several(subject: Subject, results: Sequence[Result]) -> Table:
         errors = _by_place(maps)
         unjudged = max(unjudged, int(np.isnan(errors["pixel_rgb"]).sum()))
         columns = [errors[name] for name in ("pixel_recovery", "pixel_rgb", "region_recovery")]
-        columns.append(result.errors["recovery"][list(maps)])
-        rows.append((result.method, *(cell for column in columns for cell in _mean_and_median(column))))
+        mixed = result.at(np.array(list(maps), np.int64))
+        columns.append(mixed.errors["recovery"])
+        rows.append((mixed.marked_name, *(cell for column in columns for cell in _mean_and_median(column))))
     none_left = (f"{unjudged} images have no pixel whose light is known and that is not masked: they are left out",)
     return Table(
         f"{subject.name}: recovery angular error of the {sum(subject.mixed)} images under several lights, degrees",

@@ -1,22 +1,16 @@
-"""What `generate` shows (progress, notes on rendering by colour), and the table of those who have none (`demo:`)."""
+"""What `generate` shows: progress, and notes on rendering by colour."""
 
 from __future__ import annotations
 
-import subprocess
 import sys
 import time
 from collections.abc import Generator
 from contextlib import ExitStack, contextmanager
 from datetime import timedelta
-from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Final
 
 from foundation.console import shows_progress
-from foundation.errors import InputError, StorageError
-from foundation.files import sha256_of
 from foundation.secret_texts import printable
-from foundation.version import software
 
 if TYPE_CHECKING:
     from rich.progress import Progress
@@ -138,53 +132,3 @@ def matrix_sentence(matrix: ColourMatrix, camera: str, *, chosen: bool) -> str:
         f"{sentence}; {why}if the print's colours were not managed, its faults are in the matrix as well: --matrix "
         "NAME or FILE takes that of a camera"
     )
-
-
-DEMO: Final = "demo:"
-"""What stands in place of a table's folder."""
-
-CAMERA: Final = "Canon_EOS_600D"
-LIGHTS: Final = "2856K,4000K,D55,D65,FL2,LED-B3,7500K,10000K"
-"""Incandescent lamp to blue sky, a fluorescent lamp and an LED between."""
-
-BITS: Final = 4
-"""Bits kept of each channel: 4096 colours, 5 MB."""
-
-
-def table_folder(given: Path, cache: Path | None = None) -> Path:
-    """Return the folder of a table: the one given, or that of the table to begin with, made if it is not there.
-
-    `cache`: where the table is kept; None for `foundation.files.cache_folder`.
-    """
-    if str(given) != DEMO:
-        return given
-    from foundation.files import cache_folder
-
-    cache = cache or cache_folder()
-    if cache is None:
-        raise InputError(
-            f"{DEMO} needs a place to keep its table, and there is no home folder; set XDG_CACHE_HOME, or make one "
-            "with sim table"
-        )
-    key = sha256_of(repr((software(), CAMERA, LIGHTS, BITS)).encode())[:12]
-    folder = cache / f"demo-{key}"
-    if not (folder / "lut.json").is_file():
-        _make(folder)
-    print(f"{DEMO} {folder}: a computed table of {CAMERA}, {8**BITS} colours under {LIGHTS}; see sim table --help")
-    return folder
-
-
-def _make(folder: Path) -> None:
-    """Have ``sim table`` make it, as a user would: this package knows tables and nothing that makes them."""
-    options = ["--camera", CAMERA, "--lights", LIGHTS, "--print", "managed", "--paper", "matt"]
-    with TemporaryDirectory() as place:
-        settings = Path(place) / "settings.toml"
-        settings.write_text(f"[chart]\nbits = {BITS}\n", encoding="utf-8")
-        words = [sys.executable, "-m", "synthesis.cli", "table", str(folder), *options, "--settings", str(settings)]
-        done = subprocess.run(words, stdout=subprocess.DEVNULL, check=False)
-    # Another program may have made it meanwhile, of the same bytes.
-    if done.returncode and not (folder / "lut.json").is_file():
-        raise StorageError(
-            f"the table for {DEMO} could not be made in {folder}: sim table ended with exit code {done.returncode}, "
-            "and says above why; mend that, or make a table elsewhere with sim table"
-        )

@@ -637,6 +637,63 @@ def truth_of(description: Description) -> str:
     return "it is the mean of the white references that lie among the colours, under the same light."
 
 
+def pixels_of(description: Description) -> str:
+    """Return in words how a pixel comes from the table's samples, by the rendering of the dataset."""
+    samples = description.table.samples
+    if option(description, "rendering") is None:
+        return (
+            f"Each pixel is one of the {samples} samples that the table has of its colour, drawn by the seed; where "
+            "lights mix, one of each."
+        )
+    return (
+        "Each pixel is the mean of its colour, interpolated between cells of the table, plus the deviation of one of "
+        f"the {samples} samples of the nearest cell from their mean, drawn by the seed and scaled to the noise at that "
+        "level; where lights mix, of each."
+    )
+
+
+def noise_of(description: Description) -> str:
+    """Return in words how many electrons a count is and what noise a sample has, as far as the table says it."""
+    green = "Green is the mean of two photosites, so that its noise has half the variance of one."
+    table = description.table
+    if table.computed is None:
+        return f"Gain and read noise are in `report.html` of the table, as measured. {green}"
+    try:
+        body, iso = table.computed["body"], float(table.computed["exposure"]["iso"])
+        gain, read, early = (float(body[name]) for name in ("electrons_per_dn", "read_noise_dn", "sensor_noise_e"))
+    except (KeyError, TypeError, ValueError):
+        return f"The table does not state gain and read noise. {green}"
+    stretched = f"; a count is {FULL / table.white_level:.4g} of the files' units" * (
+        option(description, "scale") == "full"
+    )
+    return (
+        f"In the model of the sensor a count is {gain * 100 / iso:.4g} electrons at its ISO {iso:g}{stretched}; "
+        f"at ISO 100 it is {gain:.4g}, and the read noise of a photosite {read:.4g} counts, of which {early:.4g} "
+        f"electrons arise before the amplifier. {green}"
+    )
+
+
+def _repeats(description: Description) -> str:
+    """Return in words whether pictures come more than once."""
+    if description.images <= description.sources:
+        return "Each picture is in one image."
+    return "Images of one picture repeat it, or parts of it, under another light or with other noise."
+
+
+def _procedure(description: Description) -> str:
+    """Return in words how the table's colours were obtained and what vouches for them."""
+    name = table_name(description)
+    if description.table.computed is not None:
+        return (
+            f"{name}: samples of all colours of a chart were computed under known lights. No frame was taken, and "
+            "there is no report; `computed` under `table` in `dataset.json` has the model and its settings."
+        )
+    return (
+        f"A chart of all colours under known lights: {name}. The table's report has the verdict on it and every figure "
+        "with its limit."
+    )
+
+
 def option(description: Description, name: str) -> Any:
     """Return an option as `dataset.json` has it; None where it was off."""
     return description.options.get(name)
@@ -851,7 +908,9 @@ def datasheet(description: Description) -> str:
         "authors": f"The table: {authors}. The dataset: {OPEN}" if authors else OPEN,
         "camera": table.camera,
         "citation": citation_of(description),
-        "dates": origin["Dates"],
+        "dates": "No frame was taken for the table."
+        if table.computed is not None
+        else f"The table's frames: {origin['Dates']}.",
         "format": option(description, "format"),
         "images": counted_images(description),
         "kind": kind_of(description),
@@ -859,12 +918,15 @@ def datasheet(description: Description) -> str:
         "licence": origin["Licence"],
         "lights": len(description.lights),
         "name": name_of(description),
+        "noise": noise_of(description),
         "open": OPEN,
         "origin": "\n".join(f"| {name} | {table_cell(value)} |" for name, value in origin.items()),
         "pixels": description.pixels,
+        "pixels_are": pixels_of(description),
+        "procedure": _procedure(description),
         "rendering": "colorimetrically, by the cells whose measured colour matches" if by_colour else rendering,
         "replaced": description.replaced_pixels,
-        "samples": table.samples,
+        "repeats": _repeats(description),
         "seed": description.seed,
         "skipped": len(description.skipped),
         "software": description.software,
@@ -874,7 +936,6 @@ def datasheet(description: Description) -> str:
         else "None; keep all images of a picture in one part.",
         "summary": summary_of(description),
         "table": table.sha256,
-        "table_name": table_name(description),
         "table_software": table.software,
         "truth": truth_of(description),
         "uncertainty": uncertainty_of(description),
@@ -917,6 +978,7 @@ def card(description: Description) -> str:
         f"again, `SHA256SUMS` the hash of every file but this one, `{DATASHEET}` and `{CROISSANT}`\n"
         f"- **More**: [{DATASHEET}]({DATASHEET}) (Datasheets for Datasets), [{CROISSANT}]({CROISSANT}) (MLCommons)\n\n"
         f"## Reading\n\n{_reading(description)}\n\n{brightness_note(description)}\n\n"
+        f"## Noise\n\n{pixels_of(description)} {noise_of(description)}\n\n"
         f"## Licence\n\n**To be stated by whoever publishes**: images are made of pictures, which have licences of "
         f"their own (`sources.csv` names them), and of the table, whose licence is in the list below. Put the result "
         f"into the front matter, in place of `unknown`.\n\n"

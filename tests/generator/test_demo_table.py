@@ -9,18 +9,20 @@ import cv2
 import numpy as np
 import pytest
 
+from calibration.cli import main as build_lut
+from calibration.table import demo_table
+from calibration.table.demo_table import table_folder
 from calibration.table.lut import open_lut
+from evaluation.cli import main as evaluate
 from foundation.errors import InputError
 from generator.cli import main
-from generator.command import output
-from generator.command.output import table_folder
 
 
 @pytest.fixture(autouse=True)
 def small(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """Make it small, and keep it elsewhere than in the user's folder."""
-    monkeypatch.setattr(output, "BITS", 1)
-    monkeypatch.setattr(output, "LIGHTS", "D65,A")
+    monkeypatch.setattr(demo_table, "BITS", 1)
+    monkeypatch.setattr(demo_table, "LIGHTS", "D65,A")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
 
 
@@ -48,3 +50,10 @@ def test_one_command_makes_images_of_a_picture(tmp_path: Path) -> None:
     cv2.imwrite(str(picture), np.random.default_rng(1).integers(0, 255, (20, 30, 3), dtype=np.uint8))
     assert main(["demo:", str(tmp_path / "out"), "--sources", str(picture), "--illuminations", "0-1"]) == 0
     assert json.loads((tmp_path / "out" / "dataset.json").read_text("utf-8"))["images"]
+
+
+def test_other_commands_take_it_too(capsys: pytest.CaptureFixture[str]) -> None:
+    assert build_lut(["--info", "demo:"]) == 0
+    assert "computed by sim table" in capsys.readouterr().out
+    assert build_lut(["--match", "demo:", "demo:"]) == 0
+    assert evaluate(["paper", "chromaticities", "demo:"]) == 0

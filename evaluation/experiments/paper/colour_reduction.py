@@ -165,7 +165,7 @@ def bits_table(found: BitsResult, kind: ErrorKind, name: str) -> Table:
     """Return the six numbers of every method for the images as they are and each number of bits."""
     versions = {"as it is": found.raw, **{str(count): results for count, results in found.reduced.items()}}
     return Table(
-        f"{name}: {kind} angular error after bits of the sRGB codes were set to zero, degrees",
+        f"{name}: {kind} angular error after bits of the codes that Flash makes were set to zero, degrees",
         ("Algorithm", "Bits set to zero", *PAPER_COLUMNS[1:]),
         tuple(
             (results[place].method, label, *results[place].summary(kind).as_tuple())

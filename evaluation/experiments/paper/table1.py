@@ -215,7 +215,7 @@ def block_table(block: Block, kind: ErrorKind) -> Table:
     published = TABLE1.get(block.cell, {})
     rows: list[tuple[str | float | None, ...]] = []
     for result in block.results:
-        rows.append((result.method, *result.summary(kind).as_tuple()))
+        rows.append((result.marked_name, *result.summary(kind).as_tuple()))
         if result.method in published:
             rows.append(("paper", *published[result.method].as_tuple()))
     notes = [f"{counted(len(block.scenes), 'image')}; lights {block.lights}."]
@@ -418,7 +418,7 @@ def table2_tables(found: Sequence[Trained], kind: ErrorKind, name: str, with_pub
         published = TABLE2["real" if training == "real" else "generated"]
         for trained in found:
             result = trained.real if training == "real" else trained.generated
-            rows.append((result.method, *result.summary(kind).as_tuple()))
+            rows.append((result.marked_name, *result.summary(kind).as_tuple()))
             known = published.get(LEARNERS.get(trained.learner, ""))
             if known and with_published:
                 rows.append(("paper", *known.as_tuple()))

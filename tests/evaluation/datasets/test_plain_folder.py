@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from evaluation.datasets import DataOptions, open_scenes
+from evaluation.datasets.opening import with_black_judged
 from foundation.errors import FormatError, InputError
 from tests.evaluation.datasets.made_up import image_of, plain_folder, write_png
 
@@ -61,6 +62,54 @@ def test_what_is_not_given_is_stated(copy: Path) -> None:
     assert data.treatment["saturation"].startswith("none: neither")
     assert data.treatment["mask"] == "none"
     assert data.folds is None
+
+
+def three_images(folder: Path, least: int) -> Path:
+    """Fill a folder with images of 200 to 4000 counts over `least`, and the table of them."""
+    folder.mkdir()
+    for number in range(3):
+        pixels = np.full((6, 6, 3), 200 + number, np.uint16)
+        pixels[0] = 4000
+        write_png(folder / f"{number}.png", pixels + least)
+    write_table(folder, *(f"{number},1,2,1" for number in range(3)))
+    return folder
+
+
+def judged(folder: Path, black: float | None = None) -> str:
+    """Return what is said of the black level."""
+    data = open_scenes(folder, options=DataOptions(black=black))
+    return with_black_judged(data, black).treatment["black level"]
+
+
+def test_a_black_level_above_all_pixels_is_refused(tmp_path: Path) -> None:
+    folder = three_images(tmp_path / "own", 0)
+    assert judged(folder, 3999).startswith("3999, as the user gave it")
+    with pytest.raises(InputError, match=r"60000 is above every pixel of all 3 images.* 4000 .*png"):
+        judged(folder, 60000)
+
+
+def test_a_black_level_that_may_be_missing_is_told(tmp_path: Path) -> None:
+    folder = three_images(tmp_path / "own", 0)
+    assert "no pixel of 3 images looked at is below 200" in judged(folder)
+    # What was given is not doubted, and one dark pixel is enough.
+    assert "missing" not in judged(folder, 0)
+    pixels = np.full((6, 6, 3), 4000, np.uint16)
+    pixels[2, 2, 1] = 7
+    write_png(folder / "1.png", pixels)
+    assert "missing" not in judged(folder)
+
+
+@pytest.mark.parametrize("row", ["a,nan,1,1", "a,0,0,0"])
+def test_a_line_of_ones_own_is_to_be_corrected(copy: Path, row: str) -> None:
+    write_table(copy, row)
+    with pytest.raises(FormatError, match="correct the line"):
+        open_scenes(copy)
+
+
+def test_a_table_between_semicolons_is_told_by_its_columns(copy: Path) -> None:
+    (copy / "gt.csv").write_text("image;r;g;b\na;1;2;1\n")
+    with pytest.raises(FormatError, match=r"gt\.csv lacks the columns image,r,g,b \(found: image;r;g;b\)"):
+        open_scenes(copy)
 
 
 @pytest.mark.parametrize(

@@ -153,3 +153,10 @@ def test_a_file_that_was_corrected_loads(tmp_path: Path) -> None:
         find_method(f"{file}:Brightest")
     file.write_text(TEN_LINES)
     assert find_method(f"{file}:Brightest").name == "Brightest pixel"
+
+
+def test_a_file_named_as_a_package_is_named_with_its_ending(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("evaluation.py").write_text("class Mine:\n    pass\n")
+    with pytest.raises(InputError, match=r"package of this suite.* evaluation\.py:Mine"):
+        find_method("evaluation:Mine")

@@ -123,7 +123,10 @@ def test_what_is_no_light_is_kept_as_it_is(tmp_path: Path) -> None:
     ("text", "message"),
     [
         ("image,r,g,b\na/one,1,1,1\n", r"2 images of the data set are missing \(a/two\.png, three\.v1\.png\)"),
-        ("a/one,1,1,1\na/one.png,1,1,1\na/two,1,1,1\nthree.v1,1,1,1", r"1 image stands there twice \(a/one\.png\)"),
+        (
+            "a/one,1,1,1\na/one.png,1,1,1\na/one,1,1,1\na/two,1,1,1\nthree.v1,1,1,1",
+            r"1 image stands there more than once \(a/one\.png\)",
+        ),
         ("a/one,1,1,1\na/two,1,1,1\nthree.v1,1,1,1\nfour,1,1,1", r"1 line is of no image of the data set \(four\)"),
     ],
 )

@@ -13,7 +13,8 @@ import pytest
 
 from evaluation.experiments.running import evaluate
 from evaluation.metrics import recovery_error, summarise
-from evaluation.results.result import Subject
+from evaluation.reports.table_output import table_to_latex
+from evaluation.results.result import Subject, table_csv
 from evaluation.results.tables import Table, lights_tables, statistics_rows, summary_table, table_to_csv
 from evaluation.scene import MixedScene, Scene
 from tests.evaluation.made_up import MixedWall, walls
@@ -116,6 +117,17 @@ def test_causes_are_named_few_at_a_time() -> None:
         "White: no light for 4 of 6 images (wall 0.png returned None, wall 1.png returned 0 0 0, wall 3.png returned "
         "None …); their light was taken to be grey"
     )
+
+
+def test_a_row_says_itself_that_grey_stands_in() -> None:
+    scenes = walls(6)
+    results = evaluate(scenes, [White(None, (0, 0, 0), (1, 1, 1), None, (1, np.nan, 1))])
+    table = summary_table(subject_of(scenes), results, "recovery")
+    assert table.rows[0][0] == "White (no light: 4 of 6)"
+    assert "White (no light: 4 of 6) & " in table_to_latex(table)
+    assert [line.rpartition(",")[2] for line in table_csv(results, "recovery").splitlines()] == ["no_estimate", "4"]
+    # The count stands in a column of its own where programs read it, beside the plain name.
+    assert {(row[0], row[-1]) for row in statistics_rows(subject_of(scenes), results).rows} == {("White", 4)}
 
 
 TABLE = Table(

@@ -147,6 +147,38 @@ def test_nothing_that_was_not_photographed_is_called_so(
     assert word in kind_of(with_origin(plain, origin, computed=computed))
 
 
+def test_pixels_are_told_by_the_rendering(plain: Dataset) -> None:
+    by_colour = plain.description
+    by_codes = by_colour.model_copy(
+        update={"options": {key: value for key, value in by_colour.options.items() if key != "rendering"}}
+    )
+    for text in (card, datasheet):
+        assert "interpolated between cells" in text(by_colour)
+        assert "Each pixel is one of the" not in text(by_colour)
+        assert "Each pixel is one of the" in text(by_codes)
+        assert "interpolated" not in text(by_codes)
+
+
+def test_a_computed_table_has_neither_frames_nor_report_but_a_known_gain(plain: Dataset) -> None:
+    body = {"electrons_per_dn": 1.8, "read_noise_dn": 6.0, "sensor_noise_e": 2.8}
+    computed = {"by": "sim table", "body": body, "exposure": {"iso": 200}}
+    text = datasheet(with_origin(plain, None, computed=computed))
+    assert "The table's report has the verdict" not in text
+    assert "The table's frames" not in text
+    assert "a count is 0.9 electrons at its ISO 200" in text
+    assert "read noise of a photosite 6 counts, of which 2.8" in text
+    assert "The table's report has the verdict" in datasheet(plain.description)
+    # A table that others computed need not say it.
+    assert "does not state gain" in card(with_origin(plain, None, computed={"by": "others"}))
+
+
+def test_a_picture_is_said_to_repeat_only_where_it_does(plain: Dataset) -> None:
+    assert "Images of one picture repeat it" in datasheet(plain.description.model_copy(update={"images": 9}))
+    assert "Each picture is in one image" in datasheet(
+        plain.description.model_copy(update={"images": plain.description.sources})
+    )
+
+
 def test_the_titles_lights_are_the_tables(plain: Dataset) -> None:
     assert plain.description.table.lights == 4
     assert len(plain.description.lights) == 2
