@@ -22,7 +22,15 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any, Final, TypeVar
 
-from acquisition.run.devices import Devices, holds_whole_turns, period_s, reported_error, wheel_of
+from acquisition.run.devices import (
+    Devices,
+    LightNotShown,
+    fault_of,
+    holds_whole_turns,
+    period_s,
+    reported_error,
+    wheel_of,
+)
 from acquisition.run.rig.opening import known_frame_bytes, open_rig
 from drivers.camera import CameraIdentity, ReportsSupplies, Supplies
 from drivers.presenter import BLACK, ReportsWarnings
@@ -312,38 +320,40 @@ def ask(devices: Devices) -> Answers:
     faults: list[CropError] = []
     unasked: list[str] = []
 
-    def answer(question: Callable[[], _T], otherwise: _T) -> _T:
+    def answer(device: str, question: Callable[[], _T], otherwise: _T) -> _T:
         try:
             return question()
         except DeviceError as fault:
-            faults.append(fault)
+            faults.append(fault_of(device, fault))
             return otherwise
 
     camera, projector, presenter = devices.camera, devices.projector, devices.presenter
-    identity = answer(camera.identity, None)
+    identity = answer("camera", camera.identity, None)
     offered: tuple[float, ...] = ()
     supplies: Supplies | None = None
     # A camera that cannot be reached is asked once: each question would wait for it.
     if identity is not None:
-        offered = answer(camera.shutter_speeds, ())
+        offered = answer("camera", camera.shutter_speeds, ())
         if not offered:
             unasked.append("shutter times: the camera lists none")
         if isinstance(camera, ReportsSupplies):
-            supplies = answer(camera.supplies, None)
+            supplies = answer("camera", camera.supplies, None)
         if supplies is None or (supplies.battery is None and not supplies.mains):
             unasked.append("battery: the camera does not tell; see that it runs on mains power")
         unasked.append("ISO speed and aperture: they are set and verified before the lamp is lit")
     state, lit = "", None
     if projector is not None:
-        state, lit = answer(lambda: _projector_state(projector), ("", None))
+        state, lit = answer("projector", lambda: _projector_state(projector), ("", None))
         if lit is not None:
-            error = answer(lambda: reported_error(projector), None)
+            error = answer("projector", lambda: reported_error(projector), None)
             faults += [] if error is None else [error]
     else:
         unasked.append("lamp: the projector is not under control; switch it on half an hour before")
     warnings: tuple[str, ...] = ()
     if isinstance(presenter, ReportsWarnings):
-        warnings = answer(presenter.warnings, ())
+        warnings = answer("display", presenter.warnings, ())
+    if isinstance(presenter, LightNotShown) and presenter.unasked:
+        unasked.append(presenter.unasked)
     return Answers(identity, offered, supplies, state, lit, warnings, tuple(unasked), tuple(faults))
 
 
@@ -630,7 +640,7 @@ def dry_run(settings: LabSettings, folder: Path, retake: str | None = None) -> R
             require_frames_folder(folder)
         work = outline(settings, folder, session, retake)
         try:
-            devices = opened.enter_context(open_rig(settings, work.chart, session))
+            devices = opened.enter_context(open_rig(settings, work.chart, session, shows=False))
         except CropError as fault:
             return make_plan(settings, work, Answers(faults=(fault,)), free_bytes_at(folder))
         return make_plan(settings, work, ask(devices), free_bytes_at(folder), known_frame_bytes(settings))

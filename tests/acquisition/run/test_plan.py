@@ -336,7 +336,7 @@ class TestAsking:
         clock, camera = SimulatedClock(), Silent(fault=DeviceError("no camera on USB"))
         answers = ask(Devices(camera, Silent(), Unmoved(clock, power=Power.ON), clock))
         assert camera.log == ["identity"]
-        assert [str(fault) for fault in answers.faults] == ["no camera on USB"]
+        assert [str(fault) for fault in answers.faults] == ["camera: no camera on USB"]
         assert answers.lit
 
     def test_a_broken_lamp_is_a_fault(self) -> None:
