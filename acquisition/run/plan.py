@@ -12,6 +12,7 @@ from __future__ import annotations
 import errno
 import math
 import os
+import shlex
 import shutil
 import statistics
 from collections import Counter
@@ -52,7 +53,7 @@ from foundation.errors import (
     counted,
 )
 from foundation.files import file_sha256, storage_error
-from foundation.secret_texts import target_label
+from foundation.secret_texts import is_address, is_webhook, target_label
 
 FIXED: Final = (
     "rig", "camera", "simulated.body", "simulated.camera", "simulated.seed", "simulated.room",
@@ -436,6 +437,7 @@ def make_plan(
     found = (
         *answers.faults,
         *answers.warnings,
+        *settings_doubts(settings),
         _exposure_fault(settings, work, answers),
         _battery_fault(work, answers),
         _card_fault(work, answers, size.value),
@@ -453,6 +455,29 @@ def make_plan(
         tuple(one for one in found if isinstance(one, CropError)),
         tuple(one for one in found if isinstance(one, str)),
     )
+
+
+def settings_doubts(settings: LabSettings) -> tuple[str, ...]:
+    """Return what of the settings may be a mistake that is otherwise found in the night, a sentence each."""
+    return tuple(doubt for key, target in _targets(settings) if (doubt := _target_doubt(key, target)))
+
+
+def _targets(settings: LabSettings) -> tuple[tuple[str, str], ...]:
+    """Return who is told of a run, by the key that names them."""
+    return ("sequence.notify", settings.sequence.notify), ("notify.alive", settings.notify.alive)
+
+
+def _target_doubt(key: str, target: str) -> str:
+    """Return why nobody may hear what a target is told; empty where it is a URL, a command that is there, or none."""
+    command = shlex.split(target)[:1]
+    if is_webhook(target) or not command or shutil.which(command[0]):
+        return ""
+    label = target_label(target)
+    if is_address(target):
+        return f"{key}: {label} is no command that is there; an address begins with https://"
+    if Path(command[0]).is_file():
+        return f"{key}: {command[0]} may not be executed; chmod +x {shlex.quote(command[0])}"
+    return f"{key}: {label} is no command that is there; name one by its whole path, or a URL with https://"
 
 
 def has_lamp_control(settings: LabSettings) -> bool:
@@ -555,8 +580,9 @@ def plan_lines(plan: RunPlan) -> tuple[str, ...]:
             answers.projector or ("could not be asked" if has_lamp_control(settings) else "not under control"),
         ),
     ]
-    if settings.sequence.notify:
-        lines.append(("notices", f"to {target_label(settings.sequence.notify)}"))
+    for name, (_, target) in zip(("notices", "alive"), _targets(settings), strict=True):
+        if target:
+            lines.append((name, f"to {target_label(target)}"))
     lines += [("not asked", sentence) for sentence in answers.unasked]
     lines += [("doubt", sentence) for sentence in plan.doubts]
     lines += [("fault", str(fault)) for fault in plan.faults]

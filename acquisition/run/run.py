@@ -35,7 +35,16 @@ from experiment.lights import load_illuminations
 from experiment.session.folder import Session, busy_sentence, session_exists
 from experiment.session.heartbeat import BEGINS, RunState, SessionPlace, SignOfLife, signs_of_life
 from experiment.session.journal import beat_beside
-from experiment.session.records import ACCEPTED, VOIDED, FrameJudge, FrameKind, SessionStep, duration_text, last_moment
+from experiment.session.records import (
+    ACCEPTED,
+    DOUBT,
+    VOIDED,
+    FrameJudge,
+    FrameKind,
+    SessionStep,
+    duration_text,
+    last_moment,
+)
 from experiment.session.repair import secrets_warning
 from foundation.clock import Clock, SteadyClock
 from foundation.console import Ending
@@ -250,8 +259,7 @@ def take_session(
     running frame; None for a run that nobody asks. `first`: numbers of steps that are taken before all others.
     """
     sequence = settings.sequence
-    life = Life(settings.notify.alive, session.folder.name, announce, devices.clock)
-    reports = _Reports(session, devices.clock, announce, state, sequence.notify, life)
+    reports = _Reports(session, devices.clock, announce, state, settings)
     asked = ending or Ending()
     retry = RetryPolicy(
         devices.clock,
@@ -263,10 +271,10 @@ def take_session(
     )
 
     def count(frame: Taken) -> None:
-        life.sign(f"{len(session.steps) - frame.left} of {len(session.steps)} frames")
+        reports.working(f"{len(session.steps) - frame.left} of {len(session.steps)} frames")
         observe(frame)
 
-    life.ready()
+    reports.ready()
     try:
         for stray in session.set_aside_strays():
             reports.tell("stray", f"{stray.name}: complete, but not in the journal; kept, not used")
@@ -340,16 +348,31 @@ class _Reports:
         clock: Clock,
         announce: Callable[[str], object],
         state: Callable[[str], object],
-        notify: str,
-        life: Life,
+        settings: LabSettings,
     ) -> None:
         self._journal = session.journal
         self._clock = clock
         self._announce = announce
         self._state = state
-        self._notices = Notices(notify, session.folder.name, announce)
-        self._life = life
+        name = session.folder.name
+        self._notices = Notices(settings.sequence.notify, name, lambda why: self.doubt(f"sequence.notify: {why}"))
+        self._life = Life(settings.notify.alive, name, lambda why: self.doubt(f"notify.alive: {why}"), clock)
         self._pauses = PauseNotices(self._notify, clock)
+
+    def ready(self) -> None:
+        """Say that devices and session are open."""
+        self._life.ready()
+
+    def working(self, doing: str) -> None:
+        """Say what the run does now, and what could not be told of it to others."""
+        self._life.sign(doing)
+        self._notices.say_failures()
+
+    def doubt(self, sentence: str) -> None:
+        """Tell what stops nothing and is to be seen in the morning; a disk that cannot take it is told of already."""
+        self._announce(f"{DOUBT}: {sentence}")
+        with suppress(StorageError):
+            self._journal.note(self._clock.now(), DOUBT, sentence)
 
     def tell(self, what: str, sentence: str, /) -> None:
         """Tell what happens."""
@@ -367,7 +390,7 @@ class _Reports:
         if doing == "paused":
             self._pauses.paused(sentence)
         self._state(sentence)
-        self._life.sign(f"{doing}: {sentence}")
+        self.working(f"{doing}: {sentence}")
         self._journal.beat(doing, sentence, datetime.now(UTC) + timedelta(seconds=within_s))
 
     def late(self, sentence: str, begun: datetime) -> None:

@@ -29,12 +29,13 @@ from acquisition.run.plan import (
     order_of,
     outline,
     plan_lines,
+    settings_doubts,
 )
 from drivers.camera import CameraIdentity, ExposureSettings, Supplies
 from drivers.presenter import Colour
 from drivers.projector import Power, Severity
 from experiment.chart.layout import design_chart
-from experiment.config import LabSettings, load_lab
+from experiment.config import LabSettings, NotifySettings, load_lab
 from experiment.lights import Illumination, save_illuminations
 from experiment.session.folder import Session
 from experiment.session.records import plan_steps
@@ -369,6 +370,7 @@ def lab(tmp_path: Path) -> Path:
     path.write_text(
         'rig = "simulated"\nchart = "chart.json"\nilluminations = "lights.csv"\n[simulated]\nbody = "Test"\n'
         '[judge]\nresponse = false\n[sequence]\nnotify = "https://ntfy.example/s3cret"\n'
+        '[notify]\nalive = "https://ping.example/s3cret"\n'
     )
     return path
 
@@ -390,6 +392,34 @@ def small_disk(lab: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(shutil, "disk_usage", small)
 
 
+@pytest.mark.parametrize(
+    ("target", "said", "unsaid"),
+    [
+        ("{there}/tell --phone", "", "s3cret"),
+        ("{there}/gone --phone s3cret", "{there}/gone … is no command that is there", "s3cret"),
+        ("{there}/plain --phone", "chmod +x {there}/plain", "--phone"),
+        (
+            "ntfy.example/s3cret",
+            "ntfy.example/… is no command that is there; an address begins",
+            "s3cret",
+        ),
+        ("https://ntfy.example/s3cret", "", "s3cret"),
+        ("", "", "s3cret"),
+    ],
+)
+def test_who_would_not_hear_what_he_is_told_is_doubted(target: str, said: str, unsaid: str, tmp_path: Path) -> None:
+    for name, mode in (("tell", 0o755), ("plain", 0o644)):
+        (tmp_path / name).touch(mode)
+    target, said = target.format(there=tmp_path), said.format(there=tmp_path)
+    of_notify = SETTINGS.model_copy(update={"sequence": SETTINGS.sequence.model_copy(update={"notify": target})})
+    of_alive = SETTINGS.model_copy(update={"notify": NotifySettings(alive=target)})
+    for key, settings in (("sequence.notify", of_notify), ("notify.alive", of_alive)):
+        doubts = settings_doubts(settings)
+        assert planned(settings=settings).doubts == doubts
+        assert len(doubts) == bool(said)
+        assert all(doubt.startswith(f"{key}: ") and said in doubt and unsaid not in doubt for doubt in doubts)
+
+
 class TestDryRun:
     def test_a_new_session_is_printed_and_not_made(self, lab: Path, capsys: pytest.CaptureFixture[str]) -> None:
         before = contents(lab.parent)
@@ -400,6 +430,7 @@ class TestDryRun:
         assert "shuffled by seed 1" in text
         assert "in standby: it will be lit" in text
         assert "notices     to https://ntfy.example/…" in text
+        assert "alive       to https://ping.example/…" in text
         assert "s3cret" not in text
 
     def test_a_session_is_looked_at_and_not_changed(self, lab: Path, capsys: pytest.CaptureFixture[str]) -> None:
