@@ -457,9 +457,26 @@ def make_plan(
     )
 
 
+LONG_SETTLE_S: Final = 10.0
+"""Settling above which seconds may have been taken for milliseconds: chosen, many times what projectors need."""
+SHORT_WARM_UP_S: Final = 300.0
+"""Warm-up below which a lamp is not yet steady: chosen; makers ask for ten minutes to half an hour."""
+
+
 def settings_doubts(settings: LabSettings) -> tuple[str, ...]:
     """Return what of the settings may be a mistake that is otherwise found in the night, a sentence each."""
-    return tuple(doubt for key, target in _targets(settings) if (doubt := _target_doubt(key, target)))
+    doubts = [doubt for key, target in _targets(settings) if (doubt := _target_doubt(key, target))]
+    settle_s, warm_up_s = settings.sequence.settle_s, settings.sequence.warm_up_s
+    if settle_s > LONG_SETTLE_S:
+        doubts.append(
+            f"sequence.settle_s = {settle_s:g}: each frame waits so many seconds; a projector shows a colour within one"
+        )
+    if settings.rig == "lab" and has_lamp_control(settings) and warm_up_s < SHORT_WARM_UP_S:
+        doubts.append(
+            f"sequence.warm_up_s = {warm_up_s:g}: a lamp changes its light for longer, at least "
+            f"{SHORT_WARM_UP_S:g} s are expected of one; of a laser or LEDs it may be enough"
+        )
+    return tuple(doubts)
 
 
 def _targets(settings: LabSettings) -> tuple[tuple[str, str], ...]:

@@ -35,7 +35,7 @@ from drivers.camera import CameraIdentity, ExposureSettings, Supplies
 from drivers.presenter import Colour
 from drivers.projector import Power, Severity
 from experiment.chart.layout import design_chart
-from experiment.config import LabSettings, NotifySettings, load_lab
+from experiment.config import LabRig, LabSettings, NotifySettings, ProjectorCable, load_lab, parse_lab
 from experiment.lights import Illumination, save_illuminations
 from experiment.session.folder import Session
 from experiment.session.records import plan_steps
@@ -418,6 +418,21 @@ def test_who_would_not_hear_what_he_is_told_is_doubted(target: str, said: str, u
         assert planned(settings=settings).doubts == doubts
         assert len(doubts) == bool(said)
         assert all(doubt.startswith(f"{key}: ") and said in doubt and unsaid not in doubt for doubt in doubts)
+
+
+def test_times_that_were_meant_otherwise_are_doubted() -> None:
+    sequence, real = SETTINGS.sequence, parse_lab('rig = "lab"\nchart = "c"\nilluminations = "i"\n', "LAB.toml")
+    control = real.model_copy(
+        update={"lab": LabRig(projector=ProjectorCable(control="pjlink", host="h"))},
+    )
+
+    def doubts(settings: LabSettings, **changes: float) -> int:
+        return len(settings_doubts(settings.model_copy(update={"sequence": sequence.model_copy(update=changes)})))
+
+    assert doubts(control) == 0
+    assert doubts(control, settle_s=500.0) == 1
+    assert doubts(control, warm_up_s=20.0) == 1
+    assert doubts(real, warm_up_s=20.0) == 0, "the lamp is not under control"
 
 
 class TestDryRun:
