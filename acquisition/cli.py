@@ -337,7 +337,9 @@ def run(
         outcome = run_session(
             settings, session, shown.progress, shown.announce, retake, ending, shown.taken, shown.state
         )
-    told.add(session=session, frames=outcome.total, left=outcome.left, refused=outcome.refused)
+    told.add(session=session, frames=outcome.total, left=outcome.left, refused=outcome.refused, doubts=outcome.doubts)
+    for doubt in outcome.doubts:
+        print(f"doubt: {doubt}")
     if not outcome.complete:
         raise QualityError(
             f"{outcome.left} of {outcome.total} frames are without an accepted frame; " + "; ".join(outcome.refused)

@@ -42,6 +42,7 @@ from experiment.session.records import (
     FrameJudge,
     FrameKind,
     SessionStep,
+    doubts_of,
     duration_text,
     last_moment,
 )
@@ -86,7 +87,7 @@ def run_session(
             total = len(session.steps)
             if len(session.done_steps()) == total:
                 observe(total, total)
-                return RunOutcome(total, 0, ())
+                return RunOutcome(total, 0, (), tuple(doubts_of(session.journal.events())))
         chart = load_chart(settings.chart) if session is None else session.chart
         devices = opened.enter_context(open_rig(settings, chart, session))
         require_plan(settings, folder, session, devices)
@@ -229,11 +230,13 @@ class RunOutcome:
 
     - `total`, `left`: steps of the plan, and those without an accepted frame.
     - `refused`: why steps were left for the next run, a sentence each.
+    - `doubts`: what stopped nothing in this run and those before, and is to be seen.
     """
 
     total: int
     left: int
     refused: tuple[str, ...]
+    doubts: tuple[str, ...] = ()
 
     @property
     def complete(self) -> bool:
@@ -283,7 +286,8 @@ def take_session(
             if len(job.queue):
                 _take_open(job, judge or ExposureJudge(settings), count, asked)
         session.journal.require_whole()
-        outcome = RunOutcome(len(session.steps), len(job.queue), job.queue.given_up)
+        doubts = tuple(doubts_of(session.journal.events()))
+        outcome = RunOutcome(len(session.steps), len(job.queue), job.queue.given_up, doubts)
         if asked.asked and not outcome.complete:
             raise KeyboardInterrupt
         leave_lab(devices, RunEnd.COMPLETE if outcome.complete else RunEnd.UNFINISHED, sequence, reports.tell)

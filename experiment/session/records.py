@@ -223,6 +223,11 @@ class SessionEvent:
     number: int
 
 
+def doubts_of(events: Iterable[SessionEvent]) -> list[str]:
+    """Return what stopped no run and is to be seen in the morning, each once, in the order of the events."""
+    return list(dict.fromkeys(event.detail for event in events if event.what == DOUBT))
+
+
 def last_moment(attempts: Iterable[Attempt]) -> datetime | None:
     """Return when the last of those attempts was over that gave a frame; None where none did."""
     ends = (attempt.ended_at for attempt in attempts if attempt.has_frame and attempt.ended_at is not None)

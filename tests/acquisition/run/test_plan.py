@@ -370,7 +370,6 @@ def lab(tmp_path: Path) -> Path:
     path.write_text(
         'rig = "simulated"\nchart = "chart.json"\nilluminations = "lights.csv"\n[simulated]\nbody = "Test"\n'
         '[judge]\nresponse = false\n[sequence]\nnotify = "https://ntfy.example/s3cret"\n'
-        '[notify]\nalive = "https://ping.example/s3cret"\n'
     )
     return path
 
@@ -437,6 +436,7 @@ def test_times_that_were_meant_otherwise_are_doubted() -> None:
 
 class TestDryRun:
     def test_a_new_session_is_printed_and_not_made(self, lab: Path, capsys: pytest.CaptureFixture[str]) -> None:
+        lab.write_text(lab.read_text() + '[notify]\nalive = "https://ping.example/s3cret"\n')
         before = contents(lab.parent)
         assert main(["run", str(lab), str(lab.parent / "night"), "--dry-run"]) == 0
         assert contents(lab.parent) == before
@@ -451,7 +451,14 @@ class TestDryRun:
     def test_a_session_is_looked_at_and_not_changed(self, lab: Path, capsys: pytest.CaptureFixture[str]) -> None:
         night = lab.parent / "night"
         found = json_of(main, ["run", lab, night], capsys)
-        assert found == {"command": "acquire run", "session": str(night), "frames": 8, "left": 0, "refused": []}
+        assert found == {
+            "command": "acquire run",
+            "session": str(night),
+            "frames": 8,
+            "left": 0,
+            "refused": [],
+            "doubts": [],
+        }
         with Session.open_for_run(night) as session:
             session.retake("2")
         before = contents(lab.parent)
