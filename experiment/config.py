@@ -379,6 +379,9 @@ class LabSettings(Settings):
 
 def load_lab(path: Path) -> LabSettings:
     """Read `LAB.toml`, every path resolved against its folder; a ConfigurationError names what cannot be used."""
+    if path.is_dir():
+        remedy = f"name {path / 'LAB.toml'}"
+        raise ConfigurationError("a folder, a file of settings was expected", about=path, remedy=remedy)
     folder = path.resolve().parent
     settings = parse_lab(
         read_text(path, "acquire init writes one to begin with; it comes before the session", "settings"),

@@ -528,7 +528,7 @@ def _disk_fault(work: Work, size: Estimate, free_bytes: int) -> StorageError | s
         return None
     sentence = (
         f"the disk of {work.folder} has {bytes_text(free_bytes)} free, the run needs {bytes_text(needed)}: "
-        f"{bytes_text(missing, up=True)} are missing; free them, or name a session folder on another disk"
+        f"{bytes_text(missing, up=True)} are missing; free as much, or name a session folder on another disk"
     )
     return StorageError(sentence) if size.sure else f"{sentence} (the size of a frame is {size.basis})"
 
@@ -580,7 +580,7 @@ def _card_fault(work: Work, answers: Answers, size: float) -> CropError | None:
 
 
 def plan_lines(plan: RunPlan) -> tuple[str, ...]:
-    """Return the plan as text: in each line what is meant, and what is known of it."""
+    """Return the plan as text: in each line what is meant, and what is known of it; `RunPlan.require` tells faults."""
     work, settings, answers = plan.work, plan.settings, plan.answers
     count = counted(work.left, "frame")
     lines = [
@@ -602,7 +602,6 @@ def plan_lines(plan: RunPlan) -> tuple[str, ...]:
             lines.append((name, f"to {target_label(target)}"))
     lines += [("not asked", sentence) for sentence in answers.unasked]
     lines += [("doubt", sentence) for sentence in plan.doubts]
-    lines += [("fault", str(fault)) for fault in plan.faults]
     return tuple(f"{name:<11} {text}" for name, text in lines)
 
 

@@ -231,6 +231,12 @@ def test_a_value_of_another_kind_is_answered_as_it_is_written(text: str, expecte
     assert "1234" not in str(told.value) or "serial" in text
 
 
+def test_a_folder_of_a_lab_is_answered_with_its_file(tmp_path: Path) -> None:
+    with pytest.raises(ConfigurationError) as told:
+        load_lab(tmp_path)
+    assert told.value.remedy == f"name {tmp_path / 'LAB.toml'}"
+
+
 def test_replay_needs_a_recording(tmp_path: Path) -> None:
     lab = tmp_path / "LAB.toml"
     lab.write_text(MINIMAL.replace("simulated", "replay"))
