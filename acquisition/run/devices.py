@@ -375,6 +375,8 @@ def ask_all(questions: Questions) -> None:
 
 def fault_of(name: str, fault: CropError) -> CropError:
     """Return a fault that begins with the device that it is of: an address alone does not tell which one it is."""
+    if str(fault).startswith((name, f"the {name}")):
+        return fault
     if fault.about is not None:
         fault.problem = f"{fault.about}: {fault.problem}"
     fault.about = name

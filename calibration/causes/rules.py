@@ -285,7 +285,8 @@ READINGS: Final = {
     "lone_primary": ("white has of one primary more", "±%"),
     "mixed": ("white has of one primary more, of another less", "±%"),
     "colour_scatter": ("scatter of white's colour", "%"), "other_iso": ("frames of another ISO speed", ""),
-    "lit": ("of the unfit cells have added light", "%"), "misplaced": ("of the unfit cells lie at an unsure place", "%"),
+    "lit": ("of the unfit cells have added light", "%"),
+    "misplaced": ("of the unfit cells lie at an unsure place", "%"),
     "uneven": ("of the unfit cells are uneven", "%"), "waves_px": ("waves of the sheet", "px"),
     "beyond_cell": ("light from beyond the cell", "%"),
 }  # fmt: skip
