@@ -146,7 +146,8 @@ def test_a_port_at_which_nobody_listens(bench: Bench, camera: str) -> None:
     code, said = bench.told(camera + pjlink(port := free_port()))
     assert code == 3
     assert said == (
-        f"projector: nothing listens at 127.0.0.1:{port}; check the port, and that network control is enabled on the device"
+        f"projector: nothing listens at 127.0.0.1:{port}; check the port, and that network control is enabled on the "
+        "device"
     )
 
 
