@@ -337,7 +337,9 @@ def run(
         outcome = run_session(
             settings, session, shown.progress, shown.announce, retake, ending, shown.taken, shown.state
         )
-    told.add(session=session, frames=outcome.total, left=outcome.left, refused=outcome.refused)
+    told.add(session=session, frames=outcome.total, left=outcome.left, refused=outcome.refused, doubts=outcome.doubts)
+    for doubt in outcome.doubts:
+        print(f"doubt: {doubt}")
     if not outcome.complete:
         raise QualityError(
             f"{outcome.left} of {outcome.total} frames are without an accepted frame; " + "; ".join(outcome.refused)
@@ -375,9 +377,10 @@ def status(
 ) -> None:
     """Show how far a session is, how long it will take, what was measured last, and what was refused.
 
-    Reads SESSION, also while it is being taken; writes nothing. Says so when the run was killed. Ends with 3 when a run
-    is there, and a step of it is late, no sign of life came in its time, or it is paused for a device; with 4 when it
-    is paused for its frames, with 5 when its disk is full or at fault.
+    Reads SESSION, also while it is being taken; writes nothing. Ends with 0 when a run is at work, or the session is
+    complete. Ends with 3 when a step of the run is late, no sign of life came in its time, it is paused for a device or
+    ended for one, or it was killed; with 4 when it is paused for its frames, or ended with frames left; with 5 when its
+    disk is full or at fault.
     """
     from datetime import UTC, datetime
 
@@ -395,9 +398,10 @@ def status(
     if warning := secrets_warning(session):
         print(f"warning: {warning}", file=sys.stderr)
     head = view.head(now)
-    if head.state in ("late", "silent", "paused"):
-        kind = {"the disk": StorageError, "the frames": QualityError}.get(head.cause, DeviceError)
-        raise kind(head.sentence)
+    if head.state in ("late", "silent", "paused", "stopped", "incomplete"):
+        of_none = QualityError if head.state == "incomplete" else DeviceError
+        kinds = {"": of_none, "the disk": StorageError, "the frames": QualityError}
+        raise kinds.get(head.cause, DeviceError)(head.sentence)
 
 
 @app.command(epilog=EXIT_CODES)

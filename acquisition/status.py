@@ -12,7 +12,7 @@ from datetime import datetime
 from typing import Any
 
 from acquisition.monitor.view import AttemptView, Head, SessionView
-from experiment.session.records import ACCEPTED, Check, duration_text
+from experiment.session.records import ACCEPTED, Check, doubts_of, duration_text
 from foundation.errors import counted
 
 LAST = 5
@@ -55,6 +55,7 @@ def status_lines(view: SessionView, now: datetime) -> list[str]:
     ]
     if (drift := _white_drift(view)) is not None:
         lines.append(f"white   {drift:+.2%} since the first white frame")
+    lines += _block("doubts", doubts_of(view.events))
     lines += _block("last measured", [check_text(check) for check in _newest_checks(view).values()])
     judged = [attempt for attempt in view.attempts if attempt.verdict is not None]
     lines += _block("last verdicts", [_verdict_text(attempt) for attempt in judged[-LAST:]])
@@ -75,6 +76,7 @@ def status_json(view: SessionView, now: datetime) -> dict[str, Any]:
         "white_drift": _white_drift(view),
         "checks": {name: asdict(check) for name, check in _newest_checks(view).items()},
         "without_accepted_frame": _open_reasons(view),
+        "doubts": doubts_of(view.events),
         "events": [{"at": event.at.isoformat(), "what": event.what, "detail": event.detail} for event in view.events],
     }
 

@@ -253,6 +253,8 @@ class TroubledLab:
             def tell(self, event: str, message: str, at: datetime) -> None:
                 told.append((seconds(), event, message))
 
+            def say_failures(self) -> None: ...
+
             def close(self) -> None: ...
 
         replaced: dict[str, Any] = {"open_rig": self.opened, "Notices": Recorded}

@@ -379,6 +379,9 @@ class LabSettings(Settings):
 
 def load_lab(path: Path) -> LabSettings:
     """Read `LAB.toml`, every path resolved against its folder; a ConfigurationError names what cannot be used."""
+    if path.is_dir():
+        remedy = f"name {path / 'LAB.toml'}"
+        raise ConfigurationError("a folder, a file of settings was expected", about=path, remedy=remedy)
     folder = path.resolve().parent
     settings = parse_lab(
         read_text(path, "acquire init writes one to begin with; it comes before the session", "settings"),
@@ -471,9 +474,35 @@ def _mistake(kind: type[Settings], error: ErrorDetails) -> str:
             reason = "a list was expected, in square brackets"
             if isinstance(error["input"], str):
                 reason += f": [{json.dumps(error['input'], ensure_ascii=False)}]"
+        case "float_parsing" | "float_type" | "int_parsing" | "int_type" | "int_from_float":
+            reason = _number_expected(key, error["input"], error["type"].startswith("int"))
+        case "string_type":
+            given = error["input"]
+            is_number = isinstance(given, int | float) and not isinstance(given, bool)
+            meant = f': "{MASK if _is_secret(key) else given}"' if is_number else ""
+            reason = f"a text was expected, in quotation marks{meant}"
+        case "greater_than" | "greater_than_equal" | "less_than" | "less_than_equal":
+            ((bound, limit),) = error.get("ctx", {}).items()
+            reason = f"a number {_BOUNDS[bound]} {limit:g} was expected"
         case _:
             reason = error["msg"].removeprefix("Value error, ")
     return f"{key} = {MASK if _is_secret(key) else repr(error['input'])}: {reason}"
+
+
+_BOUNDS: Final = {"gt": "above", "ge": "of at least", "lt": "below", "le": "of at most"}
+"""What a number is to be, by the name of its bound in an error of pydantic."""
+
+
+def _number_expected(key: str, given: object, whole: bool) -> str:
+    """Return what number is expected of a key in place of something else, as it is written."""
+    what = "a whole number" if whole else "a number"
+    reason = f"{what} of seconds was expected" if key.endswith("_s") else f"{what} was expected"
+    text = given.strip() if isinstance(given, str) else ""
+    if (parts := re.fullmatch(r"1 */ *([1-9]\d*)", text)) is not None and not whole:
+        return f"{reason}: {1 / int(parts[1]):.6g}"
+    if key == "sequence.patience_s":
+        return f'{reason}, or "forever"'
+    return reason
 
 
 def _places(kind: type[BaseModel], name: str, table: str, is_table: bool, above: str = "") -> list[str]:

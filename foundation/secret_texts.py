@@ -30,6 +30,10 @@ _UNPRINTABLE = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u2028\u2029\u202a-\u202e
 names have them whose bytes are no UTF-8."""
 
 
+_ADDRESS = re.compile(r"[A-Za-z0-9-]+(?:\.[A-Za-z0-9-]+)+(?::\d+)?/\S*|[A-Za-z0-9.-]+\.[a-z]{2,}:\d+")
+"""A host with a dot and a path or a port: no command has such a name."""
+
+
 def masked(text: str) -> str:
     """Return a text with the user, the password and the secret parameters of every URL in it masked.
 
@@ -72,8 +76,19 @@ def is_webhook(target: str) -> bool:
     return target.lower().startswith(("http://", "https://"))
 
 
+def is_address(target: str) -> bool:
+    """Return whether a target that is no URL looks like one without its scheme.
+
+    Examples
+    --------
+    >>> [is_address(target) for target in ("ntfy.sh/my-lab", "lab.example:80", "/usr/bin/tell", "./tell.sh", "tell x")]
+    [True, True, False, False, False]
+    """
+    return _ADDRESS.fullmatch(target) is not None
+
+
 def target_label(target: str) -> str:
-    """Return what may be shown of a target: a URL's scheme and host, or a command's first word.
+    """Return what may be shown of a target: a URL's scheme and host, also where that lacks, or a command's first word.
 
     The rest may be a secret: a webhook's path is one, and so are user names, queries and most arguments.
 
@@ -85,5 +100,7 @@ def target_label(target: str) -> str:
     if is_webhook(target):
         parts = urlsplit(target)
         return f"{parts.scheme}://{parts.netloc.rpartition('@')[2]}/{MASK}"
+    if is_address(target):
+        return f"{target.partition('/')[0]}/{MASK}"
     words = shlex.split(target)
     return " ".join([*words[:1], *([MASK] if words[1:] else [])])

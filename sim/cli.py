@@ -214,6 +214,9 @@ def camera(
                 _until_interrupted("USB/IP camera {} at {}:{}, bus id 1-1".format(eos.body.model, *server.address))
 
 
+_PASSWORD_OPTION = " (sim camera takes a projector's password as --projector-password)"
+
+
 @contextmanager
 def _film(
     world: World, screen: str | None, projector: str | None, password: str | None, events: Sequence[str]
@@ -223,6 +226,7 @@ def _film(
     from drivers.pjlink import PjLinkProjector
     from drivers.presenter import WHITE
     from foundation.clock import SystemClock
+    from foundation.errors import DeviceRefused
     from sim.camera.film import WatchedFilm, WorldFilm
     from sim.projectors.watching import Beam, ScreenPlace, Screenshots
     from sim.world.disturbances import read_disturbances
@@ -242,7 +246,10 @@ def _film(
     if projector is not None:
         host, port = _host_and_port(projector)
         asked = PjLinkProjector(lambda: TcpLink.connect(host, port, 5.0), password, label=projector, clock=clock)
-        asked.power()
+        try:
+            asked.power()
+        except DeviceRefused as error:
+            raise DeviceRefused(f"{error}{_PASSWORD_OPTION}") from error
     with Beam(pictures, asked, world.room.light_of, clock) as beam:
         # The first frame would else come seconds late.
         world.signal(WHITE, REFERENCE_EXPOSURE)
@@ -250,7 +257,8 @@ def _film(
         def gather(number: int, seconds: float) -> tuple[NDArray[np.float32], float]:
             print(f"exposure {number} begins, {seconds:g} s", flush=True)
             thrown = beam.gather(seconds, lambda: print(f"exposure {number} half over", flush=True))
-            print(f"exposure {number} ends: {thrown}", flush=True)
+            dark = f"; no lamp: {beam.trouble}{_PASSWORD_OPTION}" if beam.trouble else ""
+            print(f"exposure {number} ends: {thrown}{dark}", flush=True)
             return thrown.picture, thrown.lamp
 
         yield WatchedFilm(world, gather, serial, happens, clock.now())

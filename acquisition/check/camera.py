@@ -29,7 +29,7 @@ from experiment.framing.homography import project
 from experiment.framing.pictures import edge_blurs
 from experiment.framing.planes import CHANNELS, CLIPPING_SHARE, frame_black, phases
 from experiment.measures.sensor import HIGHEST, LOWEST, deviations
-from foundation.errors import DeviceError, StorageError
+from foundation.errors import DeviceError, StorageError, counted
 from foundation.robust import sigma_of
 
 USUAL_FOCAL_DIAGONALS = 1.3
@@ -289,7 +289,8 @@ def judge_hot(dark: Mosaic, share: float, white: Mosaic) -> Finding:
     return judged(
         LIMITS["hot photosites"],
         rate,
-        f"{count} photosites stand out in the dark by {HOT_COUNTS:g} counts and more, {rate:.0f} of a million",
+        f"{counted(count, 'photosite stands', 'photosites stand')} out in the dark by {HOT_COUNTS:g} counts and more, "
+        f"{rate:.0f} of a million",
         "expose for a shorter time at a lower f-number, let the camera cool, or map the photosites out by its menu "
         "(sensor cleaning)",
         {"count": count},

@@ -52,7 +52,7 @@ from acquisition.check.light_and_print import (
 from acquisition.check.places import Levels
 from acquisition.judge.measure import disagreement
 from acquisition.run.devices import Devices, ask_all, make_ready, period_s, reported_error
-from acquisition.run.plan import planned_steps
+from acquisition.run.plan import planned_steps, settings_doubts
 from acquisition.run.retry import RetryPolicy
 from acquisition.run.rig.opening import open_rig
 from calibration.figures.all_figures import BY_NAME, FIGURES
@@ -129,6 +129,7 @@ def check_lab(
         *_light_findings(seen, figures, chart, bool(lights), settings.judge.dark_percent),
         *_sensor_findings(seen, camera.timings, figures, chart, options),
         *screen,
+        *(Finding("settings", "remark", doubt) for doubt in settings_doubts(settings)),
         judge_disk(options.session or Path(settings.file).parent, frames, seen.first.size),
         *supplies,
     ]

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from typing import Final
 
-from calibration.figures.light import DARK_DRIFT, OFF_CODES_DEG, WHITE_DRIFT
+from calibration.figures.light import DARK_DRIFT, LEAK_SHARE, OFF_CODES_DEG, WHITE_DRIFT
 
 LIGHT_SIGMAS: Final = 5.5
 """Standard deviations of two degrees of freedom: exceeded by chance once in four million frames."""
@@ -30,6 +30,9 @@ STALE_ADVANTAGE: Final = 13.8
 
 OTHER_ADVANTAGE: Final = 20.0
 """The same for any other light of the plan: a likelihood 22 000 times larger, as there are 706 of them."""
+
+ROOM_LIGHT_PERCENT: Final = 100 * LEAK_SHARE.accept
+"""Light under the black picture, of white, from which on `build-lut` remarks on it: a night of it is to be known."""
 
 UNEVEN: Final = 0.02
 """Deviation of a tile from the light of the whole frame, relative: an LCD's unevenness changes by as much between

@@ -19,7 +19,7 @@ import re
 import secrets
 import threading
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
@@ -46,6 +46,9 @@ Json = dict[str, Any]
 FRESH_S = 0.25
 """A file that changed so short a time before it was looked at may change again within the resolution of its time stamp
 (10 ms at the slowest tick of Linux, more over a network), and is read once more."""
+
+LOOK_AGAIN_S = 10.0
+"""After so long a session is read again though its journal is as before: files of its frames may be gone."""
 
 RECENT = 3
 """Newest attempts that are told again whenever anything is: a preview is written after its row, and a pipeline has two
@@ -77,10 +80,15 @@ class _Numbered:
 
 
 class SessionWatch:
-    """A session that is looked at again and again; may be used from several threads."""
+    """A session that is looked at again and again; may be used from several threads.
 
-    def __init__(self, folder: Path) -> None:
+    `clock`: returns seconds; the machine's own unless a test has another.
+    """
+
+    def __init__(self, folder: Path, clock: Callable[[], float] = time.monotonic) -> None:
         self.folder = folder
+        self._clock = clock
+        self._read_at = -math.inf
         self._lock = threading.Lock()
         self._signature: _Signature = ()
         self._unsettled = True
@@ -147,8 +155,10 @@ class SessionWatch:
     def _refresh(self) -> None:
         """Read what has changed, and number the changes."""
         signature = _signature(self.folder / JOURNAL_FILE)
-        if signature == self._signature and not self._unsettled:
+        now = self._clock()
+        if signature == self._signature and not self._unsettled and now < self._read_at + LOOK_AGAIN_S:
             return
+        self._read_at = now
         newest = max((changed for _, changed, _ in signature), default=0)
         self._unsettled = bool(signature) and time.time_ns() - newest < FRESH_S * 1e9
         self._signature = signature

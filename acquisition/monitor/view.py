@@ -92,7 +92,8 @@ class Head:
     - `seconds_per_frame`: median interval of the newest `RECENT` attempts; None before the second.
     - `remaining_s`: time left by the lab's clock, retakes and references included; None while it is unknown.
     - `eta`: when all frames are there, by the wall clock; None where that cannot be told.
-    - `cause`: of a run that is late or paused: one of `CAUSES`; empty where that is not known, or nothing is wrong.
+    - `cause`: of a run that is late or paused, or ended with frames left: one of `CAUSES`; empty where that is not
+      known, or nothing is wrong.
     - `last`: when the newest frame was released, by the lab's clock.
     """
 
@@ -291,7 +292,7 @@ def head_of(
         seconds_per_frame=frame_s,
         remaining_s=remaining,
         eta=now + timedelta(seconds=remaining) if near and remaining is not None else None,
-        cause=_cause(sentence) if state in ("late", "paused") else "",
+        cause=_cause(sentence) if state in ("late", "paused", "incomplete") else "",
         last=next((one.taken_at for one in reversed(attempts) if one.taken_at is not None), None),
     )
 

@@ -32,7 +32,7 @@ from typing import Final
 
 from acquisition.run.retry import INSTANT_S, PAUSE_S, Pause, Report, RetryPolicy
 from drivers.camera import Camera
-from drivers.presenter import BLACK, Presenter
+from drivers.presenter import BLACK, Colour, Presenter
 from drivers.projector import Power, Projector, ReportsPictureFault, Severity
 from experiment.config import CameraSettings, LabSettings, ProjectorCable, SequenceSettings
 from experiment.session.records import duration_text
@@ -327,32 +327,60 @@ class Devices:
     clock: Clock
 
 
+@dataclass(frozen=True)
+class LightNotShown:
+    """Stands for the presenter where nothing is to be shown, in a dry run.
+
+    - `found`: what may change the light behind the codes, as far as that is known without showing any.
+    - `unasked`: what could not be asked, and why; empty where all was.
+    """
+
+    found: tuple[str, ...]
+    unasked: str = ""
+
+    def warnings(self) -> tuple[str, ...]:
+        """Return what was found; `drivers.presenter.ReportsWarnings`."""
+        return self.found
+
+    def show(self, colour: Colour) -> None:
+        """Refuse to."""
+        raise DeviceRefused(f"{colour.codes} is not shown: the light was not opened")
+
+    def close(self) -> None:
+        """Do nothing."""
+
+
 Questions = Mapping[str, Callable[[], object]]
 """What is asked, by the name of the device; each raises what its device says against it."""
 
 
-def ask_all(questions: Questions, further: Questions | None = None) -> None:
-    """Ask each question, and raise what went wrong with all of them together."""
-    faults = _faults_of(questions)
-    if not faults:
-        return
-    faults |= _faults_of({name: question for name, question in (further or {}).items() if name not in faults})
-    if len(faults) == 1:
-        raise next(iter(faults.values()))
-    of_settings = all(isinstance(fault, ConfigurationError) for fault in faults.values())
-    kind = ConfigurationError if of_settings else DeviceError
-    listed = "".join(f"\n  {name}: {fault}" for name, fault in faults.items())
-    raise kind(f"{len(faults)} of {len(questions)} devices cannot be used:{listed}") from next(iter(faults.values()))
-
-
-def _faults_of(questions: Questions) -> dict[str, CropError]:
+def ask_all(questions: Questions) -> None:
+    """Ask each question, in their order, and raise what went wrong with all of them together."""
     faults: dict[str, CropError] = {}
     for name, question in questions.items():
         try:
             question()
         except (DeviceError, ConfigurationError) as fault:
             faults[name] = fault
-    return faults
+    if not faults:
+        return
+    if len(faults) == 1:
+        ((name, fault),) = faults.items()
+        raise fault_of(name, fault)
+    of_settings = all(isinstance(fault, ConfigurationError) for fault in faults.values())
+    kind = ConfigurationError if of_settings else DeviceError
+    listed = "".join(f"\n  {name}: {fault}" for name, fault in faults.items())
+    raise kind(f"{len(faults)} of {len(questions)} devices cannot be used:{listed}") from next(iter(faults.values()))
+
+
+def fault_of(name: str, fault: CropError) -> CropError:
+    """Return a fault that begins with the device that it is of: an address alone does not tell which one it is."""
+    if str(fault).startswith((name, f"the {name}")):
+        return fault
+    if fault.about is not None:
+        fault.problem = f"{fault.about}: {fault.problem}"
+    fault.about = name
+    return fault
 
 
 MAX_TURN_ERROR = 0.005

@@ -57,6 +57,7 @@ class Life:
         if now - self._told >= ALIVE_S:
             self._told = now
             self._notices.tell("alive", doing, datetime.now(UTC))
+        self._notices.say_failures()
 
     def end(self, how: str, sentence: str) -> None:
         """Tell how the run ended; nothing follows."""

@@ -91,7 +91,7 @@ class Notices:
         }
         with suppress(queue.Full):
             self._waiting.put_nowait((event, message, json.dumps(body, ensure_ascii=False).encode()))
-        self._say_failures()
+        self.say_failures()
 
     def close(self) -> None:
         """Wait until all was delivered, or for `LIMIT_S` and a little; a second call does nothing."""
@@ -103,9 +103,10 @@ class Notices:
             if self._thread.is_alive():
                 self._failed.put(f"{target_label(self._target)} was not told all before the end")
         self._closed = True
-        self._say_failures()
+        self.say_failures()
 
-    def _say_failures(self) -> None:
+    def say_failures(self) -> None:
+        """Say what could not be delivered meanwhile; from the thread that tells, as often as it likes."""
         while not self._failed.empty():
             sentence = self._failed.get()
             # A receiver that is gone stays gone for the night: once is enough.

@@ -32,6 +32,7 @@ from datetime import datetime
 from functools import partial
 from typing import Self, TypeVar
 
+from acquisition.judge.limits import ROOM_LIGHT_PERCENT
 from acquisition.run.devices import Devices, HealthWatch, await_health
 from acquisition.run.queue import StepQueue, link_runs, step_name
 from acquisition.run.retry import FRAMES, Pause, RetryPolicy, is_curable
@@ -41,6 +42,7 @@ from experiment.config import JudgeSettings, LabSettings
 from experiment.session.folder import ReceivedFile, Session
 from experiment.session.records import (
     ACCEPTED,
+    DOUBT,
     REFERENCES,
     Check,
     FrameJudge,
@@ -663,7 +665,7 @@ class LastingCause:
 def _followed_changes(
     step: SessionStep, judgement: Judgement, steps: Sequence[SessionStep], judge: JudgeSettings
 ) -> list[tuple[str, str]]:
-    """Return what is said of changes that a run follows: words (``moved``, ``level``), each with a sentence."""
+    """Return what is said of changes that a run follows, and of light that every frame has: words, and sentences."""
     values = {check.name: check.value for check in judgement.checks if check.value is not None}
     said: list[tuple[str, str]] = []
     moved_px = values.get("movement", 0.0)
@@ -685,4 +687,11 @@ def _followed_changes(
             "on at the new level, and build-lut follows it by the white frames"
         )
         said.append(("level", sentence))
+    room_percent = values.get("dark", 0.0)
+    if step.number == min(one.number for one in steps if one.kind == step.kind) and room_percent > ROOM_LIGHT_PERCENT:
+        sentence = (
+            f"{step_name(step)}: black has {room_percent:.1f} % of white, {ROOM_LIGHT_PERCENT:g} % expected; every "
+            "light has it. Switch off what shines in the room; build-lut remarks on it, --subtract-dark takes it out"
+        )
+        said.append((DOUBT, sentence))
     return said

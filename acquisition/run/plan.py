@@ -12,6 +12,7 @@ from __future__ import annotations
 import errno
 import math
 import os
+import shlex
 import shutil
 import statistics
 from collections import Counter
@@ -22,7 +23,15 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any, Final, TypeVar
 
-from acquisition.run.devices import Devices, holds_whole_turns, period_s, reported_error, wheel_of
+from acquisition.run.devices import (
+    Devices,
+    LightNotShown,
+    fault_of,
+    holds_whole_turns,
+    period_s,
+    reported_error,
+    wheel_of,
+)
 from acquisition.run.rig.opening import known_frame_bytes, open_rig
 from drivers.camera import CameraIdentity, ReportsSupplies, Supplies
 from drivers.presenter import BLACK, ReportsWarnings
@@ -44,7 +53,7 @@ from foundation.errors import (
     counted,
 )
 from foundation.files import file_sha256, storage_error
-from foundation.secret_texts import target_label
+from foundation.secret_texts import is_address, is_webhook, target_label
 
 FIXED: Final = (
     "rig", "camera", "simulated.body", "simulated.camera", "simulated.seed", "simulated.room",
@@ -312,38 +321,40 @@ def ask(devices: Devices) -> Answers:
     faults: list[CropError] = []
     unasked: list[str] = []
 
-    def answer(question: Callable[[], _T], otherwise: _T) -> _T:
+    def answer(device: str, question: Callable[[], _T], otherwise: _T) -> _T:
         try:
             return question()
         except DeviceError as fault:
-            faults.append(fault)
+            faults.append(fault_of(device, fault))
             return otherwise
 
     camera, projector, presenter = devices.camera, devices.projector, devices.presenter
-    identity = answer(camera.identity, None)
+    identity = answer("camera", camera.identity, None)
     offered: tuple[float, ...] = ()
     supplies: Supplies | None = None
     # A camera that cannot be reached is asked once: each question would wait for it.
     if identity is not None:
-        offered = answer(camera.shutter_speeds, ())
+        offered = answer("camera", camera.shutter_speeds, ())
         if not offered:
             unasked.append("shutter times: the camera lists none")
         if isinstance(camera, ReportsSupplies):
-            supplies = answer(camera.supplies, None)
+            supplies = answer("camera", camera.supplies, None)
         if supplies is None or (supplies.battery is None and not supplies.mains):
             unasked.append("battery: the camera does not tell; see that it runs on mains power")
         unasked.append("ISO speed and aperture: they are set and verified before the lamp is lit")
     state, lit = "", None
     if projector is not None:
-        state, lit = answer(lambda: _projector_state(projector), ("", None))
+        state, lit = answer("projector", lambda: _projector_state(projector), ("", None))
         if lit is not None:
-            error = answer(lambda: reported_error(projector), None)
+            error = answer("projector", lambda: reported_error(projector), None)
             faults += [] if error is None else [error]
     else:
         unasked.append("lamp: the projector is not under control; switch it on half an hour before")
     warnings: tuple[str, ...] = ()
     if isinstance(presenter, ReportsWarnings):
-        warnings = answer(presenter.warnings, ())
+        warnings = answer("display", presenter.warnings, ())
+    if isinstance(presenter, LightNotShown) and presenter.unasked:
+        unasked.append(presenter.unasked)
     return Answers(identity, offered, supplies, state, lit, warnings, tuple(unasked), tuple(faults))
 
 
@@ -426,6 +437,7 @@ def make_plan(
     found = (
         *answers.faults,
         *answers.warnings,
+        *settings_doubts(settings),
         _exposure_fault(settings, work, answers),
         _battery_fault(work, answers),
         _card_fault(work, answers, size.value),
@@ -443,6 +455,46 @@ def make_plan(
         tuple(one for one in found if isinstance(one, CropError)),
         tuple(one for one in found if isinstance(one, str)),
     )
+
+
+LONG_SETTLE_S: Final = 10.0
+"""Settling above which seconds may have been taken for milliseconds: chosen, many times what projectors need."""
+SHORT_WARM_UP_S: Final = 300.0
+"""Warm-up below which a lamp is not yet steady: chosen; makers ask for ten minutes to half an hour."""
+
+
+def settings_doubts(settings: LabSettings) -> tuple[str, ...]:
+    """Return what of the settings may be a mistake that is otherwise found in the night, a sentence each."""
+    doubts = [doubt for key, target in _targets(settings) if (doubt := _target_doubt(key, target))]
+    settle_s, warm_up_s = settings.sequence.settle_s, settings.sequence.warm_up_s
+    if settle_s > LONG_SETTLE_S:
+        doubts.append(
+            f"sequence.settle_s = {settle_s:g}: each frame waits so many seconds; a projector shows a colour within one"
+        )
+    if settings.rig == "lab" and has_lamp_control(settings) and warm_up_s < SHORT_WARM_UP_S:
+        doubts.append(
+            f"sequence.warm_up_s = {warm_up_s:g}: a lamp changes its light for longer, at least "
+            f"{SHORT_WARM_UP_S:g} s are expected of one; of a laser or LEDs it may be enough"
+        )
+    return tuple(doubts)
+
+
+def _targets(settings: LabSettings) -> tuple[tuple[str, str], ...]:
+    """Return who is told of a run, by the key that names them."""
+    return ("sequence.notify", settings.sequence.notify), ("notify.alive", settings.notify.alive)
+
+
+def _target_doubt(key: str, target: str) -> str:
+    """Return why nobody may hear what a target is told; empty where it is a URL, a command that is there, or none."""
+    command = shlex.split(target)[:1]
+    if is_webhook(target) or not command or shutil.which(command[0]):
+        return ""
+    label = target_label(target)
+    if is_address(target):
+        return f"{key}: {label} is no command that is there; an address begins with https://"
+    if Path(command[0]).is_file():
+        return f"{key}: {command[0]} may not be executed; chmod +x {shlex.quote(command[0])}"
+    return f"{key}: {label} is no command that is there; name one by its whole path, or a URL with https://"
 
 
 def has_lamp_control(settings: LabSettings) -> bool:
@@ -476,7 +528,7 @@ def _disk_fault(work: Work, size: Estimate, free_bytes: int) -> StorageError | s
         return None
     sentence = (
         f"the disk of {work.folder} has {bytes_text(free_bytes)} free, the run needs {bytes_text(needed)}: "
-        f"{bytes_text(missing, up=True)} are missing; free them, or name a session folder on another disk"
+        f"{bytes_text(missing, up=True)} are missing; free as much, or name a session folder on another disk"
     )
     return StorageError(sentence) if size.sure else f"{sentence} (the size of a frame is {size.basis})"
 
@@ -528,7 +580,7 @@ def _card_fault(work: Work, answers: Answers, size: float) -> CropError | None:
 
 
 def plan_lines(plan: RunPlan) -> tuple[str, ...]:
-    """Return the plan as text: in each line what is meant, and what is known of it."""
+    """Return the plan as text: in each line what is meant, and what is known of it; `RunPlan.require` tells faults."""
     work, settings, answers = plan.work, plan.settings, plan.answers
     count = counted(work.left, "frame")
     lines = [
@@ -545,11 +597,11 @@ def plan_lines(plan: RunPlan) -> tuple[str, ...]:
             answers.projector or ("could not be asked" if has_lamp_control(settings) else "not under control"),
         ),
     ]
-    if settings.sequence.notify:
-        lines.append(("notices", f"to {target_label(settings.sequence.notify)}"))
+    for name, (_, target) in zip(("notices", "alive"), _targets(settings), strict=True):
+        if target:
+            lines.append((name, f"to {target_label(target)}"))
     lines += [("not asked", sentence) for sentence in answers.unasked]
     lines += [("doubt", sentence) for sentence in plan.doubts]
-    lines += [("fault", str(fault)) for fault in plan.faults]
     return tuple(f"{name:<11} {text}" for name, text in lines)
 
 
@@ -630,7 +682,7 @@ def dry_run(settings: LabSettings, folder: Path, retake: str | None = None) -> R
             require_frames_folder(folder)
         work = outline(settings, folder, session, retake)
         try:
-            devices = opened.enter_context(open_rig(settings, work.chart, session))
+            devices = opened.enter_context(open_rig(settings, work.chart, session, shows=False))
         except CropError as fault:
             return make_plan(settings, work, Answers(faults=(fault,)), free_bytes_at(folder))
         return make_plan(settings, work, ask(devices), free_bytes_at(folder), known_frame_bytes(settings))

@@ -35,7 +35,17 @@ from experiment.lights import load_illuminations
 from experiment.session.folder import Session, busy_sentence, session_exists
 from experiment.session.heartbeat import BEGINS, RunState, SessionPlace, SignOfLife, signs_of_life
 from experiment.session.journal import beat_beside
-from experiment.session.records import ACCEPTED, VOIDED, FrameJudge, FrameKind, SessionStep, duration_text, last_moment
+from experiment.session.records import (
+    ACCEPTED,
+    DOUBT,
+    VOIDED,
+    FrameJudge,
+    FrameKind,
+    SessionStep,
+    doubts_of,
+    duration_text,
+    last_moment,
+)
 from experiment.session.repair import secrets_warning
 from foundation.clock import Clock, SteadyClock
 from foundation.console import Ending
@@ -77,7 +87,7 @@ def run_session(
             total = len(session.steps)
             if len(session.done_steps()) == total:
                 observe(total, total)
-                return RunOutcome(total, 0, ())
+                return RunOutcome(total, 0, (), tuple(doubts_of(session.journal.events())))
         chart = load_chart(settings.chart) if session is None else session.chart
         devices = opened.enter_context(open_rig(settings, chart, session))
         require_plan(settings, folder, session, devices)
@@ -220,11 +230,13 @@ class RunOutcome:
 
     - `total`, `left`: steps of the plan, and those without an accepted frame.
     - `refused`: why steps were left for the next run, a sentence each.
+    - `doubts`: what stopped nothing in this run and those before, and is to be seen.
     """
 
     total: int
     left: int
     refused: tuple[str, ...]
+    doubts: tuple[str, ...] = ()
 
     @property
     def complete(self) -> bool:
@@ -250,8 +262,7 @@ def take_session(
     running frame; None for a run that nobody asks. `first`: numbers of steps that are taken before all others.
     """
     sequence = settings.sequence
-    life = Life(settings.notify.alive, session.folder.name, announce, devices.clock)
-    reports = _Reports(session, devices.clock, announce, state, sequence.notify, life)
+    reports = _Reports(session, devices.clock, announce, state, settings)
     asked = ending or Ending()
     retry = RetryPolicy(
         devices.clock,
@@ -263,10 +274,10 @@ def take_session(
     )
 
     def count(frame: Taken) -> None:
-        life.sign(f"{len(session.steps) - frame.left} of {len(session.steps)} frames")
+        reports.working(f"{len(session.steps) - frame.left} of {len(session.steps)} frames")
         observe(frame)
 
-    life.ready()
+    reports.ready()
     try:
         for stray in session.set_aside_strays():
             reports.tell("stray", f"{stray.name}: complete, but not in the journal; kept, not used")
@@ -275,7 +286,8 @@ def take_session(
             if len(job.queue):
                 _take_open(job, judge or ExposureJudge(settings), count, asked)
         session.journal.require_whole()
-        outcome = RunOutcome(len(session.steps), len(job.queue), job.queue.given_up)
+        doubts = tuple(doubts_of(session.journal.events()))
+        outcome = RunOutcome(len(session.steps), len(job.queue), job.queue.given_up, doubts)
         if asked.asked and not outcome.complete:
             raise KeyboardInterrupt
         leave_lab(devices, RunEnd.COMPLETE if outcome.complete else RunEnd.UNFINISHED, sequence, reports.tell)
@@ -340,16 +352,31 @@ class _Reports:
         clock: Clock,
         announce: Callable[[str], object],
         state: Callable[[str], object],
-        notify: str,
-        life: Life,
+        settings: LabSettings,
     ) -> None:
         self._journal = session.journal
         self._clock = clock
         self._announce = announce
         self._state = state
-        self._notices = Notices(notify, session.folder.name, announce)
-        self._life = life
+        name = session.folder.name
+        self._notices = Notices(settings.sequence.notify, name, lambda why: self.doubt(f"sequence.notify: {why}"))
+        self._life = Life(settings.notify.alive, name, lambda why: self.doubt(f"notify.alive: {why}"), clock)
         self._pauses = PauseNotices(self._notify, clock)
+
+    def ready(self) -> None:
+        """Say that devices and session are open."""
+        self._life.ready()
+
+    def working(self, doing: str) -> None:
+        """Say what the run does now, and what could not be told of it to others."""
+        self._life.sign(doing)
+        self._notices.say_failures()
+
+    def doubt(self, sentence: str) -> None:
+        """Tell what stops nothing and is to be seen in the morning; a disk that cannot take it is told of already."""
+        self._announce(f"{DOUBT}: {sentence}")
+        with suppress(StorageError):
+            self._journal.note(self._clock.now(), DOUBT, sentence)
 
     def tell(self, what: str, sentence: str, /) -> None:
         """Tell what happens."""
@@ -367,7 +394,7 @@ class _Reports:
         if doing == "paused":
             self._pauses.paused(sentence)
         self._state(sentence)
-        self._life.sign(f"{doing}: {sentence}")
+        self.working(f"{doing}: {sentence}")
         self._journal.beat(doing, sentence, datetime.now(UTC) + timedelta(seconds=within_s))
 
     def late(self, sentence: str, begun: datetime) -> None:

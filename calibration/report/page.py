@@ -165,5 +165,5 @@ def _cause(found: ProbableCause) -> dict[str, Any]:
         "rule": found.decision.rule,
         "command": retake_command(found.frames) if found.is_of_frames else "",
         "places": places_text(found),
-        "evidence": ", ".join(f"{key} {value:.3g}" for key, value in found.evidence.known().items()),
+        "evidence": found.evidence.in_words(),
     }

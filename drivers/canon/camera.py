@@ -772,8 +772,8 @@ _STUCK = (
 """Responses that a new session may cure."""
 _SUFFIXES: dict[int, str] = {ObjectFormat.CRW: ".CRW", ObjectFormat.CR2: ".CR2", ObjectFormat.CR3: ".CR3"}
 _REMEDY = (
-    "check the cable and the battery, switch the camera off and on, and end other programs that use it (photo "
-    "importers of the desktop do so by themselves); then run again"
+    "check its cable and battery, switch it off and on, and end other programs that use it (a desktop's photo importer "
+    "begins by itself)"
 )
 
 _Result = TypeVar("_Result")
@@ -956,10 +956,9 @@ class CanonEos:
         self._drop(fault)
 
     def _given_up(self, last: DeviceError, tried: str) -> str:
-        """Return why a call ends, its first cause first, for whatever came of that says less."""
-        first = self._fault or last
-        at_last = "" if str(first) == str(last) else f"; at last: {last}"
-        return f"{first}; {tried}{at_last}; {_REMEDY}"
+        """Return why a call ends, its first cause first, for whatever came of that says less; with one remedy."""
+        first, held = (str(fault).partition("; ")[0] for fault in (self._fault or last, last))
+        return f"{first}; {tried}{'' if held == first else f'; at last: {held}'}; {_REMEDY}"
 
     def _release(self, settings: ExposureSettings) -> _Shot:
         """Return the release that has happened, or may have; one that the body declines has not."""

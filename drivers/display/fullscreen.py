@@ -9,6 +9,8 @@ Rules that hold inside:
 - A display that was away for a while is filled again by the next `show`, if it comes back in the mode that it had.
 - One thread owns the window: the one that opened it. OpenGL contexts and GLFW want it so.
 - The window belongs to this process: however that ends, killed included, the window goes with it.
+- A display that the window of another process fills is not filled: neither would show what it is told to. What is
+  asked without a window (`display_warnings`, `list_displays`) covers nothing.
 - GLFW and OpenGL are used here and nowhere else; GLFW runs while anything here is open.
 
 On Linux the window is an X window. Under Wayland that is XWayland, whose compositor may scale and tint behind our back:
@@ -38,6 +40,7 @@ from drivers.display.x11 import XScreen, is_dark, is_lost, outlive
 from drivers.presenter import BLACK, Colour
 from foundation.clock import Clock, SystemClock
 from foundation.errors import ConfigurationError, DeviceError
+from foundation.holds import hold
 
 if TYPE_CHECKING:
     from types import ModuleType
@@ -122,8 +125,9 @@ def running_glfw() -> Generator[ModuleType]:
             glfw.init()
         except glfw.GLFWError as error:
             raise DeviceError(
-                f"no desktop to show a picture on ({error}); run this on the machine that the projector is connected "
-                "to, logged in there, with DISPLAY set on Linux"
+                f"no desktop to show a picture on ({_server_named()}); run this on the machine that the projector is "
+                "connected to, logged in there, with DISPLAY set on Linux, and XAUTHORITY where it is no shell of the "
+                "desktop's"
             ) from error
         if sys.platform == "linux":
             outlive(glfw.get_x11_display())
@@ -134,6 +138,14 @@ def running_glfw() -> Generator[ModuleType]:
         _users -= 1
         if not _users:
             glfw.terminate()
+
+
+def _server_named() -> str:
+    """Return which desktop was looked for; what GLFW says of it is a number and a text for programmers."""
+    if sys.platform != "linux":
+        return "none is there for this user"
+    display = os.environ.get("DISPLAY")
+    return f"DISPLAY={display} does not answer" if display else "DISPLAY is not set"
 
 
 def _library() -> ModuleType:
@@ -245,6 +257,7 @@ class FullScreen:
             if glfw.get_platform() == glfw.PLATFORM_X11:
                 self._screen = XScreen()
                 opening.callback(self._screen.close)
+            opening.enter_context(_held(self.display))
             self._window: Any = self._open_window()
             opening.callback(glfw.destroy_window, self._window)
             self._gl = OpenGl(glfw)
@@ -304,32 +317,7 @@ class FullScreen:
     def warnings(self) -> tuple[str, ...]:
         """Return what may change the light behind the codes that were read back; empty when nothing does."""
         self._require_usable()
-        found: list[str] = []
-        bent = self._bent_ramp()
-        if bent:
-            found.append(
-                f"the gamma ramp of {self.display.name} is not straight ({bent}): switch off night light and colour "
-                "management for this display"
-            )
-        if self._screen is not None and (
-            self._screen.has_extension("XWAYLAND") or self.display.name.startswith("XWAYLAND")
-        ):
-            found.append(
-                "the desktop is Wayland, whose compositor may scale and tint unseen: log in to an X session (Xorg)"
-            )
-        if self._screen is not None and not self._screen.stays_awake:
-            found.append(
-                "power saving may darken the display: install libxcb-screensaver0, or switch it off (xset -dpms)"
-            )
-        if self._screen is not None and self._screen.has_root_property(_profile_of(self._glfw, self._monitor)):
-            found.append(
-                f"a colour profile is set for {self.display.name}, which desktops may apply to what they show: remove "
-                "it in the desktop's colour settings (colormgr, dispwin -U)"
-            )
-        twins = [str(one) for one, _ in displays_of(self._glfw) if one.place == self.display.place]
-        if len(twins) > 1:
-            found.append(f"the same picture goes to several displays ({'; '.join(twins)}): extend, do not mirror")
-        return tuple(found)
+        return _warnings_of(self._glfw, self.display, self._monitor, self._screen)
 
     def close(self) -> None:
         """Leave the display black and give it back to the desktop; a second call does nothing."""
@@ -518,30 +506,79 @@ class FullScreen:
             return f"in front of it lies {cover}: close it, and switch such windows and notifications off"
         return _LOOK
 
-    def _bent_ramp(self) -> str:
-        try:
-            ramp = self._glfw.get_gamma_ramp(self._monitor)
-        except self._glfw.GLFWError:
-            # This display has none.
-            return ""
-        channels = [np.asarray(channel) for channel in ramp]
-        if any(_is_noise(values) for values in channels):
-            return ""
-        for name, values in zip(("red", "green", "blue"), channels, strict=True):
-            if not values.any():
-                # A server without a ramp of its own keeps zeros; a real one of zeros would be a black picture.
-                continue
-            off = values - np.linspace(0, 1, values.size)
-            worst = int(np.argmax(np.abs(off)))
-            if abs(off[worst]) > RAMP_TOLERANCE:
-                return f"{name} {worst / (values.size - 1):.2f} becomes {values[worst]:.2f}"
-        return ""
-
     def _require_usable(self) -> None:
         if not self._open:
             raise DeviceError(f"display {self.display} was closed; open it again")
         if threading.get_ident() != self._thread:
             raise DeviceError(f"display {self.display} belongs to the thread that opened it; use it from there")
+
+
+@contextlib.contextmanager
+def _held(display: Display) -> Generator[None]:
+    """Hold a display against other processes; a server's screens (``:0.0``) share their displays."""
+    server = re.sub(r"\.\d+$", "", os.environ.get("DISPLAY", ""))
+    with hold(f"display {display}", f"display {server} {display.place}"):
+        yield
+
+
+def display_warnings(wanted: str | int | None = None) -> tuple[str, ...]:
+    """Return what `FullScreen.warnings` does, of a display that `choose_display` finds, and open no window on it."""
+    with contextlib.ExitStack() as opened:
+        glfw = opened.enter_context(running_glfw())
+        found = displays_of(glfw)
+        display = choose_display(tuple(one for one, _ in found), wanted)
+        opened.enter_context(_held(display))
+        screen: XScreen | None = None
+        if glfw.get_platform() == glfw.PLATFORM_X11:
+            screen = XScreen()
+            opened.callback(screen.close)
+        return _warnings_of(glfw, display, next(monitor for one, monitor in found if one == display), screen)
+
+
+def _warnings_of(glfw: Any, display: Display, monitor: Any, screen: XScreen | None) -> tuple[str, ...]:
+    """Return what may change the light of a display; `screen`: the X server's, None where there is none."""
+    found: list[str] = []
+    bent = _bent_ramp(glfw, monitor)
+    if bent:
+        found.append(
+            f"the gamma ramp of {display.name} is not straight ({bent}): switch off night light and colour management "
+            "for this display"
+        )
+    if screen is not None and (screen.has_extension("XWAYLAND") or display.name.startswith("XWAYLAND")):
+        found.append(
+            "the desktop is Wayland, whose compositor may scale and tint unseen: log in to an X session (Xorg)"
+        )
+    if screen is not None and not screen.stays_awake:
+        found.append("power saving may darken the display: install libxcb-screensaver0, or switch it off (xset -dpms)")
+    if screen is not None and screen.has_root_property(_profile_of(glfw, monitor)):
+        found.append(
+            f"a colour profile is set for {display.name}, which desktops may apply to what they show: remove it in the "
+            "desktop's colour settings (colormgr, dispwin -U)"
+        )
+    twins = [str(one) for one, _ in displays_of(glfw) if one.place == display.place]
+    if len(twins) > 1:
+        found.append(f"the same picture goes to several displays ({'; '.join(twins)}): extend, do not mirror")
+    return tuple(found)
+
+
+def _bent_ramp(glfw: Any, monitor: Any) -> str:
+    try:
+        ramp = glfw.get_gamma_ramp(monitor)
+    except glfw.GLFWError:
+        # This display has none.
+        return ""
+    channels = [np.asarray(channel) for channel in ramp]
+    if any(_is_noise(values) for values in channels):
+        return ""
+    for name, values in zip(("red", "green", "blue"), channels, strict=True):
+        if not values.any():
+            # A server without a ramp of its own keeps zeros; a real one of zeros would be a black picture.
+            continue
+        off = values - np.linspace(0, 1, values.size)
+        worst = int(np.argmax(np.abs(off)))
+        if abs(off[worst]) > RAMP_TOLERANCE:
+            return f"{name} {worst / (values.size - 1):.2f} becomes {values[worst]:.2f}"
+    return ""
 
 
 def _profile_of(glfw: Any, monitor: Any) -> str:

@@ -309,6 +309,11 @@ class PacketCutter:
             return self._next_data(packets)
         if self._left < HEADER_LENGTH:
             return False
+        if self._waiting[self._at : self._at + 5].upper() in _OF_HTTP:
+            raise ProtocolError(
+                "an HTTP server answers, no camera; give the camera's address, and as port "
+                f"{PORT} unless its menu says another"
+            )
         cursor = Cursor(self._waiting[self._at : self._at + HEADER_LENGTH + 4], "a PTP/IP packet")
         length, kind = cursor.u32("length"), cursor.u32("type")
         _checked(kind, length)
@@ -338,6 +343,10 @@ class PacketCutter:
         if not self._data_left:
             self._data_kind = 0
         return self._left > 0
+
+
+_OF_HTTP: Final = (b"HTTP/", b"<!DOC", b"<HTML")
+"""How what a server of pages says begins; as packets these would be of a gigabyte."""
 
 
 def _checked(kind: int, length: int) -> None:

@@ -33,6 +33,9 @@ VOIDED = "voided"
 """Verdict of a frame that was accepted and must not be used: what was found out later says why."""
 
 
+DOUBT = "doubt"
+"""The event that tells what stops nothing, and is to be seen in the morning."""
+
 RECENT = 50
 """Attempts by which the time left is told: enough that retakes and references do not sway their median, few enough to
 follow a change of the settings."""
@@ -218,6 +221,11 @@ class SessionEvent:
     what: str
     detail: str
     number: int
+
+
+def doubts_of(events: Iterable[SessionEvent]) -> list[str]:
+    """Return what stopped no run and is to be seen in the morning, each once, in the order of the events."""
+    return list(dict.fromkeys(event.detail for event in events if event.what == DOUBT))
 
 
 def last_moment(attempts: Iterable[Attempt]) -> datetime | None:

@@ -143,11 +143,18 @@ class WatchedProjector(Protocol):
 
 @dataclass(frozen=True)
 class LampState:
-    """What a projector says of itself: `share` of its full light, whether its picture is `frozen`, its `source`."""
+    """What a projector says of itself.
+
+    - `share`: of its full light.
+    - `frozen`: whether its picture is.
+    - `source`: its input; None where it does not say.
+    - `trouble`: why it could not be asked, so that it gives no light; empty where it could.
+    """
 
     share: float
     frozen: bool = False
     source: str | None = None
+    trouble: str = ""
 
 
 def ask(projector: WatchedProjector) -> LampState:
@@ -158,8 +165,8 @@ def ask(projector: WatchedProjector) -> LampState:
             return LampState(WARMING_SHARE)
         if power is not Power.ON or projector.muted():
             return LampState(0.0)
-    except DeviceError:
-        return LampState(0.0)
+    except DeviceError as fault:
+        return LampState(0.0, trouble=str(fault))
     frozen, source = False, None
     # Class 1 knows no freeze, and some projectors no input.
     with contextlib.suppress(DeviceError):
@@ -228,6 +235,12 @@ class Beam:
             self._thread.join()
             self._projector.close()
         self._pictures.close()
+
+    @property
+    def trouble(self) -> str:
+        """Why the projector could not be asked when it last was, so that it gives no light; empty where it could."""
+        with self._looking:
+            return self._state.trouble
 
     def gather(self, seconds: float, halfway: Callable[[], None] = lambda: None) -> ThrownLight:
         """Return what reaches the chart from now on, for so many seconds; returns when they are over."""

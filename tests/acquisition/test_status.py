@@ -48,8 +48,8 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path / "night"
 
 
-def say(folder: Path, capsys: pytest.CaptureFixture[str]) -> str:
-    assert main(["status", str(folder)]) == 0
+def say(folder: Path, capsys: pytest.CaptureFixture[str], code: int = 0) -> str:
+    assert main(["status", str(folder)]) == code
     return capsys.readouterr().out
 
 
@@ -96,13 +96,37 @@ def test_a_pause_is_no_success_either(
 
 def test_a_killed_run_has_no_time_left(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     subprocess.run([sys.executable, "-c", ENDED, str(folder)], check=True)
-    told = say(folder, capsys)
+    told = say(folder, capsys, code=3)
     assert "state   stopped at 20" in told
     assert "killed or power lost: run the same command again\n" in told
     assert "left    4 frames; no run is at work\n" in told
-    assert main(["status", "--json", str(folder)]) == 0
+    assert main(["status", "--json", str(folder)]) == 3
     values = json.loads(capsys.readouterr().out)
     assert (values["state"], values["alive"], values["remaining_s"]) == ("stopped", False, None)
+
+
+@pytest.mark.parametrize(
+    ("sentence", "code"),
+    [
+        ("the camera: no camera on USB; the run waited 10 min 00 s", 3),
+        ("4 of 8 frames left; light 3: the chart has moved", 4),
+        ("interrupted; run the same command again", 4),
+        ("the disk: No space left on device", 5),
+    ],
+)
+def test_a_run_that_ended_with_frames_left_is_no_success(
+    folder: Path, sentence: str, code: int, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with closing(Journal.open_for_run(folder / "journal.sqlite")) as journal:
+        journal.beat("ended", sentence, datetime.now(UTC))
+    assert "state   incomplete" in say(folder, capsys, code)
+
+
+def test_what_is_to_be_seen_in_the_morning_stays(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with closing(Journal.open_for_run(folder / "journal.sqlite")) as journal:
+        for what in ("doubt", "doubt", *["moved"] * 10):
+            journal.note(datetime.now(UTC), what, f"a {what} of the night")
+    assert "doubts:\n  a doubt of the night\nlast" in say(folder, capsys)
 
 
 def test_a_copy_of_a_session_at_work_is_no_run(

@@ -11,6 +11,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -137,6 +138,7 @@ def test_check_reports_what_may_alter_the_light(
 @pytest.mark.parametrize("maker", ["epson", "benq"])
 def test_a_makers_language_over_the_network(lab: Path, maker: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("acquisition.run.rig.lab.FullScreen", simulated_display)
+    monkeypatch.setattr("acquisition.run.rig.lab.CanonEos", Mock())
     beamer = SimulatedProjector(SystemClock(), power=Power.ON)
     peer = partial(EpsonPeer, beamer, network=True) if maker == "epson" else partial(BenqPeer, beamer, network=True)
     with serve_peer(peer) as server:

@@ -86,7 +86,12 @@ def bench(lab: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixt
         choose_display(bench.displays, display)
         return SimulatedPresenter(Screen(), clock)
 
+    def warnings(display: str | int | None) -> tuple[str, ...]:
+        choose_display(bench.displays, display)
+        return ()
+
     monkeypatch.setattr("acquisition.run.rig.lab.FullScreen", presenter)
+    monkeypatch.setattr("acquisition.run.rig.lab.display_warnings", warnings)
     monkeypatch.setattr("acquisition.run.rig.lab.open_usb", partial(open_usb, backend=bench.bus))
     return bench
 
@@ -126,7 +131,7 @@ def test_a_cable_that_cannot_be(bench: Bench, camera: str, text: str, words: str
 def test_a_serial_port_that_is_not_there(bench: Bench, camera: str) -> None:
     code, said = bench.told(f'{camera}[lab.projector]\ncontrol = "benq"\ndevice = "/dev/ttyCROP9"\n')
     assert code == 3
-    assert said.startswith("there is no serial port /dev/ttyCROP9; found: ")
+    assert said.startswith("projector: there is no serial port /dev/ttyCROP9; found: ")
 
 
 def test_another_language_than_the_projectors(bench: Bench, camera: str) -> None:
@@ -141,7 +146,8 @@ def test_a_port_at_which_nobody_listens(bench: Bench, camera: str) -> None:
     code, said = bench.told(camera + pjlink(port := free_port()))
     assert code == 3
     assert said == (
-        f"nothing listens at 127.0.0.1:{port}; check the port, and that network control is enabled on the device"
+        f"projector: nothing listens at 127.0.0.1:{port}; check the port, and that network control is enabled on the "
+        "device"
     )
 
 

@@ -198,7 +198,7 @@ def test_no_secret_gets_into_the_session(target: str, label: str) -> None:
         ('notify = "https:///s3cret"', "a URL names a host"),
         ('notify = "https://s3cret:99999/"', "sequence.notify = …: Port out of range"),
         ('notify = "https://x/s3cret word"', "a URL has no spaces"),
-        ('notify = ["s3cret"]', "sequence.notify = …: Input should be a valid string"),
+        ('notify = ["s3cret"]', "sequence.notify = …: a text was expected"),
     ],
 )
 def test_a_mistake_in_a_secret_is_named_without_it(line: str, expected: str) -> None:
@@ -207,6 +207,34 @@ def test_a_mistake_in_a_secret_is_named_without_it(line: str, expected: str) -> 
     assert expected in str(caught.value)
     assert "s3cret" not in str(caught.value)
     assert caught.value.__cause__ is None
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ('[camera]\nshutter_s = "1/2"', "camera.shutter_s = '1/2': a number of seconds was expected: 0.5"),
+        ('[camera]\nshutter_s = "1/30"', "a number of seconds was expected: 0.0333333"),
+        ('[camera]\niso = "ISO"', "camera.iso = 'ISO': a whole number was expected"),
+        ("[camera]\niso = 100.5", "a whole number was expected"),
+        ("[camera]\nshutter_s = 0", "a number above 0 was expected"),
+        ("[sequence]\nattempts = 90", "a number of at most 20 was expected"),
+        ('[sequence]\nsettle_s = "500 ms"', "a number of seconds was expected"),
+        ('[sequence]\npatience_s = "for ever"', 'a number of seconds was expected, or "forever"'),
+        ("[lab.projector]\npassword = 1234", 'password = …: a text was expected, in quotation marks: "…"'),
+        ("[lab.camera]\nserial = 1234", 'serial = 1234: a text was expected, in quotation marks: "1234"'),
+    ],
+)
+def test_a_value_of_another_kind_is_answered_as_it_is_written(text: str, expected: str) -> None:
+    with pytest.raises(ConfigurationError) as told:
+        parse_lab(f"{MINIMAL}{text}\n", "LAB.toml")
+    assert expected in str(told.value)
+    assert "1234" not in str(told.value) or "serial" in text
+
+
+def test_a_folder_of_a_lab_is_answered_with_its_file(tmp_path: Path) -> None:
+    with pytest.raises(ConfigurationError) as told:
+        load_lab(tmp_path)
+    assert told.value.remedy == f"name {tmp_path / 'LAB.toml'}"
 
 
 def test_replay_needs_a_recording(tmp_path: Path) -> None:

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import uuid
 from collections.abc import Callable, Generator, Iterable
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from functools import partial
+from pathlib import Path
 
-from acquisition.run.devices import Devices, ask_all, require_whole_turns
+from acquisition.run.devices import Devices, LightNotShown, ask_all, require_whole_turns
 from drivers.camera import Camera
 from drivers.canon.camera import CanonEos
-from drivers.display.fullscreen import FullScreen, identify_displays, list_displays
+from drivers.display.fullscreen import FullScreen, display_warnings, identify_displays, list_displays
 from drivers.display.jvc import PORT as JVC_PORT
 from drivers.display.jvc import JvcFlatField
 from drivers.display.lightcrafter import LightCrafter, find_lightcrafter
@@ -32,6 +33,7 @@ from experiment.session.folder import Session
 from experiment.session.records import last_moment
 from foundation.clock import Clock, SteadyClock, SystemClock
 from foundation.errors import ConfigurationError, CropError
+from foundation.holds import hold
 
 __all__ = ["Attached", "attached_devices", "identify_displays"]
 
@@ -40,14 +42,17 @@ CONNECT_S = 5.0
 """How long a projector may take to accept a connection; on a lab's network it takes milliseconds."""
 
 
-def open_lab(settings: LabSettings, session: Session | None, opened: ExitStack) -> Devices:
-    """Open the camera, the projector and its light that LAB.toml names.
+def open_lab(settings: LabSettings, session: Session | None, opened: ExitStack, shows: bool = True) -> Devices:
+    """Open the camera, the projector and its light that LAB.toml names, of which another program may be at work.
 
-    `session`: the session that is taken up: time goes on behind its last frame; None for a new one, and for a check.
+    What is opened last is the light: its black would cover the picture of a run that has the camera. `session`: the
+    session that is taken up: time goes on behind its last frame; None for a new one, and for a check. `shows`: whether
+    the light is opened; if not, a `LightNotShown` stands for it.
     """
+    _hold_lab(settings.file, opened)
     clock = session_clock(session)
     require_whole_turns(settings.camera, settings.lab.projector)
-    projectors: list[Projector] = []
+    projectors: list[Projector | None] = []
     presenters: list[Presenter] = []
     cameras: list[Camera] = []
 
@@ -55,25 +60,31 @@ def open_lab(settings: LabSettings, session: Session | None, opened: ExitStack) 
         projector = _lab_projector(settings.lab.projector, clock, settings.file)
         if projector is not None:
             opened.callback(projector.close)
-            projectors.append(projector)
-
-    def open_presenter() -> None:
-        presenters.append(_lab_presenter(settings.lab.light, clock, settings.file))
-        opened.callback(presenters[0].close)
+            projector.identity()
+        projectors.append(projector)
 
     def open_camera() -> None:
-        cameras.append(_lab_camera(settings.lab.camera, clock, settings.file))
-        opened.callback(cameras[0].close)
+        camera = _lab_camera(settings.lab.camera, clock, settings.file)
+        opened.callback(camera.close)
+        camera.identity()
+        cameras.append(camera)
 
-    # One that cannot be opened does not keep the others' faults from being told.
-    ask_all(
-        {"projector": open_projector, "display": open_presenter, "camera": open_camera},
-        {
-            "projector": lambda: [projector.identity() for projector in projectors],
-            "camera": lambda: [camera.identity() for camera in cameras],
-        },
-    )
-    return Devices(cameras[0], presenters[0], projectors[0] if projectors else None, clock)
+    def open_presenter() -> None:
+        light = _lab_presenter if shows and cameras and projectors else _light_not_shown
+        presenters.append(light(settings.lab.light, clock, settings.file))
+        opened.callback(presenters[0].close)
+
+    # One that cannot be used does not keep the others' faults from being told.
+    ask_all({"camera": open_camera, "projector": open_projector, "display": open_presenter})
+    return Devices(cameras[0], presenters[0], projectors[0], clock)
+
+
+def _hold_lab(file: str, opened: ExitStack) -> None:
+    """Hold the lab of a LAB.toml against other commands: two at one cable take each other's answers."""
+    # Settings that come from no file have nobody who could name them a second time.
+    with suppress(OSError):
+        place = Path(file).stat()
+        opened.enter_context(hold(f"the lab of {file}", f"lab {place.st_dev} {place.st_ino}"))
 
 
 def session_clock(session: Session | None) -> SteadyClock:
@@ -156,6 +167,18 @@ def _lab_presenter(light: LightSource, clock: Clock, file: str) -> Presenter:
             port = light.port or JVC_PORT
             label = f"the JVC projector at {host}:{port}"
             return JvcFlatField(lambda: TcpLink.connect(host, port, CONNECT_S), label=label, clock=clock)
+
+
+def _light_not_shown(light: LightSource, _: Clock, file: str) -> LightNotShown:
+    """Return what stands for a light that is not to be shown; a fault where it could not be."""
+    match light.shown_by:
+        case "display":
+            return LightNotShown(display_warnings(light.display))
+        case "lightcrafter":
+            return LightNotShown((), "light: the LightCrafter is black as soon as it is opened")
+        case "jvc":
+            _required(light.host, "lab.light.host", "the projector's address", file)
+            return LightNotShown((), "light: the projector's picture is black as soon as it is opened")
 
 
 def _required(value: str | None, key: str, what: str, file: str) -> str:

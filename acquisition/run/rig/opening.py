@@ -21,10 +21,13 @@ def open_rig(
     settings: LabSettings,
     chart: Chart,
     session: Session | None = None,
+    *,
+    shows: bool = True,
 ) -> Generator[Devices]:
     """Open every device that the settings name; close them all at the end, whatever the end.
 
-    `session`: the session that is taken up; None for a new one, and for a check, which records nothing.
+    `session`: the session that is taken up; None for a new one, and for a check, which records nothing. `shows`:
+    whether the light is opened, which is black then; what a dry run asks it shows nothing.
     """
     if settings.rig == "imported":
         raise ConfigurationError(
@@ -35,7 +38,7 @@ def open_rig(
         if settings.rig == "lab":
             from acquisition.run.rig.lab import open_lab
 
-            yield open_lab(settings, session, opened)
+            yield open_lab(settings, session, opened, shows)
         else:
             from acquisition.run.rig.simulated import open_simulated
 

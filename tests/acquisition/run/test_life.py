@@ -95,6 +95,20 @@ def test_a_run_tells_a_service_manager(tmp_path: Path, monkeypatch: pytest.Monke
     assert got[-1].startswith("STOPPING=1\nSTATUS=complete")
 
 
+def test_who_could_not_be_told_is_noted_while_the_run_goes_on(tmp_path: Path) -> None:
+    gone = str(tmp_path / "gone")
+    sequence = SETTINGS.sequence.model_copy(update={"notify": f"{gone} s3cret"})
+    settings = SETTINGS.model_copy(update={"sequence": sequence, "notify": NotifySettings(alive=f"{gone} s3cret")})
+    lights = tuple(Illumination(n, "uniform", None, Colour(255, n, 0)) for n in range(2))
+    lab = Lab(tmp_path / "session", lights=lights)
+    lab.screen.fails = dict.fromkeys(range(2, 40), DeviceError("a screen saver covers the picture"))
+    assert take_session(lab.session, lab.devices, settings).complete
+    events = lab.session.journal.events()
+    doubts = [event.detail for event in events if event.what == "doubt"]
+    assert sorted(doubt.partition(":")[0] for doubt in doubts) == ["notify.alive", "sequence.notify"], "once a cause"
+    assert all(gone in doubt and "s3cret" not in doubt for doubt in doubts)
+
+
 def test_a_dead_mans_switch_hears_of_frames_and_pauses_and_of_the_end(tmp_path: Path) -> None:
     heard = tmp_path / "heard"
     program = f"import sys; open({str(heard)!r}, 'a').write(sys.stdin.read() + chr(10))"

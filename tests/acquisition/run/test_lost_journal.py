@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from acquisition.cli import main
-from acquisition.monitor.feed import SessionWatch
+from acquisition.monitor.feed import LOOK_AGAIN_S, SessionWatch
 from acquisition.monitor.view import read_session
 from acquisition.run.pipeline import Taken
 from acquisition.run.run import RunOutcome, take_session
@@ -25,6 +25,7 @@ from experiment.session.journal_file import LostJournalError, open_to_read
 from experiment.session.ledger import Rows, ledger_path, read_ledger, rows_of
 from experiment.session.records import ACCEPTED
 from foundation.errors import FormatError, StorageError
+from sim.clock import SimulatedClock
 from tests.acquisition.run.scripted import SETTINGS, Lab
 
 LIGHTS = tuple(Illumination(n, "uniform", None, Colour(255, 30 * n, 0)) for n in range(6))
@@ -293,7 +294,12 @@ def test_a_complete_session_whose_files_go_is_complete_no_more(
     folder = lab.session.folder
     run(lab)
     lab.session.close()
+    clock = SimulatedClock()
+    watch = SessionWatch(folder, clock.monotonic)
+    assert watch.head().state == "complete"
     mishap(folder / "frames" / "0002_light_000.dng")
-    assert main(["status", str(folder)]) == 0
+    clock.sleep(LOOK_AGAIN_S)
+    assert watch.head().state == "incomplete", "a page that is open looks again"
+    assert main(["status", str(folder)]) == 4
     assert "incomplete: frames/0002_light_000.dng: gone or cut" in capsys.readouterr().out
     assert read_session(folder).head(lab.clock.now()).done == len(lab.session.steps) - 1

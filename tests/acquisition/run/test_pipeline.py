@@ -55,6 +55,22 @@ def refused(reason: str, *, voids: bool = False, lasting: bool = False) -> Judge
     return Judgement((Check("light", 9.0, 0.0, 2.0, "°", reason),), measurement=b"bad", voids=voids, lasting=lasting)
 
 
+@pytest.mark.parametrize(("percent", "doubted"), [(0.4, False), (0.6, True)])
+def test_light_in_the_room_is_doubted_once_and_lastingly(folder: Path, percent: float, doubted: bool) -> None:
+    class Lit(ScriptedJudge):
+        def judge(self, file: Path, step: SessionStep) -> Judgement:
+            known = super().judge(file, step)
+            return Judgement((Check("dark", percent, None, 2.5, "%"),)) if step.kind == "dark" else known
+
+    lab = Lab(folder, lights=FOUR, reference_every=2)
+    judge = Lit()
+    outcome = run(lab, judge)
+    assert outcome.complete
+    assert sum(step.kind == "dark" for step in judge.judged) > 1
+    assert len(outcome.doubts) == doubted
+    assert all(f"{percent} % of white" in doubt for doubt in outcome.doubts)
+
+
 def run(lab: Lab, judge: ScriptedJudge | None = None, **more: Any) -> RunOutcome:
     return take_session(lab.session, lab.devices, PATIENT, judge, **more)
 

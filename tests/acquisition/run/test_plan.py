@@ -29,12 +29,13 @@ from acquisition.run.plan import (
     order_of,
     outline,
     plan_lines,
+    settings_doubts,
 )
 from drivers.camera import CameraIdentity, ExposureSettings, Supplies
 from drivers.presenter import Colour
 from drivers.projector import Power, Severity
 from experiment.chart.layout import design_chart
-from experiment.config import LabSettings, load_lab
+from experiment.config import LabRig, LabSettings, NotifySettings, ProjectorCable, load_lab, parse_lab
 from experiment.lights import Illumination, save_illuminations
 from experiment.session.folder import Session
 from experiment.session.records import plan_steps
@@ -336,7 +337,7 @@ class TestAsking:
         clock, camera = SimulatedClock(), Silent(fault=DeviceError("no camera on USB"))
         answers = ask(Devices(camera, Silent(), Unmoved(clock, power=Power.ON), clock))
         assert camera.log == ["identity"]
-        assert [str(fault) for fault in answers.faults] == ["no camera on USB"]
+        assert [str(fault) for fault in answers.faults] == ["camera: no camera on USB"]
         assert answers.lit
 
     def test_a_broken_lamp_is_a_fault(self) -> None:
@@ -390,8 +391,52 @@ def small_disk(lab: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(shutil, "disk_usage", small)
 
 
+@pytest.mark.parametrize(
+    ("target", "said", "unsaid"),
+    [
+        ("{there}/tell --phone", "", "s3cret"),
+        ("{there}/gone --phone s3cret", "{there}/gone … is no command that is there", "s3cret"),
+        ("{there}/plain --phone", "chmod +x {there}/plain", "--phone"),
+        (
+            "ntfy.example/s3cret",
+            "ntfy.example/… is no command that is there; an address begins",
+            "s3cret",
+        ),
+        ("https://ntfy.example/s3cret", "", "s3cret"),
+        ("", "", "s3cret"),
+    ],
+)
+def test_who_would_not_hear_what_he_is_told_is_doubted(target: str, said: str, unsaid: str, tmp_path: Path) -> None:
+    for name, mode in (("tell", 0o755), ("plain", 0o644)):
+        (tmp_path / name).touch(mode)
+    target, said = target.format(there=tmp_path), said.format(there=tmp_path)
+    of_notify = SETTINGS.model_copy(update={"sequence": SETTINGS.sequence.model_copy(update={"notify": target})})
+    of_alive = SETTINGS.model_copy(update={"notify": NotifySettings(alive=target)})
+    for key, settings in (("sequence.notify", of_notify), ("notify.alive", of_alive)):
+        doubts = settings_doubts(settings)
+        assert planned(settings=settings).doubts == doubts
+        assert len(doubts) == bool(said)
+        assert all(doubt.startswith(f"{key}: ") and said in doubt and unsaid not in doubt for doubt in doubts)
+
+
+def test_times_that_were_meant_otherwise_are_doubted() -> None:
+    sequence, real = SETTINGS.sequence, parse_lab('rig = "lab"\nchart = "c"\nilluminations = "i"\n', "LAB.toml")
+    control = real.model_copy(
+        update={"lab": LabRig(projector=ProjectorCable(control="pjlink", host="h"))},
+    )
+
+    def doubts(settings: LabSettings, **changes: float) -> int:
+        return len(settings_doubts(settings.model_copy(update={"sequence": sequence.model_copy(update=changes)})))
+
+    assert doubts(control) == 0
+    assert doubts(control, settle_s=500.0) == 1
+    assert doubts(control, warm_up_s=20.0) == 1
+    assert doubts(real, warm_up_s=20.0) == 0, "the lamp is not under control"
+
+
 class TestDryRun:
     def test_a_new_session_is_printed_and_not_made(self, lab: Path, capsys: pytest.CaptureFixture[str]) -> None:
+        lab.write_text(lab.read_text() + '[notify]\nalive = "https://ping.example/s3cret"\n')
         before = contents(lab.parent)
         assert main(["run", str(lab), str(lab.parent / "night"), "--dry-run"]) == 0
         assert contents(lab.parent) == before
@@ -400,12 +445,20 @@ class TestDryRun:
         assert "shuffled by seed 1" in text
         assert "in standby: it will be lit" in text
         assert "notices     to https://ntfy.example/…" in text
+        assert "alive       to https://ping.example/…" in text
         assert "s3cret" not in text
 
     def test_a_session_is_looked_at_and_not_changed(self, lab: Path, capsys: pytest.CaptureFixture[str]) -> None:
         night = lab.parent / "night"
         found = json_of(main, ["run", lab, night], capsys)
-        assert found == {"command": "acquire run", "session": str(night), "frames": 8, "left": 0, "refused": []}
+        assert found == {
+            "command": "acquire run",
+            "session": str(night),
+            "frames": 8,
+            "left": 0,
+            "refused": [],
+            "doubts": [],
+        }
         with Session.open_for_run(night) as session:
             session.retake("2")
         before = contents(lab.parent)
@@ -434,7 +487,7 @@ class TestDryRun:
     def test_a_full_disk_is_printed_and_is_the_exit_code(self, lab: Path, capsys: pytest.CaptureFixture[str]) -> None:
         assert main(["run", str(lab), str(lab.parent / "night"), "--dry-run"]) == 5
         said = capsys.readouterr()
-        assert "fault       the disk of" in said.out
+        assert "the disk of" not in said.out, "a fault is said once"
         assert "are missing" in said.err
         found = json_of(main, ["run", lab, lab.parent / "night", "--dry-run"], capsys, code=5)
         assert (found["command"], found["frames"]) == ("acquire run", 8)

@@ -183,6 +183,23 @@ def test_another_device_that_fails_meanwhile_waits_its_turn() -> None:
     assert retry.attempt(room.broken(until(100, DeviceError("covered"))), "the screen") == "done"
 
 
+def test_a_pause_gives_one_order_and_says_nothing_twice() -> None:
+    room = Room(600.0)
+    full = StorageError("cannot write session: No space left on device; free space, then run the same command again")
+    gone = LinkClosed("EOS at usb 1 is gone; check its cable")
+    given_up = DeviceError("EOS at usb 1 is gone; no connection for 60 s; at last: no camera on USB; check its cable")
+    with pytest.raises(StorageError) as ended:
+        room.retry.attempt(room.broken(lambda now: full), "the disk")
+    assert str(ended.value).count("run the same command again") == 1
+    sentences = [sentence for _, sentence in room.said] + [sentence for _, _, sentence, _ in room.beats]
+    assert not [sentence for sentence in sentences if "again" in sentence]
+    assert any("free space (the run waits up to" in sentence for sentence in sentences)
+    room = Room(600.0)
+    with pytest.raises(LinkClosed) as lost:
+        room.retry.attempt(room.broken(lambda now: gone if now == 0 else given_up), "the camera")
+    assert str(lost.value).count("is gone") == 1
+
+
 @pytest.mark.parametrize("limit_s", [0.1, 0.3, 1.0, 600.0, 601.7])
 def test_patience_ends_in_time_with_the_first_cause(limit_s: float) -> None:
     room = Room(limit_s)

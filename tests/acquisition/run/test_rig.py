@@ -2,22 +2,26 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from pathlib import Path
 from unittest.mock import Mock
 
 import pytest
 
+from acquisition.run.plan import ask
 from acquisition.run.rig.lab import attached_devices
 from acquisition.run.rig.opening import open_rig
 from acquisition.run.rig.simulated import simulated_body, simulated_room
 from acquisition.run.run import run_session
+from drivers.presenter import WHITE
 from drivers.raw.rawfile import read_raw
 from experiment.chart.layout import design_chart
 from experiment.config import CameraSettings, LabSettings, SimulatedSettings, load_lab, parse_lab
 from experiment.lights import plan_illuminations, save_illuminations
 from experiment.session.folder import Session
 from foundation.clock import Clock
-from foundation.errors import ConfigurationError
+from foundation.errors import ConfigurationError, DeviceRefused
 from sim.projectors.projector import Screen, SimulatedPresenter
 from sim.world.sensors import FACTS
 
@@ -119,11 +123,52 @@ def test_an_imported_session_cannot_be_taken() -> None:
 )
 def test_a_cable_that_is_not_named_is_said(text: str, expected: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("acquisition.run.rig.lab.FullScreen", simulated_display)
+    monkeypatch.setattr("acquisition.run.rig.lab.display_warnings", Mock(return_value=()))
     # A camera that answers: its fault would be told with the settings', and is a device's.
     monkeypatch.setattr("acquisition.run.rig.lab.CanonEos", Mock())
     real = parse_lab(HEAD.replace("simulated", "lab") + text, "LAB.toml")
     with pytest.raises(ConfigurationError, match=expected), open_rig(real, design_chart(bits=1)):
         pass
+
+
+@pytest.mark.parametrize("light", ["", 'shown_by = "jvc"\nhost = "h"\n', 'shown_by = "lightcrafter"\n'])
+def test_what_a_dry_run_opens_shows_nothing(light: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("FullScreen", "JvcFlatField", "LightCrafter"):
+        monkeypatch.setattr(f"acquisition.run.rig.lab.{name}", Mock(side_effect=AssertionError("the light was opened")))
+    monkeypatch.setattr("acquisition.run.rig.lab.display_warnings", Mock(return_value=("a bent ramp",)))
+    monkeypatch.setattr("acquisition.run.rig.lab.CanonEos", Mock())
+    real = parse_lab(HEAD.replace("simulated", "lab") + f"[lab.light]\n{light}", "LAB.toml")
+    with open_rig(real, design_chart(bits=1), shows=False) as devices:
+        answers = ask(devices)
+        assert ("a bent ramp" in answers.warnings, any("black" in said for said in answers.unasked)) in (
+            (True, False),
+            (False, True),
+        )
+        with pytest.raises(DeviceRefused):
+            devices.presenter.show(WHITE)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="names of sockets without files are Linux's")
+def test_a_lab_at_which_another_command_is_at_work_is_not_touched(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    lab = tmp_path / "LAB.toml"
+    lab.write_text(HEAD.replace("simulated", "lab"))
+    place = lab.stat()
+    program = f"from foundation.holds import hold\nwith hold('', 'lab {place.st_dev} {place.st_ino}'): print(), input()"
+    opened = Mock(side_effect=AssertionError("a device was opened"))
+    for name in ("FullScreen", "CanonEos", "display_warnings"):
+        monkeypatch.setattr(f"acquisition.run.rig.lab.{name}", opened)
+    with subprocess.Popen([sys.executable, "-uc", program], stdin=subprocess.PIPE, stdout=subprocess.PIPE) as other:
+        assert other.stdout is not None
+        other.stdout.readline()
+        for shows in (True, False):
+            with (
+                pytest.raises(DeviceRefused, match=f"process {other.pid}"),
+                open_rig(parse_lab(lab.read_text(), str(lab)), design_chart(bits=1), shows=shows),
+            ):
+                pass
+        other.communicate(b"\n")
 
 
 def test_an_unknown_language_is_named_with_the_known_ones() -> None:

@@ -133,7 +133,7 @@ def test_data_are_handed_on_as_they_come() -> None:
         ("ffffffff 01000000", "INIT_COMMAND_REQUEST packet of 4294967295 bytes"),
         ("0b000000 0a000000", "DATA packet of 11 bytes"),
         ("00000000 00000000", "type 0 and 0 bytes"),
-        ("48545450 2f312e31", "type 825110831"),
+        ("48545450 2f312e31", "an HTTP server answers"),
         ("13000000 07000000 0120 05000000 0000000000", "list of parameters"),
         ("26000000 07000000 0120 05000000" + "00" * 24, "0 to 5 of 4 bytes"),
         ("12000000 06000000 03000000 1091 05000000", "data phase"),

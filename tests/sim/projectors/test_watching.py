@@ -184,7 +184,7 @@ class Answers:
         (Answers(state=Power.STANDBY), LampState(0.0)),
         (Answers(state=Power.COOLING), LampState(0.0)),
         (Answers(state=Power.WARMING), LampState(WARMING_SHARE)),
-        (Answers(gone=True), LampState(0.0)),
+        (Answers(gone=True), LampState(0.0, trouble="nobody there")),
         (Answers(is_frozen=None, source=None), LampState(1.0)),
         (Answers(is_frozen=True), LampState(1.0, True, "31")),
     ],
