@@ -33,6 +33,12 @@ def group_of(scene: Scene) -> str:
     return str(getattr(scene, "group", scene.name))
 
 
+def groups_of(scenes: Sequence[Scene]) -> tuple[str, ...] | None:
+    """Return the group of each scene; None where no two share one."""
+    groups = tuple(map(group_of, scenes))
+    return groups if len(set(groups)) < len(groups) else None
+
+
 def choose_folds(data: SceneSet, text: str | None = None, seed: int = 0) -> tuple[npt.NDArray[np.int64], str]:
     """Return the fold of each image, (N,) int64 from 0, and where the folds come from, for the reader.
 
@@ -45,10 +51,10 @@ def choose_folds(data: SceneSet, text: str | None = None, seed: int = 0) -> tupl
         if is_number(text) or not (Path(text).suffix or Path(text).is_file()):
             raise InputError(f"--folds is {text!r}, expected a number from 2, or a CSV file with image,fold")
         return read_folds(Path(text), [scene.name for scene in data.scenes]), f"from {text}"
-    groups = {group_of(scene) for scene in data.scenes}
+    groups = groups_of(data.scenes)
     origin = f"drawn by seed {seed}"
-    if len(groups) < len(data.scenes):
-        origin += f", {len(groups)} groups of images kept together"
+    if groups is not None:
+        origin += f", {len(set(groups))} groups of images kept together"
     return draw_scene_folds(data.scenes, FOLDS if text is None else int(text), seed), origin
 
 
@@ -90,11 +96,13 @@ def draw_folds(count: int, folds: int, seed: int = 0, groups: Sequence[str] | No
 
 def draw_scene_folds(scenes: Sequence[Scene], folds: int, seed: int = 0) -> npt.NDArray[np.int64]:
     """Return the fold of each scene, (N,) int64 from 0, groups and copies kept together: the same for all commands."""
-    groups = [group_of(scene) for scene in scenes]
-    if len(set(groups)) == len(groups):
-        groups = [groups[first] for first in first_copies(scenes)]
-    # Names would be dealt in another order than numbers, and data sets without groups have none but their names.
-    return draw_folds(len(groups), folds, seed, None if len(set(groups)) == len(groups) else groups)
+    groups = groups_of(scenes)
+    if groups is None:
+        names = [scene.name for scene in scenes]
+        copied = tuple(names[first] for first in first_copies(scenes))
+        # Names would be dealt in another order than numbers, and data sets without groups have none but their names.
+        groups = copied if len(set(copied)) < len(copied) else None
+    return draw_folds(len(scenes), folds, seed, groups)
 
 
 def read_folds(path: Path, names: Sequence[str]) -> npt.NDArray[np.int64]:
