@@ -73,7 +73,8 @@ LAYOUTS: Mapping[str, Layout] = {
         "a dataset made by generate",
         "dataset.json",
         lambda folder: folder.has("dataset.json"),
-        lambda place, _, __: open_generated(place),
+        lambda place, options, _: open_generated(place, options.subset),
+        ("subset",),
         takes=None,
     ),
     "thumbnails": Layout(
