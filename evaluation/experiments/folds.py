@@ -77,12 +77,12 @@ def draw_folds(count: int, folds: int, seed: int = 0, groups: Sequence[str] | No
     kinds, member, sizes = np.unique(names, return_inverse=True, return_counts=True)
     if not _LEAST <= folds <= len(kinds):
         told = f"{count} images" + ("" if groups is None else f" in {len(kinds)} groups that stay together")
-        what = "images" if groups is None else "groups"
+        what, own = ("images", "an image") if groups is None else ("groups", "a group")
         if len(kinds) < _LEAST:
             needed = f"cross-validation needs {_LEAST} {what} at least; give more images"
         else:
             most = f"2 to {len(kinds)}" if len(kinds) > _LEAST else "2"
-            needed = f"each fold holds an image of its own; {most} folds are possible here (--folds)"
+            needed = f"each fold holds {own} of its own; {most} folds are possible here (--folds)"
         raise InputError(f"{counted(folds, 'fold')} of {told}: {needed}")
     order = np.random.default_rng(seed).permutation(len(kinds))
     # The largest groups first, each into the emptiest fold: sizes then differ by less than the largest group.
