@@ -73,10 +73,14 @@ def _require_methods_in_place(command: str, words: Sequence[str]) -> None:
                 right = f"evaluate {command} {value or behind} DATA"
                 raise InputError(f"evaluate {command} takes METHOD and DATA in this order, without {name}: {right}")
     if command == "run" and len(words) > 1 and not any(word.startswith("-") for word in words[:2]):
+        from evaluation.learning.standard import standard_learners
+
         data, method = words[:2]
-        if Path(method).exists() and not Path(data).exists():
+        if data in standard_learners() or (Path(method).exists() and not Path(data).exists()):
             data, method = method, data
         right = f"evaluate run {data} --method {method}"
+        if method in standard_learners():
+            right = f"evaluate cv {method} {data}, or evaluate train {method} {data} --out MODEL.npz; it learns first"
         raise InputError(f"evaluate run takes one data set, and methods behind --method: {right}")
 
 

@@ -27,6 +27,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Sequence
+from pathlib import PurePath
 
 from foundation.secret_texts import masked
 
@@ -171,3 +172,19 @@ def nearest_names(wanted: str, known: Iterable[str], most: int = 1) -> str:
 def first_of(things: Sequence[object], most: int = 10) -> str:
     """Return things between commas as a message names them: the first ones, and an ellipsis where there are more."""
     return ", ".join(map(str, things[:most])) + (" …" if len(things) > most else "")
+
+
+def kind_of(value: object) -> str:
+    """Return what a value is, for a message about a wrong argument: type and shape of an array, the text of a text.
+
+    Examples
+    --------
+    >>> kind_of("cat.png"), kind_of(3.5), kind_of([1, 2])
+    ("the text 'cat.png'", 'float 3.5', 'a list')
+    """
+    if isinstance(value, str | PurePath):
+        return f"the text {str(value)!r}"
+    if isinstance(value, int | float | None):
+        return "None" if value is None else f"{type(value).__name__} {value}"
+    shape, dtype = getattr(value, "shape", None), getattr(value, "dtype", None)
+    return f"a {type(value).__name__}" if dtype is None else f"an array {dtype} {shape}"

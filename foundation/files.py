@@ -16,6 +16,7 @@ import io
 import os
 import shutil
 import sys
+import tempfile
 from collections.abc import Callable, Generator
 from contextlib import contextmanager
 from io import BufferedRandom
@@ -42,10 +43,7 @@ _DISK_REMEDIES = {
     "ENOSPC": f"free space or choose another disk, {_AGAIN}",
     "EDQUOT": f"what this user may use of the disk is used up: remove files there, or ask for more, {_AGAIN}",
     "EFBIG": f"no file may be so large there (FAT32 ends at 4 GiB; ulimit -f): choose another disk, {_AGAIN}",
-    "EROFS": (
-        "the disk can only be read, as the system makes one on which it found errors: see what dmesg says, mount it "
-        f"for writing or choose another, {_AGAIN}"
-    ),
+    "EROFS": f"name another place, or mount it for writing (dmesg says if it was errors), {_AGAIN}",
     "EIO": (
         "the disk fails: see what dmesg says, check its cable, copy what is on it to another while it can be read, "
         f"{_AGAIN}"
@@ -285,15 +283,23 @@ def require_free(path: Path, what: str) -> None:
 
 
 def require_free_file(path: Path, what: str) -> None:
-    """Refuse when `path` exists, be it an empty folder."""
+    """Refuse when `path` exists, be it an empty folder, or nothing can be written there."""
     try:
         taken = path.exists() or path.is_symlink()
+        folder = next(above for above in path.absolute().parents if above.exists())
+        probed = not taken and folder.is_dir()
     except OSError as error:
         if disk_remedy_of(error) is None:
             raise
         raise storage_error(path, error, "look at") from error
     if taken:
         raise InputError(f"{path} already exists; name another place for {what}, or remove what is there")
+    if probed:
+        try:
+            # What permissions and mounts say is not always so: only a file that was made says that one can be.
+            tempfile.TemporaryFile(dir=folder).close()
+        except OSError as error:
+            raise storage_error(path, error) from error
 
 
 def publish_folder(folder: Path, path: Path, what: str) -> None:

@@ -29,6 +29,7 @@ from foundation.console import (
     json_output,
     loaded,
     new_app,
+    orderly_end,
     run,
 )
 from foundation.errors import InputError
@@ -50,6 +51,7 @@ if TYPE_CHECKING:
     from generator.dataset.making import Workers
     from generator.dataset.plan import Plan
     from generator.dataset.reader import Dataset
+    from generator.dataset.records import Description
 
 app = new_app()
 _explore_app = new_app()
@@ -267,7 +269,7 @@ def _make_whole(plan: Plan, out: str, workers: Workers, output: JsonOutput) -> D
     from generator.command.output import shown_progress
     from generator.dataset.making import make_dataset
 
-    with shown_progress(plan.total) as callbacks:
+    with orderly_end(), shown_progress(plan.total) as callbacks:
         dataset = make_dataset(plan, out, workers, callbacks)
     _print_summary(dataset, out, output)
     return dataset
@@ -279,7 +281,7 @@ def _make_share(plan: Plan, out: str, shard: str, workers: Workers, output: Json
 
     share = parse_share(shard)
     shards = range(share[0], plan.shards, share[1])
-    with shown_progress(sum(map(plan.images_of, shards))) as callbacks:
+    with orderly_end(), shown_progress(sum(map(plan.images_of, shards))) as callbacks:
         done, every = make_share(plan, out, share, workers, callbacks)
     output.add(dataset=masked(out), shard=shard, shards_done=done, shards=every)
     finish = f"make a dataset of them with generate --finish {out}"
@@ -326,8 +328,16 @@ def _print_summary(dataset: Dataset, out: str, output: JsonOutput, was_there: bo
     if made.rendering is not None and made.rendering.outside:
         print(
             f"{100 * made.rendering.outside:.2g} % of the pixels are of colours that the print cannot show; colours "
-            f"are {made.rendering.distance or 0:.2g} degrees off in the mean"
+            f"are {made.rendering.distance or 0:.2g} degrees off in the mean. Ground truths are the lights', and as "
+            f"exact as ever{_wider_print(made)}"
         )
+
+
+def _wider_print(made: Description) -> str:
+    """Return what shows more colours where the table was computed with a print whose codes are ink codes."""
+    computed = made.table.computed or {}
+    unmanaged = computed.get("room", {}).get("profile") == "unmanaged"
+    return "; sim table --print managed makes a table that shows more colours" if unmanaged else ""
 
 
 def _counted(number: int, thing: str) -> str:

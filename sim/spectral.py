@@ -242,10 +242,14 @@ def read_sensitivities(name: str, more: Sequence[str] = ()) -> Sensitivities:
         known = [*known_sensitivities(), *more]
         near = f"{nearest_names(name, known)} ".lstrip()
         raise InputError(
-            f"no camera {name!r}: cannot read such a file ({error.strerror}); {near}known by name are "
+            f"no camera {name!r}: {_unread(error)}; {near}known by name are "
             f"{', '.join(known)}; name one of them, or a file of spectral sensitivities"
         ) from error
     return parse_sensitivities(data, path.name.removesuffix(SUFFIX).removesuffix(".json"), str(path))
+
+
+def _unread(error: OSError) -> str:
+    return "there is no such file" if isinstance(error, FileNotFoundError) else f"cannot read it ({error.strerror})"
 
 
 def parse_sensitivities(data: bytes, name: str, where: str) -> Sensitivities:

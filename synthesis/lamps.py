@@ -213,6 +213,8 @@ def _named(name: str, known: list[str], given: str) -> list[str]:
         return [name]
     if re.fullmatch(r"[\d.:]+", name):
         hint = f"temperatures in kelvin end in K: {name}K for a black body, daylight:{name} for daylight"
+    elif span := re.fullmatch(r"(\d+)K?\s*-\s*(\d+)K?", name, re.ASCII | re.IGNORECASE):
+        hint = f"a range of black bodies has a step: {span[1]}:{span[2]}:500K"
     else:
         hint = nearest_names(name, [*known, *SETS], 3) or "name such as D65, A, FL2, LED-B3, cie-led"
     raise InputError(f"--lights {given}: there is no file and no published light {name!r}; {hint}")

@@ -35,7 +35,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 
 from calibration.citation import OriginRecord
 from experiment.lights import COLUMNS, NAME, Illumination, load_illuminations
-from foundation.errors import FormatError, StorageError
+from foundation.errors import FormatError, InputError, StorageError, kind_of
 from foundation.files import file_sha256, partial_path, read_text, reading_error, sha256_of, storage_error, write_whole
 from foundation.folders import require_plain_folder
 from foundation.records import Record, from_json
@@ -412,6 +412,12 @@ class Lut:
     white: npt.NDArray[np.float64]
     provenance: Provenance
 
+    def __repr__(self) -> str:
+        """Return one line: provenance alone would be some hundred kilobytes."""
+        lights, colours, samples, _ = self.samples.shape
+        told = f"{lights} lights, {colours} colours of {samples} samples"
+        return f"Lut({str(self.folder)!r}, {self.provenance.camera}, {told})"
+
     @cached_property
     def ground_truth(self) -> npt.NDArray[np.float64]:
         """(L, 3) float64, the lights' chromaticities, r + g + b = 1."""
@@ -569,6 +575,12 @@ def _load_white(path: Path) -> npt.NDArray[np.float64]:
     if not ((white > 0).all() and (white < MOST_WHITE).all()):
         raise FormatError(f"{path}: a ground truth is not between 0 and {MOST_WHITE}; build the table again")
     return white
+
+
+def require_lut(given: object) -> None:
+    """Refuse what is no table, such as the path of one, or a picture in its place."""
+    if not isinstance(given, Lut):
+        raise InputError(f"the table is {kind_of(given)}, expected a Lut, which open_lut(FOLDER) returns, as first")
 
 
 class LutWriter:

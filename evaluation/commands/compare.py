@@ -26,6 +26,8 @@ Reads one or two RESULTS: results folders, or the errors.csv in them. Of one, ev
 two, each method that both have. Images are matched by their names; images that one of them lacks are named and left
 out, and ground truths that differ are refused.
 
+Images of one group, such as one picture under several lights, count as one: whole groups are tested and drawn.
+
 Prints Wilcoxon's signed-rank test and a sentence for each comparison; of up to three comparisons, and with --images of
 all, also each statistic's difference and ratio with bootstrap intervals, and the images that differ most. Writes
 nothing unless asked with --out.
@@ -81,6 +83,7 @@ def compare(
     notes = (
         *comparing.notes_of(comparisons),
         *_unchecked(runs, results),
+        *_ungrouped(runs, results),
         *_unlike(results),
         *_guessed(runs, results),
         *_indistinct(comparisons, results),
@@ -197,6 +200,29 @@ def _unchecked(runs: Sequence[Mapping[str, MethodErrors]], places: Sequence[str]
         f"{place} holds no ground truths: whether they agree is not known"
         for run, place in zip(runs, places, strict=True)
         if len(runs) == 2 and any(method.truths is None for method in run.values())
+    ]
+
+
+def _ungrouped(runs: Sequence[Mapping[str, MethodErrors]], places: Sequence[str]) -> list[str]:
+    """Return a sentence for results of generated images that do not say which are of one picture.
+
+    Results of before `groups` stood in `run.json` have no column of groups even where images share their pictures.
+    """
+    if any(method.groups is not None for run in runs for method in run.values()):
+        return []
+
+    def silent(place: str) -> bool:
+        try:
+            about = _run_json(place)["data_set"]
+            return about["layout"] == "generated" and "groups" not in about
+        except (KeyError, TypeError):
+            return False
+
+    return [
+        f"{place} does not say which images are of one picture: where some are, they are not independent, and p and "
+        "intervals are too small; run the methods again to have them counted by picture"
+        for place in places
+        if silent(place)
     ]
 
 

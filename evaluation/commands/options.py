@@ -94,8 +94,8 @@ class DataReading:
         str | None,
         _reading_option(
             "NAME",
-            "Part of the data set: train or test of simple-cube++; lab_printouts … of intel-tau; train, val, test, "
-            "single, mixed or test-mixed … of lsmi. \\[default: all]",
+            "Part of the data set: train, validation or test of generated or (train, test) of simple-cube++; "
+            "lab_printouts … of intel-tau; train, val, test, single, mixed or test-mixed … of lsmi. \\[default: all]",
         ),
     ] = None
     truth: Annotated[

@@ -43,7 +43,7 @@ def train(
     method: Annotated[str, argument("METHOD", f"One of {LEARNERS_HELP}.")],
     data: Data,
     *,
-    out: Annotated[Path, option("MODEL.npz", "The new file to write the model to.")],
+    out: Annotated[Path, option("MODEL.npz", "The new file to write the model to; its folder is made if missing.")],
     adapt: Annotated[
         Path | None, option("MODEL.npz", "Adapt this model of the same method to DATA, in place of training anew.")
     ] = None,

@@ -129,7 +129,7 @@ def transfer(
     from dataclasses import asdict, replace
 
     from evaluation.datasets import open_scenes
-    from evaluation.experiments.folds import FOLDS, choose_folds
+    from evaluation.experiments.folds import FOLDS, choose_folds, groups_of
     from evaluation.experiments.transfer.outcome import TransferOutcome, figures_of, harm_notes, save_outcome
     from evaluation.experiments.transfer.plan import is_generated, plan_transfer
     from evaluation.experiments.transfer.rows import count_images
@@ -167,7 +167,7 @@ def transfer(
             counted=places,
         )
     plan = replace(plan, notes=(*plan.notes, *_suspicions(counted, rows)))
-    figures = figures_of(rows, error)
+    figures = figures_of(rows, error, groups=groups_of(counted.scenes))
     plan = replace(plan, notes=(*plan.notes, *harm_notes(figures)))
     settings: dict[str, Any] = {
         "methods": [describe_method(learner) for learner in learners],

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 
+from evaluation.datasets.options import choose
 from evaluation.scene import SceneSet
+from foundation.errors import InputError
 from foundation.secret_texts import masked
 from generator.dataset.reader import Dataset, open_dataset
-from generator.dataset.records import Entry
+from generator.dataset.records import SPLITS, Entry
 
 
 @dataclass(frozen=True)
@@ -64,9 +66,21 @@ class GeneratedMixedScene(GeneratedScene):
         return self.dataset.read_ground_truth_map(self.entry)
 
 
-def open_generated(place: Path | str) -> SceneSet:
-    """Return a dataset made by `generate`; images are read when they are evaluated."""
+def open_generated(place: Path | str, subset: str | None = None) -> SceneSet:
+    """Return a dataset made by `generate`, or one part of it; images are read when they are evaluated.
+
+    `subset`: train, validation or test of `generate --split`; a picture is in one part with all its images.
+    """
     dataset = open_dataset(place)
+    parts = [part for part in SPLITS if any(entry.split == part for entry in dataset.entries)]
+    if subset is not None and not parts:
+        raise InputError(
+            f"--subset is {subset}, but {masked(str(place))} was not divided; generate --split 0.8,0.1,0.1 divides a "
+            "dataset by pictures, and evaluate cv keeps the images of a picture in one fold without that"
+        )
+    part = choose(subset, parts, "subset", masked(str(place)))
+    if part is not None:
+        dataset = replace(dataset, entries=tuple(entry for entry in dataset.entries if entry.split == part))
     table = dataset.description.table
     white = table.white_level
     # Whoever reads results must see that no camera took a photograph of these colours.
@@ -80,7 +94,7 @@ def open_generated(place: Path | str) -> SceneSet:
     known = max((one for one in stated if one is not None), default=None) if None not in stated else None
     within = "" if known is None else f"; its direction is known to {known:.2g} degrees at worst (k = 2)"
     return SceneSet(
-        name=_name_of(str(place)),
+        name=_name_of(str(place)) + (f" {part}" if part else ""),
         layout="generated",
         place=masked(str(place)),
         scenes=tuple(

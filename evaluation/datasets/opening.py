@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from evaluation.datasets.ffcc import is_ffcc, open_ffcc
-from evaluation.datasets.files import Folder, RawScene, pedestal_note, require_above_black
+from evaluation.datasets.files import IMAGE_ENDINGS, Folder, RawScene, pedestal_note, require_above_black
 from evaluation.datasets.generated import open_generated
 from evaluation.datasets.options import DataOptions
 from evaluation.datasets.plain_folder import ASSUMED_BLACK, is_plain_folder, open_plain_folder, require_no_other_table
@@ -25,7 +25,7 @@ from evaluation.datasets.published.lsmi import is_lsmi, open_lsmi
 from evaluation.datasets.published.nus8 import is_nus8, open_nus8
 from evaluation.datasets.thumbnails import open_thumbnails
 from evaluation.scene import SceneSet
-from foundation.errors import FormatError, InputError
+from foundation.errors import FormatError, InputError, first_of
 
 _LEVELS = ("black", "saturation")
 
@@ -73,7 +73,8 @@ LAYOUTS: Mapping[str, Layout] = {
         "a dataset made by generate",
         "dataset.json",
         lambda folder: folder.has("dataset.json"),
-        lambda place, _, __: open_generated(place),
+        lambda place, options, _: open_generated(place, options.subset),
+        ("subset",),
         takes=None,
     ),
     "thumbnails": Layout(
@@ -271,6 +272,13 @@ def _recognise(place: str) -> tuple[str, Folder | None]:
     folder = Folder(path)
     found = [name for name, known in LAYOUTS.items() if not known.general and known.matches(folder)]
     found = found or [name for name, known in LAYOUTS.items() if known.general and known.matches(folder)]
+    pictures = [name for name in folder.files if name.lower().endswith((*IMAGE_ENDINGS, ".jpg", ".jpeg"))]
+    if not found and pictures and not any(name.endswith((".csv", ".mat", ".txt", ".json")) for name in folder.files):
+        raise FormatError(
+            f"{place} is no dataset: pictures ({first_of(pictures)}) without ground truths; name a published set's "
+            "whole folder, put a .csv with image,r,g,b beside images of 16 bits, or make a dataset of pictures: "
+            f"generate LUT OUT --sources {place}"
+        )
     if not found:
         require_no_other_table(folder)
         signs = "; ".join(f"{known.signs} ({name})" for name, known in LAYOUTS.items())

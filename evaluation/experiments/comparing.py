@@ -4,6 +4,9 @@ The same images lie under both, so everything is paired: the signed-rank test (F
 ranking methods", Biometrics Bulletin 1 (1945) 80-83), whose recommendation for colour constancy is S. D. Hordley,
 G. D. Finlayson, "Reevaluation of color constancy algorithm performance", JOSA A 23 (2006) 1008-1020; intervals of the
 differences and ratios of all statistics (`bootstrap.paired`); and the images on which the two differ most.
+
+Images of one picture or place are no independent images. Where results say which belong together, the test is of the
+groups' mean errors and the bootstrap draws whole groups: a thousand images of fifteen pictures are fifteen cases.
 """
 
 from __future__ import annotations
@@ -17,7 +20,7 @@ import numpy as np
 import numpy.typing as npt
 from markupsafe import Markup
 
-from evaluation.experiments.bootstrap import STATISTICS, Compared, paired
+from evaluation.experiments.bootstrap import STATISTICS, Compared, numbered, paired
 from evaluation.metrics import ErrorKind
 from evaluation.reports.table_output import table_part, tables_to_latex
 from evaluation.results.files import MethodErrors
@@ -99,6 +102,8 @@ class Matched:
     - `images`: N names, in the first's order, at least one.
     - `one`, `other`: (N,) float64 each, degrees.
     - `missing`: images that only the other has, and images that only the one has.
+    - `groups`: what each image shares with others, such as its picture; None if every image is one of its own, or
+      neither says.
     """
 
     names: tuple[str, str]
@@ -107,18 +112,33 @@ class Matched:
     one: npt.NDArray[np.float64]
     other: npt.NDArray[np.float64]
     missing: tuple[tuple[str, ...], tuple[str, ...]] = ((), ())
+    groups: tuple[str, ...] | None = None
+
+    @property
+    def cases(self) -> str:
+        """What is independent, and counted by the test, in words."""
+        images = counted(len(self.images), "image")
+        return images if self.groups is None else f"{counted(len(set(self.groups)), 'group')} of {images}"
+
+    def case_errors(self) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+        """Return the errors of both, (C,) float64 each, degrees: a mean for each group, or the images' own."""
+        if self.groups is None:
+            return self.one, self.other
+        numbers = numbered(self.groups)
+        sizes = np.bincount(numbers)
+        return np.bincount(numbers, self.one) / sizes, np.bincount(numbers, self.other) / sizes
 
 
 @dataclass(frozen=True)
 class SignedRank:
     """Wilcoxon's signed-rank test of paired errors.
 
-    - `wins`, `losses`, `ties`: images on which the one's error is smaller, larger, equal.
+    - `wins`, `losses`, `ties`: images, or groups of them, on which the one's error is smaller, larger, equal.
     - `p`: two-sided probability of a rank sum as uneven as this where neither is better. Equal errors are ranked and
       then left out (J. W. Pratt, JASA 54 (1959) 655-667). Exact up to 50 images where none are equal, else from the
       normal distribution that the rank sum tends to, corrected for ties.
     - `effect`: matched-pairs rank-biserial correlation (D. S. Kerby, Comprehensive Psychology 3 (2014)): (losses -
-      wins) / all as shares of the rank sum; -1 where the one is better on every image, 0 where neither is, 1 where it
+      wins) / all as shares of the rank sum; -1 where the one is better on every one, 0 where neither is, 1 where it
       is worse.
     """
 
@@ -165,6 +185,9 @@ def match(one: MethodErrors, other: MethodErrors, names: tuple[str, str], kind: 
                 "the same"
             )
     here = set(one.images)
+    known: tuple[str, ...] = ()
+    for side, chosen in ((other, [place for _, place in both]), (one, [place for place, _ in both])):
+        known = known if side.groups is None else tuple(side.groups[place] for place in chosen)
     return Matched(
         names=names,
         kind=kind,
@@ -175,13 +198,14 @@ def match(one: MethodErrors, other: MethodErrors, names: tuple[str, str], kind: 
             tuple(image for image in other.images if image not in here),
             tuple(image for image in one.images if image not in places),
         ),
+        groups=known if len(set(known)) < len(known) else None,
     )
 
 
 def signed_rank(one: npt.ArrayLike, other: npt.ArrayLike) -> SignedRank:
     """Return the signed-rank test of paired errors.
 
-    `one`, `other`: (N,) float each, degrees, in the same order of images.
+    `one`, `other`: (N,) float each, degrees, in the same order of images, which are independent of each other.
 
     Examples
     --------
@@ -222,10 +246,10 @@ def holm(probabilities: Sequence[float]) -> list[float]:
 
 def compare(pairs: Sequence[Matched], seed: int = 0, level: float = 0.95) -> tuple[Comparison, ...]:
     """Return the comparison of each pair; their p-values are corrected for one another."""
-    tests = [signed_rank(pair.one, pair.other) for pair in pairs]
+    tests = [signed_rank(*pair.case_errors()) for pair in pairs]
     corrected = holm([test.p for test in tests])
     return tuple(
-        Comparison(pair, test, p, paired(pair.one, pair.other, seed, level=level))
+        Comparison(pair, test, p, paired(pair.one, pair.other, seed, level=level, groups=pair.groups))
         for pair, test, p in zip(pairs, tests, corrected, strict=True)
     )
 
@@ -244,8 +268,7 @@ def verdict(comparison: Comparison, level: float = 0.95) -> str:
     """Return in one sentence what a comparison says, and whether chance would explain it."""
     matched, test = comparison.matched, comparison.test
     one, other = matched.names
-    images = counted(len(matched.images), "image")
-    told = f"{one} errs less than {other} on {test.wins} of {images}, more on {test.losses}"
+    told = f"{one} errs less than {other} on {test.wins} of {matched.cases}, more on {test.losses}"
     told += f", the same on {test.ties}" if test.ties else ""
     if comparison.p_holm > 1 - level:
         return f"{told}: not significant (Holm-corrected p = {comparison.p_holm:.2g})."
@@ -275,18 +298,30 @@ _LABELLED = 5
 
 METHOD = (
     "Wilcoxon signed-rank test, two-sided; equal errors are ranked and then left out (Pratt).",
-    "Effect: matched-pairs rank-biserial correlation, -1: the first errs less on every image; 1: more on every one.",
+    "Effect: matched-pairs rank-biserial correlation, -1: the first errs less on every one; 1: more on every one.",
 )
 """What the numbers of `tests_table` are."""
+
+GROUPED = (
+    "Images of one group, such as one picture under several lights, are not independent: tested are the groups' mean "
+    "errors, and counts are of groups."
+)
+"""What they are besides where images belong together."""
 
 
 def tests_table(comparisons: Sequence[Comparison]) -> Table:
     """Return the signed-rank tests, a row a comparison."""
     several = len(comparisons) > 1
-    notes = (*METHOD, *((f"p (Holm) is corrected for the {len(comparisons)} comparisons here.",) if several else ()))
+    grouped = any(made.matched.groups is not None for made in comparisons)
+    notes = (
+        *METHOD,
+        *((f"p (Holm) is corrected for the {len(comparisons)} comparisons here.",) if several else ()),
+        *((GROUPED,) if grouped else ()),
+    )
+    heads = ("First", "Second", "p", "p (Holm)", "Effect", "Images", *(("Groups",) if grouped else ()))
     return Table(
         f"Paired {comparisons[0].matched.kind} errors",
-        ("First", "Second", "p", "p (Holm)", "Effect", "Images", "First better", "Second better", "Equal"),
+        (*heads, "First better", "Second better", "Equal"),
         tuple(
             (
                 *made.matched.names,
@@ -294,6 +329,7 @@ def tests_table(comparisons: Sequence[Comparison]) -> Table:
                 f"{made.p_holm:.2g}",
                 made.test.effect,
                 len(made.matched.images),
+                *([len(set(made.matched.groups or made.matched.images))] if grouped else []),
                 made.test.wins,
                 made.test.losses,
                 made.test.ties,
@@ -307,16 +343,22 @@ def tests_table(comparisons: Sequence[Comparison]) -> Table:
 def statistics_table(comparison: Comparison, level: float) -> Table:
     """Return every statistic of one comparison, with difference and ratio."""
     one, other = comparison.matched.names
-    images = counted(len(comparison.matched.images), "image")
+    matched = comparison.matched
+    over = "images" if matched.groups is None else "groups of images"
+    single = matched.groups is not None and len(set(matched.groups)) == 1
     return Table(
-        f"{one} against {other}: {comparison.matched.kind} errors of {images}, degrees",
+        f"{one} against {other}: {matched.kind} errors of {matched.cases}, degrees",
         ("Statistic", "First", "Second", "Difference", "from", "to", "Ratio", "ratio from", "ratio to"),
         tuple(
-            (_HEADS[made.statistic], made.one, made.other, *made.difference, *(_known(number) for number in made.ratio))
+            (_HEADS[made.statistic], made.one, made.other, *map(_known, (*made.difference, *made.ratio)))
             for made in comparison.statistics
         ),
         digits=3,
-        notes=(f"Intervals of {level:.0%}: BCa bootstrap over images, 2000 resamples, the same for both.",),
+        notes=(
+            "No intervals: all images are of one group, and what it comes to says nothing of others."
+            if single
+            else f"Intervals of {level:.0%}: BCa bootstrap over {over}, 2000 resamples, the same for both.",
+        ),
     )
 
 
@@ -400,10 +442,12 @@ def _statistics_csv(comparisons: Sequence[Comparison]) -> str:
 
 
 def _images_csv(comparisons: Sequence[Comparison]) -> str:
-    rows: list[tuple[str, ...]] = [("first", "second", "image", "first_deg", "second_deg", "difference_deg")]
+    heads = ("first", "second", "image", "first_deg", "second_deg", "difference_deg", "group")
+    rows: list[tuple[str, ...]] = [heads]
     for made in comparisons:
         matched = made.matched
-        for image, one, other in zip(matched.images, matched.one, matched.other, strict=True):
+        groups = matched.groups or matched.images
+        for image, one, other, group in zip(matched.images, matched.one, matched.other, groups, strict=True):
             numbers = (f"{number:.6f}" for number in (one, other, one - other))
-            rows.append((*matched.names, image, *numbers))
+            rows.append((*matched.names, image, *numbers, group))
     return csv_text(rows)

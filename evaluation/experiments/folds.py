@@ -33,6 +33,12 @@ def group_of(scene: Scene) -> str:
     return str(getattr(scene, "group", scene.name))
 
 
+def groups_of(scenes: Sequence[Scene]) -> tuple[str, ...] | None:
+    """Return the group of each scene; None where no two share one."""
+    groups = tuple(map(group_of, scenes))
+    return groups if len(set(groups)) < len(groups) else None
+
+
 def choose_folds(data: SceneSet, text: str | None = None, seed: int = 0) -> tuple[npt.NDArray[np.int64], str]:
     """Return the fold of each image, (N,) int64 from 0, and where the folds come from, for the reader.
 
@@ -45,10 +51,10 @@ def choose_folds(data: SceneSet, text: str | None = None, seed: int = 0) -> tupl
         if is_number(text) or not (Path(text).suffix or Path(text).is_file()):
             raise InputError(f"--folds is {text!r}, expected a number from 2, or a CSV file with image,fold")
         return read_folds(Path(text), [scene.name for scene in data.scenes]), f"from {text}"
-    groups = {group_of(scene) for scene in data.scenes}
+    groups = groups_of(data.scenes)
     origin = f"drawn by seed {seed}"
-    if len(groups) < len(data.scenes):
-        origin += f", {len(groups)} groups of images kept together"
+    if groups is not None:
+        origin += f", {len(set(groups))} groups of images kept together"
     return draw_scene_folds(data.scenes, FOLDS if text is None else int(text), seed), origin
 
 
@@ -71,12 +77,12 @@ def draw_folds(count: int, folds: int, seed: int = 0, groups: Sequence[str] | No
     kinds, member, sizes = np.unique(names, return_inverse=True, return_counts=True)
     if not _LEAST <= folds <= len(kinds):
         told = f"{count} images" + ("" if groups is None else f" in {len(kinds)} groups that stay together")
-        what = "images" if groups is None else "groups"
+        what, own = ("images", "an image") if groups is None else ("groups", "a group")
         if len(kinds) < _LEAST:
             needed = f"cross-validation needs {_LEAST} {what} at least; give more images"
         else:
             most = f"2 to {len(kinds)}" if len(kinds) > _LEAST else "2"
-            needed = f"each fold holds an image of its own; {most} folds are possible here (--folds)"
+            needed = f"each fold holds {own} of its own; {most} folds are possible here (--folds)"
         raise InputError(f"{counted(folds, 'fold')} of {told}: {needed}")
     order = np.random.default_rng(seed).permutation(len(kinds))
     # The largest groups first, each into the emptiest fold: sizes then differ by less than the largest group.
@@ -90,11 +96,13 @@ def draw_folds(count: int, folds: int, seed: int = 0, groups: Sequence[str] | No
 
 def draw_scene_folds(scenes: Sequence[Scene], folds: int, seed: int = 0) -> npt.NDArray[np.int64]:
     """Return the fold of each scene, (N,) int64 from 0, groups and copies kept together: the same for all commands."""
-    groups = [group_of(scene) for scene in scenes]
-    if len(set(groups)) == len(groups):
-        groups = [groups[first] for first in first_copies(scenes)]
-    # Names would be dealt in another order than numbers, and data sets without groups have none but their names.
-    return draw_folds(len(groups), folds, seed, None if len(set(groups)) == len(groups) else groups)
+    groups = groups_of(scenes)
+    if groups is None:
+        names = [scene.name for scene in scenes]
+        copied = tuple(names[first] for first in first_copies(scenes))
+        # Names would be dealt in another order than numbers, and data sets without groups have none but their names.
+        groups = copied if len(set(copied)) < len(copied) else None
+    return draw_folds(len(scenes), folds, seed, groups)
 
 
 def read_folds(path: Path, names: Sequence[str]) -> npt.NDArray[np.int64]:

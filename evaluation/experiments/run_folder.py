@@ -23,7 +23,7 @@ import numpy as np
 import numpy.typing as npt
 
 from evaluation.datasets.identity import known_again, state_of
-from evaluation.experiments.folds import folds_to_csv
+from evaluation.experiments.folds import folds_to_csv, groups_of
 from evaluation.experiments.running import SceneMethod, answer_scenes, require_truths
 from evaluation.experiments.suspicions import suspicions
 from evaluation.learning.model_files import StoredMethod, TrainingRecord, scenes_sha256
@@ -199,6 +199,7 @@ def describe_run(
             data.name,
             tuple(scene.name for scene in data.scenes),
             tuple(isinstance(scene, MixedScene) for scene in data.scenes),
+            groups_of(data.scenes),
         ),
         layout=data.layout,
         place=data.place,
@@ -333,6 +334,7 @@ def _files(run: Run, kind: ErrorKind, pictures: Mapping[tuple[int, int], bytes])
             "place": run.place,
             "images": len(subject.images),
             "images_under_several_lights": sum(subject.mixed),
+            "groups": len(set(subject.groups or subject.images)),
             "sha256": run.data_sha256,
             **({} if run.truth_uncertainty_deg is None else {"truth_uncertainty_deg": run.truth_uncertainty_deg}),
         },
@@ -346,7 +348,7 @@ def _files(run: Run, kind: ErrorKind, pictures: Mapping[tuple[int, int], bytes])
     texts = {
         "run.json": run_json(content),
         "results.csv": table_to_csv(statistics_rows(subject, results)),
-        ERRORS_FILE: errors_csv(subject.images, run.truths, results),
+        ERRORS_FILE: errors_csv(subject.images, run.truths, results, subject.groups),
         "table.tex": "\n".join(map(table_to_latex, tables)),
         "report.html": run_page(run, kind, pictures),
         "pixels.csv": pixels,

@@ -1,9 +1,9 @@
 """The files of a results folder that other programs read, and their estimates: `errors.csv`, `run.json`.
 
 A line of `errors.csv` has the columns `image`, `method`, the estimate, the truth (`truth_r`, `truth_g`, `truth_b`),
-`recovery` and `reproduction` in degrees, and `guessed`. Columns are found by their names, so others may stand between
-them. A file without the truth's columns, or without `guessed`, is read too: its truths are not known, and no image is
-guessed.
+`recovery` and `reproduction` in degrees, `guessed`, and, where images belong together, `group`. Columns are found by
+their names, so others may stand between them. A file without the truth's columns, or without `guessed`, is read too:
+its truths are not known, and no image is guessed.
 
 Estimates that another program has made are `image,r,g,b`, one line an image of the data set, with a head or without;
 commas, semicolons or tabs separate. An image is named as the data set names it, or without its extension. Every image
@@ -51,6 +51,8 @@ class MethodErrors:
     - `errors`: kind of error to (N,) float64, degrees.
     - `guessed`: (N,) bool, True where no pixel was usable and the estimate is therefore grey.
     - `estimates`: (N, 3) float64, linear camera RGB of any length; None where the file does not hold them all.
+    - `groups`: what each image shares with others, such as the picture that it was made from; None where the file does
+      not hold them all.
     """
 
     method: str
@@ -59,6 +61,7 @@ class MethodErrors:
     errors: Mapping[ErrorKind, npt.NDArray[np.float64]]
     guessed: npt.NDArray[np.bool_]
     estimates: npt.NDArray[np.float64] | None = None
+    groups: tuple[str, ...] | None = None
 
 
 def read_errors(place: Path | str) -> dict[str, MethodErrors]:
@@ -76,7 +79,7 @@ def read_errors(place: Path | str) -> dict[str, MethodErrors]:
             "evaluate run writes them"
         )
     known = all(name in columns for name in _TRUTH)
-    found: dict[str, dict[str, tuple[list[float], bool, list[float]]]] = {}
+    found: dict[str, dict[str, _Line]] = {}
     for row in rows:
         where = f"{path}, line {rows.line_num}"
         wanted = (*_KINDS, *(_TRUTH if known else ()))
@@ -89,22 +92,29 @@ def read_errors(place: Path | str) -> dict[str, MethodErrors]:
         images = found.setdefault(row["method"] or "", {})
         if row["image"] in images:
             raise FormatError(f"{where}: {row['method']} on {row['image']} stands there a second time; remove one")
-        images[row["image"]] = numbers, _GUESSED[guessed], [_estimate(row.get(name)) for name in _ESTIMATE]
+        estimate = [_estimate(row.get(name)) for name in _ESTIMATE]
+        images[row["image"]] = numbers, _GUESSED[guessed], estimate, row.get("group") or ""
     if not found:
         raise FormatError(f"{path} has no line of errors below its head; run the methods again")
     return {method: _errors_of(method, images, known) for method, images in found.items()}
 
 
-def _errors_of(method: str, images: Mapping[str, tuple[list[float], bool, list[float]]], known: bool) -> MethodErrors:
-    numbers = np.array([line for line, _, _ in images.values()])
-    estimates = np.array([estimate for _, _, estimate in images.values()])
+_Line = tuple[list[float], bool, list[float], str]
+"""Of an image: errors and truth, whether it was guessed, the estimate, and its group."""
+
+
+def _errors_of(method: str, images: Mapping[str, _Line], known: bool) -> MethodErrors:
+    numbers = np.array([line[0] for line in images.values()])
+    estimates = np.array([line[2] for line in images.values()])
+    groups = tuple(line[3] for line in images.values())
     return MethodErrors(
         method=method,
         images=tuple(images),
         truths=numbers[:, 2:] if known else None,
         errors={kind: numbers[:, place] for place, kind in enumerate(_KINDS)},
-        guessed=np.array([guessed for _, guessed, _ in images.values()]),
+        guessed=np.array([line[1] for line in images.values()]),
         estimates=estimates if np.isfinite(estimates).all() else None,
+        groups=groups if all(groups) else None,
     )
 
 
@@ -127,18 +137,25 @@ RUN_FORMAT = "crop.run"
 """What `run.json` says of itself."""
 
 
-def errors_csv(images: Sequence[str], truths: npt.NDArray[np.float64], results: Sequence[Result]) -> str:
+def errors_csv(
+    images: Sequence[str],
+    truths: npt.NDArray[np.float64],
+    results: Sequence[Result],
+    groups: Sequence[str] | None = None,
+) -> str:
     """Return every estimate, truth and error as CSV text: `errors.csv`.
 
-    The columns are image, method, r, g, b, truth_r, truth_g, truth_b, recovery, reproduction, guessed, cause. Lights
-    have the sum 1, errors are degrees; `guessed` is 1 where the method gave no light and grey stands in for it, `cause`
-    says why.
+    The columns are image, method, r, g, b, truth_r, truth_g, truth_b, recovery, reproduction, guessed, cause, and group
+    where images belong together. Lights have the sum 1, errors are degrees; `guessed` is 1 where the method gave no
+    light and grey stands in for it, `cause` says why.
 
-    `truths`: (N, 3) float64, camera RGB of any length.
+    `truths`: (N, 3) float64, camera RGB of any length. `groups`: what each of the N images shares with others; None if
+    every image is one of its own.
     """
     shares = truths / truths.sum(axis=1, keepdims=True)
     given = [result.estimates / result.estimates.sum(axis=1, keepdims=True) for result in results]
-    rows: list[tuple[object, ...]] = [("image", "method", *_ESTIMATE, *_TRUTH, *_KINDS, "guessed", "cause")]
+    shared = [] if groups is None else ["group"]
+    rows: list[tuple[object, ...]] = [("image", "method", *_ESTIMATE, *_TRUTH, *_KINDS, "guessed", "cause", *shared)]
     for place, image in enumerate(images):
         for result, estimates in zip(results, given, strict=True):
             numbers = (*estimates[place], *shares[place])
@@ -150,6 +167,7 @@ def errors_csv(images: Sequence[str], truths: npt.NDArray[np.float64], results: 
                     *(f"{part:.9f}" for part in numbers),
                     *(f"{error:.6f}" for error in errors),
                     *(int(result.guessed[place]), cause),
+                    *([] if groups is None else [groups[place]]),
                 )
             )
     return csv_text(rows)

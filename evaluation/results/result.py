@@ -207,11 +207,14 @@ class Subject:
     - `name`: the data set's name.
     - `images`: the images' names.
     - `mixed`: whether several lights fall on each image.
+    - `groups`: what each image shares with others, such as the picture that it was made from; None if every image is
+      one of its own.
     """
 
     name: str
     images: tuple[str, ...]
     mixed: tuple[bool, ...]
+    groups: tuple[str, ...] | None = None
 
 
 @dataclass(frozen=True, eq=False)

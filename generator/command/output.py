@@ -48,20 +48,20 @@ class _Images:
     def __init__(self, total: int, shown: ExitStack) -> None:
         self._total = total
         self._shown = shown
-        self._made = self._found = 0
+        self._made = self._found = self._told = 0
         self._began = time.monotonic()
         self._bar: Progress | None = None
 
     def leave_out(self, images: int) -> None:
-        """Show that more images are found finished; less than 0 takes some back."""
+        """Count more images that are found finished; less than 0 takes some back."""
         self._total -= images
-        if images > 0:
-            self._print(f"{images}{' more' if self._found else ''} images were found finished")
         self._found += images
 
     def advance(self) -> None:
         """Show that one more image is made, and the mean rate: a cluster reports the images of a shard at once."""
         self._made += 1
+        if not self._told:
+            self._tell_found()
         if self._bar is None and sys.stderr.isatty() and time.monotonic() - self._began > SOON_S:
             self._bar = self._shown.enter_context(_bar())
             self._bar.add_task("images", total=self._total, rate="", left="")
@@ -78,9 +78,16 @@ class _Images:
         self._print(sentence, style="yellow")
 
     def end(self) -> None:
-        """Show what was made, where no bar does."""
+        """Show what was found of shards that were taken up later, and what was made, where no bar does."""
+        self._tell_found()
         if self._bar is None:
             print(f"images {self._made}/{self._total} {self._rate():.1f}/s", file=sys.stderr)
+
+    def _tell_found(self) -> None:
+        """Show how many images were found finished in all; shards that were begun are found one after another."""
+        if self._found > self._told:
+            self._print(f"{self._found} images were found finished" + (" in all" if self._told else ""))
+            self._told = self._found
 
     def _rate(self) -> float:
         return self._made / max(time.monotonic() - self._began, 0.1)

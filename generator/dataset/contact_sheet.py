@@ -127,7 +127,8 @@ def _draw(dataset: Dataset, max_rows: int, max_columns: int) -> Figure:
     camera = table.camera if table.computed is None else f"{table.camera}, computed"
     sources = len({entry.source for entry in dataset.entries})
     things = "pictures" if sources == made.images else "images"
-    shown = f"; {sum(map(len, grid))} of {made.images} {things} shown" if alone else ""
+    count = sum(map(len, grid))
+    shown = f"; {count} of {made.images} {things} shown" if alone or count < made.images else ""
     put(margin, 0.5, camera, 13, weight="bold")
     put(
         margin,
@@ -160,7 +161,9 @@ def _draw(dataset: Dataset, max_rows: int, max_columns: int) -> Figure:
             name = _short(entry.source, _NAME) if alone else _short(entry.source)
             put(margin + column * (cell + gap), under + 0.17, name, 7, _FAINT, style="italic")
         top += heights[row] + below
-    put(margin, height - 0.25, "Tone mapped with the Flash operator; camera RGB, no white balance", 6.5, _FAINT)
+    put(
+        margin, height - 0.25, "Tone mapped (Flash), each exposed for itself; camera RGB, no white balance", 6.5, _FAINT
+    )
     return figure
 
 

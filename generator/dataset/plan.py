@@ -177,15 +177,19 @@ class DatasetOptions:
         if self.crops < 1:
             raise InputError(f"{self.crops} crops of each picture were asked for, expected 1 or more")
         split = self.split
-        if split is not None and not (len(split) == 3 and min(split) >= 0 and abs(sum(split) - 1) < 1e-6):
+        if split is not None and not (len(split) == 3 and min(split) >= 0 and abs(sum(split) - 1) < _ROUNDED):
             shares = ",".join(f"{share:g}" for share in split)
             raise InputError(f"the split {shares} is to be three shares from 0 that sum to 1, such as 0.8,0.1,0.1")
+
+
+_ROUNDED: Final = 1e-6
+"""By which a sum of shares may differ from 1."""
 
 
 def parse_split(text: str) -> tuple[float, float, float]:
     """Return the shares of train, validation and test of a text such as `0.8,0.1,0.1` or `80,10,10`.
 
-    Two numbers are train and test.
+    Two numbers are train and test. Whole numbers and percentages are scaled to the sum 1; other shares must have it.
 
     Examples
     --------
@@ -201,6 +205,12 @@ def parse_split(text: str) -> tuple[float, float, float]:
     if len(parts) != 3 or not min(parts) >= 0 or not 0 < sum(parts) < float("inf"):
         raise InputError(f"the split {text!r} is to be shares of train, validation and test, such as 0.8,0.1,0.1")
     total = sum(parts)
+    whole = total >= 1 and all(part == int(part) for part in parts)
+    if not (whole or abs(total - 1) < _ROUNDED or abs(total - 100) < 100 * _ROUNDED):
+        raise InputError(
+            f"the split {text} sums to {total:g}, and every picture is put into a part; expected shares that sum to 1, "
+            "such as 0.8,0.1,0.1, or whole numbers such as 8,1,1"
+        )
     return parts[0] / total, parts[1] / total, parts[2] / total
 
 

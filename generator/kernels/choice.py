@@ -34,7 +34,7 @@ import numpy.typing as npt
 from numpy import uint32, uint64
 
 from foundation.compiled import compiled, inlined
-from foundation.errors import InputError, QualityError
+from foundation.errors import InputError, QualityError, kind_of
 from generator.kernels.vector import GROUP, LANES, LINE, choose, copy1, offset_at, prefetch_once, write_colours
 from generator.philox import KEY_STEPS, MULTIPLIERS, ROUNDS, SAMPLES
 
@@ -287,10 +287,12 @@ def check_tables(tables: Samples | Sequence[Samples]) -> list[Samples]:
     return checked
 
 
-def check_picture(picture: Picture) -> None:
+def check_picture(picture: Any) -> None:
     """Check that `picture` is uint8 (H, W, 3)."""
-    if picture.dtype != np.uint8 or picture.ndim != 3 or picture.shape[2] != 3:
-        raise InputError(f"the picture is {picture.dtype} {picture.shape}, expected uint8 (height, width, 3)")
+    if getattr(picture, "dtype", None) != np.uint8 or picture.ndim != 3 or picture.shape[2] != 3:
+        raise InputError(
+            f"the picture is {kind_of(picture)}, expected an array uint8 (height, width, 3), such as read_picture(FILE)"
+        )
 
 
 def check_out(

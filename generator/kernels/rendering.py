@@ -392,7 +392,9 @@ def known_light(lut: Lut, light: int) -> int:
     try:
         number = operator.index(light)
     except TypeError as error:
-        raise InputError(f"light {light!r} is no number of a light; give a whole one from 0") from error
+        raise InputError(
+            f"light {light!r} is no light; give its whole number from 0, or a text such as 5600K"
+        ) from error
     if not 0 <= number < len(lut.samples):
         raise InputError(f"there is no light {number}; the table {lut.folder} has lights 0 to {len(lut.samples) - 1}")
     return number

@@ -19,6 +19,7 @@ import numpy.typing as npt
 
 from foundation.errors import InputError, first_of, nearest_names
 from generator import philox
+from generator.kernels.rendering import known_light
 from generator.lights.distributions import Distribution, load_ground_truths
 from generator.lights.gamut import Gamut, Match, OutsideGamut, OutsideGamutError, black_body, rgb_of
 from generator.lights.lighting import LightChoice, Lighting, Mixture, parse_mixture, plain
@@ -317,6 +318,16 @@ def parse_light(text: str, lut: Lut, gamut: Gamut | None = None, outside: Outsid
             f"is r={red},b={blue}"
         )
     return (gamut or Gamut.of(lut)).match(rgb_of([numbers["r"], numbers["b"]]), outside).mixture
+
+
+def light_of(given: int | str | Mixture, lut: Lut) -> Mixture:
+    """Return a light that is given by its number in the table, by a text that `parse_light` reads, or as a mixture."""
+    if isinstance(given, str):
+        return parse_light(given, lut)
+    if isinstance(given, Mixture):
+        given.white(lut)
+        return given
+    return plain(known_light(lut, given))
 
 
 def nearest_lights(lut: Lut, truths: npt.NDArray[np.float64], file: str = "", each: int = 1) -> SequentialLights:

@@ -9,26 +9,27 @@ import numpy.typing as npt
 
 from foundation.errors import InputError
 from generator.kernels.choice import check_picture, replace_unfit_colours
-from generator.kernels.rendering import draw_samples, known_light, read_light
-from generator.lights.lighting import plain
+from generator.kernels.rendering import draw_samples
+from generator.lights.choices import light_of
 from generator.rendering import DEFAULT, Rendering
 from generator.rendering.matrices import matrix_for
 
 if TYPE_CHECKING:
     from calibration.table.lut import Lut
+    from generator.lights.lighting import Mixture
 
 
 def render(
     lut: Lut,
     picture: npt.NDArray[np.uint8],
-    light: int,
+    light: int | str | Mixture,
     *,
     rendering: Rendering = DEFAULT,
     seed: int = 0,
     image: int = 0,
     threads: int = 1,
 ) -> npt.NDArray[np.uint16]:
-    """Return the raw linear image of `picture` printed, lit by the table's light `light` and photographed.
+    """Return the raw linear image of `picture` printed, lit by `light` and photographed.
 
     It is image number `image` of the dataset that `generate` makes with the same seed, where that shows the whole
     picture and keeps the print's black.
@@ -40,7 +41,9 @@ def render(
     picture
         (H, W, 3) uint8 sRGB codes, from `pictures.picture.read_picture` or any array.
     light
-        Number of the light in the table.
+        Number of the light in the table; a text as the command's ``--light`` takes it, such as ``"D65"``, ``"5600K"``
+        or ``"12:0.25+40:0.75"``; or a mixture that `lights.choices.parse_light` made of one, whose ``white(lut)`` is
+        the ground truth.
     rendering
         ``"colorimetric"``: the print shows the camera the picture's colours; where in the chart they are takes seconds
         a table, once. ``"codes"``: a picture's codes are those of the print, as in the paper; colours that the table
@@ -56,7 +59,7 @@ def render(
     Raises
     ------
     InputError
-        The table has no such light, there is no such rendering, or the picture is not of that shape and type.
+        The table has no such light, there is no such rendering, or table or picture are none.
     QualityError
         The print has no contrast under the light, so that there is no rendering by colour.
 
@@ -68,15 +71,17 @@ def render(
     >>> image.shape == picture.shape, image.dtype
     (True, dtype('uint16'))
     """
+    from calibration.table.lut import require_lut
     from generator.rendering.colorimetric import rendering_with
 
+    require_lut(lut)
     check_picture(picture)
     if rendering not in get_args(Rendering):
         raise InputError(f"{rendering!r} is no rendering; use one of {', '.join(get_args(Rendering))}")
+    mixture = light_of(light, lut)
     if rendering == "codes":
-        samples = read_light(lut, light, picture.shape[0] * picture.shape[1])
         fit, _ = replace_unfit_colours(picture, lut.provenance)
+        samples = mixture.samples(lut, seed, fit)
         return draw_samples(samples, fit, seed=seed, image=image, threads=threads)
-    alone = plain(known_light(lut, light))
     by_colour, most = rendering_with(lut, matrix_for(lut)), lut.provenance.white_level
-    return by_colour.draw(picture, [alone], most=most, seed=seed, image=image, threads=threads)
+    return by_colour.draw(picture, [mixture], most=most, seed=seed, image=image, threads=threads)

@@ -30,14 +30,15 @@ from typing import TYPE_CHECKING, Any, Final, get_args
 import numpy as np
 import numpy.typing as npt
 
-from foundation.errors import InputError
+from foundation.errors import InputError, kind_of
 from generator import philox
 from generator.kernels.choice import replace_unfit_colours
 from generator.kernels.planar import draw_batch, scales_of
 from generator.kernels.printing import PrintedLight, draw_printed_crops
+from generator.lights.choices import light_of
 from generator.lights.lighting import Mixture
 from generator.rendering import DEFAULT, Rendering
-from generator.rendering.black_points import KEEP, BlackPoint, veil_of
+from generator.rendering.black_points import KEEP, BlackPoint, parse_black_point, veil_of
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -144,8 +145,9 @@ class Crops:
     length
         Items of an epoch.
     lights
-        What lights to draw from, each as likely: numbers of the table's lights, or mixtures of them, which take 5 MB
-        of memory each. None: all lights of the table.
+        What lights to draw from, each as likely: numbers of the table's lights, texts as the command's ``--light``
+        takes them, such as ``"D65"`` or ``"5600K"``, or mixtures. What is no single light of the table takes 5 MB of
+        memory each. None: all lights of the table.
     exposure
         Least and largest gain, > 0; drawn evenly in stops. What a gain above 1 takes past saturation is cut off there.
     noise
@@ -168,7 +170,7 @@ class Crops:
     matrix
         Linear sRGB to the camera's RGB, for colorimetric rendering; None for that of the table's camera.
     black_point
-        What becomes of the print's black.
+        What becomes of the print's black; a text as the command's ``--black-point`` takes it, such as ``"random"``.
 
     Raises
     ------
@@ -192,7 +194,7 @@ class Crops:
         size: tuple[int, int] = (128, 128),
         *,
         length: int = 1 << 20,
-        lights: Sequence[int | Mixture] | None = None,
+        lights: Sequence[int | str | Mixture] | None = None,
         exposure: tuple[float, float] = (1.0, 1.0),
         noise: SensorNoise | None = None,
         iso: IsoSpeed | None = None,
@@ -202,8 +204,14 @@ class Crops:
         threads: int = 1,
         rendering: Rendering = DEFAULT,
         matrix: ColourMatrix | None = None,
-        black_point: BlackPoint = KEEP,
+        black_point: BlackPoint | str = KEEP,
     ) -> None:
+        from calibration.table.lut import require_lut
+
+        require_lut(lut)
+        if isinstance(black_point, str):
+            black_point = parse_black_point(black_point)
+        _require_kinds(gallery, size, lights, black_point)
         height, width = size
         if min(height, width) < 1:
             raise InputError(f"crops of {height}x{width} px were asked for, expected 1 or more")
@@ -222,9 +230,9 @@ class Crops:
             raise InputError("an ISO speed was given without the noise of the table; give noise=measured_noise(lut)")
         philox.key_of(seed)
         chosen = range(len(lut.samples)) if lights is None else lights
-        if not chosen:
+        if not len(chosen):
             raise InputError("there is no light to draw from; name some or leave the choice out")
-        mixtures = [light if isinstance(light, Mixture) else Mixture((light,), (1.0,)) for light in chosen]
+        mixtures = [light_of(light, lut) for light in chosen]
         whites = np.stack([mixture.white(lut) for mixture in mixtures])
         self.lut = lut
         self.gallery = gallery
@@ -391,6 +399,24 @@ class Crops:
             raise IndexError(f"item {item} of {self.length}")
         batch = self.batch([item])
         return batch.images[0], batch.illuminants[0]
+
+
+def _require_kinds(gallery: object, size: object, lights: object, black_point: object) -> None:
+    """Refuse arguments of another kind than expected, each with what makes one of that kind."""
+    from generator.training.gallery import Gallery
+
+    if not isinstance(gallery, Gallery):
+        raise InputError(
+            f"the gallery is {kind_of(gallery)}, expected one of gallery_of([picture, …]) or open_gallery(FOLDER)"
+        )
+    if np.shape(size) != (2,) or isinstance(size, str):  # pyright: ignore[reportCallIssue, reportArgumentType]
+        raise InputError(f"the size of crops is {kind_of(size)}, expected height and width, such as (128, 128)")
+    if isinstance(lights, int | str | Mixture):
+        raise InputError(f"the lights are {kind_of(lights)}, expected a list, such as [0, 3] or ['D65']")
+    if not isinstance(black_point, BlackPoint):
+        raise InputError(
+            f"the black point is {kind_of(black_point)}, expected 'keep', 'compensate', 'random' or 'random:MAX'"
+        )
 
 
 def _below(words: npt.NDArray[np.uint32], bound: int | npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:

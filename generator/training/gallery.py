@@ -16,9 +16,10 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import ValidationError
 
-from foundation.errors import FormatError, InputError
+from foundation.errors import FormatError, InputError, kind_of
 from foundation.files import storage_error, whole_folder, write_whole
 from foundation.records import Record
+from generator.kernels.choice import check_picture
 from generator.pictures.picture import Picture
 from generator.pictures.sources import Source
 
@@ -70,6 +71,10 @@ class Gallery:
     offsets: npt.NDArray[np.int64]
     folder: Path | None = None
 
+    def __repr__(self) -> str:
+        """Return one line, of however many pictures."""
+        return f"Gallery of {len(self)} pictures" + ("" if self.folder is None else f" in {str(self.folder)!r}")
+
     def __len__(self) -> int:
         """Return the number of pictures."""
         return len(self.names)
@@ -108,13 +113,14 @@ def gallery_of(pictures: Sequence[Picture], names: Sequence[str] | None = None) 
     >>> len(gallery), gallery.codes.shape, gallery.picture(1).shape
     (2, (84,), (2, 2, 3))
     """
-    if not pictures:
-        raise InputError("a gallery of no pictures was asked for, expected 1 or more")
+    if isinstance(pictures, str) or not len(pictures):
+        raise InputError(f"a gallery of {kind_of(pictures)} was asked for, expected a list of 1 or more pictures")
     if names is not None and len(names) != len(pictures):
         raise InputError(f"{len(pictures)} pictures of a gallery have {len(names)} names, expected one each")
     for picture in pictures:
-        if picture.dtype != np.uint8 or picture.ndim != 3 or picture.shape[2] != 3 or not picture.size:
-            raise InputError(f"a picture is {picture.dtype} {picture.shape}, expected uint8 (height, width, 3)")
+        check_picture(picture)
+        if not picture.size:
+            raise InputError(f"a picture is {picture.shape[1]}x{picture.shape[0]} px, expected 1 or more")
     sizes = np.array([picture.shape[:2] for picture in pictures], dtype=np.int64)
     codes = np.concatenate([picture.reshape(-1) for picture in pictures])
     chosen = [str(number) for number in range(len(pictures))] if names is None else names

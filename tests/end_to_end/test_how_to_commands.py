@@ -153,9 +153,10 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (at / "LAB.toml").write_text(LAB + "[judge]\nresponse = false\n" + SIMULATED)
     assert run("acquire", "run", at / "LAB.toml", at / "session") == 0
     assert run("build-lut", at / "session", at / "lut") == 0
+    parts = ("--split", "1,1", "--exact-split")
     spectra = ("--lights", "2000:10000:2000K,D65")
     assert run("sim", "table", at / "computed", "--settings", at / "small.toml", *spectra) == 0
-    assert run("generate", at / "computed", at / "dataset", "--sources", at / "pictures") == 0
+    assert run("generate", at / "computed", at / "dataset", "--sources", at / "pictures", *parts) == 0
     shutil.copy(at / "dataset" / "gt.txt", at / "gt.txt")
     lights = [line.replace(" ", ",") for line in (at / "gt.txt").read_text().splitlines()[:2]]
     (at / "own_lights.csv").write_text(f"image,r,g,b\n0,{lights[0]}\n1,{lights[1]}\n")

@@ -127,3 +127,9 @@ def test_going_on_is_promised_only_by_what_keeps_its_work(
     monkeypatch.setattr("evaluation.cli.run", run)
     main(given)
     assert told == [promised]
+
+
+@pytest.mark.parametrize("words", [("kernel-ridge", "split"), ("split", "kernel-ridge")])
+def test_who_runs_a_learner_is_told_to_train_it(words: tuple[str, str], capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(list(words)) == 2
+    assert "evaluate cv kernel-ridge split" in " ".join(capsys.readouterr().err.split())

@@ -325,6 +325,7 @@ def test_require_free(tmp_path: Path) -> None:
 
 def test_an_empty_folder_is_no_free_file(tmp_path: Path) -> None:
     require_free_file(tmp_path / "new", "the lights")
+    require_free_file(tmp_path / "no" / "such" / "new", "the lights")
     (tmp_path / "link").symlink_to(tmp_path / "nowhere")
     for path in (tmp_path, tmp_path / "link"):
         with pytest.raises(InputError, match="for the lights"):
@@ -403,3 +404,15 @@ def test_a_text_in_another_encoding_is_to_be_saved_anew(tmp_path: Path, content:
     with pytest.raises(FormatError, match=told) as caught:
         read_csv(path, "mend it")
     assert "UTF-8" in caught.value.remedy
+
+
+@pytest.mark.parametrize(("number", "said"), [(errno.EROFS, "mount it for writing"), (errno.EACCES, "ask its owner")])
+def test_a_place_that_cannot_be_written_is_found_before_the_work(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: int, said: str
+) -> None:
+    def refused(dir: Path) -> None:
+        raise OSError(number, os.strerror(number), str(dir))
+
+    monkeypatch.setattr("tempfile.TemporaryFile", refused)
+    with pytest.raises(StorageError, match=said):
+        require_free_file(tmp_path / "no" / "model.npz", "the model")

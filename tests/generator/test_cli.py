@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import signal
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -152,6 +153,21 @@ def test_shares_are_finished_and_verified(generate: Generate, capsys: pytest.Cap
     Path("out/gt.txt").write_text("\n".join(reversed(truths)))
     assert generate("--verify", "out") == 4
     assert "gt.txt has changed\n" in capsys.readouterr().out
+
+
+def test_who_asks_for_the_end_is_told_and_goes_on_later(
+    generate: Generate, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def ended(*_: object) -> None:
+        signal.raise_signal(signal.SIGTERM)
+
+    wish = ("--sources", "pictures", "--illuminations", "all")
+    with monkeypatch.context() as patched:
+        patched.setattr("generator.command.output._Images.advance", ended)
+        assert generate("lut", "out", *wish) == 130
+    assert "interrupted" in capsys.readouterr().err
+    assert generate("lut", "out", *wish) == 0
+    assert capsys.readouterr().err.count("were found finished") <= 1
 
 
 def test_a_share_is_gone_on_with_by_the_whole(generate: Generate, capsys: pytest.CaptureFixture[str]) -> None:

@@ -7,11 +7,17 @@ import re
 import subprocess
 import sys
 import textwrap
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 import pytest
+
+from foundation.errors import InputError
+from generator import open_lut, read_picture, render
+from generator.rendering import Rendering
+from generator.training import Crops, gallery_of
 
 pytestmark = pytest.mark.slow
 
@@ -35,6 +41,56 @@ def test_the_lines_of_the_page_for_programmers() -> None:
     assert names["image"].shape == (40, 50, 3)
     assert names["made"].description.images == 2
     assert names["entry"].truth == pytest.approx(tuple(lut.ground_truth[3]), abs=1e-9)
+
+
+@pytest.mark.usefixtures("table_and_picture")
+def test_a_table_is_one_line() -> None:
+    shown = repr(open_lut("lut"))
+    assert shown.startswith("Lut('lut'")
+    assert len(shown) < 150
+    assert repr(gallery_of([np.zeros((4, 4, 3), np.uint8)] * 99)) == "Gallery of 99 pictures"
+
+
+@pytest.mark.usefixtures("table_and_picture")
+def test_lights_are_named_as_on_the_command_line() -> None:
+    lut, picture = open_lut("lut"), read_picture("cat.png")
+    for rendering in get_args(Rendering):
+        plain = render(lut, picture, 3, rendering=rendering, seed=1)
+        assert np.array_equal(render(lut, picture, "3", rendering=rendering, seed=1), plain)
+        mixed = render(lut, picture, "0:0.5+3:0.5", rendering=rendering, seed=1)
+        assert not np.array_equal(mixed, plain)
+    gallery = gallery_of([picture])
+    crops = Crops(lut, gallery, (8, 8), lights=["3", 0, "0:0.5+3:0.5"], black_point="random")
+    assert [light.label for light in crops.lights] == ["3", "0", "0:0.5+3:0.5"]
+    assert crops.black_point.kind == "random"
+    with pytest.raises(InputError, match="write 5200K"):
+        render(lut, picture, "daylight")
+
+
+@pytest.mark.usefixtures("table_and_picture")
+def test_wrong_arguments_are_answered_with_what_is_expected() -> None:
+    lut, picture = open_lut("lut"), read_picture("cat.png")
+    gallery = gallery_of([picture])
+    wrong: list[tuple[Callable[..., Any], tuple[Any, ...], dict[str, Any], str]] = [
+        (render, (picture, lut, 3), {}, "open_lut"),
+        (render, ("lut", picture, 3), {}, "the text 'lut', expected a Lut"),
+        (render, (lut, "cat.png", 3), {}, r"the text 'cat.png', expected an array uint8"),
+        (render, (lut, picture / 255, 3), {}, "float64"),
+        (render, (lut, picture, 2.5), {}, "2.5 is no light"),
+        (Crops, ("lut", gallery), {}, "open_lut"),
+        (Crops, (lut, [picture], (8, 8)), {}, "gallery_of"),
+        (Crops, (lut, "pictures", (8, 8)), {}, "gallery_of"),
+        (Crops, (lut, gallery, 8), {}, "height and width"),
+        (Crops, (lut, gallery, (8, 8)), {"lights": 3}, "a list"),
+        (Crops, (lut, gallery, (8, 8)), {"lights": ["D66"]}, "'D66' is no light"),
+        (Crops, (lut, gallery, (8, 8)), {"black_point": "rnd"}, "'rnd'"),
+        (Crops, (lut, gallery, (8, 8)), {"black_point": 0.5}, "'compensate'"),
+        (gallery_of, ("cat.png",), {}, "the text 'cat.png'"),
+        (gallery_of, (["cat.png"],), {}, "read_picture"),
+    ]
+    for function, given, options, told in wrong:
+        with pytest.raises(InputError, match=told):
+            function(*given, **options)
 
 
 @pytest.mark.usefixtures("table_and_picture")

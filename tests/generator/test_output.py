@@ -19,6 +19,17 @@ from generator.rendering.matrices import SOURCE, camera_matrix
 from tests.generator.conftest import MakeLut
 
 
+def test_what_was_found_before_the_first_image_is_one_sum(capsys: pytest.CaptureFixture[str]) -> None:
+    with shown_progress(9) as callbacks:
+        for found in (3, 2, -1):
+            callbacks.on_done(found)
+        callbacks.on_image()
+        callbacks.on_done(2)
+        callbacks.on_image()
+    lines = capsys.readouterr().err.splitlines()
+    assert lines[:2] == ["4 images were found finished", "6 images were found finished in all"]
+
+
 class _Terminal(io.StringIO):
     def isatty(self) -> bool:
         return True

@@ -83,6 +83,7 @@ def test_spectra_that_are_no_black_bodies_have_names_and_no_temperature() -> Non
     ("given", "message"),
     [
         ("D66", "no published light 'D66'; did you mean 'D65'"),
+        ("2000-10000K", "2000:10000:500K"),
         ("5600", "5600K for a black body, daylight:5600"),
         ("D65,A,D65", "'D65' is there twice"),
         ("nowhere.csv", "cannot read spectra nowhere.csv: No such file"),

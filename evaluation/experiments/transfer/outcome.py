@@ -19,8 +19,8 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from evaluation.experiments.bootstrap import STATISTICS, ErrorSample, bca, resamples
-from evaluation.experiments.folds import folds_to_csv
+from evaluation.experiments.bootstrap import STATISTICS, ErrorSample, bca, numbered, resamples
+from evaluation.experiments.folds import folds_to_csv, groups_of
 from evaluation.experiments.paper.published import TABLE2
 from evaluation.experiments.transfer.plan import TransferPlan, is_generated
 from evaluation.experiments.transfer.rows import NAIVE, TransferRow, Way
@@ -111,24 +111,30 @@ class _Replicates:
 
 
 def figures_of(
-    rows: Sequence[TransferRow], error: ErrorKind, seed: int = 0, base: str | None = None
+    rows: Sequence[TransferRow],
+    error: ErrorKind,
+    seed: int = 0,
+    base: str | None = None,
+    groups: Sequence[str] | None = None,
 ) -> TransferFigures:
     """Return statistics, intervals and ratios of rows on the same test images.
 
     `base`: `TransferRow.training` of rows that every other one is held to as well, with x for × and in any case; None
-    for no such ratios.
+    for no such ratios. `groups`: what each test image shares with others, so that they are drawn together; None if
+    every one is one of its own.
     """
+    numbers = None if groups is None else numbered(groups)
     bases = _named(rows, base)
     samples = [[ErrorSample.of(result.errors[error]) for result in row.results] for row in rows]
     drawn: list[list[Floats]] = [[] for _ in rows]
-    for counts in resamples(len(samples[0][0].order), seed, COUNT):
+    for counts in resamples(len(samples[0][0].order), seed, COUNT, numbers):
         for batches, several in zip(drawn, samples, strict=True):
             batches.append(np.mean([one.statistics(counts) for one in several], axis=0))
     known = [
         _Replicates(
             np.mean([one.estimate() for one in several], axis=0),
             np.concatenate(batches),
-            np.mean([one.without_each() for one in several], axis=0),
+            np.mean([one.without_each(numbers) for one in several], axis=0),
         )
         for several, batches in zip(samples, drawn, strict=True)
     ]
@@ -651,7 +657,8 @@ def save_outcome(outcome: TransferOutcome, folder: Path) -> None:
     truths = np.stack([scene.truth for scene in outcome.test.scenes])
     with whole_folder(folder, "the results") as partial:
         write_whole(partial / "results.csv", table_to_csv(long_table(outcome.figures)))
-        write_whole(partial / "errors.csv", errors_csv(names, truths, labelled_results(outcome.rows)))
+        groups = groups_of(outcome.test.scenes)
+        write_whole(partial / "errors.csv", errors_csv(names, truths, labelled_results(outcome.rows), groups))
         for seed, folds in enumerate(outcome.folds):
             write_whole(partial / f"folds_{seed}.csv", folds_to_csv(every, folds))
         write_whole(partial / "tables.tex", "\n".join(table_to_latex(table) for table in outcome.tables()))

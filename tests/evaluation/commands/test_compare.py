@@ -139,11 +139,33 @@ def test_runs_of_the_command_run(dataset: Path, tmp_path: Path, capsys: pytest.C
     capsys.readouterr()
     assert main(["compare", str(tmp_path / "one"), str(tmp_path / "two")]) == 0
     printed = capsys.readouterr().out
-    assert "White-Patch (one) errs less than White-Patch (two) on 0 of 16 images, more on 0, the same on 16" in printed
+    assert (
+        "White-Patch (one) errs less than White-Patch (two) on 0 of 8 groups of 16 images, more on 0, the same on 8"
+        in printed
+    )
     assert "ground truths" not in printed
+    assert "of one picture" not in printed
     assert main(["compare", str(tmp_path / "one")]) == 0
     # Random codes: white is in every image, and grey on average only by chance.
-    assert "White-Patch errs less than Gray-world on 16 of 16 images" in capsys.readouterr().out
+    assert "White-Patch errs less than Gray-world on 8 of 8 groups of 16 images" in capsys.readouterr().out
+
+
+def test_results_of_before_groups_were_kept_say_so(
+    dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "out"
+    assert main(["run", str(dataset), "--methods", "white-patch,gray-world", "--out", str(out)]) == 0
+    rows = list(csv.reader((out / "errors.csv").read_text().splitlines()))
+    assert rows[0][-1] == "group"
+    (out / "errors.csv").write_text("".join(",".join(row[:-1]) + "\n" for row in rows))
+    about = json.loads((out / "run.json").read_text())
+    assert about["data_set"].pop("groups") == 8
+    (out / "run.json").write_text(json.dumps(about))
+    capsys.readouterr()
+    assert main(["compare", str(out)]) == 0
+    printed = capsys.readouterr().out
+    assert f"{out} does not say which images are of one picture" in printed
+    assert "of 16 images" in printed
 
 
 def test_images_without_a_light_are_told(runs: tuple[str, str], capsys: pytest.CaptureFixture[str]) -> None:

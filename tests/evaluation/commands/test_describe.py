@@ -84,7 +84,7 @@ def test_options_of_the_set_beside(dataset: Path, tmp_path: Path, capsys: pytest
     assert "│ made        │     16 │" in printed
     assert "│ NUS SonyA57 │      1 │" in printed  # Neither Nikon's two images nor the one that is missing.
     assert main(["describe", str(dataset), "--against", str(dataset), "--against-subset", "test"]) == 2
-    assert "--subset has no meaning for" in capsys.readouterr().err
+    assert "was not divided; generate --split" in capsys.readouterr().err
 
 
 def test_options_that_nothing_is_read_by_are_refused(

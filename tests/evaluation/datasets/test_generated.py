@@ -13,7 +13,10 @@ from fsspec.core import url_to_fs
 from calibration.table.lut import open_lut
 from evaluation.cli import main
 from evaluation.datasets import open_scenes
+from evaluation.datasets.options import DataOptions
+from evaluation.experiments.folds import group_of
 from evaluation.scene import MixedScene
+from foundation.errors import InputError
 from generator.dataset.making import DatasetOptions, generate_dataset
 from generator.dataset.records import Layout
 from generator.lights.choices import ListedLights, SimultaneousLights
@@ -74,3 +77,25 @@ def test_every_layout(made_lut: Path, tmp_path: Path, layout: Layout, together: 
             assert isinstance(there, MixedScene)
             np.testing.assert_array_equal(here.read_truth_map(), there.read_truth_map())
             np.testing.assert_array_equal(here.read()[0], there.read()[0])
+
+
+@pytest.mark.parametrize("layout", get_args(Layout))
+def test_parts_are_those_of_generate_and_share_no_picture(made_lut: Path, tmp_path: Path, layout: Layout) -> None:
+    options = DatasetOptions(previews=False, layout=layout, split=(0.5, 0, 0.5), split_exact=True)
+    generate_dataset(open_lut(made_lut), tmp_path / "made", random_scenes(6, 24, 20), [0, 1], options=options)
+    parts = {part: open_scenes(tmp_path / "made", options=DataOptions(subset=part)) for part in ("train", "test")}
+    assert [data.name for data in parts.values()] == ["made train", "made test"]
+    pictures = {part: {group_of(scene) for scene in data.scenes} for part, data in parts.items()}
+    assert all(len(own) == 3 for own in pictures.values())
+    assert not pictures["train"] & pictures["test"]
+    whole = open_scenes(tmp_path / "made")
+    assert sum(len(data.scenes) for data in parts.values()) == len(whole.scenes) == 12
+    assert parts["train"].scenes[0].read()[0].shape == (20, 24, 3)
+    with pytest.raises(InputError, match="no subset 'validation'; it has train, test"):
+        open_scenes(tmp_path / "made", options=DataOptions(subset="validation"))
+
+
+def test_a_part_of_what_was_not_divided_is_refused(made_lut: Path, tmp_path: Path) -> None:
+    generate_dataset(open_lut(made_lut), tmp_path / "made", random_scenes(2, 24, 20), [0, 1])
+    with pytest.raises(InputError, match="was not divided"):
+        open_scenes(tmp_path / "made", options=DataOptions(subset="test"))

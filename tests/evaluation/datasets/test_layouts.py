@@ -113,6 +113,10 @@ def test_a_layout_named_for_something_else_says_what_is_missing(layout: str, tmp
 
 def test_a_folder_that_looks_like_none_is_told_what_was_looked_for(tmp_path: Path) -> None:
     (tmp_path / "1.png").write_bytes(b"")
+    with pytest.raises(FormatError, match=r"pictures \(1\.png\) without ground truths") as told:
+        open_scenes(tmp_path)
+    assert len(str(told.value)) < 400
+    (tmp_path / "notes.txt").write_text("nothing")
     with pytest.raises(FormatError, match="is no dataset of a layout that is known") as told:
         open_scenes(tmp_path)
     for name, layout in LAYOUTS.items():

@@ -13,6 +13,7 @@ from evaluation.experiments.bootstrap import (
     ErrorSample,
     independent,
     intervals,
+    numbered,
     paired,
     resamples,
 )
@@ -169,3 +170,33 @@ def test_refuses_what_it_does_not_know() -> None:
         intervals([1, 2], count=0)
     with pytest.raises(InputError, match="a confidence of 95"):
         intervals([1, 2], level=95)
+
+
+def test_groups_are_drawn_and_left_out_whole() -> None:
+    random = np.random.default_rng(14)
+    names = [str(place) for place in random.permutation(np.repeat(np.arange(7), [1, 2, 3, 4, 5, 6, 7]))]
+    groups = numbered(names)
+    errors = skewed(random, len(names)).round(1) + 0.1
+    sample = ErrorSample.of(errors)
+    for drawn in resamples(len(names), 3, 40, groups):
+        assert all(len(set(row[groups == number])) == 1 for row in drawn for number in range(7))
+        assert all(sum(row[groups == number][0] for number in range(7)) == 7 for row in drawn)
+        expected = [summarise(np.repeat(errors, row)).as_tuple() for row in drawn]
+        np.testing.assert_allclose(sample.statistics(drawn), expected, rtol=1e-12)
+    expected = [summarise(errors[groups != number]).as_tuple() for number in range(7)]
+    np.testing.assert_allclose(sample.without_each(groups), expected, rtol=1e-12)
+
+
+def test_intervals_of_groups_cover_where_those_of_images_do_not() -> None:
+    random = np.random.default_rng(15)
+    hits = np.zeros(2)
+    for _ in range(WORLDS // 2):
+        # 40 pictures under 10 lights: what a picture adds to a method's error is the same under each.
+        shift = np.repeat(random.normal(0.3, 1, 40), 10)
+        hard = skewed(random, 400)
+        kinds = [str(number // 10) for number in range(400)]
+        for place, groups in enumerate((kinds, None)):
+            _, low, high = paired(hard + shift, hard, count=400, groups=groups)[0].difference
+            hits[place] += low <= 0.3 <= high
+    assert 0.88 < hits[0] / (WORLDS // 2) < 0.99
+    assert hits[1] / (WORLDS // 2) < 0.7

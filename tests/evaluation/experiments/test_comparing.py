@@ -3,18 +3,22 @@
 from __future__ import annotations
 
 import itertools
+from dataclasses import replace
 
 import numpy as np
 import numpy.typing as npt
 import pytest
 
+from evaluation.experiments import comparing
 from evaluation.experiments.comparing import (
+    Matched,
     compare,
     holm,
     largest_differences,
     match,
     missing_images,
     signed_rank,
+    statistics_table,
     verdict,
 )
 from evaluation.results.files import MethodErrors
@@ -126,3 +130,46 @@ def test_largest_differences_come_first_and_equal_errors_never() -> None:
     made = match(errors("abcd", [1, 5, 2, 3]), errors("abcd", [2, 1, 2, 3.5]), ("", ""), "reproduction")
     assert [made.images[place] for place in largest_differences(made)] == ["b", "a", "d"]
     assert largest_differences(made, 1) == [1]
+
+
+def test_images_of_one_picture_are_one_case() -> None:
+    """What 40 lights show of 12 pictures is 12 cases: false alarms stay rare, which by image they do not."""
+    random = np.random.default_rng(5)
+    images = [f"{picture} {light}" for picture in range(12) for light in range(40)]
+    groups = tuple(image.partition(" ")[0] for image in images)
+    alarms = np.zeros(2)
+    matched: list[Matched] = []
+    for _ in range(200):
+        # Neither is better: which errs less on a picture is chance, and the same under every light.
+        one, other = np.repeat(random.gamma(3, 1, (2, 12)), 40, axis=1) + random.uniform(0, 0.1, (2, 480))
+        told = [MethodErrors("", tuple(images), None, {"recovery": each, "reproduction": each}, np.zeros(480, bool),
+                             groups=groups) for each in (one, other)]  # fmt: skip
+        matched.append(made := match(told[0], told[1], ("A", "B"), "recovery"))
+        alarms += [signed_rank(*made.case_errors()).p < 0.05, signed_rank(one, other).p < 0.05]
+    assert alarms[0] / 200 < 0.1
+    assert alarms[1] / 200 > 0.5
+    (comparison,) = compare(matched[-1:])
+    assert comparison.matched.cases == "12 groups of 480 images"
+    assert comparison.test.wins + comparison.test.losses == 12
+    assert "12 groups of 480 images" in verdict(comparison)
+    table = comparing.tests_table([comparison])
+    assert dict(zip(table.columns, table.rows[0], strict=True))["Groups"] == 12
+    assert "over groups of images" in statistics_table(comparison, 0.95).notes[0]
+
+
+def test_a_single_group_says_nothing_of_others() -> None:
+    mine = replace(errors("abcdefghi", np.arange(9.0) + 1), groups=("cat.png",) * 9)
+    made = match(mine, errors("abcdefghi", np.arange(9.0) + 2), ("A", "B"), "recovery")
+    (comparison,) = compare([made])
+    assert comparison.test.p == 1
+    assert "not significant" in verdict(comparison)
+    assert np.isnan(comparison.statistics[0].difference[1:]).all()
+    assert "No intervals" in statistics_table(comparison, 0.95).notes[0]
+
+
+def test_groups_of_one_image_each_change_nothing() -> None:
+    mine, others = errors("abcdef", [1, 2, 3, 4, 5, 7]), errors("abcdef", [2, 1, 4, 6, 7, 8])
+    plain = compare([match(mine, others, ("A", "B"), "recovery")])[0]
+    grouped = compare([match(replace(mine, groups=tuple("uvwxyz")), others, ("A", "B"), "recovery")])[0]
+    assert grouped.test == plain.test
+    assert grouped.statistics == plain.statistics

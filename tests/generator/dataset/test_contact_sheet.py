@@ -61,7 +61,8 @@ def test_images_of_one_light_a_picture_fill_a_grid(
         make(self, s)
 
     monkeypatch.setattr(text.Text, "set_text", noted)
-    made = generate_dataset(make_lut(), tmp_path / "out", random_scenes(30, 24, 16), RandomLights(1, 4, 0))
+    lut = make_lut()
+    made = generate_dataset(lut, tmp_path / "out", random_scenes(30, 24, 16), RandomLights(1, 4, 0))
     whole = contact_sheet(made)
     assert 0.6 < whole.shape[0] / whole.shape[1] < 1.1
     assert any("24 of 30 pictures shown" in word for word in words)
@@ -73,3 +74,7 @@ def test_images_of_one_light_a_picture_fill_a_grid(
     few = contact_sheet(made, max_rows=2, max_columns=3)
     assert few.shape[0] < whole.shape[0]
     assert any("4 of 30 pictures shown" in word for word in words)
+    assert any("each exposed for itself" in word for word in words)
+    words.clear()
+    contact_sheet(generate_dataset(lut, tmp_path / "rows", random_scenes(5, 24, 16), [0, 1, 2]), 2, 2)
+    assert any("; 4 of 15 images shown" in word for word in words)

@@ -81,10 +81,22 @@ def test_parts_are_of_sources_and_stay_when_others_come(make_lut: Callable[..., 
 
 @pytest.mark.parametrize(
     ("text", "shares"),
-    [("0.8,0.1,0.1", (0.8, 0.1, 0.1)), ("80,10,10", (0.8, 0.1, 0.1)), ("3,1", (0.75, 0.0, 0.25)), ("0,0,1", (0, 0, 1))],
+    [
+        ("0.8,0.1,0.1", (0.8, 0.1, 0.1)),
+        ("80,10,10", (0.8, 0.1, 0.1)),
+        ("3,1", (0.75, 0.0, 0.25)),
+        ("66.6,33.4", (0.666, 0, 0.334)),
+        ("0,0,1", (0, 0, 1)),
+    ],
 )
 def test_shares_as_they_are_written(text: str, shares: tuple[float, float, float]) -> None:
     assert parse_split(text) == pytest.approx(shares)
+
+
+@pytest.mark.parametrize("text", [".7,.2", "0.5,0.1,0.1", "1.5,1"])
+def test_shares_that_leave_pictures_over_are_refused(text: str) -> None:
+    with pytest.raises(InputError, match="every picture is put into a part"):
+        parse_split(text)
 
 
 @pytest.mark.parametrize("text", ["", "1", "a,b", "1,1,1,1", "-1,2", "0,0", "nan,1", "inf,1,1"])
