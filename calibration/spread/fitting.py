@@ -123,10 +123,11 @@ _POWER_ODDS = 0.5
 """How likely it is that what a lens scatters falls by one of these from its core on (chosen)."""
 
 _SCATTERED = 0.04
-"""Standard deviation of all that such a lens scatters, and `_OFF_LAW` of a kernel's share against the law's, relative:
-of what is seen beside cells follows then what lies over all of the frame, channel by channel (chosen)."""
+"""Standard deviation of all that such a lens scatters (chosen)."""
 
 _OFF_LAW = 0.35
+"""Standard deviation of a kernel's share against the law's, relative: of what is seen beside cells follows what lies
+over all of the frame, channel by channel (chosen)."""
 
 _SCATTER_APART = 0.5
 """The same as `CHANNELS_APART` of such a lens."""

@@ -341,7 +341,7 @@ class LogChroma(FeatureLearner):
         return LogChromaModel(filters, bias, centre, np.array(grid))
 
     def restore(self, arrays: Mapping[str, npt.NDArray[np.generic]]) -> LogChromaModel:
-        """Return the model whose arrays are given: filters (2, 64, 33) complex128 and others, see there."""
+        """Return the model whose arrays are given: filters (2, 64, 33) complex128, bias (64, 64) float64 and others."""
         shapes = {"filters": (_CHANNELS, BINS, BINS // 2 + 1), "bias": (BINS, BINS), "centre": (2,), "grid": (2,)}
         found: dict[str, Any] = {name: arrays[name] for name in shapes}
         for name, shape in shapes.items():
@@ -373,7 +373,7 @@ class Lessons:
 
     @classmethod
     def restored(cls, arrays: Mapping[str, npt.NDArray[np.generic]]) -> Lessons:
-        """Return those that `arrays` holds, of the shapes and dtypes above."""
+        """Return those that `arrays` holds: places and counts (K,) int64 and uint16, lights (M, 3) float64."""
         found: list[Any] = [arrays[name] for name in ("learned_places", "learned_counts", "learned_lights")]
         places, counts, lights = found
         if places.ndim != 1 or places.shape != counts.shape or lights.ndim != 2 or lights.shape[1] != 3:
@@ -409,7 +409,7 @@ class LogChromaModel:
     lessons: Lessons | None = None
 
     def arrays(self) -> Mapping[str, npt.NDArray[np.generic]]:
-        """Return the arrays by their names, filters (2, 64, 33) complex128, and what it learned of if that is known."""
+        """Return the arrays by name: filters (2, 64, 33) complex128, others float64, and its lessons if they are known."""
         own = {"filters": self.filters, "bias": self.bias, "centre": self.centre, "grid": self.grid}
         held = {} if self.lessons is None else {f"learned_{name}": array for name, array in vars(self.lessons).items()}
         return {**own, **held}
