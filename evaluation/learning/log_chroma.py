@@ -409,7 +409,7 @@ class LogChromaModel:
     lessons: Lessons | None = None
 
     def arrays(self) -> Mapping[str, npt.NDArray[np.generic]]:
-        """Return the arrays by name: filters (2, 64, 33) complex128, others float64, and its lessons if they are known."""
+        """Return the arrays by name: filters (2, 64, 33) complex128, others float64, and its lessons if known."""
         own = {"filters": self.filters, "bias": self.bias, "centre": self.centre, "grid": self.grid}
         held = {} if self.lessons is None else {f"learned_{name}": array for name, array in vars(self.lessons).items()}
         return {**own, **held}
