@@ -552,10 +552,10 @@ def name_evidence(table: TableMeasurements, limit: float) -> Gathered:
     lights = table.session.lights
     whites = [frame.record for number, frame in enumerate(table.white_frames) if lights + number in exchanged]
     named = [frame.record for frame in table.frames if frame.record.illumination in far | exchanged]
-    known = gathered.evidence.known() | {"off_codes_deg": float(codes.off_deg.max())}
+    evidence = replace(gathered.evidence, off_codes_deg=float(codes.off_deg.max()))
     if as_another:
-        known["named_right"] = 0.0
-    return Gathered(Evidence(**known), (*named, *whites), ())
+        evidence = replace(evidence, named_right=0.0)
+    return Gathered(evidence, (*named, *whites), ())
 
 
 def brightness_evidence(table: TableMeasurements, limit: float) -> Gathered:
