@@ -22,25 +22,22 @@ LAST = 5
 BEYOND = " (beyond; it follows from another cause, or is followed)"
 """What marks a value outside its limits that refused no frame."""
 
-_MEANINGS = """\
-data: photosites without counts
-clipping: photosites that are clipped
-exposure: brightest photosites, of saturation
-chart: tags found, or references on a chart without
-repeated: noise of the difference to earlier frames, of that of independent ones
-movement: of the chart, from where it lies at rest
-blur: of the print, softer than in the first white frame
-rows: strips of rows that show what belongs elsewhere
-uniformity: the tile that deviates most from the frame's light
-light: from the light ordered to the one seen
-lamp: brighter than foretold from the frames before
-ambient: light from elsewhere, of white
-dark: light in the dark frame, of white
-white drift: brightness of white since the first white frame
-additivity: white beyond the sum of the primaries
-"""
-MEANINGS: dict[str, str] = {
-    name: meaning for name, _, meaning in (line.partition(": ") for line in _MEANINGS.splitlines())
+MEANINGS = {
+    "data": "photosites without counts",
+    "clipping": "photosites that are clipped",
+    "exposure": "brightest photosites, of saturation",
+    "chart": "tags found, or references on a chart without",
+    "repeated": "noise of the difference to earlier frames, of that of independent ones",
+    "movement": "of the chart, from where it lies at rest",
+    "blur": "of the print, softer than in the first white frame",
+    "rows": "strips of rows that show what belongs elsewhere",
+    "uniformity": "the tile that deviates most from the frame's light",
+    "light": "from the light ordered to the one seen",
+    "lamp": "brighter than foretold from the frames before",
+    "ambient": "light from elsewhere, of white",
+    "dark": "light in the dark frame, of white",
+    "white drift": "brightness of white since the first white frame",
+    "additivity": "white beyond the sum of the primaries",
 }
 """What the numbers of the checks are, for who has not read docs/how-to/night-run.md."""
 

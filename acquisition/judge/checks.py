@@ -280,6 +280,11 @@ def _by_region(tiles: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
     return np.asarray(grid.mean(axis=(1, 3))).reshape(-1, 3)
 
 
+def white_overlap(state: JudgeState) -> Check:
+    """Return how far white is beyond the sum of the primaries; told, and never a reason to refuse."""
+    return Check("additivity", round(100 * state.model.overlap, 2), None, None, "%")
+
+
 def judge_white(first: Frame | None, frame: Frame) -> Check:
     """Return how far paper is from that of the session's first frame of this light, white or the brightest grey."""
     if first is None or np.isnan(frame.paper).any() or np.isnan(first.paper).any():

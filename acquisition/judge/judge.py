@@ -32,6 +32,7 @@ from acquisition.judge.checks import (
     judge_white,
     named_once,
     voids_others,
+    white_overlap,
 )
 from acquisition.judge.light import FrameLight
 from acquisition.judge.light_checks import judge_evenness, judge_light
@@ -200,7 +201,7 @@ class LiveJudge:
         of_light, lamp = judge_light(state, step, light, self._plan, judge.light_deg, judge.drift_percent)
         checks += [*evenness, *of_light]
         if step.kind == "white" and state.modelled:
-            checks.append(Check("additivity", round(100 * state.model.overlap, 2), None, None, "%"))
+            checks.append(white_overlap(state))
         return Findings(frame, tuple(checks), light, off, lamp)
 
     def _preview(

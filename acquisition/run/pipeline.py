@@ -688,7 +688,7 @@ def _followed_changes(
         )
         said.append(("level", sentence))
     room_percent = values.get("dark", 0.0)
-    if step.number == min(one.number for one in steps if one.kind == step.kind) and room_percent > ROOM_LIGHT_PERCENT:
+    if room_percent > ROOM_LIGHT_PERCENT and step.number == min(one.number for one in steps if one.kind == step.kind):
         sentence = (
             f"{step_name(step)}: black has {room_percent:.1f} % of white, {ROOM_LIGHT_PERCENT:g} % expected; every "
             "light has it. Switch off what shines in the room; build-lut remarks on it, --subtract-dark takes it out"

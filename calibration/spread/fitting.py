@@ -463,12 +463,13 @@ class _Lenses:
         `known`: the same, as much of it as is certain in spite of what fits no lens.
         """
         matrix, vector = known
-        priors = np.array([np.linalg.inv(_usual_shares(bits, lens)) for lens in _supposed_lenses(bits < VARYING_BITS)])
+        lenses = _supposed_lenses(bits < VARYING_BITS)
+        priors = np.array([np.linalg.inv(_usual_shares(bits, lens)) for lens in lenses])
         # The logarithm of the integral over all shares (D. MacKay, Bayesian interpolation, 1992), about the likeliest
         # of those that a lens can have: a veil below 0 is no reason to suppose one.
         gains = np.array([_positive(matrix + prior, vector, np.arange(TERMS))[1] for prior in priors])
         evidence = gains + np.linalg.slogdet(priors)[1] - np.linalg.slogdet(matrix + priors)[1]
-        odds = np.array([lens.odds for lens in _supposed_lenses(bits < VARYING_BITS)])
+        odds = np.array([lens.odds for lens in lenses])
         weights = odds * np.exp(0.5 * (evidence - evidence.max()))
         return _Lenses(
             shown[0] + priors,

@@ -254,6 +254,17 @@ def _refuse_results(folder: Path, place: str) -> None:
         )
 
 
+def _refuse_pictures(folder: Folder, place: str) -> None:
+    """Refuse a folder of pictures beside which no file could hold their ground truths."""
+    pictures = [name for name in folder.files if name.lower().endswith((*IMAGE_ENDINGS, ".jpg", ".jpeg"))]
+    if pictures and not any(name.endswith((".csv", ".mat", ".txt", ".json")) for name in folder.files):
+        raise FormatError(
+            f"{place} is no dataset: pictures ({first_of(pictures)}) without ground truths; name a published set's "
+            "whole folder, put a .csv with image,r,g,b beside images of 16 bits, or make a dataset of pictures: "
+            f"generate LUT OUT --sources {place}"
+        )
+
+
 def _recognise(place: str) -> tuple[str, Folder | None]:
     """Return the layout of a place, and the names in its folder if it is one."""
     if "://" in place:
@@ -272,14 +283,8 @@ def _recognise(place: str) -> tuple[str, Folder | None]:
     folder = Folder(path)
     found = [name for name, known in LAYOUTS.items() if not known.general and known.matches(folder)]
     found = found or [name for name, known in LAYOUTS.items() if known.general and known.matches(folder)]
-    pictures = [name for name in folder.files if name.lower().endswith((*IMAGE_ENDINGS, ".jpg", ".jpeg"))]
-    if not found and pictures and not any(name.endswith((".csv", ".mat", ".txt", ".json")) for name in folder.files):
-        raise FormatError(
-            f"{place} is no dataset: pictures ({first_of(pictures)}) without ground truths; name a published set's "
-            "whole folder, put a .csv with image,r,g,b beside images of 16 bits, or make a dataset of pictures: "
-            f"generate LUT OUT --sources {place}"
-        )
     if not found:
+        _refuse_pictures(folder, place)
         require_no_other_table(folder)
         signs = "; ".join(f"{known.signs} ({name})" for name, known in LAYOUTS.items())
         raise FormatError(f"{place} is no dataset of a layout that is known. Looked for: {signs}. Name its folder")

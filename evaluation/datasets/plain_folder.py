@@ -24,16 +24,7 @@ from pathlib import Path
 
 import numpy as np
 
-from evaluation.datasets.files import (
-    IMAGE_ENDINGS,
-    Folder,
-    Light,
-    Mask,
-    RawScene,
-    light_of,
-    number_of,
-    read_rows,
-)
+from evaluation.datasets.files import IMAGE_ENDINGS, Folder, Light, Mask, RawScene, light_of, number_of, read_rows
 from evaluation.datasets.options import DataOptions, stated
 from evaluation.scene import Image, SceneSet
 from foundation.errors import FormatError, InputError, first_of
