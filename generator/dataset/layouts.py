@@ -924,7 +924,7 @@ def datasheet(description: Description) -> str:
         "pixels": description.pixels,
         "pixels_are": pixels_of(description),
         "procedure": _procedure(description),
-        "rendering": "colorimetrically, by the cells whose measured colour matches" if by_colour else rendering,
+        "rendering": "colorimetrically, interpolated between the cells of the chart" if by_colour else rendering,
         "replaced": description.replaced_pixels,
         "repeats": _repeats(description),
         "seed": description.seed,
