@@ -22,7 +22,7 @@ from calibration.citation import OriginRecord
 from calibration.radiometry.dark_frames import DarkSummary
 from calibration.radiometry.drift import DriftCorrection
 from calibration.radiometry.greys import PhotonTransfer, tint_deg
-from calibration.radiometry.primaries import Primaries
+from calibration.radiometry.primaries import Additivity, Primaries
 from calibration.radiometry.superposition import Superposition
 from calibration.registration.register import Registration
 from calibration.sampling import bleed
@@ -133,8 +133,11 @@ class SessionMeasurements:
     codes: tuple[tuple[int, int, int], ...]
 
 
-_USUAL_TOO_DARK = 0.2
-"""Share of the dark light by which dark frames differ from what is there in the lights' (judgement)."""
+_USUAL_SCATTER = 0.001
+"""Standard deviation of a frame's brightness, a share, where white frames do not show it (judgement)."""
+
+_SCATTER_FRAMES = 3
+"""White frames from which on they show it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -147,16 +150,13 @@ class LightMeasurements:
       known.
     - `subtracted`: (L, 3) float64 counts, dark light of bare paper that was subtracted; None where none was to be.
     - `share_at_zero`: (L,) float64, share of each light's samples in the table that are 0; (0,) after a check.
-    - `additivity`: (3,) float64, by how much the primaries together differ from white, relative to white; None where a
-      frame that is needed is missing.
+    - `additivity`: how white is made of the primaries; None where a frame that is needed is missing.
     - `codes`: how the whites agree with their codes, by all other lights (`calibration.checks.light_codes`); lights
       from index L on in `exchanges` and `seen_as` are white frames. None after a check.
     - `white_frames`: the same of the white frames: of the first alone where the others differ from it as a lamp drifts,
       or of all. None without.
     - `drift`: how the lights are brought to one lamp in the table; None where that was not asked for. All else is as
       measured.
-    - `of_primaries`: (3,) float64, how much of red, green and blue alone full white has, 1 where it adds; None where a
-      frame that is needed is missing.
     - `stray`: light in frames that the dark ones do not show; None without the three primaries each alone or a dark
       frame.
     """
@@ -166,12 +166,11 @@ class LightMeasurements:
     gains: _Array
     subtracted: _Array | None
     share_at_zero: _Array
-    additivity: _Array | None
+    additivity: Additivity | None
     codes: CodeAgreement | None
     white_frames: CodeAgreement | None
     drift: DriftCorrection | None = None
     stray: StrayLight | None = None
-    of_primaries: _Array | None = None
 
     @property
     def off_codes_deg(self) -> _Array | None:
@@ -186,17 +185,6 @@ class LightMeasurements:
             both = [light for light in (pair.one, pair.other) if light < len(off)]
             off[both] = np.maximum(off[both], pair.angle_deg)
         return off
-
-    def too_dark(self, dark: _Array) -> _Array:
-        """Return how much too much dark light (3,) float64 was perhaps subtracted, counts, of `dark` (3,) that was.
-
-        White then has twice as much beyond the sum of the primaries, each of which lacks it; a projector that adds
-        light of its own to white looks the same. Where no light shows it, a usual share of what is subtracted.
-        """
-        if self.additivity is None:
-            return _USUAL_TOO_DARK * dark
-        beyond = -self.additivity * self.white[int(np.argmax(self.white.sum(axis=1)))]
-        return np.minimum(np.abs(beyond) / 2, dark)
 
     def lights_off_codes(self, accepted_deg: float) -> list[int]:
         """Return the lights further than `accepted_deg` from what their codes predict, the furthest first."""
@@ -342,10 +330,10 @@ class TableMeasurements:
 
     @property
     def white_scatter(self) -> float:
-        """Standard deviation of a white frame's brightness about its neighbours', a share; 0 of less than three."""
+        """Standard deviation of a white frame's brightness about its neighbours', a share; what is usual of few."""
         whites = np.array([frame.paper.white.sum() for frame in self.white_frames])
-        if len(whites) < 3:
-            return 0.0
+        if len(whites) < _SCATTER_FRAMES:
+            return _USUAL_SCATTER
         off = whites[1:-1] - (whites[:-2] + whites[2:]) / 2
         return float(np.sqrt((off**2).mean() / 1.5) / whites.mean())
 

@@ -165,16 +165,16 @@ def bleed(cell_px: float, blur_px: float, window: int = WINDOW_PX) -> float:
     return float(ndtr(-(cell_px / 2 - window // 2 - MISPLACEMENT_PX) / max(blur_px, _LEAST_BLUR_PX)))
 
 
-def mean_bleed(cell_px: float, blur_px: float, window: int = WINDOW_PX) -> float:
-    """Return the share, 0 … 1, of the light of a window's mean that comes from beyond its cell, placed rightly.
+def mean_bleed(cell_px: float, blur_px: npt.NDArray[np.float64], window: int = WINDOW_PX) -> npt.NDArray[np.float64]:
+    """Return the share (N,), 0 … 1, of the light of a window's mean from beyond its cell, at blurs (N,) float64.
 
     Units and sources are those of `bleed`.
     """
     from scipy.special import ndtr
 
     at = np.arange(-(window // 2), window // 2 + 1)
-    inside = 1 - 2 * ndtr(-(cell_px / 2 - at) / max(blur_px, _LEAST_BLUR_PX)).mean()
-    return float(1 - inside**2)
+    inside = 1 - 2 * ndtr(-(cell_px / 2 - at) / np.maximum(blur_px, _LEAST_BLUR_PX)[:, None]).mean(axis=1)
+    return np.asarray(1 - inside**2, dtype=np.float64)
 
 
 def largest_blur_px(cell_px: float) -> float:

@@ -493,9 +493,10 @@ def drift_evidence(table: TableMeasurements, limit: float) -> Gathered:
 
 def sum_evidence(table: TableMeasurements, limit: float) -> Gathered:
     """Return what is known of primaries that do not add up to white: whether it is one of them, and its frame."""
-    light, off = light_evidence(table, limit), table.lights.of_primaries
-    if light.frames or off is None:
+    light, white = light_evidence(table, limit), table.lights.additivity
+    if light.frames or white is None:
         return light
+    off = white.amounts
     low, middle, high = np.argsort(off).tolist()
     under, over = (float(step) for step in (off[middle] - off[low], off[high] - off[middle]))
     lone, other = max(under, over), min(under, over)

@@ -312,18 +312,13 @@ def _too_dark(table: TableMeasurements) -> float | None:
     if lights.subtracted is None or lights.additivity is None or not _are_named_right(table):
         return None
     white = lights.white[int(np.argmax(lights.white.sum(axis=1)))]
-    beyond = -lights.additivity / 2
-    doubt = _UNSTEADY if len(table.white_frames) < _STEADY_FRAMES else table.white_scatter
+    beyond, doubt = -lights.additivity.off / 2, table.white_scatter
+    if table.sensor.superposition.measured:
+        doubt = np.hypot(doubt, lights.additivity.error / 2)
     certain = beyond - 2 * doubt
     allowed = _DARK_ALLOWS * np.maximum(dark, 0) / white + doubt
     return float(certain.max()) if (beyond > 0).all() and (beyond <= allowed).all() and (certain > 0).any() else 0.0
 
-
-_UNSTEADY = 0.001
-"""Standard deviation of a frame's brightness, a share, where white frames do not show it (judgement)."""
-
-_STEADY_FRAMES = 3
-"""White frames from which on they show it."""
 
 _DARK_ALLOWS = 1.25
 """Over the dark frames' light, what may have been subtracted too much: all of it, and its error."""
@@ -350,7 +345,7 @@ def _beyond_sum(sign: int) -> Callable[[TableMeasurements], float | None]:
         # What was subtracted too much is a figure of its own.
         if off is None or not _are_named_right(table) or (sign < 0 and (_too_dark(table) or 0) > TOO_DARK.accept):
             return None
-        return max(float((sign * off).max()), 0.0)
+        return max(float((sign * off.off).max()), 0.0)
 
     return measure
 
@@ -363,7 +358,7 @@ def _sum_evidence(table: TableMeasurements, limit: float) -> Gathered:
 def _sum_row(table: TableMeasurements) -> SummaryRow | None:
     off = table.lights.additivity
     note = "R, G, B, of white; 0 is additive"
-    return None if off is None else SummaryRow("Red + green + blue − white", percents(off), note)
+    return None if off is None else SummaryRow("Red + green + blue − white", percents(off.off), note)
 
 
 ADDITIVITY = Figure(

@@ -81,7 +81,7 @@ class Accumulator:
     - `highest_at`: (C,) int64, the light under which it was reached; −1 for a white frame.
     - `outside`: (C,) bool, whether a cell was cut off in a frame.
     - `covered`: (C,) bool, whether a cell did not look like the chart's in a frame in which the chart was registered.
-    - `place_error`: (C,) float64 half-size px, three standard errors of a cell's place, the worst of the frames in
+    - `place_error`: (C,) float64 half-size px, two standard errors of a cell's place, the worst of the frames in
       which the chart was registered; over the clearance of its samples (`Registration.clearance`).
     - `even_sum`: (C, S, 3) float32, sum of the frames of even light, counts above black.
     - `even_noise2`: (C, 3) float64, sum of the variances of one sample in these frames, counts².
@@ -127,7 +127,7 @@ class Accumulator:
             highest_at=np.zeros(count, dtype=np.int64),
             outside=np.zeros(count, dtype=np.bool_),
             covered=_covered_cells(baseline, baseline.first),
-            place_error=_place_errors(baseline, baseline.first),
+            place_error=baseline.first.registration.expanded_px(baseline.points.cells_mm),
             even_sum=np.zeros((count, samples, 3), dtype=np.float32),
             even_noise2=np.zeros((count, 3)),
             even_frames=0,
@@ -217,7 +217,9 @@ class Accumulator:
             estimate=self.estimate.restarted(),
             hot=self.hot.restarted(median_noise(self.darks)),
             covered=self.covered | _covered_cells(self.baseline, registered),
-            place_error=np.maximum(self.place_error, _place_errors(self.baseline, registered)),
+            place_error=np.maximum(
+                self.place_error, registered.registration.expanded_px(self.baseline.points.cells_mm)
+            ),
         )
         return after, measured
 
@@ -314,7 +316,7 @@ class Accumulator:
             elif self.place_error[colour] > MAX_PLACE_ERROR_PX:
                 cause = (
                     f"misplaced: its place is known to {self.place_error[colour]:.2f} px, {MAX_PLACE_ERROR_PX:g} px "
-                    "allowed (three standard errors); the print waves there, or little of it is seen"
+                    "allowed (k = 2); the print waves there, or little of it is seen"
                 )
             elif lit_by_others[colour] > MOST_ADDED:
                 cause = (
@@ -364,12 +366,6 @@ def _disturbance(under: list[tuple[int, float]]) -> str:
     deviation = f"{abs(off):.1%} {'darker' if off < 0 else 'brighter'} than its code gives"
     how = deviation if off else "too dark to be compared"
     return f"under light {light}{more} it is {how}, next to cells that are far off"
-
-
-def _place_errors(baseline: Baseline, registered: RegisteredFrame) -> _Array:
-    """Return three standard errors (C,) of the cells' places, in the order of colours, over their clearance."""
-    registration = registered.registration
-    return 3 * registration.uncertainty_px(baseline.points.cells_mm) / registration.clearance
 
 
 def _covered_cells(baseline: Baseline, registered: RegisteredFrame) -> npt.NDArray[np.bool_]:

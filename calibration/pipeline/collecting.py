@@ -112,7 +112,7 @@ def _figures(
             noise=done.noise(),
             transfer=baseline.transfer,
             linearity=linearity,
-            superposition=baseline.superposition or Superposition.usual(float(saturation - even.black.mean())),
+            superposition=_superposition(done),
         ),
         dark_frames=dark,
         cells=CellMeasurements(
@@ -128,6 +128,12 @@ def _figures(
         budget=Budget.none(),
     )
     return replace(table, budget=budget_of(table))
+
+
+def _superposition(done: Accumulator) -> Superposition:
+    """Return how counts deviate from proportion to light, as frames show it, else as is usual."""
+    black = float(np.mean([frame.black.mean() for frame in done.frames]))
+    return done.baseline.superposition or Superposition.usual(done.saturation - black)
 
 
 def _field_at_cells(baseline: Baseline, even: FrameMeasurements) -> _Array:
@@ -163,15 +169,13 @@ def _light_figures(done: Accumulator, by_light: Sequence[FrameMeasurements]) -> 
     agreement = _code_agreement(
         illuminations, by_light, compared, dark, gains if len(compared) < 2 else np.ones_like(gains)
     )
-    added = additivity(illuminations, white, full_white, dark, gains)
     return LightMeasurements(
         white=white,
         white_error=error,
         gains=gains,
         subtracted=np.array([frame.dark for frame in by_light]) if options.subtract_dark else None,
         share_at_zero=np.array([frame.share_at_zero for frame in by_light]),
-        additivity=None if added is None else added[0],
-        of_primaries=None if added is None else added[1],
+        additivity=additivity(illuminations, white, full_white, dark, gains, _superposition(done)),
         codes=agreement.rows(slice(len(by_light))),
         white_frames=agreement.rows(slice(len(by_light), None)) if whites else None,
         stray=_stray_light(illuminations, by_light, whites, dark, gains),

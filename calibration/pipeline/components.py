@@ -27,12 +27,20 @@ _RESPONSE = 0.003
 _SINGLE_DARK = 0.2
 """Relative change of dark light over a session, where one dark frame does not show it (judgement)."""
 
+_USUAL_TOO_DARK = 0.2
+"""Share of the dark light by which dark frames differ from what is there in the lights', where no light shows it
+(judgement)."""
+
 _FLICKER = 1e-4
-"""Relative, independent in each channel: a lamp that flickers, or a wheel that is cut, within an exposure (judgement:
-half-second exposures; Heinz et al. 2018)."""
+"""Relative: a lamp that flickers, or a wheel that is cut, within an exposure (judgement: half-second exposures; Heinz
+et al. 2018)."""
 
 _STRAY = 1e-4
-"""Relative, independent in each channel: light from beside the print where no figure shows it (judgement)."""
+"""Relative: light from beside the print where no figure shows it (judgement)."""
+
+_COMMON = 0.5
+"""Share of the mean square of these two that all channels have in common: a lamp flickers as a whole, a wheel is cut in
+one primary; walls send back the light that is shown, in their own colour (judgement)."""
 
 
 def budget_of(table: TableMeasurements) -> Budget:
@@ -53,15 +61,15 @@ def budget_of(table: TableMeasurements) -> Budget:
     )
 
 
-def _even(square: _Array | float, lights: int, cells: _Array) -> tuple[_Array, _Array]:
-    """Return the same mean square relative error, (3,) or a number, of all lights and cells, channels apart."""
-    squares = np.broadcast_to(square, (3,))
-    return np.broadcast_to(np.diag(squares), (lights, 3, 3)), np.broadcast_to(squares, cells.shape)
-
-
 def _diagonal(squares: _Array) -> _Array:
     """Return errors that are independent in each channel, (L, 3, 3), of mean squares (L, 3)."""
     return squares[:, :, None] * np.eye(3)
+
+
+def _partly_common(size: float, lights: int) -> _Array:
+    """Return mean square relative errors (L, 3, 3) of a size that `_COMMON` of is in all channels alike."""
+    square = size**2 * (_COMMON * np.ones((3, 3)) + (1 - _COMMON) * np.eye(3))
+    return np.broadcast_to(square, (lights, 3, 3))
 
 
 def _noise(table: TableMeasurements, white: _Array, cells: _Array) -> Component:
@@ -101,7 +109,7 @@ def _darkness(table: TableMeasurements, white: _Array, cells: _Array) -> Compone
     if lights.subtracted is not None and dark.lights:
         light = np.maximum(dark.light, 0)
         changes = np.var(dark.lights, axis=0, ddof=1) if len(dark.lights) > 1 else (_SINGLE_DARK * light) ** 2
-        error = error + dark.error**2 + changes + lights.too_dark(light) ** 2
+        error = error + dark.error**2 + changes + _too_dark(table, light) ** 2
         source = "scatter of the dark frames; what lights of several primaries have beyond the primaries' sum"
         assumed = lights.additivity is None or len(dark.lights) < 2
     at_cells = error / white[int(np.argmax(white.sum(axis=1)))] ** 2
@@ -110,6 +118,20 @@ def _darkness(table: TableMeasurements, white: _Array, cells: _Array) -> Compone
             1.0 if lights.subtracted is None else np.minimum(cells, 1.0) ** 2
         ),
     )  # fmt: skip
+
+
+def _too_dark(table: TableMeasurements, dark: _Array) -> _Array:
+    """Return how much too much dark light (3,) counts was perhaps subtracted, of `dark` (3,) counts that was.
+
+    White then has twice as much beyond the sum of the primaries, each of which lacks it; a projector that adds light of
+    its own to white looks the same.
+    """
+    found = table.lights.additivity
+    if found is None:
+        return _USUAL_TOO_DARK * dark
+    white = table.lights.white[int(np.argmax(table.lights.white.sum(axis=1)))]
+    beyond = np.sqrt(found.off**2 + found.error**2 + table.white_scatter**2) * white
+    return np.minimum(beyond / 2, dark)
 
 
 def _linearity(table: TableMeasurements, white: _Array, cells: _Array) -> Component:
@@ -128,9 +150,9 @@ def _linearity(table: TableMeasurements, white: _Array, cells: _Array) -> Compon
 
 
 def _added_light(table: TableMeasurements, white: _Array, cells: _Array) -> Component:
-    stray = _STRAY**2 if table.lights.stray is None else _STRAY**2 + table.lights.stray.share**2
-    lights, _ = _even(stray, len(white), cells)
-    at_cells = (stray + table.cells.added.mean_square) / cells**2
+    shown = 0.0 if table.lights.stray is None else table.lights.stray.share
+    lights = _partly_common(_STRAY, len(white)) + shown**2 * np.eye(3)
+    at_cells = (_STRAY**2 + shown**2 + table.cells.added.mean_square) / cells**2
     return Component(
         "added light", "reflections and light of single frames", table.lights.stray is None,
         "light that lies on dark and bright cells alike; codes of 0, and white against the primaries", lights, at_cells,
@@ -141,14 +163,18 @@ def _flicker(white: _Array, cells: _Array) -> Component:
     return Component(
         "flicker", "flicker within an exposure", True,
         "usual of lamps and wheels; a drift from frame to frame is in each light's own ground truth",
-        *_even(_FLICKER**2, len(white), cells),
+        _partly_common(_FLICKER, len(white)), np.broadcast_to(_FLICKER**2, cells.shape),
     )  # fmt: skip
 
 
 def _geometry(table: TableMeasurements, white: _Array, cells: _Array) -> Component:
-    """Return what reaches a cell's mean from its neighbours by the sharp core, and by where the cell was found."""
+    """Return what reaches a cell's mean from its neighbours by the sharp core, and by where the cell was found.
+
+    A place that is known to some error blurs the cell's rim by as much, in the mean.
+    """
     registration, window = table.registration, table.cells.window
-    of_neighbours = mean_bleed(registration.cell_px, registration.blur_px, window)
+    blur_px = np.hypot(registration.blur_px, registration.uncertainty_px(table.cells.stains.places_mm))
+    of_neighbours = mean_bleed(registration.cell_px, blur_px, window)[:, None]
     contrast = np.sqrt(((cells - cells.mean(axis=0)) ** 2 + cells.var(axis=0)) / cells**2)
     nothing = np.zeros((len(white), 3, 3))
     return Component(

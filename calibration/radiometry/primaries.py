@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from calibration.radiometry.superposition import Superposition
 from experiment.lights import Illumination
 from experiment.measures.least_squares import product
 from experiment.measures.paper import FlatField, Paper
@@ -31,32 +32,54 @@ _LARGEST = 0.2
 """Share by which a cell's field may differ from paper's; beyond, the difference is noise and left out."""
 
 
+@dataclass(frozen=True, eq=False)
+class Additivity:
+    """How white is made of the primaries.
+
+    - `off`: (3,) float64, by how much they together differ from white in each channel, relative to white.
+    - `error`: (3,) float64, its standard error by what is not known of the sensor.
+    - `amounts`: (3,) float64, how much of red, green and blue alone white has, 1 where it adds.
+    """
+
+    off: _Array
+    error: _Array
+    amounts: _Array
+
+
 def additivity(
-    lights: Sequence[Illumination], white: _Array, full_white: _Array | None, dark: _Array, gains: _Array
-) -> tuple[_Array, _Array] | None:
-    """Return by how much the primaries together differ from white, relative to white, and how much of each it has.
+    lights: Sequence[Illumination],
+    white: _Array,
+    full_white: _Array | None,
+    dark: _Array,
+    gains: _Array,
+    sensor: Superposition,
+) -> Additivity | None:
+    """Return how white is made of the primaries; None when one of them or white is missing.
 
     red + green + blue − 2 black = white where light adds: each of the three brings the projector's black along. A
     projector with a white segment on its wheel, or one that processes colours, gives more or less. It harms no table,
-    since each light's ground truth is measured; it means that a light cannot be predicted from its codes.
+    since each light's ground truth is measured; it means that a light cannot be predicted from its codes. A sensor that
+    compresses white would hide that too much dark light was subtracted: what is measured of that is taken out first.
 
     `lights`: L lights; used are the three with one full primary, and full white if `full_white` is None. `white`: (L,
     3) their ground truths. `full_white`: (3,) paper under full white from the white frames, None without. `dark`: (3,)
     paper in the dark frames; zeros where already subtracted. `gains`: (L, 3) the lamp's drift at each light, of which
-    white frames are free; `drift_gains`. Returns (3,) float64 by channel, and (3,) by primary, 1 where white adds; None
-    when a primary or white is missing.
+    white frames are free; `drift_gains`. `sensor`: how its counts deviate from proportion to light.
     """
-    found: dict[tuple[int, int, int], _Array] = {}
-    for light in lights:
-        found[light.codes] = white[light.index] / gains[light.index]
-    total = full_white if full_white is not None else found.get((255, 255, 255))
-    primaries = [found.get(code) for code in ((255, 0, 0), (0, 255, 0), (0, 0, 255))]
-    red, green, blue = primaries
-    if total is None or red is None or green is None or blue is None or not np.isfinite(dark).all():
+    index_of = {light.codes: light.index for light in lights}
+    primaries = [index_of[codes] for codes in ((255, 0, 0), (0, 255, 0), (0, 0, 255)) if codes in index_of]
+    full = index_of.get((255, 255, 255))
+    if len(primaries) < 3 or (full_white is None and full is None) or not np.isfinite(dark).all():
         return None
-    alone = np.stack([red, green, blue]) - dark
-    amounts = np.linalg.lstsq(alone.T, total - dark, rcond=None)[0]
-    return (red + green + blue - 2 * dark) / total - 1, np.asarray(amounts, dtype=np.float64)
+    counts = np.array([white[full] if full_white is None else full_white, *white[primaries]])
+    deviation, weights = sensor.relative(np.maximum(counts, 0))
+    drift = np.ones(3) if full_white is not None else gains[full]
+    total, *alone = counts / (1 + deviation) / np.array([drift, *gains[primaries]]) - dark
+    off = (np.sum(alone, axis=0) - total) / (total + dark)
+    together = np.einsum("pc,pck->ck", np.array(alone) / (total + dark), weights[1:]) - weights[0]
+    error = np.sqrt(np.einsum("ck,kl,cl->c", together, sensor.covariance, together))
+    amounts: _Array = np.asarray(np.linalg.lstsq(np.array(alone).T, total, rcond=None)[0], dtype=np.float64)
+    return Additivity(off, error, amounts)
 
 
 def drift_gains(at_s: _Array, white_at_s: _Array, white: _Array) -> _Array:

@@ -34,7 +34,7 @@ from foundation.errors import RegistrationError
 from foundation.robust import sigma_of
 
 MAX_PLACE_ERROR_PX = 0.5
-"""Three standard errors of the place of a cell of 10 px, at most: at 0.5 px the outermost of its 25 pixels, rounding
+"""Two standard errors of the place of a cell of 10 px, at most: at 0.5 px the outermost of its 25 pixels, rounding
 included, has 0.1 % of its light from the next cell at a blur of 0.7 px (`calibration.sampling`)."""
 
 CLEARANCE_PX = 1.75
@@ -134,9 +134,13 @@ class Registration:
         """Return the standard error (N,) float64 px of the places of points (N, 2) on the print, in green."""
         return self.place_errors.at(points_mm)
 
+    def expanded_px(self, points_mm: npt.ArrayLike) -> _Array:
+        """Return two standard errors (N,) float64 px of the places (N, 2), as they matter to cells of 10 px."""
+        return 2 * self.uncertainty_px(points_mm) / self.clearance
+
     def uncertain(self, points_mm: npt.ArrayLike) -> _Mask:
-        """Return which points (N,) bool are known too badly to be sampled: three standard errors exceed the limit."""
-        return np.asarray(3 * self.uncertainty_px(points_mm) > MAX_PLACE_ERROR_PX * self.clearance)
+        """Return which points (N,) bool are known too badly to be sampled."""
+        return np.asarray(self.expanded_px(points_mm) > MAX_PLACE_ERROR_PX)
 
     @property
     def places_known_px(self) -> tuple[float, float]:

@@ -196,7 +196,7 @@ def _channels(table: TableMeasurements) -> dict[str, Any]:
         "dark_counts": _numbers(dark.light),
         "dark_error": _numbers(dark.error),
         "dark_noise": _numbers(dark.noise),
-        ADDITIVITY.name: None if lights.additivity is None else _numbers(lights.additivity),
+        ADDITIVITY.name: None if lights.additivity is None else _numbers(lights.additivity.off),
         "stray": None if lights.stray is None else lights.stray.to_json(),
         "gain_e_per_count": _numbers(transfer.gain_e),
         "read_noise_counts": _numbers(transfer.read_noise),

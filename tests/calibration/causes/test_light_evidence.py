@@ -30,7 +30,7 @@ def table(off: tuple[float, float, float], white: np.ndarray[Any, Any] = STEADY)
     """Return of a table what the primaries' evidence is gathered from: full white has `off` of red, green and blue."""
     frames = [SimpleNamespace(record=record(light), exposure=0.5) for light in range(3)]
     whites = [SimpleNamespace(paper=SimpleNamespace(white=1000 * row)) for row in white]
-    lights = SimpleNamespace(of_primaries=np.array(off))
+    lights = SimpleNamespace(additivity=SimpleNamespace(amounts=np.array(off)))
     made = SimpleNamespace(frames=frames, white_frames=whites, lights=lights, primary_lights=(0, 1, 2))
     return cast("TableMeasurements", made)
 

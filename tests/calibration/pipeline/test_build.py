@@ -154,7 +154,7 @@ def test_dark_frames_show_the_projector_s_black(built: BuildResult, lab: Lab) ->
 
 def test_the_simulated_projector_s_light_adds(built: BuildResult) -> None:
     assert built.figures.lights.additivity is not None
-    assert np.abs(built.figures.lights.additivity).max() < 0.006
+    assert np.abs(built.figures.lights.additivity.off).max() < 0.006
 
 
 def test_every_level_of_grey_is_the_print_s(built: BuildResult, lab: Lab, table: Lut) -> None:

@@ -9,7 +9,9 @@ import pytest
 
 from benchmarks.cases import chart_of
 from benchmarks.sessions import AS_PLANNED, FrameChange, light_named, short_plan, short_session, world_of
+from benchmarks.troubles import Troubles, tried
 from calibration.figures.all_figures import FIGURES
+from calibration.figures.light import TOO_DARK
 from calibration.pipeline.baseline import BuildOptions
 from calibration.pipeline.build import build
 from calibration.report.page import summary
@@ -68,3 +70,9 @@ def test_light_that_is_always_there_is_not_remarked_on_here(
     assert stray.share < 0.002
     (row,) = [row for row in summary(result.figures) if row.name == "Light that no dark frame shows"]
     assert "1 of 6 lights" in row.note
+
+
+def test_a_sensor_that_compresses_white_does_not_hide_what_was_subtracted_too_much() -> None:
+    _, says, table = tried(3, Troubles(compression=0.037, in_darks=(0.0017, 0.0058, 0.0036)), small=True)
+    assert table is None
+    assert says[0].startswith(f"{TOO_DARK.title}: 0.4")

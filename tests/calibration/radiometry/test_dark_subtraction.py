@@ -132,7 +132,7 @@ def test_table_and_ground_truth_are_those_of_a_dark_room(room: Lab, subtracted: 
 
 def test_light_adds_when_the_dark_is_out(room: Lab, subtracted: BuildResult) -> None:
     assert subtracted.figures.lights.additivity is not None
-    assert np.abs(subtracted.figures.lights.additivity).max() < 0.006
+    assert np.abs(subtracted.figures.lights.additivity.off).max() < 0.006
     assert "leak_share" not in {row.figure.name for row in subtracted.verdict.rows}
     note = next(row.note for row in summary(subtracted.figures) if row.name.startswith("Light while"))
     assert note.endswith("; subtracted from samples and ground truth")

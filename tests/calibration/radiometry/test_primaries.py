@@ -10,7 +10,8 @@ import numpy.typing as npt
 import pytest
 
 from calibration.pipeline.build import build
-from calibration.radiometry.primaries import Primaries, additivity, drift_gains, pure_lights
+from calibration.radiometry.primaries import Additivity, Primaries, additivity, drift_gains, pure_lights
+from calibration.radiometry.superposition import NODES, Superposition
 from calibration.table.lut import open_lut
 from drivers.presenter import Colour
 from experiment.lights import Illumination, plan_illuminations
@@ -18,6 +19,8 @@ from experiment.measures.paper import FlatField, Paper, PaperReader
 from sim.world.room import Room
 from tests.calibration.lab import SETTINGS, hang, renumbered, take
 
+FULL = 12000.0
+USUAL = Superposition.usual(FULL)
 PRIMARIES = ((255, 0, 0), (0, 255, 0), (0, 0, 255))
 
 _Array = npt.NDArray[np.float64]
@@ -32,24 +35,41 @@ def test_light_adds_but_for_the_black_that_each_brings_along() -> None:
     white = black + parts.sum(axis=0)
     even = np.ones((3, 3))
 
-    def told(seen: _Array, full_white: _Array, gains: _Array = even) -> tuple[_Array, _Array]:
-        found = additivity(lights(PRIMARIES), seen, full_white, black, gains)
+    def told(seen: _Array, full_white: _Array, gains: _Array = even) -> Additivity:
+        found = additivity(lights(PRIMARIES), seen, full_white, black, gains, USUAL)
         assert found is not None
         return found
 
-    beyond, amounts = told(parts + black, white)
-    assert beyond == pytest.approx(np.zeros(3), abs=1e-9)
-    assert amounts == pytest.approx(np.ones(3))
-    assert told(parts + black, 1.25 * white)[0] == pytest.approx(np.full(3, -0.2), abs=1e-3)
-    assert told(0.9 * (parts + black), white, 0.9 * even)[0] == pytest.approx(np.zeros(3), abs=1e-9)
+    adds = told(parts + black, white)
+    assert adds.off == pytest.approx(np.zeros(3), abs=1e-9)
+    assert adds.amounts == pytest.approx(np.ones(3))
+    assert told(parts + black, 1.25 * white).off == pytest.approx(np.full(3, -0.2), abs=1e-3)
+    assert told(0.9 * (parts + black), white, 0.9 * even).off == pytest.approx(np.zeros(3), abs=1e-9)
     # A shadow in the frame of green alone: white has more of green than that frame.
     shadowed = parts * np.array([[1.0], [0.9], [1.0]]) + black
-    assert told(shadowed, white)[1] == pytest.approx([1, 1 / 0.9, 1])
+    assert told(shadowed, white).amounts == pytest.approx([1, 1 / 0.9, 1])
+
+
+def test_what_is_measured_of_a_sensor_is_taken_out_of_white() -> None:
+    parts, nodes = np.array([[3000.0, 700, 90], [400, 6000, 500], [80, 900, 4000]]), np.array(NODES)
+    seen, white = (light * (1 - 0.04 * light / FULL) for light in (parts, parts.sum(axis=0)))
+    known = replace(USUAL, deviation=-0.04 * nodes**2 * FULL, covariance=USUAL.covariance / 100, unmeasured=None)
+
+    def of(sensor: Superposition) -> Additivity:
+        found = additivity(lights(PRIMARIES), seen, white, np.zeros(3), np.ones((3, 3)), sensor)
+        assert found is not None
+        return found
+
+    assert of(USUAL).off.max() > 0.008
+    assert np.abs(of(known).off).max() < 0.002
+    # What is not known of the sensor may be in white, too.
+    assert of(known).error == pytest.approx(of(USUAL).error / 10, rel=0.1)
+    assert of(USUAL).error.max() > 0.001
 
 
 def test_a_missing_primary_leaves_it_untold() -> None:
-    assert additivity(lights(PRIMARIES[:2]), np.ones((2, 3)), np.ones(3), np.zeros(3), np.ones((2, 3))) is None
-    assert additivity(lights(PRIMARIES), np.ones((3, 3)), None, np.zeros(3), np.ones((3, 3))) is None
+    assert additivity(lights(PRIMARIES[:2]), np.ones((2, 3)), np.ones(3), np.zeros(3), np.ones((2, 3)), USUAL) is None
+    assert additivity(lights(PRIMARIES), np.ones((3, 3)), None, np.zeros(3), np.ones((3, 3)), USUAL) is None
 
 
 def test_the_drift_is_linear_between_white_frames() -> None:
