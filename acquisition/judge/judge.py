@@ -38,8 +38,7 @@ from acquisition.judge.light import FrameLight
 from acquisition.judge.light_checks import judge_evenness, judge_light
 from acquisition.judge.measure import Anchor, Frame, measure
 from acquisition.judge.state import Examined, JudgeState, LampSeen, is_brightest_grey, primary_of
-from drivers.raw.rawfile import Mosaic, read_raw
-from drivers.raw.wholeness import filled_fault
+from drivers.raw.rawfile import Mosaic, filled_fault, read_raw
 from experiment.chart.model import Chart
 from experiment.config import LabSettings
 from experiment.framing.pictures import preview_jpeg

@@ -33,8 +33,7 @@ import numpy as np
 import numpy.typing as npt
 
 from drivers.camera import ExposureSettings
-from drivers.raw.rawfile import Mosaic, read_raw
-from drivers.raw.wholeness import filled_fault
+from drivers.raw.rawfile import Mosaic, filled_fault, read_raw
 from experiment.chart.model import Chart
 from experiment.config import LabSettings, LimitSettings
 from experiment.framing.field import FoundField
