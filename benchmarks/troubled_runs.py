@@ -41,7 +41,7 @@ from drivers.links.link import Link, PeerLink
 from drivers.links.usb import open_usb
 from drivers.presenter import BLACK, Colour
 from drivers.projector import Power
-from drivers.ptp.session import Answer, NoAnswer, PtpRequest, Transport
+from drivers.ptp.protocol import Answer, NoAnswer, PtpRequest, Transport
 from drivers.ptp.usb import UsbTransport
 from experiment.chart.layout import design_chart
 from experiment.chart.model import Chart

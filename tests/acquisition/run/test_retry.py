@@ -25,7 +25,7 @@ from acquisition.run.retry import (
 from acquisition.run.rig.opening import open_rig
 from drivers.camera import keep_awake
 from drivers.presenter import WHITE
-from drivers.ptp.session import OperationDeclined
+from drivers.ptp.protocol import OperationDeclined
 from drivers.raw.rawfile import read_raw
 from experiment.chart.layout import design_chart
 from experiment.config import LabSettings
