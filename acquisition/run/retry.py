@@ -42,7 +42,7 @@ from dataclasses import dataclass
 from datetime import datetime
 from typing import Final, Protocol, TypeVar
 
-from experiment.session.journal_file import HeldJournalError, LostJournalError
+from experiment.session.journal import HeldJournalError, LostJournalError
 from experiment.session.records import duration_text
 from foundation import errors
 from foundation.clock import Clock
