@@ -31,8 +31,7 @@ from unittest.mock import patch
 
 from acquisition.cli import main as acquire
 from acquisition.run import run as runs
-from acquisition.run.devices import Devices
-from acquisition.run.retry import pause_cause
+from acquisition.run.devices import Devices, pause_cause
 from acquisition.run.rig import simulated
 from acquisition.run.rig.opening import open_rig
 from acquisition.run.run import run_session

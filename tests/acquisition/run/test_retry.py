@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from acquisition.run.retry import (
+from acquisition.run.devices import (
     BACK_OFF_S,
     LONGEST_BACK_OFF_S,
     PAUSE_S,
