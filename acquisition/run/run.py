@@ -17,7 +17,7 @@ from pathlib import Path
 
 from acquisition.judge.judge import LiveJudge
 from acquisition.judge.measure import ExposureJudge
-from acquisition.monitor.feed import write_session_report
+from acquisition.monitor.view import write_session_report
 from acquisition.run.devices import TRY_S, Devices, RetryPolicy, RunEnd, RunWatch, leave_lab, make_ready
 from acquisition.run.notices import Life, Notices, PauseNotices
 from acquisition.run.pipeline import Job, Pipeline, Saver, StepQueue, Taken, link_runs, unclosed_kinds, white_first

@@ -13,8 +13,7 @@ from pathlib import Path
 import pytest
 
 from acquisition.cli import main
-from acquisition.monitor.feed import LOOK_AGAIN_S, SessionWatch
-from acquisition.monitor.view import read_session
+from acquisition.monitor.view import LOOK_AGAIN_S, SessionWatch, read_session
 from acquisition.run.pipeline import Taken
 from acquisition.run.run import RunOutcome, take_session
 from drivers.presenter import Colour
