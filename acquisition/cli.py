@@ -471,7 +471,7 @@ def report(
 
     Reads SESSION, also while it is being taken. acquire run writes the same file when it ends.
     """
-    from acquisition.monitor.feed import write_session_report
+    from acquisition.monitor.view import write_session_report
 
     path = write_session_report(session, out)
     print(f"{path}: written")

@@ -17,7 +17,7 @@ from drivers.links.network import LOOPBACK
 from drivers.links.usb import open_usb
 from drivers.ptp.codes import Operation, ResponseCode
 from drivers.ptp.ip import IpTransport
-from drivers.ptp.session import Answer, PtpEvent, PtpRequest, PtpResponse, Transport
+from drivers.ptp.protocol import Answer, PtpEvent, PtpRequest, PtpResponse, Transport
 from drivers.ptp.usb import UsbTransport
 from foundation.clock import SystemClock
 from sim.buses.ptp import serve_ptpip

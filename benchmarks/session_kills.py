@@ -39,9 +39,8 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 from acquisition.run import devices
-from acquisition.run.devices import Devices
-from acquisition.run.queue import StepQueue, link_runs
-from acquisition.run.retry import Pause
+from acquisition.run.devices import Devices, Pause
+from acquisition.run.pipeline import StepQueue, link_runs
 from acquisition.run.run import take_session
 from drivers.camera import CameraIdentity, CapturedFrame, ExposureSettings
 from drivers.presenter import BLACK, Colour

@@ -31,8 +31,7 @@ from unittest.mock import patch
 
 from acquisition.cli import main as acquire
 from acquisition.run import run as runs
-from acquisition.run.devices import Devices
-from acquisition.run.retry import pause_cause
+from acquisition.run.devices import Devices, pause_cause
 from acquisition.run.rig import simulated
 from acquisition.run.rig.opening import open_rig
 from acquisition.run.run import run_session
@@ -41,7 +40,7 @@ from drivers.links.link import Link, PeerLink
 from drivers.links.usb import open_usb
 from drivers.presenter import BLACK, Colour
 from drivers.projector import Power
-from drivers.ptp.session import Answer, NoAnswer, PtpRequest, Transport
+from drivers.ptp.protocol import Answer, NoAnswer, PtpRequest, Transport
 from drivers.ptp.usb import UsbTransport
 from experiment.chart.layout import design_chart
 from experiment.chart.model import Chart

@@ -39,8 +39,8 @@ from calibration.radiometry.primaries import pure_lights
 from calibration.sampling import Sites
 from drivers.camera import ExposureSettings
 from drivers.presenter import WHITE
-from drivers.raw.plain_dng import Area
 from drivers.raw.rawfile import Mosaic
+from drivers.raw.storage import Area
 from experiment.lights import Illumination, parse_ccts, shown_colour
 from foundation.colorimetry import linear_srgb, planck, xyz_of
 from foundation.errors import FormatError, InputError, nearest_names

@@ -51,9 +51,8 @@ from acquisition.check.light_and_print import (
 )
 from acquisition.check.places import Levels
 from acquisition.judge.measure import disagreement
-from acquisition.run.devices import Devices, ask_all, make_ready, period_s, reported_error
+from acquisition.run.devices import Devices, RetryPolicy, ask_all, make_ready, period_s, reported_error
 from acquisition.run.plan import planned_steps, settings_doubts
-from acquisition.run.retry import RetryPolicy
 from acquisition.run.rig.opening import open_rig
 from calibration.figures.all_figures import BY_NAME, FIGURES
 from calibration.figures.figure import CheckMeasurements, Figure, Outcome, worst_outcome

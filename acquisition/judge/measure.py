@@ -33,8 +33,7 @@ import numpy as np
 import numpy.typing as npt
 
 from drivers.camera import ExposureSettings
-from drivers.raw.rawfile import Mosaic, read_raw
-from drivers.raw.wholeness import filled_fault
+from drivers.raw.rawfile import Mosaic, filled_fault, read_raw
 from experiment.chart.model import Chart
 from experiment.config import LabSettings, LimitSettings
 from experiment.framing.field import FoundField
@@ -134,7 +133,7 @@ class Sums:
     empty: int
 
 
-def sum_counts(counts: npt.NDArray[np.uint16], places: FramePlaces, clipping: float, floor: float) -> Sums:
+def _sum_counts(counts: npt.NDArray[np.uint16], places: FramePlaces, clipping: float, floor: float) -> Sums:
     """Return the mean counts at all places, in one pass.
 
     `counts`: (H, W) uint16, the visible area.
@@ -207,7 +206,7 @@ def measure(mosaic: Mosaic, black: _Array | None = None) -> Measured:
     black = frame_black(mosaic) if black is None else black
     mean_black = float(black.mean())
     floor = _EMPTY_SHARE * mean_black if mean_black >= _LEAST_BLACK else 0.0
-    sums = sum_counts(mosaic.counts, places, CLIPPING_SHARE * mosaic.white_level, floor)
+    sums = _sum_counts(mosaic.counts, places, CLIPPING_SHARE * mosaic.white_level, floor)
     rows, columns = places.sampled
     sampled = np.stack([blocks[r, c][rows, columns] for r in range(2) for c in range(2)], axis=-1)
     of = phases(mosaic)

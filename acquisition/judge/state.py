@@ -296,7 +296,7 @@ class JudgeState:
                 model = self.model
                 for number, frame in enumerate((red, green, blue)):
                     light = basis.light(frame)
-                    model = model.learn(light.amounts, primary_codes(number), light.covariance)
+                    model = model.learn(light.amounts, _primary_codes(number), light.covariance)
                 if self.white is not None and not self.moved_on:
                     light = basis.light(self.white)
                     model = model.learn(light.amounts, (255, 255, 255), light.covariance)
@@ -311,11 +311,11 @@ def is_brightest_grey(step: SessionStep) -> bool:
     return step.kind == "response" and step.colour.codes == (TOP, TOP, TOP)
 
 
-def primary_codes(primary: int) -> Codes:
+def _primary_codes(primary: int) -> Codes:
     """Return the codes that show primary 0, 1 or 2 alone at `TOP` (`experiment.session.records`)."""
     return PRIMARIES[primary].codes
 
 
 def primary_of(codes: Codes) -> int | None:
     """Return which primary codes show alone at `TOP`; None if they show anything else."""
-    return next((number for number in range(3) if codes == primary_codes(number)), None)
+    return next((number for number in range(3) if codes == _primary_codes(number)), None)

@@ -6,8 +6,7 @@ import json
 import re
 from pathlib import Path
 
-from acquisition.monitor.feed import SessionWatch, live_page, to_bytes
-from acquisition.monitor.view import read_session
+from acquisition.monitor.view import SessionWatch, live_page, read_session, to_bytes
 from experiment.session.journal import JOURNAL_FILE
 from experiment.session.ledger import ledger_path
 from foundation.errors import FormatError

@@ -1,12 +1,42 @@
-"""What a session is taken with, by contract only: camera, presenter and projector, made ready and asked at each frame.
+"""What a session is taken with, by contract only: made ready, asked at each frame, waited for where it fails or hangs.
+
+Camera, presenter and projector are the devices; the disk is waited for in the same way::
+
+    retry = RetryPolicy(clock, settings.sequence.patience_s, report, idle, on_wait)
+    retry.attempt(lambda: presenter.show(colour), "the screen")
+    retry.attempt(lambda: journal.begin(step, file, clock.now()), "the disk")
+
+or, where a try is more than one call::
+
+    pause = retry.pause("the camera", idle=False)
+    while True:
+        try:
+            frame = …
+        except DeviceError as fault:
+            pause.wait(fault)  # returns after some seconds for the next try; raises when the time is over
+        else:
+            pause.over()  # says that the run goes on, if it had said that it paused
+            break
 
 Rules that hold inside:
 
+- The first failure is tried again after a second (`retry`), so that what passes at once pauses nothing. What lasts
+  pauses the run (`paused`) with the cause that holds *now*; another cause is told as soon as it is there (`still
+  paused`); with other digits it is no other. `resumed` ends it.
+- Every few seconds of a pause come `on_wait`, with cause and countdown, and `idle`, for devices that are not at fault.
+- When the time is over, the error is of the first cause's class and names it first; what held at last is added.
+- What fails again before `RECURS_WITHIN` frames were accepted was not mended: its pauses count together, and share one
+  patience and one back-off. A cause that comes and goes ends a run as one does that stays.
+- Nothing that is told may end the run: a full disk, which cannot take the note of a pause, gets it when there is space.
+- What is no `CropError` passes through at once: Ctrl-C ends a pause; `on_wait` and `idle` may raise
+  `KeyboardInterrupt`.
+- A step that hangs, a camera that does not answer for one, leaves the run unable to say so itself: `RunWatch` looks
+  each second in a thread of its own. It sees, too, that the machine slept or the process was stopped: nobody knows what
+  the screen showed meanwhile.
 - A lamp that was lit when it was first asked for is taken as warm; one that was lit meanwhile gets its warm-up, and
   gets it anew where it goes out during that.
-- A projector that reports a fault, shows no picture or does not answer is unhealthy: the run pauses, with the cause
-  that holds now (`acquisition.run.retry`).
-- A projector that was out of reach for as long as a lamp takes to light may have lost its power meanwhile.
+- A projector that reports a fault, shows no picture or does not answer is unhealthy: the run pauses. One that was out
+  of reach for as long as a lamp takes to light may have lost its power meanwhile.
 - It is lit by the program once, before the first frame: whoever switched it off later may have had a reason. With
   `sequence.relight` it is lit again where it is in standby, once a pause: a lamp that does not light is not worn out.
 - Whatever ends the run, the screen goes black, and the lamp's fate is decided and said:
@@ -24,20 +54,32 @@ somebody ended it     is left as it is                       somebody is there, 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping
-from contextlib import suppress
+import re
+import threading
+from collections.abc import Callable, Generator, Iterable, Mapping
+from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from dataclasses import dataclass
+from datetime import UTC, datetime, timedelta
 from enum import Enum
-from typing import Final
+from typing import Final, Protocol, Self, TypeVar
 
-from acquisition.run.retry import INSTANT_S, PAUSE_S, Pause, Report, RetryPolicy
 from drivers.camera import Camera
 from drivers.presenter import BLACK, Colour, Presenter
 from drivers.projector import Power, Projector, ReportsPictureFault, Severity
 from experiment.config import CameraSettings, LabSettings, ProjectorCable, SequenceSettings
+from experiment.session.journal import HeldJournalError, LostJournalError
 from experiment.session.records import duration_text
-from foundation.clock import Clock
-from foundation.errors import ConfigurationError, CropError, DeviceError, DeviceFault, DeviceRefused, LinkError
+from foundation import errors
+from foundation.clock import Clock, elapsed_s
+from foundation.errors import (
+    ConfigurationError,
+    CropError,
+    DeviceError,
+    DeviceFault,
+    DeviceRefused,
+    LinkError,
+    StorageError,
+)
 
 POWER_LIMIT_S: Final = 300.0
 """How long a lamp may take to light; makers state up to 130 s with repeated ignition."""
@@ -393,7 +435,7 @@ ENGRAVED_S = (
 """Shutter times in thirds of a stop as cameras show them, seconds: what is named before a camera can be asked."""
 
 
-def light_period_s(projector: ProjectorCable) -> float:
+def _light_period_s(projector: ProjectorCable) -> float:
     """Return the seconds after which the projector's light repeats: a turn of its wheel, else a picture."""
     return 1 / (projector.colour_wheel_hz or projector.refresh_hz)
 
@@ -408,7 +450,7 @@ def wheel_of(settings: LabSettings) -> float:
 def period_s(settings: LabSettings) -> float:
     """Return the seconds after which the light before the camera repeats: a turn of its wheel, or a picture."""
     wheel_hz = wheel_of(settings)
-    return 1 / wheel_hz if wheel_hz else light_period_s(settings.lab.projector)
+    return 1 / wheel_hz if wheel_hz else _light_period_s(settings.lab.projector)
 
 
 def holds_whole_turns(shutter_s: float, period_s: float) -> bool:
@@ -420,7 +462,7 @@ def holds_whole_turns(shutter_s: float, period_s: float) -> bool:
 
 def require_whole_turns(camera: CameraSettings, projector: ProjectorCable) -> None:
     """Require that an exposure holds whole turns of the colour wheel, or whole pictures where there is no wheel."""
-    period = light_period_s(projector)
+    period = _light_period_s(projector)
     shutter = camera.shutter_s
     if holds_whole_turns(shutter, period):
         return
@@ -439,3 +481,370 @@ def require_whole_turns(camera: CameraSettings, projector: ProjectorCable) -> No
         value=shutter,
         expected=(below, above),
     )
+
+
+RETRY_S: Final = 1.0
+"""Before the second try: a notification in front of the picture, or a cable put back, needs no more."""
+PAUSE_S: Final = 5.0
+"""Between two tries in a pause; an operator who mends something does not notice so short a wait."""
+SLOW_S: Final = 10.0
+"""A try that failed after so long has been tried often enough by its driver: the pause is told at once."""
+TRY_S: Final = 300.0
+"""How long a try may go without a sign of life: a camera's driver waits 90 s for a frame of 30 s, then
+looks for it for 70 s more over a new connection, and a question may go without an answer for 20 s."""
+RECURS_WITHIN: Final = 10
+"""Frames that must be accepted after a pause for the next one to count anew: what works for half a minute between two
+faults lets a session get on, and what works for a frame or two does not."""
+BACK_OFF_S: Final = 5.0
+"""Between the second and the third try of what costs a refused file each; the second comes at once, each later pause is
+twice the one before."""
+LONGEST_BACK_OFF_S: Final = 300.0
+"""Between two such tries at most: an operator can wait for five minutes."""
+FRAMES: Final = "the frames"
+"""What is waited for where nothing fails but every frame is refused."""
+TOLD_LATER: Final = " (this was at "
+"""What stands behind a sentence that the disk could not take when it was said."""
+INSTANT_S: Final = 1e-6
+"""Resolution of simulated time: nothing shorter can be waited for."""
+
+_Result = TypeVar("_Result")
+
+
+class Report(Protocol):
+    """Where words and sentences of a run go: terminal first, then journal, then whoever is notified."""
+
+    def __call__(self, what: str, sentence: str, /) -> None:
+        """Tell what happens, with its cause.
+
+        ``retry``, ``paused``, ``still paused``, ``resumed``, ``relit`` or ``warming up``.
+        """
+        ...
+
+
+class _WaitCallback(Protocol):
+    """Where signs of life of a wait go: the journal's heartbeat, and a line on the terminal."""
+
+    def __call__(self, state: str, sentence: str, within_s: float, /) -> None:
+        """Tell the state (``paused`` or ``waiting``), what is waited for and how long, and when the next is due."""
+        ...
+
+
+def is_curable(fault: CropError) -> bool:
+    """Return whether waiting may help: any fault of a device or of the disk, but nothing that the user gave."""
+    return isinstance(fault, DeviceError | StorageError) and not isinstance(fault, HeldJournalError | LostJournalError)
+
+
+class RetryPolicy:
+    """How long, and how, a run waits for what fails.
+
+    `idle`: keeps the other devices awake; called every few seconds. Its `DeviceError` is left to the device's own next
+    use. `on_wait`: told every few seconds of a wait, with the time left in the sentence.
+    `breakable`: a block in which somebody's request ends the run at once, put around every wait.
+    """
+
+    def __init__(
+        self,
+        clock: Clock,
+        limit_s: float,
+        report: Report = lambda what, sentence: None,
+        idle: Callable[[], None] = lambda: None,
+        on_wait: _WaitCallback = lambda state, sentence, within_s: None,
+        breakable: Callable[[], AbstractContextManager[None]] = nullcontext,
+    ) -> None:
+        self.clock = clock
+        self.limit_s = limit_s
+        self.breakable = breakable
+        self._tell, self._idle, self._on_wait = report, idle, on_wait
+        self._untold: list[tuple[str, str, datetime]] = []
+        self._histories: dict[str, _History] = {}
+
+    def accepted(self) -> None:
+        """Note an accepted frame: what was waited for before so many of them counts as mended."""
+        for name, history in list(self._histories.items()):
+            history.frames += 1
+            if history.frames >= RECURS_WITHIN:
+                del self._histories[name]
+
+    def attempt(
+        self,
+        action: Callable[[], _Result],
+        name: str,
+        *,
+        curable: Callable[[CropError], bool] = is_curable,
+        idle: bool = True,
+    ) -> _Result:
+        """Return what `action` returns, tried until it succeeds or the time is over."""
+        pause = self.pause(name, idle=idle)
+        while True:
+            try:
+                result = action()
+            except CropError as fault:
+                if not curable(fault):
+                    raise
+                pause.wait(fault)
+            else:
+                pause.over()
+                return result
+
+    def pause(self, name: str, *, idle: bool = True) -> Pause:
+        """Return what waits for `name`, and counts from its first failure; parameters as those of `attempt`."""
+        return Pause(self, name, idle, self._histories.setdefault(name, _History()))
+
+    def report(self, what: str, sentence: str) -> None:
+        """Tell what happens; where the disk cannot take it, it is told again as soon as something else can be."""
+        self._untold.append((what, sentence, self.clock.now()))
+        with suppress(StorageError):
+            while self._untold:
+                what, sentence, at = self._untold[0]
+                late = (self.clock.now() - at).total_seconds() > RETRY_S
+                self._tell(what, f"{sentence}{TOLD_LATER}{at.astimezone():%H:%M:%S})" if late else sentence)
+                self._untold.pop(0)
+
+    def wait(self, seconds: float, state: str, sentence: Callable[[], str], *, idle: bool = True) -> None:
+        """Let `seconds` pass; what `sentence` returns is told every few of them."""
+        until = self.clock.monotonic() + seconds
+        while (left := until - self.clock.monotonic()) >= INSTANT_S:
+            self.sign_of_life(state, sentence(), 2 * PAUSE_S + TRY_S * idle)
+            self.clock.sleep(min(left, PAUSE_S))
+            if idle:
+                with suppress(DeviceError):
+                    self._idle()
+
+    def sign_of_life(self, state: str, sentence: str, within_s: float) -> None:
+        """Tell what is waited for; a disk that cannot take it does not matter."""
+        with suppress(StorageError):
+            self._on_wait(state, sentence, within_s)
+
+
+@dataclass
+class _History:
+    """What was waited for a thing so far: `pauses` of `spent_s` together, and accepted `frames` since the last."""
+
+    pauses: int = 0
+    spent_s: float = 0.0
+    back_off_s: float = 0.0
+    frames: int = 0
+
+
+class Pause:
+    """The wait for one thing that fails; given by `RetryPolicy.pause`."""
+
+    def __init__(self, policy: RetryPolicy, name: str, idle: bool, history: _History) -> None:
+        self._policy = policy
+        self._history = history
+        self._name = name
+        self._idle = idle
+        self._begun_trying = policy.clock.monotonic()
+        self._first: CropError | None = None
+        self._failed_at = self._begun_trying
+        self._told = ""
+
+    def wait(self, fault: CropError) -> None:
+        """Say what holds now, and return when it is time for the next try."""
+        with self._policy.breakable():
+            self._wait(fault)
+
+    def back_off(self, fault: CropError) -> None:
+        """Wait as `wait` does, longer each time, for a try that costs something."""
+        clock, history = self._policy.clock, self._history
+        until = clock.monotonic() + history.back_off_s
+        self.wait(fault)
+        while clock.monotonic() < until:
+            self.wait(fault)
+        history.back_off_s = min(max(2 * history.back_off_s, BACK_OFF_S), LONGEST_BACK_OFF_S)
+
+    def _wait(self, fault: CropError) -> None:
+        policy = self._policy
+        now = policy.clock.monotonic()
+        first = self._first or fault
+        again = self._first is not None
+        if not again:
+            self._first, self._failed_at = fault, now
+        left = self._left_s()
+        if left < INSTANT_S:
+            raise self._ended(first, fault) from fault
+        if not again and now - self._begun_trying < SLOW_S:
+            policy.report("retry", _waited_for(self._name, fault))
+            policy.clock.sleep(min(RETRY_S, left))
+            return
+        kind = _kind(fault)
+        if kind != self._told:
+            how_long = "for as long as it takes" if math.isinf(policy.limit_s) else f"up to {duration_text(left)}"
+            policy.report(
+                "still paused" if self._told else "paused",
+                f"{_waited_for(self._name, fault)} (the run waits {how_long}, and goes on by itself)",
+            )
+            self._told = kind
+        policy.wait(min(PAUSE_S, left), "paused", lambda: self._countdown(fault), idle=self._idle)
+        policy.sign_of_life("paused", self._countdown(fault), TRY_S)
+
+    def over(self) -> None:
+        """Say that the run goes on, where it had said that it paused."""
+        if self._told:
+            are = "are" if self._name.endswith("s") else "is"
+            lasted = duration_text(self._lasted_s())
+            self._policy.report("resumed", f"{self._name} {are} ready again after a pause of {lasted}")
+            self._history.pauses += 1
+            self._history.frames = 0
+            self._history.spent_s += max(self._lasted_s(), PAUSE_S)
+            self._told = ""
+
+    def _left_s(self) -> float:
+        return self._policy.limit_s - self._history.spent_s - self._lasted_s()
+
+    def _lasted_s(self) -> float:
+        return self._policy.clock.monotonic() - self._failed_at
+
+    def _countdown(self, fault: CropError) -> str:
+        left = self._left_s()
+        end = "waits for as long as it takes" if math.isinf(left) else f"ends in {duration_text(max(left, 0))}"
+        return (
+            f"{_waited_for(self._name, fault)} (paused for {duration_text(self._lasted_s())}; goes on by itself, {end})"
+        )
+
+    def _ended(self, first: CropError, fault: CropError) -> CropError:
+        if not self._policy.limit_s:
+            return first
+        # What came first is told without its remedy: that of what holds now helps. A fault may name it already.
+        cause = str(first).partition("; ")[0]
+        at_last = fault if _kind(cause) in _kind(fault) else f"{cause}; at last: {fault}"
+        waited = duration_text(self._policy.limit_s)
+        if self._history.pauses:
+            waited += f", in {self._history.pauses + 1} pauses with few frames between them,"
+        return _family(first)(
+            _waited_for(self._name, at_last),
+            remedy=f"the run waited {waited} for that and ended: when it is mended run the same command again",
+        )
+
+
+def pause_cause(sentence: str) -> str:
+    """Return what a pause is for, of the sentence that tells it: the same at each of its times, and for all frames."""
+    name, *_ = sentence.partition(": ")
+    return name if name == FRAMES else _kind(sentence.partition(TOLD_LATER)[0].rpartition(" (")[0])
+
+
+_RUN_AGAIN = re.compile(r"(?:,|;)? (?:then )?run (?:the same command )?again")
+"""What the remedies of errors end with that also end a command."""
+
+
+def _waited_for(name: str, fault: CropError | str) -> str:
+    """Return a fault as `_named` does, without the order to run again: the run that waits goes on by itself."""
+    return _RUN_AGAIN.sub("", _named(name, fault))
+
+
+def _named(name: str, fault: CropError | str) -> str:
+    """Return a fault with the name of what has it, which many name themselves."""
+    return str(fault) if str(fault).startswith(name) else f"{name}: {fault}"
+
+
+def _kind(fault: CropError | str) -> str:
+    """Return a fault's words without its numbers, which may change from one try to the next."""
+    return re.sub(r"\d+(?:[.,]\d+)*", "#", str(fault))
+
+
+def _family(fault: CropError) -> type[CropError]:
+    """Return the nearest class of the tree of errors; classes of drivers want more than a sentence."""
+    return next(kind for kind in type(fault).__mro__ if kind.__module__ == errors.__name__)
+
+
+TICK_S: Final = 1.0
+"""Between two looks at the time."""
+
+GAP_S: Final = 10.0
+"""A look that comes so late was held up: a busy machine lets a thread wait for a second or two."""
+
+LATE_TIMES: Final = 3.0
+"""A step is late when it takes so many times as long as it is expected to: a download that is tried again takes two."""
+
+LATE_S: Final = 10.0
+"""And so many seconds more: a disk, or a machine with other work, may stall for some."""
+
+
+@dataclass
+class _Step:
+    """What `device` does since `begun`, seconds as they elapse; `expected_s` is what it takes."""
+
+    device: str
+    doing: str
+    expected_s: float
+    begun: float
+    is_told: bool = False
+
+
+class RunWatch:
+    """Looks at the time in a thread of its own; use it in a `with` block.
+
+    `on_late`: called by that thread, once for a step that is late, with the sentence that says so and when it began.
+    `elapsed`: returns seconds that pass while the machine sleeps, too; None: the machine's.
+    """
+
+    def __init__(
+        self,
+        on_late: Callable[[str, datetime], object] = lambda sentence, begun: None,
+        elapsed: Callable[[], float] | None = None,
+    ) -> None:
+        self._on_late = on_late
+        self._elapsed = elapsed or elapsed_s
+        self._lock = threading.Lock()
+        self._last = self._elapsed()
+        self._gap_s = 0.0
+        self._step: _Step | None = None
+        self._took: dict[str, float] = {}
+        self._over = threading.Event()
+        self._thread = threading.Thread(target=self._watch, name="watch", daemon=True)
+
+    def __enter__(self) -> Self:
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._over.set()
+        self._thread.join()
+
+    def gap_s(self) -> float:
+        """Return for how long the program stood still since this was asked last, seconds; 0 where it did not."""
+        self.look()
+        with self._lock:
+            gap_s, self._gap_s = self._gap_s, 0.0
+        return gap_s
+
+    @contextmanager
+    def step(self, device: str, doing: str, expected_s: float, kind: str) -> Generator[None]:
+        """Note what a device does in the block: at least `expected_s`, or as long as the last of its `kind` took."""
+        step = _Step(device, doing, max(expected_s, self._took.get(kind, 0.0)), self._elapsed())
+        with self._lock:
+            self._step = step
+        try:
+            yield
+        finally:
+            with self._lock:
+                self._step = None
+                if not step.is_told:
+                    self._took[kind] = self._elapsed() - step.begun
+
+    def look(self) -> None:
+        """Look at the time."""
+        late: _Step | None = None
+        with self._lock:
+            now = self._elapsed()
+            passed, self._last = now - self._last, now
+            step = self._step
+            if passed > GAP_S:
+                self._gap_s += passed
+                if step is not None:
+                    step.begun += passed
+            if step is not None and not step.is_told and now - step.begun > LATE_TIMES * step.expected_s + LATE_S:
+                late, step.is_told = step, True
+        if late is not None:
+            begun = datetime.now(UTC) - timedelta(seconds=now - late.begun)
+            expected = duration_text(late.expected_s) if late.expected_s >= 1 else f"{late.expected_s:.1g} s"
+            since = f"{begun.astimezone():%Y-%m-%d %H:%M:%S}"
+            self._on_late(
+                f"late since {since}: {late.device} {late.doing}, for which {expected} is expected; look at "
+                f"{late.device} and what it is connected by",
+                begun,
+            )
+
+    def _watch(self) -> None:
+        while not self._over.wait(TICK_S):
+            self.look()

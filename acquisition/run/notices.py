@@ -1,4 +1,4 @@
-"""Who is told of a run: the terminal, a command that is run, a URL to which JSON is posted; nothing waits for them.
+"""Who is told of a run: the terminal, a command, a URL, systemd, a dead man's switch; nothing waits for them.
 
 Rules that hold inside:
 
@@ -6,6 +6,8 @@ Rules that hold inside:
 - A notice that cannot be delivered hurts nobody: what failed is said once, by the thread that tells.
 - Of the target nothing is said but a URL's scheme and host, or a program's name: the rest may be a secret. Errors of
   libraries, whose text may hold it, are told by their number or kind.
+- Signs of life (`Life`) come from the steps of the run itself, a frame, a try in a pause: a run that hangs gives none,
+  and its silence tells that it hangs.
 
 What a receiver gets, on its standard input or as the body of a POST (`application/json`)::
 
@@ -33,14 +35,13 @@ import time
 from collections import deque
 from collections.abc import Callable, Mapping
 from contextlib import suppress
-from datetime import datetime
+from datetime import UTC, datetime
 from types import TracebackType
 from typing import Final, Self
 from urllib.parse import unquote, urlsplit, urlunsplit
 
-from acquisition.run.pipeline import Taken
-from acquisition.run.queue import step_name
-from acquisition.run.retry import pause_cause
+from acquisition.run.devices import pause_cause
+from acquisition.run.pipeline import Taken, step_name
 from experiment.session.records import RECENT, Check, Judgement, TimedAttempt, duration_text, time_left
 from foundation.clock import Clock
 from foundation.console import shows_progress
@@ -244,12 +245,12 @@ class TimeLeft:
 def verdict_line(taken: Taken) -> str:
     """Return what is said of the last frame in a line: its verdict, and numbers with their units."""
     judgement = taken.judgement
-    numbers = [number_text(check) for name in SHOWN for check in _of_name(judgement, name)]
+    numbers = [_number_text(check) for name in SHOWN for check in _of_name(judgement, name)]
     said = "accepted" if judgement.accepted else "refused"
     return ", ".join([f"{step_name(taken.step)} {said}", *numbers])
 
 
-def number_text(check: Check) -> str:
+def _number_text(check: Check) -> str:
     """Return a check's name and number, as in ``light 0.21°``."""
     unit = "" if not check.unit else check.unit if check.unit.startswith("°") else f" {check.unit}"
     return f"{check.name} {check.value:.3g}{unit}{' (beyond its limit)' if check.is_beyond else ''}"
@@ -343,3 +344,74 @@ def _print(line: str) -> None:
     # A log on a disk that is full for a while ends no run: the journal has what counts.
     with suppress(OSError):
         print(line, file=sys.stderr)
+
+
+ALIVE_S: Final = 60.0
+"""Between two signs to a dead man's switch: services of that kind count minutes."""
+
+WATCHDOG_SHARE: Final = 0.25
+"""Of the watchdog's time, between two signs at least: sd_watchdog_enabled(3) recommends half of it at most."""
+
+
+class Life:
+    """Gives signs of life of a run; close it at the end.
+
+    `target`: the dead man's switch, a URL or a command; empty: none. `environment`: what a service manager has set.
+    """
+
+    def __init__(
+        self,
+        target: str,
+        session: str,
+        warn: Callable[[str], object],
+        clock: Clock,
+        environment: Mapping[str, str] = os.environ,
+    ) -> None:
+        self._notices = Notices(target, session, warn)
+        self._clock = clock
+        self._manager = environment.get("NOTIFY_SOCKET", "")
+        self._watchdog_s = _watchdog_s(environment)
+        self._told = self._fed = -math.inf
+
+    def ready(self) -> None:
+        """Tell that devices and session are open, and the run is at work."""
+        self._to_manager("READY=1")
+        self.sign("at work")
+
+    def sign(self, doing: str) -> None:
+        """Tell what the run does now, as often as is wanted."""
+        now = self._clock.monotonic()
+        if now - self._fed >= self._watchdog_s * WATCHDOG_SHARE:
+            self._fed = now
+            self._to_manager(f"WATCHDOG=1\nSTATUS={' '.join(doing.split())}")
+        if now - self._told >= ALIVE_S:
+            self._told = now
+            self._notices.tell("alive", doing, datetime.now(UTC))
+        self._notices.say_failures()
+
+    def end(self, how: str, sentence: str) -> None:
+        """Tell how the run ended; nothing follows."""
+        self._to_manager(f"STOPPING=1\nSTATUS={how}: {' '.join(sentence.split())}")
+        self._notices.tell(how, sentence, datetime.now(UTC))
+
+    def close(self) -> None:
+        """Let what was told be delivered."""
+        self._notices.close()
+
+    def _to_manager(self, text: str) -> None:
+        """Send a datagram as sd_notify(3) describes; a manager that does not take it hurts nobody."""
+        if self._manager[:1] in ("/", "@"):
+            address = self._manager.replace("@", "\0", 1) if self._manager.startswith("@") else self._manager
+            with suppress(OSError), socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC) as link:
+                link.setblocking(False)
+                link.sendto(text.encode(), address)
+
+
+def _watchdog_s(environment: Mapping[str, str]) -> float:
+    """Return after how many seconds of silence this process is ended; 0 where nobody does."""
+    if environment.get("WATCHDOG_PID", str(os.getpid())) != str(os.getpid()):
+        return 0.0
+    try:
+        return int(environment.get("WATCHDOG_USEC", "0")) / 1e6
+    except ValueError:
+        return 0.0

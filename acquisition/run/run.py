@@ -17,16 +17,12 @@ from pathlib import Path
 
 from acquisition.judge.judge import LiveJudge
 from acquisition.judge.measure import ExposureJudge
-from acquisition.monitor.feed import write_session_report
-from acquisition.run.devices import Devices, RunEnd, leave_lab, make_ready
-from acquisition.run.life import Life
-from acquisition.run.notices import Notices, PauseNotices
-from acquisition.run.pipeline import Job, Pipeline, Saver, Taken
+from acquisition.monitor.view import write_session_report
+from acquisition.run.devices import TRY_S, Devices, RetryPolicy, RunEnd, RunWatch, leave_lab, make_ready
+from acquisition.run.notices import Life, Notices, PauseNotices
+from acquisition.run.pipeline import Job, Pipeline, Saver, StepQueue, Taken, link_runs, unclosed_kinds, white_first
 from acquisition.run.plan import nothing_to_retake, planned_steps, require_plan, require_same
-from acquisition.run.queue import StepQueue, link_runs, unclosed_kinds, white_first
-from acquisition.run.retry import TRY_S, RetryPolicy
 from acquisition.run.rig.opening import open_rig
-from acquisition.run.watch import RunWatch
 from drivers.camera import keep_awake
 from drivers.presenter import BLACK, WHITE
 from experiment.chart.model import load_chart

@@ -52,9 +52,8 @@ from calibration.spread.fitting import DARK_LEVEL, LEAST_COUNTS, LOOSE_UNEVENNES
 from calibration.spread.predicting import VARYING_BITS
 from calibration.spread.surroundings import FrameLevels, photosite_offsets_px, printed_grid, unsuitable
 from calibration.table.lut import Lut, SourceFrame
-from drivers.raw.plain_dng import Area
-from drivers.raw.rawfile import Mosaic, decode_raw
-from drivers.raw.wholeness import filled_fault
+from drivers.raw.rawfile import Mosaic, decode_raw, filled_fault
+from drivers.raw.storage import Area
 from experiment.chart.model import Chart
 from experiment.config import CameraSettings, CitationSettings
 from experiment.framing.field import Corners

@@ -75,14 +75,18 @@ from drivers.ptp.codes import (
     ResponseCode,
     WhiteBalance,
 )
-from drivers.ptp.datasets import Cursor, DeviceInfo, StorageInfo, decode_u32_array, describe
-from drivers.ptp.session import (
+from drivers.ptp.protocol import (
     PASSING,
     PASSING_LIMIT_S,
     START_TIMEOUT_S,
+    Cursor,
+    DeviceInfo,
     OperationDeclined,
     PtpSession,
+    StorageInfo,
     Transport,
+    decode_u32_array,
+    describe,
 )
 from foundation.clock import Clock, SystemClock
 from foundation.errors import DeviceError, DeviceRefused, InputError, LinkClosed, LinkError, LinkTimeout, ProtocolError

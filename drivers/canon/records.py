@@ -25,7 +25,7 @@ from dataclasses import dataclass, field
 from typing import Final
 
 from drivers.ptp.codes import EosEvent, Property
-from drivers.ptp.datasets import MAX_DATASET, Cursor, describe, encode_array, encode_integer
+from drivers.ptp.protocol import MAX_DATASET, Cursor, describe, encode_array, encode_integer
 from foundation.errors import InputError, ProtocolError
 
 _RAW: Final = 6

@@ -1,6 +1,6 @@
 """The numbers of PTP and their names: the standard's, and Canon's for its EOS bodies.
 
-Messages carry plain integers, for a device may use codes that no one has named; `drivers.ptp.datasets.describe` turns
+Messages carry plain integers, for a device may use codes that no one has named; `drivers.ptp.protocol.describe` turns
 one into words. Of responses and event records all that are known have a name here, for users read them; of the rest
 those in use.
 Canon's meanings hold for EOS bodies alone: other makers use the same numbers for other things.

@@ -29,8 +29,20 @@ from typing import Annotated, Final, TypeVar
 
 from drivers.links.link import Link
 from drivers.links.network import TcpLink
-from drivers.ptp.datasets import U32, Cursor, FieldKind, PtpDataset, Rest, encode_integer
-from drivers.ptp.session import CableTransport, PtpEvent, PtpRequest, PtpResponse, Reception, Transaction
+from drivers.ptp.protocol import (
+    U32,
+    CableTransport,
+    Cursor,
+    FieldKind,
+    PtpDataset,
+    PtpEvent,
+    PtpRequest,
+    PtpResponse,
+    Reception,
+    Rest,
+    Transaction,
+    encode_integer,
+)
 from foundation.clock import Clock
 from foundation.errors import DeviceRefused, LinkClosed, LinkError, LinkTimeout, ProtocolError
 
@@ -424,7 +436,7 @@ _CALL_OFF_S: Final = 2.0
 
 
 class IpTransport(CableTransport):
-    """A `drivers.ptp.session.Transport` over two links.
+    """A `drivers.ptp.protocol.Transport` over two links.
 
     `open_command`, `open_event`: open the two connections; called again by `reset`. The second may raise `LinkClosed`
     for as long as the device has not opened its port: it is tried for 2 s. `guid`: 16 bytes by which a camera knows a

@@ -27,15 +27,16 @@ from enum import IntEnum
 
 from drivers.links.link import Pipe, PipeStalled, UsbPipes
 from drivers.ptp.codes import ResponseCode
-from drivers.ptp.datasets import Cursor, encode_integer
-from drivers.ptp.session import (
+from drivers.ptp.protocol import (
     MAX_PARAMETERS,
     CableTransport,
+    Cursor,
     PtpEvent,
     PtpRequest,
     PtpResponse,
     Reception,
     Transaction,
+    encode_integer,
 )
 from foundation.clock import Clock
 from foundation.errors import LinkError, LinkTimeout, ProtocolError
@@ -276,7 +277,7 @@ _EMPTY_READS = 16
 
 
 class UsbTransport(CableTransport):
-    """A `drivers.ptp.session.Transport` over the pipes of a still image interface, which it closes in the end."""
+    """A `drivers.ptp.protocol.Transport` over the pipes of a still image interface, which it closes in the end."""
 
     def __init__(self, pipes: UsbPipes, clock: Clock) -> None:
         super().__init__()

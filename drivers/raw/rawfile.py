@@ -5,11 +5,13 @@ Rules that hold inside:
 - Nothing is subtracted, scaled, rotated or interpolated: `Mosaic.counts` equals what ``dcraw -D -4 -T`` writes, but for
   the rotation that dcraw applies.
 - Whatever the bytes, the outcome is a `Mosaic` or one `FormatError`. A file that has been cut is an error wherever its
-  structure betrays it, since LibRaw fills what is missing with zeros in some formats. What a file does not state of
-  camera, lens and exposure, or states in a damaged place, is empty or None.
-- LibRaw is called here and nowhere else in the suite. A DNG that holds its counts plainly does not need it
-  (`drivers.raw.plain_dng`). LibRaw's table of colour matrices is asked by opening a raw file of nothing but a camera's
-  name, made here: no matrix is copied into the suite.
+  structure betrays it, since LibRaw fills what is missing with zeros or ones without a word in some formats, and so
+  does whoever copies a file from a bad card (`filled_fault`). What a file does not state of camera, lens and exposure,
+  or states in a damaged place, is empty or None.
+- LibRaw is called here and nowhere else in the suite. A DNG that holds its counts as memory does needs none: it is read
+  as LibRaw would, and what is not sure of it is left to LibRaw. Rows and columns of colour filters and of black levels
+  count from the active area's corner (DNG 1.7, ActiveArea). LibRaw's table of colour matrices is asked by opening a raw
+  file of nothing but a camera's name, made here: no matrix is copied into the suite.
 
 Sources: Exif 2.32, section 4.6.5 (BodySerialNumber, LensModel); DNG 1.7.1 (CameraSerialNumber). Canon's note, which
 bodies before Exif 2.3 (such as the 550D) have instead, is a TIFF directory without a standard: P. Harvey, ExifTool,
@@ -32,19 +34,20 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.raw.cr3 import Cr3, Cr3Damaged, is_cr3, read_cr3
 from drivers.raw.lossless_jpeg import lossless_fault
-from drivers.raw.plain_dng import (
-    BAYER_PATTERNS,
+from drivers.raw.storage import (
     Area,
-    PlainDng,
-    active_area,
-    read_plainly,
-    stated_areas,
-    stated_black,
+    Cr3,
+    NotBayer,
+    RawDamaged,
+    RawUnsupported,
+    Stored,
+    checked,
+    ciff_entries,
+    is_cr3,
+    read_cr3,
+    stored_frames,
 )
-from drivers.raw.storage import NotBayer, RawDamaged, RawUnsupported, Stored, checked, ciff_entries, stored_frames
-from drivers.raw.wholeness import levels_fault
 from drivers.tiff import CFA, Directory, Tags, TiffDamaged, TiffTag, ValueType, head, is_tiff, read_directories, text
 from foundation.errors import FormatError
 from foundation.files import read_whole
@@ -52,7 +55,7 @@ from foundation.robust import MAD_TO_SIGMA
 
 if TYPE_CHECKING:
     from rawpy import RawPy
-
+import sys
 
 _EXIF_POINTER, _NOTE = int(TiffTag.EXIF_IFD_POINTER), 37500
 """Tags (Exif 2.32): of the Exif directory in the first one, and of the maker's note in that."""
@@ -115,7 +118,7 @@ def body_and_lens(data: bytes | memoryview, directories: Sequence[Directory]) ->
     return serial or noted_serial, lens or noted_lens
 
 
-def ciff_camera(data: bytes | memoryview) -> tuple[str, str]:
+def _ciff_camera(data: bytes | memoryview) -> tuple[str, str]:
     """Return maker and model from Canon's CRW heap (0x080A); two empty strings for any other file."""
     start, size = ciff_entries(data).get(0x080A, (0, 0))
     maker, model, *_ = (*bytes(data[start : start + size]).split(b"\0"), b"", b"")
@@ -347,9 +350,9 @@ def decode_raw(data: bytes | memoryview, path: Path, *, known_whole: bool = Fals
     if not data:
         raise _unreadable(path, "it is empty")
     contents = _examined(path, data, known_whole)
-    plain = read_plainly(data, contents.directories, contents.frames[0])
+    plain = _plain_mosaic(path, data, contents)
     if plain is not None:
-        return _plain_mosaic(path, data, contents, plain)
+        return plain
     import rawpy
 
     with _libraw_silenced():
@@ -360,27 +363,6 @@ def decode_raw(data: bytes | memoryview, path: Path, *, known_whole: bool = Fals
             raise _unreadable(path, f"LibRaw says {_reason(error)}") from error
         except (MemoryError, NotImplementedError, RuntimeError, ValueError) as error:
             raise _unreadable(path, str(error) or type(error).__name__) from error
-
-
-def _plain_mosaic(path: Path, data: bytes | memoryview, contents: _Contents, plain: PlainDng) -> Mosaic:
-    visible, camera = plain.active, _camera_name(data, contents.directories)
-    serial, lens = body_and_lens(data, contents.directories)
-    _require_levels(path, plain.black, plain.white_level, 16)
-    return Mosaic(
-        counts=_part(plain.sensor, visible),
-        pattern=plain.pattern,
-        black=plain.black,
-        white_level=plain.white_level,
-        camera=camera,
-        sensor=plain.sensor,
-        visible=visible,
-        masked=_masked_areas(contents.frames[0].directory, camera, visible, plain.sensor.shape),
-        iso=plain.iso,
-        aperture=plain.aperture,
-        shutter_s=plain.shutter_s,
-        serial=serial,
-        lens=lens,
-    )
 
 
 def _mosaic(path: Path, raw: RawPy, data: bytes | memoryview, contents: _Contents) -> Mosaic:
@@ -417,7 +399,7 @@ def _mosaic(path: Path, raw: RawPy, data: bytes | memoryview, contents: _Content
     ):
         raise _unreadable(path, f"its visible area {framed} does not lie on its {columns}×{rows} sensor")
     pixels = stored.directory
-    visible = active_area(pixels, (rows, columns)) or _dcraw_frame((rows, columns), framed)
+    visible = _active_area(pixels, (rows, columns)) or _dcraw_frame((rows, columns), framed)
     # rawpy's pattern is aligned with the sensor's corner, whatever the margins; ours with the visible one.
     colours = np.roll(pattern, (-visible.top, -visible.left), axis=(0, 1))
     names = raw.color_desc.decode("ascii", "replace")
@@ -425,7 +407,7 @@ def _mosaic(path: Path, raw: RawPy, data: bytes | memoryview, contents: _Content
     if letters not in BAYER_PATTERNS:
         raise _not_bayer(path, f"its colour filters are {letters}")
     black = np.array(raw.black_level_per_channel, dtype=np.float64)[colours]
-    stated = stated_black(pixels)
+    stated = _stated_black(pixels)
     if stated is not None:
         black = stated
     white = () if pixels is None else pixels.numbers(TiffTag.WHITE_LEVEL)
@@ -486,7 +468,7 @@ def _examined(path: Path, data: bytes | memoryview, known_whole: bool) -> _Conte
         cr3 = read_cr3(data) if is_cr3(data) else None
         directories = read_directories(data) if is_tiff(data) else []
         frames = stored_frames(data, directories) if cr3 is None else checked(data, cr3.frames)
-    except (TiffDamaged, Cr3Damaged, RawDamaged) as error:
+    except (TiffDamaged, RawDamaged) as error:
         raise _unreadable(path, str(error)) from error
     except RawUnsupported as error:
         raise _unsupported(path, str(error)) from error
@@ -499,12 +481,6 @@ def _examined(path: Path, data: bytes | memoryview, known_whole: bool) -> _Conte
     return _Contents(directories, cr3, frames)
 
 
-def _require_levels(path: Path, black: NDArray[np.float64], white_level: float, bits: int) -> None:
-    fault = levels_fault(black, white_level, bits)
-    if fault is not None:
-        raise _unreadable(path, fault)
-
-
 def _camera_name(data: bytes | memoryview, directories: list[Directory]) -> str:
     for directory in directories:
         maker, model = directory.text(TiffTag.MAKE), directory.text(TiffTag.MODEL)
@@ -513,7 +489,7 @@ def _camera_name(data: bytes | memoryview, directories: list[Directory]) -> str:
     for directory in directories:
         if directory.text(TiffTag.UNIQUE_CAMERA_MODEL):
             return directory.text(TiffTag.UNIQUE_CAMERA_MODEL)
-    return _joined(*ciff_camera(data))
+    return _joined(*_ciff_camera(data))
 
 
 def _joined(maker: str, model: str) -> str:
@@ -538,7 +514,7 @@ def _masked_areas(
     Those that a CR3 states, in a box whose meaning no standard confirms, narrow down what is known of Canon's sensors,
     and add nothing to it.
     """
-    stated = stated_areas(pixels, TiffTag.MASKED_AREAS, sensor)
+    stated = _stated_areas(pixels, TiffTag.MASKED_AREAS, sensor)
     if stated:
         return stated
     if (camera, sensor) in _MASKED:
@@ -631,3 +607,177 @@ def _null_stream() -> int | None:
     libc = ctypes.CDLL(None)
     libc.fopen.restype = ctypes.c_void_p
     return libc.fopen(b"/dev/null", b"w")
+
+
+BAYER_PATTERNS = ("RGGB", "BGGR", "GRBG", "GBRG")
+
+
+_PLAIN: dict[TiffTag, tuple[tuple[int, ...], ...]] = {
+    TiffTag.COMPRESSION: ((1,),),
+    TiffTag.PHOTOMETRIC_INTERPRETATION: ((CFA,),),
+    TiffTag.BITS_PER_SAMPLE: ((16,),),
+    TiffTag.SAMPLES_PER_PIXEL: ((1,), ()),
+    TiffTag.CFA_REPEAT_PATTERN_DIM: ((2, 2),),
+    TiffTag.CFA_PLANE_COLOR: ((0, 1, 2), ()),
+    TiffTag.CFA_LAYOUT: ((1,), ()),
+    TiffTag.LINEARIZATION_TABLE: ((),),
+    TiffTag.GRAY_RESPONSE_CURVE: ((),),
+    TiffTag.TILE_OFFSETS: ((),),
+}
+"""What a plain file states, or does not state."""
+
+
+def _plain_mosaic(path: Path, data: bytes | memoryview, contents: _Contents) -> Mosaic | None:
+    """Return the mosaic of a DNG that holds its counts as memory does; None for any other file.
+
+    LibRaw copies such counts one by one, which takes longer than all that is done with a frame afterwards.
+    """
+    stored, directories = contents.frames[0], contents.directories
+    pixels = stored.directory
+    if pixels is None or data[:2] != b"II" or sys.byteorder != "little":
+        return None
+    if any(pixels.integers(tag) not in allowed for tag, allowed in _PLAIN.items()):
+        return None
+    size = stored.rows, stored.columns
+    pattern = pixels.integers(TiffTag.CFA_PATTERN)
+    white, black = pixels.numbers(TiffTag.WHITE_LEVEL), _stated_black(pixels)
+    letters = "".join("RGB"[index] for index in pattern if 0 <= index < 3)
+    if letters not in BAYER_PATTERNS or len(white) != 1 or black is None:
+        return None
+    visible, start = _active_area(pixels, size), stored.extents[0][0]
+    enough = sum(length for _, length in stored.extents) == 2 * size[0] * size[1]
+    if visible is None or not enough or start % 2:
+        return None
+    _require_levels(path, black, int(white[0]), 16)
+    sensor = np.frombuffer(data, dtype=np.uint16, count=size[0] * size[1], offset=start).reshape(size)
+    iso, aperture, shutter = (
+        _exposure(directories, tag)
+        for tag in (TiffTag.PHOTOGRAPHIC_SENSITIVITY, TiffTag.F_NUMBER, TiffTag.EXPOSURE_TIME)
+    )
+    camera = _camera_name(data, directories)
+    serial, lens = body_and_lens(data, directories)
+    return Mosaic(
+        counts=_part(sensor, visible),
+        pattern=letters,
+        black=black,
+        white_level=int(white[0]),
+        camera=camera,
+        sensor=sensor,
+        visible=visible,
+        masked=_masked_areas(pixels, camera, visible, size),
+        iso=round(iso) if iso else None,
+        aperture=(round(aperture, 4) or None) if iso else None,
+        shutter_s=(shutter or None) if iso else None,
+        serial=serial,
+        lens=lens,
+    )
+
+
+def _exposure(directories: Sequence[Directory], tag: TiffTag) -> float:
+    """Return the first number of `tag` in any directory, 0 if none has it."""
+    found = (directory.numbers(tag) for directory in directories)
+    return next((numbers[0] for numbers in found if numbers), 0.0)
+
+
+def _stated_black(pixels: Directory | None) -> NDArray[np.float64] | None:
+    """Return DNG's BlackLevel for the visible block, (2, 2) float64; None where LibRaw is needed for it.
+
+    LibRaw cuts the level to an integer. The rows and columns of BlackLevel count from the active area's corner
+    (DNG 1.7, BlackLevel); deltas per row and column enter by their mean, as in LibRaw.
+    """
+    if pixels is None or not pixels.numbers(TiffTag.BLACK_LEVEL):
+        return None
+    levels = np.array(pixels.numbers(TiffTag.BLACK_LEVEL), dtype=np.float64)
+    shape = pixels.integers(TiffTag.BLACK_LEVEL_REPEAT_DIM) or (1, 1)
+    if shape not in ((1, 1), (1, 2), (2, 1), (2, 2)) or levels.size != shape[0] * shape[1]:
+        return None
+    deltas = [pixels.numbers(tag) for tag in (TiffTag.BLACK_LEVEL_DELTA_H, TiffTag.BLACK_LEVEL_DELTA_V)]
+    extra = sum(float(np.mean(delta)) for delta in deltas if delta)
+    black = np.broadcast_to(levels.reshape(shape), (2, 2)) + extra
+    black.setflags(write=False)
+    return black
+
+
+def _active_area(pixels: Directory | None, sensor: tuple[int, int]) -> Area | None:
+    """Return the visible area that a DNG states; LibRaw would make its top even for a Canon, dcraw does not."""
+    areas = _stated_areas(pixels, TiffTag.ACTIVE_AREA, sensor)
+    return areas[0] if areas and min(areas[0].height, areas[0].width) >= 2 else None
+
+
+def _stated_areas(pixels: Directory | None, tag: TiffTag, sensor: tuple[int, int]) -> tuple[Area, ...]:
+    """Return the rectangles of `tag`, stored as top, left, bottom, right, that lie on the sensor."""
+    edges = () if pixels is None else pixels.integers(tag)
+    return tuple(
+        Area(top, left, bottom - top, right - left)
+        for top, left, bottom, right in zip(*(iter(edges),) * 4, strict=False)
+        if 0 <= top < bottom <= sensor[0] and 0 <= left < right <= sensor[1]
+    )
+
+
+_LEAST_BLACK = 16
+"""Counts of black from which on a photosite that is far below it is none; cameras without such a level cut at zero."""
+
+_TILE = (32, 256)
+"""Rows and columns of the smallest part that is looked at: the least that is stored by itself."""
+
+_LARGEST = 65535
+"""The largest count: what ones are read as."""
+
+
+def _require_levels(path: Path, black: NDArray[np.float64], white_level: float, bits: int) -> None:
+    """Refuse a file whose black and white level are none of a sensor of so many `bits`.
+
+    `black`: (2, 2) counts. A mean of deltas may take a black level of zero below it, by a part of a count.
+    """
+    if not 0 < white_level <= 1 << bits:
+        raise _unreadable(path, f"its white level is {white_level:g}, 1 to {1 << bits} expected of {bits} bits")
+    if not -1 < black.min() <= black.max() < white_level:
+        raise _unreadable(
+            path,
+            f"its black level is {black.min():g} to {black.max():g}, 0 to its white level of {white_level:g} expected",
+        )
+
+
+def filled_fault(counts: NDArray[np.uint16], black: NDArray[np.float64], white_level: int) -> str | None:
+    """Return which part of a frame is no exposure, as of a file that was cut and filled up; None if none is.
+
+    `counts`: (H, W) of the visible area; `black`: (2, 2) counts. A row, or a tile of 32×256, in which no photosite
+    reaches half of the black level is none that a sensor gives, whose dark is that level and noise about it; where it
+    has no such level, one of nothing but zeros. Nor is one of nothing but ones, where white is far below them.
+    """
+    level = float(black.min())
+    floor = level / 2 if level >= _LEAST_BLACK else 1
+    reached = f"half of its black level of {level:g} counts" if level >= _LEAST_BLACK else "one count"
+    brightest = counts.max(axis=1)
+    low = _extent_text(np.flatnonzero(brightest < floor), counts.shape)
+    if low is None:
+        low = _extent_text(np.argwhere(_tiles(np.maximum, counts) < floor), counts.shape)
+    if low is not None:
+        return f"{low} do not reach {reached}, as where a cut file was filled with zeros"
+    if white_level > _LARGEST // 2 or brightest.max() < _LARGEST:
+        return None
+    high = _extent_text(np.flatnonzero(counts.min(axis=1) == _LARGEST), counts.shape)
+    if high is None:
+        high = _extent_text(np.argwhere(_tiles(np.minimum, counts) == _LARGEST), counts.shape)
+    return None if high is None else f"{high} have nothing but the count {_LARGEST}, as where lost bytes are all ones"
+
+
+def _tile_size(shape: tuple[int, ...]) -> tuple[int, int]:
+    return min(_TILE[0], shape[0]), min(_TILE[1], shape[1])
+
+
+def _tiles(extreme: np.ufunc, counts: NDArray[np.uint16]) -> NDArray[np.uint16]:
+    """Return the largest or least count of each tile; what is left at the edges belongs to the last."""
+    height, width = _tile_size(counts.shape)
+    bands = extreme.reduceat(counts, range(0, counts.shape[0] - height + 1, height), axis=0)
+    return extreme.reduceat(bands, range(0, counts.shape[1] - width + 1, width), axis=1)
+
+
+def _extent_text(found: NDArray[np.intp], shape: tuple[int, ...]) -> str | None:
+    """Return in words which rows, or which tiles, were found; None where none was."""
+    if not len(found):
+        return None
+    if found.ndim == 1:
+        return f"{len(found)} of its {shape[0]} rows, from row {found[0]},"
+    height, width = _tile_size(shape)
+    return f"{len(found)} parts of {height}×{width}, from row {found[0][0] * height}, column {found[0][1] * width},"

@@ -31,6 +31,7 @@ from experiment.chart.model import Chart, load_chart
 from experiment.lights import Illumination, load_illuminations, save_illuminations
 from experiment.session.journal import (
     JOURNAL_FILE,
+    MOST_BYTES,
     PATIENCE_S,
     Journal,
     lost_files,
@@ -38,7 +39,6 @@ from experiment.session.journal import (
     time_text,
     without_journal,
 )
-from experiment.session.journal_file import MOST_BYTES
 from experiment.session.ledger import ledger_path, read_ledger
 from experiment.session.records import AcceptedFile, FrameRecord, Judgement, SessionStep
 from experiment.session.repair import (

@@ -26,7 +26,6 @@ from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Literal, Protocol
 
-from experiment.session.journal_file import file_system_of
 from foundation.errors import CropError
 
 RunState = Literal["running", "late", "waiting", "paused", "ended"]
@@ -82,6 +81,17 @@ class Process:
 
 INVENTED_NUMBERS = ("fuse", "cifs", "smb3", "smbfs", "virtiofs")
 """File systems, as /proc/self/mounts names them, that may make up the numbers of their files: those say nothing."""
+
+
+def file_system_of(path: Path) -> str:
+    """Return the kind of file system that a file lies on, as /proc/self/mounts names it; empty where nobody says."""
+    try:
+        mounts = [line.split() for line in Path("/proc/self/mounts").read_text().splitlines()]
+    except OSError:
+        return ""
+    place = path.resolve()
+    holding = [(len(at), kind) for _, at, kind, *_ in mounts if place.is_relative_to(at.replace("\\040", " "))]
+    return max(holding, default=(0, ""))[1]
 
 
 _GETVERSION = 0x80007601 | struct.calcsize("l") << 16

@@ -34,7 +34,7 @@ from drivers.ptp.ip import (
     Ping,
     Pong,
 )
-from drivers.ptp.session import Answer, NoAnswer, PtpRequest, PtpResponse, Responder
+from drivers.ptp.protocol import Answer, NoAnswer, PtpRequest, PtpResponse, Responder
 from foundation.errors import LinkClosed, LinkTimeout, ProtocolError
 
 GUID = bytes(range(16))

@@ -38,7 +38,7 @@ from usb.backend import IBackend
 from drivers.links.link import STILL_IMAGE_CLASS
 from drivers.links.usb import open_usb
 from drivers.ptp.codes import VENDOR_CANON_USB, ResponseCode
-from drivers.ptp.session import NoAnswer, PtpRequest, Responder
+from drivers.ptp.protocol import NoAnswer, PtpRequest, Responder
 from drivers.ptp.usb import (
     HIGH_SPEED_PACKET,
     ContainerReader,
@@ -631,7 +631,7 @@ def _described(descriptors: bytes, kind: int, index: int = 0) -> SimpleNamespace
 
 
 class MemoryTransport(UsbTransport):
-    """A `drivers.ptp.session.Transport` to a responder on a bus of its own: no cable, no thread and no wait."""
+    """A `drivers.ptp.protocol.Transport` to a responder on a bus of its own: no cable, no thread and no wait."""
 
     def __init__(self, responder: Responder) -> None:
         self._device = PtpUsbDevice(responder, UsbIdentity(name="the simulated Canon Digital Camera"))

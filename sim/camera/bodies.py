@@ -38,7 +38,7 @@ from drivers.ptp.codes import (
     Property,
     WhiteBalance,
 )
-from drivers.ptp.datasets import DeviceInfo
+from drivers.ptp.protocol import DeviceInfo
 
 NO_LIST = 1
 """Kind of a list record: the property has no list; with few exceptions it cannot be set."""

@@ -67,16 +67,19 @@ from drivers.ptp.codes import (
     ResponseCode,
     StorageType,
 )
-from drivers.ptp.datasets import (
+from drivers.ptp.protocol import (
+    Answer,
     DevicePropDesc,
     ObjectInfo,
+    PtpEvent,
+    PtpRequest,
+    PtpResponse,
     StorageInfo,
     Value,
     decode_value,
     encode_u32_array,
     encode_value,
 )
-from drivers.ptp.session import Answer, PtpEvent, PtpRequest, PtpResponse
 from foundation.clock import Clock
 from foundation.errors import CropError, DeviceError, DeviceRefused, LinkClosed, ProtocolError
 from sim.camera.bodies import FOCUS_CENTRE, FREE, LIST, MIRROR_LOCKUP, EosModel, custom_functions, focus_points
@@ -227,7 +230,7 @@ _SHUTDOWN_WARNING_S = 10.0
 
 
 class SimulatedEos:
-    """An EOS body on a cable; a `drivers.ptp.session.Responder`.
+    """An EOS body on a cable; a `drivers.ptp.protocol.Responder`.
 
     `card_bytes`: capacity of the card; None for an empty slot. `auto_power_off_s`: idle seconds after which it goes to
     sleep; 0 for never, None for the body's own setting. Asking for events keeps no body awake, KeepDeviceOn does.

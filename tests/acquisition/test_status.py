@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 from acquisition.cli import main
-from acquisition.judge.light_checks import lamp_check
+from acquisition.judge.judge import lamp_check
 from acquisition.status import MEANINGS, check_text
 from experiment.session.journal import Journal
 from experiment.session.records import Check

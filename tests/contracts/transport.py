@@ -12,7 +12,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from drivers.ptp.codes import ResponseCode
-from drivers.ptp.session import MAX_COLLECTED, Answer, NoAnswer, PtpEvent, PtpRequest, PtpResponse, Transport
+from drivers.ptp.protocol import MAX_COLLECTED, Answer, NoAnswer, PtpEvent, PtpRequest, PtpResponse, Transport
 from foundation.errors import LinkClosed, LinkTimeout, ProtocolError
 
 PATIENCE_S = 10.0
@@ -67,7 +67,7 @@ def payload(size: int) -> bytes:
 
 @dataclass
 class Echo:
-    """A `drivers.ptp.session.Responder` that does what it is told."""
+    """A `drivers.ptp.protocol.Responder` that does what it is told."""
 
     raised: list[PtpEvent] = field(default_factory=list[PtpEvent])
     cancellations: list[int] = field(default_factory=list[int])

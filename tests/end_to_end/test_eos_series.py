@@ -15,7 +15,7 @@ from drivers.canon.camera import CanonEos
 from drivers.canon.records import OtherRecord, TransferRequest, decode_events, encode_events
 from drivers.links.link import UsbPipes
 from drivers.ptp.codes import Operation, ResponseCode
-from drivers.ptp.session import Answer, NoAnswer, PtpRequest, PtpResponse, Responder
+from drivers.ptp.protocol import Answer, NoAnswer, PtpRequest, PtpResponse, Responder
 from foundation.errors import DeviceError, DeviceRefused
 from foundation.files import whole_file
 from sim.camera.bodies import EOS_550D

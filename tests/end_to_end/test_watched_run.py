@@ -10,8 +10,7 @@ from pathlib import Path
 import pytest
 
 from acquisition.cli import main
-from acquisition.monitor.feed import SessionWatch
-from acquisition.monitor.view import Head
+from acquisition.monitor.view import Head, SessionWatch
 
 pytestmark = pytest.mark.slow
 

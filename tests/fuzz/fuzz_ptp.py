@@ -29,13 +29,7 @@ with atheris.instrument_imports():
     )
     from drivers.ptp import ip as ptpip
     from drivers.ptp import usb as container
-    from drivers.ptp.datasets import (
-        DeviceInfo,
-        ObjectInfo,
-        StorageInfo,
-        decode_u32_array,
-        encode_u32_array,
-    )
+    from drivers.ptp.protocol import DeviceInfo, ObjectInfo, StorageInfo, decode_u32_array, encode_u32_array
     from foundation.errors import ProtocolError
     from tests.drivers.ptp import examples
 

@@ -33,8 +33,7 @@ import imagecodecs
 import numpy as np
 import tifffile
 
-from drivers.raw.rawfile import Mosaic, decode_raw
-from drivers.raw.wholeness import filled_fault
+from drivers.raw.rawfile import Mosaic, decode_raw, filled_fault
 from foundation.errors import FormatError
 from tests.drivers.raw.maker_files import COLUMNS, ROWS, Counts, areas, box, counts_of, cr3, maker_files, track
 from tests.drivers.raw.raw_files import dng_bytes, longs, shorts

@@ -17,8 +17,8 @@ from acquisition.check.frames import (
     search,
 )
 from acquisition.run.devices import ENGRAVED_S
-from drivers.raw.plain_dng import Area
 from drivers.raw.rawfile import Mosaic
+from drivers.raw.storage import Area
 
 PERIOD_S = 1 / 60
 TIMES = fitting_times(ENGRAVED_S, PERIOD_S)

@@ -8,8 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from acquisition.judge.judge import LiveJudge
-from acquisition.judge.light_checks import crept
+from acquisition.judge.judge import LiveJudge, crept
 from acquisition.judge.state import Leaning
 from drivers.camera import ExposureSettings
 from drivers.presenter import BLACK, WHITE, Colour

@@ -9,13 +9,7 @@ import numpy.typing as npt
 import pytest
 
 from acquisition.judge import light, limits
-from acquisition.judge.checks import (
-    MOST_RESTARTS,
-    judge_dark,
-    judge_first_frames,
-    judge_first_primary,
-    judge_white,
-)
+from acquisition.judge.judge import MOST_RESTARTS, judge_dark, judge_first_frames, judge_first_primary, judge_white
 from acquisition.judge.light import Basis, Codes, ProjectorModel
 from acquisition.judge.measure import SEGMENTS, TILE_COLUMNS, TILE_ROWS, Frame, FramePlaces, Measured, Noise
 from acquisition.judge.state import JudgeState, Seen

@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from acquisition.monitor.feed import SessionWatch, place_of, planned_places
+from acquisition.monitor.view import SessionWatch, place_of, planned_places
 from experiment.session.journal import Journal
 from experiment.session.records import link_steps
 from tests.acquisition.monitor.made_up import LIGHTS, MadeUpRun
@@ -114,14 +114,14 @@ def test_nothing_new_is_nothing_told_and_the_journal_is_not_opened(
     run: MadeUpRun, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     watch = SessionWatch(run.folder)
-    monkeypatch.setattr("acquisition.monitor.feed.FRESH_S", 0.0)
+    monkeypatch.setattr("acquisition.monitor.view.FRESH_S", 0.0)
     cursor = told(watch)["cursor"]
     assert watch.state(cursor) is None
 
     def opened(*_: object) -> None:
         raise AssertionError("opened")
 
-    monkeypatch.setattr("acquisition.monitor.feed.read_session", opened)
+    monkeypatch.setattr("acquisition.monitor.view.read_session", opened)
     assert watch.state(cursor) is None
 
 

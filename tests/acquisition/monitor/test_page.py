@@ -12,8 +12,8 @@ from pathlib import Path
 
 import pytest
 
-from acquisition.monitor.feed import write_session_report
 from acquisition.monitor.serving import MonitorServer, open_monitor
+from acquisition.monitor.view import write_session_report
 from experiment.lights import plan_illuminations
 from tests.acquisition.monitor.browser import (
     NAMELESS,

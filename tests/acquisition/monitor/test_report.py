@@ -12,8 +12,8 @@ from typing import Any
 import pytest
 
 from acquisition.cli import main
-from acquisition.monitor import feed
-from acquisition.monitor.feed import write_session_report
+from acquisition.monitor import view
+from acquisition.monitor.view import write_session_report
 from experiment.session.journal import Journal
 from foundation.errors import FormatError, StorageError
 from tests.acquisition.monitor.made_up import MadeUpRun
@@ -68,7 +68,7 @@ def test_pictures_are_bounded_and_those_of_refused_frames_go_first(
     run: MadeUpRun, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     bound = int(3.5 * max(path.stat().st_size for path in (run.folder / "previews").iterdir()))
-    monkeypatch.setattr(feed, "MOST_PICTURES_BYTES", bound)
+    monkeypatch.setattr(view, "MOST_PICTURES_BYTES", bound)
     write_session_report(run.folder, tmp_path / "night.html")
     pictures = data_of(tmp_path / "night.html")["pictures"]
     assert list(pictures)[:2] == ["4", "6"]
@@ -78,7 +78,7 @@ def test_pictures_are_bounded_and_those_of_refused_frames_go_first(
 
 @pytest.mark.parametrize("count", [0, 1, 2, 7, 100])
 def test_any_number_of_pictures_is_spread_over_the_night(count: int) -> None:
-    places = feed._spread(count)  # pyright: ignore[reportPrivateUsage]
+    places = view._spread(count)  # pyright: ignore[reportPrivateUsage]
     assert sorted(places) == list(range(count))
     if count == 100:
         first = sorted(places[:10])
@@ -110,7 +110,7 @@ def test_a_full_disk_is_said_and_leaves_the_session_as_it_was(run: MadeUpRun, mo
     def full(path: Path, data: object) -> None:
         raise StorageError(f"cannot write {path}: no space")
 
-    monkeypatch.setattr(feed, "write_whole", full)
+    monkeypatch.setattr(view, "write_whole", full)
     assert main(["report", str(run.folder)]) == StorageError.exit_code
     assert not (run.folder / "report.html").exists()
 

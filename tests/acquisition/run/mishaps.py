@@ -26,7 +26,7 @@ from drivers.pjlink import PjLinkProjector
 from drivers.presenter import BLACK, Colour
 from drivers.projector import Power, Severity
 from drivers.ptp.codes import ResponseCode
-from drivers.ptp.session import Responder, Transport
+from drivers.ptp.protocol import Responder, Transport
 from drivers.ptp.usb import UsbTransport
 from experiment.chart.layout import design_chart
 from experiment.config import LabSettings

@@ -14,10 +14,12 @@ import pytest
 
 from acquisition.run.devices import (
     OBEYS_S,
+    PAUSE_S,
     POWER_LIMIT_S,
     RELIGHT_S,
     Devices,
     HealthWatch,
+    RetryPolicy,
     RunEnd,
     await_health,
     health_fault,
@@ -25,7 +27,6 @@ from acquisition.run.devices import (
     leave_lab,
     make_ready,
 )
-from acquisition.run.retry import PAUSE_S, RetryPolicy
 from drivers.links.link import Link, PeerLink
 from drivers.pjlink import NoResolution, PjLinkProjector
 from drivers.presenter import BLACK, Colour

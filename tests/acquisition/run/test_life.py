@@ -14,7 +14,7 @@ from typing import Any
 
 import pytest
 
-from acquisition.run.life import ALIVE_S, Life
+from acquisition.run.notices import ALIVE_S, Life
 from acquisition.run.run import take_session
 from drivers.presenter import Colour
 from experiment.config import NotifySettings

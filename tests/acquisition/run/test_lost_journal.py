@@ -13,15 +13,13 @@ from pathlib import Path
 import pytest
 
 from acquisition.cli import main
-from acquisition.monitor.feed import LOOK_AGAIN_S, SessionWatch
-from acquisition.monitor.view import read_session
+from acquisition.monitor.view import LOOK_AGAIN_S, SessionWatch, read_session
 from acquisition.run.pipeline import Taken
 from acquisition.run.run import RunOutcome, take_session
 from drivers.presenter import Colour
 from experiment.lights import Illumination
 from experiment.session.folder import Session, rebuild_journal, session_exists
-from experiment.session.journal import Journal, beat_beside
-from experiment.session.journal_file import LostJournalError, open_to_read
+from experiment.session.journal import Journal, LostJournalError, beat_beside, open_to_read
 from experiment.session.ledger import Rows, ledger_path, read_ledger, rows_of
 from experiment.session.records import ACCEPTED
 from foundation.errors import FormatError, StorageError

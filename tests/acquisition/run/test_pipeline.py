@@ -10,8 +10,8 @@ from typing import Any
 
 import pytest
 
+from acquisition.run.devices import PAUSE_S
 from acquisition.run.pipeline import Taken
-from acquisition.run.retry import PAUSE_S
 from acquisition.run.run import RunOutcome, take_session
 from drivers.presenter import BLACK, WHITE, Colour
 from drivers.projector import Power

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from acquisition.run.queue import GIVEN_UP_IN_A_ROW, StepQueue, unclosed_kinds
+from acquisition.run.pipeline import GIVEN_UP_IN_A_ROW, StepQueue, unclosed_kinds
 from drivers.presenter import BLACK, WHITE, Colour
 from experiment.lights import Illumination
 from experiment.session.records import FrameKind, SessionStep, plan_steps

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from acquisition.run.retry import (
+from acquisition.run.devices import (
     BACK_OFF_S,
     LONGEST_BACK_OFF_S,
     PAUSE_S,
@@ -25,13 +25,13 @@ from acquisition.run.retry import (
 from acquisition.run.rig.opening import open_rig
 from drivers.camera import keep_awake
 from drivers.presenter import WHITE
-from drivers.ptp.session import OperationDeclined
+from drivers.ptp.protocol import OperationDeclined
 from drivers.raw.rawfile import read_raw
 from experiment.chart.layout import design_chart
 from experiment.config import LabSettings
 from experiment.lights import Illumination
 from experiment.session.folder import Session
-from experiment.session.journal_file import HeldJournalError
+from experiment.session.journal import HeldJournalError
 from experiment.session.records import plan_steps
 from foundation.errors import (
     ConfigurationError,

@@ -11,7 +11,7 @@ import pytest
 from acquisition.monitor.view import read_session
 from acquisition.run import run
 from acquisition.run.devices import Devices
-from acquisition.run.queue import link_runs
+from acquisition.run.pipeline import link_runs
 from acquisition.run.rig.lab import session_clock
 from acquisition.run.run import (
     check_frames,

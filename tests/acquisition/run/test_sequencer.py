@@ -8,9 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from acquisition.run.devices import Devices
+from acquisition.run.devices import PAUSE_S, Devices
 from acquisition.run.pipeline import Taken
-from acquisition.run.retry import PAUSE_S
 from acquisition.run.run import take_session
 from drivers.links.link import Link, PeerLink
 from drivers.pjlink import PjLinkProjector

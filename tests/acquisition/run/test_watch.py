@@ -10,11 +10,10 @@ import pytest
 
 from acquisition.judge.measure import ExposureJudge
 from acquisition.monitor.view import Head, read_session
-from acquisition.run import run
+from acquisition.run import devices, run
+from acquisition.run.devices import GAP_S, LATE_S, LATE_TIMES, RunWatch
 from acquisition.run.run import take_session
-from acquisition.run.watch import GAP_S, LATE_S, LATE_TIMES, RunWatch
 from drivers.presenter import Colour
-from foundation import clock
 from tests.acquisition.run.scripted import SETTINGS, Lab
 
 
@@ -42,7 +41,7 @@ def test_a_jump_is_told_once() -> None:
 @pytest.fixture
 def time(monkeypatch: pytest.MonkeyPatch) -> Time:
     one = Time()
-    monkeypatch.setattr(clock, "elapsed_s", one)
+    monkeypatch.setattr(devices, "elapsed_s", one)
     return one
 
 

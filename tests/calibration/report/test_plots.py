@@ -16,8 +16,8 @@ from calibration.comparison.comparing import CellDifferences
 from calibration.comparison.report import draw_map
 from calibration.report import plots
 from calibration.report.plots import draw_chromaticities, draw_print, half_size
-from drivers.raw.plain_dng import Area
 from drivers.raw.rawfile import Mosaic
+from drivers.raw.storage import Area
 from experiment.chart.layout import design_chart
 from experiment.measures.stains import Stains
 

@@ -10,7 +10,7 @@ from drivers.camera import CapturedFrame, capture
 from drivers.canon.camera import CanonEos
 from drivers.links.link import UsbPipes
 from drivers.links.usb import open_usb
-from drivers.ptp.session import Responder, Transport
+from drivers.ptp.protocol import Responder, Transport
 from drivers.ptp.usb import UsbTransport
 from foundation.errors import DeviceError, DeviceFault, DeviceRefused
 from sim.buses.usb import PtpUsbDevice, SimulatedBus

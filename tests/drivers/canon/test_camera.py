@@ -42,7 +42,7 @@ from drivers.canon.records import (
 from drivers.links.usb import open_usb
 from drivers.ptp.codes import AeMode, CaptureDestination, EosEvent, Operation, Property, ResponseCode
 from drivers.ptp.ip import IpTransport
-from drivers.ptp.session import Answer, PtpEvent, PtpRequest, PtpResponse, Reception, Responder, Transaction, Transport
+from drivers.ptp.protocol import Answer, PtpEvent, PtpRequest, PtpResponse, Reception, Responder, Transaction, Transport
 from drivers.ptp.usb import UsbTransport
 from foundation.errors import DeviceError, DeviceRefused, LinkClosed, ProtocolError
 from sim.buses.ptp import serve_ptpip

@@ -10,7 +10,7 @@ import usb.core
 
 from drivers.links.link import Pipe, PipeStalled
 from drivers.links.usb import UDEV_RULE, UsbDevice, list_devices, open_usb
-from drivers.ptp.session import PtpRequest
+from drivers.ptp.protocol import PtpRequest
 from drivers.ptp.usb import UsbTransport
 from foundation.errors import DeviceRefused, InputError, LinkClosed, LinkTimeout
 from sim.buses.usb import BULK_IN, BULK_OUT, PtpUsbDevice, Setup, SimulatedBus, Stalled, UsbIdentity

@@ -14,8 +14,7 @@ from pathlib import Path
 from typing import TypedDict
 
 from drivers.ptp.codes import AeMode, DriveMode, Operation, Property
-from drivers.ptp.datasets import Cursor, DevicePropDesc, read_value
-from drivers.ptp.session import PtpRequest
+from drivers.ptp.protocol import Cursor, DevicePropDesc, PtpRequest, read_value
 from sim.camera.bodies import EOS_550D
 from sim.camera.eos import SimulatedEos
 from sim.clock import SimulatedClock

@@ -15,7 +15,7 @@ from drivers.canon import records as datasets
 from drivers.canon import records as values
 from drivers.ptp import ip as ptpip
 from drivers.ptp import usb as container
-from drivers.ptp.datasets import DeviceInfo, ObjectInfo, StorageInfo, decode_u32_array, decode_value
+from drivers.ptp.protocol import DeviceInfo, ObjectInfo, StorageInfo, decode_u32_array, decode_value
 
 # ISO 15740, 5.5.1: version 1.00, vendor 0xb "ab", two operations, one event, no properties, one capture format,
 # two image formats, "C", "EOS", "1", "2".

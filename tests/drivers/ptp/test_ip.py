@@ -28,7 +28,7 @@ from drivers.ptp.ip import (
     Pong,
     StartData,
 )
-from drivers.ptp.session import PtpEvent, PtpRequest, PtpResponse
+from drivers.ptp.protocol import PtpEvent, PtpRequest, PtpResponse
 from foundation.clock import SystemClock
 from foundation.errors import DeviceRefused, LinkClosed, LinkTimeout, ProtocolError
 from sim.buses.ptp import serve_ptpip

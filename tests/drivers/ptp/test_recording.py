@@ -24,15 +24,16 @@ from drivers.canon.records import (
 )
 from drivers.ptp import usb as container
 from drivers.ptp.codes import DataType, Operation, Property
-from drivers.ptp.datasets import (
+from drivers.ptp.ip import EndData, OperationRequest, PacketCutter, StartData, encode
+from drivers.ptp.protocol import (
     DeviceInfo,
     DevicePropDesc,
+    PtpRequest,
+    PtpResponse,
     StorageInfo,
     decode_u32_array,
     encode_u32_array,
 )
-from drivers.ptp.ip import EndData, OperationRequest, PacketCutter, StartData, encode
-from drivers.ptp.session import PtpRequest, PtpResponse
 from drivers.ptp.usb import ContainerReader, DataPiece, DataStart
 from tests.drivers.ptp.conversations import EOS_60D_PROPERTIES, Recorded, read_description
 

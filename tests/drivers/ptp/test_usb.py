@@ -12,7 +12,7 @@ from drivers.links.link import Pipe, PipeStalled, UsbPipes
 from drivers.links.usb import open_usb
 from drivers.ptp import usb as container
 from drivers.ptp.codes import EventCode, Operation, ResponseCode
-from drivers.ptp.session import PtpEvent, PtpRequest, PtpResponse, next_transaction
+from drivers.ptp.protocol import PtpEvent, PtpRequest, PtpResponse, next_transaction
 from drivers.ptp.usb import ContainerReader, DataPiece, DataStart, DeviceStatus, Message, UsbTransport
 from foundation.errors import DeviceError, LinkClosed, LinkTimeout, ProtocolError
 from sim.buses.usb import PtpUsbDevice, SimulatedBus

@@ -10,10 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from drivers.raw import rawfile
-from drivers.raw.cr3 import Cr3, Cr3Damaged, is_cr3, read_cr3
-from drivers.raw.plain_dng import Area
 from drivers.raw.rawfile import read_raw
-from drivers.raw.storage import Stored
+from drivers.raw.storage import Area, Cr3, RawDamaged, Stored, is_cr3, read_cr3
 from foundation.errors import FormatError
 from tests.drivers.raw.maker_files import CANON, PIXELS, SIDES, areas, box, cr3, ifd, large_box, track
 
@@ -43,14 +41,14 @@ def test_where_the_samples_of_a_track_are(
 ) -> None:
     data = cr3("Canon EOS R", track(areas(), b"CRAW", SIDES, box(b"stsz", places[0]), box(b"co64", places[1])))
     if isinstance(frames, str):
-        with pytest.raises(Cr3Damaged, match=frames):
+        with pytest.raises(RawDamaged, match=frames):
             read_cr3(data)
     else:
         assert [frame.extents for frame in read_cr3(data).frames] == list(frames)
 
 
 def test_a_track_without_places_is_damaged() -> None:
-    with pytest.raises(Cr3Damaged, match="does not say where"):
+    with pytest.raises(RawDamaged, match="does not say where"):
         read_cr3(cr3("Canon EOS R", track(areas(), b"CRAW", SIDES, box(b"stsz", bytes(12)))))
 
 
@@ -79,13 +77,13 @@ def test_the_last_box_may_reach_to_the_end_or_have_a_long_size(size: int) -> Non
 def test_a_file_cut_anywhere_is_damaged() -> None:
     data = cr3()
     for length in range(len(data)):
-        with pytest.raises(Cr3Damaged):
+        with pytest.raises(RawDamaged):
             read_cr3(data[:length])
 
 
 def test_boxes_without_end_are_refused() -> None:
     brand = box(b"ftyp", b"crx ", bytes(4))
-    with pytest.raises(Cr3Damaged, match="more than 4096 boxes"):
+    with pytest.raises(RawDamaged, match="more than 4096 boxes"):
         read_cr3(brand + box(b"moov", 10_000 * box(b"free")))
 
 
@@ -96,7 +94,7 @@ def test_whatever_the_bytes_it_is_read_or_damaged(noise: bytes, place: int) -> N
     for candidate in (bytes(data), b"\0\0\0\x18ftypcrx " + noise):
         try:
             said = read_cr3(candidate)
-        except Cr3Damaged:
+        except RawDamaged:
             continue
         assert len(said.black) <= 2
 

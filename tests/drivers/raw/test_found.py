@@ -8,8 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from drivers.raw.rawfile import decode_raw
-from drivers.raw.wholeness import filled_fault
+from drivers.raw.rawfile import decode_raw, filled_fault
 from foundation.errors import FormatError
 from tests.data_files import shipped
 from tests.fuzz.raw import run, seeds

@@ -15,9 +15,8 @@ import pytest
 
 from drivers.presenter import Colour
 from experiment.lights import Illumination
-from experiment.session import journal_file
-from experiment.session.journal import Journal, time_text
-from experiment.session.journal_file import JOURNAL_VERSION, create_file, require_sound_rows
+from experiment.session import journal as journals
+from experiment.session.journal import JOURNAL_VERSION, Journal, create_file, require_sound_rows, time_text
 from experiment.session.records import ACCEPTED, FAILED, AcceptedFile, Judgement, SessionEvent, plan_steps
 from foundation.errors import FormatError, StorageError
 
@@ -160,7 +159,7 @@ def test_a_journal_that_may_not_be_read_is_not_damaged(path: Path, monkeypatch: 
 
 
 def test_a_journal_that_another_holds_is_not_damaged(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(journal_file, "READING_LIMIT_S", 0)
+    monkeypatch.setattr(journals, "READING_LIMIT_S", 0)
     with closing(sqlite3.connect(path)) as other:
         other.execute("BEGIN EXCLUSIVE")
         with pytest.raises(FormatError, match="is locked"):

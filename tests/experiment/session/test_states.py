@@ -13,7 +13,7 @@ import pytest
 
 from acquisition.judge.measure import ExposureJudge
 from acquisition.run.devices import Devices
-from acquisition.run.queue import StepQueue
+from acquisition.run.pipeline import StepQueue
 from acquisition.run.rig.opening import open_rig
 from acquisition.run.run import take_session
 from drivers.camera import Camera, CapturedFrame

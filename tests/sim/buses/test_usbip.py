@@ -17,8 +17,7 @@ from hypothesis import strategies as st
 
 from drivers.links.link import Pipe, PipeStalled
 from drivers.links.network import TcpServer
-from drivers.ptp.datasets import DeviceInfo
-from drivers.ptp.session import PtpRequest, PtpResponse
+from drivers.ptp.protocol import DeviceInfo, PtpRequest, PtpResponse
 from drivers.ptp.usb import ContainerReader, DataPiece, DataStart, UsbTransport, encode
 from foundation.errors import LinkClosed, LinkTimeout, ProtocolError
 from sim.buses.usb import BULK_IN, BULK_OUT, INTERRUPT_IN, PtpUsbDevice, UsbIdentity

@@ -48,16 +48,17 @@ from drivers.ptp.codes import (
     ReleaseButton,
     ResponseCode,
 )
-from drivers.ptp.datasets import (
+from drivers.ptp.protocol import (
+    Answer,
     DeviceInfo,
     DevicePropDesc,
     ObjectInfo,
+    PtpRequest,
     StorageInfo,
     decode_u32_array,
     decode_value,
     encode_string,
 )
-from drivers.ptp.session import Answer, PtpRequest
 from foundation.errors import DeviceRefused, LinkClosed
 from sim.buses.usb import MemoryTransport
 from sim.camera.bodies import EOS_6D_MARK_II, EOS_550D, EOS_550D_AS_LISTED, EOS_BODIES, TEST_BODY, EosModel

@@ -1,23 +1,34 @@
-"""Datasets against bytes written from the standard, and round trips of whatever they can hold."""
+"""PTP on any cable: datasets against bytes written from the standard, and a session against a scripted cable."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from drivers.ptp import datasets
-from drivers.ptp.codes import DataType, ObjectFormat, Operation
-from drivers.ptp.datasets import (
+from drivers.ptp import protocol
+from drivers.ptp.codes import DataType, ObjectFormat, Operation, ResponseCode
+from drivers.ptp.protocol import (
+    LAST_TRANSACTION,
+    OPEN_TRIES,
+    PASSING_LIMIT_S,
     DeviceInfo,
     DevicePropDesc,
     ObjectInfo,
+    OperationDeclined,
+    PtpEvent,
+    PtpRequest,
+    PtpResponse,
+    PtpSession,
     StorageInfo,
+    Transaction,
     Value,
 )
-from foundation.errors import ProtocolError
+from foundation.errors import DeviceRefused, LinkClosed, LinkTimeout, ProtocolError
+from sim.clock import SimulatedClock
 from tests.drivers.ptp import examples
 from tests.drivers.ptp.examples import U16, U32
 
@@ -100,14 +111,14 @@ def test_properties_are_the_standards_bytes() -> None:
     ],
 )
 def test_values_are_the_standards_bytes(data_type: int, value: Value, octets: str) -> None:
-    assert datasets.encode_value(data_type, value) == bytes.fromhex(octets)
-    assert datasets.decode_value(data_type, bytes.fromhex(octets)) == value
+    assert protocol.encode_value(data_type, value) == bytes.fromhex(octets)
+    assert protocol.decode_value(data_type, bytes.fromhex(octets)) == value
 
 
 def test_a_string_without_its_nul_can_still_be_written() -> None:
-    text = datasets.decode_value(DataType.STRING, b"\xff" + b"x\0" * 255)
+    text = protocol.decode_value(DataType.STRING, b"\xff" + b"x\0" * 255)
     assert text == "x" * 254
-    assert datasets.decode_value(DataType.STRING, datasets.encode_value(DataType.STRING, text)) == text
+    assert protocol.decode_value(DataType.STRING, protocol.encode_value(DataType.STRING, text)) == text
 
 
 @pytest.mark.parametrize(
@@ -115,7 +126,7 @@ def test_a_string_without_its_nul_can_still_be_written() -> None:
     [("01 0000", ""), ("03 4300 4600 4600", "CFF"), ("04 4300 0000 4600 0000", "C"), ("02 00d8 0000", "\ufffd")],
 )
 def test_strings_as_devices_send_them(octets: str, text: str) -> None:
-    assert datasets.decode_value(DataType.STRING, bytes.fromhex(octets)) == text
+    assert protocol.decode_value(DataType.STRING, bytes.fromhex(octets)) == text
 
 
 @pytest.mark.parametrize(
@@ -138,7 +149,7 @@ def test_strings_as_devices_send_them(octets: str, text: str) -> None:
 )
 def test_what_the_wire_cannot_hold_is_our_own_mistake(data_type: int, value: Value) -> None:
     with pytest.raises(ValueError, match=r"."):
-        datasets.encode_value(data_type, value)
+        protocol.encode_value(data_type, value)
 
 
 def test_a_fault_says_what_where_and_how_much() -> None:
@@ -150,7 +161,7 @@ def test_a_fault_says_what_where_and_how_much() -> None:
 
 def test_more_than_the_bound_is_refused_unread() -> None:
     with pytest.raises(ProtocolError, match="1048576"):
-        datasets.decode_u32_array(bytes(datasets.MAX_DATASET + 1))
+        protocol.decode_u32_array(bytes(protocol.MAX_DATASET + 1))
 
 
 DATASETS = st.one_of(
@@ -170,7 +181,7 @@ def test_any_value_comes_back(kind: DataType, data: st.DataObject) -> None:
     least, most = (-(1 << bits - 1), (1 << bits - 1) - 1) if signed else (0, (1 << bits) - 1)
     values = data.draw(st.lists(st.integers(least, most), min_size=1, max_size=5).map(tuple))
     for data_type, value in ((kind, values[0]), (0x4000 | kind, values)):
-        assert datasets.decode_value(data_type, datasets.encode_value(data_type, value)) == value
+        assert protocol.decode_value(data_type, protocol.encode_value(data_type, value)) == value
 
 
 @settings(max_examples=400)
@@ -181,4 +192,123 @@ def test_any_dataset_comes_back(dataset: DeviceInfo | StorageInfo | ObjectInfo) 
 
 @given(st.lists(U32, max_size=50).map(tuple))
 def test_any_list_of_handles_comes_back(handles: tuple[int, ...]) -> None:
-    assert datasets.decode_u32_array(datasets.encode_u32_array(handles)) == handles
+    assert protocol.decode_u32_array(protocol.encode_u32_array(handles)) == handles
+
+
+class Scripted:
+    """A cable that answers from a script of response codes and errors, OK when it is over."""
+
+    label = "the scripted camera"
+
+    def __init__(self, *script: int | Exception) -> None:
+        self.script = list(script)
+        self.asked: list[PtpRequest] = []
+        self.resets = 0
+
+    def transact(
+        self,
+        request: PtpRequest,
+        *,
+        send: bytes | None = None,
+        receive: Callable[[bytes], object] | None = None,
+        timeout: float,
+    ) -> Transaction:
+        self.asked.append(request)
+        step = self.script.pop(0) if self.script else ResponseCode.OK
+        if isinstance(step, Exception):
+            raise step
+        return Transaction(PtpResponse(step, request.transaction, (7,)), b"data")
+
+    def events(self) -> tuple[PtpEvent, ...]:
+        return (PtpEvent(0xC101),)
+
+    def reset(self) -> None:
+        self.resets += 1
+
+    def close(self) -> None: ...
+
+
+def opened(*script: int | Exception) -> tuple[PtpSession, Scripted, SimulatedClock]:
+    cable, clock = Scripted(*script), SimulatedClock()
+    session = PtpSession(cable, clock)
+    session.open()
+    return session, cable, clock
+
+
+@pytest.mark.parametrize("answer", [ResponseCode.OK, ResponseCode.SESSION_ALREADY_OPEN])
+def test_opens_with_number_0_and_counts_from_1(answer: int) -> None:
+    session, cable, _ = opened(answer)
+    assert session.call(Operation.GET_DEVICE_INFO) == ((7,), b"data")
+    session.close()
+    assert cable.asked == [PtpRequest(0x1002, 0, (1,)), PtpRequest(0x1001, 1), PtpRequest(0x1003, 2)]
+
+
+def test_takes_the_next_session_number_where_one_is_not_taken() -> None:
+    _, cable, _ = opened(ResponseCode.INVALID_TRANSACTION_ID, ResponseCode.INVALID_TRANSACTION_ID)
+    assert [request.parameters for request in cable.asked] == [(1,), (2,), (3,)]
+
+
+def test_resets_a_silent_body_and_tries_again() -> None:
+    _, cable, _ = opened(LinkTimeout("silent"), ProtocolError("garbage"))
+    assert (len(cable.asked), cable.resets) == (OPEN_TRIES, OPEN_TRIES - 1)
+
+
+@pytest.mark.parametrize("fault", [LinkTimeout("silent"), ProtocolError("garbage")])
+def test_gives_up_on_a_body_that_stays_silent(fault: Exception) -> None:
+    with pytest.raises(type(fault)):
+        opened(*[fault] * OPEN_TRIES)
+
+
+def test_a_body_that_is_gone_is_not_asked_again() -> None:
+    cable = Scripted(LinkClosed("gone"))
+    with pytest.raises(LinkClosed):
+        PtpSession(cable, SimulatedClock()).open()
+    assert len(cable.asked) == 1
+
+
+def test_an_opening_that_is_refused_is_refused() -> None:
+    with pytest.raises(DeviceRefused, match=r"answers ACCESS_DENIED \(0x200f\) to OPEN_SESSION \(0x1002\)\(0x1\)"):
+        opened(ResponseCode.ACCESS_DENIED)
+
+
+@pytest.mark.parametrize("code", [0x2019, 0xA102, 0xA106])
+def test_what_is_declined_for_the_moment_is_asked_again_under_a_new_number(code: int) -> None:
+    session, cable, clock = opened(ResponseCode.OK, code, code, code)
+    session.call(Operation.EOS_KEEP_DEVICE_ON)
+    assert [request.transaction for request in cable.asked[1:]] == [1, 2, 3, 4]
+    assert clock.monotonic() == pytest.approx(0.05 + 0.1 + 0.2)
+
+
+def test_patience_ends_by_the_clock() -> None:
+    session, _, clock = opened(ResponseCode.OK, *[0x2019] * 1000)
+    with pytest.raises(OperationDeclined, match="wait until it is idle") as caught:
+        session.call(Operation.EOS_KEEP_DEVICE_ON)
+    assert caught.value.code == 0x2019
+    assert clock.monotonic() == pytest.approx(PASSING_LIMIT_S)
+
+
+def test_no_patience_asks_once() -> None:
+    session, cable, clock = opened(ResponseCode.OK, 0x2019)
+    with pytest.raises(OperationDeclined):
+        session.call(Operation.EOS_REMOTE_RELEASE_ON, 3, 1, retry_s=0.0)
+    assert (len(cable.asked), clock.monotonic()) == (2, 0.0)
+
+
+def test_every_other_answer_is_told_by_its_name_at_once() -> None:
+    session, cable, _ = opened(ResponseCode.OK, 0x200F)
+    with pytest.raises(DeviceRefused, match=r"the scripted camera answers ACCESS_DENIED \(0x200f\)"):
+        session.call(Operation.EOS_KEEP_DEVICE_ON)
+    assert len(cable.asked) == 2
+
+
+def test_numbers_begin_anew_after_the_last() -> None:
+    session, cable, _ = opened()
+    session._transaction = LAST_TRANSACTION - 1  # pyright: ignore[reportPrivateUsage] - four thousand million calls later
+    for _ in range(3):
+        session.call(Operation.EOS_KEEP_DEVICE_ON)
+    assert [request.transaction for request in cable.asked[1:]] == [0xFFFFFFFE, 1, 2]
+
+
+def test_closing_a_session_on_a_dead_cable_does_nothing() -> None:
+    session, _, _ = opened(ResponseCode.OK, LinkClosed("gone"))
+    session.close()
