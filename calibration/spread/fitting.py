@@ -96,6 +96,9 @@ USUAL_VEIL = 0.01
 """Standard deviation of the veil that lenses have before it is measured: 0.3 to 1.5 % by ISO 9358 and ISO 18844. Where
 a print is lit so evenly that it shows no veil, this is what is known of it."""
 
+_WIDE_KERNELS = 2
+"""Far kernels that, as the veil does, look like light that lies smoothly over a part of the print."""
+
 _FAR_STEPS = (0.01, 0.01, 0.004, 0.003)
 """Standard deviation of each far kernel's share before it is measured, beside what the one before lets expect."""
 
@@ -420,13 +423,16 @@ def fit_spread(
         hidden = DARK_LEVEL * one.bend / float(np.median(one.even * one.field))
         unknown[veil[one.channel], veil[one.channel]] += hidden**2
     even = _positive(matrix, vector, _terms(candidates))[0][veil]
-    if misfit > MOST_MISFIT or (few and even.mean() > MOST_VEIL):
-        # Other light lies smoothly over the frame, or shares grow towards the corners where cells are too few to see
-        # it; what an even veil would have been taken for is not known.
+    # Other light lies smoothly over the frame, or shares grow towards the corners where cells are too few to see it.
+    untold = misfit > MOST_MISFIT or (few and even.mean() > MOST_VEIL)
+    if untold:
+        # What an even veil would have been taken for is not known.
         unknown[np.ix_(veil, veil)] += np.outer(even, even)
         candidates.pop()
         far.pop()
     kept = _selected(matrix, vector, misfit, candidates)
+    if untold:
+        unknown += _usual_wide_light(bits, scatters=len(kept) > 0)
     _, gain = _positive(matrix, vector, kept)
     # No lens is without far light: to leave out what is not certain is to be wrong by all of it.
     shares, covariance = lenses.shares(np.union1d(kept, _terms(far)))
@@ -522,6 +528,20 @@ def _supposed_lenses(few: bool) -> list[_Lens]:
         replace(one, veil_apart=alike, odds=one.odds * (1 - without) * odds)
         for (one, without), (alike, odds) in product(scatter, apart)
     ]
+
+
+def _usual_wide_light(bits: int, scatters: bool) -> _Array:
+    """Return the mean squares (TERMS, TERMS) beforehand of the shares that spread over much of the frame, 0 of others.
+
+    `scatters`: whether it is known that the lens does.
+    """
+    wide = _terms(far_groups()[-_WIDE_KERNELS - 1 :])
+    supposed = [lens for lens in _supposed_lenses(bits < VARYING_BITS) if lens.near == 1 or not scatters]
+    found = np.zeros((TERMS, TERMS))
+    for lens in supposed:
+        share = lens.odds / sum(one.odds for one in supposed)
+        found[np.ix_(wide, wide)] += share * _usual_shares(bits, lens)[np.ix_(wide, wide)]
+    return found
 
 
 def _usual_shares(bits: int, lens: _Lens) -> _Array:
