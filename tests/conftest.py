@@ -69,6 +69,15 @@ def pytest_xdist_auto_num_workers() -> int:
     return processors + (processors + 1) // 2
 
 
+@pytest.fixture(scope="module")
+def undrawn() -> Iterator[None]:
+    """Leave the pictures of build-lut's reports blank, where a module's tests look at none."""
+    from tests.calibration.lab import blank_pictures
+
+    with blank_pictures():
+        yield
+
+
 @pytest.fixture
 def hang_up() -> Iterator[None]:
     """Let SIGHUP end programs as it does on a terminal, also where the tests run under nohup, which ignores it."""
