@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
@@ -126,7 +126,7 @@ def figures_alone(result: BuildResult, session: Session, folder: Path) -> None:
 
 
 @contextmanager
-def blank_pictures() -> Iterator[None]:
+def blank_pictures() -> Generator[None]:
     """Leave the pictures of reports blank within: drawing them takes three times as long as a small build."""
 
     def blank(draw: Callable[..., None], *arguments: object) -> bytes:

@@ -11,6 +11,7 @@ from __future__ import annotations
 import ast
 import re
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -31,11 +32,11 @@ _ARRAY = re.compile(r"\bNDArray\b|\bArrayLike\b")
 _CONSTANT = re.compile(r"_?[A-Z][A-Z0-9_]*")
 
 
-def modules(package: str) -> Iterator[tuple[Path, ast.Module, list[str]]]:
-    """Yield each module of a package: its path, its tree, and its lines."""
-    for path in sorted((ROOT / package).rglob("*.py")):
-        text = path.read_text()
-        yield path.relative_to(ROOT), ast.parse(text), text.splitlines()
+@cache
+def modules(package: str) -> tuple[tuple[Path, ast.Module, list[str]], ...]:
+    """Return each module of a package: its path, its tree, and its lines."""
+    texts = {path: path.read_text() for path in sorted((ROOT / package).rglob("*.py"))}
+    return tuple((path.relative_to(ROOT), ast.parse(text), text.splitlines()) for path, text in texts.items())
 
 
 def aliases(tree: ast.Module) -> dict[str, str]:
@@ -56,23 +57,25 @@ def aliases(tree: ast.Module) -> dict[str, str]:
     return found
 
 
-PUBLIC = {
-    (".".join(path.with_suffix("").parts), name): text
-    for package in PACKAGES
-    for path, tree, _ in modules(package)
-    for name, text in aliases(tree).items()
-}
-"""What the names for arrays stand for, by module and name."""
+@cache
+def public() -> dict[tuple[str, str], str]:
+    """Return what the names for arrays stand for, by module and name."""
+    return {
+        (".".join(path.with_suffix("").parts), name): text
+        for package in PACKAGES
+        for path, tree, _ in modules(package)
+        for name, text in aliases(tree).items()
+    }
 
 
 def known_arrays(tree: ast.Module) -> dict[str, str]:
     """Return the names for arrays that a module has or imports."""
     imported = {
-        item.asname or item.name: PUBLIC[node.module, item.name]
+        item.asname or item.name: public()[node.module, item.name]
         for node in tree.body
         if isinstance(node, ast.ImportFrom) and node.module
         for item in node.names
-        if (node.module, item.name) in PUBLIC
+        if (node.module, item.name) in public()
     }
     return imported | aliases(tree)
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 import ast
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -60,6 +61,7 @@ def shape_of(node: ast.ClassDef) -> Shape:
     return shape
 
 
+@cache
 def shapes() -> dict[str, list[tuple[Path, Shape]]]:
     """Return every class of the product by its name."""
     found: dict[str, list[tuple[Path, Shape]]] = {}
@@ -71,14 +73,11 @@ def shapes() -> dict[str, list[tuple[Path, Shape]]]:
     return found
 
 
-CLASSES = shapes()
-
-
 def made_with(shape: Shape) -> set[str]:
     """Return the attributes that an object has after its `__init__`, its bases' included."""
     known = set(shape.made_with)
     for base in shape.bases:
-        for _, other in CLASSES.get(base, []):
+        for _, other in shapes().get(base, []):
             known |= made_with(other)
     return known
 
@@ -87,7 +86,7 @@ def made_with(shape: Shape) -> set[str]:
 def test_no_attribute_appears_after_its_object_was_made(package: str) -> None:
     late = [
         f"{path.relative_to(ROOT)}:{line} {name}.{attribute}"
-        for name, homes in CLASSES.items()
+        for name, homes in shapes().items()
         for path, shape in homes
         if path.relative_to(ROOT).parts[0] == package
         for attribute, line in shape.assigned.items()
