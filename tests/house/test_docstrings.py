@@ -12,13 +12,11 @@ import ast
 import re
 from collections.abc import Iterator
 from functools import cache
-from pathlib import Path
 
 import pytest
 
 from foundation.packages import PACKAGES
-
-ROOT = Path(__file__).parents[2]
+from tests.house.sources import sources
 
 Function = ast.FunctionDef | ast.AsyncFunctionDef
 
@@ -30,13 +28,6 @@ DTYPE = re.compile(r"\b(?:u?int(?:8|16|32|64)?|float(?:16|32|64)?|bool|dtype)\b"
 _OPEN_DTYPES = re.compile(r"\bArrayLike\b|NDArray\[[^]]*\b(?:Any|generic|number|floating|\w*integer|inexact)\b")
 _ARRAY = re.compile(r"\bNDArray\b|\bArrayLike\b")
 _CONSTANT = re.compile(r"_?[A-Z][A-Z0-9_]*")
-
-
-@cache
-def modules(package: str) -> tuple[tuple[Path, ast.Module, list[str]], ...]:
-    """Return each module of a package: its path, its tree, and its lines."""
-    texts = {path: path.read_text() for path in sorted((ROOT / package).rglob("*.py"))}
-    return tuple((path.relative_to(ROOT), ast.parse(text), text.splitlines()) for path, text in texts.items())
 
 
 def aliases(tree: ast.Module) -> dict[str, str]:
@@ -61,10 +52,10 @@ def aliases(tree: ast.Module) -> dict[str, str]:
 def public() -> dict[tuple[str, str], str]:
     """Return what the names for arrays stand for, by module and name."""
     return {
-        (".".join(path.with_suffix("").parts), name): text
+        (".".join(source.path.with_suffix("").parts), name): text
         for package in PACKAGES
-        for path, tree, _ in modules(package)
-        for name, text in aliases(tree).items()
+        for source in sources(package)
+        for name, text in aliases(source.tree).items()
     }
 
 
@@ -139,10 +130,11 @@ def entries(docstring: str) -> tuple[str, dict[str, str]]:
 def without_shape(package: str) -> list[str]:
     """Return the arrays of public functions of which no shape is stated, or no dtype where it is open."""
     missing: list[str] = []
-    for path, tree, _ in modules(package):
-        for name, function in public_functions(tree.body):
+    for source in sources(package):
+        path, known = source.path, known_arrays(source.tree)
+        for name, function in public_functions(source.tree.body):
             head, described = entries(ast.get_docstring(function) or "")
-            for array, annotation in arrays_of(function, known_arrays(tree)).items():
+            for array, annotation in arrays_of(function, known).items():
                 says = " ".join((described.get(array) or head).split())
                 if not has_shape(says):
                     missing.append(f"{path}:{function.lineno} {name}({array}): no shape")
@@ -203,9 +195,10 @@ def has_reason(node: ast.stmt, after: ast.stmt | None, lines: list[str]) -> bool
 def without_reason(package: str) -> list[str]:
     """Return the numeric constants of a package that stand without a reason."""
     return [
-        f"{path}:{node.lineno} {name}"
-        for path, tree, lines in modules(package)
-        for name, node, after in constants(tree)
+        f"{source.path}:{node.lineno} {name}"
+        for source in sources(package)
+        for lines in (source.text.splitlines(),)
+        for name, node, after in constants(source.tree)
         if not has_reason(node, after, lines)
     ]
 
