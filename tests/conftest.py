@@ -69,6 +69,26 @@ def pytest_xdist_auto_num_workers() -> int:
     return processors + (processors + 1) // 2
 
 
+@pytest.fixture(scope="session", autouse=True)
+def kept_files(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Keep what is computed once for a table, and costs a second, in one folder for a whole run, not in the user's."""
+    folder = tmp_path_factory.getbasetemp()
+    if "PYTEST_XDIST_WORKER" in os.environ:
+        # Those of the other processes lie beside it.
+        folder = folder.parent
+    os.environ["XDG_CACHE_HOME"] = str(folder / "kept")
+    return folder / "kept"
+
+
+@pytest.fixture(scope="module")
+def undrawn() -> Iterator[None]:
+    """Leave the pictures of build-lut's reports blank, where a module's tests look at none."""
+    from tests.calibration.lab import blank_pictures
+
+    with blank_pictures():
+        yield
+
+
 @pytest.fixture
 def hang_up() -> Iterator[None]:
     """Let SIGHUP end programs as it does on a terminal, also where the tests run under nohup, which ignores it."""

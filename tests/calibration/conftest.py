@@ -10,7 +10,7 @@ from calibration.pipeline.build import build
 from calibration.report.report import write_report
 from calibration.verdict import BuildResult
 from experiment.session.folder import Session
-from tests.calibration.lab import LIGHTS, Lab, hang, take
+from tests.calibration.lab import LIGHTS, Lab, blank_pictures, hang, take
 
 
 @pytest.fixture(scope="session")
@@ -26,5 +26,6 @@ def session(lab: Lab, tmp_path_factory: pytest.TempPathFactory) -> Generator[Ses
 
 @pytest.fixture(scope="session")
 def built(session: Session, tmp_path_factory: pytest.TempPathFactory) -> BuildResult:
-    """Return the table of the session with its report; to be read, not changed."""
-    return build(session, tmp_path_factory.mktemp("table") / "lut", report=write_report)
+    """Return the table of the session with its report, whose pictures are blank; to be read, not changed."""
+    with blank_pictures():
+        return build(session, tmp_path_factory.mktemp("table") / "lut", report=write_report)

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Generator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from functools import cache
@@ -12,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
+import pytest
 
 from benchmarks.sessions import record_session
 from calibration.report.report import report_json
@@ -121,6 +123,19 @@ def take(
 def figures_alone(result: BuildResult, session: Session, folder: Path) -> None:
     """Write a report without its page, whose pictures take seconds."""
     (folder / REPORT_JSON).write_text(json.dumps(report_json(result)))
+
+
+@contextmanager
+def blank_pictures() -> Generator[None]:
+    """Leave the pictures of reports blank within: drawing them takes three times as long as a small build."""
+
+    def blank(draw: Callable[..., None], *arguments: object) -> bytes:
+        return b"\x89PNG\r\n\x1a\n"
+
+    with pytest.MonkeyPatch.context() as patched:
+        for page in ("calibration.report.report", "calibration.comparison.report"):
+            patched.setattr(f"{page}.png_of", blank)
+        yield
 
 
 def renumbered(lights: Sequence[Illumination]) -> tuple[Illumination, ...]:

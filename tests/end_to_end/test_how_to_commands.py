@@ -20,7 +20,7 @@ import pytest
 from croplab import COMMANDS
 from tests.house.test_documented_commands import FOUND
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("undrawn")]
 
 HOW_TO = "docs/how-to/"
 ELSEWHERE = {"rehearsal.md"}

@@ -24,7 +24,7 @@ from experiment.session.folder import Session
 from foundation.errors import FormatError
 from sim.world.world import World
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("undrawn")]
 
 Run = Callable[..., int]
 

@@ -18,7 +18,7 @@ from experiment.session.folder import Session
 from experiment.session.repair import held_secrets
 from tests.found_texts import files_with
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("undrawn")]
 
 PASSWORD = "pj-5ecret-word"
 TOKEN = "ntfy-t0ken-path"

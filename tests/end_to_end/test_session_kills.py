@@ -1,4 +1,4 @@
-"""Sixty runs killed at random operations and times; `python -m benchmarks.session_kills` kills ten thousand."""
+"""Thirty runs killed at random operations and times; `python -m benchmarks.session_kills` kills ten thousand."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import pytest
 
 from benchmarks.session_kills import KilledSessions
 
-KILLS = 60
+KILLS = 30
 
 pytestmark = [
     pytest.mark.slow,

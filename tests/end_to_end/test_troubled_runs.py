@@ -9,7 +9,7 @@ import pytest
 from benchmarks.troubled_runs import CAUSES, Cause, night, outcome_of
 from calibration.cli import main as build_lut
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("undrawn")]
 
 CHOSEN = ("one frame late, from a frame on", "a camera that hangs for four minutes", "a journal that is overwritten")
 

@@ -18,15 +18,23 @@ from foundation.errors import InputError
 from generator.cli import main
 
 
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("kept")
+
+
 @pytest.fixture(autouse=True)
-def small(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """Make it small, and keep it elsewhere than in the user's folder."""
+def small(monkeypatch: pytest.MonkeyPatch, folder: Path) -> None:
+    """Make it small, and keep it for the tests that use it."""
     monkeypatch.setattr(demo_table, "BITS", 1)
     monkeypatch.setattr(demo_table, "LIGHTS", "D65,A")
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    monkeypatch.setenv("XDG_CACHE_HOME", str(folder))
 
 
-def test_it_is_made_once_and_says_what_it_is(capsys: pytest.CaptureFixture[str]) -> None:
+def test_it_is_made_once_and_says_what_it_is(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     first = table_folder(Path("demo:"))
     assert "computed table" in capsys.readouterr().out
     made = (first / "lut.json").stat().st_mtime_ns

@@ -78,7 +78,6 @@ pytestmark = pytest.mark.slow
 def place(make_lut: MakeLut, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     make_lut()
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     assert cv2.imwrite("grey.png", np.full((8, 8, 3), 128, np.uint8))
     return tmp_path
 

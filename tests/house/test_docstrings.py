@@ -11,13 +11,12 @@ from __future__ import annotations
 import ast
 import re
 from collections.abc import Iterator
-from pathlib import Path
+from functools import cache
 
 import pytest
 
 from foundation.packages import PACKAGES
-
-ROOT = Path(__file__).parents[2]
+from tests.house.sources import sources
 
 Function = ast.FunctionDef | ast.AsyncFunctionDef
 
@@ -29,13 +28,6 @@ DTYPE = re.compile(r"\b(?:u?int(?:8|16|32|64)?|float(?:16|32|64)?|bool|dtype)\b"
 _OPEN_DTYPES = re.compile(r"\bArrayLike\b|NDArray\[[^]]*\b(?:Any|generic|number|floating|\w*integer|inexact)\b")
 _ARRAY = re.compile(r"\bNDArray\b|\bArrayLike\b")
 _CONSTANT = re.compile(r"_?[A-Z][A-Z0-9_]*")
-
-
-def modules(package: str) -> Iterator[tuple[Path, ast.Module, list[str]]]:
-    """Yield each module of a package: its path, its tree, and its lines."""
-    for path in sorted((ROOT / package).rglob("*.py")):
-        text = path.read_text()
-        yield path.relative_to(ROOT), ast.parse(text), text.splitlines()
 
 
 def aliases(tree: ast.Module) -> dict[str, str]:
@@ -56,23 +48,25 @@ def aliases(tree: ast.Module) -> dict[str, str]:
     return found
 
 
-PUBLIC = {
-    (".".join(path.with_suffix("").parts), name): text
-    for package in PACKAGES
-    for path, tree, _ in modules(package)
-    for name, text in aliases(tree).items()
-}
-"""What the names for arrays stand for, by module and name."""
+@cache
+def public() -> dict[tuple[str, str], str]:
+    """Return what the names for arrays stand for, by module and name."""
+    return {
+        (".".join(source.path.with_suffix("").parts), name): text
+        for package in PACKAGES
+        for source in sources(package)
+        for name, text in aliases(source.tree).items()
+    }
 
 
 def known_arrays(tree: ast.Module) -> dict[str, str]:
     """Return the names for arrays that a module has or imports."""
     imported = {
-        item.asname or item.name: PUBLIC[node.module, item.name]
+        item.asname or item.name: public()[node.module, item.name]
         for node in tree.body
         if isinstance(node, ast.ImportFrom) and node.module
         for item in node.names
-        if (node.module, item.name) in PUBLIC
+        if (node.module, item.name) in public()
     }
     return imported | aliases(tree)
 
@@ -136,10 +130,11 @@ def entries(docstring: str) -> tuple[str, dict[str, str]]:
 def without_shape(package: str) -> list[str]:
     """Return the arrays of public functions of which no shape is stated, or no dtype where it is open."""
     missing: list[str] = []
-    for path, tree, _ in modules(package):
-        for name, function in public_functions(tree.body):
+    for source in sources(package):
+        path, known = source.path, known_arrays(source.tree)
+        for name, function in public_functions(source.tree.body):
             head, described = entries(ast.get_docstring(function) or "")
-            for array, annotation in arrays_of(function, known_arrays(tree)).items():
+            for array, annotation in arrays_of(function, known).items():
                 says = " ".join((described.get(array) or head).split())
                 if not has_shape(says):
                     missing.append(f"{path}:{function.lineno} {name}({array}): no shape")
@@ -200,9 +195,10 @@ def has_reason(node: ast.stmt, after: ast.stmt | None, lines: list[str]) -> bool
 def without_reason(package: str) -> list[str]:
     """Return the numeric constants of a package that stand without a reason."""
     return [
-        f"{path}:{node.lineno} {name}"
-        for path, tree, lines in modules(package)
-        for name, node, after in constants(tree)
+        f"{source.path}:{node.lineno} {name}"
+        for source in sources(package)
+        for lines in (source.text.splitlines(),)
+        for name, node, after in constants(source.tree)
         if not has_reason(node, after, lines)
     ]
 

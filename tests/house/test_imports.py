@@ -9,25 +9,14 @@ from __future__ import annotations
 import ast
 import tomllib
 from collections import defaultdict
-from functools import cache
 from graphlib import CycleError, TopologicalSorter
-from pathlib import Path
 
 import grimp
 import pytest
 
-ROOT = Path(__file__).parents[2]
+from tests.house.sources import ROOT, sources
+
 PACKAGES: list[str] = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["importlinter"]["root_packages"]
-FILES = sorted(path for package in PACKAGES for path in (ROOT / package).rglob("*.py"))
-
-
-@cache
-def tree_of(path: Path) -> ast.Module:
-    return ast.parse(path.read_text(encoding="utf-8"))
-
-
-def place(path: Path) -> str:
-    return str(path.relative_to(ROOT))
 
 
 @pytest.mark.parametrize("package", PACKAGES)
@@ -48,9 +37,9 @@ def test_no_modules_import_each_other_in_a_circle() -> None:
 
 def test_a_public_class_name_has_one_home() -> None:
     homes: defaultdict[str, list[str]] = defaultdict(list)
-    for path in FILES:
-        for node in tree_of(path).body:
+    for source in (source for package in PACKAGES for source in sources(package)):
+        for node in source.tree.body:
             if isinstance(node, ast.ClassDef) and not node.name.startswith("_"):
-                homes[node.name].append(place(path))
+                homes[node.name].append(str(source.path))
     shared = {name: files for name, files in homes.items() if len(files) > 1}
     assert not shared

@@ -9,13 +9,13 @@ from __future__ import annotations
 import ast
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
 
 import pytest
 
 from foundation.packages import PACKAGES
-
-ROOT = Path(__file__).parents[2]
+from tests.house.sources import sources
 
 
 @dataclass
@@ -60,25 +60,23 @@ def shape_of(node: ast.ClassDef) -> Shape:
     return shape
 
 
+@cache
 def shapes() -> dict[str, list[tuple[Path, Shape]]]:
     """Return every class of the product by its name."""
     found: dict[str, list[tuple[Path, Shape]]] = {}
     for package in PACKAGES:
-        for path in sorted((ROOT / package).rglob("*.py")):
-            for node in ast.walk(ast.parse(path.read_text())):
+        for source in sources(package):
+            for node in ast.walk(source.tree):
                 if isinstance(node, ast.ClassDef):
-                    found.setdefault(node.name, []).append((path, shape_of(node)))
+                    found.setdefault(node.name, []).append((source.path, shape_of(node)))
     return found
-
-
-CLASSES = shapes()
 
 
 def made_with(shape: Shape) -> set[str]:
     """Return the attributes that an object has after its `__init__`, its bases' included."""
     known = set(shape.made_with)
     for base in shape.bases:
-        for _, other in CLASSES.get(base, []):
+        for _, other in shapes().get(base, []):
             known |= made_with(other)
     return known
 
@@ -86,10 +84,10 @@ def made_with(shape: Shape) -> set[str]:
 @pytest.mark.parametrize("package", PACKAGES)
 def test_no_attribute_appears_after_its_object_was_made(package: str) -> None:
     late = [
-        f"{path.relative_to(ROOT)}:{line} {name}.{attribute}"
-        for name, homes in CLASSES.items()
+        f"{path}:{line} {name}.{attribute}"
+        for name, homes in shapes().items()
         for path, shape in homes
-        if path.relative_to(ROOT).parts[0] == package
+        if path.parts[0] == package
         for attribute, line in shape.assigned.items()
         if attribute not in made_with(shape)
     ]

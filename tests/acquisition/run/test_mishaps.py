@@ -12,7 +12,7 @@ import pytest
 
 from tests.acquisition.run.mishaps import MISHAPS, TroubledLab, take_all
 
-SEEDS = range(10, 60)
+SEEDS = range(10, 30)
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -21,8 +21,8 @@ def test_mishaps_cost_no_frame(tmp_path: Path, seed: int) -> None:
 
 
 @pytest.mark.slow
-def test_fifty_sessions_of_twenty_lights_with_mishaps_of_every_kind(tmp_path: Path) -> None:
+def test_twenty_sessions_of_twenty_lights_with_mishaps_of_every_kind(tmp_path: Path) -> None:
     happened = Counter(name for seed in SEEDS for name in TroubledLab(seed).mishaps)
     assert set(happened) == {mishap.__name__ for mishap in MISHAPS}, "every kind of mishap came up"
     complete = sum(take_all(tmp_path / f"{seed}", seed) for seed in SEEDS)
-    assert complete > 37, "most of what happens once is lived with"
+    assert complete > 14, "most of what happens once is lived with"

@@ -33,7 +33,7 @@ from sim.world.room import Room
 from tests.calibration.lab import LIGHTS, SETTINGS, TAKEN_AT, Lab, hang, renumbered, take
 from tests.json_of import json_of
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("undrawn")]
 
 
 def angle_deg(one: npt.NDArray[np.float64], other: npt.NDArray[np.float64]) -> float:

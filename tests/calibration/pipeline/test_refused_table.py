@@ -20,7 +20,7 @@ from foundation.errors import QualityError
 from tests.calibration.lab import LIGHTS, Lab, take
 from tests.json_of import json_of
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("undrawn")]
 
 STRICT = (replace(next(limit for limit in FIGURES if limit.name == "darkest_counts"), refuse=60_000.0),)
 

@@ -22,12 +22,12 @@ pytestmark = pytest.mark.slow
 LIGHT = renumbered(LIGHTS[5:6])
 
 
-@pytest.mark.parametrize(("bits", "seed"), [(1, 1), (2, 1), (2, 3)])
+@pytest.mark.parametrize(("bits", "seed"), [(1, 1), (2, 3)])
 def test_a_small_chart_becomes_a_table(bits: int, seed: int, tmp_path: Path) -> None:
     lab = hang_chart(design_chart(bits, seed=seed), "Test", Room(projector_falloff=0.3))
     with take(lab, tmp_path / "session", LIGHT) as session:
         result = build(session, tmp_path / "lut")
-        if seed == 1:
+        if bits == 1:
             write_report(result, session, tmp_path)
     # One light alone does not show how linear the sensor is.
     assert {row.figure.name for row in result.verdict.remarks} == {"linearity_known"}
@@ -35,7 +35,7 @@ def test_a_small_chart_becomes_a_table(bits: int, seed: int, tmp_path: Path) -> 
     assert not result.figures.cells.unfit
     assert judged_values(result.figures).keys().isdisjoint({"unlike_scatter", "unlike_block", "doubtful_share"})
     # What is not judged is not shown as clean.
-    if seed == 1:
+    if bits == 1:
         report = (tmp_path / "report.html").read_text()
         assert "The course of the session" in report
         assert "<h2>The print</h2>" not in report

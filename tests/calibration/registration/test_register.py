@@ -173,7 +173,7 @@ def test_a_mirrored_frame_is_called_mirrored(lab: Lab, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("roll", [90.0, -90.0, 180.0, 37.0])
 def test_a_turned_camera_sees_the_same_chart(tmp_path: Path, roll: float) -> None:
-    lab = hang(2, "A6", "EOS 550D", room=Room(waviness_mm=0.5, roll_deg=roll, fill=0.55))
+    lab = hang(1, "A7", room=Room(waviness_mm=0.5, roll_deg=roll, fill=0.55))
     mosaic = lab.mosaic(tmp_path)
     registration = register(mosaic, lab.chart)
     error = registration.to_pixels(lab.chart.centres_mm) - lab.truth_px(lab.chart.centres_mm, mosaic)
@@ -182,13 +182,11 @@ def test_a_turned_camera_sees_the_same_chart(tmp_path: Path, roll: float) -> Non
     assert abs((turned + 180) % 360 - 180) < 5
 
 
-@pytest.mark.parametrize(
-    ("seed", "body", "bits", "page"), [(101, "EOS 550D", 4, "A2"), (102, "Test", 2, "A6"), (103, "Test", 2, "A6")]
-)
-def test_rooms_that_nothing_was_tuned_for(seed: int, body: str, bits: int, page: str) -> None:
+@pytest.mark.parametrize("seed", [102, 103])
+def test_rooms_that_nothing_was_tuned_for(seed: int) -> None:
     """More of them, on whole charts, are in `benchmarks.rooms`."""
     case = rooms.random_case(seed)
-    error = rooms.miss(replace(case, body=body, room=replace(case.room, blur_px=0.7)), bits, page)
+    error = rooms.miss(replace(case, body="Test", room=replace(case.room, blur_px=0.7)), 2, "A6")
     assert error.max() < rooms.SILENT_PX / 2
     assert np.sqrt((error**2).mean()) < 0.1
 

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import base64
 import json
 import re
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
@@ -14,7 +16,9 @@ from calibration.figures.all_figures import FIGURES
 from calibration.pipeline.build import build
 from calibration.report.plots import draw_places, draw_reference_residuals, half_size, reference_residuals
 from calibration.report.report import write_report
+from calibration.verdict import BuildResult
 from drivers.raw.rawfile import read_raw
+from experiment.session.folder import Session
 from foundation.plots import png_of
 from tests.calibration.causes.rooms import HAND, nth_white, taken
 from tests.calibration.lab import Lab
@@ -41,6 +45,18 @@ def test_the_report_names_and_circles_a_hand(lab: Lab, tmp_path: Path) -> None:
     assert found["files"] == ["frames/0004_white.dng"] == [place["file"] for place in found["places"]]
     assert found["command"] == "acquire run LAB.toml SESSION --retake bad"
     assert found["evidence"]["showing"] == pytest.approx(1 / 8)
+
+
+def test_every_picture_of_a_report_is_drawn(session: Session, built: BuildResult, tmp_path: Path) -> None:
+    write_report(built, session, tmp_path)
+    page = (tmp_path / "report.html").read_text()
+    pictures = re.findall(r"data:image/png;base64,([^'\"]+)", page)
+    assert len(pictures) == 12
+    for picture in pictures:
+        pixels = cv2.imdecode(np.frombuffer(base64.b64decode(picture), dtype=np.uint8), cv2.IMREAD_COLOR)
+        assert pixels is not None
+        assert pixels.shape[1] > 300
+        assert pixels.std() > 5, "something is on it"
 
 
 def test_pictures_are_drawn_of_many_places_and_of_residuals(lab: Lab, tmp_path: Path) -> None:

@@ -188,8 +188,6 @@ def test_reduction(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     [
         ("paper reduction noise.png --out out", "out/report.html"),
         ("run photos.npz --csv out.csv", "out.csv"),
-        ("describe photos.npz --out out.json", "out.json"),
-        ("cv kernel-ridge photos.npz --out out", "out/report.html"),
     ],
 )
 def test_what_was_computed_is_kept_where_the_reader_of_the_output_left(

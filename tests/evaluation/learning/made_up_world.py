@@ -8,6 +8,16 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from evaluation.learning.convnet import ConvNet
+from evaluation.learning.feature_learner import FeatureLearner
+from evaluation.learning.standard import standard_learners
+
+SIZE = 32
+"""Width and height of scenes, px."""
+
+LEARNERS: dict[str, FeatureLearner] = {**standard_learners(), "convnet": ConvNet(working_size=SIZE)}
+"""All methods; the network's square is no larger than the scenes, three quarters of it would be black."""
+
 
 @dataclass(frozen=True, eq=False)
 class MadeUp:
@@ -29,7 +39,7 @@ def lights_on_a_line(count: int, rng: np.random.Generator) -> npt.NDArray[np.flo
     return np.stack([red, np.full(count, 0.42), 0.58 - red], axis=1)
 
 
-def world(count: int, seed: int = 0, size: int = 32, cast: float = 0.25) -> list[MadeUp]:
+def world(count: int, seed: int = 0, size: int = SIZE, cast: float = 0.25) -> list[MadeUp]:
     """Return scenes of 4 px tiles whose surfaces are near grey, each scene with a cast of its own.
 
     The cast is what keeps Gray-world from being right: log-normal with a standard deviation of `cast` in the red and

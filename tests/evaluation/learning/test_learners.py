@@ -11,25 +11,24 @@ import pytest
 
 from evaluation.learning.feature_learner import FeatureLearner, LearnedMethod
 from evaluation.learning.model_files import load_model, save_model
-from evaluation.learning.standard import standard_learners
 from evaluation.methods.prepared import GREY
 from evaluation.metrics import recovery_error
 from foundation.errors import InputError
-from tests.evaluation.learning.made_up_world import constant_light, world
+from tests.evaluation.learning.made_up_world import LEARNERS, constant_light, world
 from tests.evaluation.learning.stories import story
 
 pytestmark = pytest.mark.slow
 
 TRAIN, TEST = world(90), world(40, seed=1)
-LEARNERS = {key: learner for key, learner in standard_learners().items() if key != "constant-light"}
+LOOKING = {key: learner for key, learner in LEARNERS.items() if key != "constant-light"}
 """All that look at images; the constant light has tests of its own."""
 
 
-@pytest.fixture(scope="module", params=LEARNERS)
+@pytest.fixture(scope="module", params=LOOKING)
 def learner(request: pytest.FixtureRequest) -> FeatureLearner:
     if request.param == "convnet":
         pytest.importorskip("torch", reason="PyTorch is not installed: pip install torch")
-    return LEARNERS[request.param]
+    return LOOKING[request.param]
 
 
 @pytest.fixture(scope="module")

@@ -47,11 +47,12 @@ def test_a_record_is_json_without_anything_of_this_process() -> None:
     assert record["settings"]["settings"]["p"] == 2.0
 
 
-@pytest.mark.parametrize(
-    "settings", [{"p": 3}, {"inner": Inner(np.arange(4.0) + 1e-12)}, {"raw": b"ac"}, {"shape": (2, 1)}, {"new": None}]
-)
-def test_another_setting_is_another_record(settings: dict[str, Any]) -> None:
-    assert describe_method(Own(**settings)) != describe_method(Own())
+def test_another_setting_is_another_record() -> None:
+    others: list[dict[str, Any]] = [
+        {}, {"p": 3}, {"inner": Inner(np.arange(4.0) + 1e-12)}, {"raw": b"ac"}, {"shape": (2, 1)}, {"new": None},
+    ]  # fmt: skip
+    records = [json.dumps(describe_method(Own(**settings))) for settings in others]
+    assert len(set(records)) == len(records)
 
 
 def test_a_circle_of_objects_ends() -> None:

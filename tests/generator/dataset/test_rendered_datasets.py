@@ -50,11 +50,6 @@ BY_CODES = "0d79ec9438b4255ee6852ce3fe2b00713a20332b0d2d3210c9fdf5ed8323ddc6"
 """Of the first image of `made` by codes, as it was before there was any other rendering."""
 
 
-@pytest.fixture(autouse=True)
-def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-
-
 @pytest.fixture
 def pictures(tmp_path: Path) -> Path:
     folder = tmp_path / "pictures"

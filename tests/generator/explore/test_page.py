@@ -56,7 +56,6 @@ def tab(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Tab]:
 @pytest.fixture
 def explorer(make_table: MakeTable, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Explorer:
     """Return an explorer of a print under three black bodies, with two pictures of names that are markup."""
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     monkeypatch.chdir(tmp_path)
     folder = tmp_path / "pictures"
     folder.mkdir()

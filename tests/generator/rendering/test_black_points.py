@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -231,10 +230,7 @@ def test_of_greys_a_grey_is_taken_out_and_not_the_tinted_black_cell(make_lut: Ma
     assert np.ptp(seen) > 0.05 * seen.max()
 
 
-def test_black_of_a_picture_is_black_where_mixtures_are_brighter_than_the_black_cell(
-    make_table: MakeTable, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+def test_black_of_a_picture_is_black_where_mixtures_are_brighter_than_the_black_cell(make_table: MakeTable) -> None:
     tint = np.array([1.15, 1.0, 0.85])
 
     def redden(samples: npt.NDArray[np.uint16]) -> None:

@@ -40,7 +40,7 @@ RAMP = np.repeat(np.arange(256, dtype=np.uint8)[:, None, None], 3, axis=2).repea
 """All greys, (256, 1024, 3)."""
 
 
-@pytest.fixture(autouse=True)
+@pytest.fixture
 def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     return tmp_path / "cache" / "croplab"
@@ -153,13 +153,13 @@ def test_a_map_does_not_depend_on_last_digits(make_table: MakeTable, monkeypatch
     assert find_map(lut, MINE).sha256 == before
 
 
-@pytest.mark.parametrize("length", [-9, 0, 400])
-def test_a_damaged_map_is_as_good_as_none(make_table: MakeTable, cache: Path, length: int) -> None:
+def test_a_damaged_map_is_as_good_as_none(make_table: MakeTable, cache: Path) -> None:
     lut = make_table(bits=1)
     whole = ColorimetricRendering(lut, MINE).map.sha256
     (path,) = cache.iterdir()
-    path.write_bytes(path.read_bytes()[:length])
-    assert ColorimetricRendering(lut, MINE).map.sha256 == whole
+    for length in (-9, 0, 400):
+        path.write_bytes(path.read_bytes()[:length])
+        assert ColorimetricRendering(lut, MINE).map.sha256 == whole, length
 
 
 def test_where_nothing_can_be_kept_nothing_is(make_table: MakeTable, tmp_path: Path) -> None:

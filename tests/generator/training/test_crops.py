@@ -281,10 +281,7 @@ def test_pytorch_that_is_missing_is_an_import_error_and_named() -> None:
     assert (done.stdout, done.stderr) == ("training batches for PyTorch need it: pip install torch\n", "")
 
 
-def test_crops_by_colour_are_windows_of_the_image_that_is_rendered_so(
-    make_lut: MakeLut, gallery: Gallery, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+def test_crops_by_colour_are_windows_of_the_image_that_is_rendered_so(make_lut: MakeLut, gallery: Gallery) -> None:
     lut = make_lut(bits=BITS)
     black_point = BlackPoint("random")
     options: dict[str, Any] = {"lights": [1, 3], "length": 30, "seed": 8, "matrix": MATRIX}

@@ -14,6 +14,8 @@ from generator.training.crops import Crops
 from generator.training.gallery import gallery_of
 from tests.generator.conftest import MakeLut
 
+pytestmark = pytest.mark.slow
+
 torch: Any = pytest.importorskip("torch", reason="PyTorch is not installed: pip install torch")
 batches: Any = pytest.importorskip("generator.training.torch_crops")
 CropDataset, CropStream, collated = batches.CropDataset, batches.CropStream, batches.collated

@@ -80,7 +80,7 @@ def test_intervals_of_spreads_cover() -> None:
     random = np.random.default_rng(5)
     real = describe(random_set("real", 3))
     hits = 0
-    for number in range(80):
+    for number in range(40):
         one, other = random.normal(0, 1.5, 60), random.normal(0, 1, 60)
         sets = [
             dataclasses.replace(real, values={**dict.fromkeys(real.values, np.full(60, np.nan)), "grey_red": values})
@@ -89,7 +89,7 @@ def test_intervals_of_spreads_cover() -> None:
         found = {made.quantity.name: made for made in compare_figures(*sets, seed=number)}
         change = found["grey_spread_red"].change
         hits += change[1] <= 1.5 <= change[2]
-    assert 0.86 < hits / 80 <= 1
+    assert 0.86 < hits / 40 <= 1
 
 
 def test_generate_calls_figures_by_the_same_names() -> None:
