@@ -37,8 +37,7 @@ from pydantic import ValidationError
 
 from foundation.compiled import ordered_map
 from foundation.errors import FormatError, InputError
-from foundation.files import stream_sha256
-from foundation.folders import MOST_JSON_BYTES, bounded_lines, is_inside_name, parse_json_object
+from foundation.files import MOST_JSON_BYTES, bounded_lines, is_inside_name, parse_json_object, stream_sha256
 from generator.dataset.layouts import JOINED, member_name, read_member
 from generator.dataset.records import (
     COMPLETED_BY_HAND,

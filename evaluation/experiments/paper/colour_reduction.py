@@ -39,8 +39,7 @@ from evaluation.results.tables import PAPER_COLUMNS, Table
 from evaluation.scene import Image, Scene, SceneSet
 from foundation.compiled import ordered_map
 from foundation.errors import FormatError, InputError
-from foundation.files import reading_error, whole_folder, write_whole
-from foundation.folders import is_inside_name, read_inside
+from foundation.files import is_inside_name, read_inside, reading_error, whole_folder, write_whole
 from generator.pictures.picture import clear_bits
 from generator.pictures.preview import Flash, fit_flash
 

@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 
 from foundation.errors import FormatError, InputError
-from foundation.folders import FolderLock, held_folder
+from foundation.files import FolderLock, held_folder
 from generator.dataset import layouts as plain_files
 from generator.dataset import shards
 from generator.dataset.making import (
