@@ -23,9 +23,8 @@ if TYPE_CHECKING:
     from generator.kernels.mixing import mix_samples, mixed_table
     from generator.kernels.planar import draw_batch, draw_planar
     from generator.kernels.rendering import draw_mosaic, draw_samples
-    from generator.pictures.picture import read_picture
     from generator.pictures.preview import flash
-    from generator.pictures.sources import find_pictures
+    from generator.pictures.sources import find_pictures, read_picture
     from generator.rendering.render import render
 
 __all__ = [
@@ -61,7 +60,7 @@ _HOMES = {
     "mix_samples": "generator.kernels.mixing",
     "mixed_table": "generator.kernels.mixing",
     "open_dataset": "generator.dataset.reader",
-    "read_picture": "generator.pictures.picture",
+    "read_picture": "generator.pictures.sources",
     "render": "generator.rendering.render",
 }
 

@@ -283,7 +283,7 @@ def _photograph(
     from generator.dataset.shards import photograph
     from generator.kernels.choice import replace_unfit_colours
     from generator.lights.lighting import Lighting, plain
-    from generator.pictures.picture import keep_bits
+    from generator.pictures.sources import keep_bits
 
     picture = keep_bits(picture, rendered.bits)
     if rendered.rendering == "codes":

@@ -45,8 +45,7 @@ from generator.dataset.records import (
 )
 from generator.dataset.workplace import Workplace
 from generator.lights.lighting import Lighting, Mixture
-from generator.pictures.picture import Cut, Picture, keep_bits
-from generator.pictures.sources import Source, hash_since
+from generator.pictures.sources import Cut, Picture, Source, hash_since, keep_bits
 from generator.stores import Pieces
 from generator.variation.variation import Varied
 

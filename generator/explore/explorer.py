@@ -28,8 +28,7 @@ from generator.kernels.choice import replace_unfit_colours
 from generator.lights.choices import parse_light
 from generator.lights.gamut import Gamut, black_body, rb_of
 from generator.lights.lighting import Lighting, Mixture
-from generator.pictures.picture import Picture, Preparation, open_picture
-from generator.pictures.sources import SUFFIXES, PictureFile
+from generator.pictures.sources import SUFFIXES, Picture, PictureFile, Preparation, open_picture
 from generator.rendering import DEFAULT, Rendering
 from generator.rendering.colorimetric import reference_light
 from generator.rendering.matrices import ColourMatrix, matrix_for
