@@ -18,7 +18,8 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from calibration.table.lut import Lut
-    from generator.dataset.making import Callbacks, DatasetOptions, Workers, generate_dataset
+    from generator.dataset.making import Callbacks, Workers, generate_dataset
+    from generator.dataset.plan import DatasetOptions
     from generator.dataset.reader import open_dataset
     from generator.kernels.mixing import mix_samples, mixed_table
     from generator.kernels.planar import draw_batch, draw_planar
@@ -48,7 +49,7 @@ __all__ = [
 
 _HOMES = {
     "Callbacks": "generator.dataset.making",
-    "DatasetOptions": "generator.dataset.making",
+    "DatasetOptions": "generator.dataset.plan",
     "Workers": "generator.dataset.making",
     "draw_batch": "generator.kernels.planar",
     "draw_mosaic": "generator.kernels.rendering",

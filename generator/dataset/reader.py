@@ -264,8 +264,6 @@ def _fault_of(store: Store, name: str, digest: str) -> str | None:
 MOST_LIST_BYTES: Final = 4 << 30
 """Lists that are read whole have a line an image or source, some hundred bytes: this is forty million of them."""
 
-__all__ = ["Dataset", "Description", "Entry", "open_dataset"]
-
 
 @dataclass(frozen=True)
 class Dataset:

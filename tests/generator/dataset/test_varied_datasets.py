@@ -17,7 +17,8 @@ from evaluation.datasets.generated import open_generated
 from evaluation.scene import MixedScene
 from foundation.errors import InputError
 from generator.cli import main
-from generator.dataset.making import DatasetOptions, Workers, generate_dataset
+from generator.dataset.making import Workers, generate_dataset
+from generator.dataset.plan import DatasetOptions
 from generator.dataset.reader import Dataset, file_faults, open_dataset
 from generator.lights.choices import RandomLights, SimultaneousLights
 from generator.masks.making import parse_masks

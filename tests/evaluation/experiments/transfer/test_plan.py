@@ -27,7 +27,8 @@ from evaluation.experiments.transfer.plan import (
 )
 from evaluation.scene import MixedScene, SceneSet
 from foundation.errors import FormatError, InputError
-from generator.dataset.making import DatasetOptions, generate_dataset
+from generator.dataset.making import generate_dataset
+from generator.dataset.plan import DatasetOptions
 from generator.dataset.reader import Dataset
 from generator.lights.choices import ListedLights, SimultaneousLights
 from generator.lights.lighting import mixture_of
