@@ -185,7 +185,7 @@ def _from_adobe_rgb(codes: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
 
     Examples
     --------
-    >>> from_adobe_rgb(np.array([[[128, 128, 128], [200, 100, 50]]], np.uint8))
+    >>> _from_adobe_rgb(np.array([[[128, 128, 128], [200, 100, 50]]], np.uint8))
     array([[[129, 129, 129],
             [227, 100,  42]]], dtype=uint8)
     """
