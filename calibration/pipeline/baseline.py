@@ -57,7 +57,7 @@ from drivers.raw.storage import Area
 from experiment.chart.model import Chart
 from experiment.config import CameraSettings, CitationSettings
 from experiment.framing.field import Corners
-from experiment.framing.movement import STILL_PX, Shift, gauges_of, shift_between
+from experiment.framing.pictures import STILL_PX, Shift, gauges_of, shift_between
 from experiment.framing.planes import CHANNELS, CLIPPING_SHARE, Channel, Plane, frame_black, strongest_channel
 from experiment.measures.least_squares import code_polynomial, code_powers, least_squares, page_polynomial
 from experiment.measures.paper import MAX_ORDER, MAX_ORDER_AROUND, FlatField, PaperReader

@@ -76,8 +76,7 @@ from calibration.table.lut import (
     frames_sha256,
 )
 from calibration.verdict import COMMAND, BuildResult, judge, judged_values, refusal, retake_json
-from experiment.framing.movement import Shift
-from experiment.framing.pictures import annotated_png
+from experiment.framing.pictures import Shift, annotated_png
 from experiment.session.folder import Session
 from experiment.session.records import FrameRecord
 from foundation.compiled import processor_count
