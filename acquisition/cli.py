@@ -430,7 +430,7 @@ def rebuild(session: Annotated[Path, typer.Argument(help="Session folder.")]) ->
     """
     from experiment.session.folder import busy_sentence, rebuild_journal
     from experiment.session.journal import JOURNAL_FILE
-    from foundation.folders import held_folder
+    from foundation.files import held_folder
 
     with held_folder(session, busy_sentence(session)):
         attempts = rebuild_journal(session)

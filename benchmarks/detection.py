@@ -23,7 +23,7 @@ from pathlib import Path
 import numpy as np
 
 from acquisition.judge import limits
-from acquisition.judge.light import ProjectorModel
+from acquisition.judge.state import ProjectorModel
 from benchmarks.disturbance_trials import detection
 from benchmarks.false_alarms import false_alarms, odd_worlds
 from benchmarks.judged_labs import Lab, lab_of, rooms

@@ -174,7 +174,8 @@ def _read(scene: Scene) -> int:
 
 def make_dataset(folder: Path) -> Path:
     """Return a dataset of 24 PNG images of 1536 x 1024 px, a photograph with shot noise."""
-    from generator.dataset.making import DatasetOptions, generate_dataset
+    from generator.dataset.making import generate_dataset
+    from generator.dataset.plan import DatasetOptions
     from generator.pictures.sources import find_pictures
 
     (folder / "pictures").mkdir()

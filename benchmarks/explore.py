@@ -28,8 +28,7 @@ from calibration.table.lut import open_lut
 from generator.explore.explorer import MAX_SIDE, Explorer
 from generator.explore.server import ExploreServer
 from generator.lights.gamut import Gamut
-from generator.pictures.picture import Preparation
-from generator.pictures.sources import find_pictures
+from generator.pictures.sources import Preparation, find_pictures
 from tests.acquisition.monitor.browser import CHROMIUM, browser_tab
 
 PLACES = 40

@@ -36,7 +36,8 @@ from benchmarks.encode import METADATA, at_once, photograph
 from benchmarks.generator import SAMPLES, noisy_table, report
 from calibration.table.lut import Lut, open_lut
 from foundation.compiled import processor_count
-from generator.dataset.making import DatasetOptions, generate_dataset
+from generator.dataset.making import generate_dataset
+from generator.dataset.plan import DatasetOptions
 from generator.files import encode_pieces
 from generator.pictures.sources import find_pictures
 from generator.rendering import Rendering

@@ -25,7 +25,8 @@ from calibration.table.lut import Lut, LutWriter, Provenance, open_lut
 from drivers.presenter import Colour
 from foundation.console import run
 from foundation.errors import DeviceError
-from generator.dataset.making import DatasetOptions, Workers, generate_dataset
+from generator.dataset.making import Workers, generate_dataset
+from generator.dataset.plan import DatasetOptions
 from generator.lights.choices import RandomLights
 from generator.pictures.sources import random_scenes
 

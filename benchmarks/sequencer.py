@@ -51,8 +51,7 @@ from experiment.lights import Illumination, plan_illuminations
 from experiment.session.folder import Session
 from experiment.session.journal import Journal
 from experiment.session.records import Judgement, SessionStep, plan_steps
-from foundation.clock import Clock, SystemClock
-from sim.clock import OPENING, SimulatedClock
+from foundation.clock import OPENING, Clock, SimulatedClock, SystemClock
 from sim.world.sensors import BODIES
 from tests.drivers.raw.raw_files import write_cr2
 

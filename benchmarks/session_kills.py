@@ -53,8 +53,8 @@ from experiment.session.journal import Journal
 from experiment.session.ledger import ledger_path, settled_frames
 from experiment.session.records import ACCEPTED, VOIDED, Check, Judgement, SessionStep, plan_steps
 from experiment.session.repair import unsound_files
+from foundation.clock import OPENING, SimulatedClock
 from foundation.errors import DeviceError, FormatError
-from sim.clock import OPENING, SimulatedClock
 from sim.projectors.projector import SimulatedProjector
 from tests.end_to_end.conftest import make_lab
 

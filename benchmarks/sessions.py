@@ -33,7 +33,7 @@ from drivers.presenter import Colour
 from drivers.raw.rawfile import read_raw
 from experiment.chart.model import Chart
 from experiment.chart.printing import drawing
-from experiment.framing.movement import STILL_PX
+from experiment.framing.pictures import STILL_PX
 from experiment.framing.planes import CHANNELS
 from experiment.lights import Illumination
 from experiment.session.folder import ReceivedFile, Session

@@ -48,11 +48,10 @@ from experiment.config import LabSettings, load_lab
 from experiment.lights import plan_illuminations, save_illuminations
 from experiment.session.folder import Session
 from experiment.session.records import ACCEPTED, REFUSED, VOIDED
-from foundation.clock import SteadyClock
+from foundation.clock import OPENING, SimulatedClock, SteadyClock
 from foundation.errors import CropError, LinkClosed, QualityError
 from sim.buses.usb import PtpUsbDevice, SimulatedBus
 from sim.camera.eos import SimulatedEos
-from sim.clock import OPENING, SimulatedClock
 from sim.projectors.pjlink import PjLinkPeer
 from sim.projectors.projector import Screen, SimulatedPresenter, SimulatedProjector
 

@@ -31,7 +31,7 @@ from calibration.spread.correction import LensFigures
 from calibration.spread.fitting import PointSpread
 from calibration.table.lut import Unfit
 from drivers.raw.rawfile import FrameOrigin
-from experiment.framing.movement import Shift
+from experiment.framing.pictures import Shift
 from experiment.framing.planes import Channel
 from experiment.measures.paper import Paper
 from experiment.measures.sensor import black_drift

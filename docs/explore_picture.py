@@ -18,8 +18,7 @@ from calibration.table.lut import open_lut
 from examples.photographs import main as save_photographs
 from generator.explore.explorer import Explorer
 from generator.explore.server import ExploreServer
-from generator.pictures.picture import Preparation
-from generator.pictures.sources import find_pictures
+from generator.pictures.sources import Preparation, find_pictures
 from synthesis.cli import main as sim
 from tests.acquisition.monitor.browser import browser_tab
 

@@ -23,7 +23,7 @@ from foundation.colorimetry import angles_deg
 from generator.kernels.printing import NODES, SIDE, nearest_nodes
 from generator.lights.choices import parse_lights
 from generator.lights.lighting import plain
-from generator.pictures.picture import open_picture
+from generator.pictures.sources import open_picture
 from generator.rendering.colorimetric import ColorimetricRendering, source_colours
 from generator.rendering.matrices import matrix_for
 

@@ -1,6 +1,7 @@
 """Time is handed in, so that a simulated lab need not wait.
 
-Whoever waits or stamps a time takes a `Clock`. `SystemClock` is the real one; the simulated one lives in `sim.clock`.
+Whoever waits or stamps a time takes a `Clock`. `SystemClock` is the real one, `SteadyClock` one whose date is not set
+back, `SimulatedClock` the simulated lab's, whose time passes only when somebody waits for it.
 """
 
 from __future__ import annotations
@@ -101,3 +102,29 @@ class SteadyClock:
     def sleep(self, seconds: float) -> None:
         """Let `seconds` (≥ 0) pass."""
         self._clock.sleep(seconds)
+
+
+OPENING = datetime(2026, 1, 1, 8, 0, 0, tzinfo=UTC)
+"""When the simulated lab opens for a session that has not begun."""
+
+
+class SimulatedClock:
+    """A clock that stands still until `sleep` moves it."""
+
+    def __init__(self, start: datetime = OPENING) -> None:
+        self._start = start
+        self._elapsed = timedelta()
+
+    def now(self) -> datetime:
+        """Return the simulated wall-clock time, UTC."""
+        return self._start + self._elapsed
+
+    def monotonic(self) -> float:
+        """Return simulated seconds since this clock was made."""
+        return self._elapsed.total_seconds()
+
+    def sleep(self, seconds: float) -> None:
+        """Let `seconds` (≥ 0) of simulated time pass at once."""
+        if seconds < 0:
+            raise ValueError(f"cannot sleep {seconds} s")
+        self._elapsed += timedelta(seconds=seconds)

@@ -18,14 +18,14 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from calibration.table.lut import Lut
-    from generator.dataset.making import Callbacks, DatasetOptions, Workers, generate_dataset
+    from generator.dataset.making import Callbacks, Workers, generate_dataset
+    from generator.dataset.plan import DatasetOptions
     from generator.dataset.reader import open_dataset
     from generator.kernels.mixing import mix_samples, mixed_table
     from generator.kernels.planar import draw_batch, draw_planar
     from generator.kernels.rendering import draw_mosaic, draw_samples
-    from generator.pictures.picture import read_picture
     from generator.pictures.preview import flash
-    from generator.pictures.sources import find_pictures
+    from generator.pictures.sources import find_pictures, read_picture
     from generator.rendering.render import render
 
 __all__ = [
@@ -49,7 +49,7 @@ __all__ = [
 
 _HOMES = {
     "Callbacks": "generator.dataset.making",
-    "DatasetOptions": "generator.dataset.making",
+    "DatasetOptions": "generator.dataset.plan",
     "Workers": "generator.dataset.making",
     "draw_batch": "generator.kernels.planar",
     "draw_mosaic": "generator.kernels.rendering",
@@ -61,7 +61,7 @@ _HOMES = {
     "mix_samples": "generator.kernels.mixing",
     "mixed_table": "generator.kernels.mixing",
     "open_dataset": "generator.dataset.reader",
-    "read_picture": "generator.pictures.picture",
+    "read_picture": "generator.pictures.sources",
     "render": "generator.rendering.render",
 }
 

@@ -197,8 +197,7 @@ def explore(
     from generator.explore.explorer import Explorer
     from generator.explore.samples import sample_folder
     from generator.explore.server import ExploreServer
-    from generator.pictures.picture import Preparation
-    from generator.pictures.sources import find_pictures
+    from generator.pictures.sources import Preparation, find_pictures
 
     loaded()
     table = open_lut(table_folder(lut))

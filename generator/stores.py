@@ -26,8 +26,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING, BinaryIO, Final, Protocol, cast
 
 from foundation.errors import CropError, FormatError, InputError, StorageError
-from foundation.files import is_partial, partial_path, reading_error, storage_error, sync_folder
-from foundation.folders import is_inside_name, open_inside
+from foundation.files import (
+    is_inside_name,
+    is_partial,
+    open_inside,
+    partial_path,
+    reading_error,
+    storage_error,
+    sync_folder,
+)
 from foundation.secret_texts import masked
 
 if TYPE_CHECKING:

@@ -34,7 +34,6 @@ from experiment.chart.model import Chart
 from experiment.framing.planes import CLIPPING_SHARE
 from experiment.lights import Illumination
 from experiment.measures.paper import MAX_ORDER, MAX_ORDER_AROUND, MIN_REFERENCES, Paper, PaperReader
-from experiment.measures.sensor import saturation
 from foundation.compiled import ordered_map
 from foundation.errors import QualityError, StorageError
 from foundation.files import require_free, whole_folder
@@ -110,7 +109,7 @@ class PatchMeasurement:
         mosaic, black = self.sensor.expose(*self.lamp.lit(light), self.iso, light + 1)
         cells, references = self._sites()
         samples, highest = gather(mosaic, black, references)
-        seen = usable_means(samples, highest, references, saturation(mosaic))
+        seen = usable_means(samples, highest, references, mosaic.saturation())
         whites, greys = np.split(seen, [len(self.points.whites_mm)])
         _require_unclipped(whites, f"light {light}")
         paper, shape = self.reader.read(whites, f"light {light}")
@@ -123,7 +122,7 @@ class PatchMeasurement:
     def _paper_of_even_frame(self) -> Paper:
         mosaic, black = self.sensor.expose(*self.lamp.even(), self.iso, 0)
         _, references = self._sites()
-        seen = usable_means(*gather(mosaic, black, references), references, saturation(mosaic))
+        seen = usable_means(*gather(mosaic, black, references), references, mosaic.saturation())
         whites = seen[: len(self.points.whites_mm)]
         _require_unclipped(whites, "the frame of white")
         return self.reader.read(whites, "the frame of white")[0]

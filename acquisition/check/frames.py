@@ -31,7 +31,6 @@ from experiment.config import LabSettings
 from experiment.framing.field import Corners
 from experiment.framing.finding import Framing, find_chart
 from experiment.framing.planes import CHANNELS, CLIPPING_SHARE, PAPER_PERCENTILE, frame_black, phases
-from experiment.measures.sensor import saturation as shown_saturation
 from foundation.errors import DeviceError, RegistrationError
 
 
@@ -550,7 +549,7 @@ def _recorded(camera: Photographer, first: Shot, found: _Look) -> CheckFrames:
     """Return what a recording shows: one white frame and one dark one, as they were exposed."""
     dark = camera.take(BLACK)
     stated = float(first.mosaic.white_level)
-    counts = float(shown_saturation(first.mosaic))
+    counts = float(first.mosaic.saturation())
     saturation = Saturation(counts, counts < stated, stated)
     why = "a recording has no picture to mute"
     trials = (found.level(first, saturation),)

@@ -28,7 +28,6 @@ import numpy as np
 import numpy.typing as npt
 
 from acquisition.judge import limits
-from acquisition.judge.light import BLACK_DN, Basis, Codes, Fit, FrameLight, Prediction, ProjectorModel, Residuals
 from acquisition.judge.measure import (
     SEGMENTS,
     TILE_COLUMNS,
@@ -42,10 +41,18 @@ from acquisition.judge.measure import (
     refusal,
 )
 from acquisition.judge.state import (
+    BLACK_DN,
+    Basis,
+    Codes,
     Examined,
+    Fit,
+    FrameLight,
     JudgeState,
     LampSeen,
     Leaning,
+    Prediction,
+    ProjectorModel,
+    Residuals,
     Seen,
     combined,
     is_brightest_grey,

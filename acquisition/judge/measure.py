@@ -4,7 +4,7 @@
 is in it, and nothing in it depends on other frames. Every photosite of the visible area counts towards one tile and one
 strip, so that nothing escapes between places. `Anchor` is the chart's place in the first white frame, from which later
 frames tell how far it has moved, and blurred: its gauges are the chart's tags, or the outline of its field, or, where
-no chart is looked for, the places of most texture (`experiment.framing.movement`); the frame is kept around them alone.
+no chart is looked for, the places of most texture (`experiment.framing.pictures`); the frame is kept around them alone.
 `Frame` is both, and the bytes that the journal keeps of it.
 
 Format of the bytes (version 1): a zip archive of arrays as `numpy.savez` writes it, without pickled objects. `facts` is
@@ -39,7 +39,7 @@ from experiment.config import LabSettings, LimitSettings
 from experiment.framing.field import FoundField
 from experiment.framing.finding import FoundTag, Framing, find_chart, find_tags
 from experiment.framing.homography import project
-from experiment.framing.movement import Shift, gauge_boxes, gauges_of, shift_between
+from experiment.framing.pictures import Shift, gauge_boxes, gauges_of, shift_between
 from experiment.framing.planes import (
     CHANNELS,
     CLIPPING_SHARE,

@@ -57,11 +57,10 @@ from drivers.raw.storage import Area
 from experiment.chart.model import Chart
 from experiment.config import CameraSettings, CitationSettings
 from experiment.framing.field import Corners
-from experiment.framing.movement import STILL_PX, Shift, gauges_of, shift_between
+from experiment.framing.pictures import STILL_PX, Shift, gauges_of, shift_between
 from experiment.framing.planes import CHANNELS, CLIPPING_SHARE, Channel, Plane, frame_black, strongest_channel
 from experiment.measures.least_squares import code_polynomial, code_powers, least_squares, page_polynomial
 from experiment.measures.paper import MAX_ORDER, MAX_ORDER_AROUND, FlatField, PaperReader
-from experiment.measures.sensor import saturation
 from experiment.session.folder import Session
 from experiment.session.records import FrameRecord
 from foundation.errors import CropError, FormatError, InputError
@@ -785,7 +784,7 @@ def decode_frame(session: Session, record: FrameRecord) -> DecodedFrame:
             "SESSION --retake with the number of its light"
         )
     black = frame_black(mosaic)
-    return DecodedFrame(record, mosaic, black, strongest_channel(mosaic, black), saturation(mosaic))
+    return DecodedFrame(record, mosaic, black, strongest_channel(mosaic, black), mosaic.saturation())
 
 
 def stated_origin(session: Session) -> StatedOrigin:

@@ -76,14 +76,21 @@ from calibration.table.lut import (
     frames_sha256,
 )
 from calibration.verdict import COMMAND, BuildResult, judge, judged_values, refusal, retake_json
-from experiment.framing.movement import Shift
-from experiment.framing.pictures import annotated_png
+from experiment.framing.pictures import Shift, annotated_png
 from experiment.session.folder import Session
 from experiment.session.records import FrameRecord
 from foundation.compiled import processor_count
 from foundation.errors import CropError, FormatError, QualityError, RegistrationError, counted, first_of
-from foundation.files import partial_path, publish_folder, require_free, storage_error, sync_folder, write_whole
-from foundation.folders import clear_folder, held_folder
+from foundation.files import (
+    clear_folder,
+    held_folder,
+    partial_path,
+    publish_folder,
+    require_free,
+    storage_error,
+    sync_folder,
+    write_whole,
+)
 from foundation.records import to_plain
 from foundation.version import software
 

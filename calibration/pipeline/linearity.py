@@ -18,9 +18,9 @@ import numpy.typing as npt
 from calibration.measurements import LinearityMeasurements
 from calibration.pipeline.baseline import Baseline
 from drivers.raw.rawfile import Mosaic, read_raw
-from experiment.framing.movement import REREGISTER_PX, Shift
+from experiment.framing.pictures import REREGISTER_PX, Shift
 from experiment.framing.planes import CLIPPING_SHARE, frame_black, strongest_channel
-from experiment.measures.sensor import HIGHEST, LOWEST, deviations, saturation
+from experiment.measures.sensor import HIGHEST, LOWEST, deviations
 from foundation.errors import FormatError, InputError
 
 LEAST_FRAMES = 4
@@ -60,7 +60,7 @@ def read_linearity(folder: Path, baseline: Baseline) -> LinearityMeasurements:
                 f"{settings[0][0]}, f/{settings[0][1]}; a series differs in its exposure time alone"
             )
         black = frame_black(mosaic)
-        limit = saturation(mosaic)
+        limit = mosaic.saturation()
         _require_in_place(baseline.movement(mosaic, black, strongest_channel(mosaic, black), str(path)), path)
         means, highest = baseline.patches(mosaic, black)
         means[highest >= CLIPPING_SHARE * limit] = np.nan

@@ -29,7 +29,7 @@ from calibration.sampling import (
     table_values,
 )
 from calibration.spread.surroundings import FrameLevels
-from experiment.framing.movement import REREGISTER_PX, STILL_PX, Shift, gauges_of, shift_between
+from experiment.framing.pictures import REREGISTER_PX, STILL_PX, Shift, gauges_of, shift_between
 from experiment.measures.paper import Paper
 from foundation.errors import RegistrationError
 

@@ -26,7 +26,7 @@ from calibration.registration.register import Registration
 from calibration.sampling import rim_difference, sample_noise, sites_at
 from drivers.raw.rawfile import Mosaic
 from experiment.chart.model import Chart
-from experiment.framing.movement import STILL_PX
+from experiment.framing.pictures import STILL_PX
 from experiment.framing.planes import CHANNELS, frame_black, phases
 from experiment.measures.paper import FlatField
 from experiment.measures.stains import Stains

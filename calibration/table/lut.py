@@ -36,8 +36,16 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 from calibration.citation import OriginRecord
 from experiment.lights import COLUMNS, NAME, Illumination, load_illuminations
 from foundation.errors import FormatError, InputError, StorageError, kind_of
-from foundation.files import file_sha256, partial_path, read_text, reading_error, sha256_of, storage_error, write_whole
-from foundation.folders import require_plain_folder
+from foundation.files import (
+    file_sha256,
+    partial_path,
+    read_text,
+    reading_error,
+    require_plain_folder,
+    sha256_of,
+    storage_error,
+    write_whole,
+)
 from foundation.records import Record, from_json
 
 FORMAT: Final = "crop.lut"

@@ -56,8 +56,15 @@ from calibration.table.lut import (
 )
 from experiment.lights import load_illuminations
 from foundation.errors import CropError, FormatError, InputError, StorageError
-from foundation.files import file_sha256, require_free, storage_error, whole_folder, write_whole
-from foundation.folders import parse_json_object, require_plain_tree
+from foundation.files import (
+    file_sha256,
+    parse_json_object,
+    require_free,
+    require_plain_tree,
+    storage_error,
+    whole_folder,
+    write_whole,
+)
 
 FORMAT: Final = "crop.lut.published"
 

@@ -209,6 +209,9 @@ _SKIPPED_COLUMNS = 4
 _LEAST_MASKED = 256
 """Photosites per phase below which a masked mean is less certain than the metadata."""
 
+_PLATEAU = 64
+"""Photosites at a frame's highest count from which on that count is saturation: noise does not pile up so at one."""
+
 
 @dataclass(frozen=True, eq=False)
 class Mosaic:
@@ -220,7 +223,7 @@ class Mosaic:
     - `black`: (2, 2) float64, counts, the black level for each position of that block, as the file's metadata states it
       or, for Canon's own formats, as LibRaw finds it in the borders, cut to an integer.
     - `white_level`: counts, as the metadata or LibRaw's table states it. It is not the saturation: 15 831 is stated for
-      a 550D that saturates at 13 584 (ISO 100). Measure that from an overexposed frame.
+      a 550D that saturates at 13 584 (ISO 100); see `saturation`.
     - `camera`: maker and model, ``Canon EOS 550D``; empty where the file does not say.
     - `sensor`: (RH, RW) uint16, the whole sensor with its masked borders.
     - `visible`: where `counts` lies on the sensor.
@@ -272,6 +275,17 @@ class Mosaic:
                 kept = np.abs(values - median) <= 6 * max(spread, 1.0)
                 means[row, column] = (values * numbers)[kept].sum() / numbers[kept].sum()
         return means
+
+    def saturation(self) -> int:
+        """Return the raw count at which the sensor saturates, as far as this frame shows it.
+
+        What the metadata state, or what the frame shows if that is lower: a plateau of at least 64 photosites at its
+        highest count. A session without one clipped photosite keeps the stated value and its clipping limit lies too
+        high; it does no harm there, as nothing came near.
+        """
+        top = int(self.counts.max())
+        is_shown = top < self.white_level and int(np.count_nonzero(self.counts == top)) >= _PLATEAU
+        return top if is_shown else self.white_level
 
     def block_planes(self) -> NDArray[np.uint16]:
         """Return the four positions of the 2×2 blocks as planes, (2, 2, H/2, W/2).

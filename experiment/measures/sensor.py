@@ -1,4 +1,4 @@
-"""The sensor as frames show it: its black level and saturation, and whether its counts are proportional to the light.
+"""The sensor as frames show it: how its black level drifts, and whether its counts are proportional to the light.
 
 Black is each frame's own, one value for each position of the 2×2 block. Raw counts are never scaled in time.
 
@@ -17,7 +17,6 @@ from collections.abc import Sequence
 import numpy as np
 import numpy.typing as npt
 
-from drivers.raw.rawfile import Mosaic
 from experiment.measures.least_squares import least_squares
 
 MAX_BLACK_DRIFT = 1.0
@@ -26,9 +25,6 @@ photosite, and a thirtieth of the darkest cells of use."""
 
 LOWEST, HIGHEST = 0.05, 0.95
 """Between which shares of saturation a sensor has to be linear (EMVA 1288)."""
-
-_PLATEAU = 64
-"""Photosites at a frame's highest count from which on that count is saturation: noise does not pile up so at one."""
 
 _NODES = 10
 """Levels at which the deviation is measured: about half a stop apart."""
@@ -46,21 +42,6 @@ _HARD, _SOFT = 1e2, 0.1
 """Weights of the constraints on deviations, beside patches of weight 1: mean and slope are 0, each one is near 0."""
 
 _Array = npt.NDArray[np.float64]
-
-
-def saturation(mosaic: Mosaic) -> int:
-    """Return the raw count at which the sensor saturates, as far as this frame shows it.
-
-    What the metadata state, or what the frame shows if that is lower: a plateau of at least 64 photosites at the
-    frame's highest count. LibRaw's tables state 15 831 for an EOS 550D that saturates at 13 584 (ISO 100), so a
-    session without one clipped photosite keeps the stated value and its clipping limit lies too high; it does no harm
-    there, as nothing came near.
-    """
-    counts = mosaic.counts
-    top = int(counts.max())
-    if top < mosaic.white_level and int(np.count_nonzero(counts == top)) >= _PLATEAU:
-        return top
-    return mosaic.white_level
 
 
 def black_drift(blacks: Sequence[_Array]) -> float:

@@ -51,17 +51,19 @@ from experiment.session.repair import (
 )
 from foundation.errors import DeviceError, FormatError, InputError, StorageError
 from foundation.files import (
+    held_folder,
     is_partial,
     read_text,
     reading_error,
     require_free,
+    require_plain_folder,
     storage_error,
     stream_sha256,
+    unmounted_at,
     whole_file,
     whole_folder,
     write_whole,
 )
-from foundation.folders import held_folder, require_plain_folder, unmounted_at
 
 FRAME_COLUMNS = ("kind", "illumination", "file", "sha256", "taken_at", "exposure_s", "verdict")
 """Columns of `frames.csv` (docs/formats.md)."""

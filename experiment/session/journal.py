@@ -75,9 +75,15 @@ from experiment.session.records import (
     SessionStep,
 )
 from foundation.errors import FormatError, InputError, StorageError, counted
-from foundation.files import disk_remedy_of, partial_path, storage_error, sync_folder
+from foundation.files import (
+    disk_remedy_of,
+    is_inside_name,
+    partial_path,
+    require_plain_folder,
+    storage_error,
+    sync_folder,
+)
 from foundation.files import reading_error as file_reading_error
-from foundation.folders import is_inside_name, require_plain_folder
 
 JOURNAL_FILE = "journal.sqlite"
 """Name of the journal in a session's folder."""

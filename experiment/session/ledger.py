@@ -23,8 +23,7 @@ from typing import Any, Final, cast
 
 from experiment.session.records import VOIDED
 from foundation.errors import FormatError, StorageError, counted
-from foundation.files import reading_error, storage_error, write_whole
-from foundation.folders import is_inside_name, open_inside
+from foundation.files import is_inside_name, open_inside, reading_error, storage_error, write_whole
 
 LEDGER_FILE: Final = "ledger.jsonl"
 """Its name in a session's folder."""

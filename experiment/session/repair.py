@@ -27,8 +27,7 @@ import tomli_w
 from experiment.session.records import AcceptedFile
 from foundation.compiled import ordered_map, processor_count
 from foundation.errors import FormatError, InputError, StorageError
-from foundation.files import file_sha256, reading_error, storage_error, write_whole
-from foundation.folders import read_inside
+from foundation.files import file_sha256, read_inside, reading_error, storage_error, write_whole
 from foundation.secret_texts import MASK, target_label
 
 SETTINGS_FILE: Final = "session.toml"

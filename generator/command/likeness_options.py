@@ -264,7 +264,7 @@ def _drawn(
 
 def _black_under(lut: Lut, light: int, rendered: DatasetOptions) -> BlackShares:
     """Return the print's black under a light of the table; a QualityError where it is as bright as half of white."""
-    from generator.dataset.shards import rendering_of
+    from generator.dataset.making import rendering_of
     from generator.lights.lighting import plain
     from generator.likeness.real_data import BlackShares
     from generator.rendering.black_points import veil_of
@@ -280,10 +280,10 @@ def _photograph(
     lut: Lut, light: int, rendered: DatasetOptions, seed: int, picture: npt.NDArray[np.uint8], number: int
 ) -> npt.NDArray[np.uint16]:
     """Return the raw image of a picture as the dataset renders it, under one of the table's lights."""
-    from generator.dataset.shards import photograph
+    from generator.dataset.making import photograph
     from generator.kernels.choice import replace_unfit_colours
     from generator.lights.lighting import Lighting, plain
-    from generator.pictures.picture import keep_bits
+    from generator.pictures.sources import keep_bits
 
     picture = keep_bits(picture, rendered.bits)
     if rendered.rendering == "codes":

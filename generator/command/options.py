@@ -23,8 +23,7 @@ if TYPE_CHECKING:
     from generator.dataset.making import Workers
     from generator.dataset.plan import DatasetOptions
     from generator.lights.request import LightRequest
-    from generator.pictures.picture import Preparation
-    from generator.pictures.sources import Source
+    from generator.pictures.sources import Preparation, Source
     from generator.rendering import Rendering
     from generator.variation.variation import ExposureChoice, Variation
 
@@ -97,7 +96,7 @@ class PictureOptions:
 
     def preparation(self, seed: int) -> Preparation:
         """Return what is done to each picture; an InputError says which option cannot be used."""
-        from generator.pictures.picture import Preparation
+        from generator.pictures.sources import Preparation
 
         crop = None if self.crop is None else _size(self.crop, "--crop")
         return Preparation(self.max_side, crop, self.cover, self.crop_at, self.profiles, seed, self.crops)

@@ -15,7 +15,7 @@ from foundation.secret_texts import printable
 if TYPE_CHECKING:
     from rich.progress import Progress
 
-    from generator.dataset.shards import Callbacks
+    from generator.dataset.making import Callbacks
     from generator.rendering.matrices import ColourMatrix
 
 
@@ -29,7 +29,7 @@ def shown_progress(images: int) -> Generator[Callbacks]:
 
     On a terminal that is a bar; elsewhere, and where the work is done at once, one line at the end.
     """
-    from generator.dataset.shards import SILENT, Callbacks
+    from generator.dataset.making import SILENT, Callbacks
 
     if not shows_progress():
         yield SILENT

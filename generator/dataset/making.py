@@ -1,7 +1,21 @@
 """Making a dataset: whole, in shares beside other programs, and out of the shards of all shares.
 
 Shards are made by threads of this program, or by the workers of a Dask cluster. Either takes the shards that are not
-done and returns when they are, whatever died meanwhile; to make a shard twice is harmless, see `shards`.
+done and returns when they are, whatever died meanwhile. A shard is made from its sources to the record that says it is
+done: pictures are read, photographed and written.
+
+Rules that hold inside:
+
+- A shard's bytes depend on its job alone: not on the workers, on other shards, or on how often it is made.
+- Its record is written last, when all else has been synchronised with the disk: a shard with a record is whole. The
+  program may be killed at any instruction, and any number of programs may make the same shard at once.
+- Of a shard without a record, an image counts whose files are there with the hashes that were noted when they were
+  written, and whose source is as it was. The bytes of the others do not depend on it.
+- At most about three pictures are in memory for each worker.
+
+An image under one light has that light's ground truth, however its intensity falls off. Where it falls off with a tint
+(`generator.variation.variation`) the light stands in the records twice, as it is at the near and at the far end, and
+masks and maps say how much of either reaches a pixel.
 """
 
 from __future__ import annotations
@@ -9,24 +23,28 @@ from __future__ import annotations
 import csv
 import hashlib
 import io
+import math
 import re
 import threading
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
-from functools import partial
+from dataclasses import dataclass, replace
+from functools import lru_cache, partial
 from itertools import islice
 from pathlib import Path
 from queue import SimpleQueue
 from typing import TYPE_CHECKING, Any, Final
 
+import numpy as np
+import numpy.typing as npt
+
 from foundation.errors import CropError, DeviceError, FormatError, InputError, first_of
 from foundation.files import HashingWriter
 from foundation.version import software
-from generator.dataset.layouts import card, croissant, datasheet
-from generator.dataset.plan import DatasetOptions, Plan
+from generator.dataset.layouts import Beside, Sample, ShardWriter, card, croissant, datasheet, open_writer
+from generator.dataset.plan import DatasetOptions, Plan, ShardJob, light_of, split_of, versions
 from generator.dataset.reader import Dataset, load_description, open_dataset
 from generator.dataset.records import (
     CARD,
@@ -46,16 +64,18 @@ from generator.dataset.records import (
     VERSION,
     Description,
     Details,
+    FinishedImage,
     ImageRecord,
     Light,
+    LightRow,
     RenderingSummary,
     ShardRecord,
     Skipped,
     SourceRecord,
     TableRecord,
+    Triple,
     image_key,
 )
-from generator.dataset.shards import SILENT, Callbacks, ShardCancelled, ShardDone, make_elsewhere, make_shard
 from generator.dataset.workplace import (
     Workplace,
     differences,
@@ -67,9 +87,10 @@ from generator.dataset.workplace import (
 )
 from generator.files import suffix_of
 from generator.lights.choices import ListedLights
-from generator.lights.lighting import LightChoice
-from generator.pictures.sources import hash_since
-from generator.stores import DESCRIPTION, Store, is_remote, local_path, open_store
+from generator.lights.lighting import LightChoice, Lighting, Mixture
+from generator.pictures.sources import Cut, Picture, Source, hash_since, keep_bits
+from generator.stores import DESCRIPTION, Pieces, Store, is_remote, local_path, open_store
+from generator.variation.variation import Varied
 
 if TYPE_CHECKING:
     import distributed
@@ -77,6 +98,478 @@ if TYPE_CHECKING:
     from calibration.table.lut import Lut
     from generator.pictures.sources import Source
     from generator.rendering import Rendering
+    from generator.rendering.colorimetric import ColorimetricRendering
+
+
+_threads: Final = threading.local()
+
+
+def photograph(
+    lut: Lut,
+    picture: Picture,
+    lighting: Lighting,
+    options: DatasetOptions,
+    seed: int,
+    number: int,
+    white_level: int,
+    black_taken: float | None = None,
+) -> tuple[npt.NDArray[np.uint16], npt.NDArray[np.float32] | None, Details]:
+    """Return the raw image of a picture's print.
+
+    `picture`: (H, W, 3) uint8, sRGB codes; where they are those of the print, of colours that the table has samples of.
+    `black_taken`: share of the print's black that is taken out, 0 … 1; None for what the options say. Returns (H, W, 3)
+    uint16, linear camera RGB; of several lights the weights (H, W, K) float32 of each in each pixel, else None; and
+    what is recorded of the rendering.
+    """
+    from generator.kernels.mixing import mix_samples
+    from generator.kernels.printing import nearest_nodes
+    from generator.kernels.rendering import draw_samples
+
+    # The hash of the table stands for its samples in the dataset's description.
+    for mixture in lighting.mixtures:
+        for light in mixture.lights:
+            lut.require_unchanged(light)
+    share = options.black_point.share(seed, number) if black_taken is None else black_taken
+    details: Details = {} if options.black_point.kind == "keep" else {"black_taken": share}
+    weights = None if lighting.masks is None else lighting.weights_of(*picture.shape[:2])
+    if options.rendering == "colorimetric":
+        rendering = rendering_of(lut, options)
+        outside, distance = rendering.map.missed(nearest_nodes(picture))
+        seen: Details = {
+            "cells": rendering.map.sha256[:16],
+            "outside": round(outside, 6),
+            "distance": round(distance, 6),
+        }
+        image = rendering.draw(
+            picture,
+            lighting.mixtures,
+            share,
+            weights,
+            most=lut.provenance.white_level if weights is None else white_level,
+            seed=seed,
+            image=number,
+            out=_reused(picture.shape),
+        )
+        return image, weights, seen | details
+    tables = [_samples(lut, mixture, picture, share, seed) for mixture in lighting.mixtures]
+    if weights is None:
+        out = _reused(picture.shape)
+        return draw_samples(tables[0], picture, seed=seed, image=number, out=out), None, details
+    image = mix_samples(tables, picture, weights, white_level=white_level, seed=seed, image=number)
+    return image, weights, details
+
+
+def _samples(lut: Lut, mixture: Mixture, picture: Picture, share: float, seed: int) -> npt.NDArray[np.uint16]:
+    """Return the samples of a light without a share of the print's black, at least those of a picture's colours."""
+    from generator.kernels.choice import colours_in
+    from generator.kernels.rendering import WHOLE_LIGHT_PIXELS
+    from generator.rendering.black_points import veil_of, without_veil
+
+    samples = mixture.samples(lut, seed, picture)
+    if not share:
+        return samples
+    colours = colours_in(picture, lut.provenance.bits) if picture.size < 3 * WHOLE_LIGHT_PIXELS else None
+    veil = veil_of(lut, mixture, share)
+    return without_veil(samples, veil, lut.provenance.white_level, colours)
+
+
+def rendering_of(lut: Lut, options: DatasetOptions) -> ColorimetricRendering:
+    """Return the rendering by colour that the options ask for; it keeps what it has found out of a table."""
+    from generator.rendering.colorimetric import rendering_with
+    from generator.rendering.matrices import matrix_for
+
+    return rendering_with(lut, options.matrix or matrix_for(lut))
+
+
+def _reused(shape: tuple[int, ...]) -> npt.NDArray[np.uint16]:
+    """Return an array uint16 of any content in memory of the calling thread, which its next call overwrites.
+
+    Fresh pages take as long to map as the drawing into them.
+    """
+    size = math.prod(shape)
+    memory: npt.NDArray[np.uint16] | None = getattr(_threads, "memory", None)
+    if memory is None or memory.size < size:
+        _threads.memory = memory = np.empty(size, np.uint16)
+    return memory[:size].reshape(shape)
+
+
+@dataclass(frozen=True, eq=False)
+class _ImageLight:
+    """The light of one image.
+
+    - `truth`: chromaticity, sum 1, of the light averaged over the pixels.
+    - `maps`: kind, what follows the image's number in the file's name, and the bytes of each map beside the image.
+    """
+
+    truth: Triple
+    rows: list[LightRow]
+    maps: list[tuple[str, str, bytes]]
+
+
+def _image_light(
+    lut: Lut, lighting: Lighting, weights: npt.NDArray[np.float32] | None, varied: Varied, tints: bool
+) -> _ImageLight:
+    """Return the light of an image.
+
+    `weights`: (H, W, K) float32, of each of K lights in each pixel; None of one light.
+    """
+    from generator.masks.maps import encode_maps, mean_weights
+
+    labels = [mixture.label for mixture in lighting.mixtures]
+    whites = lighting.whites(lut)
+    intensity = None
+    if tints:
+        weights, labels = varied.weights, labels * 2
+        whites = np.concatenate([whites, whites * np.array(varied.end)])
+    elif weights is not None:
+        intensity = varied.intensity()
+    rows = [
+        LightRow(illumination=label, truth=chromaticity(white)) for label, white in zip(labels, whites, strict=True)
+    ]
+    if weights is None:
+        return _ImageLight(rows[0].truth, rows, [])
+    reaching = weights if intensity is None else weights * intensity[..., None]
+    truth = chromaticity(np.asarray(mean_weights(reaching) @ whites))
+    return _ImageLight(truth, rows, encode_maps(weights, whites))
+
+
+def chromaticity(white: npt.NDArray[np.float64]) -> Triple:
+    """Return (r, g, b) of sum 1 of linear RGB (3,) float64."""
+    red, green, blue = (float(part) for part in white / white.sum())
+    return red, green, blue
+
+
+LARGEST_COUNT: Final = 65535
+"""Largest value of 16 bits."""
+
+
+def _ignore(*arguments: object) -> None:
+    del arguments
+
+
+@dataclass(frozen=True)
+class Callbacks:
+    """What is called while images are made, always from the calling thread.
+
+    Attributes
+    ----------
+    on_done
+        Takes how many more of the planned images are found finished: of the shards that are done before the first image
+        is made, and of a shard that was begun when it is taken up; less than 0 for images whose source proves to have
+        changed since, which are made again.
+    on_image
+        Called after each image.
+    on_skip
+        Takes the name of a source that cannot be read, the reason, and the number of images that are left out.
+    on_wait
+        Takes a sentence for the user where the work waits for somebody to do something.
+
+    Examples
+    --------
+    >>> left_out = []
+    >>> callbacks = Callbacks(on_skip=lambda name, reason, images: left_out.append(name))
+    >>> callbacks.on_skip("bad.png", "bad.png is no picture", 2)
+    >>> left_out
+    ['bad.png']
+    """
+
+    on_done: Callable[[int], None] = _ignore
+    on_image: Callable[[], None] = _ignore
+    on_skip: Callable[[str, str, int], None] = _ignore
+    on_wait: Callable[[str], None] = _ignore
+
+
+SILENT: Final = Callbacks()
+"""Callbacks that do nothing."""
+
+
+@dataclass(frozen=True)
+class _ReadSource:
+    """The crops of a source, or all of it, and what is recorded of it; no crops where all its images are finished.
+
+    Where sRGB codes are those of the print, they are codes that the table has samples of.
+    """
+
+    cuts: tuple[Cut, ...]
+    record: SourceRecord
+    black_taken: float | None
+
+
+class _ShardCancelled(Exception):
+    """A shard was given up because something else failed; whoever caused it handles it."""
+
+
+def make_shard(
+    job: ShardJob,
+    lut: Lut,
+    place: Workplace,
+    pool: ThreadPoolExecutor,
+    workers: int,
+    callbacks: Callbacks = SILENT,
+    cancelled: threading.Event | None = None,
+) -> ShardRecord:
+    """Make a shard and commit its record."""
+    sources: list[SourceRecord] = []
+    skipped: list[Skipped] = []
+    images: list[ImageRecord] = []
+    used: set[int] = set()
+    pending: deque[Future[Sample]] = deque()
+    reading: deque[Future[_ReadSource]] = deque()
+    finished = _finished_images(job, place, pool)
+    if finished:
+        callbacks.on_done(len(finished))
+
+    def finish_one(writer: ShardWriter) -> None:
+        sample = pending.popleft().result()
+        writer.append(sample)
+        images.append(sample.record)
+        if sample.record.number not in finished:
+            callbacks.on_image()
+
+    def forget_changed(wanted: list[tuple[int, int, Lighting]], source: SourceRecord | None) -> None:
+        changed = [number for number, _, _ in wanted if number in finished and finished[number].source != source]
+        for number in changed:
+            del finished[number]
+        if changed:
+            callbacks.on_done(-len(changed))
+
+    with _writer_of(job, place) as writer, _cancelling(pending, reading):
+        for row, source in enumerate(job.sources):
+            while len(reading) <= workers and row + len(reading) < len(job.sources):
+                reading.append(pool.submit(_read, job, lut, row + len(reading), finished))
+            wanted = _wanted(job, job.position + row)
+            try:
+                read = reading.popleft().result()
+            except FormatError as error:
+                forget_changed(wanted, None)
+                skipped.append(Skipped(position=job.position + row, name=source.name))
+                callbacks.on_skip(source.name, str(error), len(wanted))
+                continue
+            forget_changed(wanted, read.record)
+            sources.append(read.record)
+            for number, crop, lighting in wanted:
+                while len(pending) >= 2 * workers:
+                    finish_one(writer)
+                if cancelled is not None and cancelled.is_set():
+                    raise _ShardCancelled
+                used.update(light for mixture in lighting.mixtures for light in mixture.lights)
+                if number in finished:
+                    pending.append(pool.submit(_taken_up, finished[number]))
+                else:
+                    pending.append(pool.submit(_photographed, job, lut, place, writer, number, read, crop, lighting))
+        while pending:
+            finish_one(writer)
+        files = writer.close()
+    record = ShardRecord(
+        shard=job.shard,
+        sources=sources,
+        skipped=skipped,
+        images=images,
+        files=files,
+        lights=[light_of(lut, light) for light in sorted(used)],
+    )
+    place.commit(record)
+    return record
+
+
+def _finished_images(job: ShardJob, place: Workplace, pool: ThreadPoolExecutor) -> dict[int, FinishedImage]:
+    """Return by number the images of a shard that whoever was at it before has finished."""
+    noted = place.noted(job.shard)
+    whole = pool.map(place.is_whole, noted)
+    return {image.image.number: image for image, is_whole in zip(noted, whole, strict=True) if is_whole}
+
+
+def _taken_up(image: FinishedImage) -> Sample:
+    """Return a finished image for `ShardWriter.append`."""
+    source = image.source
+    return Sample(image.image, source.name, source.split, source.width, source.height, (), tuple(image.files))
+
+
+def _writer_of(job: ShardJob, place: Workplace) -> ShardWriter:
+    options = job.options
+    lightings = job.choice.lightings_of(job.position * options.crops)
+    maps = options.variation.tints or any(lighting.masks is not None for lighting in lightings)
+    return open_writer(options.layout, place.files, job.shard, Beside(options.previews, maps, options.has_details))
+
+
+@contextmanager
+def _cancelling(*queues: deque[Future[Any]]) -> Generator[None]:
+    """Cancel what still waits for a thread if the block fails."""
+    try:
+        yield
+    except BaseException:
+        for queue in queues:
+            for future in queue:
+                future.cancel()
+        raise
+
+
+@dataclass(frozen=True)
+class _ShardDone:
+    """Result of a task: how many images its shard has, and of each source that cannot be read name, reason, images.
+
+    `found`: how many of the images whoever was at the shard before had finished.
+    """
+
+    images: int
+    skipped: tuple[tuple[str, str, int], ...]
+    found: int = 0
+
+
+def make_elsewhere(job: ShardJob, place: Workplace) -> _ShardDone:
+    """Make a shard in a program of its own, which opens the table itself: the task of an engine's worker.
+
+    A shard that is done already is not made again.
+    """
+    if place.has(job.shard):
+        return _ShardDone(len(place.load(job.shard).images), ())
+    found = versions(job.options.form, job.options.layout)
+    if found != job.versions:
+        differing = [name for name in job.versions if found.get(name) != job.versions[name]]
+        raise InputError(
+            "a worker has other libraries than the plan was made with: "
+            + ", ".join(f"{name} {found.get(name)} for {job.versions[name]}" for name in differing)
+            + "; install the same on every machine"
+        )
+    skipped: list[tuple[str, str, int]] = []
+    taken_up: list[int] = []
+
+    def skip(name: str, reason: str, images: int) -> None:
+        skipped.append((name, reason, images))
+
+    lut = _table_of(job.table, job.table_sha256)
+    with ThreadPoolExecutor(1) as pool:
+        record = make_shard(job, lut, place, pool, 1, Callbacks(on_done=taken_up.append, on_skip=skip))
+    return _ShardDone(len(record.images), tuple(skipped), sum(taken_up))
+
+
+@lru_cache(maxsize=2)
+def _table_of(folder: Path, sha256: str) -> Lut:
+    from calibration.table.lut import open_lut
+
+    lut = open_lut(folder)
+    if lut.sha256 != sha256:
+        raise InputError(
+            f"the table {folder} of a worker is not that of the plan; give every machine the same table at that path"
+        )
+    return lut
+
+
+def _wanted(job: ShardJob, position: int) -> list[tuple[int, int, Lighting]]:
+    """Return number, crop and lighting of each image of the source at `position` that is in the shard."""
+    crops, each = job.options.crops, job.choice.lights_each
+    numbered = (
+        ((position * crops + crop) * each + place, crop, lighting)
+        for crop in range(crops)
+        for place, lighting in enumerate(job.choice.lightings_of(position * crops + crop))
+    )
+    return [wanted for wanted in numbered if job.first <= wanted[0] < job.stop]
+
+
+def _read(job: ShardJob, lut: Lut, place: int, finished: Mapping[int, FinishedImage]) -> _ReadSource:
+    from generator.files import smallest_side
+    from generator.kernels.choice import replace_unfit_colours
+
+    known = _known_source(job, job.position + place, finished) if finished else None
+    if known is not None:
+        return _ReadSource((), known, None)
+    source: Source = job.sources[place]
+    scene = source.read()
+    whole = (Cut(0, 0, scene.picture),) if job.options.crops == 1 else scene.cuts
+    if len(whole) != job.options.crops:
+        raise InputError(
+            f"{source.name} has {max(1, len(whole))} crops, expected {job.options.crops}; give the preparation of "
+            "pictures and the options of the dataset the same number, and leave random scenes out"
+        )
+    whole = tuple(replace(cut, picture=keep_bits(cut.picture, job.options.bits)) for cut in whole)
+    if job.options.rendering == "codes":
+        fit = [replace_unfit_colours(cut.picture, lut.provenance) for cut in whole]
+    else:
+        # Mixtures of cells hold fit ones alone.
+        fit = [(cut.picture, 0) for cut in whole]
+    height, width = scene.picture.shape[:2]
+    least = smallest_side(job.options.form)
+    if min(height, width) < least:
+        raise FormatError(
+            f"{source.name} is {width}x{height} px, too small for {job.options.form}, which takes {least}x{least} and "
+            "more; choose another format, or leave it out"
+        )
+    record = SourceRecord(
+        position=job.position + place,
+        name=source.name,
+        sha256=scene.sha256,
+        profile=scene.profile,
+        width=width,
+        height=height,
+        replaced_pixels=sum(replaced for _, replaced in fit),
+        split=job.parts[place] if job.parts else split_of(job.options.split, job.seed, scene.sha256, source.name),
+        weight=scene.weight,
+    )
+    cuts = tuple(replace(cut, picture=picture) for cut, (picture, _) in zip(whole, fit, strict=True))
+    return _ReadSource(cuts, record, scene.black_taken)
+
+
+def _known_source(job: ShardJob, position: int, finished: Mapping[int, FinishedImage]) -> SourceRecord | None:
+    """Return the record of a source that is as it was when every image of it was finished; else None."""
+    known = [finished[number].source if number in finished else None for number, _, _ in _wanted(job, position)]
+    first = known[0] if known else None
+    if first is None or any(source != first for source in known):
+        return None
+    # Of a file on a store no hash is known before it is read.
+    return first if hash_since(job.sources[position - job.position], -math.inf) == first.sha256 else None
+
+
+def _photographed(
+    job: ShardJob,
+    lut: Lut,
+    place: Workplace,
+    writer: ShardWriter,
+    number: int,
+    source: _ReadSource,
+    crop: int,
+    lighting: Lighting,
+) -> Sample:
+    from generator.files import (
+        FULL,
+        ImageMetadata,
+        encode_pieces,
+        encode_preview,
+        suffix_of,
+        to_full_scale,
+    )
+    from generator.pictures.preview import preview_of
+
+    options, cut = job.options, source.cuts[crop]
+    height, width = cut.picture.shape[:2]
+    white_level = lut.provenance.white_level
+    # What exceeds saturation may be below it once it is exposed anew, and is cut then.
+    most = LARGEST_COUNT if options.variation.is_on else white_level
+    taken = source.black_taken
+    image, weights, rendered = photograph(lut, cut.picture, lighting, options, job.seed, number, most, taken)
+    varied = options.variation.apply(image, white_level, job.seed, number)
+    light = _image_light(lut, lighting, weights, varied, options.variation.tints)
+    stored, level = (image, white_level) if options.scale == "table" else (to_full_scale(image, white_level), FULL)
+    metadata = ImageMetadata(level, light.truth, lut.provenance.camera)
+    files: list[tuple[str, str, Pieces]] = [
+        ("images", suffix_of(options.form), encode_pieces(stored, options.form, metadata)),
+        *((kind, ending, (data,)) for kind, ending, data in light.maps),
+    ]
+    if options.previews:
+        files.append(("previews", ".jpg", (encode_preview(preview_of(image, white_level)),)))
+    details: Details = {"crop": crop, "left": cut.left, "top": cut.top} if options.crops > 1 else {}
+    if source.record.weight is not None:
+        details["weight"] = source.record.weight
+    record = ImageRecord(
+        number=number,
+        position=source.record.position,
+        truth=light.truth,
+        lights=light.rows,
+        details=details | rendered | varied.details,
+    )
+    sample = writer.store(Sample(record, source.record.name, source.record.split, width, height, tuple(files)))
+    if sample.stored:
+        place.note(job.shard, FinishedImage(image=record, source=source.record, files=list(sample.stored)))
+    return sample
 
 
 @dataclass(frozen=True)
@@ -157,7 +650,7 @@ CONNECT_S: Final = 10.0
 _Event = Callable[[], None]
 
 
-def make_shards(
+def _make_shards(
     plan: Plan, shards: Sequence[int], place: Workplace, workers: Workers, callbacks: Callbacks = SILENT
 ) -> None:
     """Make shards of a plan that are not done."""
@@ -195,7 +688,7 @@ def _by_threads(plan: Plan, shards: Sequence[int], place: Workplace, workers: in
                         return
                     job = plan.job(shard)
                 make_shard(job, plan.lut, place, pool, depth, queued, cancelled)
-        except ShardCancelled:
+        except _ShardCancelled:
             pass
         except BaseException as error:
             events.put(partial(fail, error))
@@ -224,7 +717,7 @@ def _by_dask(
     waiting: Iterator[int] = iter(shards)
     with _client(address, workers) as client:
 
-        def submit(shard: int) -> distributed.Future[ShardDone]:
+        def submit(shard: int) -> distributed.Future[_ShardDone]:
             attempts[shard] += 1
             key = f"crop-shard-{shard}-{attempts[shard]}-{plan.seed}-{id(plan)}"
             return client.submit(make_elsewhere, plan.job(shard), place, key=key, pure=False)
@@ -309,19 +802,6 @@ def _client(address: str, workers: int) -> Generator[distributed.Client]:
         yield client
 
 
-__all__ = [
-    "Callbacks",
-    "DatasetOptions",
-    "Plan",
-    "Workers",
-    "finish_dataset",
-    "generate_dataset",
-    "made_before",
-    "make_dataset",
-    "make_share",
-]
-
-
 def generate_dataset(
     lut: Lut,
     out: Path | str,
@@ -396,8 +876,8 @@ def make_dataset(plan: Plan, out: Path | str, workers: Workers | None = None, ca
         with workplace(out, identity) as place:
             _make(plan, place, range(plan.shards), workers or Workers(), callbacks)
             try:
-                assemble(place, identity)
-            except NothingMadeError:
+                _assemble(place, identity)
+            except _NothingMadeError:
                 place.discard()
                 raise
     return open_dataset(out)
@@ -489,7 +969,7 @@ def finish_dataset(out: Path | str) -> Dataset:
                     f"{len(missing)} of {identity['shards']} shards of {out} are not made yet: {first_of(missing)}; "
                     "run their shares, or the command without a share, which makes all that is missing"
                 )
-            assemble(place, identity)
+            _assemble(place, identity)
     return open_dataset(out)
 
 
@@ -497,10 +977,10 @@ def _make(plan: Plan, place: Workplace, wanted: range, workers: Workers, callbac
     done = place.done()
     missing = [shard for shard in wanted if shard not in done]
     callbacks.on_done(sum(plan.images_of(shard) for shard in wanted if shard in done))
-    make_shards(plan, missing, place, workers, callbacks)
+    _make_shards(plan, missing, place, workers, callbacks)
 
 
-class NothingMadeError(FormatError):
+class _NothingMadeError(FormatError):
     """None of the sources can be read, so there is no dataset."""
 
 
@@ -552,7 +1032,7 @@ class _ListedFile:
         return f"{self.sha256}  {self.name}\n"
 
 
-def assemble(place: Workplace, identity: Mapping[str, Any]) -> None:
+def _assemble(place: Workplace, identity: Mapping[str, Any]) -> None:
     """Write what a dataset has beside its images, and give the dataset its name."""
     options = identity["options"]
     suffix = suffix_of(options["format"])
@@ -602,7 +1082,7 @@ def assemble(place: Workplace, identity: Mapping[str, Any]) -> None:
             for file in record.files:
                 sums.write(f"{file.sha256}  {file.name}\n".encode())
         if not counts["images"]:
-            raise NothingMadeError(
+            raise _NothingMadeError(
                 f"none of the {identity['sources']['count']} pictures can be used: all were "
                 "left out, each with its reason; name others, or ask for a smaller crop if they are too small"
             )

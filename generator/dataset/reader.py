@@ -37,8 +37,7 @@ from pydantic import ValidationError
 
 from foundation.compiled import ordered_map
 from foundation.errors import FormatError, InputError
-from foundation.files import stream_sha256
-from foundation.folders import MOST_JSON_BYTES, bounded_lines, is_inside_name, parse_json_object
+from foundation.files import MOST_JSON_BYTES, bounded_lines, is_inside_name, parse_json_object, stream_sha256
 from generator.dataset.layouts import JOINED, member_name, read_member
 from generator.dataset.records import (
     COMPLETED_BY_HAND,
@@ -264,8 +263,6 @@ def _fault_of(store: Store, name: str, digest: str) -> str | None:
 
 MOST_LIST_BYTES: Final = 4 << 30
 """Lists that are read whole have a line an image or source, some hundred bytes: this is forty million of them."""
-
-__all__ = ["Dataset", "Description", "Entry", "open_dataset"]
 
 
 @dataclass(frozen=True)

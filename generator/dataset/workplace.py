@@ -30,8 +30,16 @@ from pathlib import Path, PurePosixPath
 from typing import Any, Final, cast
 
 from foundation.errors import CropError, FormatError, InputError
-from foundation.files import partial_path, publish_folder, require_free, sha256_of, storage_error, stream_sha256
-from foundation.folders import clear_folder, held_folder
+from foundation.files import (
+    clear_folder,
+    held_folder,
+    partial_path,
+    publish_folder,
+    require_free,
+    sha256_of,
+    storage_error,
+    stream_sha256,
+)
 from foundation.records import from_json
 from generator.dataset.records import FinishedImage, ShardRecord, shard_key
 from generator.stores import DESCRIPTION, LocalStore, RemoteStore, Store, is_remote, local_path, open_store

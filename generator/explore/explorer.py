@@ -1,6 +1,6 @@
 """What a page may ask of a table: its lights, a picture under one of them, one pixel's noise, and the command for it.
 
-Images are made as `generate` makes them (`generator.dataset.shards.photograph`): the first image of a dataset of this
+Images are made as `generate` makes them (`generator.dataset.making.photograph`): the first image of a dataset of this
 picture alone, under this light alone, with seed 0. So the command that is shown makes the bytes that are shown.
 """
 
@@ -22,14 +22,13 @@ import numpy.typing as npt
 
 from foundation.errors import FormatError, InputError
 from foundation.secret_texts import masked
+from generator.dataset.making import chromaticity, photograph
 from generator.dataset.plan import DatasetOptions, light_of
-from generator.dataset.shards import chromaticity, photograph
 from generator.kernels.choice import replace_unfit_colours
 from generator.lights.choices import parse_light
 from generator.lights.gamut import Gamut, black_body, rb_of
 from generator.lights.lighting import Lighting, Mixture
-from generator.pictures.picture import Picture, Preparation, open_picture
-from generator.pictures.sources import SUFFIXES, PictureFile
+from generator.pictures.sources import SUFFIXES, Picture, PictureFile, Preparation, open_picture
 from generator.rendering import DEFAULT, Rendering
 from generator.rendering.colorimetric import reference_light
 from generator.rendering.matrices import ColourMatrix, matrix_for

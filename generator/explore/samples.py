@@ -15,8 +15,7 @@ import numpy.typing as npt
 from foundation.colorimetry import srgb_codes
 from foundation.errors import InputError
 from foundation.files import cache_folder, sha256_of, write_whole
-from generator.pictures.picture import Picture
-from generator.pictures.sources import RandomScene
+from generator.pictures.sources import Picture, RandomScene
 
 _WIDTH: Final = 900
 """Width of the pictures, px: as much as a page shows without making them smaller."""

@@ -20,7 +20,7 @@ import numpy.typing as npt
 from foundation.errors import InputError, first_of, nearest_names
 from generator import philox
 from generator.kernels.rendering import known_light
-from generator.lights.distributions import Distribution, load_ground_truths
+from generator.lights.distributions import Distribution
 from generator.lights.gamut import Gamut, Match, OutsideGamut, OutsideGamutError, black_body, rgb_of
 from generator.lights.lighting import LightChoice, Lighting, Mixture, parse_mixture, plain
 from generator.masks.making import MaskPlan
@@ -28,20 +28,6 @@ from generator.named_numbers import parse_numbers
 
 if TYPE_CHECKING:
     from calibration.table.lut import Lut
-
-__all__ = [
-    "DrawnLights",
-    "LightChoice",
-    "ListedLights",
-    "RandomLights",
-    "SequentialLights",
-    "SimultaneousLights",
-    "load_ground_truths",
-    "matched_lights",
-    "nearest_lights",
-    "parse_light",
-    "parse_lights",
-]
 
 _BATCH: Final = 32
 """Chromaticities drawn at a time: one of them lies in the gamut for all but narrow gamuts, and numpy is used well."""

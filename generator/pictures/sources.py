@@ -1,29 +1,703 @@
-"""Where source pictures come from: files, folders of any size, remote stores, or random colours."""
+"""Source pictures: where they come from, and how a file becomes 8-bit sRGB codes, as a printer would be given them.
+
+They are files, folders of any size, remote stores, or random colours. These steps turn a file's values into codes, in
+this order, so that one picture always gives the same codes::
+
+    channels      the first three as R, G, B; a single one as grey; of several images in a file the first
+    depth         8-bit codes are kept; 16-bit codes v become ⌊(v + 128) / 257⌋; floating-point values are linear
+                  light, 1 = white, clipped and encoded with the sRGB curve (IEC 61966-2-1) unless the file calls itself
+                  sRGB
+    transparency  white shows through, as paper does in a print; mixed in the values that the file holds
+    profile       codes of another colour space become those of sRGB; see below
+    orientation   turned as the file's EXIF or TIFF orientation asks
+    size          only ever made smaller, on request, by averaging areas of codes
+    crop          cut, on request, from the centre or at places that the picture's name and a seed choose
+
+AVIF pictures (AV1 Image File Format), which OpenImageIO's wheels do not read, come from Pillow, which has libavif. It
+makes codes of 8 bits of any depth and does not say which primaries and transfer function they are of. The file does
+(ISO/IEC 14496-12, box ``colr`` of type ``nclx``, with the code points of ITU-T H.273); what is not sRGB or BT.709 by
+them, such as pictures of high dynamic range, is refused: taken as sRGB, its colours would be wrong.
+
+A chart is printed from sRGB codes, so a picture in another space, such as Adobe RGB (1998) or Display P3, has to be
+converted or its colours come out dull. LittleCMS converts, by relative colorimetry (ICC.1:2022, clause 6.3.2), in 8
+bits; a profile that moves no code by more than one is sRGB under another name and is left alone.
+
+A camera set to Adobe RGB embeds no profile, but says so in its EXIF data (DCF 2.0, interoperability index R03).
+"""
 
 from __future__ import annotations
 
 import errno
+import hashlib
+import io
 import logging
 import os
 import re
+import struct
 import tempfile
+import warnings
+import zlib
 from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import lru_cache
 from pathlib import Path, PurePosixPath
-from typing import TYPE_CHECKING, Any, Final, Protocol
+from typing import TYPE_CHECKING, Any, Final, Literal, Protocol
 
 import numpy as np
+import numpy.typing as npt
 
+from foundation.colorimetry import srgb_codes
 from foundation.errors import FormatError, InputError, StorageError
 from foundation.files import file_sha256, sha256_of, stream_sha256
 from foundation.secret_texts import masked
 from generator import philox
-from generator.pictures.picture import LARGEST_SIDE, UNPREPARED, Cut, Picture, Preparation, open_picture
 from generator.stores import DESCRIPTION, filesystem, is_remote, local_path
 
 if TYPE_CHECKING:
     from fsspec.spec import AbstractFileSystem
+    from PIL.ImageCms import ImageCmsTransform
+
+
+_PRIMARIES: Final = frozenset({1, 2, 5, 6})
+"""Code points (H.273, table 2) that are sRGB's primaries, unspecified, or those of standard video, whose difference
+programs ignore as this one does."""
+
+_TRANSFERS: Final = frozenset({1, 2, 6, 13, 14, 15})
+"""Code points (H.273, table 3) that are sRGB's transfer function, unspecified, or BT.709's, written for it."""
+
+_ORIENTATION: Final = 0x0112
+"""The tag Orientation (TIFF 6.0)."""
+
+_PNG: Final = b"\x89PNG\r\n\x1a\n"
+"""First bytes of a PNG file."""
+
+_HEAD: Final = 1 << 20
+"""Bytes in which the boxes before the pixels are looked for; they are some hundred."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class _AvifPicture:
+    """What a file holds.
+
+    - `codes`: (H, W, 3) uint8.
+    - `alpha`: (H, W) float64, 0 … 1; None if it is opaque.
+    - `orientation`: 1 … 8, as the TIFF tag.
+    - `icc`: its colour profile, if it has one.
+    """
+
+    codes: npt.NDArray[np.uint8]
+    alpha: npt.NDArray[np.float64] | None
+    orientation: int
+    icc: bytes | None
+
+
+def _read_avif(path: Path, most_pixels: int) -> _AvifPicture:
+    """Return the picture in an AVIF file."""
+    from PIL import Image
+
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", Image.DecompressionBombWarning)
+            with Image.open(path, formats=["AVIF"]) as picture:
+                if picture.width * picture.height > most_pixels:
+                    raise FormatError(
+                        f"cannot read {path}: {picture.width}x{picture.height} px are more than {most_pixels}; "
+                        "make it smaller"
+                    )
+                icc = picture.info.get("icc_profile")
+                orientation = int(picture.getexif().get(_ORIENTATION, 1))
+                has_alpha = picture.mode in ("RGBA", "LA")
+                pixels = np.asarray(picture.convert("RGBA" if has_alpha else "RGB"))
+    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
+        reason = " ".join(str(error).replace(str(path), "").split()).rstrip(".") or type(error).__name__
+        raise FormatError(f"cannot read {path}: {reason}; use another copy, or convert it to PNG") from error
+    if not icc:
+        _require_srgb(path)
+    alpha = pixels[..., 3].astype(np.float64) / 255 if has_alpha and pixels[..., 3].min() < 255 else None
+    return _AvifPicture(np.ascontiguousarray(pixels[..., :3]), alpha, orientation, icc or None)
+
+
+def _require_srgb(path: Path) -> None:
+    """Refuse a file whose codes are of another colour space."""
+    with path.open("rb") as stream:
+        head = stream.read(_HEAD)
+    place = head.find(b"colrnclx")
+    if place < 0 or place + 12 > len(head):
+        return
+    primaries, transfer = struct.unpack(">HH", head[place + 8 : place + 12])
+    if primaries not in _PRIMARIES or transfer not in _TRANSFERS:
+        raise FormatError(
+            f"cannot read {path}: its colours have primaries {primaries} and transfer function {transfer} of ITU-T "
+            "H.273, not those of sRGB; convert it to PNG in sRGB"
+        )
+
+
+ASSUMED: Final = "none, taken as sRGB"
+"""Remark on a picture without a profile."""
+
+ADOBE_RGB: Final = "Adobe RGB (1998) by EXIF, converted to sRGB"
+"""Remark on a picture that a camera made in that space."""
+
+_PROBE_STEPS: Final = 9
+"""Codes of each channel, every 32nd, of the grid of 729 colours that shows whether a profile is sRGB."""
+_ADOBE_GAMMA: Final = 563 / 256
+"""Adobe RGB (1998) Color Image Encoding, clause 4.3.1.2."""
+_ADOBE_TO_SRGB: Final = np.array(
+    [[1.39835574, -0.39835574, 0.0], [0.0, 1.0, 0.0], [0.0, -0.04292899, 1.04292899]], np.float32
+)
+"""Of linear light: the matrices of Adobe RGB (1998), clause 4.3.5.3, and IEC 61966-2-1; both have the white D65."""
+_STEPS: Final = 65535
+"""Steps of the table of encoded linear light: where the curve is steepest a step is a twentieth of a code."""
+_ROWS: Final = 256
+"""Rows that are converted together, so that their float32 take little memory beside the picture."""
+
+
+def to_srgb(codes: npt.NDArray[np.uint8], icc: bytes | None) -> tuple[npt.NDArray[np.uint8], str]:
+    """Return the sRGB codes of a picture, and how its profile was treated.
+
+    `codes`: (H, W, 3) uint8 in the space of the profile; a grey profile is applied where the channels are alike. `icc`:
+    the embedded profile; None where there is none. Returns (H, W, 3) uint8, the same array if no code changes; and a
+    remark, such as ``"Display P3, converted to sRGB"``.
+
+    Examples
+    --------
+    >>> codes, remark = to_srgb(np.zeros((2, 2, 3), np.uint8), icc=None)
+    >>> remark
+    'none, taken as sRGB'
+    """
+    if icc is None:
+        return codes, ASSUMED
+    transform, mode, word = _transform(icc)
+    if mode == "L" and (codes != codes[..., :1]).any():
+        return codes, f"{word.rpartition(', ')[0]} of grey, not applied to colours, taken as sRGB"
+    if transform is None:
+        return codes, word
+    from PIL import Image, ImageCms
+
+    picture = Image.fromarray(codes if mode == "RGB" else np.ascontiguousarray(codes[..., 0]))
+    converted = ImageCms.applyTransform(picture, transform)
+    return np.array(converted, dtype=np.uint8), word
+
+
+def _from_adobe_rgb(codes: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
+    """Return the sRGB codes (H, W, 3) uint8 of Adobe RGB (1998) codes (H, W, 3) uint8, clipped to the gamut of sRGB.
+
+    Examples
+    --------
+    >>> _from_adobe_rgb(np.array([[[128, 128, 128], [200, 100, 50]]], np.uint8))
+    array([[[129, 129, 129],
+            [227, 100,  42]]], dtype=uint8)
+    """
+    linear = (np.arange(256, dtype=np.float32) / 255) ** _ADOBE_GAMMA
+    encoded = srgb_codes(np.arange(_STEPS + 1) / _STEPS)
+    out = np.empty_like(codes)
+    for top in range(0, len(codes), _ROWS):
+        wanted = linear[codes[top : top + _ROWS]] @ _ADOBE_TO_SRGB.T
+        out[top : top + _ROWS] = encoded[np.rint(np.clip(wanted, 0, 1) * _STEPS).astype(np.uint16)]
+    return out
+
+
+@lru_cache(maxsize=16)
+def _transform(icc: bytes) -> tuple[ImageCmsTransform | None, str, str]:
+    """Return the transform of a profile or None, the mode of its pictures, and the remark."""
+    from PIL import Image, ImageCms
+
+    try:
+        profile = ImageCms.ImageCmsProfile(io.BytesIO(icc))
+        # Clause 7.2.6: the data colour space field.
+        space = icc[16:20].decode("latin-1").strip()
+        name = " ".join(ImageCms.getProfileDescription(profile).split()) or "unnamed"
+        mode = {"RGB": "RGB", "GRAY": "L"}.get(space)
+        if mode is None:
+            return None, "RGB", f"{name} of {space} colours, not applied, taken as sRGB"
+        srgb = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB"))  # pyright: ignore[reportUnknownMemberType, reportUnknownArgumentType]
+        transform = ImageCms.buildTransform(profile, srgb, mode, "RGB", ImageCms.Intent.RELATIVE_COLORIMETRIC)
+    except (ImageCms.PyCMSError, OSError, ValueError) as error:
+        return None, "RGB", f"damaged ({' '.join(str(error).split())}), not applied, taken as sRGB"
+    steps = np.rint(np.linspace(0, 255, 256 if mode == "L" else _PROBE_STEPS)).astype(np.uint8)
+    probe = steps[None] if mode == "L" else np.stack(np.meshgrid(steps, steps, steps), axis=-1).reshape(1, -1, 3)
+    seen = np.array(ImageCms.applyTransform(Image.fromarray(probe), transform), dtype=np.int16)
+    if np.abs(seen - (probe[..., None] if mode == "L" else probe)).max() <= 1:
+        return None, mode, f"{name}, is sRGB"
+    return transform, mode, f"{name}, converted to sRGB"
+
+
+_CANDIDATES: Final = 8
+"""Places of which a further crop takes the best; chosen, not measured: with one, crops may be nearly the same."""
+
+
+def random_places(
+    free: tuple[int, int],
+    size: tuple[int, int],
+    count: int,
+    seed: int,
+    name: str,
+    first: tuple[int, int] | None = None,
+) -> list[tuple[int, int]]:
+    """Return `count` different places of crops in a picture.
+
+    Candidate n is made of the first two words of Philox with counter (a + n mod 2³², b, number, 6); a, b, number are
+    the first three words of the SHA-256 of the picture's name. The first crop is at candidate 0, or at `first`. Each
+    further one is at that of the next eight candidates which overlaps least with the crops before it, the first of
+    equals, as in best-candidate sampling (D. Mitchell, "Spectrally optimal sampling for distribution ray tracing",
+    SIGGRAPH 1991), where its eight are all taken, at the first free place after them, row by row.
+
+    `free`: columns and rows at which a crop can begin, 1 or more; together `count` or more places. `size`: width and
+    height of a crop, px. `first`: column and row of the first crop, px; None for a random place. Returns column and row
+    of each, px.
+
+    Examples
+    --------
+    >>> sorted(random_places((2, 2), (8, 8), 4, seed=0, name="a.png"))
+    [(0, 0), (0, 1), (1, 0), (1, 1)]
+    """
+    digest = hashlib.sha256(name.encode("utf-8", "surrogateescape")).digest()
+    a, b, number = (int.from_bytes(digest[at : at + 4], "little") for at in (0, 4, 8))
+    tried = (a + np.arange(1 + _CANDIDATES * (count - 1), dtype=np.int64)) % (1 << 32)
+    across, down, _, _ = philox.words(seed, tried, b, number, philox.CROPS)
+    candidates = [
+        (int(column) * free[0] >> 32, int(row) * free[1] >> 32) for column, row in zip(across, down, strict=True)
+    ]
+    places = candidates[:1] if first is None else [first]
+    for crop in range(1, count):
+        begin = 1 + _CANDIDATES * (crop - 1)
+        left = [place for place in candidates[begin : begin + _CANDIDATES] if place not in places]
+        if left:
+            places.append(min(left, key=lambda place: max(_overlap(place, other, size) for other in places)))
+            continue
+        last = candidates[begin + _CANDIDATES - 1]
+        start, total = last[1] * free[0] + last[0], free[0] * free[1]
+        following = (((start + step) % total % free[0], (start + step) % total // free[0]) for step in range(total))
+        places.append(next(place for place in following if place not in places))
+    return places
+
+
+def _overlap(one: tuple[int, int], other: tuple[int, int], size: tuple[int, int]) -> int:
+    """Return the pixels that crops at two places share."""
+    wide, high = (max(0, side - abs(a - b)) for side, a, b in zip(size, one, other, strict=True))
+    return wide * high
+
+
+def clear_bits(codes: npt.NDArray[np.uint8], bits: int) -> npt.NDArray[np.uint8]:
+    """Return codes (...) uint8 with their lowest `bits` bits, 0 … 8, set to zero.
+
+    Examples
+    --------
+    >>> clear_bits(np.array([7, 8, 200, 255], np.uint8), 3)
+    array([  0,   8, 200, 248], dtype=uint8)
+    """
+    if not 0 <= bits <= 8:
+        raise InputError(f"{bits} bits of a code of 8 were to be set to zero, expected 0 to 8")
+    return codes & np.uint8(0xFF << bits & 0xFF)
+
+
+def keep_bits(codes: npt.NDArray[np.uint8], bits: int | None) -> npt.NDArray[np.uint8]:
+    """Return codes (...) uint8 of which the highest `bits` bits, 0 … 8, are kept.
+
+    All of them, the same array, if None.
+    """
+    return codes if bits is None else clear_bits(codes, 8 - bits)
+
+
+Picture = npt.NDArray[np.uint8]
+
+LARGEST_SIDE: Final = 65535
+"""Longest side of a crop or a random scene, px: what 16 bits count."""
+LARGEST_PICTURE: Final = 1 << 29
+"""Most pixels of a picture, 1.6 GB of codes: a small file can claim more than memory holds."""
+
+_UNCALIBRATED: Final = 0xFFFF
+"""Value of the tag ColorSpace (EXIF 2.3, tag 40961) for a space that is not sRGB."""
+_MULTIPLIED: Final = frozenset({"dpx", "iff", "openexr", "rla", "tiff"})
+"""Formats whose colours are multiplied by alpha unless the file says otherwise, by OpenImageIO's names."""
+
+
+@dataclass(frozen=True, slots=True)
+class Preparation:
+    """How pictures are prepared on request: made smaller, cut, taken as sRGB.
+
+    - `max_side`: longest side allowed, px; a larger picture is made smaller.
+    - `crop`: (width, height), px, to cut every picture to.
+    - `cover`: whether a picture is first made as small as still covers the crop.
+    - `crop_at`: where to cut: ``"centre"``, or ``"random"``, a place that the seed and the picture's name choose; None
+      for the centre of one crop, and random places of several.
+    - `crops`: how many different crops to cut. The first is where `crop_at` says, at random that of one; the others are
+      at random places far from it and from each other.
+    - `profiles`: ``"honour"`` converts pictures of other colour spaces to sRGB; ``"ignore"`` takes all codes as they
+      stand.
+    - `seed`: 0 … 2⁶⁴ − 1, of random crops.
+    """
+
+    max_side: int | None = None
+    crop: tuple[int, int] | None = None
+    cover: bool = False
+    crop_at: Literal["centre", "random"] | None = None
+    profiles: Literal["honour", "ignore"] = "honour"
+    seed: int = 0
+    crops: int = 1
+
+    def __post_init__(self) -> None:
+        if self.max_side is not None and self.max_side < 1:
+            raise InputError(f"the longest side is to be {self.max_side} px, expected 1 or more")
+        if self.crop is not None and not all(1 <= side <= LARGEST_SIDE for side in self.crop):
+            raise InputError(
+                f"a crop of {self.crop[0]}x{self.crop[1]} was asked for, expected sides of 1 to {LARGEST_SIDE} px"
+            )
+        if self.crop is None and (self.cover or self.crop_at == "random"):
+            raise InputError("no crop was given to cover or to cut at random; give its size, such as 512x512")
+        if self.crops < 1:
+            raise InputError(f"{self.crops} crops of a picture were asked for, expected 1 or more")
+        if self.crops > 1 and self.crop is None:
+            raise InputError(f"{self.crops} crops of a picture have no size; give that of a crop: --crop 512x512")
+
+    @property
+    def place(self) -> Literal["centre", "random"]:
+        """Where the first crop is cut."""
+        return self.crop_at or ("centre" if self.crops == 1 else "random")
+
+    def describe(self) -> dict[str, Any]:
+        """Return the options that are set, as a JSON object."""
+        options: dict[str, Any] = {"profiles": self.profiles}
+        if self.max_side is not None:
+            options["max_side"] = self.max_side
+        if self.crop is not None:
+            options |= {"crop": list(self.crop), "cover": self.cover, "crop_at": self.place}
+        if self.crops > 1:
+            options |= {"crops": self.crops}
+        return options
+
+
+UNPREPARED: Final = Preparation()
+"""Nothing is done on request: the whole picture in its own size, profiles honoured."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Cut:
+    """A part of a picture: place of its top left pixel in the picture, px, and its codes (H, W, 3) uint8."""
+
+    left: int
+    top: int
+    picture: Picture
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class _Reading:
+    """A picture as it was read.
+
+    - `picture`: (H, W, 3) uint8, sRGB codes; of several crops the first.
+    - `profile`: how its colour profile was treated, in words, such as ``"Display P3, converted to sRGB"``.
+    - `cuts`: the crops, where several were asked for.
+    """
+
+    picture: Picture
+    profile: str
+    cuts: tuple[Cut, ...] = ()
+
+
+def read_picture(path: Path | str, max_side: int | None = None) -> Picture:
+    """Return the sRGB codes (H, W, 3) uint8 of a picture file; the head of this file lists the steps.
+
+    Parameters
+    ----------
+    path
+        Any file that OpenImageIO reads, or AVIF.
+    max_side
+        Longest side allowed, px; a larger picture is made smaller. None allows any.
+
+    Raises
+    ------
+    FormatError
+        The file cannot be read as a picture.
+
+    Examples
+    --------
+    >>> from PIL import Image
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     path = Path(folder) / "orange.png"
+    ...     Image.new("RGB", (40, 20), (255, 128, 0)).save(path)
+    ...     codes = read_picture(path, max_side=10)
+    >>> codes.shape, codes.dtype, codes[0, 0]
+    ((5, 10, 3), dtype('uint8'), array([255, 128,   0], dtype=uint8))
+    """
+    return open_picture(Path(path), Preparation(max_side=max_side)).picture
+
+
+def open_picture(
+    path: Path,
+    preparation: Preparation = UNPREPARED,
+    name: str | None = None,
+    data: bytes | None = None,
+    most_pixels: int | None = None,
+) -> _Reading:
+    """Return the sRGB codes of a picture file and how its profile was treated; the head of this file lists the steps.
+
+    `name`: name of the picture, which chooses the place of a random crop; its file's name if None. `data`: the file's
+    bytes, where they were read already. `most_pixels`: of the largest file that is read; `LARGEST_PICTURE` if None.
+    Returns the codes (H, W, 3) uint8 and the treatment of its profile.
+
+    Examples
+    --------
+    >>> from PIL import Image
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     path = Path(folder) / "orange.png"
+    ...     Image.new("RGB", (40, 20), (255, 128, 0)).save(path)
+    ...     reading = open_picture(path, Preparation(crop=(8, 8)))
+    >>> reading.picture.shape, reading.profile
+    ((8, 8, 3), 'none, taken as sRGB')
+    """
+    values = _read(path, data, LARGEST_PICTURE if most_pixels is None else most_pixels)
+    light = values.light
+    if values.linear:
+        light = np.clip(np.nan_to_num(light, nan=0.0, posinf=1.0, neginf=0.0), 0.0, None)
+    if values.alpha is not None:
+        opaque = values.alpha[..., None]
+        white = (1.0 - opaque) * (1.0 if values.linear else 255.0)
+        light = (light if values.associated else light * opaque) + white
+    if values.linear:
+        codes = srgb_codes(light)
+    else:
+        # Rounding takes seconds on a large picture, and codes of 8 bits have nothing to round.
+        codes = (light if light.dtype == np.uint8 else np.rint(np.clip(light, 0, 255))).astype(np.uint8, copy=False)
+    if values.linear:
+        word = "linear light, encoded as sRGB"
+    elif values.icc is None and not values.adobe_rgb:
+        word = ASSUMED
+    elif preparation.profiles == "ignore":
+        word = "ignored, taken as sRGB"
+    elif values.icc is not None:
+        codes, word = to_srgb(codes, values.icc)
+    else:
+        codes, word = _from_adobe_rgb(codes), ADOBE_RGB
+    codes = _turn(codes, values.orientation)
+    cuts = _fit(codes, preparation, path, path.name if name is None else name)
+    return _Reading(cuts[0].picture, word, cuts if preparation.crops > 1 else ())
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class _Values:
+    """Values of a file: `light` (H, W, 3) uint8 or float64, 0 … 255 or linear 0 … 1; `alpha` (H, W) float64 0 … 1."""
+
+    light: npt.NDArray[Any]
+    alpha: npt.NDArray[np.float64] | None
+    associated: bool
+    linear: bool
+    orientation: int
+    icc: bytes | None
+    adobe_rgb: bool
+
+
+def _read(path: Path, data: bytes | None, most_pixels: int) -> _Values:
+    if not path.is_file():
+        raise FormatError(f"cannot read {path}: there is no such file; name a picture")
+    if path.suffix.lower() == ".avif":
+        picture = _read_avif(path, most_pixels)
+        return _Values(picture.codes, picture.alpha, False, False, picture.orientation, picture.icc, False)
+    has_profile = _checked_png(path, data)
+    with _named_in_text(path) as name:
+        values = _read_named(path, name, data, most_pixels)
+    # The reader drops a profile that it cannot use without a word; no bytes are a damaged one.
+    lost = has_profile and values.icc is None and not values.adobe_rgb
+    return replace(values, icc=b"") if lost else values
+
+
+def _checked_png(path: Path, data: bytes | None) -> bool:
+    """Return whether a file is a PNG that has a colour profile (PNG, third edition, clause 5.3).
+
+    Pixels that are damaged or cut off are refused here: libpng, which finds them, too, prints lines of its own.
+    """
+    try:
+        with path.open("rb") as stream:
+            if stream.read(len(_PNG)) != _PNG:
+                return False
+            content = memoryview(_PNG + stream.read() if data is None else data)
+    except OSError:
+        # OpenImageIO names the fault.
+        return False
+    place, has_profile = len(_PNG), False
+    while place + 8 <= len(content):
+        size, kind = struct.unpack(">I4s", content[place : place + 8])
+        end = place + 12 + size
+        has_profile |= kind == b"iCCP"
+        if kind in (b"IHDR", b"PLTE", b"IDAT"):
+            cut = end > len(content)
+            if cut or zlib.crc32(content[place + 4 : end - 4]) != int.from_bytes(content[end - 4 : end]):
+                fault = "it ends within" if cut else "the checksum is not that of"
+                raise FormatError(
+                    f"cannot read {path}: {fault} its chunk {kind.decode()} at byte {place}; the file is damaged, use "
+                    "another copy"
+                )
+        place = end
+    return has_profile
+
+
+def _read_named(path: Path, name: str, data: bytes | None, most_pixels: int) -> _Values:
+    import OpenImageIO as oiio  # noqa: N813
+
+    request = oiio.ImageSpec()
+    request.attribute("oiio:UnassociatedAlpha", 1)
+    stream = oiio.ImageInput.open(name, request)
+    if stream is None:
+        reason = _reason(oiio.geterror()).replace(name, str(path))
+        raise FormatError(f"cannot read {path}: {reason}; use another picture, or convert it to PNG")
+    try:
+        spec = stream.spec()
+        if spec.deep or spec.depth > 1 or spec.nchannels < 1:
+            raise FormatError(f"cannot read {path}: it is no flat picture; use another, or convert it to PNG")
+        if spec.width * spec.height > most_pixels:
+            raise FormatError(
+                f"cannot read {path}: {spec.width}x{spec.height} px are more than {most_pixels}; make it smaller"
+            )
+        space = str(spec.get_string_attribute("oiio:ColorSpace")).lower()
+        kind = spec.format.basetype
+        floating = kind in (oiio.HALF, oiio.FLOAT, oiio.DOUBLE)
+        linear = floating and "srgb" not in space.replace("lin_srgb", "")
+        pixels = None
+        if stream.format_name() == "jpeg" and spec.nchannels == 3:
+            pixels = _jpeg(path.read_bytes() if data is None else data)
+        if pixels is None:
+            pixels = stream.read_image("float" if floating else "uint8" if kind == oiio.UINT8 else "uint16")
+        if pixels is None or stream.has_error:
+            raise FormatError(
+                f"cannot read {path}: {_reason(stream.geterror())}; the file is damaged, use another copy"
+            )
+        alpha_channel = spec.alpha_channel
+        kept_apart = spec.get_int_attribute("oiio:UnassociatedAlpha", 0) or stream.format_name() not in _MULTIPLIED
+        orientation = spec.get_int_attribute("Orientation", 1)
+        icc = spec.getattribute("ICCProfile")
+        uncalibrated = spec.get_int_attribute("Exif:ColorSpace", 0) == _UNCALIBRATED
+    finally:
+        stream.close()
+    pixels = np.asarray(pixels).reshape(spec.height, spec.width, spec.nchannels)
+    # Of a GIF file the reader names the channel after the last.
+    alpha_channel = min(alpha_channel, spec.nchannels - 1)
+    alpha = None
+    if alpha_channel > 0:
+        top = 1.0 if floating else float(np.iinfo(pixels.dtype).max)
+        alpha = np.clip(pixels[..., alpha_channel].astype(np.float64) / top, 0.0, 1.0)
+        # The fourth byte of a plain BMP file means nothing, and most programs write 0.
+        if alpha.min() == 1.0 or (not alpha.any() and stream.format_name() == "bmp"):
+            alpha = None
+    colours = [channel for channel in range(spec.nchannels) if channel != alpha_channel]
+    if colours[:3] == [0, 1, 2]:
+        values = pixels[..., :3]
+    else:
+        values = pixels[..., colours[:3] if len(colours) >= 3 else [colours[0] if colours else 0] * 3]
+    if values.dtype == np.uint16:
+        values = ((values.astype(np.uint32) + 128) // 257).astype(np.uint8)
+    elif floating:
+        values = values.astype(np.float64) * (1.0 if linear else 255.0)
+    associated = not kept_apart
+    if alpha is not None and not floating:
+        # What is brighter than its alpha was not multiplied by it, whatever the format's custom.
+        associated = associated and not bool(np.any(values > 255.0 * alpha[..., None] + 1.0))
+    profile = None if icc is None else np.asarray(icc, dtype=np.uint8).tobytes()
+    adobe_rgb = uncalibrated and profile is None and _interoperability(path) == "R03"
+    return _Values(values, alpha, associated, linear, orientation, profile, adobe_rgb)
+
+
+@contextmanager
+def _named_in_text(path: Path) -> Generator[str]:
+    """Yield a name of a file that OpenImageIO takes: a link to the file where its own name is not UTF-8."""
+    try:
+        str(path).encode()
+    except UnicodeEncodeError:
+        with tempfile.TemporaryDirectory() as folder:
+            suffix = path.suffix.encode("ascii", "ignore").decode()
+            link = Path(folder) / f"picture{suffix}"
+            link.symlink_to(path.absolute())
+            yield str(link)
+    else:
+        yield str(path)
+
+
+def _interoperability(path: Path) -> str:
+    """Return the interoperability index of a file's EXIF data; empty if there is none."""
+    from PIL import Image
+    from PIL.ExifTags import IFD
+
+    try:
+        with Image.open(path) as picture:
+            index = picture.getexif().get_ifd(IFD.Interop).get(1, "")
+    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError):
+        # Damaged data, or a picture too large for Pillow: it has no index then. OpenImageIO has read the picture.
+        return ""
+    return str(index).strip("\0 ")
+
+
+def _jpeg(data: bytes) -> npt.NDArray[np.uint8] | None:
+    """Return the pixels (H, W, 3) uint8 of a usual colour JPEG in half of OpenImageIO's time, or None for another."""
+    import simplejpeg
+
+    try:
+        if simplejpeg.decode_jpeg_header(data)[2] != "YCbCr":
+            return None
+        return simplejpeg.decode_jpeg(data, strict=True)
+    except ValueError:
+        # OpenImageIO reads it, or names the fault.
+        return None
+
+
+def _reason(message: str) -> str:
+    """Return a library's message on one line without its full stop, to be a part of our sentence."""
+    return " ".join(message.split()).rstrip(".") or "no known picture format"
+
+
+def _turn(picture: Picture, orientation: int) -> Picture:
+    """Return `picture` (H, W, 3) uint8 turned upright (TIFF 6.0, tag Orientation)."""
+    turned = {
+        2: lambda: picture[:, ::-1],
+        3: lambda: picture[::-1, ::-1],
+        4: lambda: picture[::-1],
+        5: lambda: picture.transpose(1, 0, 2),
+        6: lambda: picture.transpose(1, 0, 2)[:, ::-1],
+        7: lambda: picture.transpose(1, 0, 2)[::-1, ::-1],
+        8: lambda: picture.transpose(1, 0, 2)[::-1],
+    }.get(orientation)
+    return np.ascontiguousarray(turned() if turned else picture)
+
+
+def _fit(picture: Picture, preparation: Preparation, path: Path, name: str) -> tuple[Cut, ...]:
+    """Return `picture` (H, W, 3) uint8 made smaller and cut, in as many crops as are asked for."""
+    height, width = picture.shape[:2]
+    scale = 1.0 if preparation.max_side is None else preparation.max_side / max(height, width)
+    if preparation.crop is None:
+        return (Cut(0, 0, _shrink(picture, scale)),)
+    wide, high = preparation.crop
+    if preparation.cover:
+        scale = min(scale, max(wide / width, high / height))
+    picture = _shrink(picture, scale)
+    height, width = picture.shape[:2]
+    if wide > width or high > height:
+        raise FormatError(
+            f"cannot cut {path}: it is {width}x{height} px where the crop is {wide}x{high}; ask for a smaller crop"
+        )
+    centre = ((width - wide) // 2, (height - high) // 2)
+    places = [centre]
+    if preparation.place == "random" or preparation.crops > 1:
+        free = (width - wide + 1, height - high + 1)
+        if preparation.crops > free[0] * free[1]:
+            raise FormatError(
+                f"cannot cut {path} in {preparation.crops} different crops of {wide}x{high} px: it is "
+                f"{width}x{height} px and has {free[0] * free[1]}; ask for fewer, or for smaller ones"
+            )
+        first = centre if preparation.place == "centre" else None
+        places = random_places(free, (wide, high), preparation.crops, preparation.seed, name, first)
+    return tuple(
+        Cut(left, top, np.ascontiguousarray(picture[top : top + high, left : left + wide])) for left, top in places
+    )
+
+
+def _shrink(picture: Picture, scale: float) -> Picture:
+    """Return `picture` (H, W, 3) uint8 scaled by `scale` if below 1, each pixel the mean of the area that it covers."""
+    if scale >= 1:
+        return picture
+    import cv2
+
+    height, width = picture.shape[:2]
+    size = (max(1, round(width * scale)), max(1, round(height * scale)))
+    return np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
+
 
 SUFFIXES: Final = frozenset(
     {".avif", ".bmp", ".dpx", ".exr", ".gif", ".hdr", ".j2k", ".jp2", ".jpe", ".jpeg", ".jpg"}

@@ -39,7 +39,7 @@ def render(
     lut
         A table, from `calibration.table.lut.open_lut`.
     picture
-        (H, W, 3) uint8 sRGB codes, from `pictures.picture.read_picture` or any array.
+        (H, W, 3) uint8 sRGB codes, from `pictures.sources.read_picture` or any array.
     light
         Number of the light in the table; a text as the command's ``--light`` takes it, such as ``"D65"``, ``"5600K"``
         or ``"12:0.25+40:0.75"``; or a mixture that `lights.choices.parse_light` made of one, whose ``white(lut)`` is

@@ -88,8 +88,6 @@ class Recycled:
         return memory
 
 
-__all__ = ["Batch", "Crops"]
-
 _HALF: Final = np.uint64(32)
 """Bits of a random word."""
 

@@ -20,8 +20,7 @@ from foundation.errors import FormatError, InputError, kind_of
 from foundation.files import storage_error, whole_folder, write_whole
 from foundation.records import Record
 from generator.kernels.choice import check_picture
-from generator.pictures.picture import Picture
-from generator.pictures.sources import Source
+from generator.pictures.sources import Picture, Source
 
 FORMAT: Final = "crop.gallery"
 VERSION: Final = 1

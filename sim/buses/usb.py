@@ -53,8 +53,8 @@ from drivers.ptp.usb import (
     encode_data_header,
     ends_with_empty_packet,
 )
+from foundation.clock import SimulatedClock
 from foundation.errors import ProtocolError
-from sim.clock import SimulatedClock
 
 PACKET = HIGH_SPEED_PACKET
 INTERRUPT_PACKET = 8

@@ -36,8 +36,8 @@ from numpy.typing import NDArray
 from drivers.camera import ExposureSettings
 from drivers.presenter import BLACK, Colour
 from drivers.tiff import CFA, D65, Tags, TiffTag, ValueType, head, rationals, text
+from foundation.clock import OPENING
 from foundation.errors import DeviceError, DeviceRefused
-from sim.clock import OPENING
 from sim.world.disturbances import CALM, Disturbances, Moment
 from sim.world.sensors import Body
 from sim.world.world import World

@@ -33,11 +33,11 @@ from drivers.canon.camera import EosState, plan, shutter_speeds
 from drivers.canon.records import decode_events
 from drivers.projector import Power
 from drivers.ptp.codes import Property
+from foundation.clock import SimulatedClock
 from foundation.errors import DeviceRefused
 from sim.buses.ptp import serve_ptpip
 from sim.camera.bodies import TEST_BODY
 from sim.camera.eos import SimulatedEos
-from sim.clock import SimulatedClock
 from sim.projectors.pjlink import serve_pjlink
 from sim.projectors.projector import SimulatedProjector
 from tests.contracts.camera import SeededFilm

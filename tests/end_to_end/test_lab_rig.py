@@ -28,14 +28,13 @@ from drivers.raw.rawfile import read_raw
 from experiment.chart.model import load_chart
 from experiment.config import load_lab
 from experiment.session.folder import Session
-from foundation.clock import Clock, SystemClock
+from foundation.clock import OPENING, Clock, SystemClock
 from sim.buses.ptp import serve_ptpip
 from sim.buses.serial import PseudoTerminal
 from sim.buses.usb import PtpUsbDevice, SimulatedBus
 from sim.camera.bodies import EOS_BODIES
 from sim.camera.eos import SimulatedEos
 from sim.camera.film import WorldFilm
-from sim.clock import OPENING
 from sim.projectors.pjlink import serve_pjlink
 from sim.projectors.projector import Screen, SimulatedPresenter, SimulatedProjector
 from sim.projectors.serial import PEERS, BenqPeer, EpsonPeer

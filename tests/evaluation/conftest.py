@@ -11,7 +11,8 @@ import pytest
 from calibration.table.lut import LutWriter, Provenance, open_lut
 from drivers.presenter import Colour
 from experiment.lights import Illumination
-from generator.dataset.making import DatasetOptions, generate_dataset
+from generator.dataset.making import generate_dataset
+from generator.dataset.plan import DatasetOptions
 from generator.pictures.sources import random_scenes
 from tests.evaluation.real_images import Collection, collections
 

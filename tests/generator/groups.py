@@ -5,7 +5,8 @@ from __future__ import annotations
 import dataclasses
 from typing import Any
 
-from generator.dataset.making import Callbacks, DatasetOptions, Workers
+from generator.dataset.making import Callbacks, Workers
+from generator.dataset.plan import DatasetOptions
 
 
 def grouped(**wishes: Any) -> dict[str, Any]:

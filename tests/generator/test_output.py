@@ -14,7 +14,7 @@ import pytest
 from generator.cli import main
 from generator.command import output as progress
 from generator.command.output import matrix_sentence, shown_progress
-from generator.dataset.shards import SILENT
+from generator.dataset.making import SILENT
 from generator.rendering.matrices import SOURCE, camera_matrix
 from tests.generator.conftest import MakeLut
 

@@ -22,12 +22,12 @@ from experiment.chart.printing import drawing
 from experiment.config import LabSettings
 from experiment.session.folder import Session
 from experiment.session.records import last_moment
+from foundation.clock import OPENING, SimulatedClock
 from foundation.errors import ConfigurationError, FormatError
 from sim.buses.usb import MemoryTransport
 from sim.camera.bodies import EOS_BODIES
 from sim.camera.eos import SimulatedEos
 from sim.camera.film import Film, RecordedFrame, ReplayFilm, WorldFilm
-from sim.clock import OPENING, SimulatedClock
 from sim.projectors.pjlink import PjLinkPeer
 from sim.projectors.projector import Screen, SimulatedPresenter, SimulatedProjector
 from sim.spectral import known_sensitivities

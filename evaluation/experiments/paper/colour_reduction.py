@@ -39,10 +39,9 @@ from evaluation.results.tables import PAPER_COLUMNS, Table
 from evaluation.scene import Image, Scene, SceneSet
 from foundation.compiled import ordered_map
 from foundation.errors import FormatError, InputError
-from foundation.files import reading_error, whole_folder, write_whole
-from foundation.folders import is_inside_name, read_inside
-from generator.pictures.picture import clear_bits
+from foundation.files import is_inside_name, read_inside, reading_error, whole_folder, write_whole
 from generator.pictures.preview import Flash, fit_flash
+from generator.pictures.sources import clear_bits
 
 BITS: Final = tuple(range(8))
 """Numbers of bits set to zero, as in the paper's figure."""

@@ -26,7 +26,6 @@ from drivers.raw.rawfile import Mosaic, read_raw
 from experiment.chart.layout import paper_chart
 from experiment.framing.finding import find_chart
 from experiment.lights import plan_illuminations
-from experiment.measures.sensor import saturation
 from experiment.session.folder import Session
 from experiment.session.records import SessionStep
 from foundation.errors import QualityError, RegistrationError
@@ -151,7 +150,7 @@ def say(case: Case, folder: Path) -> Said:
         place = place_chart(framing, lab.chart)
         placed = PlacedChart(framing, place, window_px(lab.chart, place))
         forecast = Forecast.of(
-            measure_table(lab.chart, placed, (shots[0],), shots[1], float(saturation(shots[0].mosaic)))
+            measure_table(lab.chart, placed, (shots[0],), shots[1], float(shots[0].mosaic.saturation()))
         )
     except RegistrationError:
         pass

@@ -8,11 +8,10 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from acquisition.judge import light, limits
+from acquisition.judge import limits, state
 from acquisition.judge.judge import MOST_RESTARTS, judge_dark, judge_first_frames, judge_first_primary, judge_white
-from acquisition.judge.light import Basis, Codes, ProjectorModel
 from acquisition.judge.measure import SEGMENTS, TILE_COLUMNS, TILE_ROWS, Frame, FramePlaces, Measured, Noise
-from acquisition.judge.state import JudgeState, Seen
+from acquisition.judge.state import Basis, Codes, JudgeState, ProjectorModel, Seen
 from drivers.presenter import Colour
 from experiment.config import JudgeSettings
 from experiment.session.records import TOP, Check, SessionStep
@@ -272,7 +271,7 @@ def test_first_frames_are_taken_again_as_often_as_a_passer_by_needs_and_then_som
 
 
 def test_of_a_curve_a_small_part_is_the_primary_s_own() -> None:
-    nodes = len(light._NODES)  # pyright: ignore[reportPrivateUsage]
+    nodes = len(state._NODES)  # pyright: ignore[reportPrivateUsage]
     covariance = ProjectorModel.unknown().covariance
     own, shared = covariance[:nodes, :nodes], covariance[:nodes, nodes : 2 * nodes]
     np.testing.assert_allclose(own, covariance[nodes : 2 * nodes, nodes : 2 * nodes])

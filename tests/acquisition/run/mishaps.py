@@ -34,11 +34,11 @@ from experiment.lights import Illumination
 from experiment.session.folder import Session
 from experiment.session.journal import Journal
 from experiment.session.records import Judgement, SessionStep, plan_steps
+from foundation.clock import SimulatedClock
 from foundation.errors import CropError, DeviceError, LinkClosed, StorageError
 from sim.buses.usb import PtpUsbDevice, SimulatedBus
 from sim.camera.bodies import EOS_550D
 from sim.camera.eos import SimulatedEos
-from sim.clock import SimulatedClock
 from sim.projectors.pjlink import PjLinkPeer
 from sim.projectors.projector import SimulatedProjector
 from tests import cable_faults as faults

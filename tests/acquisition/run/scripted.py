@@ -20,9 +20,9 @@ from experiment.config import LabSettings
 from experiment.lights import Illumination
 from experiment.session.folder import Session
 from experiment.session.records import plan_steps
+from foundation.clock import SimulatedClock
 from foundation.errors import DeviceError
 from sim.camera.film import write_dng
-from sim.clock import SimulatedClock
 from sim.projectors.projector import SimulatedProjector
 from sim.world.sensors import BODIES
 

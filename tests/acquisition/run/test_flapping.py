@@ -14,8 +14,8 @@ from drivers.presenter import BLACK, Colour
 from experiment.config import LabSettings
 from experiment.lights import Illumination
 from experiment.session.records import ACCEPTED, REFUSED, Check, Judgement, SessionStep
+from foundation.clock import SimulatedClock
 from foundation.errors import QualityError
-from sim.clock import SimulatedClock
 from tests.acquisition.run.scripted import SETTINGS, WELL, Lab
 
 LIGHTS = tuple(Illumination(n, "uniform", None, Colour(255, 6 * n, 0)) for n in range(40))

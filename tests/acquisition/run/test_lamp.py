@@ -33,9 +33,9 @@ from drivers.presenter import BLACK, Colour
 from drivers.projector import Fault, Lamp, Power, Projector, Severity
 from drivers.serial_projectors.optoma import OptomaProjector
 from experiment.config import SequenceSettings
+from foundation.clock import SimulatedClock
 from foundation.errors import DeviceError, DeviceFault, LinkClosed, LinkTimeout, StorageError
 from sim.buses.serial import SerialPeerLink
-from sim.clock import SimulatedClock
 from sim.projectors.pjlink import PjLinkPeer
 from sim.projectors.projector import SimulatedProjector
 from sim.projectors.serial import OptomaPeer

@@ -19,8 +19,8 @@ from acquisition.run.run import take_session
 from drivers.presenter import Colour
 from experiment.config import NotifySettings
 from experiment.lights import Illumination
+from foundation.clock import SimulatedClock
 from foundation.errors import DeviceError
-from sim.clock import SimulatedClock
 from tests.acquisition.run.scripted import SETTINGS, Lab
 
 

@@ -22,8 +22,8 @@ from experiment.session.folder import Session, rebuild_journal, session_exists
 from experiment.session.journal import Journal, LostJournalError, beat_beside, open_to_read
 from experiment.session.ledger import Rows, ledger_path, read_ledger, rows_of
 from experiment.session.records import ACCEPTED
+from foundation.clock import SimulatedClock
 from foundation.errors import FormatError, StorageError
-from sim.clock import SimulatedClock
 from tests.acquisition.run.scripted import SETTINGS, Lab
 
 LIGHTS = tuple(Illumination(n, "uniform", None, Colour(255, 30 * n, 0)) for n in range(6))

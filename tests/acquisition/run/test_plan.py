@@ -39,8 +39,8 @@ from experiment.config import LabRig, LabSettings, NotifySettings, ProjectorCabl
 from experiment.lights import Illumination, save_illuminations
 from experiment.session.folder import Session
 from experiment.session.records import plan_steps
+from foundation.clock import SimulatedClock
 from foundation.errors import ConfigurationError, CropError, DeviceError, DeviceFault, DeviceRefused, StorageError
-from sim.clock import SimulatedClock
 from sim.projectors.projector import SimulatedProjector
 from sim.world.sensors import BODIES
 from tests.json_of import json_of

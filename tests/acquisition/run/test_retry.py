@@ -33,6 +33,7 @@ from experiment.lights import Illumination
 from experiment.session.folder import Session
 from experiment.session.journal import HeldJournalError
 from experiment.session.records import plan_steps
+from foundation.clock import SimulatedClock
 from foundation.errors import (
     ConfigurationError,
     CropError,
@@ -43,7 +44,6 @@ from foundation.errors import (
     LinkTimeout,
     StorageError,
 )
-from sim.clock import SimulatedClock
 
 
 @dataclass

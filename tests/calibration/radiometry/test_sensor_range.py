@@ -10,13 +10,13 @@ import pytest
 
 from drivers.camera import ExposureSettings
 from drivers.presenter import WHITE
-from experiment.measures.sensor import black_drift, saturation
+from experiment.measures.sensor import black_drift
 from tests.calibration.lab import Lab
 
 
 def test_saturation_is_what_the_frame_shows(lab: Lab, tmp_path: Path) -> None:
     normal = lab.mosaic(tmp_path)
-    assert saturation(normal) == normal.white_level == lab.world.body.saturation
+    assert normal.saturation() == normal.white_level == lab.world.body.saturation
     # A sensor that saturates below what its file states, as LibRaw's tables have it for the EOS 550D.
     plateau = 12_800
 
@@ -25,7 +25,7 @@ def test_saturation_is_what_the_frame_shows(lab: Lab, tmp_path: Path) -> None:
 
     bright = lab.mosaic(tmp_path, WHITE, settings=ExposureSettings(100, 8.0, 2.0), paint=saturate)
     assert bright.white_level > plateau
-    assert saturation(bright) == plateau
+    assert bright.saturation() == plateau
 
 
 def test_black_drift_is_the_worst_position() -> None:

@@ -12,11 +12,11 @@ from drivers.links.link import UsbPipes
 from drivers.links.usb import open_usb
 from drivers.ptp.protocol import Responder, Transport
 from drivers.ptp.usb import UsbTransport
+from foundation.clock import SimulatedClock
 from foundation.errors import DeviceError, DeviceFault, DeviceRefused
 from sim.buses.usb import PtpUsbDevice, SimulatedBus
 from sim.camera.bodies import EOS_550D, EosModel
 from sim.camera.eos import SimulatedEos
-from sim.clock import SimulatedClock
 from tests.contracts.camera import SeededFilm
 
 

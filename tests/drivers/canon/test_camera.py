@@ -44,12 +44,12 @@ from drivers.ptp.codes import AeMode, CaptureDestination, EosEvent, Operation, P
 from drivers.ptp.ip import IpTransport
 from drivers.ptp.protocol import Answer, PtpEvent, PtpRequest, PtpResponse, Reception, Responder, Transaction, Transport
 from drivers.ptp.usb import UsbTransport
+from foundation.clock import SimulatedClock
 from foundation.errors import DeviceError, DeviceRefused, LinkClosed, ProtocolError
 from sim.buses.ptp import serve_ptpip
 from sim.buses.usb import PtpUsbDevice, SimulatedBus
 from sim.camera.bodies import EOS_6D_MARK_II, EOS_550D, EosModel
 from sim.camera.eos import SimulatedEos
-from sim.clock import SimulatedClock
 from tests import cable_faults as faults
 from tests.cable_faults import Occasion
 from tests.contracts.camera import SETTINGS, Bench, CameraContract

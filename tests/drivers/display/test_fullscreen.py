@@ -31,8 +31,8 @@ from drivers.display.fullscreen import (
 from drivers.display.x11 import XScreen, is_dark
 from drivers.presenter import BLACK, WHITE, Colour
 from experiment.lights import plan_illuminations
+from foundation.clock import SimulatedClock
 from foundation.errors import ConfigurationError, DeviceError, DeviceRefused
-from sim.clock import SimulatedClock
 from tests.contracts.presenter import Bench, PresenterContract
 from tests.drivers.display.x_servers import Picture, VirtualScreen, screenshot, two_outputs, virtual_screen
 

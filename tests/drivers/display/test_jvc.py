@@ -13,8 +13,8 @@ from drivers.display.jvc import JvcFlatField
 from drivers.links.link import PeerLink
 from drivers.links.network import TcpLink, serve_peer
 from drivers.presenter import BLACK, WHITE, Colour
+from foundation.clock import SimulatedClock
 from foundation.errors import DeviceError, DeviceRefused, LinkClosed, LinkTimeout, ProtocolError
-from sim.clock import SimulatedClock
 from sim.projectors.jvc import JvcPeer
 from sim.projectors.projector import Screen
 from tests.contracts.presenter import Bench, PresenterContract

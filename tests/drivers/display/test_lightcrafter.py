@@ -24,9 +24,9 @@ from drivers.display.lightcrafter import (
 )
 from drivers.links.usb import HidDevice, open_hid
 from drivers.presenter import BLACK, WHITE, Colour
+from foundation.clock import SimulatedClock
 from foundation.errors import DeviceError, DeviceRefused, InputError, LinkClosed, LinkTimeout, ProtocolError
 from sim.buses.usb import SimulatedBus
-from sim.clock import SimulatedClock
 from sim.projectors.lightcrafter import REPORT_OUT, VIDEO_INPUT, Controller, LightCrafterUsb
 from sim.projectors.projector import Screen
 from tests.contracts.presenter import Bench, PresenterContract

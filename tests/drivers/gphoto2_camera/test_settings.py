@@ -17,8 +17,8 @@ from hypothesis import strategies as st
 from drivers import gphoto2_camera
 from drivers.camera import CameraIdentity, ExposureSettings, ReportsSupplies, Supplies, capture
 from drivers.gphoto2_camera import BodySetting, Gphoto2Camera, battery_level, is_same, label_of, number_of, plan
+from foundation.clock import SimulatedClock
 from foundation.errors import DeviceError, DeviceRefused
-from sim.clock import SimulatedClock
 from tests.contracts.camera import SETTINGS, Bench, CameraContract, SeededFilm
 from tests.drivers.gphoto2_camera.bodies import (
     BODIES,

@@ -12,9 +12,9 @@ from drivers.links.link import Pipe, PipeStalled
 from drivers.links.usb import UDEV_RULE, UsbDevice, list_devices, open_usb
 from drivers.ptp.protocol import PtpRequest
 from drivers.ptp.usb import UsbTransport
+from foundation.clock import SimulatedClock
 from foundation.errors import DeviceRefused, InputError, LinkClosed, LinkTimeout
 from sim.buses.usb import BULK_IN, BULK_OUT, PtpUsbDevice, Setup, SimulatedBus, Stalled, UsbIdentity
-from sim.clock import SimulatedClock
 from tests.contracts.transport import ECHO, PATIENCE_S, Bench, Echo, TransportContract
 
 

@@ -16,11 +16,11 @@ from drivers.links.link import Link, PeerLink
 from drivers.links.network import TcpLink
 from drivers.pjlink import Input, NoResolution, PjLinkProjector, Resolution
 from drivers.projector import Fault, Lamp, Power, ProjectorIdentity, Severity
+from foundation.clock import SimulatedClock
 from foundation.errors import DeviceFault, DeviceRefused, LinkClosed, LinkTimeout, ProtocolError
 from sim.buses.ptp import serve_ptpip
 from sim.camera.bodies import EOS_550D
 from sim.camera.eos import SimulatedEos
-from sim.clock import SimulatedClock
 from sim.projectors.pjlink import PjLinkPeer, serve_pjlink
 from sim.projectors.projector import ProjectorTraits, SimulatedProjector
 from tests.contracts.camera import SeededFilm

@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 from drivers import pjlink as wire
 from drivers.links.network import Address, UdpSocket
 from drivers.pjlink import FoundProjector, PjLinkReply, search
+from foundation.clock import SimulatedClock
 from foundation.errors import LinkClosed, LinkTimeout
-from sim.clock import SimulatedClock
 
 MAC = "00:11:22:aa:bb:cc"
 

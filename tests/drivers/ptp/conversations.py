@@ -15,9 +15,9 @@ from typing import TypedDict
 
 from drivers.ptp.codes import AeMode, DriveMode, Operation, Property
 from drivers.ptp.protocol import Cursor, DevicePropDesc, PtpRequest, read_value
+from foundation.clock import SimulatedClock
 from sim.camera.bodies import EOS_550D
 from sim.camera.eos import SimulatedEos
-from sim.clock import SimulatedClock
 from tests.contracts.camera import SeededFilm
 from tests.data_files import available
 

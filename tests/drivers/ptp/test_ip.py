@@ -29,10 +29,9 @@ from drivers.ptp.ip import (
     StartData,
 )
 from drivers.ptp.protocol import PtpEvent, PtpRequest, PtpResponse
-from foundation.clock import SystemClock
+from foundation.clock import SimulatedClock, SystemClock
 from foundation.errors import DeviceRefused, LinkClosed, LinkTimeout, ProtocolError
 from sim.buses.ptp import serve_ptpip
-from sim.clock import SimulatedClock
 from tests.contracts.link import read_exactly
 from tests.contracts.transport import PATIENCE_S, Bench, Echo, TransportContract
 from tests.drivers.links.troubled_links import Dribbling

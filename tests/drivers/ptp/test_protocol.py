@@ -27,8 +27,8 @@ from drivers.ptp.protocol import (
     Transaction,
     Value,
 )
+from foundation.clock import SimulatedClock
 from foundation.errors import DeviceRefused, LinkClosed, LinkTimeout, ProtocolError
-from sim.clock import SimulatedClock
 from tests.drivers.ptp import examples
 from tests.drivers.ptp.examples import U16, U32
 

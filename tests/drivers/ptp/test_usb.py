@@ -14,9 +14,9 @@ from drivers.ptp import usb as container
 from drivers.ptp.codes import EventCode, Operation, ResponseCode
 from drivers.ptp.protocol import PtpEvent, PtpRequest, PtpResponse, next_transaction
 from drivers.ptp.usb import ContainerReader, DataPiece, DataStart, DeviceStatus, Message, UsbTransport
+from foundation.clock import SimulatedClock
 from foundation.errors import DeviceError, LinkClosed, LinkTimeout, ProtocolError
 from sim.buses.usb import PtpUsbDevice, SimulatedBus
-from sim.clock import SimulatedClock
 from tests.cable_faults import CutOff, Deaf, Garbling, HeaderAlone, Joining, ShortReads, Stalling, WithoutEmptyPackets
 from tests.contracts.transport import (
     ECHO,

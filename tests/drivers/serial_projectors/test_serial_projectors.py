@@ -25,6 +25,7 @@ from drivers.serial_projectors.epson import EpsonOnNetwork, EpsonProjector
 from drivers.serial_projectors.nec import NecProjector
 from drivers.serial_projectors.optoma import OptomaProjector
 from experiment.config import ProjectorCable
+from foundation.clock import SimulatedClock
 from foundation.errors import (
     ConfigurationError,
     DeviceError,
@@ -35,7 +36,6 @@ from foundation.errors import (
     ProtocolError,
 )
 from sim.buses.serial import SerialPeerLink
-from sim.clock import SimulatedClock
 from sim.projectors.projector import SimulatedProjector
 from sim.projectors.serial import PEERS, SERIAL_NUMBER, BenqPeer, EpsonPeer, NecPeer, OptomaPeer
 from tests.contracts.projector import Bench, ProjectorContract

@@ -17,7 +17,8 @@ from evaluation.datasets.options import DataOptions
 from evaluation.experiments.folds import group_of
 from evaluation.scene import MixedScene
 from foundation.errors import InputError
-from generator.dataset.making import DatasetOptions, generate_dataset
+from generator.dataset.making import generate_dataset
+from generator.dataset.plan import DatasetOptions
 from generator.dataset.records import Layout
 from generator.lights.choices import ListedLights, SimultaneousLights
 from generator.masks.making import parse_masks

@@ -18,7 +18,8 @@ from experiment.config import LabSettings
 from experiment.lights import Illumination
 from experiment.session.folder import Session
 from experiment.session.records import Check, Judgement, plan_steps
-from generator.dataset.making import DatasetOptions, generate_dataset
+from generator.dataset.making import generate_dataset
+from generator.dataset.plan import DatasetOptions
 from generator.lights.choices import ListedLights, SimultaneousLights
 from generator.masks.making import parse_masks
 from generator.pictures.sources import random_scenes

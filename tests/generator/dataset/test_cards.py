@@ -12,7 +12,8 @@ import pytest
 
 from calibration.citation import NOT_RECORDED, OriginRecord
 from generator.dataset.layouts import CONFORMS_TO, JOINED, OPEN, card, datasheet, kind_of, size_category
-from generator.dataset.making import DatasetOptions, generate_dataset
+from generator.dataset.making import generate_dataset
+from generator.dataset.plan import DatasetOptions
 from generator.dataset.records import Description, Layout, Split
 from generator.pictures.sources import random_scenes
 

@@ -11,7 +11,8 @@ import pytest
 from matplotlib import text
 
 from generator.dataset.contact_sheet import contact_sheet
-from generator.dataset.making import DatasetOptions, generate_dataset
+from generator.dataset.making import generate_dataset
+from generator.dataset.plan import DatasetOptions
 from generator.dataset.reader import Dataset
 from generator.dataset.records import Entry
 from generator.lights.choices import RandomLights

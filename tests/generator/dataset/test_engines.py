@@ -15,8 +15,8 @@ import psutil
 import pytest
 
 from foundation.errors import InputError
-from generator.dataset.making import Callbacks, DatasetOptions, Workers, generate_dataset, parse_engine
-from generator.dataset.shards import SILENT
+from generator.dataset.making import SILENT, Callbacks, Workers, generate_dataset, parse_engine
+from generator.dataset.plan import DatasetOptions
 from generator.lights.choices import RandomLights
 from generator.pictures.sources import find_pictures, random_scenes
 

@@ -17,8 +17,8 @@ from evaluation.datasets.generated import open_generated
 from foundation.errors import FormatError, InputError
 from generator import open_lut, read_picture, render
 from generator.cli import main
-from generator.dataset.making import DatasetOptions, generate_dataset
-from generator.dataset.plan import STRETCHED, Scale, exact_parts, sizes_of
+from generator.dataset.making import generate_dataset
+from generator.dataset.plan import STRETCHED, DatasetOptions, Scale, exact_parts, sizes_of
 from generator.dataset.reader import Dataset, open_dataset
 from generator.files import FULL, from_full_scale, to_full_scale
 from generator.pictures.sources import find_pictures, random_scenes

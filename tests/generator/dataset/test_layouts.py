@@ -23,7 +23,8 @@ import pytest
 from foundation.errors import FormatError, InputError, StorageError
 from generator.command.options import ImageOptions
 from generator.dataset.layouts import JOINED
-from generator.dataset.making import DatasetOptions, generate_dataset
+from generator.dataset.making import generate_dataset
+from generator.dataset.plan import DatasetOptions
 from generator.dataset.reader import Dataset, file_faults, open_dataset
 from generator.dataset.records import COMPLETED_BY_HAND, Layout
 from generator.lights.choices import ListedLights, SimultaneousLights

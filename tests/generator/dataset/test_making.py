@@ -15,12 +15,12 @@ import numpy as np
 import pytest
 
 from foundation.errors import FormatError, InputError
-from generator.dataset.making import Callbacks, DatasetOptions, generate_dataset
+from generator.dataset.making import Callbacks, generate_dataset
+from generator.dataset.plan import DatasetOptions
 from generator.dataset.reader import open_dataset
 from generator.lights.choices import ListedLights, RandomLights
 from generator.lights.lighting import mixture_of
-from generator.pictures.picture import read_picture
-from generator.pictures.sources import find_pictures, random_scenes
+from generator.pictures.sources import find_pictures, random_scenes, read_picture
 from generator.rendering.render import render
 
 pytestmark = pytest.mark.slow

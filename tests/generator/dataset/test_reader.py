@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING
 import pytest
 
 from foundation.errors import FormatError
-from generator.dataset.making import DatasetOptions, generate_dataset
+from generator.dataset.making import generate_dataset
+from generator.dataset.plan import DatasetOptions
 from generator.dataset.reader import open_dataset
 from generator.lights.choices import ListedLights, SimultaneousLights
 from generator.masks.making import parse_masks

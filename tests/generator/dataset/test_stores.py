@@ -21,10 +21,10 @@ from fsspec.implementations.memory import MemoryFileSystem
 from fsspec.registry import register_implementation
 
 from foundation.errors import FormatError, InputError, StorageError
-from generator.dataset.making import DatasetOptions, Plan, finish_dataset, generate_dataset, make_dataset, make_share
+from generator.dataset.making import finish_dataset, generate_dataset, make_dataset, make_elsewhere, make_share
+from generator.dataset.plan import DatasetOptions, Plan
 from generator.dataset.reader import file_faults, open_dataset
 from generator.dataset.records import Layout
-from generator.dataset.shards import make_elsewhere
 from generator.dataset.workplace import workplace
 from generator.lights.choices import ListedLights
 from generator.pictures.sources import find_pictures, random_scenes

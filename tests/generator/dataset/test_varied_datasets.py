@@ -17,12 +17,12 @@ from evaluation.datasets.generated import open_generated
 from evaluation.scene import MixedScene
 from foundation.errors import InputError
 from generator.cli import main
-from generator.dataset.making import DatasetOptions, Workers, generate_dataset
+from generator.dataset.making import Workers, generate_dataset
+from generator.dataset.plan import DatasetOptions
 from generator.dataset.reader import Dataset, file_faults, open_dataset
 from generator.lights.choices import RandomLights, SimultaneousLights
 from generator.masks.making import parse_masks
-from generator.pictures.picture import Preparation, read_picture
-from generator.pictures.sources import find_pictures
+from generator.pictures.sources import Preparation, find_pictures, read_picture
 from generator.rendering.render import render
 from generator.variation.iso_speed import parse_iso
 from generator.variation.variation import Variation, parse_exposure, parse_gradient, varied_by

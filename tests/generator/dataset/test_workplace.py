@@ -18,22 +18,21 @@ import numpy as np
 import pytest
 
 from foundation.errors import FormatError, InputError
-from foundation.folders import FolderLock, held_folder
+from foundation.files import FolderLock, held_folder
 from generator.dataset import layouts as plain_files
-from generator.dataset import shards
+from generator.dataset import making
 from generator.dataset.making import (
+    SILENT,
     Callbacks,
-    DatasetOptions,
-    Plan,
     Workers,
     finish_dataset,
     generate_dataset,
     make_dataset,
     make_share,
 )
+from generator.dataset.plan import DatasetOptions, Plan
 from generator.dataset.reader import Dataset, open_dataset
 from generator.dataset.records import FinishedImage, Layout, ShardRecord
-from generator.dataset.shards import SILENT
 from generator.dataset.workplace import Workplace, workplace
 from generator.lights.choices import ListedLights, RandomLights, SimultaneousLights
 from generator.masks.making import parse_masks
@@ -102,14 +101,14 @@ def made_after(monkeypatch: pytest.MonkeyPatch, call: Callable[[Callbacks], obje
     found: list[int] = []
     reported: list[None] = []
     rendered: list[int] = []
-    photograph = shards.photograph
+    photograph = making.photograph
 
     def noted(*arguments: Any) -> Any:
         rendered.append(arguments[5])
         return photograph(*arguments)
 
     with monkeypatch.context() as patched:
-        patched.setattr(shards, "photograph", noted)
+        patched.setattr(making, "photograph", noted)
         call(Callbacks(on_done=found.append, on_image=lambda: reported.append(None)))
     return sum(found), len(reported), sorted(rendered)
 

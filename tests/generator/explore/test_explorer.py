@@ -16,8 +16,7 @@ from generator.dataset.reader import open_dataset
 from generator.explore.explorer import MOST_DROPPED, Explorer
 from generator.explore.samples import sample_folder
 from generator.lights.gamut import black_body, rb_of
-from generator.pictures.picture import Preparation, read_picture
-from generator.pictures.sources import find_pictures
+from generator.pictures.sources import Preparation, find_pictures, read_picture
 from generator.rendering import Rendering
 from tests.generator.conftest import MakeLut
 from tests.generator.rendering.conftest import MakeTable

@@ -19,9 +19,8 @@ from generator.explore.explorer import Explorer
 from generator.explore.server import ExploreServer
 from generator.lights.gamut import rb_of
 from generator.lights.lighting import parse_mixture
-from generator.pictures.picture import Preparation
 from generator.pictures.preview import flash
-from generator.pictures.sources import find_pictures
+from generator.pictures.sources import Preparation, find_pictures
 from tests.acquisition.monitor.browser import (
     NAMELESS,
     OUTSIDE,

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from foundation.errors import FormatError, InputError
-from generator.pictures.picture import Preparation, open_picture, random_places
+from generator.pictures.sources import Preparation, open_picture, random_places
 
 
 @pytest.fixture

@@ -24,9 +24,8 @@ from hypothesis import strategies as st
 from PIL import Image, ImageCms, features
 
 from foundation.errors import FormatError, InputError
-from generator.pictures import picture
-from generator.pictures.picture import Preparation, open_picture, read_picture, to_srgb
-from generator.pictures.sources import find_pictures
+from generator.pictures import sources
+from generator.pictures.sources import Preparation, find_pictures, open_picture, read_picture, to_srgb
 from tests.generator.pictures.icc import gamma_profile
 from tests.generator.pictures.oiio_files import write
 
@@ -358,10 +357,10 @@ def test_white_shows_through(tmp_path: Path, suffix: str) -> None:
 
 
 def test_white_shows_through_a_gif(tmp_path: Path) -> None:
-    picture = Image.new("P", (3, 1))
-    picture.putpalette([200, 10, 0, 0, 90, 7])
-    picture.putdata([0, 1, 0])
-    picture.save(tmp_path / "clear.gif", transparency=0)
+    sources = Image.new("P", (3, 1))
+    sources.putpalette([200, 10, 0, 0, 90, 7])
+    sources.putdata([0, 1, 0])
+    sources.save(tmp_path / "clear.gif", transparency=0)
     np.testing.assert_array_equal(read_picture(tmp_path / "clear.gif"), [[[255] * 3, [0, 90, 7], [255] * 3]])
 
 
@@ -398,8 +397,8 @@ def test_floating_point_is_linear_light(tmp_path: Path) -> None:
 
 def test_transparent_light_is_mixed_with_white_as_light(tmp_path: Path) -> None:
     half = np.array([[[0.25, 0.0, 0.0, 0.5]]], np.float32)  # associated: red 0.5 at half coverage
-    picture = read_picture(write(tmp_path / "clear.exr", half, "float"))
-    np.testing.assert_array_equal(picture[0, 0], [225, 188, 188])  # codes of 0.75, 0.5, 0.5
+    sources = read_picture(write(tmp_path / "clear.exr", half, "float"))
+    np.testing.assert_array_equal(sources[0, 0], [225, 188, 188])  # codes of 0.75, 0.5, 0.5
 
 
 @pytest.mark.parametrize("orientation", range(1, 9))
@@ -462,6 +461,6 @@ def test_a_picture_larger_than_any_is_named(
     tmp_path: Path, colours: npt.NDArray[np.uint8], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = write(tmp_path / "huge.png", colours, "uint8")
-    monkeypatch.setattr(picture, "LARGEST_PICTURE", 7 * 5 - 1)
+    monkeypatch.setattr(sources, "LARGEST_PICTURE", 7 * 5 - 1)
     with pytest.raises(FormatError, match=r"huge\.png: 7x5 px are more than 34; make it smaller"):
         read_picture(path)

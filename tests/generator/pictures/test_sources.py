@@ -16,8 +16,7 @@ import pytest
 
 from foundation.errors import FormatError, InputError, StorageError
 from generator.pictures import sources as scene
-from generator.pictures.picture import Preparation
-from generator.pictures.sources import PictureFile, RandomScene, find_pictures, random_scenes
+from generator.pictures.sources import PictureFile, Preparation, RandomScene, find_pictures, random_scenes
 from generator.stores import filesystem
 from tests.generator.pictures.oiio_files import write
 

@@ -17,8 +17,7 @@ from hypothesis import strategies as st
 
 from foundation.errors import FormatError, InputError
 from generator.lights.lighting import Mixture
-from generator.pictures.picture import Picture
-from generator.pictures.sources import random_scenes
+from generator.pictures.sources import Picture, random_scenes
 from generator.rendering import Rendering
 from generator.rendering.black_points import BlackPoint, veil_of
 from generator.rendering.colorimetric import ColorimetricRendering

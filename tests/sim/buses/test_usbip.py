@@ -19,12 +19,12 @@ from drivers.links.link import Pipe, PipeStalled
 from drivers.links.network import TcpServer
 from drivers.ptp.protocol import DeviceInfo, PtpRequest, PtpResponse
 from drivers.ptp.usb import ContainerReader, DataPiece, DataStart, UsbTransport, encode
+from foundation.clock import SimulatedClock
 from foundation.errors import LinkClosed, LinkTimeout, ProtocolError
 from sim.buses.usb import BULK_IN, BULK_OUT, INTERRUPT_IN, PtpUsbDevice, UsbIdentity
 from sim.buses.usbip import ImportRequest, RequestReader, Submit, Unlink, UsbIpService, serve_usbip
 from sim.camera.bodies import EOS_550D
 from sim.camera.eos import SimulatedEos
-from sim.clock import SimulatedClock
 from tests.contracts.camera import SeededFilm
 from tests.contracts.transport import GIVE, HANG, PATIENCE_S, RAISE, Bench, Echo, TransportContract, payload
 from tests.joined_links import JoinedLink, joined_links

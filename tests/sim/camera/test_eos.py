@@ -59,11 +59,11 @@ from drivers.ptp.protocol import (
     decode_value,
     encode_string,
 )
+from foundation.clock import OPENING, SimulatedClock
 from foundation.errors import DeviceRefused, LinkClosed
 from sim.buses.usb import MemoryTransport
 from sim.camera.bodies import EOS_6D_MARK_II, EOS_550D, EOS_550D_AS_LISTED, EOS_BODIES, TEST_BODY, EosModel
 from sim.camera.eos import CARD, DCIM, EMPTY_SLOT, FOLDER, SimulatedEos
-from sim.clock import OPENING, SimulatedClock
 from tests.drivers.ptp.conversations import EOS_60D_PROPERTIES, Recorded, conversations, read_description, transcript
 
 REAL = {"the transcript": transcript} | {name: make for name, make in conversations().items() if name == "EOS 60D"}

@@ -21,7 +21,7 @@ from pypjlink.projector import ProjectorError
 from drivers.links.network import TcpServer
 from drivers.pjlink import NoResolution
 from drivers.projector import Power, Severity
-from sim.clock import SimulatedClock
+from foundation.clock import SimulatedClock
 from sim.projectors.pjlink import serve_pjlink
 from sim.projectors.projector import ProjectorTraits, SimulatedProjector
 

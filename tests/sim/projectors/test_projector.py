@@ -9,8 +9,8 @@ import pytest
 from drivers.links.network import UdpSocket
 from drivers.pjlink import NoResolution, PjLinkReply, search
 from drivers.projector import Power, Severity
+from foundation.clock import SimulatedClock
 from foundation.errors import DeviceFault, LinkTimeout
-from sim.clock import SimulatedClock
 from sim.projectors.pjlink import Announcer, PjLinkPeer, ProjectorDatagrams
 from sim.projectors.projector import ProjectorTraits, SimulatedProjector
 from tests.contracts.projector import Bench, ProjectorContract

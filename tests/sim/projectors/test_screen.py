@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from sim.clock import SimulatedClock
+from foundation.clock import SimulatedClock
 from sim.projectors.projector import Screen, SimulatedPresenter
 from tests.contracts.presenter import Bench, PresenterContract
 

@@ -23,9 +23,9 @@ from drivers.projector import Power, Severity
 from drivers.serial_projectors import LANGUAGES
 from drivers.serial_projectors.benq import BenqProjector
 from drivers.serial_projectors.epson import EpsonOnNetwork, EpsonProjector
+from foundation.clock import SimulatedClock
 from sim.buses.serial import PseudoTerminal
 from sim.cli import main
-from sim.clock import SimulatedClock
 from sim.projectors.projector import ProjectorTraits, SimulatedProjector
 from sim.projectors.serial import PEERS, SERIAL_NUMBER, BenqPeer, EpsonPeer, OptomaPeer
 

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from drivers.links.link import PeerLink
 from drivers.pjlink import Input, PjLinkProjector
 from drivers.projector import Power
+from foundation.clock import SimulatedClock
 from foundation.errors import DeviceError, DeviceRefused, InputError, LinkClosed
-from sim.clock import SimulatedClock
 from sim.projectors.pjlink import PjLinkPeer
 from sim.projectors.projector import ProjectorTraits, SimulatedProjector
 from sim.projectors.watching import (

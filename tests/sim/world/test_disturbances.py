@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 
 from drivers.presenter import BLACK, WHITE, Colour
 from drivers.raw.rawfile import read_raw
+from foundation.clock import OPENING
 from foundation.errors import ConfigurationError
 from sim.camera.film import WorldFilm
-from sim.clock import OPENING
 from sim.world.disturbances import (
     KINDS,
     OVERSCAN,

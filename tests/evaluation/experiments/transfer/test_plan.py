@@ -27,13 +27,13 @@ from evaluation.experiments.transfer.plan import (
 )
 from evaluation.scene import MixedScene, SceneSet
 from foundation.errors import FormatError, InputError
-from generator.dataset.making import DatasetOptions, generate_dataset
+from generator.dataset.making import generate_dataset
+from generator.dataset.plan import DatasetOptions
 from generator.dataset.reader import Dataset
 from generator.lights.choices import ListedLights, SimultaneousLights
 from generator.lights.lighting import mixture_of
 from generator.masks.making import parse_masks
-from generator.pictures.picture import Preparation
-from generator.pictures.sources import random_scenes
+from generator.pictures.sources import Preparation, random_scenes
 from generator.rendering.matrices import ColourMatrix
 from tests.evaluation.experiments.transfer.conftest import BOTH, LIGHTS, Maker, save_pictures, write_table
 
