@@ -684,7 +684,7 @@ def _plain(value: float | str) -> str:
 
 def _source_row(source: SourceRecord) -> str:
     known = (source.position, source.name, source.sha256 or "", source.width, source.height, source.replaced_pixels)
-    return _row((*known, source.split or "", source.profile or ""))
+    return _row((*known, source.split or "", source.profile or "", source.note or ""))
 
 
 def _image_rows(name: str, source: str, image: ImageRecord, stated: Mapping[int, Light] | None) -> str:

@@ -6,7 +6,7 @@
     ground_truth.csv     image,source,illumination,r,g,b with r + g + b = 1, one row a light
     gt.txt               r g b a line in image order: the mean of the lights over the image
     images.csv           where options do something to each image: what they did to it
-    sources.csv          position,name,sha256,width,height,replaced_pixels,split,profile
+    sources.csv          position,name,sha256,width,height,replaced_pixels,split,profile,note
     splits/train.txt …   names of images, where the dataset was divided
     dataset.json         the table's hash, seed, options: enough to make every byte again
     SHA256SUMS           hashes of all files; `sha256sum -c SHA256SUMS` verifies them

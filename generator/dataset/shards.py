@@ -57,6 +57,9 @@ if TYPE_CHECKING:
 
 _threads: Final = threading.local()
 
+TINY_PX: Final = 16
+"""A shorter side below which a picture is noted: icons and failed downloads are so small, photographs never are."""
+
 
 def photograph(
     lut: Lut,
@@ -448,6 +451,11 @@ def _read(job: ShardJob, lut: Lut, place: int, finished: Mapping[int, FinishedIm
             f"{source.name} is {width}x{height} px, too small for {job.options.form}, which takes {least}x{least} and "
             "more; choose another format, or leave it out"
         )
+    notes = [*scene.notes]
+    if min(height, width) < TINY_PX:
+        notes.append(f"tiny, {width}x{height} px")
+    if not all(cut.picture.any() for cut in whole):
+        notes.append("all black")
     record = SourceRecord(
         position=job.position + place,
         name=source.name,
@@ -457,6 +465,7 @@ def _read(job: ShardJob, lut: Lut, place: int, finished: Mapping[int, FinishedIm
         height=height,
         replaced_pixels=sum(replaced for _, replaced in fit),
         split=job.parts[place] if job.parts else split_of(job.options.split, job.seed, scene.sha256, source.name),
+        note="; ".join(notes) or None,
         weight=scene.weight,
     )
     cuts = tuple(replace(cut, picture=picture) for cut, (picture, _) in zip(whole, fit, strict=True))

@@ -132,6 +132,11 @@ ASSUMED: Final = "none, taken as sRGB"
 ADOBE_RGB: Final = "Adobe RGB (1998) by EXIF, converted to sRGB"
 """Remark on a picture that a camera made in that space."""
 
+LINEAR: Final = "floating-point values, taken as linear light"
+TRANSPARENT: Final = "transparent, composited on white"
+PROFILE_UNUSED: Final = "colour profile not applied"
+"""Notes on a picture, for its row of the dataset's list of sources."""
+
 _PROBE_STEPS: Final = 9
 """Codes of each channel, every 32nd, of the grid of 729 colours that shows whether a profile is sRGB."""
 _ADOBE_GAMMA: Final = 563 / 256
@@ -381,11 +386,13 @@ class Reading:
     - `picture`: (H, W, 3) uint8, sRGB codes; of several crops the first.
     - `profile`: how its colour profile was treated, in words, such as ``"Display P3, converted to sRGB"``.
     - `cuts`: the crops, where several were asked for.
+    - `notes`: what else of the file was not plain sRGB codes and may look unlike what its owner expects.
     """
 
     picture: Picture
     profile: str
     cuts: tuple[Cut, ...] = ()
+    notes: tuple[str, ...] = ()
 
 
 def read_picture(path: Path | str, max_side: int | None = None) -> Picture:
@@ -462,9 +469,16 @@ def open_picture(
         codes, word = to_srgb(codes, values.icc)
     else:
         codes, word = from_adobe_rgb(codes), ADOBE_RGB
+    honoured = values.icc is not None and preparation.profiles == "honour"
+    noted = {
+        LINEAR: values.linear,
+        TRANSPARENT: values.alpha is not None,
+        PROFILE_UNUSED: honoured and word.endswith("taken as sRGB"),
+    }
     codes = _turn(codes, values.orientation)
     cuts = _fit(codes, preparation, path, path.name if name is None else name)
-    return Reading(cuts[0].picture, word, cuts if preparation.crops > 1 else ())
+    notes = tuple(note for note, holds in noted.items() if holds)
+    return Reading(cuts[0].picture, word, cuts if preparation.crops > 1 else (), notes)
 
 
 @dataclass(frozen=True, eq=False, slots=True)

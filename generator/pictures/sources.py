@@ -57,6 +57,7 @@ class SourcePicture:
     - `cuts`: the crops, where several were asked for.
     - `weight`: by which it was drawn; None where pictures were not drawn by weights.
     - `black_taken`: share of the print's black, 0 … 1, that is taken out of its images; None where options say it.
+    - `notes`: as those of `picture.Reading`.
     """
 
     picture: Picture
@@ -65,6 +66,7 @@ class SourcePicture:
     cuts: tuple[Cut, ...] = ()
     weight: float | None = None
     black_taken: float | None = None
+    notes: tuple[str, ...] = ()
 
 
 class Source(Protocol):
@@ -132,7 +134,7 @@ class PictureFile:
                 raise InputError(
                     f"there is not enough memory to read {self.location}; use fewer workers, or leave it out"
                 ) from error
-        return SourcePicture(reading.picture, sha256, reading.profile, reading.cuts)
+        return SourcePicture(reading.picture, sha256, reading.profile, reading.cuts, notes=reading.notes)
 
 
 def hash_since(source: Source, moment: float) -> str | None:

@@ -25,7 +25,7 @@ from PIL import Image, ImageCms, features
 
 from foundation.errors import FormatError, InputError
 from generator.pictures import picture
-from generator.pictures.picture import Preparation, open_picture, read_picture, to_srgb
+from generator.pictures.picture import PROFILE_UNUSED, Preparation, open_picture, read_picture, to_srgb
 from generator.pictures.sources import find_pictures
 from tests.generator.pictures.icc import gamma_profile
 from tests.generator.pictures.oiio_files import write
@@ -112,6 +112,7 @@ def test_a_profile_that_the_reader_drops_is_noted(tmp_path: Path, dull: Codes, p
     reading = open_picture(path)
     np.testing.assert_array_equal(reading.picture, dull)
     assert reading.profile.startswith("damaged")
+    assert reading.notes == (PROFILE_UNUSED,)
     path.write_bytes(png_with(path, dull, zlib.compress(ADOBE_RGB)))
     assert open_picture(path).profile.endswith("converted to sRGB")
 
