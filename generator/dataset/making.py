@@ -66,8 +66,8 @@ from generator.dataset.workplace import (
     workplace,
 )
 from generator.files import suffix_of
-from generator.lights.choices import ListedLights
-from generator.lights.lighting import LightChoice
+from generator.lights.choices import listed_lights
+from generator.lights.lighting import LightChoice, Mixture
 from generator.pictures.sources import hash_since
 from generator.stores import DESCRIPTION, Store, is_remote, local_path, open_store
 
@@ -326,7 +326,7 @@ def generate_dataset(
     lut: Lut,
     out: Path | str,
     sources: Sequence[Source],
-    lights: LightChoice | Sequence[int],
+    lights: LightChoice | Sequence[int | str | Mixture],
     *,
     seed: int = 0,
     options: DatasetOptions | None = None,
@@ -345,8 +345,9 @@ def generate_dataset(
     sources
         The pictures; see `generator.pictures.sources`.
     lights
-        Which lights fall on which picture; see `generator.lights.choices`. A sequence of numbers of the table's lights
-        is the same for every picture.
+        The same lights for every picture, each a number in the table, a text as the command's ``--light`` takes it
+        (``"5600K"``, ``"D65"``, ``"12:0.25+40:0.75"``), or a mixture; or a choice of `generator.lights.choices`, which
+        says which lights fall on which picture.
     seed
         0 … 2⁶⁴ − 1; chooses the samples of every pixel.
     options
@@ -381,7 +382,7 @@ def generate_dataset(
     ...     [(entry.image, entry.source, entry.illumination) for entry in made.entries]
     [('000000.tiff', 'cat.png', '0'), ('000001.tiff', 'cat.png', '3')]
     """
-    choice: LightChoice = lights if isinstance(lights, LightChoice) else ListedLights(tuple(lights))
+    choice: LightChoice = lights if isinstance(lights, LightChoice) else listed_lights(lights, lut)
     plan = Plan(lut, sources, choice, seed, options or DatasetOptions())
     return make_dataset(plan, out, workers if isinstance(workers, Workers) else Workers(count=workers), callbacks)
 

@@ -36,7 +36,7 @@ import numpy.typing as npt
 from pydantic import ValidationError
 
 from foundation.compiled import ordered_map
-from foundation.errors import FormatError, InputError
+from foundation.errors import FormatError, InputError, counted
 from foundation.files import stream_sha256
 from foundation.folders import MOST_JSON_BYTES, bounded_lines, is_inside_name, parse_json_object
 from generator.dataset.layouts import JOINED, member_name, read_member
@@ -280,6 +280,10 @@ class Dataset:
     store: Store
     description: Description
     entries: tuple[Entry, ...]
+
+    def __repr__(self) -> str:
+        """Return one line: a dataset has an entry for each of its images."""
+        return f"Dataset({self.store.place!r}, {counted(self.description.images, 'image')}, layout {self.layout})"
 
     def read_image(self, entry: Entry) -> npt.NDArray[np.uint16]:
         """Return the image (H, W, 3) uint16, linear camera RGB, `description.table.white_level` = saturation.
