@@ -330,9 +330,9 @@ def light_of(given: int | str | Mixture, lut: Lut) -> Mixture:
     return plain(known_light(lut, given))
 
 
-def listed_lights(given: Iterable[int | str | Mixture], lut: Lut) -> ListedLights:
+def listed_lights(given: Iterable[int | str | Mixture] | str | float | Mixture, lut: Lut) -> ListedLights:
     """Return the same lights for every picture, each given as `light_of` takes it."""
-    if isinstance(given, str) or not isinstance(given, Iterable):
+    if isinstance(given, str | int | float | Mixture):
         raise InputError(f"the lights are {kind_of(given)}, expected a list, such as [0, 3] or ['D65']")
     # Numbers stay numbers: a dataset is the same by whatever way its lights were given.
     return ListedLights(
