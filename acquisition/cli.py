@@ -24,7 +24,7 @@ from foundation.console import (
     orderly_end,
     with_json,
 )
-from foundation.errors import DeviceError, InputError, QualityError, StorageError, first_of
+from foundation.errors import DeviceError, InputError, QualityError, StorageError, counted, first_of
 
 if TYPE_CHECKING:
     from experiment.config import LabSettings
@@ -291,8 +291,10 @@ def check(
             print(line)
         if picture is not None:
             print(f"picture     {picture}")
-    if report.faults:
-        raise QualityError("; ".join(report.faults))
+    if faults := [finding.name for finding in report.of("fault")]:
+        raise QualityError(
+            f"{counted(len(faults), 'fault')}: {', '.join(faults)}", remedy="the verdicts say what mends it"
+        )
 
 
 @app.command(epilog=EXIT_CODES)
