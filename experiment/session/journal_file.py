@@ -31,7 +31,7 @@ from pathlib import Path
 from typing import Final, TypeVar
 from urllib.parse import quote
 
-from foundation.errors import FormatError, InputError, StorageError
+from foundation.errors import RUN_AGAIN, FormatError, InputError, StorageError
 from foundation.files import disk_remedy_of, partial_path, storage_error, sync_folder
 from foundation.files import reading_error as file_reading_error
 from foundation.folders import is_inside_name, require_plain_folder
@@ -432,8 +432,7 @@ def reading_error(path: Path, error: OSError | sqlite3.DatabaseError) -> FormatE
         return file_reading_error(path, fault, "check the permissions of its folder")
     if failed or (_is_damage(error) and _is_sound(path)):
         return StorageError(
-            f"cannot read {path}: {error}, and its disk did not say why; check the disk and its cable, then run the "
-            "same command again"
+            f"cannot read {path}: {error}, and its disk did not say why; check the disk and its cable, {RUN_AGAIN}"
         )
     if not _is_damage(error):
         return FormatError(f"cannot read {path}: {error}; check its permissions and the disk")
@@ -457,7 +456,7 @@ def writing_error(path: Path, error: sqlite3.DatabaseError) -> FormatError | Inp
         return FormatError(f"{path} is damaged: {error}; {restoring(path)}")
     else:
         remedy = "check the disk and its cable"
-    return StorageError(f"cannot write {path}: {error}; {remedy}, then run the same command again")
+    return StorageError(f"cannot write {path}: {error}; {remedy}, {RUN_AGAIN}")
 
 
 def _disk_fault(path: Path) -> OSError | None:
