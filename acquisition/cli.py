@@ -24,7 +24,7 @@ from foundation.console import (
     orderly_end,
     with_json,
 )
-from foundation.errors import DeviceError, InputError, QualityError, StorageError, first_of
+from foundation.errors import DeviceError, InputError, QualityError, StorageError, counted, first_of
 
 if TYPE_CHECKING:
     from experiment.config import LabSettings
@@ -291,8 +291,10 @@ def check(
             print(line)
         if picture is not None:
             print(f"picture     {picture}")
-    if report.faults:
-        raise QualityError("; ".join(report.faults))
+    if faults := [finding.name for finding in report.of("fault")]:
+        raise QualityError(
+            f"{counted(len(faults), 'fault')}: {', '.join(faults)}", remedy="the verdicts say what mends it"
+        )
 
 
 @app.command(epilog=EXIT_CODES)
@@ -379,18 +381,18 @@ def status(
 
     Reads SESSION, also while it is being taken; writes nothing. Ends with 0 when a run is at work, or the session is
     complete. Ends with 3 when a step of the run is late, no sign of life came in its time, it is paused for a device or
-    ended for one, or it was killed; with 4 when it is paused for its frames, or ended with frames left; with 5 when its
-    disk is full or at fault.
+    ended for one, or it was killed; with 4 when it is paused for its frames, or ended with frames left, or its files,
+    chart or lights are lost; with 5 when its disk is full or at fault.
     """
     from datetime import UTC, datetime
 
-    from acquisition.monitor.view import read_session
-    from acquisition.status import status_json, status_lines
+    from acquisition.status import read_status, status_json, status_lines
     from experiment.session.folder import journal_path
     from experiment.session.repair import secrets_warning
 
     journal_path(session)
-    view, now = read_session(session), datetime.now(UTC)
+    now = datetime.now(UTC)
+    view = read_status(session, now)
     if told.asked:
         told.add(**status_json(view, now))
     else:

@@ -28,7 +28,7 @@ from typing import TYPE_CHECKING, BinaryIO
 
 from drivers.camera import CameraIdentity, CapturedFrame, ExposureSettings, Supplies
 from foundation.clock import Clock, SystemClock
-from foundation.errors import ConfigurationError, DeviceError, DeviceRefused, LinkClosed, LinkTimeout
+from foundation.errors import RUN_AGAIN, ConfigurationError, DeviceError, DeviceRefused, LinkClosed, LinkTimeout
 
 if TYPE_CHECKING:
     import gphoto2
@@ -473,7 +473,7 @@ def _translated(error: gphoto2.GPhoto2Error, label: str) -> DeviceError:
         case gp.GP_ERROR_IO | gp.GP_ERROR_IO_READ | gp.GP_ERROR_IO_WRITE | gp.GP_ERROR_IO_INIT:
             return LinkClosed(f"{what}; check the cable and the USB permission, switch the camera off and on")
         case _:
-            return DeviceError(f"{what}; switch the camera off and on, then run again")
+            return DeviceError(f"{what}; switch the camera off and on, {RUN_AGAIN}")
 
 
 def _text(camera: gphoto2.Camera, names: Iterable[str]) -> str:

@@ -11,7 +11,7 @@ import os
 import re
 import shlex
 import tomllib
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, TypeVar, cast
 from urllib.parse import urlsplit
@@ -436,14 +436,15 @@ def checked(kind: type[_AnySettings], document: dict[str, Any], where: str) -> _
         return kind.model_validate(document)
     except ValidationError as error:
         found = [_mistake(kind, one) for one in error.errors()]
-        listed = (
-            f" {found[0]}"
-            if len(found) == 1
-            else "".join([f" {len(found)} mistakes:", *(f"\n  {one}" for one in found)])
-        )
         # The cause has the values, too.
         secret = any(_is_secret(_key_of(one)) for one in error.errors())
-        raise ConfigurationError(f"{where}:{listed}") from (None if secret else error)
+        raise ConfigurationError(f"{where}:{_listed(found)}") from (None if secret else error)
+
+
+def _listed(found: Sequence[str]) -> str:
+    """Return one mistake behind a space, several on lines of their own."""
+    several = [f" {len(found)} mistakes:", *(f"\n  {one}" for one in found)]
+    return f" {found[0]}" if len(found) == 1 else "".join(several)
 
 
 def _key_of(error: ErrorDetails) -> str:
@@ -525,6 +526,7 @@ def _look_up_secrets(document: dict[str, Any], folder: Path, where: str) -> None
 
     A password of devices that this rig does not have is left out: nobody has to know it to rehearse a session.
     """
+    missing: list[ConfigurationError] = []
     for key in _SECRETS:
         *tables, last = key.split(".")
         holder: Any = document
@@ -535,18 +537,23 @@ def _look_up_secrets(document: dict[str, Any], folder: Path, where: str) -> None
             place = cast("dict[str, Any]", found)
             if tables[0] == "lab" and document.get("rig") != "lab":
                 del holder[last]
-            else:
-                holder[last] = _found_secret(key, place, folder, where)
+                continue
+            try:
+                holder[last] = _found_secret(key, place, folder)
+            except ConfigurationError as error:
+                missing.append(error)
+    if missing:
+        raise ConfigurationError(f"{where}:{_listed([str(one) for one in missing])}") from missing[0]
 
 
-def _found_secret(key: str, place: dict[str, Any], folder: Path, where: str) -> str:
+def _found_secret(key: str, place: dict[str, Any], folder: Path) -> str:
     """Return the secret of a key from an environment variable, or the first line of a file."""
     match place:
         case {"env": str(name), **more} if not more:
             secret = os.environ.get(name, "")
             if not secret:
                 raise ConfigurationError(
-                    f"{where}: {key}: the environment has no {name}; set it for this command, as in: "
+                    f"{key}: the environment has no {name}; set it for this command, as in: "
                     f"read -rs {name} && export {name}"
                 )
         case {"file": str(name), **more} if not more:
@@ -554,20 +561,17 @@ def _found_secret(key: str, place: dict[str, Any], folder: Path, where: str) -> 
             try:
                 # Neither a device nor a pipe: these never end.
                 if path.exists() and not path.is_file():
-                    raise ConfigurationError(f"{where}: {key}: {path} is no file; name one that holds the secret alone")
+                    raise ConfigurationError(f"{key}: {path} is no file; name one that holds the secret alone")
                 with path.open(encoding="utf-8-sig") as stream:
                     secret = stream.read(_SECRET_BYTES).partition("\n")[0].strip()
             except (OSError, UnicodeDecodeError, ValueError) as error:
                 reason = (error.strerror if isinstance(error, OSError) else None) or "it is no text"
-                raise ConfigurationError(
-                    f"{where}: {key}: cannot read {path}: {reason}; name a readable file"
-                ) from error
+                raise ConfigurationError(f"{key}: cannot read {path}: {reason}; name a readable file") from error
             if not secret:
-                raise ConfigurationError(f"{where}: {key}: the first line of {path} is empty; write the secret there")
+                raise ConfigurationError(f"{key}: the first line of {path} is empty; write the secret there")
         case _:
             raise ConfigurationError(
-                f'{where}: {key}: expected the text itself, {{ env = "NAME" }} or {{ file = "PATH" }}, '
-                "and nothing beside"
+                f'{key}: expected the text itself, {{ env = "NAME" }} or {{ file = "PATH" }}, and nothing beside'
             )
     return secret
 

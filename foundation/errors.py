@@ -28,12 +28,16 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Sequence
 from pathlib import PurePath
+from typing import Final
 
 from foundation.secret_texts import masked
 
 EXIT_INTERRUPTED = 130
 """Exit code of a command that Ctrl-C ended; 128 + SIGINT, as shells have it."""
 
+
+RUN_AGAIN: Final = "then run the same command again"
+"""What ends a remedy that a command did not wait for; one that waits goes on by itself (`CropError.while_waiting`)."""
 
 _LONGEST = 8000
 """Longest sentence of an error: names and values that stand in it may be a stranger's, and as long as he likes."""
@@ -49,7 +53,8 @@ class CropError(Exception):
     about
         File, folder or device that it is about: the sentence begins with it. None where the problem names it.
     remedy
-        What to do, an imperative: the sentence ends with it. "" where the problem says it.
+        What to do, an imperative: the sentence ends with it. Where it is not given apart, it is what stands behind the
+        first semicolon of the problem; "" where nothing does.
     value, expected
         What was found and what should have been, for programs; the problem says both in words.
 
@@ -72,12 +77,25 @@ class CropError(Exception):
     ) -> None:
         super().__init__(problem)
         self.problem, self.remedy = problem, remedy
+        if not remedy:
+            self.problem, _, self.remedy = problem.partition("; ")
         self.about, self.value, self.expected = about, value, expected
 
     def __str__(self) -> str:
         """Return the sentence, users, passwords and tokens of addresses in it masked; cut where it has no end."""
+        return self._sentence(self.remedy)
+
+    def without_remedy(self) -> str:
+        """Return the sentence up to its remedy: what is wrong."""
+        return self._sentence("")
+
+    def while_waiting(self) -> str:
+        """Return the sentence for where the command waits and goes on by itself: without the order to run it again."""
+        return self._sentence(self.remedy.removesuffix(RUN_AGAIN).rstrip(" ,;"))
+
+    def _sentence(self, remedy: str) -> str:
         begin = "" if self.about is None else f"{self.about}: "
-        text = masked(f"{begin}{self.problem}{f'; {self.remedy}' if self.remedy else ''}")
+        text = masked(f"{begin}{self.problem}{f'; {remedy}' if remedy else ''}")
         return text if len(text) <= _LONGEST else f"{text[: _LONGEST // 2]} … {text[-_LONGEST // 4 :]}"
 
 

@@ -39,7 +39,7 @@ from io import BufferedRandom
 from pathlib import Path
 from typing import Any, BinaryIO, Final, TypeGuard, cast
 
-from foundation.errors import FormatError, InputError, StorageError
+from foundation.errors import RUN_AGAIN, FormatError, InputError, StorageError
 
 _PARTIAL = ".partial"
 _A_LINK = "it is a link to a place that is not there: make or mount that place, or name another"
@@ -52,29 +52,28 @@ _REMEDIES = {
     errno.ENAMETOOLONG: "name it shorter",
     errno.ELOOP: "links there lead in a circle; name the place that is meant",
 }
-_AGAIN = "then run the same command again"
-_GONE = f"the disk is gone: connect and mount it, {_AGAIN}"
-_SERVER = f"the server of that folder does not answer: see to the network and to the server, {_AGAIN}"
+_GONE = f"the disk is gone: connect and mount it, {RUN_AGAIN}"
+_SERVER = f"the server of that folder does not answer: see to the network and to the server, {RUN_AGAIN}"
 _DISK_REMEDIES = {
-    "ENOSPC": f"free space or choose another disk, {_AGAIN}",
-    "EDQUOT": f"what this user may use of the disk is used up: remove files there, or ask for more, {_AGAIN}",
-    "EFBIG": f"no file may be so large there (FAT32 ends at 4 GiB; ulimit -f): choose another disk, {_AGAIN}",
-    "EROFS": f"name another place, or mount it for writing (dmesg says if it was errors), {_AGAIN}",
+    "ENOSPC": f"free space or choose another disk, {RUN_AGAIN}",
+    "EDQUOT": f"what this user may use of the disk is used up: remove files there, or ask for more, {RUN_AGAIN}",
+    "EFBIG": f"no file may be so large there (FAT32 ends at 4 GiB; ulimit -f): choose another disk, {RUN_AGAIN}",
+    "EROFS": f"name another place, or mount it for writing (dmesg says if it was errors), {RUN_AGAIN}",
     "EIO": (
         "the disk fails: see what dmesg says, check its cable, copy what is on it to another while it can be read, "
-        f"{_AGAIN}"
+        f"{RUN_AGAIN}"
     ),
     "ENODEV": _GONE,
     "ENXIO": _GONE,
     "ENOMEDIUM": _GONE,
-    "ENOENT": f"its folder is gone: connect and mount the disk it was on, {_AGAIN}",
-    "ESTALE": f"the folder was taken away or mounted anew on its server: mount it again here, {_AGAIN}",
+    "ENOENT": f"its folder is gone: connect and mount the disk it was on, {RUN_AGAIN}",
+    "ESTALE": f"the folder was taken away or mounted anew on its server: mount it again here, {RUN_AGAIN}",
     "ENOTCONN": _SERVER,
     "EREMOTEIO": _SERVER,
     "EHOSTDOWN": _SERVER,
-    "EUCLEAN": f"the file system is damaged: unmount it and have it checked (fsck), {_AGAIN}",
-    "EMFILE": f"close other programs, or allow more open files (ulimit -n), {_AGAIN}",
-    "ENFILE": f"close other programs, {_AGAIN}",
+    "EUCLEAN": f"the file system is damaged: unmount it and have it checked (fsck), {RUN_AGAIN}",
+    "EMFILE": f"close other programs, or allow more open files (ulimit -n), {RUN_AGAIN}",
+    "ENFILE": f"close other programs, {RUN_AGAIN}",
 }
 """What helps against each fault of a disk, by the names of errno(3); not every system knows all of them."""
 _DISK_FAULTS = {getattr(errno, name): remedy for name, remedy in _DISK_REMEDIES.items() if hasattr(errno, name)}
@@ -134,7 +133,7 @@ def storage_error(path: Path, error: OSError, what: str = "write") -> InputError
     by_name = remedy is not None and not isinstance(error, PermissionError)
     return (InputError if by_name else StorageError)(
         f"cannot {what} {path}: {error.strerror or error}; "
-        f"{remedy or disk_remedy_of(error) or f'see to the disk, or choose another, {_AGAIN}'}"
+        f"{remedy or disk_remedy_of(error) or f'see to the disk, or choose another, {RUN_AGAIN}'}"
     )
 
 

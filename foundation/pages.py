@@ -24,6 +24,9 @@ from markupsafe import Markup, escape
 _INTERVAL = re.compile(r"(?<=\d) – (?=[-−]?\d)")
 """What stands between the ends of an interval in a table's cell."""
 
+_OPTION = re.compile(r"(?<![\w-])--[a-z][\w-]*")
+"""An option of a command, in escaped text: browsers break lines behind each hyphen, so that `-` ends up by itself."""
+
 
 @dataclass(frozen=True)
 class RenderedPage:
@@ -160,7 +163,8 @@ def _hash(text: str) -> str:
 
 
 def _unbroken(text: str) -> Markup:
-    return Markup(_INTERVAL.sub("\u00a0–\u00a0", escape(text)))
+    """Return a text whose intervals and options of commands stay on one line; as it was where it is copied."""
+    return Markup(_OPTION.sub(r"<span class='option'>\g<0></span>", _INTERVAL.sub("\u00a0–\u00a0", str(escape(text)))))
 
 
 def _element(picture: bytes, alt: str) -> Markup:

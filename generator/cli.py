@@ -293,6 +293,7 @@ def _print_summary(dataset: Dataset, out: str, output: JsonOutput, was_there: bo
     lights = len({light for entry in dataset.entries for light in entry.lights})
     # A picture that was drawn several times is a source each time; one that was made and not read has no hash.
     different = len({source.sha256 or source.name for source in dataset.sources})
+    noted = [source for source in dataset.sources if source.note]
     pictures = _counted(made.sources, "picture")
     if different < made.sources:
         pictures += f", {different} of them different,"
@@ -306,6 +307,7 @@ def _print_summary(dataset: Dataset, out: str, output: JsonOutput, was_there: bo
         lights=lights,
         splits=made.splits,
         skipped=[skipped.name for skipped in made.skipped],
+        noted=len(noted),
         pixels=made.pixels,
         replaced_pixels=made.replaced_pixels,
         rendering=None if made.rendering is None else made.rendering.model_dump(mode="json"),
@@ -318,6 +320,10 @@ def _print_summary(dataset: Dataset, out: str, output: JsonOutput, was_there: bo
     if made.skipped:
         tried = made.sources + len(made.skipped)
         print(f"{len(made.skipped)} of {tried} pictures were left out; dataset.json lists them")
+    if noted:
+        example = printable(f"{noted[0].name}: {noted[0].note}")
+        has = "has a note" if len(noted) == 1 else "have notes"
+        print(f"{_counted(len(noted), 'picture')} {has} in sources.csv, such as {example}")
     if made.replaced_pixels:
         share = 100 * made.replaced_pixels / made.pixels
         print(

@@ -120,11 +120,6 @@ class CheckReport:
         """Return the findings of one grade."""
         return tuple(finding for finding in self.findings if finding.grade == grade)
 
-    @property
-    def faults(self) -> tuple[str, ...]:
-        """What must be mended before a session, a sentence each."""
-        return tuple(f"{finding.name}: {finding.sentence()}" for finding in self.of("fault"))
-
     def lines(self) -> tuple[str, ...]:
         """Return the report as lines for a terminal: devices, then findings, faults first."""
         described = [

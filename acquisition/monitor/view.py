@@ -158,6 +158,7 @@ class SessionView:
     - `place`: where it lies; None if that is not known.
     - `frame_bytes`: size of its largest frame; 0 before the first.
     - `lost`: files of frames that count and are gone or cut, by step; only looked for where all frames are there.
+    - `unreadable`: why no table can be made of it, and what helps, such as a lost chart; empty where nobody looked.
     """
 
     name: str
@@ -171,6 +172,7 @@ class SessionView:
     place: SessionPlace | None
     frame_bytes: int = 0
     lost: Mapping[int, str] = field(default_factory=dict[int, str])
+    unreadable: str = ""
 
     def head(self, now: datetime) -> Head:
         """Return how it stands at the wall clock's `now`; process and disk are looked at."""
@@ -338,6 +340,8 @@ def _state_of(
     heartbeat, here, total = view.heartbeat, view.place, len(view.steps)
     copied = heartbeat is not None and heartbeat.state != "ended" and heartbeat.is_of(here) is False
     over = heartbeat is None or heartbeat.state == "ended" or copied or heartbeat.is_dead(now, process_alive)
+    if over and view.unreadable:
+        return "incomplete", view.unreadable
     if over and total and not left:
         return "complete", f"complete, {total} frames; next: build-lut {shlex.quote(view.given)} LUT/"
     if over and view.lost:

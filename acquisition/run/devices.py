@@ -664,7 +664,7 @@ class Pause:
         if left < INSTANT_S:
             raise self._ended(first, fault) from fault
         if not again and now - self._begun_trying < SLOW_S:
-            policy.report("retry", _waited_for(self._name, fault))
+            policy.report("retry", _named(self._name, fault.while_waiting()))
             policy.clock.sleep(min(RETRY_S, left))
             return
         kind = _kind(fault)
@@ -672,7 +672,7 @@ class Pause:
             how_long = "for as long as it takes" if math.isinf(policy.limit_s) else f"up to {duration_text(left)}"
             policy.report(
                 "still paused" if self._told else "paused",
-                f"{_waited_for(self._name, fault)} (the run waits {how_long}, and goes on by itself)",
+                f"{_named(self._name, fault.while_waiting())} (the run waits {how_long}, and goes on by itself)",
             )
             self._told = kind
         policy.wait(min(PAUSE_S, left), "paused", lambda: self._countdown(fault), idle=self._idle)
@@ -698,21 +698,20 @@ class Pause:
     def _countdown(self, fault: CropError) -> str:
         left = self._left_s()
         end = "waits for as long as it takes" if math.isinf(left) else f"ends in {duration_text(max(left, 0))}"
-        return (
-            f"{_waited_for(self._name, fault)} (paused for {duration_text(self._lasted_s())}; goes on by itself, {end})"
-        )
+        held = _named(self._name, fault.while_waiting())
+        return f"{held} (paused for {duration_text(self._lasted_s())}; goes on by itself, {end})"
 
     def _ended(self, first: CropError, fault: CropError) -> CropError:
         if not self._policy.limit_s:
             return first
         # What came first is told without its remedy: that of what holds now helps. A fault may name it already.
-        cause = str(first).partition("; ")[0]
-        at_last = fault if _kind(cause) in _kind(fault) else f"{cause}; at last: {fault}"
+        cause, held = first.without_remedy(), fault.while_waiting()
+        at_last = held if _kind(cause) in _kind(held) else f"{cause}; at last: {held}"
         waited = duration_text(self._policy.limit_s)
         if self._history.pauses:
             waited += f", in {self._history.pauses + 1} pauses with few frames between them,"
         return _family(first)(
-            _waited_for(self._name, at_last),
+            _named(self._name, at_last),
             remedy=f"the run waited {waited} for that and ended: when it is mended run the same command again",
         )
 
@@ -723,18 +722,9 @@ def pause_cause(sentence: str) -> str:
     return name if name == FRAMES else _kind(sentence.partition(TOLD_LATER)[0].rpartition(" (")[0])
 
 
-_RUN_AGAIN = re.compile(r"(?:,|;)? (?:then )?run (?:the same command )?again")
-"""What the remedies of errors end with that also end a command."""
-
-
-def _waited_for(name: str, fault: CropError | str) -> str:
-    """Return a fault as `_named` does, without the order to run again: the run that waits goes on by itself."""
-    return _RUN_AGAIN.sub("", _named(name, fault))
-
-
-def _named(name: str, fault: CropError | str) -> str:
-    """Return a fault with the name of what has it, which many name themselves."""
-    return str(fault) if str(fault).startswith(name) else f"{name}: {fault}"
+def _named(name: str, sentence: str) -> str:
+    """Return what is said of a fault with the name of what has it, which many name themselves."""
+    return sentence if sentence.startswith(name) else f"{name}: {sentence}"
 
 
 def _kind(fault: CropError | str) -> str:

@@ -961,7 +961,7 @@ class CanonEos:
 
     def _given_up(self, last: DeviceError, tried: str) -> str:
         """Return why a call ends, its first cause first, for whatever came of that says less; with one remedy."""
-        first, held = (str(fault).partition("; ")[0] for fault in (self._fault or last, last))
+        first, held = (fault.without_remedy() for fault in (self._fault or last, last))
         return f"{first}; {tried}{'' if held == first else f'; at last: {held}'}; {_REMEDY}"
 
     def _release(self, settings: ExposureSettings) -> _Shot:

@@ -39,7 +39,7 @@ import numpy.typing as npt
 from drivers.display.x11 import XScreen, is_dark, is_lost, outlive
 from drivers.presenter import BLACK, Colour
 from foundation.clock import Clock, SystemClock
-from foundation.errors import ConfigurationError, DeviceError
+from foundation.errors import RUN_AGAIN, ConfigurationError, DeviceError
 from foundation.holds import hold
 
 if TYPE_CHECKING:
@@ -407,8 +407,8 @@ class FullScreen:
         self._glfw.poll_events()
         if self._screen is not None and is_lost(self._glfw.get_x11_display()):
             raise DeviceError(
-                f"the X server of display {self.display} is gone: somebody logged out, or it crashed; log in, then run "
-                "again"
+                f"the X server of display {self.display} is gone: somebody logged out, or it crashed; log in, "
+                f"{RUN_AGAIN}"
             )
 
     def _require_full(self) -> None:

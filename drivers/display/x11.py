@@ -26,7 +26,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from foundation.errors import DeviceError
+from foundation.errors import RUN_AGAIN, DeviceError
 
 INPUT_ONLY = 2
 """Window class of what shows nothing (X protocol, CreateWindow)."""
@@ -229,7 +229,7 @@ class XScreen:
         self._require_open()
         with self._ask("get_geometry", self._root) as reply:
             if not reply:
-                raise DeviceError("the X server is gone: somebody logged out, or it crashed; log in, then run again")
+                raise DeviceError(f"the X server is gone: somebody logged out, or it crashed; log in, {RUN_AGAIN}")
             width, height = struct.unpack("=HH", reply.bytes(16, 4))
         return width, height
 

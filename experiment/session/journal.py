@@ -74,7 +74,7 @@ from experiment.session.records import (
     SessionEvent,
     SessionStep,
 )
-from foundation.errors import FormatError, InputError, StorageError, counted
+from foundation.errors import RUN_AGAIN, FormatError, InputError, StorageError, counted
 from foundation.files import (
     disk_remedy_of,
     is_inside_name,
@@ -1000,8 +1000,7 @@ def reading_error(path: Path, error: OSError | sqlite3.DatabaseError) -> FormatE
         return file_reading_error(path, fault, "check the permissions of its folder")
     if failed or (_is_damage(error) and _is_sound(path)):
         return StorageError(
-            f"cannot read {path}: {error}, and its disk did not say why; check the disk and its cable, then run the "
-            "same command again"
+            f"cannot read {path}: {error}, and its disk did not say why; check the disk and its cable, {RUN_AGAIN}"
         )
     if not _is_damage(error):
         return FormatError(f"cannot read {path}: {error}; check its permissions and the disk")
@@ -1025,7 +1024,7 @@ def _writing_error(path: Path, error: sqlite3.DatabaseError) -> FormatError | In
         return FormatError(f"{path} is damaged: {error}; {_restoring(path)}")
     else:
         remedy = "check the disk and its cable"
-    return StorageError(f"cannot write {path}: {error}; {remedy}, then run the same command again")
+    return StorageError(f"cannot write {path}: {error}; {remedy}, {RUN_AGAIN}")
 
 
 def _disk_fault(path: Path) -> OSError | None:

@@ -26,7 +26,7 @@ import tomli_w
 
 from experiment.session.records import AcceptedFile
 from foundation.compiled import ordered_map, processor_count
-from foundation.errors import FormatError, InputError, StorageError
+from foundation.errors import RUN_AGAIN, FormatError, InputError, StorageError
 from foundation.files import file_sha256, read_inside, reading_error, storage_error, write_whole
 from foundation.secret_texts import MASK, target_label
 
@@ -93,7 +93,7 @@ def _require_readable(folder: Path, unread: Sequence[tuple[AcceptedFile, OSError
         more = f" and {len(lasting) - 1} more" if lasting[1:] else ""
         raise StorageError(
             f"cannot read {folder / frame.file}{more}: {error.strerror}; check the disk, its cable and the "
-            "permissions, or move the files elsewhere to have their frames taken again, then run the same command again"
+            f"permissions, or move the files elsewhere to have their frames taken again, {RUN_AGAIN}"
         ) from error
 
 

@@ -86,7 +86,7 @@ from generator.dataset.workplace import (
     workplace,
 )
 from generator.files import suffix_of
-from generator.lights.choices import ListedLights
+from generator.lights.choices import listed_lights
 from generator.lights.lighting import LightChoice, Lighting, Mixture
 from generator.pictures.sources import Cut, Picture, Source, hash_since, keep_bits
 from generator.stores import DESCRIPTION, Pieces, Store, is_remote, local_path, open_store
@@ -102,6 +102,9 @@ if TYPE_CHECKING:
 
 
 _threads: Final = threading.local()
+
+TINY_PX: Final = 16
+"""A shorter side below which a picture is noted: icons and failed downloads are so small, photographs never are."""
 
 
 def photograph(
@@ -494,6 +497,11 @@ def _read(job: ShardJob, lut: Lut, place: int, finished: Mapping[int, FinishedIm
             f"{source.name} is {width}x{height} px, too small for {job.options.form}, which takes {least}x{least} and "
             "more; choose another format, or leave it out"
         )
+    notes = [*scene.notes]
+    if min(height, width) < TINY_PX:
+        notes.append(f"tiny, {width}x{height} px")
+    if not all(cut.picture.any() for cut in whole):
+        notes.append("all black")
     record = SourceRecord(
         position=job.position + place,
         name=source.name,
@@ -503,6 +511,7 @@ def _read(job: ShardJob, lut: Lut, place: int, finished: Mapping[int, FinishedIm
         height=height,
         replaced_pixels=sum(replaced for _, replaced in fit),
         split=job.parts[place] if job.parts else split_of(job.options.split, job.seed, scene.sha256, source.name),
+        note="; ".join(notes) or None,
         weight=scene.weight,
     )
     cuts = tuple(replace(cut, picture=picture) for cut, (picture, _) in zip(whole, fit, strict=True))
@@ -806,7 +815,7 @@ def generate_dataset(
     lut: Lut,
     out: Path | str,
     sources: Sequence[Source],
-    lights: LightChoice | Sequence[int],
+    lights: LightChoice | Sequence[int | str | Mixture],
     *,
     seed: int = 0,
     options: DatasetOptions | None = None,
@@ -825,8 +834,9 @@ def generate_dataset(
     sources
         The pictures; see `generator.pictures.sources`.
     lights
-        Which lights fall on which picture; see `generator.lights.choices`. A sequence of numbers of the table's lights
-        is the same for every picture.
+        The same lights for every picture, each a number in the table, a text as the command's ``--light`` takes it
+        (``"5600K"``, ``"D65"``, ``"12:0.25+40:0.75"``), or a mixture; or a choice of `generator.lights.choices`, which
+        says which lights fall on which picture.
     seed
         0 … 2⁶⁴ − 1; chooses the samples of every pixel.
     options
@@ -861,7 +871,7 @@ def generate_dataset(
     ...     [(entry.image, entry.source, entry.illumination) for entry in made.entries]
     [('000000.tiff', 'cat.png', '0'), ('000001.tiff', 'cat.png', '3')]
     """
-    choice: LightChoice = lights if isinstance(lights, LightChoice) else ListedLights(tuple(lights))
+    choice: LightChoice = lights if isinstance(lights, LightChoice) else listed_lights(lights, lut)
     plan = Plan(lut, sources, choice, seed, options or DatasetOptions())
     return make_dataset(plan, out, workers if isinstance(workers, Workers) else Workers(count=workers), callbacks)
 
@@ -1164,7 +1174,7 @@ def _plain(value: float | str) -> str:
 
 def _source_row(source: SourceRecord) -> str:
     known = (source.position, source.name, source.sha256 or "", source.width, source.height, source.replaced_pixels)
-    return _row((*known, source.split or "", source.profile or ""))
+    return _row((*known, source.split or "", source.profile or "", source.note or ""))
 
 
 def _image_rows(name: str, source: str, image: ImageRecord, stated: Mapping[int, Light] | None) -> str:

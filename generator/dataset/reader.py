@@ -6,7 +6,7 @@
     ground_truth.csv     image,source,illumination,r,g,b with r + g + b = 1, one row a light
     gt.txt               r g b a line in image order: the mean of the lights over the image
     images.csv           where options do something to each image: what they did to it
-    sources.csv          position,name,sha256,width,height,replaced_pixels,split,profile
+    sources.csv          position,name,sha256,width,height,replaced_pixels,split,profile,note
     splits/train.txt …   names of images, where the dataset was divided
     dataset.json         the table's hash, seed, options: enough to make every byte again
     SHA256SUMS           hashes of all files; `sha256sum -c SHA256SUMS` verifies them
@@ -36,7 +36,7 @@ import numpy.typing as npt
 from pydantic import ValidationError
 
 from foundation.compiled import ordered_map
-from foundation.errors import FormatError, InputError
+from foundation.errors import FormatError, InputError, counted
 from foundation.files import MOST_JSON_BYTES, bounded_lines, is_inside_name, parse_json_object, stream_sha256
 from generator.dataset.layouts import JOINED, member_name, read_member
 from generator.dataset.records import (
@@ -277,6 +277,10 @@ class Dataset:
     store: Store
     description: Description
     entries: tuple[Entry, ...]
+
+    def __repr__(self) -> str:
+        """Return one line: a dataset has an entry for each of its images."""
+        return f"Dataset({self.store.place!r}, {counted(self.description.images, 'image')}, layout {self.layout})"
 
     def read_image(self, entry: Entry) -> npt.NDArray[np.uint16]:
         """Return the image (H, W, 3) uint16, linear camera RGB, `description.table.white_level` = saturation.

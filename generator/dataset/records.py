@@ -29,7 +29,7 @@ UNCERTAINTY_COLUMN: Final = "uncertainty_deg"
 
 IMAGES: Final = "images.csv"
 SOURCES: Final = "sources.csv"
-SOURCE_COLUMNS: Final = ("position", "name", "sha256", "width", "height", "replaced_pixels", "split", "profile")
+SOURCE_COLUMNS: Final = ("position", "name", "sha256", "width", "height", "replaced_pixels", "split", "profile", "note")
 TRUTHS: Final = "gt.txt"
 SUMS: Final = "SHA256SUMS"
 DATASHEET: Final = "DATASHEET.md"
@@ -110,6 +110,8 @@ class SourceRecord(Record):
     - `width`, `height`: size of its images, px.
     - `replaced_pixels`: pixels of colours that the table lists as unfit, which took the nearest fit colour.
     - `split`: the part of the dataset that its images belong to; None where it was not divided.
+    - `note`: what is to be known of it, between semicolons: what it took to read it, or that it is black or tiny; None
+      for nothing.
     - `weight`: by which it was drawn, 1 that of a picture neither favoured nor disfavoured; None where pictures were
       not drawn.
     """
@@ -122,6 +124,7 @@ class SourceRecord(Record):
     height: int
     replaced_pixels: int
     split: Split | None = None
+    note: str | None = None
     weight: float | None = None
 
 

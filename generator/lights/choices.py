@@ -10,14 +10,14 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final, Literal
 
 import numpy as np
 import numpy.typing as npt
 
-from foundation.errors import InputError, first_of, nearest_names
+from foundation.errors import InputError, first_of, kind_of, nearest_names
 from generator import philox
 from generator.kernels.rendering import known_light
 from generator.lights.distributions import Distribution
@@ -314,6 +314,16 @@ def light_of(given: int | str | Mixture, lut: Lut) -> Mixture:
         given.white(lut)
         return given
     return plain(known_light(lut, given))
+
+
+def listed_lights(given: Iterable[int | str | Mixture] | str | float | Mixture, lut: Lut) -> ListedLights:
+    """Return the same lights for every picture, each given as `light_of` takes it."""
+    if isinstance(given, str | int | float | Mixture):
+        raise InputError(f"the lights are {kind_of(given)}, expected a list, such as [0, 3] or ['D65']")
+    # Numbers stay numbers: a dataset is the same by whatever way its lights were given.
+    return ListedLights(
+        tuple(light_of(light, lut) if isinstance(light, str | Mixture) else known_light(lut, light) for light in given)
+    )
 
 
 def nearest_lights(lut: Lut, truths: npt.NDArray[np.float64], file: str = "", each: int = 1) -> SequentialLights:

@@ -139,6 +139,11 @@ ASSUMED: Final = "none, taken as sRGB"
 ADOBE_RGB: Final = "Adobe RGB (1998) by EXIF, converted to sRGB"
 """Remark on a picture that a camera made in that space."""
 
+LINEAR: Final = "floating-point values, taken as linear light"
+TRANSPARENT: Final = "transparent, composited on white"
+PROFILE_UNUSED: Final = "colour profile not applied"
+"""Notes on a picture, for its row of the dataset's list of sources."""
+
 _PROBE_STEPS: Final = 9
 """Codes of each channel, every 32nd, of the grid of 729 colours that shows whether a profile is sRGB."""
 _ADOBE_GAMMA: Final = 563 / 256
@@ -388,11 +393,13 @@ class _Reading:
     - `picture`: (H, W, 3) uint8, sRGB codes; of several crops the first.
     - `profile`: how its colour profile was treated, in words, such as ``"Display P3, converted to sRGB"``.
     - `cuts`: the crops, where several were asked for.
+    - `notes`: what else of the file was not plain sRGB codes and may look unlike what its owner expects.
     """
 
     picture: Picture
     profile: str
     cuts: tuple[Cut, ...] = ()
+    notes: tuple[str, ...] = ()
 
 
 def read_picture(path: Path | str, max_side: int | None = None) -> Picture:
@@ -469,9 +476,16 @@ def open_picture(
         codes, word = to_srgb(codes, values.icc)
     else:
         codes, word = _from_adobe_rgb(codes), ADOBE_RGB
+    honoured = values.icc is not None and preparation.profiles == "honour"
+    noted = {
+        LINEAR: values.linear,
+        TRANSPARENT: values.alpha is not None,
+        PROFILE_UNUSED: honoured and word.endswith("taken as sRGB"),
+    }
     codes = _turn(codes, values.orientation)
     cuts = _fit(codes, preparation, path, path.name if name is None else name)
-    return _Reading(cuts[0].picture, word, cuts if preparation.crops > 1 else ())
+    notes = tuple(note for note, holds in noted.items() if holds)
+    return _Reading(cuts[0].picture, word, cuts if preparation.crops > 1 else (), notes)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -731,6 +745,7 @@ class SourcePicture:
     - `cuts`: the crops, where several were asked for.
     - `weight`: by which it was drawn; None where pictures were not drawn by weights.
     - `black_taken`: share of the print's black, 0 … 1, that is taken out of its images; None where options say it.
+    - `notes`: as those of `picture.Reading`.
     """
 
     picture: Picture
@@ -739,6 +754,7 @@ class SourcePicture:
     cuts: tuple[Cut, ...] = ()
     weight: float | None = None
     black_taken: float | None = None
+    notes: tuple[str, ...] = ()
 
 
 class Source(Protocol):
@@ -806,7 +822,7 @@ class PictureFile:
                 raise InputError(
                     f"there is not enough memory to read {self.location}; use fewer workers, or leave it out"
                 ) from error
-        return SourcePicture(reading.picture, sha256, reading.profile, reading.cuts)
+        return SourcePicture(reading.picture, sha256, reading.profile, reading.cuts, notes=reading.notes)
 
 
 def hash_since(source: Source, moment: float) -> str | None:

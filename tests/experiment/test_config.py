@@ -319,6 +319,15 @@ def test_a_secret_that_is_not_there_is_named(lab_with: Callable[..., Path], plac
     assert "s3cret" not in str(caught.value)
 
 
+def test_all_secrets_that_are_not_there_are_named_at_once(lab_with: Callable[..., Path]) -> None:
+    sequence = '[sequence]\nnotify = { file = "gone.txt" }\n[notify]\nalive = { env = "PJLINK" }'
+    with pytest.raises(ConfigurationError, match="2 mistakes") as caught:
+        load_lab(lab_with(f'password = {{ env = "NOWHERE" }}\n{sequence}'))
+    _, *told = str(caught.value).splitlines()
+    assert [one.split(":")[0].strip() for one in told] == ["sequence.notify", "lab.projector.password"]
+    assert "s3cret" not in str(caught.value)
+
+
 def test_nobody_needs_a_password_to_rehearse(lab_with: Callable[..., Path]) -> None:
     settings = load_lab(lab_with('password = { env = "NOWHERE" }', REAL.replace('"lab"', '"simulated"')))
     assert settings.lab.projector.password is None

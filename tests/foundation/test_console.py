@@ -7,6 +7,7 @@ import gc
 import io
 import logging
 import os
+import pickle
 import signal
 import subprocess
 import sys
@@ -46,6 +47,27 @@ def test_messages_name_the_first_of_many() -> None:
     assert errors.first_of(range(3)) == "0, 1, 2"
     assert errors.first_of(["a", "b", "c"], 2) == "a, b …"
     assert errors.first_of(range(10)) == "0, 1, 2, 3, 4, 5, 6, 7, 8, 9"
+
+
+@pytest.mark.parametrize(
+    ("error", "problem", "waiting"),
+    [
+        (errors.LinkClosed("gone; check its cable", about="camera"), "camera: gone", "camera: gone; check its cable"),
+        (errors.LinkClosed("gone: a; b", remedy="mend it"), "gone: a; b", "gone: a; b; mend it"),
+        (errors.StorageError(f"full; free space, {errors.RUN_AGAIN}"), "full", "full; free space"),
+        (errors.StorageError("full", remedy=f"free space; {errors.RUN_AGAIN}"), "full", "full; free space"),
+        (errors.StorageError("full", remedy=errors.RUN_AGAIN), "full", "full"),
+        (errors.DeviceError("run the same command again, it said"), *["run the same command again, it said"] * 2),
+    ],
+)
+def test_an_error_knows_its_remedy_apart_however_it_was_given(
+    error: errors.CropError, problem: str, waiting: str
+) -> None:
+    assert error.without_remedy() == problem
+    assert error.while_waiting() == waiting
+    assert str(error).startswith(waiting)
+    again = pickle.loads(pickle.dumps(error))
+    assert (str(again), again.remedy) == (str(error), error.remedy)
 
 
 # The tree in the docstring of foundation.errors.

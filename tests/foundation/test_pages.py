@@ -156,6 +156,18 @@ def test_an_interval_is_not_broken_over_two_lines() -> None:
     assert "a – b" in shown
 
 
+def test_an_option_of_a_command_is_not_broken_over_two_lines() -> None:
+    """The hyphens stay what they are: the command is copied from the page."""
+    option = "<span class='option'>--retake</span>"
+    for piece in (
+        pages.note("run it with --retake 12"),
+        pages.verdict("refuse", "(--retake <12>)"),
+        pages.table("What helps", ("",), (("--retake",),), (False,)),
+    ):
+        assert option in piece
+    assert "span" not in pages.paragraph("a row --- of hyphens, and a--b")
+
+
 @pytest.mark.parametrize("top", [8, 90, 1e7])
 @pytest.mark.parametrize("drawn_by", [svg_of, png_of])
 def test_logarithmic_axes_have_plain_numbers(drawn_by: Callable[[Callable[[Any], None]], bytes], top: float) -> None:

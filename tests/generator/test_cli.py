@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import json
 import signal
 from pathlib import Path
@@ -41,6 +42,29 @@ def generate(monkeypatch: pytest.MonkeyPatch, make_lut: Callable[..., Lut], tmp_
         return main(arguments)
 
     return call
+
+
+def test_what_is_odd_of_a_picture_is_noted(generate: Generate, capsys: pytest.CaptureFixture[str]) -> None:
+    """Every picture can be used, and each looks unlike what its owner sees on a screen, or like a mistake."""
+    Path("pictures/two.png").unlink()
+    cv2.imwrite("pictures/alpha.png", np.full((20, 20, 4), 90, np.uint8))
+    cv2.imwrite("pictures/black.png", np.zeros((20, 20, 3), np.uint8))
+    cv2.imwrite("pictures/float.tif", np.full((20, 20, 3), 0.5, np.float32))
+    cv2.imwrite("pictures/tiny.png", np.zeros((20, 15, 3), np.uint8))
+    assert generate("lut", "out", "--sources", "pictures", "--illuminations", "0", "--json") == 0
+    printed = capsys.readouterr()
+    assert json.loads(printed.out)["noted"] == 4
+    with Path("out/sources.csv").open(newline="") as stream:
+        notes = {row["name"]: row["note"].split("; ") for row in csv.DictReader(stream)}
+    assert notes.pop("one.png") == [""]
+    assert {name: [note.split(",")[0] for note in listed] for name, listed in notes.items()} == {
+        "alpha.png": ["transparent"],
+        "black.png": ["all black"],
+        "float.tif": ["floating-point values"],
+        "tiny.png": ["tiny", "all black"],
+    }
+    assert generate("lut", "out", "--sources", "pictures", "--illuminations", "0") == 0
+    assert capsys.readouterr().out.count("4 pictures have notes in sources.csv, such as alpha.png: transparent") == 1
 
 
 def test_a_dataset_with_its_contact_sheet(generate: Generate, capsys: pytest.CaptureFixture[str]) -> None:

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from foundation.errors import InputError
-from generator import open_lut, read_picture, render
+from generator import find_pictures, generate_dataset, open_lut, read_picture, render
 from generator.rendering import Rendering
 from generator.training import Crops, gallery_of
 
@@ -65,6 +65,13 @@ def test_lights_are_named_as_on_the_command_line() -> None:
     assert crops.black_point.kind == "random"
     with pytest.raises(InputError, match="write 5200K"):
         render(lut, picture, "daylight")
+    texts, numbers = (
+        generate_dataset(lut, place, find_pictures("cat.png"), lights)
+        for place, lights in (("texts", ["3", "0:0.5+3:0.5"]), ("numbers", [3]))
+    )
+    assert repr(texts) == "Dataset('texts', 2 images, layout folder)"
+    assert [entry.lights for entry in texts.entries] == [("3",), ("0:0.5+3:0.5",)]
+    assert np.array_equal(texts.read_image(texts.entries[0]), numbers.read_image(numbers.entries[0]))
 
 
 @pytest.mark.usefixtures("table_and_picture")
@@ -85,6 +92,10 @@ def test_wrong_arguments_are_answered_with_what_is_expected() -> None:
         (Crops, (lut, gallery, (8, 8)), {"lights": ["D66"]}, "'D66' is no light"),
         (Crops, (lut, gallery, (8, 8)), {"black_point": "rnd"}, "'rnd'"),
         (Crops, (lut, gallery, (8, 8)), {"black_point": 0.5}, "'compensate'"),
+        (generate_dataset, (lut, "out", find_pictures("cat.png"), "D65"), {}, "the text 'D65', expected a list"),
+        (generate_dataset, (lut, "out", find_pictures("cat.png"), 3), {}, "expected a list"),
+        (generate_dataset, (lut, "out", find_pictures("cat.png"), ["D66"]), {}, "'D66' is no light"),
+        (generate_dataset, (lut, "out", find_pictures("cat.png"), [2.5]), {}, "2.5 is no light"),
         (gallery_of, ("cat.png",), {}, "the text 'cat.png'"),
         (gallery_of, (["cat.png"],), {}, "read_picture"),
     ]

@@ -211,9 +211,11 @@ def test_the_command_prints_faults_first_and_ends_with_4(
     assert main(["check", str(lab), "--picture", str(picture)]) == 4
     printed = capsys.readouterr()
     told = [line for line in printed.out.splitlines() if line.startswith(("fault", "remark", "not checked", "good"))]
-    assert told[0].startswith("fault       room light")
+    of_fault, *_ = told
+    assert of_fault.startswith("fault       room light")
     assert told[-1].startswith("good")
-    assert "error: room light:" in printed.err
+    assert "1 fault: room light" in printed.err
+    assert (printed.out + printed.err).count(of_fault.split(maxsplit=3)[3]) == 1
     assert picture.read_bytes()[:4] == b"\x89PNG"
     assert "stays on" in printed.out
 

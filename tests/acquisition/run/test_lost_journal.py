@@ -301,3 +301,23 @@ def test_a_complete_session_whose_files_go_is_complete_no_more(
     assert main(["status", str(folder)]) == 4
     assert "incomplete: frames/0002_light_000.dng: gone or cut" in capsys.readouterr().out
     assert read_session(folder).head(lab.clock.now()).done == len(lab.session.steps) - 1
+
+
+@pytest.mark.parametrize("name", ["chart.json", "illuminations.csv"])
+@pytest.mark.parametrize("mishap", [Path.unlink, lambda path: os.truncate(path, 9)])  # type: ignore[misc]
+def test_a_complete_session_without_its_chart_or_lights_says_what_is_lost(
+    lab: Lab, name: str, mishap: Callable[[Path], object], capsys: pytest.CaptureFixture[str]
+) -> None:
+    """All frames are there, and no table can be made of them."""
+    folder = lab.session.folder
+    run(lab)
+    lab.session.close()
+    kept = (folder / name).read_bytes()
+    mishap(folder / name)
+    assert main(["status", str(folder)]) == 4
+    said = capsys.readouterr()
+    assert "incomplete" in said.out
+    assert str(folder / name) in said.err
+    assert "restore it from a copy" in said.err
+    (folder / name).write_bytes(kept)
+    assert main(["status", str(folder)]) == 0

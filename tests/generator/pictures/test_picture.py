@@ -25,7 +25,14 @@ from PIL import Image, ImageCms, features
 
 from foundation.errors import FormatError, InputError
 from generator.pictures import sources
-from generator.pictures.sources import Preparation, find_pictures, open_picture, read_picture, to_srgb
+from generator.pictures.sources import (
+    PROFILE_UNUSED,
+    Preparation,
+    find_pictures,
+    open_picture,
+    read_picture,
+    to_srgb,
+)
 from tests.generator.pictures.icc import gamma_profile
 from tests.generator.pictures.oiio_files import write
 
@@ -111,6 +118,7 @@ def test_a_profile_that_the_reader_drops_is_noted(tmp_path: Path, dull: Codes, p
     reading = open_picture(path)
     np.testing.assert_array_equal(reading.picture, dull)
     assert reading.profile.startswith("damaged")
+    assert reading.notes == (PROFILE_UNUSED,)
     path.write_bytes(png_with(path, dull, zlib.compress(ADOBE_RGB)))
     assert open_picture(path).profile.endswith("converted to sRGB")
 
