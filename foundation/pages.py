@@ -21,11 +21,9 @@ from typing import Any, Literal
 from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup, escape
 
-_INTERVAL = re.compile(r"(?<=\d) – (?=[-−]?\d)")
-"""What stands between the ends of an interval in a table's cell."""
-
-_OPTION = re.compile(r"(?<![\w-])--[a-z][\w-]*")
-"""An option of a command, in escaped text: browsers break lines behind each hyphen, so that `-` ends up by itself."""
+_UNBROKEN = re.compile(r"(?<![\w-])--[a-z][\w-]*|[-−]?\d[\d.]* – [-−]?\d[\d.]*")
+"""An option of a command and an interval, in escaped text: browsers break lines behind each hyphen and dash, whatever
+space follows."""
 
 
 @dataclass(frozen=True)
@@ -163,8 +161,8 @@ def _hash(text: str) -> str:
 
 
 def _unbroken(text: str) -> Markup:
-    """Return a text whose intervals and options of commands stay on one line; as it was where it is copied."""
-    return Markup(_OPTION.sub(r"<span class='option'>\g<0></span>", _INTERVAL.sub("\u00a0–\u00a0", str(escape(text)))))
+    """Return a text whose intervals and options of commands stay on one line; what is copied of it is the text."""
+    return Markup(_UNBROKEN.sub(r"<span class='unbroken'>\g<0></span>", str(escape(text))))
 
 
 def _element(picture: bytes, alt: str) -> Markup:
