@@ -110,9 +110,12 @@ def table(
     return _piece("table", title, heads, rows, numeric, notes)
 
 
-def figure(picture: bytes, caption: str, alt: str | None = None) -> Markup:
-    """Return a figure of the bytes of an SVG, PNG or JPEG file; SVG stands in the page and takes its colours."""
-    return _piece("figure", picture, caption, alt)
+def figure(picture: bytes, caption: str, alt: str | None = None, wide: bool = False) -> Markup:
+    """Return a figure of the bytes of an SVG, PNG or JPEG file; SVG stands in the page and takes its colours.
+
+    A `wide` one, of several panels side by side, scrolls sideways on a phone, where it would be too small to read.
+    """
+    return _piece("figure", picture, caption, alt, None, wide)
 
 
 def row(parts: Sequence[Markup]) -> Markup:

@@ -145,6 +145,12 @@ def sheet(name: str) -> str:
     return (Path(pages.__file__).parent / "templates" / name).read_text(encoding="utf-8")
 
 
+def test_a_wide_figure_scrolls_where_it_would_be_too_small() -> None:
+    png = pages.figure(b"\x89PNG", "many panels", wide=True)
+    assert "<figure class='wide'>" in png
+    assert "<figure>" in pages.figure(b"\x89PNG", "one panel")
+
+
 def test_what_is_no_picture_is_refused() -> None:
     with pytest.raises(ValueError, match="GIF89a"):
         pages.figure(b"GIF89a", "")
