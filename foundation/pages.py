@@ -16,10 +16,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 from importlib import resources
-from typing import Any, Literal
+from typing import Any, Final, Literal
 
 from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup, escape
+
+_LEAST_SVG: Final = "36rem"
+"""Width below which a drawing scrolls in its place, since its letters would be too small."""
 
 _UNBROKEN = re.compile(r"(?<![\w-])--[a-z][\w-]*|[-−]?\d[\d.]* – [-−]?\d[\d.]*")
 """An option of a command and an interval, in escaped text: browsers break lines behind each hyphen and dash, whatever
@@ -177,4 +180,7 @@ def _element(picture: bytes, alt: str) -> Markup:
     found = re.search(r"<svg\b.*</svg>", picture.decode("utf-8", errors="replace"), re.DOTALL)
     if not found:
         raise ValueError(f"a picture that begins with {picture[:8]!r} is none; expected PNG, JPEG or SVG")
-    return Markup(found[0].replace("<svg", f"<svg role='img' aria-label='{escape(alt)}'", 1))
+    # No drawing is made larger than it is, so that its letters are those of the others on the page.
+    own = re.search(r'<svg\b[^>]* width="([\d.]+)pt"', found[0])
+    style = f" style='min-width: min({_LEAST_SVG}, {own[1]}pt)'" if own else ""
+    return Markup(found[0].replace("<svg", f"<svg role='img' aria-label='{escape(alt)}'{style}", 1))

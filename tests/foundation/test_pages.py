@@ -151,6 +151,11 @@ def test_a_wide_figure_scrolls_where_it_would_be_too_small() -> None:
     assert "<figure>" in pages.figure(b"\x89PNG", "one panel")
 
 
+def test_a_drawing_is_not_made_larger_than_it_is() -> None:
+    small = pages.figure(b'<svg xmlns="x" width="273.6pt" height="273.6pt"><path/></svg>', "a plane")
+    assert "min-width: min(36rem, 273.6pt)" in small
+
+
 def test_what_is_no_picture_is_refused() -> None:
     with pytest.raises(ValueError, match="GIF89a"):
         pages.figure(b"GIF89a", "")
