@@ -16,16 +16,17 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 from importlib import resources
-from typing import Any, Literal
+from typing import Any, Final, Literal
 
 from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup, escape
 
-_INTERVAL = re.compile(r"(?<=\d) – (?=[-−]?\d)")
-"""What stands between the ends of an interval in a table's cell."""
+_LEAST_SVG: Final = "36rem"
+"""Width below which a drawing scrolls in its place, since its letters would be too small."""
 
-_OPTION = re.compile(r"(?<![\w-])--[a-z][\w-]*")
-"""An option of a command, in escaped text: browsers break lines behind each hyphen, so that `-` ends up by itself."""
+_UNBROKEN = re.compile(r"(?<![\w-])--[a-z][\w-]*|[-−]?\d[\d.]* – [-−]?\d[\d.]*")
+"""An option of a command and an interval, in escaped text: browsers break lines behind each hyphen and dash, whatever
+space follows."""
 
 
 @dataclass(frozen=True)
@@ -112,9 +113,12 @@ def table(
     return _piece("table", title, heads, rows, numeric, notes)
 
 
-def figure(picture: bytes, caption: str, alt: str | None = None) -> Markup:
-    """Return a figure of the bytes of an SVG, PNG or JPEG file; SVG stands in the page and takes its colours."""
-    return _piece("figure", picture, caption, alt)
+def figure(picture: bytes, caption: str, alt: str | None = None, wide: bool = False) -> Markup:
+    """Return a figure of the bytes of an SVG, PNG or JPEG file; SVG stands in the page and takes its colours.
+
+    A `wide` one, of several panels side by side, scrolls sideways on a phone, where it would be too small to read.
+    """
+    return _piece("figure", picture, caption, alt, None, wide)
 
 
 def row(parts: Sequence[Markup]) -> Markup:
@@ -163,8 +167,8 @@ def _hash(text: str) -> str:
 
 
 def _unbroken(text: str) -> Markup:
-    """Return a text whose intervals and options of commands stay on one line; as it was where it is copied."""
-    return Markup(_OPTION.sub(r"<span class='option'>\g<0></span>", _INTERVAL.sub("\u00a0–\u00a0", str(escape(text)))))
+    """Return a text whose intervals and options of commands stay on one line; what is copied of it is the text."""
+    return Markup(_UNBROKEN.sub(r"<span class='unbroken'>\g<0></span>", str(escape(text))))
 
 
 def _element(picture: bytes, alt: str) -> Markup:
@@ -176,4 +180,7 @@ def _element(picture: bytes, alt: str) -> Markup:
     found = re.search(r"<svg\b.*</svg>", picture.decode("utf-8", errors="replace"), re.DOTALL)
     if not found:
         raise ValueError(f"a picture that begins with {picture[:8]!r} is none; expected PNG, JPEG or SVG")
-    return Markup(found[0].replace("<svg", f"<svg role='img' aria-label='{escape(alt)}'", 1))
+    # No drawing is made larger than it is, so that its letters are those of the others on the page.
+    own = re.search(r'<svg\b[^>]* width="([\d.]+)pt"', found[0])
+    style = f" style='min-width: min({_LEAST_SVG}, {own[1]}pt)'" if own else ""
+    return Markup(found[0].replace("<svg", f"<svg role='img' aria-label='{escape(alt)}'{style}", 1))

@@ -275,7 +275,7 @@ def comparison_page(comparison: TableComparison, pictures: Sequence[_Picture]) -
     """Return the text of `report.html`."""
     tables = comparison.one, comparison.other
     kind, sentence = _VERDICTS[comparison.same]
-    shown = [(heading(each.title), figure(each.png, each.caption, each.title)) for each in pictures]
+    shown = [(heading(each.title), figure(each.png, each.caption, each.title, wide=True)) for each in pictures]
     return page(
         f"{tables[0].place.name} and {tables[1].place.name} compared",
         [

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, Final
 
@@ -39,6 +40,12 @@ _DECADE: Final = 10.0
 """Points on the two axes stay apart by at least this factor, so that close errors do not fill the figure."""
 
 
+_AXES_PT: Final = 330.0
+"""Height of the scatter's axes, about, in typographic points; it is 5.4 inches with its labels."""
+_LABEL_PT, _LABEL_RISE_PT = 8.5, 3.0
+"""Height of a label of 7 points, and by how much one stands above its point."""
+
+
 def error_scatter(
     one: npt.NDArray[np.float64], other: npt.NDArray[np.float64], names: tuple[str, str], marked: dict[int, str]
 ) -> bytes:
@@ -55,19 +62,20 @@ def error_scatter(
         axes = figure.add_subplot()
         axes.plot([low, high], [low, high], color=FAINT, linewidth=1, zorder=1)
         for colour, chosen in ((SERIES[0], one <= other), (SERIES[1], one > other)):
-            axes.scatter(x[chosen], y[chosen], s=14, color=colour, alpha=0.55, linewidths=0, zorder=2)
+            axes.scatter(x[chosen], y[chosen], s=14, color=colour, alpha=0.8, linewidths=0, zorder=2)
         places = np.array(list(marked), dtype=np.int64)
         axes.scatter(x[places], y[places], s=34, facecolors="none", edgecolors=INK, linewidths=0.8, zorder=3)
-        for place, name in marked.items():
+        for place, rise in zip(marked, _rises(x[places], y[places], low, high), strict=True):
             left = x[place] > middle
             axes.annotate(
-                name,
+                marked[place],
                 (x[place], y[place]),
-                xytext=(-5 if left else 5, 3),
+                xytext=(-5 if left else 5, rise),
                 textcoords="offset points",
                 ha="right" if left else "left",
                 fontsize=7,
                 color=INK,
+                arrowprops={"arrowstyle": "-", "color": FAINT, "linewidth": 0.5, "shrinkA": 0, "shrinkB": 2.5},
             )
         axes.set(
             xscale="log",
@@ -82,6 +90,24 @@ def error_scatter(
         axes.yaxis.set_major_formatter("{x:g}")
 
     return svg_of(draw, inches=(5.6, 5.4))
+
+
+def _rises(x: npt.NDArray[np.float64], y: npt.NDArray[np.float64], low: float, high: float) -> npt.NDArray[np.float64]:
+    """Return by how much labels stand above their points, typographic points, so that none covers another.
+
+    `x`, `y`: (N,) float64, between `low` and `high` of logarithmic axes. Those of each quarter of the figure are piled
+    up from its outer edge to the middle.
+    """
+    middle = np.sqrt(low * high)
+    heights = _AXES_PT * np.log(y / low) / np.log(high / low)
+    places = heights + _LABEL_RISE_PT
+    for left in (False, True):
+        for inward, upper in ((1, False), (-1, True)):
+            quarter = np.flatnonzero(((x > middle) == left) & ((y > middle) == upper))
+            quarter = quarter[np.argsort(inward * heights[quarter])]
+            for before, after in pairwise(quarter):
+                places[after] = inward * max(inward * places[after], inward * places[before] + _LABEL_PT)
+    return places - heights
 
 
 _SAME_TRUTH_DEG: Final = 0.01

@@ -145,6 +145,17 @@ def sheet(name: str) -> str:
     return (Path(pages.__file__).parent / "templates" / name).read_text(encoding="utf-8")
 
 
+def test_a_wide_figure_scrolls_where_it_would_be_too_small() -> None:
+    png = pages.figure(b"\x89PNG", "many panels", wide=True)
+    assert "<figure class='wide'>" in png
+    assert "<figure>" in pages.figure(b"\x89PNG", "one panel")
+
+
+def test_a_drawing_is_not_made_larger_than_it_is() -> None:
+    small = pages.figure(b'<svg xmlns="x" width="273.6pt" height="273.6pt"><path/></svg>', "a plane")
+    assert "min-width: min(36rem, 273.6pt)" in small
+
+
 def test_what_is_no_picture_is_refused() -> None:
     with pytest.raises(ValueError, match="GIF89a"):
         pages.figure(b"GIF89a", "")
@@ -152,13 +163,14 @@ def test_what_is_no_picture_is_refused() -> None:
 
 def test_an_interval_is_not_broken_over_two_lines() -> None:
     shown = pages.table("Intervals", ("Method", "Mean"), (("a – b", "2.30 – 3.41"),), (False, True))
-    assert "2.30\u00a0–\u00a03.41" in shown
-    assert "a – b" in shown
+    assert "<span class='unbroken'>2.30 – 3.41</span>" in shown
+    assert "<td>a – b</td>" in shown
+    assert "0.9 (<span class='unbroken'>−0.1 – 1.9</span>)" in pages.note("0.9 (−0.1 – 1.9)")
 
 
 def test_an_option_of_a_command_is_not_broken_over_two_lines() -> None:
     """The hyphens stay what they are: the command is copied from the page."""
-    option = "<span class='option'>--retake</span>"
+    option = "<span class='unbroken'>--retake</span>"
     for piece in (
         pages.note("run it with --retake 12"),
         pages.verdict("refuse", "(--retake <12>)"),

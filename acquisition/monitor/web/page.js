@@ -25,8 +25,8 @@ const STATES = {
   unknown: ["?", "no sign of life known"],
 };
 const LOUD = new Set(["paused", "late", "silent", "incomplete", "stopped", "complete"]);
-const WHITE = "white, red ─ green ╌ blue ┈";
-const BLACK = "black, red ─ green ╌ blue ┈";
+const WHITE = "white, red\u00a0─ green\u00a0╌ blue\u00a0┈";
+const BLACK = "black, red\u00a0─ green\u00a0╌ blue\u00a0┈";
 const PACE = "seconds a frame";
 // Plots in the order in which an operator asks; what is not named here follows in the order of the journal.
 const PLOT_ORDER = [

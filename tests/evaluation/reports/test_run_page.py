@@ -8,6 +8,7 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from html import unescape
+from itertools import pairwise
 from typing import Any
 
 import cv2
@@ -47,6 +48,18 @@ def test_names_are_neither_mathematics_nor_left_out() -> None:
     scatter = texts(error_scatter(random.random(5), random.random(5), ("$a$", "_b"), {0: "im $x_1$"}))
     assert all(name in curves and name in planes for name in NAMES)
     assert {"im $x_1$", "$a$: error, degrees", "_b: error, degrees"} <= set(scatter)
+
+
+@pytest.mark.parametrize("error", [20.0, 0.02])
+def test_labels_of_images_with_like_errors_stand_one_above_another(error: float) -> None:
+    one, other = np.array([0.5, 0.5, 0.52, 5.0, 5.1]), np.array([20.0, error, error, error, 1.0])
+    svg = error_scatter(one, other, ("A", "B"), {place: f"image {place}" for place in range(5)}).decode()
+    labels = {
+        name: float(height) for height, name in re.findall(r'<text [^>]* y="([-\d.]+)"[^>]*>(image \d)</text>', svg)
+    }
+    assert len(labels) == 5
+    left = sorted(labels[f"image {place}"] for place in range(3))
+    assert all(below - above > 7 for above, below in pairwise(left)), "a label has 7 points"
 
 
 METHODS = [GrayEdge("Gray-world", 0, 1, 0, 0), GrayEdge("White <Patch>", 0, np.inf, 0, 0)]
