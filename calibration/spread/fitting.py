@@ -132,6 +132,10 @@ _OFF_LAW = 0.35
 """Standard deviation of a kernel's share against the law's, relative: of what is seen beside cells follows what lies
 over all of the frame, channel by channel (chosen)."""
 
+_LAW_APART = 0.7
+"""As `CHANNELS_APART`, of how a lens's light deviates from a law: the form is the lens's, the amount each channel's
+(chosen)."""
+
 _SCATTER_APART = 0.5
 """The same as `CHANNELS_APART` of such a lens."""
 
@@ -566,7 +570,7 @@ def _usual_shares(bits: int, lens: _Lens) -> _Array:
         off_law = np.zeros_like(sizes)
     for one, row, own in zip(kernels, sizes, off_law, strict=True):
         for other, both, alone in zip(kernels, row, own, strict=True):
-            usual[np.ix_(one, other)] = both * channels_alike(lens.far_apart) + alone * np.eye(3)
+            usual[np.ix_(one, other)] = both * channels_alike(lens.far_apart) + alone * channels_alike(_LAW_APART)
     usual[np.ix_(veil, veil)] = (lens.veil * USUAL_VEIL) ** 2 * channels_alike(lens.veil_apart)
     return usual
 

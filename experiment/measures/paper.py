@@ -80,6 +80,9 @@ _NEAR = 4
 _USUAL = 5.0
 """Usual deviations beyond which a reference is off: by chance one in two million."""
 
+_UNLIKELY = 0.01
+"""Likelihood of a number of terms up to which it is not asked about."""
+
 _EXACT = 1e-9
 """Coefficients of terms below this are rounding errors of their computation."""
 
@@ -206,12 +209,13 @@ class PaperReader:
         judging = self._counts[-1] if not any(self.base.coefficients) else _PLAIN
         fits = [_best_fit(basis, known[:, channel], values[:, channel], self._counts, judging) for channel in range(3)]
         solutions = np.zeros((3, basis.shape[1]))
-        for channel, (solution, _) in enumerate(fits):
-            solutions[channel, : len(solution)] = solution
+        for channel, fit in enumerate(fits):
+            solutions[channel, : len(fit.solution)] = fit.solution
         local, before = linear_combinations(self._at_centres, solutions), shape.copy()
         white, error, spread = np.zeros(3), np.zeros(3), np.zeros(3)
         left = np.zeros_like(values)
-        for channel, (solution, weights) in enumerate(fits):
+        for channel, fit in enumerate(fits):
+            solution, weights = fit.solution, fit.weights
             level = float((local[channel] * before[:, channel]).mean())
             # Light too weak to show a shape of its own, or none at all.
             own = solution / level if level > 0 and local[channel].min() > LEAST_FIELD * level else np.ones(1)
@@ -221,8 +225,10 @@ class PaperReader:
             flat = values[:, channel] / (known[:, channel] * (basis[:, : len(own)] @ own))
             white[channel] = float((weights * flat).sum() / weights.sum())
             residual = flat - white[channel]
-            scatter = float(np.sqrt((weights * residual**2).sum() / weights.sum()))
-            error[channel] = scatter / np.sqrt(float(weights.sum()))
+            if len(own) == len(solution):
+                error[channel] = fit.level_error(product(self._at_centres, before[:, channel]) / len(before))
+            else:
+                error[channel] = np.sqrt(float((weights * residual**2).sum())) / float(weights.sum())
             # All references count here: a stain that the fit rightly ignores must still be seen.
             left[:, channel] = residual / max(abs(white[channel]), 1e-9)
             spread[channel] = float(np.sqrt((left[:, channel] ** 2).mean()))
@@ -236,11 +242,11 @@ class PaperReader:
         The channels are added as they are, so that each counts by its light, as photon noise asks for.
         """
         total, even = values.sum(axis=1), np.ones(len(values))
-        first = self._shape(basis, _best_fit(basis, even, total, self._counts, self._counts[-1])[0])
+        first = self._shape(basis, _best_fit(basis, even, total, self._counts, self._counts[-1]).solution)
         if first is None:
             return None
         # Once more, with the references weighted by the light that the first fit shows.
-        return self._shape(basis, _best_fit(basis, even, total, self._counts, self._counts[-1], first[0])[0])
+        return self._shape(basis, _best_fit(basis, even, total, self._counts, self._counts[-1], first[0]).solution)
 
     def _shape(self, basis: _Array, solution: _Array) -> tuple[_Array, _Array, _Array] | None:
         """Return a solution's shape at references and at centres, mean 1 there, and its factor; None if it is even."""
@@ -263,6 +269,41 @@ class PaperReader:
         return factor[: len(page_powers(order))]
 
 
+@dataclass(frozen=True, eq=False)
+class _Fit:
+    """The light at N references by the terms that forecast best.
+
+    - `solution`: (terms,) float64. `weights`: (N,) float64, 0 … 1.
+    - `design`, `values`: (N, T) and (N,) float64, references over their usual noise, by all terms that were tried.
+    - `likely`: numbers of terms that were tried, and how likely each is.
+    """
+
+    solution: _Array
+    weights: _Array
+    design: _Array
+    values: _Array
+    likely: tuple[tuple[int, float], ...]
+
+    def level_error(self, mean: _Array) -> float:
+        """Return the standard error of the mean light, counts; `mean`: (T,) float64, that of each term.
+
+        By the references' scatter, and by how much other numbers of terms, as likely as they are, would give another
+        mean.
+        """
+        root = np.sqrt(self.weights)
+        rows, values, terms = self.design * root[:, None], self.values * root, len(self.solution)
+        left = values - rows[:, :terms] @ self.solution
+        variance = float(left @ left) / max(float(self.weights.sum()) - terms, 1.0)
+        own = mean[:terms]
+        square = variance * float(own @ np.linalg.pinv(rows[:, :terms].T @ rows[:, :terms], hermitian=True) @ own)
+        level = float(own @ self.solution)
+        for count, likely in self.likely:
+            if count != terms and likely > _UNLIKELY:
+                other = mean[:count] @ np.linalg.lstsq(rows[:, :count], values, rcond=None)[0]
+                square += likely * (float(other) - level) ** 2
+        return float(np.sqrt(square))
+
+
 def _best_fit(
     basis: _Array,
     known: _Array,
@@ -270,8 +311,8 @@ def _best_fit(
     counts: tuple[int, ...],
     judging: int,
     light: _Array | None = None,
-) -> tuple[_Array, _Array]:
-    """Return solution (terms,) and weights (N,), 0 … 1, of the fit that forecasts references best.
+) -> _Fit:
+    """Return the fit that forecasts references best.
 
     `basis`: (N, T) float64, the terms. `known`: (N,) float64, the base's shape. `values`: (N,) float64 counts above
     black. `light`: (N,) float64, relative light by which the references' noise is known; the base's shape if not given.
@@ -287,11 +328,14 @@ def _best_fit(
     weights = robust_least_squares(design[:, : max(enough, default=allowed[0])], trusted, _ROUNDS)[1]
     held_out = held_out_squares(design[:, : allowed[-1]], trusted, weights, allowed)
     used = int((weights > 0).sum())
-    best = allowed[int(np.argmin(used * np.log(np.maximum(held_out, 1e-12)) + TERM_PRICE * np.array(allowed)))]
+    price = used * np.log(np.maximum(held_out, 1e-12)) + TERM_PRICE * np.array(allowed)
+    best = allowed[int(np.argmin(price))]
+    likely = np.exp(-0.5 * (price - price.min()))
+    likely /= likely.sum()
     # Begun with these weights, so that terms which a hand in a corner seems to ask for do not take it in again.
     root = np.sqrt(weights)
     solution, again, _ = robust_least_squares(design[:, :best] * root[:, None], trusted * root, _ROUNDS)
-    return solution, weights * again
+    return _Fit(solution, weights * again, design, trusted, tuple(zip(allowed, likely.tolist(), strict=True)))
 
 
 def _residual(left: _Array, places_mm: _Array, page_mm: tuple[float, float], channel: int) -> FieldResidual:
