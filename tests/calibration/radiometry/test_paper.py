@@ -54,6 +54,22 @@ def test_noise_is_not_taken_for_shape(seed: int, level: float) -> None:
     assert np.sqrt(((paper.field.at(CENTRES) / expected - 1) ** 2).mean()) < 0.002 + 0.25 * noise / level
 
 
+def test_the_error_of_white_holds_that_of_its_field() -> None:
+    """Cells where no reference is: by the references' scatter alone errors were 1.5 times as large, and up to 12."""
+    random, level, off = np.random.default_rng(8), np.array([3000.0, 700.0, 5000.0]), []
+    true = level * falloff(CENTRES).mean(axis=0)
+    for _ in range(3):
+        places = random.random((144, 2)) * PAGE * (0.85, 1)
+        lamp = PaperReader(places, CENTRES, PAGE).read(9000 * falloff(places) * (1 + places[:, :1] / 8000))[0]
+        reader = PaperReader(places, CENTRES, PAGE, lamp.field)
+        for _ in range(40):
+            noise = random.normal(0, np.sqrt(level / 1.8 + 36) / 5, (len(places), 3))
+            paper, _ = reader.read(level * falloff(places) + noise)
+            off.append((paper.white - true) / paper.error)
+    assert 0.9 < np.sqrt(np.square(off).mean()) < 1.3
+    assert np.abs(off).max() < 6
+
+
 def test_references_that_are_covered_or_dirty_do_not_count() -> None:
     seen = 5000 * falloff(PLACES)
     seen[:30] *= 0.5
