@@ -2,21 +2,23 @@
 
 from __future__ import annotations
 
+import itertools
+import multiprocessing
 import os
 import shutil
 import signal
 import sqlite3
-import subprocess
-import sys
 from collections.abc import Generator
 from contextlib import closing
 from io import BytesIO
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 import calibration.pipeline.build as building
+import calibration.table.lut as lut_files
 from calibration.pipeline.accumulator import stored_names
 from calibration.pipeline.baseline import frame_faults
 from calibration.pipeline.build import CHECKPOINT, Checkpoint, TableProgress, append, build, unfinished_table
@@ -31,34 +33,32 @@ from tests.calibration.lab import LIGHTS, Lab, hang, renumbered, take
 
 pytestmark = pytest.mark.slow
 
-KILLER = """
-import os, signal, sys
-import calibration.pipeline.build, calibration.table.lut, calibration.report.report
-from calibration.cli import main
+FORKS = multiprocessing.get_context("forkserver")
+"""Programs beside this one, without waiting for their imports each time."""
+FORKS.set_forkserver_preload([__name__])
 
-place, count = sys.argv[1], int(sys.argv[2])
-calibration.pipeline.build.CHECKPOINT_EVERY = 3
-calibration.report.report.write_report = lambda *_: None
-owner, name = {
-    "putting": (calibration.table.lut.LutWriter, "put"),
-    "saving": (calibration.pipeline.build.UnfinishedTable, "save"),
-    "finishing": (calibration.table.lut, "write_whole"),
-    "publishing": (calibration.pipeline.build.Path, "replace"),
-}[place]
-real = getattr(owner, name)
+PLACES = {
+    "putting": (lut_files.LutWriter, "put"),
+    "saving": (building.UnfinishedTable, "save"),
+    "finishing": (lut_files, "write_whole"),
+    "publishing": (Path, "replace"),
+}
 
-def deadly(*args, **kwargs):
-    global count
-    if place == "publishing" and not args[0].is_dir():
-        return real(*args, **kwargs)
-    count -= 1
-    if count == 0:
-        os.kill(os.getpid(), signal.SIGKILL)
-    return real(*args, **kwargs)
 
-setattr(owner, name, deadly)
-sys.exit(main(sys.argv[3:]))
-"""
+def build_until_killed(place: str, count: int, folder: Path, out: Path) -> None:
+    """Build a table; the process is killed before the `count`-th call at a place."""
+    building.CHECKPOINT_EVERY = 3
+    owner, name = PLACES[place]
+    real, left = getattr(owner, name), itertools.count(count, -1)
+
+    def deadly(*given: Any, **named: Any) -> Any:
+        if (place != "publishing" or given[0].is_dir()) and next(left) == 1:
+            os.kill(os.getpid(), signal.SIGKILL)
+        return real(*given, **named)
+
+    setattr(owner, name, deadly)
+    with Session.open(folder) as session:
+        build(session, out)
 
 
 @pytest.fixture(autouse=True)
@@ -99,12 +99,10 @@ def interrupted_at(session: Session, out: Path, frame: int) -> None:
 def test_a_killed_build_goes_on_to_the_same_bytes(
     session: Session, undisturbed: dict[str, bytes], tmp_path: Path, place: str, count: int
 ) -> None:
-    done = subprocess.run(
-        [sys.executable, "-c", KILLER, place, str(count), str(session.folder), str(tmp_path / "lut")],
-        capture_output=True,
-        check=False,
-    )
-    assert done.returncode == -signal.SIGKILL, done.stderr
+    program = FORKS.Process(target=build_until_killed, args=(place, count, session.folder, tmp_path / "lut"))
+    program.start()
+    program.join()
+    assert program.exitcode == -signal.SIGKILL
     assert not (tmp_path / "lut").exists()
     build(session, tmp_path / "lut")
     assert files(tmp_path / "lut") == undisturbed
