@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+import numpy.typing as npt
 import pytest
 
 from acquisition.check import places
@@ -31,7 +32,8 @@ def test_cells_lie_where_the_room_shows_them(lab: Lab, rms_px: float, worst_px: 
     mosaic = lab.mosaic(tmp_path)
     place = place_chart(find_chart(mosaic, lab.chart), lab.chart)
     points = lab.chart.centres_mm
-    error = np.linalg.norm(np.asarray(place.to_pixels(points) - lab.truth_px(points, mosaic)), axis=1)
+    off = np.asarray(place.to_pixels(points) - lab.truth_px(points, mosaic), dtype=np.float64)
+    error: npt.NDArray[np.float64] = np.sqrt((off**2).sum(axis=1))
     assert np.sqrt(np.mean(error**2)) < rms_px
     assert error.max() < worst_px
     if lab.chart.tags:
