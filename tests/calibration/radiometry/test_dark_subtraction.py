@@ -147,7 +147,7 @@ def test_samples_keep_their_noise(room: Lab, subtracted: BuildResult) -> None:
         response = (room.world.room.response_spread * signal[:, channel]) ** 2
         expected = (signal[:, channel] / body.electrons_per_dn + body.read_noise_dn**2 + response) / photosites
         spread = samples[..., channel].var(axis=1, ddof=1)
-        # The median of 64 variances of 25 values is 0.97, good to 1.25 · √(2/24/64) = 4.5 %, and the field's 5 % squared.
+        # The median of 64 variances of 25 values is 0.97, good to 1.25 · √(2/24/64) = 4.5 %.
         assert np.median(spread / expected) == pytest.approx(0.97, abs=0.14)
 
 
