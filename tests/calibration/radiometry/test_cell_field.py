@@ -102,9 +102,11 @@ def test_a_reference_counts_for_ten_cells_and_few_patches_for_nothing() -> None:
     slope = np.polyfit(FEW.centres_mm[:, 0] / FEW.page_mm[0], change, 1)[0] / 0.02
     assert ((slope > 0.5) & (slope < 1.2)).all()
     terms = len(code_powers(2)) + page_polynomial(FEW.centres_mm, FEW.page_mm, 2).shape[1]
-    there[2 * terms - len(FEW_WHITES_MM) - 1 :] = False
-    none = field_of_cells(FEW.rgb, FEW.centres_mm, levels, there, FEW_WHITES_MM, paper, FEW.page_mm)
-    assert (none.at(FEW.centres_mm) == 1).all()
+    # Two patches for each number of the model are enough, one fewer is not.
+    for count, shaped in ((2 * terms, True), (2 * terms - 1, False)):
+        there[:] = np.arange(len(there)) < count - len(FEW_WHITES_MM)
+        found = field_of_cells(FEW.rgb, FEW.centres_mm, levels, there, FEW_WHITES_MM, paper, FEW.page_mm)
+        assert (found.at(FEW.centres_mm) == 1).all() != shaped
 
 
 def test_a_colour_without_light_has_no_shape(world: World) -> None:
