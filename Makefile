@@ -50,7 +50,7 @@ demo: $(DEMO_READY)
 test: $(READY) lint
 	$(BIN)/python -m pytest -n auto --dist worksteal
 
-# What most mistakes are caught by: every test that takes no longer than two seconds. Under a minute on two cores.
+# What most mistakes are caught by: every test function that takes no longer than a quarter of a second.
 quick: $(READY)
 	$(BIN)/python -m pytest -n auto --dist worksteal -m "not slow"
 

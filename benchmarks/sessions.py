@@ -75,8 +75,9 @@ def short_plan(lights: Mapping[str, Colour] = EIGHT_LIGHTS) -> tuple[Illuminatio
     )
 
 
+@lru_cache(maxsize=1)
 def world_of(chart: Chart, body: Body, room: Room) -> World:
-    """Return a chart in a room before a camera."""
+    """Return a chart in a room before a camera; the last one again, whose light is as long to compute as ten frames."""
     return World(_printed(chart), body, room)
 
 

@@ -43,6 +43,7 @@ def test_settings_are_never_overwritten(tmp_path: Path, capsys: pytest.CaptureFi
     assert "LAB.toml" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_an_empty_folder_gets_the_whole_experiment(tmp_path: Path) -> None:
     assert main(["init", str(tmp_path / "new" / "lab"), "--rig", "simulated"]) == 0
     assert len(load_illuminations(tmp_path / "new" / "lab" / "illuminations.csv")) == 707

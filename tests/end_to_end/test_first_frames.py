@@ -99,10 +99,8 @@ def of(said: Sequence[str], word: str) -> list[str]:
 @pytest.mark.parametrize(
     ("frame", "event"),
     [
-        (0, {"what": "lamp step", "percent": -10}),
         (0, {"what": "lamp step", "percent": -3}),
         (0, {"what": "defocus", "px": 1}),
-        (1, {"what": "ambient step", "percent": 1}),
         (2, {"what": "pop-up", "place": [-9, -9, 9, 9], "colour": [250, 250, 0]}),
         (4, {"what": "lamp step", "percent": 0, "rgb": [0, 0, -10]}),
     ],

@@ -53,7 +53,7 @@ def lab(tmp_path: Path) -> Path:
         port = free.getsockname()[1]
     folder = tmp_path / "private"
     folder.mkdir()
-    assert command("acquisition.cli", "chart", folder / "chart", "--bits", 3, "--no-tiff") == 0
+    assert command("acquisition.cli", "chart", folder / "chart", "--bits", 2, "--no-tiff") == 0
     lights = folder / "illuminations.csv"
     assert command("acquisition.cli", "illuminations", lights, "--grid", 1, "--blackbodies", "2500:7500:2500") == 0
     path = folder / "LAB.toml"

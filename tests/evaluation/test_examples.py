@@ -14,6 +14,7 @@ import evaluation
 MODULES = [info.name for info in pkgutil.walk_packages(evaluation.__path__, "evaluation.")]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", MODULES)
 def test_examples(name: str) -> None:
     # colour-science, which other tests import, makes numpy print arrays as its version 1.13 did.

@@ -37,6 +37,7 @@ PUBLISHED = {"NUS": (5.16, 4.15, 4.46, 0.95, 11.00)}
 """Gray-world at full resolution: Canon1DsMkIII in Cheng et al., CVPR 2015, as google/ffcc collects it."""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("method", "figures"), PLAIN, ids=lambda value: getattr(value, "name", ""))
 def test_plain_methods_on_real_images(
     collection: Collection, method: GrayEdge, figures: dict[str, tuple[float, ...]]

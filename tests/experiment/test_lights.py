@@ -203,6 +203,7 @@ def test_what_is_missing_or_no_text_is_refused(tmp_path: Path) -> None:
             load_illuminations(path)
 
 
+@pytest.mark.slow
 def test_the_figure_shows_each_light_at_its_chromaticity(plan: tuple[Illumination, ...], tmp_path: Path) -> None:
     path = tmp_path / "lights.png"
     plot_illuminations(plan, path)
@@ -220,6 +221,7 @@ def test_the_figure_shows_each_light_at_its_chromaticity(plan: tuple[Illuminatio
     assert path.read_bytes() == first
 
 
+@pytest.mark.slow
 def test_figures_of_other_kinds(tmp_path: Path) -> None:
     few = (Illumination(0, "uniform", None, Colour(0, 0, 0)), Illumination(1, "uniform", None, Colour(255, 9, 1)))
     for name, head in (("a.pdf", b"%PDF"), ("a.SVG", b"<?xml")):

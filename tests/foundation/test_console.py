@@ -227,6 +227,7 @@ def ended(program: str, output: int) -> tuple[int, str]:
     return done.returncode, done.stderr
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "program",
     [
@@ -425,6 +426,7 @@ def test_every_command_tells_its_version(main: Callable[[list[str]], int], capsy
     assert capsys.readouterr().out.strip() == software() == f"croplab {version('croplab')}"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("option", ["-h", "--help"])
 def test_every_command_helps(main: Callable[[list[str]], int], option: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert main([option]) == 0
@@ -489,6 +491,7 @@ def test_the_short_form_of_evaluate_takes_them_first(tmp_path: Path, capsys: pyt
 PRINTING = "from foundation.console import run; import sys; sys.exit(run(lambda: print('30 \u00b0 \u2026')))"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("encoding", ["ascii", "latin-1", "utf-8"])
 def test_a_terminal_gets_what_it_can_show(encoding: str) -> None:
     environment = {**os.environ, "PYTHONIOENCODING": encoding}

@@ -29,6 +29,7 @@ def test_a_file_that_hides_a_package_is_named(tmp_path: Path, hidden: str) -> No
     assert done.stderr.startswith(f"error: {tmp_path / hidden}.py hides the package {hidden}")
 
 
+@pytest.mark.slow
 def test_the_name_of_its_own_has_what_the_packages_have_and_loads_late(tmp_path: Path) -> None:
     code = """
 import sys, croplab

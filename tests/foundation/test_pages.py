@@ -180,6 +180,7 @@ def test_an_option_of_a_command_is_not_broken_over_two_lines() -> None:
     assert "span" not in pages.paragraph("a row --- of hyphens, and a--b")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("top", [8, 90, 1e7])
 @pytest.mark.parametrize("drawn_by", [svg_of, png_of])
 def test_logarithmic_axes_have_plain_numbers(drawn_by: Callable[[Callable[[Any], None]], bytes], top: float) -> None:

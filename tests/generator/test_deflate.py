@@ -51,6 +51,7 @@ def rows_of(image: Image16, filters: npt.NDArray[np.uint8]) -> bytes:
     return np.hstack([filters[:, None], filtered]).astype(np.uint8).tobytes()
 
 
+@pytest.mark.slow
 @settings(max_examples=150)
 @given(
     image=hnp.arrays(
@@ -177,6 +178,7 @@ def test_images_that_no_png_holds_are_refused() -> None:
 frequencies = st.lists(st.integers(0, 1 << 40) | st.just(0), min_size=1, max_size=286)
 
 
+@pytest.mark.slow
 @settings(max_examples=200)
 @given(frequencies)
 def test_codes_are_complete_and_begin_no_other(counts: list[int]) -> None:

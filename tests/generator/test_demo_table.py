@@ -31,6 +31,7 @@ def small(monkeypatch: pytest.MonkeyPatch, folder: Path) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(folder))
 
 
+@pytest.mark.slow
 def test_it_is_made_once_and_says_what_it_is(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -53,6 +54,7 @@ def test_without_a_place_the_remedy_is_named(monkeypatch: pytest.MonkeyPatch) ->
         table_folder(Path("demo:"))
 
 
+@pytest.mark.slow
 def test_one_command_makes_images_of_a_picture(tmp_path: Path) -> None:
     picture = tmp_path / "cat.png"
     cv2.imwrite(str(picture), np.random.default_rng(1).integers(0, 255, (20, 30, 3), dtype=np.uint8))
@@ -60,6 +62,7 @@ def test_one_command_makes_images_of_a_picture(tmp_path: Path) -> None:
     assert json.loads((tmp_path / "out" / "dataset.json").read_text("utf-8"))["images"]
 
 
+@pytest.mark.slow
 def test_other_commands_take_it_too(capsys: pytest.CaptureFixture[str]) -> None:
     assert build_lut(["--info", "demo:"]) == 0
     assert "computed by sim table" in capsys.readouterr().out

@@ -19,6 +19,7 @@ MODULES = sorted(
 )
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("table_and_picture")
 @pytest.mark.parametrize("name", MODULES)
 def test_examples(name: str) -> None:

@@ -42,6 +42,7 @@ def test_distinct_numbers_are_distinct_and_in_range(total: int, data: st.DataObj
     assert set(chosen) <= set(range(total))
 
 
+@pytest.mark.slow
 def test_every_order_is_equally_likely() -> None:
     # 12 orders of 2 out of 4, 12 000 draws: chi-square with 11 degrees of freedom exceeds 37.4 once in 10 000 seeds.
     draws = Counter(philox.distinct(7, 2, 4, number, philox.LIGHTS) for number in range(12_000))

@@ -54,6 +54,7 @@ def test_every_option_says_what_it_takes_in_the_same_way(name: str) -> None:
         assert text.endswith((".", "]")), f"{parameter.name}: {text}"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("room", ROOMS)
 def test_no_color_is_obeyed(room: str) -> None:
     """https://no-color.org: any value that is not empty; colours there are without it."""

@@ -160,6 +160,7 @@ CALLS: dict[str, tuple[str, dict[str, Any]]] = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", CALLS)
 def test_a_command_prints_one_object_with_the_keys_of_the_reference(
     name: str, made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
@@ -175,6 +176,7 @@ def test_a_command_prints_one_object_with_the_keys_of_the_reference(
     assert {key for key in found if key != "command" and f"`{key}`" not in section} == set()
 
 
+@pytest.mark.slow
 def test_the_inverse_of_flash_and_comparisons(made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     evaluate = main_of("evaluate")
     data, codes, results = str(made / "set"), tmp_path / "codes", tmp_path / "results"
@@ -193,6 +195,7 @@ def test_the_inverse_of_flash_and_comparisons(made: Path, tmp_path: Path, capsys
     assert {key for key in compared if key != "command" and f"`{key}`" not in section} == set()
 
 
+@pytest.mark.slow
 def test_faults_are_figures_too(made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     wish = ["--random-scenes", "2", "--size", "20x20"]
     found = json_of(main_of("generate"), [made / "lut", tmp_path / "set", *wish, "--shard-images", "1"], capsys)

@@ -21,6 +21,7 @@ from tests.drivers.pjlink.notice_port import NoticePort
 SIM = [sys.executable, "-c", "from sim.cli import main; raise SystemExit(main())"]
 
 
+@pytest.mark.slow
 def test_serves_a_projector_until_interrupted() -> None:
     with subprocess.Popen(
         [*SIM, "projector", "--pjlink", "0", "--password", "secret"],
@@ -130,6 +131,7 @@ def test_help_names_the_exit_codes(capsys: pytest.CaptureFixture[str]) -> None:
     assert "130" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_lends_a_camera_over_usb_ip_until_interrupted() -> None:
     with subprocess.Popen(
         [*SIM, "camera", "--usbip", "0", "--model", "EOS 6D Mark II"],

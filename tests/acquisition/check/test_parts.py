@@ -168,6 +168,7 @@ def test_battery_and_card_are_judged_as_far_as_the_body_tells(
     assert [found.grade for found in judge_supplies(Body(left), frames, 25 * 10**6)] == [battery, card]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("bits", "few"), [(2, True), (5, False)])
 def test_light_is_read_from_few_references_and_from_many(bits: int, few: bool) -> None:
     chart = design_chart(bits)

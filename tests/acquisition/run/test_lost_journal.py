@@ -102,6 +102,7 @@ def facts(folder: Path) -> Rows:
         return rows_of(connection)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("frame", [2, 7, 12])
 @pytest.mark.parametrize("happens", MISHAPS)
 def test_a_lost_journal_ends_the_run_and_is_made_anew(lab: Lab, happens: Callable[[Path], object], frame: int) -> None:
@@ -127,6 +128,7 @@ def test_a_lost_journal_ends_the_run_and_is_made_anew(lab: Lab, happens: Callabl
     lab.session.close()
 
 
+@pytest.mark.slow
 def test_the_ledger_equals_the_journal_after_every_kind_of_end(lab: Lab) -> None:
     lab.camera.script |= {2: b"no raw file", 5: StorageError("lost")}
     with pytest.raises(StorageError, match="lost"):
@@ -226,6 +228,7 @@ def test_a_ledger_of_a_stranger_becomes_no_statement(lab: Lab, line: str) -> Non
         rebuild_journal(lab.session.folder)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mishap", [Path.unlink, lambda path: os.truncate(path, 9)])  # type: ignore[misc]
 @pytest.mark.parametrize("after", [4, 12])
 def test_a_frame_that_is_deleted_or_cut_is_taken_again(lab: Lab, mishap: Callable[[Path], object], after: int) -> None:
@@ -263,6 +266,7 @@ def older(lab: Lab) -> Path:
     return folder
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("command", [["status"], ["report"], ["run", "LAB.toml"]])
 def test_no_command_believes_a_journal_that_the_ledger_contradicts(
     older: Path, command: list[str], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch

@@ -15,6 +15,7 @@ from tests.acquisition.run.mishaps import MISHAPS, TroubledLab, take_all
 SEEDS = range(10, 30)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(4))
 def test_mishaps_cost_no_frame(tmp_path: Path, seed: int) -> None:
     take_all(tmp_path / "session", seed)

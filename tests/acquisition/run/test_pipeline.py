@@ -208,6 +208,7 @@ class TestRefusals:
         accepted = [attempt.step for attempt in lab.session.journal.attempts() if attempt.verdict == "accepted"]
         assert sorted(accepted) == list(range(10)), "each step once"
 
+    @pytest.mark.slow
     def test_a_reference_that_voids_for_ever_ends_the_run_when_patience_does(self, folder: Path) -> None:
         class NoWhite(ScriptedJudge):
             def judge(self, file: Path, step: SessionStep) -> Judgement:
@@ -277,6 +278,7 @@ class TestRefusals:
         assert any("it is tried again after a pause" in sentence for sentence in refusals)
         assert not any("it is left for the next run" in sentence for sentence in refusals)
 
+    @pytest.mark.slow
     def test_what_lasts_ends_the_run_when_patience_does(self, folder: Path) -> None:
         lab = Lab(folder, dict.fromkeys(range(1000), NIGHT))
         begun = lab.clock.monotonic()

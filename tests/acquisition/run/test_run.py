@@ -196,6 +196,7 @@ def test_another_screen_of_a_real_lab_is_refused(folder: Path) -> None:
     assert (caught.value.expected, caught.value.value) == ("display", "display HDMI-2")
 
 
+@pytest.mark.slow
 def test_lights_taken_again_are_closed_by_a_pair_behind_the_plan(folder: Path) -> None:
     lab = Lab(folder, lights=(*LIGHTS, Illumination(2, "uniform", None, Colour(9, 255, 3))))
     assert take_session(lab.session, lab.devices, SETTINGS).complete

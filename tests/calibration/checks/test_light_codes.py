@@ -139,7 +139,7 @@ def test_any_two_lights_of_a_small_session_are_found_exchanged(codes: Codes) -> 
 
 def test_one_wrong_light_of_eight_is_named_alone() -> None:
     codes = SESSIONS["eight"]
-    for seed in range(6):
+    for seed in range(3):
         white, error = random_session(codes, seed)
         white[4] = white[5]
         found = agreement(codes, white, error)
@@ -211,7 +211,7 @@ def test_a_white_that_is_not_known_is_not_judged() -> None:
 
 def test_a_light_of_half_the_brightness_is_found() -> None:
     codes = [*SESSIONS["eight"], (255, 255, 255)]
-    for seed in range(4):
+    for seed in range(2):
         white, error = random_session(codes, seed)
         white[0] /= 2
         found = agreement(codes, white, error)

@@ -10,7 +10,8 @@ import pytest
 from calibration.cli import main
 from calibration.comparison.comparing import compare, table_of
 from calibration.pipeline.baseline import BuildOptions
-from calibration.verdict import BuildResult
+from calibration.pipeline.build import build
+from experiment.session.folder import Session
 from sim.world.room import Room
 from tests.calibration.lab import LIGHTS, Lab, hang, take
 
@@ -18,11 +19,17 @@ pytestmark = pytest.mark.slow
 
 
 @pytest.fixture(scope="module")
-def folders(lab: Lab, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
-    """Return a session in the room of `lab`, and one of another day: another sheet, other noise, a dimmer lamp."""
+def small() -> Lab:
+    """Return a lab of few colours, whose lens is not measured: it has an error of its own, which is no noise."""
+    return hang(2, "A6")
+
+
+@pytest.fixture(scope="module")
+def folders(small: Lab, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    """Return a session in the room of `small`, and one of another day: another sheet, other noise, a dimmer lamp."""
     place = tmp_path_factory.mktemp("compared")
-    again = hang(room=Room(seed=7, waviness_mm=0.5, roll_deg=0.6, white_level_share=0.69))
-    for name, room in (("monday", lab), ("friday", again)):
+    again = hang(2, "A6", room=Room(seed=7, waviness_mm=0.5, roll_deg=0.6, white_level_share=0.69))
+    for name, room in (("monday", small), ("friday", again)):
         take(room, place / name, LIGHTS, every=6).close()
     return place / "monday", place / "friday"
 
@@ -41,19 +48,19 @@ def test_two_days_differ_in_brightness_alone(
     assert {path.name for path in folders[0].parent.iterdir()} == {"monday", "friday"}
 
 
-def test_one_room_and_other_noise_are_the_same(folders: tuple[Path, Path], lab: Lab, tmp_path: Path) -> None:
-    with take(lab, tmp_path / "again", LIGHTS, every=6, frame=lambda step: lab.dng(step.colour, 900 + step.number)):
+def test_one_room_and_other_noise_are_the_same(folders: tuple[Path, Path], small: Lab, tmp_path: Path) -> None:
+    with take(small, tmp_path / "again", LIGHTS, every=6, frame=lambda step: small.dng(step.colour, 900 + step.number)):
         pass
-    # A chart this small shows the lens with an error of its own, which is no noise of the samples.
-    options = BuildOptions(lens_correction=False)
-    with table_of(folders[0], options) as one, table_of(tmp_path / "again", options) as other:
+    with table_of(folders[0], BuildOptions()) as one, table_of(tmp_path / "again", BuildOptions()) as other:
         found = compare(one, other)
     assert found.same is True
-    assert float(found.lights.angle_deg.max()) < 0.03
+    assert float(found.lights.angle_deg.max()) < 0.05
 
 
 def test_a_table_is_compared_with_a_session(
-    folders: tuple[Path, Path], built: BuildResult, capsys: pytest.CaptureFixture[str]
+    folders: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert main(["--compare", str(built.lut), str(folders[0])]) == 0
+    with Session.open(folders[0]) as session:
+        build(session, tmp_path / "lut")
+    assert main(["--compare", str(tmp_path / "lut"), str(folders[0])]) == 0
     assert "warning: both tables" in capsys.readouterr().out

@@ -227,6 +227,7 @@ def test_unfit_cells_of_either_are_left_out(one: Lut, tmp_path: Path) -> None:
     assert cells_csv(found).splitlines()[8].startswith("7,0,,,,")
 
 
+@pytest.mark.slow
 def test_the_files_hold_every_light_and_every_cell(one: Lut, tmp_path: Path) -> None:
     found = compare(one, written(tmp_path / "other", 20, gain=0.9))
     write_comparison(found, tmp_path / "report")

@@ -2,21 +2,23 @@
 
 from __future__ import annotations
 
+import itertools
+import multiprocessing
 import os
 import shutil
 import signal
 import sqlite3
-import subprocess
-import sys
 from collections.abc import Generator
 from contextlib import closing
 from io import BytesIO
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 import calibration.pipeline.build as building
+import calibration.table.lut as lut_files
 from calibration.pipeline.accumulator import stored_names
 from calibration.pipeline.baseline import frame_faults
 from calibration.pipeline.build import CHECKPOINT, Checkpoint, TableProgress, append, build, unfinished_table
@@ -31,34 +33,38 @@ from tests.calibration.lab import LIGHTS, Lab, hang, renumbered, take
 
 pytestmark = pytest.mark.slow
 
-KILLER = """
-import os, signal, sys
-import calibration.pipeline.build, calibration.table.lut, calibration.report.report
-from calibration.cli import main
+FORKS = multiprocessing.get_context("forkserver")
+"""Programs beside this one, without waiting for their imports each time."""
+FORKS.set_forkserver_preload([__name__])
 
-place, count = sys.argv[1], int(sys.argv[2])
-calibration.pipeline.build.CHECKPOINT_EVERY = 3
-calibration.report.report.write_report = lambda *_: None
-owner, name = {
-    "putting": (calibration.table.lut.LutWriter, "put"),
-    "saving": (calibration.pipeline.build.UnfinishedTable, "save"),
-    "finishing": (calibration.table.lut, "write_whole"),
-    "publishing": (calibration.pipeline.build.Path, "replace"),
-}[place]
-real = getattr(owner, name)
+PLACES = {
+    "putting": (lut_files.LutWriter, "put"),
+    "saving": (building.UnfinishedTable, "save"),
+    "finishing": (lut_files, "write_whole"),
+    "publishing": (Path, "replace"),
+}
 
-def deadly(*args, **kwargs):
-    global count
-    if place == "publishing" and not args[0].is_dir():
-        return real(*args, **kwargs)
-    count -= 1
-    if count == 0:
-        os.kill(os.getpid(), signal.SIGKILL)
-    return real(*args, **kwargs)
 
-setattr(owner, name, deadly)
-sys.exit(main(sys.argv[3:]))
-"""
+@pytest.fixture(scope="module")
+def lab() -> Lab:
+    """Return a lab of few colours: of these the lens is not measured, which takes longer than all that matters here."""
+    return hang(2, "A6")
+
+
+def build_until_killed(place: str, count: int, folder: Path, out: Path) -> None:
+    """Build a table; the process is killed before the `count`-th call at a place."""
+    building.CHECKPOINT_EVERY = 3
+    owner, name = PLACES[place]
+    real, left = getattr(owner, name), itertools.count(count, -1)
+
+    def deadly(*given: Any, **named: Any) -> Any:
+        if (place != "publishing" or given[0].is_dir()) and next(left) == 1:
+            os.kill(os.getpid(), signal.SIGKILL)
+        return real(*given, **named)
+
+    setattr(owner, name, deadly)
+    with Session.open(folder) as session:
+        build(session, out)
 
 
 @pytest.fixture(autouse=True)
@@ -99,12 +105,10 @@ def interrupted_at(session: Session, out: Path, frame: int) -> None:
 def test_a_killed_build_goes_on_to_the_same_bytes(
     session: Session, undisturbed: dict[str, bytes], tmp_path: Path, place: str, count: int
 ) -> None:
-    done = subprocess.run(
-        [sys.executable, "-c", KILLER, place, str(count), str(session.folder), str(tmp_path / "lut")],
-        capture_output=True,
-        check=False,
-    )
-    assert done.returncode == -signal.SIGKILL, done.stderr
+    program = FORKS.Process(target=build_until_killed, args=(place, count, session.folder, tmp_path / "lut"))
+    program.start()
+    program.join()
+    assert program.exitcode == -signal.SIGKILL
     assert not (tmp_path / "lut").exists()
     build(session, tmp_path / "lut")
     assert files(tmp_path / "lut") == undisturbed
@@ -134,8 +138,8 @@ def test_damage_to_what_was_done_is_noticed(
     assert files(tmp_path / "lut") == undisturbed
 
 
-def test_a_bump_before_the_interruption_is_remembered(lab: Lab, tmp_path: Path) -> None:
-    bumped = hang(room=Room(waviness_mm=0.5, roll_deg=0.7, fill=0.935))
+def test_a_bump_before_the_interruption_and_the_lens_are_remembered(tmp_path: Path) -> None:
+    lab, bumped = hang(), hang(room=Room(waviness_mm=0.5, roll_deg=0.7, fill=0.935))
 
     def frame(step: SessionStep) -> bytes:
         return (bumped if step.number >= 3 else lab).dng(step.colour, step.number)
@@ -183,7 +187,7 @@ def test_a_table_follows_its_session(session_under_way: Session, undisturbed: di
         assert not out.exists()
         with pytest.raises(FormatError, match="in the making"):
             open_lut(out)
-    # Of few colours the lens is measured on the white frames that came since, too, so all are taken in again.
+    # Of few colours the lens would be measured on the white frames that came since, too: all are taken in again.
     assert seen == [(0, 1), (3, 4), (3, 0), (lights - 1, every - 3)]
     with np.load(tmp_path / ".lut.partial" / CHECKPOINT) as stored:
         arrays = {name.rpartition(".")[2] for name in stored.files} - {"text"}
@@ -258,5 +262,5 @@ def test_the_frames_of_a_table_are_found_again(session: Session, session_under_w
     assert f"{first} cannot be read" in gone
     assert f"{second} has changed" in changed
     os.truncate(tmp_path / "lut" / "samples.npy", 1000)
-    with pytest.raises(FormatError, match=r"1000 bytes, 537728"):
+    with pytest.raises(FormatError, match=r"1000 bytes, 67328"):
         open_lut(tmp_path / "lut")

@@ -21,11 +21,17 @@ from experiment.session.folder import Session
 from experiment.session.records import SessionStep
 from foundation.errors import FormatError, QualityError
 from sim.camera.film import write_dng
-from tests.calibration.lab import LIGHTS, SETTINGS, TAKEN_AT, Lab, figures_alone, take
+from tests.calibration.lab import LIGHTS, SETTINGS, TAKEN_AT, Lab, figures_alone, hang, take
 
 pytestmark = pytest.mark.slow
 
 CORRECTED = BuildOptions(correct_drift=True)
+
+
+@pytest.fixture(scope="module")
+def lab() -> Lab:
+    """Return a lab of few colours: of these the lens is not measured, which takes longer than all that matters here."""
+    return hang(2, "A6")
 
 
 def session_of(lab: Lab, folder: Path, lamp: Callable[[int], float], every: int = 4) -> Session:

@@ -51,6 +51,12 @@ HALF = replace(SETTINGS, shutter_s=SETTINGS.shutter_s / 2)
 Frame = Callable[[SessionStep], bytes]
 
 
+@pytest.fixture(scope="module")
+def lab() -> Lab:
+    """Return a lab of few colours: of these the lens is not measured, which takes longer than all that matters here."""
+    return hang(2, "A6")
+
+
 def write_json(result: BuildResult, session: Session, folder: Path) -> None:
     """Write the report for programs alone: drawing the other takes longer than the build."""
     (folder / "report.json").write_text(json.dumps(report_json(result)))
@@ -214,7 +220,7 @@ def test_brilliant_colour_is_called_that(lab: Lab, tmp_path: Path) -> None:
         write_dng(stream, counts, world.body, settings=SETTINGS, taken_at=TAKEN_AT)
         return stream.getvalue()
 
-    dim = hang(room=Room(waviness_mm=0.5, white_level_share=0.5))
+    dim = hang(2, "A6", room=Room(waviness_mm=0.5, white_level_share=0.5))
     world = dim.world
     assert remarks(built(dim, tmp_path, frame)) == {"additivity"}
 

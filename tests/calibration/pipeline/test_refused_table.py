@@ -17,7 +17,7 @@ from calibration.report.report import write_report
 from calibration.verdict import BuildResult, judged_values
 from experiment.session.folder import Session
 from foundation.errors import QualityError
-from tests.calibration.lab import LIGHTS, Lab, take
+from tests.calibration.lab import LIGHTS, Lab, hang, take
 from tests.json_of import json_of
 
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("undrawn")]
@@ -26,8 +26,9 @@ STRICT = (replace(next(limit for limit in FIGURES if limit.name == "darkest_coun
 
 
 @pytest.fixture(scope="module")
-def short(lab: Lab, tmp_path_factory: pytest.TempPathFactory) -> Generator[Session]:
-    with take(lab, tmp_path_factory.mktemp("short") / "session", LIGHTS[:2]) as session:
+def short(tmp_path_factory: pytest.TempPathFactory) -> Generator[Session]:
+    """Lend a session of few colours: of these the lens is not measured, which takes longer than the rest."""
+    with take(hang(2, "A6"), tmp_path_factory.mktemp("short") / "session", LIGHTS[:2]) as session:
         yield session
 
 
@@ -63,12 +64,13 @@ def test_a_check_is_judged_by_the_same_limits(short: Session) -> None:
 
 
 def test_the_command_ends_with_the_exit_code_of_a_refusal(
-    short: Session, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    lab: Lab, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """A window of nine pixels does not fit into these cells."""
-    assert main(["--check", "--window", "9", str(short.folder)]) == 4
+    """A window of nine pixels does not fit into the cells of a larger chart."""
+    take(lab, tmp_path / "session", LIGHTS[:1]).close()
+    assert main(["--check", "--window", "9", str(tmp_path / "session")]) == 4
     assert "--window" in capsys.readouterr().err
-    found = json_of(main, ["--window", "9", short.folder, tmp_path / "lut"], capsys, code=4)
+    found = json_of(main, ["--window", "9", tmp_path / "session", tmp_path / "lut"], capsys, code=4)
     assert (found["command"], found["verdict"]) == ("build-lut", "refuse")
     assert found["figures"]
     assert found["channels"]["window"] == 9

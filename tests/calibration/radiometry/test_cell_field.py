@@ -10,6 +10,7 @@ from calibration.pipeline.baseline import field_of_cells
 from drivers.presenter import WHITE, Colour
 from experiment.chart.layout import paper_chart
 from experiment.chart.printing import drawing
+from experiment.measures.least_squares import code_polynomial, code_powers, page_polynomial
 from experiment.measures.paper import PaperReader
 from sim.world.rendering import Print
 from sim.world.room import Room
@@ -60,6 +61,52 @@ def test_covered_cells_and_a_stained_reference_are_left_out(world: World) -> Non
     whites[5] = np.nan
     field = field_of_cells(CHART.rgb, CHART.centres_mm, cells, there, WHITES_MM, whites, CHART.page_mm)
     assert np.sqrt(((field.at(CHART.centres_mm) / true - 1) ** 2).mean()) < 0.005
+
+
+FEW = paper_chart("A6", 2)
+FEW_WHITES_MM = np.array([reference.centre_mm for reference in FEW.references])
+
+
+def planted(
+    degree: int, order: int
+) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+    """Return levels of 64 cells and of paper whose logarithms are polynomials, and the field as that order shows it."""
+    random = np.random.default_rng(3)
+    codes = code_polynomial(FEW.rgb, degree)
+    at_cells, at_paper = (page_polynomial(at, FEW.page_mm, order) for at in (FEW.centres_mm, FEW_WHITES_MM))
+    light = 0.2 * random.standard_normal((at_cells.shape[1] - 1, 3))
+    colours = 0.3 * random.standard_normal((codes.shape[1], 3))
+    levels = 1000 * np.exp(codes @ colours + at_cells[:, 1:] @ light)
+    smooth = at_cells @ np.linalg.lstsq(at_cells, np.exp(at_cells[:, 1:] @ light), rcond=None)[0]
+    return levels, 3000 * np.exp(at_paper[:, 1:] @ light), smooth / smooth.mean(axis=0)
+
+
+def test_of_64_colours_what_has_the_form_of_the_model_is_found_to_the_last_digits() -> None:
+    """Polynomials of the second degree, in the codes and over the page: five cells for each of ten terms."""
+    levels, paper, true = planted(2, 2)
+    there = np.ones(len(levels), dtype=np.bool_)
+    there[5], levels[5] = False, 50.0
+    # Nothing is learned of what is too dark.
+    levels[[7, 20]] = 9.9
+    field = field_of_cells(FEW.rgb, FEW.centres_mm, levels, there, FEW_WHITES_MM, paper, FEW.page_mm)
+    np.testing.assert_allclose(field.at(FEW.centres_mm), true, rtol=1e-6)
+
+
+def test_a_reference_counts_for_ten_cells_and_few_patches_for_nothing() -> None:
+    levels, paper, true = planted(2, 2)
+    there = np.ones(len(levels), dtype=np.bool_)
+    # A field that cells and paper do not agree on is more that of the paper.
+    turned = paper * (1 + 0.02 * (FEW_WHITES_MM[:, :1] / FEW.page_mm[0] - 0.5))
+    both = field_of_cells(FEW.rgb, FEW.centres_mm, levels, there, FEW_WHITES_MM, turned, FEW.page_mm)
+    change = np.log(both.at(FEW.centres_mm) / true)
+    slope = np.polyfit(FEW.centres_mm[:, 0] / FEW.page_mm[0], change, 1)[0] / 0.02
+    assert ((slope > 0.5) & (slope < 1.2)).all()
+    terms = len(code_powers(2)) + page_polynomial(FEW.centres_mm, FEW.page_mm, 2).shape[1]
+    # Two patches for each number of the model are enough, one fewer is not.
+    for count, shaped in ((2 * terms, True), (2 * terms - 1, False)):
+        there[:] = np.arange(len(there)) < count - len(FEW_WHITES_MM)
+        found = field_of_cells(FEW.rgb, FEW.centres_mm, levels, there, FEW_WHITES_MM, paper, FEW.page_mm)
+        assert (found.at(FEW.centres_mm) == 1).all() != shaped
 
 
 def test_a_colour_without_light_has_no_shape(world: World) -> None:

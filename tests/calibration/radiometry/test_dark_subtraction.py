@@ -94,7 +94,7 @@ def test_a_channel_without_light_borrows_its_reflectances() -> None:
 
 @pytest.fixture(scope="module")
 def room() -> Lab:
-    return hang(room=Room(waviness_mm=0.5, ambient=0.01, black_leak=1 / 200))
+    return hang(2, "A6", room=Room(waviness_mm=0.5, ambient=0.01, black_leak=1 / 200))
 
 
 @pytest.fixture(scope="module")
@@ -147,8 +147,8 @@ def test_samples_keep_their_noise(room: Lab, subtracted: BuildResult) -> None:
         response = (room.world.room.response_spread * signal[:, channel]) ** 2
         expected = (signal[:, channel] / body.electrons_per_dn + body.read_noise_dn**2 + response) / photosites
         spread = samples[..., channel].var(axis=1, ddof=1)
-        # The median of 512 variances of 25 values, 1.25 · √(2/24/512) = 1.6 %, and the field's 5 % squared.
-        assert np.median(spread / expected) == pytest.approx(1, abs=0.12)
+        # The median of 64 variances of 25 values is 0.97, good to 1.25 · √(2/24/64) = 4.5 %.
+        assert np.median(spread / expected) == pytest.approx(0.97, abs=0.14)
 
 
 def test_what_was_subtracted_is_recorded(room: Lab, session: Session, subtracted: BuildResult) -> None:

@@ -70,6 +70,7 @@ def test_counts_that_are_proportional_deviate_by_no_more_than_is_said(lamp: tupl
     assert error[1:].max() < 0.005
 
 
+@pytest.mark.slow
 def test_a_full_chart_says_it_more_sharply() -> None:
     small, full = (relative_to_largest(seen(proportional, bits=bits))[1] for bits in (3, 5))
     assert np.all(full[:-1] < small[:-1])

@@ -95,6 +95,7 @@ def test_parallax_is_the_way_in_which_heights_are_seen(tilt_deg: float, pan_deg:
     assert lens.parallax(points[7]) == pytest.approx(lens.parallax(points)[7:8])
 
 
+@pytest.mark.slow
 @settings(max_examples=20)
 @given(st.floats(-3, 3), st.floats(-0.05, 0.05), st.floats(-0.05, 0.05))
 def test_a_displacement_without_bend_is_followed_exactly(level: float, slope_x: float, slope_y: float) -> None:
@@ -106,6 +107,7 @@ def test_a_displacement_without_bend_is_followed_exactly(level: float, slope_x: 
     assert found.at(points) == pytest.approx(moved, abs=1e-3)
 
 
+@pytest.mark.slow
 def test_its_error_is_what_it_scatters_by_and_grows_where_nothing_is_measured() -> None:
     random = np.random.default_rng(4)
     low, high = np.array([0.0, 0.0]), np.array([200.0, 150.0])
@@ -155,6 +157,7 @@ def test_an_edge_known_across_alone_tells_a_height_along_it_as_well(heights: boo
         assert off.max() > 1.5
 
 
+@pytest.mark.slow
 def test_a_sheet_that_bends_more_than_usual_is_found_to() -> None:
     """The outline is measured, and inside nothing is: the bends there are those that the outline has."""
     low, high = np.array([0.0, 0.0]), np.array([160.0, 100.0])
@@ -265,6 +268,7 @@ def misses(registration: Registration, lab: Lab, mosaic: Mosaic) -> dict[str, fl
     return found
 
 
+@pytest.mark.slow
 def test_every_channel_has_its_own_place(tmp_path: Path) -> None:
     room = Room(waviness_mm=1.0, lateral_red_px=1.0, lateral_blue_px=-0.6)
     lab = hang(room=room)
@@ -277,6 +281,7 @@ def test_every_channel_has_its_own_place(tmp_path: Path) -> None:
     assert lateral.corner_error_px("R") < 0.1
 
 
+@pytest.mark.slow
 def test_none_is_found_where_there_is_none(lab: Lab, tmp_path: Path) -> None:
     lateral = register(lab.mosaic(tmp_path), lab.chart).lateral
     for channel in ("R", "B"):

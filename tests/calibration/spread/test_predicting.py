@@ -45,6 +45,7 @@ def test_few_cells_leave_little_but_their_noise_where_black_replaces_inks(bend: 
         assert neighbour_residual(seen[:, None], 3)[:, 0].std() > 1.5 * left.std()
 
 
+@pytest.mark.slow
 def test_what_codes_predict_has_nothing_to_do_with_the_noise_that_is_left() -> None:
     level = printed(0.1)
     products: list[float] = []

@@ -48,6 +48,7 @@ def files(folder: Path) -> dict[str, bytes]:
     return {path.name: path.read_bytes() for path in folder.iterdir()}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("place", ["{}/published", "memory://bucket/published"])
 def test_there_and_back(lut: Lut, tmp_path: Path, place: str) -> None:
     MemoryFileSystem.store.clear()
@@ -238,6 +239,7 @@ CLAIMS: list[tuple[Change, str]] = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("change", "fault"), CLAIMS)
 def test_what_a_store_claims_has_to_fit_together(lut: Lut, tmp_path: Path, change: Change, fault: str) -> None:
     publish(lut, str(tmp_path / "published"))

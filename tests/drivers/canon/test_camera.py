@@ -373,6 +373,7 @@ def goes_on(lab: Lab, frames: int = 3) -> None:
     lab.camera.close()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("code", EVERY_OPERATION, ids=NAMES)
 @pytest.mark.parametrize(
     ("answer", "times"),
@@ -390,6 +391,7 @@ def test_an_operation_that_is_declined_for_a_while(moody_lab: Lab, code: Operati
     goes_on(moody_lab)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("code", EVERY_OPERATION, ids=NAMES)
 @pytest.mark.parametrize("obeys", [False, True])
 @pytest.mark.parametrize("after", [0, 3])
@@ -398,6 +400,7 @@ def test_an_operation_that_is_never_answered(moody_lab: Lab, code: Operation, ob
     goes_on(moody_lab)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("code", EVERY_OPERATION, ids=NAMES)
 @pytest.mark.parametrize("after", [0, 3])
 def test_a_body_unplugged_at_an_operation_is_found_at_its_new_address(
@@ -411,6 +414,7 @@ def test_a_body_unplugged_at_an_operation_is_found_at_its_new_address(
     goes_on(moody_lab)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("code", EVERY_OPERATION, ids=NAMES)
 @pytest.mark.parametrize("after", [0, 3])
 def test_a_response_lost_on_the_way(moody_lab: Lab, code: Operation, after: int) -> None:
@@ -419,6 +423,7 @@ def test_a_response_lost_on_the_way(moody_lab: Lab, code: Operation, after: int)
     goes_on(moody_lab)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("after", [*range(0, 14_000, 617), 4095, 4096, 4097, 8192])
 def test_a_cable_pulled_at_any_byte(after: int) -> None:
     lab = Lab(film_bytes=3000)
@@ -590,6 +595,7 @@ HINTS: dict[str, Callable[[Responder], Responder]] = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("trouble", HINTS)
 def test_hints_on_the_event_pipe_are_hints(lab: Lab, trouble: str) -> None:
     lab.device = HINTS[trouble](lab.eos)
@@ -1100,6 +1106,7 @@ def test_custom_functions_of_any_bytes_are_none_or_some(value: bytes) -> None:
     assert all(isinstance(number, int) for number in custom_functions(value))
 
 
+@pytest.mark.slow
 def test_what_a_body_claims_costs_little_memory() -> None:
     state = EosState()
     tracemalloc.start()

@@ -178,6 +178,7 @@ def test_any_records_come_back_without_the_closing_one(records: tuple[Record, ..
     assert canon.decode_events(canon.encode_events(records).removesuffix(canon.encode_events())) == records
 
 
+@pytest.mark.slow
 def test_more_records_than_any_body_queues_are_refused() -> None:
     notice = bytes.fromhex("0c000000 8bc10000 01000000")
     assert len(canon.decode_events(canon.MAX_RECORDS * notice)) == canon.MAX_RECORDS

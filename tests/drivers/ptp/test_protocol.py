@@ -184,6 +184,7 @@ def test_any_value_comes_back(kind: DataType, data: st.DataObject) -> None:
         assert protocol.decode_value(data_type, protocol.encode_value(data_type, value)) == value
 
 
+@pytest.mark.slow
 @settings(max_examples=400)
 @given(DATASETS)
 def test_any_dataset_comes_back(dataset: DeviceInfo | StorageInfo | ObjectInfo) -> None:

@@ -96,6 +96,7 @@ STATED: dict[str, tuple[str, Directory]] = {
 drewnoakes/metadata-extractor-images. Made up: where D200's strips and A7 IV's tiles begin, and the Samsung."""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("model", STATED)
 def test_what_real_cameras_state_is_believed(model: str) -> None:
     maker, pixels = STATED[model]

@@ -36,6 +36,7 @@ def example(folder: Path) -> None:
     (folder / found[1]).write_text(found[2], encoding="utf-8")
 
 
+@pytest.mark.slow
 def test_the_ten_lines_of_the_docs(
     thumbnails: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -83,6 +84,7 @@ def test_every_statistic_is_printed_on_request(thumbnails: Path, capsys: pytest.
     assert re.search(r"│ +100\.00 │", out)
 
 
+@pytest.mark.slow
 def test_what_a_method_raises_is_one_sentence(
     thumbnails: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -106,6 +108,7 @@ def test_the_published_figures_of_plain_methods(capsys: pytest.CaptureFixture[st
         assert (row["mean"], row["median"]) == pytest.approx((4.51, 3.37), abs=0.06)
 
 
+@pytest.mark.slow
 def test_what_a_method_prints_is_no_part_of_the_json(
     thumbnails: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -23,6 +23,7 @@ from tests.evaluation.datasets.made_up import image_of, write_png, write_tiff
 IMAGES = arrays(np.uint16, st.tuples(st.integers(1, 5), st.integers(1, 5), st.just(3)))
 
 
+@pytest.mark.slow
 @given(IMAGES, st.one_of(st.integers(0, 70000), st.floats(0, 70000)))
 def test_black_is_subtracted_and_nothing_falls_below_it(
     image: np.ndarray[tuple[int, ...], np.dtype[np.uint16]], black: float

@@ -132,6 +132,7 @@ def test_largest_differences_come_first_and_equal_errors_never() -> None:
     assert largest_differences(made, 1) == [1]
 
 
+@pytest.mark.slow
 def test_images_of_one_picture_are_one_case() -> None:
     """What 40 lights show of 12 pictures is 12 cases: false alarms stay rare, which by image they do not."""
     random = np.random.default_rng(5)

@@ -160,6 +160,7 @@ def test_halves_of_one_camera_are_one_test_set() -> None:
     assert table.texts()[0][2].split(" / ")[0] == f"{np.median(pooled) / np.median(real):.2f}"
 
 
+@pytest.mark.slow
 def test_the_report_has_the_pool_the_test_sets_and_what_was_told(tmp_path: Path) -> None:
     def made(*kinds: Kind, tests: tuple[str, ...], base: str | None = None) -> str:
         parts = [
@@ -234,6 +235,7 @@ def test_a_folder_comes_back_as_it_was_written(folder: Path) -> None:
     assert np.mean(medians) == pytest.approx(told, abs=2e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("file", "before", "after", "message"),
     [

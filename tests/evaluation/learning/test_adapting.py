@@ -80,6 +80,7 @@ def test_one_image_leaves_it_near_what_it_was(taught: LearnedMethod) -> None:
     assert np.mean(moved) <= 0.5 * np.mean(alone) + 1e-9
 
 
+@pytest.mark.slow
 def test_many_images_overrule_what_was_learned_wrongly() -> None:
     learner = LEARNERS["kernel-ridge"]
     wrong = learner.fit([MadeUp(one.name, one.truth[::-1].copy(), one.image) for one in world(60)])

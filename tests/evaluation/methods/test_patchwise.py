@@ -31,6 +31,7 @@ def patches_of(name: str, patches: int = 6) -> PatchwiseMethod:
     return PatchwiseMethod(standard_methods()[name], patches)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", [*local_methods().values(), patches_of("gray-edge-1"), patches_of("pca")])
 def test_each_side_gets_its_light(method: LocalMethod) -> None:
     assert isinstance(method, LocalMethod)

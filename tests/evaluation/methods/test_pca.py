@@ -21,6 +21,7 @@ def test_bright_and_dark_pixels_alone_decide() -> None:
     assert recovery_error(BrightDark().estimate(image), LIGHT) < 1e-6
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("share", [0.035, 0.2, 1e-9, 0.5, 0.499])
 @pytest.mark.parametrize("kind", [np.uint16, np.float64])
 def test_the_svd_of_sorted_pixels_gives_the_same_light(share: float, kind: type[np.uint16 | np.float64]) -> None:

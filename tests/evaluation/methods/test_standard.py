@@ -49,6 +49,7 @@ def colourful_scene(seed: int = 1) -> npt.NDArray[np.float64]:
     return 20 + 3000 * tiles * random.uniform(0.6, 1, (72, 90, 1)) * LIGHT
 
 
+@pytest.mark.slow
 @every_method
 def test_every_method_finds_the_light_on_grey_things(name: str) -> None:
     estimate = standard_methods()[name].estimate(grey_scene())
@@ -91,6 +92,7 @@ def test_a_mask_changes_what_is_seen(name: str) -> None:
     assert recovery_error(method.estimate(image, None, mask), method.estimate(image, None, ~mask)) > 1
 
 
+@pytest.mark.slow
 @every_method
 def test_an_image_without_a_usable_pixel_is_grey(name: str) -> None:
     method = standard_methods()[name]
@@ -118,6 +120,7 @@ def test_a_gain_of_a_channel_is_a_gain_of_the_estimate(name: str) -> None:
     assert recovery_error(method.estimate(image * gains), method.estimate(image) * gains) < 1e-5
 
 
+@pytest.mark.slow
 @every_method
 def test_the_dtype_of_an_image_does_not_matter(name: str) -> None:
     image, method = colourful_scene().astype(np.uint16), standard_methods()[name]

@@ -34,6 +34,7 @@ def texts(svg: bytes) -> list[str]:
     return [unescape(re.sub("<[^>]+>", "", each)).strip() for each in re.findall(r"(?s)<text.*?</text>", svg.decode())]
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("error")
 def test_names_are_neither_mathematics_nor_left_out() -> None:
     random = np.random.default_rng(0)
@@ -159,6 +160,7 @@ def test_the_curve_reaches_its_shares(monkeypatch: pytest.MonkeyPatch) -> None:
     assert points.get_array()[-1] == 4
 
 
+@pytest.mark.slow
 def test_many_methods_and_images_make_a_page_that_closes() -> None:
     data = as_set((*walls(6), MixedWall("mixed & <odd>", np.array([[2.0, 1, 1], [1, 1, 1]]))))
     results = evaluate(data.scenes, METHODS)

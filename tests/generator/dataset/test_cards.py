@@ -75,6 +75,7 @@ def with_origin(made: Dataset, origin: OriginRecord | None, **table: object) -> 
     return made.description.model_copy(update={"table": known})
 
 
+@pytest.mark.slow
 def test_the_card_is_what_the_hub_reads(made: Dataset) -> None:
     # The Hub's own client reads the front matter and refuses what it cannot use.
     hub = import_module("huggingface_hub")
@@ -91,6 +92,7 @@ def test_the_card_is_what_the_hub_reads(made: Dataset) -> None:
         assert list(place_of(made).glob(entry["path"])), entry
 
 
+@pytest.mark.slow
 def test_the_data_set_of_a_folder_loads_by_its_card(plain: Dataset, tmp_path: Path) -> None:
     load = import_module("datasets").load_dataset
     rows = load(str(place_of(plain)), split="train", cache_dir=str(tmp_path / "cache"))

@@ -49,6 +49,7 @@ class TestBits:
             np.testing.assert_array_equal(dataset.read_image(entry), expected)
         assert "2 bits a channel" in open_generated("out").treatment["bits"]
 
+    @pytest.mark.slow
     def test_all_bits_of_the_table_change_nothing_and_more_are_refused(
         self, lut: Lut, capsys: pytest.CaptureFixture[str]
     ) -> None:
@@ -70,6 +71,7 @@ class TestFullScale:
         assert np.abs(stretched - counts * (FULL / white)).max() <= 0.5 + 1e-6
         np.testing.assert_array_equal(from_full_scale(stretched, white), counts)
 
+    @pytest.mark.slow
     @pytest.mark.parametrize("layout", ["folder", "webdataset", "parquet"])
     def test_our_readers_read_what_was_stretched_as_it_was(self, lut: Lut, layout: str) -> None:
         if layout == "parquet":
@@ -150,6 +152,7 @@ class TestExactSplit:
         with pytest.raises(InputError, match=r"3.*2,2,2"):
             exact_parts(some, (1 / 3, 1 / 3, 1 / 3), 1)
 
+    @pytest.mark.slow
     def test_datasets_are_divided_so_in_every_layout_and_share(self, lut: Lut) -> None:
         wish = ("--sources", "pictures", "--random", "2", "--split", "3,1,2", "--exact-split", "--shard-images", "5")
         assert main(("lut", "whole", *wish)) == 0
@@ -171,6 +174,7 @@ class TestExactSplit:
 class TestAskedForTwice:
     WISH = ("--sources", "pictures", "--seed", "2", "--contact-sheet", "sheet.png")
 
+    @pytest.mark.slow
     def test_it_says_so_and_nothing_is_touched(self, lut: Lut, capsys: pytest.CaptureFixture[str]) -> None:
         assert main(("lut", "out", *self.WISH)) == 0
         before = {path: path.stat().st_mtime_ns for path in Path("out").rglob("*")}
@@ -184,6 +188,7 @@ class TestAskedForTwice:
         assert main(("--finish", "out")) == 0
         assert "complete already" in capsys.readouterr().out
 
+    @pytest.mark.slow
     @pytest.mark.parametrize(
         ("more", "difference"),
         [
@@ -202,6 +207,7 @@ class TestAskedForTwice:
         assert main(("lut", "out", "--sources", "pictures", "--seed", "2", *more)) == 2
         assert difference in capsys.readouterr().err
 
+    @pytest.mark.slow
     def test_pictures_that_changed_since_are_found(self, lut: Lut, capsys: pytest.CaptureFixture[str]) -> None:
         """Whatever the time that a copy brings with it."""
         assert main(("lut", "out", *self.WISH)) == 0

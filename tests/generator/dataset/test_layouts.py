@@ -89,7 +89,7 @@ import hashlib, json, sys
 import webdataset
 for sample in webdataset.WebDataset(sys.argv[1:], shardshuffle=False):
     digests = {key: hashlib.sha256(sample[key]).hexdigest() for key in ("png", "preview.jpg")}
-    print(json.dumps([sample["__key__"], json.loads(sample["json"]), digests]))
+    print(json.dumps([sample["__url__"], sample["__key__"], json.loads(sample["json"]), digests]))
 """
 
 
@@ -99,16 +99,15 @@ def test_the_webdataset_package_reads_the_shards(make: Make) -> None:
     lines = (place_of(files) / "SHA256SUMS").read_text().splitlines()
     sums = {name: digest for digest, name in (line.split("  ") for line in lines)}
     entries = {entry.image: entry for entry in made.entries}
-    for part in ("train", "test"):
-        urls = sorted((place_of(made) / part).glob("*.tar"))
-        # In a program of its own, because the package leaves files open.
-        read = subprocess.run([sys.executable, "-c", READER, *urls], capture_output=True, text=True, check=True)
-        for key, metadata, digests in map(json.loads, read.stdout.splitlines()):
-            entry = entries.pop(f"{key}.png")
-            assert digests == {"png": sums[f"images/{key}.png"], "preview.jpg": sums[f"previews/{key}.jpg"]}
-            assert metadata["truth"] == pytest.approx(entry.truth, abs=1e-9)
-            assert (metadata["source"], metadata["split"], metadata["width"]) == (entry.source, part, 28)
-            assert entry.split == part
+    urls = sorted(place_of(made).glob("*/*.tar"))
+    # In a program of its own, because the package leaves files open.
+    read = subprocess.run([sys.executable, "-c", READER, *urls], capture_output=True, text=True, check=True)
+    for url, key, metadata, digests in map(json.loads, read.stdout.splitlines()):
+        entry = entries.pop(f"{key}.png")
+        assert digests == {"png": sums[f"images/{key}.png"], "preview.jpg": sums[f"previews/{key}.jpg"]}
+        assert metadata["truth"] == pytest.approx(entry.truth, abs=1e-9)
+        assert (metadata["source"], metadata["split"], metadata["width"]) == (entry.source, entry.split, 28)
+        assert Path(url).parent.name == entry.split in ("train", "test")
     assert not entries
 
 

@@ -33,6 +33,7 @@ def test_shares_hold_on_average() -> None:
         assert abs(parts[part] - share * count) < 6 * math.sqrt(count * share * (1 - share))
 
 
+@pytest.mark.slow
 @given(st.text(), st.integers(0, 2**64 - 1), st.sampled_from([(1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)]))
 def test_a_part_of_everything_has_everything(name: str, seed: int, shares: tuple[float, float, float]) -> None:
     part = split_of(shares, seed, None, name)
@@ -53,6 +54,7 @@ def write(path: Path, seed: int) -> None:
     path.write_bytes(cv2.imencode(".png", codes)[1].tobytes())
 
 
+@pytest.mark.slow
 def test_parts_are_of_sources_and_stay_when_others_come(make_lut: Callable[..., Lut], tmp_path: Path) -> None:
     lut = make_lut()
     folder = tmp_path / "pictures"

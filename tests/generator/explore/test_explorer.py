@@ -47,6 +47,7 @@ def explorer(make_table: MakeTable, tmp_path: Path) -> Explorer:
     return Explorer("lut", lut, find_pictures([str(folder)], Preparation(max_side=SIDE)), SIDE)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rendering", get_args(Rendering))
 @pytest.mark.parametrize("light", ["1", "1:.3+2:.7", "r=.25,b=.3", "4000K"])
 def test_the_command_makes_the_image_that_is_shown(explorer: Explorer, light: str, rendering: Rendering) -> None:
@@ -145,6 +146,7 @@ def test_only_the_newest_pictures_that_were_sent_are_kept(explorer: Explorer) ->
     assert explorer.show(numbers[1], "0")["picture"]["name"] == "1.png"
 
 
+@pytest.mark.slow
 def test_sample_pictures_are_made_once(tmp_path: Path) -> None:
     folder = sample_folder(tmp_path / "kept")
     before = {path.name: path.stat().st_mtime_ns for path in folder.iterdir()}

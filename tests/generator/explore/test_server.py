@@ -133,6 +133,7 @@ def test_for_other_machines_the_address_holds_a_token(make_lut: MakeLut) -> None
         assert ask(server, f"/{server.path}picture?name=a.png", PNG)[0] == 200
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("table_and_picture")
 def test_the_command_says_where_and_ends_with_ctrl_c(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]

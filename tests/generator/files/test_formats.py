@@ -85,6 +85,7 @@ def test_opencv_reads_the_same(form: Format) -> None:
     np.testing.assert_array_equal(read[..., ::-1], image)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("form", WHOLE)
 @settings(max_examples=60)
 @given(image=images)

@@ -40,6 +40,7 @@ def test_a_light_alone_is_that_light_to_the_last_bit(make_lut: Callable[..., Lut
     np.testing.assert_array_equal(mixed_table([lut.samples[2]], [1]), lut.samples[2])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("weights", [(0.5, 0.5), (0.2, 0.8), (1.5, 0.5), (0.05, 0.3)])
 def test_mean_and_variance_are_those_of_one_exposure(
     noisy: npt.NDArray[np.uint16], weights: tuple[float, float]
@@ -149,6 +150,7 @@ def test_mixed_pixels_follow_the_formula(
     assert (mixed == 3000).any()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("streamed", [False, True])
 @pytest.mark.parametrize("lights", [2, 3, 4])
 @pytest.mark.parametrize("width", [1, 7, 8, 9, 519, 520, 521, 1053])

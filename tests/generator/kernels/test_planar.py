@@ -29,6 +29,7 @@ def expected(
     return np.minimum(cut.astype(np.float32) * np.float32(gain / WHITE), np.float32(1)).transpose(2, 0, 1)
 
 
+@pytest.mark.slow
 def test_the_whole_picture_is_the_plain_image_in_planes(
     make_lut: Callable[..., Lut], picture: npt.NDArray[np.uint8]
 ) -> None:
@@ -79,6 +80,7 @@ def test_any_window_gain_and_flip_in_a_batch(picture: npt.NDArray[np.uint8], dat
         np.testing.assert_array_equal(got[i], expected(image, windows[i], bool(flips[i]), float(gains[i])))
 
 
+@pytest.mark.slow
 def test_a_batch_from_a_table_on_disk_with_one_value_for_all(
     make_lut: Callable[..., Lut], picture: npt.NDArray[np.uint8]
 ) -> None:

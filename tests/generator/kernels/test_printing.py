@@ -124,6 +124,7 @@ def test_bands_threads_and_targets_change_no_byte() -> None:
         draw_printed(SAMPLES, picture[..., :2], [light(1)], CELL_OF)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("flip", [False, True])
 @pytest.mark.parametrize("window", [(0, 0, 77, 31), (5, 3, 40, 20), (63, 30, 1, 1), (33, 0, 30, 2)])
 def test_a_crop_is_a_window_of_the_image(flip: bool, window: tuple[int, int, int, int]) -> None:

@@ -131,6 +131,7 @@ def chi_square(pairs: npt.NDArray[np.int64], classes: int) -> float:
 LIMIT_24, LIMIT_624 = 77.0, 812.0
 
 
+@pytest.mark.slow
 def test_every_sample_is_drawn_equally_often() -> None:
     drawn = choices(2019, 7, 3000, 4000).astype(np.int64)
     assert drawn.size == 12_000_000
@@ -151,6 +152,7 @@ def test_neighbours_are_independent(down: int, right: int) -> None:
     assert chi_square(kept, 625) < LIMIT_624
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("one", "other"),
     [((0, 0), (1, 0)), ((0, 0), (1 << 32, 0)), ((0, 0), (0, 1)), ((1, 0), (0, 1)), ((6, 3), (7, 3)), ((2, 9), (3, 8))],
@@ -229,6 +231,7 @@ def test_wrong_shapes_and_numbers_are_named(picture: npt.NDArray[np.uint8]) -> N
         bits_of(9)
 
 
+@pytest.mark.slow
 def test_a_mosaic_has_each_site_s_own_channel(make_lut: Callable[..., Lut], picture: npt.NDArray[np.uint8]) -> None:
     samples = make_lut().samples[1]
     image = draw_samples(samples, picture, seed=8, image=1)

@@ -60,6 +60,7 @@ def test_a_bad_list_names_its_bad_entry(text: str, message: str) -> None:
         parse_lights(text, 9)
 
 
+@pytest.mark.slow
 def test_random_lights_are_distinct_even_and_their_seeds() -> None:
     choice = RandomLights(3, 10, seed=1)
     drawn = [numbers(choice.lightings_of(position)) for position in range(4000)]

@@ -193,6 +193,7 @@ def test_what_has_no_density_is_refused(truths: list[list[float]]) -> None:
         Fitted.of(np.array(truths, dtype=np.float64), "gt.csv")
 
 
+@pytest.mark.slow
 def test_drawn_lights_stay_in_the_gamut_and_keep_the_shape_there() -> None:
     choice = DrawnLights(GAMUT, Uniform(), 2, seed=4)
     assert isinstance(choice, LightChoice)

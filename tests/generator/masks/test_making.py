@@ -47,6 +47,7 @@ def test_one_mask_is_where_the_second_light_falls(tmp_path: Path) -> None:
     np.testing.assert_array_equal(np.rint(maps.astype(np.float64) * FULL).sum(axis=2), FULL)
 
 
+@pytest.mark.slow
 def test_as_many_masks_as_lights_are_divided_by_their_sum(tmp_path: Path) -> None:
     save(tmp_path / "a_7.png", np.full((48, 64), 0.2))
     save(tmp_path / "a_8.tif", np.full((48, 64), 0.6), 16)
@@ -157,6 +158,7 @@ def shrunk(fine: Map, height: int, width: int) -> Map:
     return np.asarray(cv2.resize(fine, (width, height), interpolation=cv2.INTER_AREA), dtype=np.float32)
 
 
+@pytest.mark.slow
 @given(
     st.sampled_from(KINDS),
     st.integers(1, 90),
@@ -274,6 +276,7 @@ def test_smooth_fields_change_over_their_scale() -> None:
     assert np.abs(np.diff(field, n=2, axis=0)).max() < 0.006
 
 
+@pytest.mark.slow
 def test_a_window_lies_where_it_was_drawn() -> None:
     drawn = np.full(64, 0.5)
     # A small one, a tenth of the picture's width to the left and as far down.

@@ -78,6 +78,7 @@ def test_what_is_refused() -> None:
         Preparation(crops=2)
 
 
+@pytest.mark.slow
 def test_places_are_even() -> None:
     places = np.array([random_places((10, 10), (5, 5), 1, 0, f"{number}")[0] for number in range(3000)])
     counts = np.bincount(places[:, 0] * 10 + places[:, 1], minlength=100)

@@ -214,6 +214,7 @@ def test_covering_keeps_all_of_the_narrow_side(tmp_path: Path) -> None:
     assert 49 <= seen[0, 0, 0] <= 52
 
 
+@pytest.mark.slow
 def test_random_places_depend_on_name_and_seed_and_reach_every_edge(tmp_path: Path) -> None:
     path = save(tmp_path / "ramp.png", ramp(13, 12), None)
     corners: set[tuple[int, int]] = set()

@@ -230,6 +230,7 @@ def test_of_greys_a_grey_is_taken_out_and_not_the_tinted_black_cell(make_lut: Ma
     assert np.ptp(seen) > 0.05 * seen.max()
 
 
+@pytest.mark.slow
 def test_black_of_a_picture_is_black_where_mixtures_are_brighter_than_the_black_cell(make_table: MakeTable) -> None:
     tint = np.array([1.15, 1.0, 0.85])
 

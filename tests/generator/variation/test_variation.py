@@ -17,6 +17,7 @@ def stops(text: str, count: int = 4000) -> list[float]:
     return [float(np.log2(exposure.factor(5, number, 0.5))) for number in range(count)]
 
 
+@pytest.mark.slow
 def test_drawn_evenly_in_stops() -> None:
     drawn = np.sort(stops("stops:low=-2,high=1"))
     # Kolmogorov and Smirnov: the largest distance of 4000 even numbers exceeds .031 once in a thousand.

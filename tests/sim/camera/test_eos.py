@@ -354,6 +354,7 @@ def test_a_transaction_number_is_used_once() -> None:
     ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("body", EOS_BODIES.values(), ids=lambda body: body.model)
 def test_carries_out_all_that_it_lists_and_nothing_else(body: EosModel) -> None:
     host = host_of(body)
@@ -885,6 +886,7 @@ def test_a_frame_under_way_outlives_its_session(host: Host) -> None:
 # With our own driver.
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "body", [EOS_550D, EOS_6D_MARK_II, replace(EOS_6D_MARK_II, wide_objects=True)], ids=["550D", "6D2", "wide"]
 )

@@ -57,6 +57,7 @@ def white_squares(centres: NDArray[np.float64], side: float) -> Print:
     return Print(PAGE_MM, boxes, rgb)
 
 
+@pytest.mark.slow
 def test_a_room_without_the_new_settings_gives_the_counts_it_gave_before_it_had_them() -> None:
     """The counts are of the room of version 0.1, before its lens had shoulders; numpy's deviates are part of them."""
     sheet = Print((210, 148), np.array([[40.0, 30, 120, 100]]), np.array([[30, 90, 200]], np.uint8))
@@ -131,6 +132,7 @@ def test_shoulders_leave_even_light_and_every_photosites_response_as_they_are() 
     np.testing.assert_allclose(wide[50:-50, 50:-50] / plain[50:-50, 50:-50], 1, atol=2e-4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("situation", [Situation(), Situation(blobs=(Blob((0.2, 0.2, 0.7, 0.9)),))])
 def test_a_veil_is_the_share_of_each_channels_mean_light_also_when_someone_stands_in_it(situation: Situation) -> None:
     centres = np.array([[60.0, 50.0], [120.0, 70.0]])

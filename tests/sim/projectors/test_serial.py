@@ -168,6 +168,7 @@ def test_a_pseudo_terminal_that_nobody_reads_can_be_closed(device: SimulatedProj
 SIM = [sys.executable, "-c", "from sim.cli import main; raise SystemExit(main())"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", sorted(PEERS))
 def test_serves_a_serial_projector_until_interrupted(name: str) -> None:
     spoken = LANGUAGES[name]

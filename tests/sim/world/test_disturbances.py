@@ -277,6 +277,7 @@ def _counts(file: bytes, path: Path) -> NDArray[np.uint16]:
     return np.asarray(read_raw(path).sensor)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 def test_every_event_is_there_when_said_and_leaves_other_frames_as_they_are(bare: World, kind: str) -> None:
     end = {"to_frame": 9} if kind in ("lamp drift", "sensor warming") else {"to_frame": 4}
@@ -326,6 +327,7 @@ def test_what_a_real_screen_does_itself_is_not_pretended() -> None:
     Disturbances((Bump(px=1.0), Person())).require_unshown("--event")
 
 
+@pytest.mark.slow
 def test_a_reflection_adds_a_share_of_papers_light_whatever_is_printed() -> None:
     """In the middle of its spot 5 % of what paper sends, at 1 / e² of that on its rim, on black ink as on paper."""
     quiet = replace(TEST, read_noise_dn=0.01, sensor_noise_e=0.0, electrons_per_dn=1e6)

@@ -243,6 +243,7 @@ def test_ink_never_covers_less_than_nothing_or_more_than_all() -> None:
     assert coverage[-1].max() < 0.06
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("on", PAPER_NAMES)
 @pytest.mark.parametrize("camera", CAMERAS)
 def test_all_colours_are_distinct_and_each_channel_grows_with_its_code(camera: str, on: PaperName) -> None:

@@ -77,6 +77,7 @@ def _beside(kind: Kind, way: Way, gain: float, real: str = "20") -> TransferRow:
     return replace(_plain_row(kind, gain), data=data, way=way, real=real)
 
 
+@pytest.mark.slow
 def test_beside_real_images_a_row_is_held_to_the_better_of_what_it_was_made_of() -> None:
     rows = [
         _plain_row("cross-validation", 1.0),
@@ -284,6 +285,7 @@ def test_what_is_not_known_is_not_drawn() -> None:
     assert not markers(forest_plot([ForestLine("Method"), unknown], PANELS))
 
 
+@pytest.mark.slow
 def test_a_wide_interval_does_not_squeeze_the_others() -> None:
     def distance(end: float) -> float:
         lines = [line("a", (1.0, 0.9, end), (1, 1, 1)), line("b", (1.2, 1.1, 1.3), (1, 1, 1))]

@@ -1,0 +1,129 @@
+"""The algebra behind a lens's shares: which unknown is whose, and solutions against those of general solvers."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+from scipy.optimize import lsq_linear
+
+from calibration.spread import fitting
+from calibration.spread.fitting import (
+    FAR_PX,
+    LEAST_GAIN,
+    NEAR_PX,
+    PLACES,
+    TERMS,
+    PointSpread,
+    far_groups,
+    free_terms,
+    groups_of_terms,
+    kernel_names,
+    place_terms,
+    terms_of,
+)
+
+KERNELS = len(NEAR_PX) + len(FAR_PX) + 1
+
+
+def equations(rows: int, size: int, seed: int) -> tuple[npt.NDArray[np.float64], ...]:
+    """Return a design, values, and their normal equations."""
+    random = np.random.default_rng(seed)
+    design, value = random.standard_normal((rows, size)), random.standard_normal(rows)
+    return design, value, design.T @ design, design.T @ value
+
+
+def test_each_unknown_belongs_to_one_channel_and_one_group() -> None:
+    assert np.concatenate([terms_of(channel) for channel in range(3)]).tolist() == list(range(TERMS))
+    groups = groups_of_terms()
+    assert sorted(np.concatenate(groups).tolist()) == list(range(TERMS))
+    # Near kernels' means and changes, then what is the same all over, a number a channel.
+    assert [len(group) for group in groups] == [3, 3 * (PLACES - 1)] * len(NEAR_PX) + [3] * (len(FAR_PX) + 1)
+    assert [group.tolist() for group in far_groups()] == [group.tolist() for group in groups[2 * len(NEAR_PX) :]]
+    assert len(kernel_names()) == KERNELS
+    assert np.flatnonzero(~free_terms()).tolist() == sorted(np.concatenate(far_groups()).tolist())
+
+
+def test_terms_over_the_frame_are_legendre_s() -> None:
+    height, width = 21, 31
+    y, x = np.mgrid[:height, :width]
+    terms = place_terms(np.stack([x.ravel(), y.ravel()], axis=1), (height, width)).reshape(height, width, PLACES)
+    np.testing.assert_allclose(terms[0, 0], np.outer([1, -1, 1], [1, -1, 1]).ravel())
+    np.testing.assert_allclose(terms[-1, -1], 1)
+    np.testing.assert_allclose(terms[10, 15], np.outer([1, 0, -0.5], [1, 0, -0.5]).ravel())
+    np.testing.assert_allclose(terms[10, -1], np.outer([1, 0, -0.5], [1, 1, 1]).ravel())
+    # Beyond the frame as at its rim.
+    np.testing.assert_allclose(place_terms(np.array([[-9.0, 99.0]]), (height, width))[0], terms[-1, 0])
+
+
+def test_shares_stand_by_term_channel_and_kernel_and_what_is_left_out_is_an_error() -> None:
+    shares = np.arange(TERMS, dtype=np.float64)
+    spread = PointSpread(shares, np.diag(shares**2), 99.0, 2 * LEAST_GAIN, 1.0, shares + 1)
+    amounts = spread.amounts()
+    assert amounts.shape == (PLACES, 3, KERNELS)
+    for channel in range(3):
+        own = shares[terms_of(channel)]
+        near = own[: PLACES * len(NEAR_PX)].reshape(len(NEAR_PX), PLACES).T
+        np.testing.assert_array_equal(amounts[:, channel, : len(NEAR_PX)], near)
+        np.testing.assert_array_equal(amounts[0, channel, len(NEAR_PX) :], own[PLACES * len(NEAR_PX) :])
+    assert not amounts[1:, :, len(NEAR_PX) :].any()
+    np.testing.assert_allclose(spread.errors(), amounts)
+    np.testing.assert_allclose(spread.unexplained, np.diag(shares**2) + 1)
+    assert spread.proven
+    assert not PointSpread(shares, spread.covariance, 99.0, LEAST_GAIN, 1.0, shares).proven
+    assert not PointSpread(0 * shares, spread.covariance, 99.0, 2 * LEAST_GAIN, 1.0, shares).proven
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_far_light_is_never_negative_and_the_rest_is_least_squares(seed: int) -> None:
+    design, value, matrix, vector = equations(2 * TERMS, TERMS, seed)
+    kept = np.sort(np.random.default_rng(seed).permutation(TERMS)[: TERMS // 2])
+    shares, gain = fitting._positive(matrix, vector, kept)  # pyright: ignore[reportPrivateUsage]
+    low = np.where(free_terms()[kept], -np.inf, 0.0)
+    expected = np.zeros(TERMS)
+    expected[kept] = lsq_linear(design[:, kept], value, (low, np.inf), tol=1e-12).x
+    np.testing.assert_allclose(shares, expected, atol=1e-6)
+    assert (shares[~free_terms()] >= 0).all()
+    assert not shares[~np.isin(np.arange(TERMS), kept)].any()
+    assert gain == pytest.approx((value**2).sum() - ((value - design @ shares) ** 2).sum())
+
+
+def test_what_is_eliminated_is_solved_for_as_well() -> None:
+    size = TERMS + 4
+    _, _, matrix, vector = equations(2 * size, size, 5)
+    prior = np.diag(np.linspace(1, 2, size))
+    inner, right = fitting._without_factors(matrix, vector, prior)  # pyright: ignore[reportPrivateUsage]
+    whole = np.linalg.solve(matrix + prior, vector)
+    np.testing.assert_allclose(np.linalg.solve(inner, right), whole[:TERMS])
+    free = np.flatnonzero(free_terms())
+    solution = fitting._solved(matrix, vector, prior, free)  # pyright: ignore[reportPrivateUsage]
+    used = np.concatenate([free, np.arange(TERMS, size)])
+    expected = np.zeros(size)
+    expected[used] = np.linalg.solve((matrix + prior)[np.ix_(used, used)], vector[used])
+    np.testing.assert_allclose(solution, expected, atol=1e-12)
+
+
+def test_kernels_that_gain_less_than_chance_and_four_standard_errors_are_left_out() -> None:
+    groups = groups_of_terms()
+    matrix = np.eye(TERMS)
+    worth = np.zeros(len(groups))
+    # A kernel gains the sum of its squares here: just enough, and just not.
+    worth[[0, 1, -1]] = [LEAST_GAIN + 3 - 1 + 0.1, LEAST_GAIN + 24 - 1 - 0.1, LEAST_GAIN + 3 - 1 + 0.1]
+    vector = np.zeros(TERMS)
+    for group, gain in zip(groups, worth, strict=True):
+        vector[group] = np.sqrt(gain / len(group))
+    for misfit, kept in ((1.0, [0, len(groups) - 1]), (1.1, [])):
+        found = fitting._selected(matrix, vector, misfit, groups)  # pyright: ignore[reportPrivateUsage]
+        assert found.tolist() == sorted(np.concatenate([np.zeros(0, int), *(groups[k] for k in kept)]).tolist())
+
+
+def test_rows_weigh_by_their_level_s_scatter_and_outliers_little() -> None:
+    random = np.random.default_rng(2)
+    level = np.repeat([100.0, 1000.0], 4000)
+    left = random.standard_normal(8000) * np.repeat([1.0, 5.0], 4000)
+    left[0] = 50.0
+    weights = fitting._weights(left, level)  # pyright: ignore[reportPrivateUsage]
+    usual = np.median(weights[:4000]), np.median(weights[4000:])
+    assert usual == pytest.approx((1, 1 / 25), rel=0.1)
+    # Huber's weight falls as the distance grows.
+    assert 0.01 < weights[0] / usual[0] < 0.06
