@@ -194,9 +194,7 @@ def explore(
     """
     del version, verbose, quiet
     from calibration.table.lut import open_lut
-    from generator.explore.explorer import Explorer
-    from generator.explore.samples import sample_folder
-    from generator.explore.server import ExploreServer
+    from generator.explore.explorer import Explorer, ExploreServer, sample_folder
     from generator.pictures.sources import Preparation, find_pictures
 
     loaded()
