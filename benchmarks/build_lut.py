@@ -48,10 +48,9 @@ from calibration.pipeline.build import build, thread_count
 from calibration.registration.register import register
 from calibration.sampling import gather_values, sites_at
 from drivers.camera import CapturedFrame
-from drivers.raw.rawfile import read_raw
+from drivers.raw.rawfile import frame_black, read_raw
 from experiment.chart.layout import design_chart
 from experiment.chart.printing import drawing
-from experiment.framing.planes import frame_black
 from experiment.lights import plan_illuminations
 from experiment.session.folder import ReceivedFile, Session
 from experiment.session.records import Judgement, plan_steps

@@ -25,8 +25,7 @@ import numpy.typing as npt
 
 from calibration.table.demo_table import table_folder
 from calibration.table.lut import open_lut
-from generator.explore.explorer import MAX_SIDE, Explorer
-from generator.explore.server import ExploreServer
+from generator.explore.explorer import MAX_SIDE, Explorer, ExploreServer
 from generator.lights.gamut import Gamut
 from generator.pictures.sources import Preparation, find_pictures
 from tests.acquisition.monitor.browser import CHROMIUM, browser_tab

@@ -29,8 +29,8 @@ from scipy.spatial import cKDTree
 
 from benchmarks.rooms import Case, PhotographedChart, photographed
 from calibration.registration.register import Registration, register
+from drivers.raw.rawfile import CHANNELS
 from experiment.chart.layout import design_chart, paper_chart
-from experiment.framing.planes import CHANNELS
 from foundation.errors import CropError
 from sim.world.room import Room
 

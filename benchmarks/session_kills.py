@@ -49,8 +49,7 @@ from experiment.chart.layout import design_chart
 from experiment.config import LabSettings
 from experiment.lights import Illumination
 from experiment.session.folder import IncomingFile, Session, rebuild_journal
-from experiment.session.journal import Journal
-from experiment.session.ledger import ledger_path, settled_frames
+from experiment.session.journal import Journal, ledger_path, settled_frames
 from experiment.session.records import ACCEPTED, VOIDED, Check, Judgement, SessionStep, plan_steps
 from experiment.session.repair import unsound_files
 from foundation.clock import OPENING, SimulatedClock

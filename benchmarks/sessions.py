@@ -30,11 +30,10 @@ from calibration.table.lut import Lut
 from calibration.verdict import BuildResult
 from drivers.camera import CapturedFrame, ExposureSettings
 from drivers.presenter import Colour
-from drivers.raw.rawfile import read_raw
+from drivers.raw.rawfile import CHANNELS, read_raw
 from experiment.chart.model import Chart
 from experiment.chart.printing import drawing
 from experiment.framing.pictures import STILL_PX
-from experiment.framing.planes import CHANNELS
 from experiment.lights import Illumination
 from experiment.session.folder import ReceivedFile, Session
 from experiment.session.records import Judgement, SessionStep, plan_steps

@@ -30,9 +30,8 @@ from calibration.spread.added_light import AddedLight
 from calibration.spread.correction import LensFigures
 from calibration.spread.fitting import PointSpread
 from calibration.table.lut import Unfit
-from drivers.raw.rawfile import FrameOrigin
+from drivers.raw.rawfile import Channel, FrameOrigin
 from experiment.framing.pictures import Shift
-from experiment.framing.planes import Channel
 from experiment.measures.paper import Paper
 from experiment.measures.sensor import black_drift
 from experiment.measures.stains import Stains

@@ -19,9 +19,8 @@ import numpy as np
 import numpy.typing as npt
 
 from calibration import kernels
-from drivers.raw.rawfile import Mosaic
+from drivers.raw.rawfile import CHANNELS, Mosaic, phases
 from experiment.framing.pictures import MAX_BLUR_PX
-from experiment.framing.planes import CHANNELS, phases
 
 UNEVEN_SHARE = 0.01
 """Difference of rim and middle, as a share of the patch, that matters (judgement)."""

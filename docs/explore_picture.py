@@ -16,8 +16,7 @@ from PIL import Image
 
 from calibration.table.lut import open_lut
 from examples.photographs import main as save_photographs
-from generator.explore.explorer import Explorer
-from generator.explore.server import ExploreServer
+from generator.explore.explorer import Explorer, ExploreServer
 from generator.pictures.sources import Preparation, find_pictures
 from synthesis.cli import main as sim
 from tests.acquisition.monitor.browser import browser_tab

@@ -30,8 +30,8 @@ from calibration.radiometry.primaries import Primaries
 from calibration.sampling import Sites, gather, gather_values, patch_means
 from calibration.table.lut import REFERENCES, LutWriter, Provenance, Unfit, frames_sha256
 from drivers.camera import ExposureSettings
+from drivers.raw.rawfile import CLIPPING_SHARE
 from experiment.chart.model import Chart
-from experiment.framing.planes import CLIPPING_SHARE
 from experiment.lights import Illumination
 from experiment.measures.paper import MAX_ORDER, MAX_ORDER_AROUND, MIN_REFERENCES, Paper, PaperReader
 from foundation.compiled import ordered_map

@@ -22,12 +22,11 @@ from acquisition.run.plan import bytes_text, free_bytes_at, needed_bytes
 from calibration.figures.light import LINEARITY
 from calibration.sampling import bleed, largest_blur_px
 from drivers.camera import Camera, ReportsSupplies, Supplies
-from drivers.raw.rawfile import Mosaic
+from drivers.raw.rawfile import CHANNELS, CLIPPING_SHARE, Mosaic, frame_black, phases
 from experiment.chart.model import Chart
 from experiment.framing.finding import MIN_MODULE_PX, Framing
 from experiment.framing.homography import project
 from experiment.framing.pictures import edge_blurs
-from experiment.framing.planes import CHANNELS, CLIPPING_SHARE, frame_black, phases
 from experiment.measures.sensor import HIGHEST, LOWEST, deviations
 from foundation.errors import DeviceError, StorageError, counted
 from foundation.robust import sigma_of

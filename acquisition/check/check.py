@@ -62,11 +62,11 @@ from calibration.figures.truth import DARKEST_COUNTS, REFERENCE_SPREAD, REFERENC
 from drivers.camera import keep_awake
 from drivers.presenter import Colour, ReportsWarnings
 from drivers.projector import Power, Projector, Severity
+from drivers.raw.rawfile import frame_black
 from experiment.chart.model import Chart, load_chart
 from experiment.config import LabSettings
 from experiment.framing.field import Corners
 from experiment.framing.pictures import blur_px
-from experiment.framing.planes import frame_black
 from experiment.lights import Illumination, load_illuminations
 from experiment.measures.paper import Paper, PaperReader
 from experiment.measures.stains import Stains, find_stains

@@ -25,12 +25,11 @@ from acquisition.check.places import ChartMap, Levels, levels, place_chart, wind
 from acquisition.run.devices import Devices, holds_whole_turns
 from drivers.camera import capture
 from drivers.presenter import BLACK, WHITE, Colour
-from drivers.raw.rawfile import Mosaic, read_raw
+from drivers.raw.rawfile import CHANNELS, CLIPPING_SHARE, PAPER_PERCENTILE, Mosaic, frame_black, phases, read_raw
 from experiment.chart.model import Chart
 from experiment.config import LabSettings
 from experiment.framing.field import Corners
 from experiment.framing.finding import Framing, find_chart
-from experiment.framing.planes import CHANNELS, CLIPPING_SHARE, PAPER_PERCENTILE, frame_black, phases
 from foundation.errors import DeviceError, RegistrationError
 
 

@@ -25,8 +25,8 @@ import numpy.typing as npt
 from acquisition.check.findings import LIMITS, Finding, judged, not_checked, percent
 from acquisition.check.places import Levels
 from calibration.figures.light import ADDITIVITY
+from drivers.raw.rawfile import CHANNELS
 from experiment.chart.model import Chart
-from experiment.framing.planes import CHANNELS
 from experiment.measures.least_squares import least_squares, page_polynomial, page_powers, robust_least_squares
 from experiment.measures.paper import MIN_REFERENCES, PaperReader
 from experiment.measures.stains import LEAST_BITS, LEAST_COUNTS, find_stains

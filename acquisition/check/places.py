@@ -4,7 +4,7 @@ Tags alone place a wavy sheet to some pixels only. So the smooth map through the
 as printed is laid over the frame as seen, and shifted until it fits best. Good to a few tenths of a pixel, where
 `calibration.registration` is to a few hundredths: enough for the middle of a cell, and a tenth of the time.
 
-Places are half-size pixels (`experiment.framing.planes`), points millimetres on the print.
+Places are half-size pixels (`drivers.raw.rawfile`), points millimetres on the print.
 """
 
 from __future__ import annotations
@@ -15,12 +15,11 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from drivers.raw.rawfile import Mosaic
+from drivers.raw.rawfile import CHANNELS, CLIPPING_SHARE, Mosaic, Plane, frame_black, plane_of
 from experiment.chart.model import Chart
 from experiment.chart.printing import field_drawing
 from experiment.framing.finding import Framing
 from experiment.framing.homography import project
-from experiment.framing.planes import CHANNELS, CLIPPING_SHARE, Plane, frame_black, plane_of
 from experiment.measures.least_squares import page_polynomial, page_powers, robust_least_squares
 
 MAX_TERMS_SHARE = 0.6

@@ -58,11 +58,10 @@ from acquisition.judge.state import (
     is_brightest_grey,
     primary_of,
 )
-from drivers.raw.rawfile import Mosaic, filled_fault, read_raw
+from drivers.raw.rawfile import CHANNELS, Channel, Mosaic, filled_fault, frame_black, phases, read_raw
 from experiment.chart.model import Chart
 from experiment.config import JudgeSettings, LabSettings
 from experiment.framing.pictures import preview_jpeg
-from experiment.framing.planes import CHANNELS, Channel, frame_black, phases
 from experiment.lights import Illumination
 from experiment.session.records import REFERENCES, Check, Judgement, SessionStep
 from foundation.colorimetry import angles_deg, decode_srgb

@@ -33,23 +33,25 @@ import numpy as np
 import numpy.typing as npt
 
 from drivers.camera import ExposureSettings
-from drivers.raw.rawfile import Mosaic, filled_fault, read_raw
+from drivers.raw.rawfile import (
+    CHANNELS,
+    CLIPPING_SHARE,
+    Channel,
+    Mosaic,
+    Plane,
+    filled_fault,
+    frame_black,
+    phases,
+    plane_of,
+    read_raw,
+    strongest_plane,
+)
 from experiment.chart.model import Chart
 from experiment.config import LabSettings, LimitSettings
 from experiment.framing.field import FoundField
 from experiment.framing.finding import FoundTag, Framing, find_chart, find_tags
 from experiment.framing.homography import project
 from experiment.framing.pictures import Shift, gauge_boxes, gauges_of, shift_between
-from experiment.framing.planes import (
-    CHANNELS,
-    CLIPPING_SHARE,
-    Channel,
-    Plane,
-    frame_black,
-    phases,
-    plane_of,
-    strongest_plane,
-)
 from experiment.session.records import FrameKind, Judgement, SessionStep
 from foundation.compiled import compiled
 from foundation.errors import FormatError

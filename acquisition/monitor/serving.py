@@ -7,8 +7,7 @@ import re
 from pathlib import Path
 
 from acquisition.monitor.view import SessionWatch, live_page, read_session, to_bytes
-from experiment.session.journal import JOURNAL_FILE
-from experiment.session.ledger import ledger_path
+from experiment.session.journal import JOURNAL_FILE, ledger_path
 from foundation.errors import FormatError
 from foundation.local_server import LocalServer, Refusal, Request, Response
 

@@ -39,8 +39,7 @@ import numpy as np
 
 from experiment.lights import Illumination, load_illuminations
 from experiment.session.heartbeat import AGAIN, BEAT_S, LATE_S, Heartbeat, Process, SessionPlace
-from experiment.session.journal import JOURNAL_FILE, Journal, lost_files, open_journal, without_journal
-from experiment.session.ledger import ledger_path
+from experiment.session.journal import JOURNAL_FILE, Journal, ledger_path, lost_files, open_journal, without_journal
 from experiment.session.records import (
     ACCEPTED,
     FAILED,

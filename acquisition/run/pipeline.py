@@ -5,9 +5,8 @@ Order of a frame n, on one thread for the devices and one that saves and judges:
     devices   settle n | begin n | expose n | screen? | show n+1 | projector? | download n | collect n-1 | settle …
     saving             |        judge n-1                                     | hash, flush, rename, judge n …
 
-`StepQueue` says which frame is next, `Pipeline` moves the devices, `Saver` completes and judges files in the other
-thread, `Verdicts` lets frames count and draws what follows for others, `LastingCause` waits for what would refuse every
-frame.
+`StepQueue` says which frame is next, `Pipeline` moves the devices, `Verdicts` lets frames count and draws what follows
+for others, `LastingCause` waits for what would refuse every frame.
 
 Rules that hold inside, of time and order:
 
@@ -41,7 +40,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from datetime import datetime
 from functools import partial
-from typing import Self, TypeVar
+from typing import TypeVar
 
 from acquisition.judge.limits import ROOM_LIGHT_PERCENT
 from acquisition.run.devices import (
@@ -106,6 +105,7 @@ class Job:
     devices: Devices
     settings: LabSettings
     queue: StepQueue
+    judge: FrameJudge
     retry: RetryPolicy
     watch: RunWatch
 
@@ -174,12 +174,23 @@ class Saved:
     preview_fault: str = ""
 
 
-class Pipeline:
-    """Takes what the job's queue lists, and journals it."""
+def take_open(job: Job, observe: Callable[[Taken], object], ending: Ending) -> None:
+    """Take what the job's queue lists, and journal it.
 
-    def __init__(self, job: Job, saver: Saver, observe: Callable[[Taken], object], ending: Ending) -> None:
-        self._job, self._saver, self._observe, self._ending = job, saver, observe, ending
-        self._lasting = LastingCause(job, saver)
+    Whatever ends it, frames that the camera has given are completed, judged and journalled first.
+    """
+    with ThreadPoolExecutor(1, "saving") as saving:
+        Pipeline(job, saving, observe, ending).run()
+
+
+class Pipeline:
+    """Moves the devices; `saving` is the thread that completes files and judges them, one after another."""
+
+    def __init__(
+        self, job: Job, saving: ThreadPoolExecutor, observe: Callable[[Taken], object], ending: Ending
+    ) -> None:
+        self._job, self._saving, self._observe, self._ending = job, saving, observe, ending
+        self._lasting = LastingCause(job)
         self._verdicts = Verdicts(job, self._lasting)
         projector = job.devices.projector
         self._health = None if projector is None else HealthWatch(projector, job.devices.clock)
@@ -189,10 +200,7 @@ class Pipeline:
         self._exposed: Colour | None = None
 
     def run(self) -> None:
-        """Take frames until the queue is empty or the end was asked for.
-
-        Whatever ends it, frames that the camera has given are completed, judged and journalled first.
-        """
+        """Take frames until the queue is empty or the end was asked for."""
         try:
             with self._ending.finishing(PROMISE):
                 light = self._next_light()
@@ -352,7 +360,7 @@ class Pipeline:
             return
         self._clear_pause(_CAMERA)
         frame = replace(frame, timings={**frame.timings, "download": clock.monotonic() - begun})
-        self._under_way.append((frame, self._saver.submit(complete, frame)))
+        self._under_way.append((frame, self._saving.submit(_save, self._job, complete, frame)))
 
     def _fetch(self, frame: Exposed) -> Callable[[], ReceivedFile]:
         """Let the camera write the frame under a hidden name; return what completes the file.
@@ -433,47 +441,22 @@ def _download(job: Job, frame: Exposed) -> Callable[[], ReceivedFile]:
     return partial(incoming.complete, captured)
 
 
-class Saver:
-    """The thread that completes files and judges them, one after another; use it in a `with` block.
-
-    At its end it waits for what was handed to it: a file that the camera has given is completed, whatever happens.
-    """
-
-    def __init__(self, session: Session, judge: FrameJudge) -> None:
-        self._session = session
-        self._judge = judge
-        self._thread = ThreadPoolExecutor(1, "saving")
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._thread.shutdown(wait=True)
-
-    def submit(self, complete: Callable[[], ReceivedFile], frame: Exposed) -> Future[Saved]:
-        """Hand over a frame's file, completed by `complete`; the result comes when all before it have."""
-        return self._thread.submit(self._save, complete, frame)
-
-    def after_pause(self) -> None:
-        """Tell the judge of a pause, if it wants to know; every file that was handed over must be judged."""
-        if isinstance(self._judge, OutlastsPauses):
-            self._judge.after_pause()
-
-    def _save(self, complete: Callable[[], ReceivedFile], frame: Exposed) -> Saved:
-        begun = time.perf_counter()
-        received = complete()
-        saved = time.perf_counter()
-        judgement, preview_fault = Judgement(frame.checks), ""
-        if judgement.accepted:
-            seen = self._judge.judge(received.path, frame.step)
-            judgement = replace(seen, checks=(*frame.checks, *seen.checks), preview=b"")
-            if seen.preview:
-                # It is derived and may be lost; flushing it would cost the devices' thread as much as a row.
-                try:
-                    write_whole(preview_path(self._session.folder, received.path.name), seen.preview)
-                except CropError as error:
-                    preview_fault = str(error)
-        return Saved(received, judgement, saved - begun, time.perf_counter() - saved, preview_fault)
+def _save(job: Job, complete: Callable[[], ReceivedFile], frame: Exposed) -> Saved:
+    """Make a frame's file whole and judge it; what the saving thread does."""
+    begun = time.perf_counter()
+    received = complete()
+    saved = time.perf_counter()
+    judgement, preview_fault = Judgement(frame.checks), ""
+    if judgement.accepted:
+        seen = job.judge.judge(received.path, frame.step)
+        judgement = replace(seen, checks=(*frame.checks, *seen.checks), preview=b"")
+        if seen.preview:
+            # It is derived and may be lost; flushing it would cost the devices' thread as much as a row.
+            try:
+                write_whole(preview_path(job.session.folder, received.path.name), seen.preview)
+            except CropError as error:
+                preview_fault = str(error)
+    return Saved(received, judgement, saved - begun, time.perf_counter() - saved, preview_fault)
 
 
 class Verdicts:
@@ -620,8 +603,8 @@ class LastingCause:
     - `last_before`: the newest attempt from before the run, or from before its last pause for something lasting.
     """
 
-    def __init__(self, job: Job, saver: Saver) -> None:
-        self._job, self._saver = job, saver
+    def __init__(self, job: Job) -> None:
+        self._job = job
         self.last_before = max((attempt.id for attempt in job.session.journal.attempts()), default=0)
         self._sentence = ""
         self._step: SessionStep | None = None
@@ -680,7 +663,9 @@ class LastingCause:
             job.queue.begin_with(step for step in job.session.steps if step.number in numbers)
             self._to_show.update(numbers)
         self.last_before = attempts[-1].id
-        self._saver.after_pause()
+        # Every file that was handed over is judged: a wait begins with that.
+        if isinstance(job.judge, OutlastsPauses):
+            job.judge.after_pause()
 
 
 def _followed_changes(

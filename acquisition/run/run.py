@@ -20,7 +20,7 @@ from acquisition.judge.measure import ExposureJudge
 from acquisition.monitor.view import write_session_report
 from acquisition.run.devices import TRY_S, Devices, RetryPolicy, RunEnd, RunWatch, leave_lab, make_ready
 from acquisition.run.notices import Life, Notices, PauseNotices
-from acquisition.run.pipeline import Job, Pipeline, Saver, StepQueue, Taken, link_runs, unclosed_kinds, white_first
+from acquisition.run.pipeline import Job, StepQueue, Taken, link_runs, take_open, unclosed_kinds, white_first
 from acquisition.run.plan import nothing_to_retake, planned_steps, require_plan, require_same
 from acquisition.run.rig.opening import open_rig
 from drivers.camera import keep_awake
@@ -278,9 +278,11 @@ def take_session(
         for stray in session.set_aside_strays():
             reports.tell("stray", f"{stray.name}: complete, but not in the journal; kept, not used")
         with RunWatch(reports.late) as watch:
-            job = Job(session, devices, settings, _open_steps(session, settings, first), retry, watch)
+            queue = _open_steps(session, settings, first)
+            job = Job(session, devices, settings, queue, judge or ExposureJudge(settings), retry, watch)
             if len(job.queue):
-                _take_open(job, judge or ExposureJudge(settings), count, asked)
+                _make_ready(job)
+                take_open(job, count, asked)
         session.journal.require_whole()
         doubts = tuple(doubts_of(session.journal.events()))
         outcome = RunOutcome(len(session.steps), len(job.queue), job.queue.given_up, doubts)
@@ -325,18 +327,16 @@ def _open_steps(session: Session, settings: LabSettings, first: Sequence[int]) -
     )
 
 
-def _take_open(job: Job, judge: FrameJudge, observe: Callable[[Taken], object], ending: Ending) -> None:
-    """Make the devices ready, and take what is open."""
+def _make_ready(job: Job) -> None:
+    """Make the devices ready to take what is open, and let the judge know what was taken."""
     devices, settings, journal = job.devices, job.settings, job.session.journal
     journal.note(devices.clock.now(), "start", f"{len(job.queue)} of {len(job.session.steps)} frames to take")
     with job.watch.step("the camera", "takes its settings", CONFIGURE_S, "configure"):
         devices.camera.configure(settings.camera.exposure)
     for step, _, measurement, accepted in journal.measurements():
-        judge.recall(step, measurement, accepted)
+        job.judge.recall(step, measurement, accepted)
     if devices.projector is not None:
         make_ready(devices.projector, settings.sequence, job.retry)
-    with Saver(job.session, judge) as saver:
-        Pipeline(job, saver, observe, ending).run()
 
 
 class _Reports:

@@ -24,7 +24,8 @@ from calibration.figures.figure import (
     Worst,
 )
 from calibration.figures.light import percent, percents, worst_light
-from experiment.framing.planes import CLIPPING_SHARE, MIN_SIGNAL
+from drivers.raw.rawfile import CLIPPING_SHARE
+from experiment.framing.field import MIN_SIGNAL
 
 if TYPE_CHECKING:
     from calibration.measurements import FrameMeasurements, TableMeasurements

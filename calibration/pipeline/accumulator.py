@@ -45,8 +45,8 @@ from calibration.registration.register import MAX_PLACE_ERROR_PX
 from calibration.sampling import has_dead_photosite, unevenness
 from calibration.spread.added_light import MOST_ADDED, AddedLight
 from calibration.table.lut import Unfit
+from drivers.raw.rawfile import CLIPPING_SHARE
 from experiment.framing.pictures import Shift
-from experiment.framing.planes import CLIPPING_SHARE
 from experiment.measures.stains import Stains, find_stains
 from experiment.session.folder import Session
 from experiment.session.records import FrameRecord

@@ -52,13 +52,22 @@ from calibration.spread.fitting import DARK_LEVEL, LEAST_COUNTS, LOOSE_UNEVENNES
 from calibration.spread.predicting import VARYING_BITS
 from calibration.spread.surroundings import FrameLevels, photosite_offsets_px, printed_grid, unsuitable
 from calibration.table.lut import Lut, SourceFrame
-from drivers.raw.rawfile import Mosaic, decode_raw, filled_fault
+from drivers.raw.rawfile import (
+    CHANNELS,
+    CLIPPING_SHARE,
+    Channel,
+    Mosaic,
+    Plane,
+    decode_raw,
+    filled_fault,
+    frame_black,
+    strongest_channel,
+)
 from drivers.raw.storage import Area
 from experiment.chart.model import Chart
 from experiment.config import CameraSettings, CitationSettings
 from experiment.framing.field import Corners
 from experiment.framing.pictures import STILL_PX, Shift, gauges_of, shift_between
-from experiment.framing.planes import CHANNELS, CLIPPING_SHARE, Channel, Plane, frame_black, strongest_channel
 from experiment.measures.least_squares import code_polynomial, code_powers, least_squares, page_polynomial
 from experiment.measures.paper import MAX_ORDER, MAX_ORDER_AROUND, FlatField, PaperReader
 from experiment.session.folder import Session

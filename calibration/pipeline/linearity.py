@@ -17,9 +17,8 @@ import numpy.typing as npt
 
 from calibration.measurements import LinearityMeasurements
 from calibration.pipeline.baseline import Baseline
-from drivers.raw.rawfile import Mosaic, read_raw
+from drivers.raw.rawfile import CLIPPING_SHARE, Mosaic, frame_black, read_raw, strongest_channel
 from experiment.framing.pictures import REREGISTER_PX, Shift
-from experiment.framing.planes import CLIPPING_SHARE, frame_black, strongest_channel
 from experiment.measures.sensor import HIGHEST, LOWEST, deviations
 from foundation.errors import FormatError, InputError
 

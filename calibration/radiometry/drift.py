@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from experiment.framing.planes import CLIPPING_SHARE
+from drivers.raw.rawfile import CLIPPING_SHARE
 from experiment.measures.paper import FlatField
 
 _Array = npt.NDArray[np.float64]

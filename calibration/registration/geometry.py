@@ -23,8 +23,8 @@ import numpy.typing as npt
 from scipy import optimize, sparse
 from scipy.sparse import linalg as sparse_linalg
 
+from drivers.raw.rawfile import CHANNELS, Channel
 from experiment.framing.homography import fit_homography, on_one_line, project
-from experiment.framing.planes import CHANNELS, Channel
 from foundation.errors import RegistrationError
 
 _PAIRS_FOR_ALL, _PAIRS_FOR_ONE = 48, 16

@@ -31,9 +31,9 @@ from calibration.registration.geometry import (
     fit_lens,
 )
 from calibration.registration.tiles import MIN_SCORE, Raster, TileComparison, box_mean, compare_tiles, find_blocks
+from drivers.raw.rawfile import CHANNELS, Channel, Plane
 from experiment.chart.model import PAPER_WHITE, Chart
 from experiment.framing.homography import rms
-from experiment.framing.planes import CHANNELS, Channel, Plane
 from foundation.errors import RegistrationError
 
 _LEAST_INFORMATION = 4.0

@@ -24,10 +24,9 @@ from calibration.measurements import FrameMeasurements, TableMeasurements
 from calibration.radiometry.greys import PhotonTransfer, noise_levels
 from calibration.registration.register import Registration
 from calibration.sampling import rim_difference, sample_noise, sites_at
-from drivers.raw.rawfile import Mosaic
+from drivers.raw.rawfile import CHANNELS, Mosaic, frame_black, phases
 from experiment.chart.model import Chart
 from experiment.framing.pictures import STILL_PX
-from experiment.framing.planes import CHANNELS, frame_black, phases
 from experiment.measures.paper import FlatField
 from experiment.measures.stains import Stains
 from foundation.colorimetry import decode_srgb

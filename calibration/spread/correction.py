@@ -42,7 +42,7 @@ from calibration.spread.surroundings import (
     Surroundings,
     UsualLight,
 )
-from experiment.framing.planes import CHANNELS
+from drivers.raw.rawfile import CHANNELS
 from experiment.measures.least_squares import page_polynomial, page_powers
 from experiment.measures.paper import FlatField
 

@@ -23,10 +23,9 @@ import numpy.typing as npt
 from calibration import kernels
 from calibration.kernels import PARTS, REACH
 from calibration.spread.fitting import NEAR_PX
-from drivers.raw.rawfile import Mosaic
+from drivers.raw.rawfile import CHANNELS, Mosaic, channel_offset_px, phases
 from experiment.chart.model import Chart
 from experiment.chart.printing import drawing
-from experiment.framing.planes import CHANNELS, channel_offset_px, phases
 
 PAD = 6
 """Slots around the outermost patches: margins and what lies behind the print, as far as wide kernels see them."""

@@ -1,4 +1,4 @@
-"""Raw files become mosaics: the sensor's counts exactly as the camera stored them, and what the file says of itself.
+"""Raw files become mosaics: the sensor's counts as the camera stored them, what the file says, and planes of a colour.
 
 Rules that hold inside:
 
@@ -8,6 +8,10 @@ Rules that hold inside:
   structure betrays it, since LibRaw fills what is missing with zeros or ones without a word in some formats, and so
   does whoever copies a file from a bad card (`filled_fault`). What a file does not state of camera, lens and exposure,
   or states in a damaged place, is empty or None.
+- A `Plane` is one colour of a mosaic, above black. Its places are half-size pixels, x right, y down, centres at
+  integers. A plane of red or blue photosites lies a quarter pixel beside the blocks' centres, and `Plane.offset_px`
+  puts its places right; green is the mean of its two photosites and lies in the middle. A sum of planes under deep red
+  or blue would be a fifth of a pixel off.
 - LibRaw is called here and nowhere else in the suite. A DNG that holds its counts as memory does needs none: it is read
   as LibRaw would, and what is not sure of it is left to LibRaw. Rows and columns of colour filters and of black levels
   count from the active area's corner (DNG 1.7, ActiveArea). LibRaw's table of colour matrices is asked by opening a raw
@@ -23,13 +27,14 @@ from __future__ import annotations
 import ctypes
 import io
 import struct
+import sys
 import threading
 from collections.abc import Generator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache, lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -55,7 +60,7 @@ from foundation.robust import MAD_TO_SIGMA
 
 if TYPE_CHECKING:
     from rawpy import RawPy
-import sys
+
 
 _EXIF_POINTER, _NOTE = int(TiffTag.EXIF_IFD_POINTER), 37500
 """Tags (Exif 2.32): of the Exif directory in the first one, and of the maker's note in that."""
@@ -795,3 +800,79 @@ def _extent_text(found: NDArray[np.intp], shape: tuple[int, ...]) -> str | None:
         return f"{len(found)} of its {shape[0]} rows, from row {found[0]},"
     height, width = _tile_size(shape)
     return f"{len(found)} parts of {height}×{width}, from row {found[0][0] * height}, column {found[0][1] * width},"
+
+
+Channel = Literal["R", "G", "B"]
+CHANNELS: tuple[Channel, Channel, Channel] = ("R", "G", "B")
+
+CLIPPING_SHARE = 0.98
+"""Counts above this share of saturation are treated as clipped (judgement: the knee of the response lies above)."""
+
+PAPER_PERCENTILE = 98
+"""Percentile of the counts that stands for paper: bare paper is more than a fiftieth of a picture, hot photosites and
+highlights are less."""
+
+
+@dataclass(frozen=True, eq=False)
+class Plane:
+    """One colour of a mosaic: `values` (H // 2, W // 2) float32, counts above black; `offset_px` (x, y).
+
+    The element [i, j] was measured at the half-size place x = j + offset_px[0], y = i + offset_px[1].
+    """
+
+    channel: Channel
+    values: NDArray[np.float32]
+    offset_px: tuple[float, float]
+
+
+def phases(mosaic: Mosaic) -> dict[Channel, tuple[tuple[int, int], ...]]:
+    """Return which (row, column) of the 2×2 block carry each colour."""
+    found: dict[Channel, tuple[tuple[int, int], ...]] = {}
+    for channel in CHANNELS:
+        found[channel] = tuple(divmod(place, 2) for place, letter in enumerate(mosaic.pattern) if letter == channel)
+    return found
+
+
+def channel_offset_px(places: Sequence[tuple[int, int]]) -> tuple[float, float]:
+    """Return where photosites at `places` of the block lie from its centre, half-size px (x, y): 0 or ±0.25."""
+    rows, columns = np.mean(np.asarray(places, dtype=np.float64), axis=0)
+    return (float(columns) - 0.5) / 2, (float(rows) - 0.5) / 2
+
+
+def frame_black(mosaic: Mosaic) -> NDArray[np.float64]:
+    """Return the black level (2, 2) float64 of each position of the block: measured in the masked border, or stated."""
+    measured = mosaic.masked_black()
+    return mosaic.black if measured is None else measured
+
+
+def plane_of(mosaic: Mosaic, channel: Channel, black: NDArray[np.float64] | None = None) -> Plane:
+    """Return one colour of a mosaic above `black`, (2, 2) float64 counts, by default measured from the frame."""
+    black = frame_black(mosaic) if black is None else black
+    places = phases(mosaic)[channel]
+    blocks = mosaic.block_planes()
+    level = float(np.mean([black[place] for place in places]))
+    values = blocks[places[0]].astype(np.float32)
+    for place in places[1:]:
+        values += blocks[place]
+    values /= len(places)
+    values -= level
+    return Plane(channel, values, channel_offset_px(places))
+
+
+def strongest_plane(mosaic: Mosaic, black: NDArray[np.float64] | None = None) -> Plane:
+    """Return the colour with the brightest paper; `black` (2, 2) float64 counts as in `plane_of`."""
+    black = frame_black(mosaic) if black is None else black
+    return plane_of(mosaic, strongest_channel(mosaic, black, every=8), black)
+
+
+def strongest_channel(mosaic: Mosaic, black: NDArray[np.float64], every: int = 16) -> Channel:
+    """Return the colour with the brightest paper, from one block in `every` along rows and columns.
+
+    `black` (2, 2) float64 counts.
+    """
+    blocks = mosaic.block_planes()[:, :, ::every, ::every]
+    levels = [
+        max(float(np.percentile(blocks[place], PAPER_PERCENTILE) - black[place]) for place in places)
+        for places in phases(mosaic).values()
+    ]
+    return CHANNELS[int(np.argmax(levels))]

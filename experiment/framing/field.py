@@ -27,11 +27,14 @@ import numpy as np
 import numpy.typing as npt
 from scipy.special import ndtr
 
+from drivers.raw.rawfile import Plane
 from experiment.chart.model import Chart
 from experiment.framing.homography import fit_homography, project
-from experiment.framing.planes import MIN_SIGNAL, Plane, paper_level
 from foundation.errors import InputError, RegistrationError
 from foundation.robust import biweight, huber_weights, sigma_of
+
+MIN_SIGNAL = 12.0
+"""Counts above black that the brightest parts of the strongest plane must have for a chart to be looked for."""
 
 CORNER_REACH_PX = 24.0
 """How far from a guess the field's outline is looked for."""
@@ -107,6 +110,16 @@ _TRIED_CELLS = 1500
 _Float = npt.NDArray[np.float32]
 _Points = npt.NDArray[np.float64]
 Corners = tuple[tuple[float, float], ...]
+
+
+def paper_level(plane: Plane) -> float:
+    """Return how bright the brightest parts of a plane are, counts above black: means of 4×4 pixels, 99.5th percentile.
+
+    Means, so that a dark frame's noise is not taken for light.
+    """
+    height, width = plane.values.shape
+    size = (max(1, width // 4), max(1, height // 4))
+    return float(np.percentile(cv2.resize(plane.values, size, interpolation=cv2.INTER_AREA), 99.5))
 
 
 @dataclass(frozen=True, eq=False)

@@ -4,7 +4,7 @@ Rules that hold inside:
 
 - One linear colour plane at a time, the strongest of the frame: a square root moves a tag's corner by a quarter pixel,
   a sum of planes under deep red or blue by a fifth.
-- Places are half-size pixels (`experiment.framing.planes`).
+- Places are half-size pixels (`drivers.raw.rawfile`).
 - Faults of the picture are a `RegistrationError` that says what was looked for, what was found, and what helps.
 
 Knows the chart and a mosaic of counts; nothing of sessions, cells' colours or lenses
@@ -25,11 +25,10 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from drivers.raw.rawfile import Mosaic
+from drivers.raw.rawfile import CHANNELS, Mosaic, Plane, frame_black, plane_of, strongest_plane
 from experiment.chart.model import TAG_MODULES, Chart
-from experiment.framing.field import FoundField, corners_text, find_field
+from experiment.framing.field import MIN_SIGNAL, FoundField, corners_text, find_field, paper_level
 from experiment.framing.homography import project, rms, robust_homography
-from experiment.framing.planes import CHANNELS, MIN_SIGNAL, Plane, frame_black, paper_level, plane_of, strongest_plane
 from foundation.errors import InputError, RegistrationError
 
 MIN_TAGS = 2

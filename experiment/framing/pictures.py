@@ -22,14 +22,10 @@ import numpy as np
 import numpy.typing as npt
 from scipy.special import ndtr
 
-from drivers.raw.rawfile import Mosaic
-from experiment.chart.model import TAG_MODULES, Chart
-from experiment.framing.field import FoundField, PreparedPicture
-from experiment.framing.finding import MIN_MODULE_PX, FoundTag, Framing, find_tags
-from experiment.framing.homography import project
-from experiment.framing.planes import (
+from drivers.raw.rawfile import (
     CHANNELS,
     Channel,
+    Mosaic,
     Plane,
     channel_offset_px,
     frame_black,
@@ -37,6 +33,10 @@ from experiment.framing.planes import (
     plane_of,
     strongest_plane,
 )
+from experiment.chart.model import TAG_MODULES, Chart
+from experiment.framing.field import FoundField, PreparedPicture
+from experiment.framing.finding import MIN_MODULE_PX, FoundTag, Framing, find_tags
+from experiment.framing.homography import project
 from foundation.robust import huber_weights, sigma_of
 
 MAX_SHIFT_PX = 3.0

@@ -34,12 +34,13 @@ from experiment.session.journal import (
     MOST_BYTES,
     PATIENCE_S,
     Journal,
+    ledger_path,
     lost_files,
     open_journal,
+    read_ledger,
     time_text,
     without_journal,
 )
-from experiment.session.ledger import ledger_path, read_ledger
 from experiment.session.records import AcceptedFile, FrameRecord, Judgement, SessionStep
 from experiment.session.repair import (
     BAD,

@@ -1,5 +1,7 @@
 """The journal of a session, `journal.sqlite`: the plan, every attempt at its frames, their verdicts, and events.
 
+Its facts stand a second time in `ledger.jsonl`, from which a journal that was lost is made anew.
+
 Rules that hold inside:
 
 - The journal is written before and after each frame; every write is a transaction of its own and on the disk when the
@@ -17,6 +19,10 @@ Rules that hold inside:
 - Files are deleted, replaced and cut, and nobody says so: a program goes on writing a file that has no name any more,
   and SQLite does not look twice at pages that it has read. So a run looks whether the journal on the disk is its own,
   and whole (`_JournalGuard`).
+- A line of the ledger is a transaction: the rows that it put or changed, by table, as a JSON object. It is on the disk
+  before the journal commits the same, so that the lines hold all that the journal holds, and at most one transaction
+  more. A later row of the same key changes the columns that it names. Signs of life, and where the session lies, are no
+  facts and are not kept. What a crash cut off is the last line alone, and is no fact.
 
 Which raw files are really there, `experiment.session.folder` knows.
 
@@ -25,6 +31,7 @@ Sources: sqlite.org/wal.html, in particular "Read-Only Databases" and "Disadvant
 
 from __future__ import annotations
 
+import base64
 import errno
 import fcntl
 import json
@@ -40,24 +47,11 @@ from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, Final, TypeVar
+from typing import Any, Final, TypeVar, cast
 from urllib.parse import quote
 
 from drivers.presenter import Colour
 from experiment.session.heartbeat import INVENTED_NUMBERS, Heartbeat, Process, RunState, SessionPlace, file_system_of
-from experiment.session.ledger import (
-    PLACE,
-    Frames,
-    Ledger,
-    Row,
-    Rows,
-    insert_rows,
-    lacking_frames,
-    ledger_path,
-    require_none_lacking,
-    rows_of,
-    settled_frames,
-)
 from experiment.session.records import (
     ACCEPTED,
     FAILED,
@@ -78,12 +72,14 @@ from foundation.errors import RUN_AGAIN, FormatError, InputError, StorageError, 
 from foundation.files import (
     disk_remedy_of,
     is_inside_name,
+    open_inside,
     partial_path,
+    reading_error,
     require_plain_folder,
     storage_error,
     sync_folder,
+    write_whole,
 )
-from foundation.files import reading_error as file_reading_error
 
 JOURNAL_FILE = "journal.sqlite"
 """Name of the journal in a session's folder."""
@@ -110,7 +106,7 @@ class Journal:
         self._version = version
         self._writes = retry is not None
         self._retry = retry or _LockRetry(path, 0, lambda sentence: None)
-        self._ledger: Ledger | None = None
+        self._ledger: _Ledger | None = None
         self._guard: _JournalGuard | None = None
         self._gives_signs = False
 
@@ -144,7 +140,7 @@ class Journal:
         copy.unlink(missing_ok=True)
         with closing(create_file(copy)) as connection, connection:
             connection.execute("BEGIN")
-            insert_rows(connection, rows)
+            _insert_rows(connection, rows)
         Journal.open(copy).close()
         _set_aside(path)
         copy.replace(path)
@@ -155,8 +151,8 @@ class Journal:
         try:
             rows = self._retry.run(lambda: rows_of(self._connection))
         except sqlite3.DatabaseError as error:
-            raise reading_error(self.path, error) from error
-        self._ledger = Ledger(ledger, rows)
+            raise _reading_fault(self.path, error) from error
+        self._ledger = _Ledger(ledger, rows)
         self._guard = _JournalGuard(self.path, self._ledger)
 
     def require_whole(self) -> None:
@@ -350,7 +346,7 @@ class Journal:
 
     def lacking(self, frames: Frames) -> Frames:
         """Return the frames among these that are not here, or have another verdict."""
-        return lacking_frames(
+        return _lacking_frames(
             frames, {*self._rows("SELECT id, sha256, verdict FROM attempts WHERE sha256 IS NOT NULL")}
         )
 
@@ -400,7 +396,7 @@ class Journal:
         try:
             return self._retry.run(lambda: self._connection.execute(query, values).fetchall())
         except sqlite3.DatabaseError as error:
-            raise reading_error(self.path, error) from error
+            raise _reading_fault(self.path, error) from error
 
     @contextmanager
     def _writing(self) -> Generator[_Change]:
@@ -435,7 +431,7 @@ class Journal:
                 if self._connection.in_transaction:
                     self._connection.execute("ROLLBACK")
 
-    def _append(self, ledger: Ledger, rows: Mapping[str, Sequence[Row]]) -> None:
+    def _append(self, ledger: _Ledger, rows: Mapping[str, Sequence[Row]]) -> None:
         if not ledger.is_there():
             # Of the file that is open: that on the disk may be gone as well.
             ledger.restore(rows_of(self._connection))
@@ -448,7 +444,7 @@ def open_journal(folder: Path) -> Journal:
     settled = settled_frames(ledger_path(folder))
     journal = Journal.open(folder / JOURNAL_FILE)
     try:
-        require_none_lacking(ledger_path(folder), journal.lacking(settled))
+        _require_none_lacking(ledger_path(folder), journal.lacking(settled))
     except BaseException:
         journal.close()
         raise
@@ -553,7 +549,7 @@ class _Look:
 class _JournalGuard:
     """Watches the journal that a run has open; `ledger` holds the same facts."""
 
-    def __init__(self, path: Path, ledger: Ledger) -> None:
+    def __init__(self, path: Path, ledger: _Ledger) -> None:
         self._path, self._ledger = path, ledger
         self._files = (path, beside(path, "-wal"))
         self._folders = {folder: self._look(folder) for folder in (path.parent, path.parent / "frames")}
@@ -592,7 +588,7 @@ class _JournalGuard:
                 sound = connection.execute("PRAGMA quick_check(1)").fetchall() == [("ok",)]
                 same = sound and rows_of(connection) == self._ledger.rows()
         except sqlite3.DatabaseError as error:
-            fault = reading_error(self._path, error)
+            fault = _reading_fault(self._path, error)
             if isinstance(fault, StorageError):
                 raise fault from error
             same = False
@@ -773,7 +769,7 @@ def open_to_read(path: Path) -> tuple[sqlite3.Connection, int]:
             connection = _opened_or_copied(path)
         return connection, _checked(path, connection)
     except (OSError, sqlite3.DatabaseError) as error:
-        raise reading_error(path, error) from error
+        raise _reading_fault(path, error) from error
 
 
 def open_for_run(path: Path, retry: _LockRetry) -> sqlite3.Connection:
@@ -786,7 +782,7 @@ def open_for_run(path: Path, retry: _LockRetry) -> sqlite3.Connection:
         connection = retry.run(lambda: _connect(path, "rw"))
         version = retry.run(lambda: _checked(path, connection))
     except (OSError, sqlite3.DatabaseError) as error:
-        raise reading_error(path, error) from error
+        raise _reading_fault(path, error) from error
     try:
         with suppress(OSError):  # Left by a run that was killed while it made a copy.
             partial_path(path).unlink(missing_ok=True)
@@ -980,7 +976,7 @@ def _checked(path: Path, connection: sqlite3.Connection) -> int:
     return version
 
 
-def reading_error(path: Path, error: OSError | sqlite3.DatabaseError) -> FormatError | StorageError:
+def _reading_fault(path: Path, error: OSError | sqlite3.DatabaseError) -> FormatError | StorageError:
     """Return why a journal cannot be read, and what helps.
 
     SQLite calls a file damaged whose disk does not read it, and a copy must not take the place of a sound journal: so
@@ -988,7 +984,7 @@ def reading_error(path: Path, error: OSError | sqlite3.DatabaseError) -> FormatE
     """
     if isinstance(error, OSError):
         gone = isinstance(error, FileNotFoundError)
-        return file_reading_error(path, error, _restoring(path) if gone else "check its permissions")
+        return reading_error(path, error, _restoring(path) if gone else "check its permissions")
     if _is_busy(error):
         return FormatError(f"cannot read {path}: {error}; see that no other program holds it")
     code = _primary_code(error)
@@ -997,7 +993,7 @@ def reading_error(path: Path, error: OSError | sqlite3.DatabaseError) -> FormatE
     openable = os.access(path, os.R_OK) or (fault is not None and disk_remedy_of(fault) is not None)
     failed = code == sqlite3.SQLITE_IOERR or (code == sqlite3.SQLITE_CANTOPEN and openable)
     if fault is not None and (failed or fault.errno not in _READABLE_FAULTS):
-        return file_reading_error(path, fault, "check the permissions of its folder")
+        return reading_error(path, fault, "check the permissions of its folder")
     if failed or (_is_damage(error) and _is_sound(path)):
         return StorageError(
             f"cannot read {path}: {error}, and its disk did not say why; check the disk and its cable, {RUN_AGAIN}"
@@ -1183,3 +1179,259 @@ def require_sound_rows(path: Path, connection: sqlite3.Connection, version: int)
             raise FormatError(
                 f"{path} names the file {file[:200]!r}, which is none of the session; {_DAMAGED}; {_restoring(path)}"
             )
+
+
+LEDGER_FILE: Final = "ledger.jsonl"
+"""Its name in a session's folder."""
+
+_MOST_LEDGER_BYTES: Final = 1 << 30
+"""Of a ledger that is read: twenty times what 707 lights have, so that a stranger's fills no memory."""
+
+PLACE: Final = "place"
+"""Key of the record that says for which folder signs of life are given."""
+
+_ROW_KEYS: Final = {
+    "plan": ("step",),
+    "attempts": ("id",),
+    "events": ("id",),
+    "checks": ("attempt", "position"),
+    "measurements": ("attempt",),
+    "timings": ("attempt", "name"),
+    "records": ("key",),
+}
+"""What tells the rows of a table apart."""
+
+_BEGUN: Final = dict.fromkeys(("ended_at", "taken_at", "exposure_s", "size", "sha256", "verdict")) | {"reason": ""}
+"""Columns of an attempt that are not known when it begins, as the journal has them then."""
+
+Row = dict[str, Any]
+Rows = dict[str, dict[tuple[Any, ...], Row]]
+"""Rows by table and key, columns by name."""
+
+
+def ledger_path(folder: Path) -> Path:
+    """Return the path of a session's ledger."""
+    return folder / LEDGER_FILE
+
+
+def rows_of(connection: sqlite3.Connection) -> Rows:
+    """Return the facts that a journal of this version holds."""
+    rows: Rows = {}
+    for table in _ROW_KEYS:
+        cursor = connection.execute(f"SELECT * FROM {table} ORDER BY rowid")
+        names = [column[0] for column in cursor.description]
+        for values in cursor.fetchall():
+            _put_row(rows, table, dict(zip(names, values, strict=True)))
+    rows.get("records", {}).pop((PLACE,), None)
+    return {table: of_table for table, of_table in rows.items() if of_table}
+
+
+def _insert_rows(connection: sqlite3.Connection, rows: Rows) -> None:
+    """Write facts into a journal that has its tables and nothing in them."""
+    for table, of_table in rows.items():
+        for row in of_table.values():
+            marks = ", ".join("?" * len(row))
+            connection.execute(f"INSERT INTO {table} ({', '.join(row)}) VALUES ({marks})", tuple(row.values()))
+
+
+def read_ledger(path: Path) -> Rows:
+    """Return the facts that a ledger holds."""
+    return _gathered(_read_transactions(path))
+
+
+def _read_transactions(path: Path, size: int = _MOST_LEDGER_BYTES + 1) -> list[Mapping[str, Sequence[Row]]]:
+    """Return the transactions in the first `size` bytes of a ledger."""
+    try:
+        with open_inside(path.parent, path.name) as stream:
+            content = stream.read(size)
+    except OSError as error:
+        raise reading_error(path, error, "restore the session from a copy") from error
+    if len(content) > _MOST_LEDGER_BYTES:
+        raise FormatError(f"{path} has more than {_MOST_LEDGER_BYTES} bytes; restore it from a copy")
+    return list(_transactions(path, content.split(b"\n")))
+
+
+def _gathered(transactions: Sequence[Mapping[str, Sequence[Row]]]) -> Rows:
+    """Return the facts that transactions left."""
+    rows: Rows = {}
+    for transaction in transactions:
+        for table, changes in transaction.items():
+            for row in changes:
+                _put_row(rows, table, row)
+    return rows
+
+
+def _transactions(path: Path, lines: Sequence[bytes]) -> Iterator[Mapping[str, Sequence[Row]]]:
+    """Yield what each line says; what stands behind the last line break was cut off."""
+    for number, line in enumerate(lines[:-1], 1):
+        try:
+            yield {table: [_checked_row(table, row) for row in rows] for table, rows in json.loads(line).items()}
+        except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
+            if number == len(lines) - 1 and not line.endswith(b"}"):
+                return
+            raise FormatError(f"{path}, line {number}, is damaged: {error}; restore it from a copy") from error
+
+
+def _checked_row(table: str, row: Row) -> Row:
+    """Return a row as the journal has it; the names in it become part of statements."""
+    if any(key not in row for key in _ROW_KEYS[table]) or not all(name.isidentifier() for name in row):
+        raise ValueError(f"a row of {table} without its key")
+    if not all(value is None or isinstance(value, str | int | float) for value in row.values()):
+        raise ValueError(f"a row of {table} with what is no number and no text")
+    if not is_inside_name(row.get("file", "frames")):
+        raise ValueError(f"the file {row['file']!r}, which is none of the session")
+    return row if "data" not in row else {**row, "data": base64.b64decode(row["data"], validate=True)}
+
+
+def _put_row(rows: Rows, table: str, row: Row) -> None:
+    key = tuple(row[name] for name in _ROW_KEYS[table])
+    rows.setdefault(table, {}).setdefault(key, dict(_BEGUN) if table == "attempts" else {}).update(row)
+
+
+def _ledger_line(rows: Mapping[str, Sequence[Row]]) -> bytes:
+    """Return a transaction as a line."""
+
+    def plain(value: object) -> str:
+        return base64.b64encode(cast("bytes", value)).decode()
+
+    return json.dumps(rows, default=plain, ensure_ascii=False, separators=(",", ":")).encode() + b"\n"
+
+
+def _ledger_lines(rows: Rows) -> bytes:
+    """Return facts as lines: the plan and the records, each attempt with what is known of it, and the events."""
+    alone = [{table: list(rows[table].values())} for table in ("plan", "records") if table in rows]
+    attempts: dict[int, dict[str, list[Row]]] = {}
+    for table, column in (
+        ("attempts", "id"),
+        ("checks", "attempt"),
+        ("measurements", "attempt"),
+        ("timings", "attempt"),
+    ):
+        for row in rows.get(table, {}).values():
+            attempts.setdefault(row[column], {}).setdefault(table, []).append(row)
+    events = [{"events": list(rows["events"].values())}] if "events" in rows else []
+    return b"".join(_ledger_line(one) for one in [*alone, *attempts.values(), *events])
+
+
+class _Ledger:
+    """A ledger that a run writes; close it after use.
+
+    `rows`: what the journal holds. Where the file says something else it is written anew; a journal that lacks
+    frames which the file has is refused by a FormatError.
+    """
+
+    def __init__(self, path: Path, rows: Rows) -> None:
+        self._path = path
+        try:
+            is_there = path.is_file()
+        except OSError as error:
+            raise storage_error(path, error, "look at") from error
+        if not is_there or not self._is_of(rows):
+            self._write_anew(rows)
+        self._handle, self._end = self._opened()
+        self._next = self._end
+
+    def close(self) -> None:
+        """Release the file; a second call does nothing."""
+        if self._handle >= 0:
+            handle, self._handle = self._handle, -1
+            with suppress(OSError):  # All that it was given is on the disk.
+                os.close(handle)
+
+    def append(self, changes: Mapping[str, Sequence[Row]]) -> None:
+        """Put a transaction down, in place of one that was never kept; it is on the disk when this returns."""
+        line = _ledger_line(changes)
+        try:
+            os.pwrite(self._handle, line, self._end)
+            os.ftruncate(self._handle, self._end + len(line))
+            os.fsync(self._handle)
+        except OSError as error:
+            with suppress(OSError):
+                os.ftruncate(self._handle, self._end)
+            raise storage_error(self._path, error) from error
+        self._next = self._end + len(line)
+
+    def keep(self) -> None:
+        """Let the last transaction stay: the journal has it, too, or is lost."""
+        self._end = self._next
+
+    def is_there(self) -> bool:
+        """Return whether the file that is written is the one on the disk, in full size."""
+        try:
+            found, own = self._path.stat(), os.fstat(self._handle)
+        except OSError:
+            return False
+        return (found.st_dev, found.st_ino, found.st_size) == (own.st_dev, own.st_ino, self._next)
+
+    def restore(self, rows: Rows) -> None:
+        """Write the file anew, which was removed or changed while it was open."""
+        self.close()
+        self._write_anew(rows)
+        self._handle, self._end = self._opened()
+        self._next = self._end
+
+    def rows(self) -> Rows:
+        """Return the facts in the file, without a transaction that the journal does not have yet."""
+        return _gathered(_read_transactions(self._path, self._end))
+
+    def _is_of(self, rows: Rows) -> bool:
+        """Return whether the file holds these facts; refuse where it knows of frames that are not among them."""
+        try:
+            transactions = _read_transactions(self._path)
+        except FormatError:
+            return False
+        if _gathered(transactions) == rows:
+            return True
+        _require_none_lacking(self._path, _lacking_frames(_frames_in(_gathered(transactions[:-1])), _frames_in(rows)))
+        return False
+
+    def _write_anew(self, rows: Rows) -> None:
+        write_whole(self._path, _ledger_lines(rows))
+
+    def _opened(self) -> tuple[int, int]:
+        """Return a handle of the file, and its size."""
+        try:
+            handle = os.open(self._path, os.O_RDWR)
+            return handle, os.fstat(handle).st_size
+        except OSError as error:
+            raise storage_error(self._path, error) from error
+
+
+Frames = set[tuple[int, str, str | None]]
+"""Frames by attempt and hash, with their verdicts."""
+
+
+def settled_frames(path: Path) -> Frames:
+    """Return the frames that a journal must hold that is opened after this: all but those of the last transaction.
+
+    None where there is no ledger, or a damaged one, which says nothing against a journal that is whole.
+    """
+    with suppress(FormatError, StorageError):
+        if os.path.isfile(path):  # noqa: PTH113 - it never raises
+            return _frames_in(_gathered(_read_transactions(path)[:-1]))
+    return set()
+
+
+def _lacking_frames(settled: Frames, known: Frames) -> Frames:
+    """Return the settled frames that are not among those known, or have another verdict there.
+
+    A frame that is known to be voided is no older state of it, since no verdict follows that one.
+    """
+    voided = {(attempt, sha256) for attempt, sha256, verdict in known if verdict == VOIDED}
+    return {frame for frame in settled - known if frame[:2] not in voided}
+
+
+def _require_none_lacking(path: Path, lacking: Frames) -> None:
+    """Refuse a journal that lacks frames of the ledger `path`, or verdicts on them."""
+    if lacking:
+        raise FormatError(
+            f"the journal of {path.parent} lacks {counted(len(lacking), 'frame')} that {path} has, or what was said of "
+            "them: it is an older one, or was damaged",
+            remedy=f"acquire rebuild {shlex.quote(str(path.parent))} makes it anew",
+        )
+
+
+def _frames_in(rows: Rows) -> Frames:
+    return {
+        (row["id"], row["sha256"], row["verdict"]) for row in rows.get("attempts", {}).values() if row.get("sha256")
+    }

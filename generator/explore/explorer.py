@@ -1,26 +1,35 @@
-"""What a page may ask of a table: its lights, a picture under one of them, one pixel's noise, and the command for it.
+"""`generate explore`: the server of a page on a table, what the page may ask, and pictures for those who name none.
 
 Images are made as `generate` makes them (`generator.dataset.making.photograph`): the first image of a dataset of this
-picture alone, under this light alone, with seed 0. So the command that is shown makes the bytes that are shown.
+picture alone, under this light alone, with seed 0. So the command that is shown makes the bytes that are shown. The
+server (see `foundation.local_server`) writes no file that stays.
+
+Pictures to begin with are shaded balls, patches with greys, and random colours. They are computed, so that nobody's
+photographs have to go with the package, and kept as files, so that a command can name them.
 """
 
 from __future__ import annotations
 
+import json
 import os
 import shlex
 import tempfile
 import threading
 from collections import OrderedDict
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from pathlib import Path, PurePosixPath
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, ClassVar, Final, get_args
 
 import numpy as np
 import numpy.typing as npt
 
-from foundation.errors import FormatError, InputError
+from foundation.colorimetry import srgb_codes
+from foundation.errors import CropError, FormatError, InputError
+from foundation.files import cache_folder, sha256_of, write_whole
+from foundation.local_server import LocalServer, Refusal, Request, Response
+from foundation.pages import render
 from foundation.secret_texts import masked
 from generator.dataset.making import chromaticity, photograph
 from generator.dataset.plan import DatasetOptions, light_of
@@ -28,7 +37,7 @@ from generator.kernels.choice import replace_unfit_colours
 from generator.lights.choices import parse_light
 from generator.lights.gamut import Gamut, black_body, rb_of
 from generator.lights.lighting import Lighting, Mixture
-from generator.pictures.sources import SUFFIXES, Picture, PictureFile, Preparation, open_picture
+from generator.pictures.sources import SUFFIXES, Picture, PictureFile, Preparation, RandomScene, open_picture
 from generator.rendering import DEFAULT, Rendering
 from generator.rendering.colorimetric import reference_light
 from generator.rendering.matrices import ColourMatrix, matrix_for
@@ -36,6 +45,7 @@ from generator.stores import is_remote
 
 if TYPE_CHECKING:
     from calibration.table.lut import Lut
+
 
 MAX_SIDE: Final = 1000
 """Longest side of a picture on the page unless said otherwise, px: what a window shows, and made in milliseconds."""
@@ -246,3 +256,171 @@ def _seen_from_here(location: str) -> str:
     """Return a file's path from the working folder if it lies below that."""
     path = Path(location)
     return os.fspath(path.relative_to(Path.cwd())) if path.is_relative_to(Path.cwd()) else location
+
+
+MOST_BYTES: Final = 64 << 20
+"""Bytes of a file that a page sends: photographs of 16 bits, and not a film."""
+
+
+class ExploreServer(LocalServer):
+    """Serves a table and its pictures.
+
+    - ``table.json``: the table, lights, gamut.
+    - ``shown.json?picture=N&light=TEXT``: a picture under a light without its pixels, and the commands.
+    - ``counts?picture=N&light=TEXT&rendering=NAME``: its image; height and width as two uint32, then the counts as
+      uint16, R, G, B, row by row, all little-endian.
+    - ``pixel.json?…&x=X&y=Y``: the noise of a pixel.
+    - ``picture?name=NAME`` by PUT: a picture's file; answered with its number.
+    """
+
+    command = "generate explore"
+    most_bytes: ClassVar[int] = MOST_BYTES
+
+    def __init__(self, explorer: Explorer, host: str, port: int) -> None:
+        self._explorer = explorer
+        title = f"Explore {explorer.lut.provenance.camera}"
+        scripts = ("plane.js", "picture.js", "explore.js")
+        self._page = render(
+            "generator.explore", "explore.html", scripts=scripts, styles=("explore.css",), connects=True, title=title
+        )
+        super().__init__(host, port)
+
+    def answer(self, request: Request) -> Response | Refusal:
+        """Return the answer; of what cannot be used, the sentence that a command would end with."""
+        try:
+            return self._answer(request)
+        except CropError as error:
+            return Refusal(422, str(error))
+
+    def _answer(self, request: Request) -> Response | Refusal:
+        asked, explorer = request.query, self._explorer
+        if request.body is not None:
+            if request.path != "picture":
+                return Refusal(404, "pictures are taken at /picture")
+            return _json({"picture": explorer.add(asked.get("name", "picture"), request.body)})
+        match request.path:
+            case "":
+                policy = f"{self._page.policy}; frame-ancestors 'none'"
+                return Response(
+                    "text/html; charset=utf-8", self._page.text.encode(), {"Content-Security-Policy": policy}
+                )
+            case "table.json":
+                return _json(explorer.describe())
+            case "shown.json":
+                return _json(explorer.show(_number(asked, "picture"), asked.get("light", "")))
+            case "counts":
+                image = explorer.counts(_number(asked, "picture"), asked.get("light", ""), _rendering(asked))
+                size = np.array(image.shape[:2], "<u4").tobytes()
+                return Response("application/octet-stream", size + image.astype("<u2", copy=False).tobytes())
+            case "pixel.json":
+                x, y = _number(asked, "x"), _number(asked, "y")
+                return _json(explorer.pixel(_number(asked, "picture"), asked.get("light", ""), _rendering(asked), x, y))
+            case _:
+                return Refusal(404, "here are /, /table.json, /shown.json, /counts and /pixel.json")
+
+
+def _json(value: Any) -> Response:
+    return Response("application/json", json.dumps(value, allow_nan=False).encode())
+
+
+def _number(asked: Mapping[str, str], name: str) -> int:
+    text = asked.get(name, "")
+    if not (text.isascii() and text.isdigit() and len(text) < 10):
+        raise InputError(f"{name}={text[:40]!r} is no number from 0")
+    return int(text)
+
+
+def _rendering(asked: Mapping[str, str]) -> Rendering:
+    text = asked.get("rendering", "codes")
+    for known in get_args(Rendering):
+        if text == known:
+            return known
+    raise InputError(f"{text[:40]!r} is no rendering; expected one of {', '.join(get_args(Rendering))}")
+
+
+_WIDTH: Final = 900
+"""Width of the pictures, px: as much as a page shows without making them smaller."""
+
+_HEIGHT: Final = 600
+"""Height, px."""
+
+_BALLS: Final = (
+    ((160, 395, 130), (0.78, 0.05, 0.04)),
+    ((395, 330, 175), (0.85, 0.55, 0.06)),
+    ((655, 400, 135), (0.06, 0.33, 0.62)),
+    ((800, 280, 75), (0.70, 0.70, 0.70)),
+    ((285, 520, 60), (0.10, 0.45, 0.12)),
+    ((520, 530, 65), (0.45, 0.10, 0.50)),
+    ((765, 535, 45), (0.90, 0.90, 0.88)),
+)
+"""Balls: centre and radius, px, and linear sRGB of the surface, back to front."""
+
+_FROM: Final = np.array([-0.5, -0.65, 0.57])
+"""Direction to the lamp: right, down, towards the viewer."""
+
+_PATCHES: Final = 6
+"""Patches in a row: hues, and below them greys."""
+
+
+def sample_folder(cache: Path | None = None) -> Path:
+    """Return the folder of the sample pictures, made if it is not there.
+
+    `cache`: where it is kept; None for `foundation.files.cache_folder`.
+    """
+    import cv2
+
+    cache = cache or cache_folder()
+    if cache is None:
+        raise InputError(
+            "the sample pictures need a place to be kept, and there is no home folder; set XDG_CACHE_HOME, or name "
+            "pictures with --sources"
+        )
+    pictures = {"balls": _balls(), "patches": _patches(), "random": _random()}
+    key = sha256_of(b"".join(picture.tobytes() for picture in pictures.values()))[:12]
+    folder = cache / f"pictures-{key}"
+    for name, picture in pictures.items():
+        path = folder / f"{name}.png"
+        if not path.is_file():
+            write_whole(path, cv2.imencode(".png", picture[..., ::-1])[1].tobytes())
+    return folder
+
+
+def _balls() -> Picture:
+    """Return matt balls with a highlight on a grey table before a wall, under one lamp."""
+    y, x = np.mgrid[:_HEIGHT, :_WIDTH].astype(np.float64)
+    lamp = _FROM / np.linalg.norm(_FROM)
+    floor = y > 0.55 * _HEIGHT
+    fall = 1.0 - 0.45 * np.hypot((x - 250) / _WIDTH, (y - 150) / _HEIGHT)
+    linear = (np.where(floor, 0.30, 0.42) * fall)[..., None] * np.ones(3)
+    for (left, top, radius), _ in _BALLS:
+        away = np.hypot((x - left - 0.55 * radius) / (1.25 * radius), (y - top - 0.85 * radius) / (0.35 * radius))
+        linear *= (1 - 0.6 * np.clip(1.3 - away, 0, 1) * floor)[..., None]
+    for (left, top, radius), surface in _BALLS:
+        across, down = (x - left) / radius, (y - top) / radius
+        towards = np.sqrt(np.maximum(1 - across**2 - down**2, 0.0))
+        facing = np.maximum(across * lamp[0] + down * lamp[1] + towards * lamp[2], 0.0)
+        mirrored = np.maximum(2 * facing * towards - lamp[2], 0.0)
+        shaded = np.array(surface) * (0.12 + 0.95 * facing)[..., None] + 0.5 * mirrored[..., None] ** 40
+        cover = np.clip(radius - np.hypot(x - left, y - top) + 0.5, 0, 1)[..., None]
+        linear += cover * (shaded - linear)
+    return srgb_codes(np.clip(linear, 0, 1))
+
+
+def _patches() -> Picture:
+    """Return patches of six hues at three saturations above a row of greys from black to white."""
+    hues = np.arange(_PATCHES) / _PATCHES
+    wheel = 0.5 + 0.5 * np.cos(2 * np.pi * (hues[:, None] - np.array([0.0, 1 / 3, 2 / 3])))
+    rows = [0.25 + part * (wheel - 0.5) for part in (0.4, 0.25, 0.1)]
+    greys = np.repeat(np.linspace(0, 1, _PATCHES)[:, None] ** 2.2, 3, axis=1)
+    patches = srgb_codes(np.clip(np.stack([*rows, greys]), 0, 1))
+    side = _WIDTH // _PATCHES
+    return _enlarged(patches, side)
+
+
+def _random() -> Picture:
+    """Return blocks of uniformly random colours, each of ten by ten pixels."""
+    return _enlarged(RandomScene(0, _WIDTH // 10, _HEIGHT // 10).read().picture, 10)
+
+
+def _enlarged(small: npt.NDArray[np.uint8], times: int) -> Picture:
+    return np.ascontiguousarray(small.repeat(times, axis=0).repeat(times, axis=1))

@@ -11,9 +11,8 @@ import cv2
 import numpy as np
 import pytest
 
-from generator.cli import main
-from generator.command import output as progress
-from generator.command.output import matrix_sentence, shown_progress
+from generator import cli as progress
+from generator.cli import main, matrix_sentence, shown_progress
 from generator.dataset.making import SILENT
 from generator.rendering.matrices import SOURCE, camera_matrix
 from tests.generator.conftest import MakeLut

@@ -13,7 +13,7 @@ import pytest
 
 from calibration.registration.register import register
 from calibration.sampling import gather, sites_at
-from experiment.framing.planes import frame_black
+from drivers.raw.rawfile import frame_black
 from experiment.measures.paper import PaperReader
 from experiment.measures.stains import Stains, find_stains
 from sim.world.room import Room

@@ -21,8 +21,7 @@ from calibration.registration.geometry import (
     fit_lens,
 )
 from calibration.registration.register import Registration, register
-from drivers.raw.rawfile import Mosaic
-from experiment.framing.planes import CHANNELS
+from drivers.raw.rawfile import CHANNELS, Mosaic
 from foundation.errors import RegistrationError
 from sim.world.room import Room
 from tests.calibration.lab import Lab, hang

@@ -12,11 +12,10 @@ import pytest
 from calibration.figures.radiometry import UNFIT_SHARE
 from calibration.registration.register import register
 from drivers.presenter import Colour
-from drivers.raw.rawfile import Mosaic
+from drivers.raw.rawfile import CHANNELS, Mosaic
 from experiment.chart.layout import paper_chart
 from experiment.chart.model import Chart
 from experiment.framing.field import field_mm
-from experiment.framing.planes import CHANNELS
 from foundation.errors import RegistrationError
 from sim.world.room import Room
 from tests.calibration.lab import Lab, hang_chart

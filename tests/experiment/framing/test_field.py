@@ -17,14 +17,13 @@ import pytest
 from scipy.special import ndtr
 
 from drivers.presenter import BLACK, WHITE, Colour
-from drivers.raw.rawfile import Mosaic, read_raw
+from drivers.raw.rawfile import CHANNELS, Mosaic, Plane, plane_of, read_raw
 from experiment.chart.layout import design_chart, paper_chart
 from experiment.chart.model import Chart
 from experiment.framing import field
 from experiment.framing.field import FoundField, corners_text, field_mm, find_field, parse_corners, refine_edges
 from experiment.framing.finding import find_chart
 from experiment.framing.pictures import blur_px
-from experiment.framing.planes import CHANNELS, Plane, plane_of
 from foundation.errors import CropError, InputError, RegistrationError
 from sim.world.room import Room
 from tests.calibration.lab import Lab, hang_chart

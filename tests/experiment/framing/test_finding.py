@@ -10,11 +10,10 @@ import numpy as np
 import pytest
 
 from drivers.presenter import BLACK, WHITE, Colour
-from drivers.raw.rawfile import Mosaic, read_raw
+from drivers.raw.rawfile import CHANNELS, Mosaic, Plane, channel_offset_px, phases, plane_of, read_raw, strongest_plane
 from experiment.chart.model import Chart
 from experiment.framing.finding import find_chart, find_tags
 from experiment.framing.pictures import blur_px, shift_between
-from experiment.framing.planes import CHANNELS, Plane, channel_offset_px, phases, plane_of, strongest_plane
 from foundation.errors import RegistrationError
 from sim.world.room import Room
 from tests.calibration.lab import Lab, hang

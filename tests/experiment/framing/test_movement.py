@@ -12,11 +12,10 @@ import pytest
 from scipy import ndimage
 
 from drivers.presenter import WHITE, Colour
-from drivers.raw.rawfile import Mosaic
+from drivers.raw.rawfile import Mosaic, Plane, plane_of, strongest_plane
 from experiment.chart.layout import paper_chart
 from experiment.framing.finding import Framing, find_chart
 from experiment.framing.pictures import gauge_boxes, shift_between
-from experiment.framing.planes import Plane, plane_of, strongest_plane
 from sim.world.room import Room
 from tests.calibration.lab import Lab, hang, hang_chart
 

@@ -21,7 +21,6 @@ import numpy.typing as npt
 import pytest
 
 from foundation.errors import FormatError, InputError, StorageError
-from generator.command.options import ImageOptions
 from generator.dataset.layouts import JOINED
 from generator.dataset.making import generate_dataset
 from generator.dataset.plan import DatasetOptions
@@ -29,6 +28,7 @@ from generator.dataset.reader import Dataset, file_faults, open_dataset
 from generator.dataset.records import COMPLETED_BY_HAND, Layout
 from generator.lights.choices import ListedLights, SimultaneousLights
 from generator.masks.making import parse_masks
+from generator.options import ImageOptions
 from generator.pictures.sources import SourcePicture, random_scenes
 from tests.generator.groups import grouped
 

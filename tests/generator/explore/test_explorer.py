@@ -13,8 +13,7 @@ import pytest
 from foundation.errors import FormatError, InputError
 from generator.cli import main
 from generator.dataset.reader import open_dataset
-from generator.explore.explorer import MOST_DROPPED, Explorer
-from generator.explore.samples import sample_folder
+from generator.explore.explorer import MOST_DROPPED, Explorer, sample_folder
 from generator.lights.gamut import black_body, rb_of
 from generator.pictures.sources import Preparation, find_pictures, read_picture
 from generator.rendering import Rendering

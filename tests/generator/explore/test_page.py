@@ -15,8 +15,7 @@ import numpy as np
 import pytest
 
 from foundation.errors import QualityError
-from generator.explore.explorer import Explorer
-from generator.explore.server import ExploreServer
+from generator.explore.explorer import Explorer, ExploreServer
 from generator.lights.gamut import rb_of
 from generator.lights.lighting import parse_mixture
 from generator.pictures.preview import flash

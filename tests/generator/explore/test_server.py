@@ -13,8 +13,7 @@ import numpy as np
 import pytest
 
 from generator.cli import main
-from generator.explore.explorer import Explorer
-from generator.explore.server import ExploreServer
+from generator.explore.explorer import Explorer, ExploreServer
 from generator.pictures.sources import RandomScene
 from tests.generator.conftest import MakeLut
 from tests.serving import serving

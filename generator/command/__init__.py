@@ -1,1 +1,0 @@
-"""The command `generate`: its options, and what it shows meanwhile."""
