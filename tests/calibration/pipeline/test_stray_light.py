@@ -12,7 +12,7 @@ from benchmarks.sessions import AS_PLANNED, FrameChange, light_named, short_plan
 from calibration.figures.all_figures import FIGURES
 from calibration.pipeline.baseline import BuildOptions
 from calibration.pipeline.build import build
-from calibration.report.page import summary
+from calibration.report.report import summary
 from calibration.verdict import BuildResult, judge, judged_values, remark
 from drivers.presenter import Colour
 from experiment.session.records import SessionStep
