@@ -22,6 +22,7 @@ from foundation.console import (
     new_app,
     option,
     orderly_end,
+    progress,
     with_json,
 )
 from foundation.errors import DeviceError, InputError, QualityError, StorageError, counted, first_of
@@ -496,7 +497,6 @@ def import_(
     when a light, or every white or dark frame, is without an accepted frame; the session is there all the same.
     """
     from acquisition.run.importing import import_session
-    from foundation.console import progress
 
     with progress("files") as advance:
         imported = import_session(frames, chart, session, advance)

@@ -495,7 +495,7 @@ def _print_result(result: BuildResult, output: JsonOutput) -> None:
 
         output.add(**report_json(result))
         return
-    from calibration.report.page import summary
+    from calibration.report.report import summary
     from calibration.verdict import remark
 
     rows = [row for row in summary(result.figures) if row.brief]

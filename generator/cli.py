@@ -33,10 +33,11 @@ from foundation.console import (
     loaded,
     new_app,
     orderly_end,
+    progress,
     run,
     shows_progress,
 )
-from foundation.errors import InputError
+from foundation.errors import InputError, QualityError, StorageError
 from foundation.secret_texts import masked, printable
 from generator.options import (
     CommonOptions,
@@ -357,8 +358,6 @@ def _counted(number: int, thing: str) -> str:
 
 def _verify(out: str, workers: int | None, output: JsonOutput) -> Dataset:
     """Print every fault of a dataset and return it; a QualityError if there is one."""
-    from foundation.console import progress
-    from foundation.errors import QualityError
     from generator.dataset.making import Workers
     from generator.dataset.reader import file_faults, open_dataset
     from generator.stores import is_remote
@@ -411,7 +410,6 @@ def _draw_sheet(dataset: Dataset, out: str, contact_sheet: Path | None) -> None:
     if contact_sheet.exists():
         print(f"{contact_sheet}: a contact sheet is there already, and stays as it is")
         return
-    from foundation.errors import StorageError
     from generator.dataset.contact_sheet import save_contact_sheet
 
     try:

@@ -48,7 +48,7 @@ import numpy as np
 import numpy.typing as npt
 from isal import isal_zlib
 
-from drivers.raw.rawfile import Matrix, camera_matrix
+from drivers.raw.rawfile import Matrix, camera_matrix, decode_raw
 from drivers.tiff import CFA, D65, RGB, Tags, TiffTag, ValueType, head, rationals, text
 from foundation.errors import FormatError, InputError
 from generator.deflate import WIDEST, Packer
@@ -538,8 +538,6 @@ def decode_image(data: bytes, form: Format, what: str) -> Image:
     linear RGB of its mosaic: red, the mean of both greens, rounded up, and blue of each 2×2 block.
     """
     if form == "dng":
-        from drivers.raw.rawfile import decode_raw
-
         return half_size(decode_raw(data, Path(what)).counts)
     require_plausible(data, what)
     try:

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 import typer
 
 from foundation.compiled import processor_count
-from foundation.console import AsJson, Quiet, Verbose, Version, option
+from foundation.console import AsJson, Quiet, Verbose, Version, option, progress
 from foundation.errors import InputError
 
 if TYPE_CHECKING:
@@ -670,7 +670,6 @@ def _drawn(
     workers: int,
 ) -> DrawnPictures:
     """Return which pictures are drawn by what they look like under the light nearest to the target's."""
-    from foundation.console import progress
     from generator.likeness.real_data import draw_pictures, measure_pictures, reference_light
     from generator.rendering.black_points import KEEP
 

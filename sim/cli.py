@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from drivers.serial_projectors import LANGUAGES
+from drivers.serial_projectors import LANGUAGES, language
 from foundation import console
 from foundation.console import EXIT_CODES, Quiet, Verbose, Version, common_first, new_app, option
 
@@ -114,7 +114,6 @@ def _serve_network(
 
 
 def _serve_serial(device: SimulatedProjector, name: str) -> None:
-    from drivers.serial_projectors import language
     from foundation.errors import ConfigurationError
 
     spoken = language(name)

@@ -45,7 +45,7 @@ from experiment.lights import Illumination, parse_ccts, shown_colour
 from foundation.colorimetry import linear_srgb, planck, xyz_of
 from foundation.errors import FormatError, InputError, nearest_names
 from sim.spectral import PublishedSpectrum, daylight, published_spectra, regridded, require_grid
-from sim.world.rendering import PAPER
+from sim.world.rendering import PAPER, counts
 from sim.world.room import WAVELENGTHS_NM, Room, printed_reflectance, sensitivities
 from sim.world.sensors import Body, HotPattern
 from sim.world.world import World
@@ -311,8 +311,6 @@ class PatchSensor:
         window) counts, without borders. Returns (2, 2) float64 counts, the estimate for each position of the block: the
         mean of as many dark counts as the body has masked photosites there, or its true black where it has none.
         """
-        from sim.world.rendering import counts
-
         body = self.body
         noise = _random(self.seed, _NOISE, frame).standard_normal(self.response.shape, dtype=np.float32)
         found = np.empty(self.response.shape, dtype=np.uint16)

@@ -1,7 +1,7 @@
 """Faults of cameras and cables, each as a wrapper around a device or cable that works.
 
 Three places can be troubled: the device, as a `drivers.ptp.protocol.Responder`; its pipes, as
-`drivers.links.link.UsbPipes`; the whole cable, as a `drivers.ptp.protocol.Transport`. A wrapper keeps the contract
+`drivers.links.usb.UsbPipes`; the whole cable, as a `drivers.ptp.protocol.Transport`. A wrapper keeps the contract
 of what it wraps and may be wrapped again. What happens and when is set on construction; nothing is random.
 
 A device that restarts in the middle of an operation is `Interrupting` with the simulated bus's ``replug``, one that is
@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection
 
-from drivers.links.link import Pipe, PipeStalled, UsbPipes
+from drivers.links.usb import Pipe, PipeStalled, UsbPipes
 from drivers.ptp.protocol import Answer, NoAnswer, PtpEvent, PtpRequest, PtpResponse, Responder, Transaction, Transport
 from drivers.ptp.usb import HEADER_LENGTH
 from foundation.errors import LinkClosed, LinkTimeout

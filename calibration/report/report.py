@@ -4,13 +4,16 @@
 verdict, what to do, and the pictures that are looked at first: the registered grid over the frame, the lights as
 planned and as the camera saw them (the paper's three figures of chromaticities), where cells err, and the noise. All
 figures follow in groups, each with its pictures, by the names that figures give of them (`Figure.drawing`).
+
+The page, one file to be mailed, is `templates/report.html`; here stands what it shows. Each figure's row comes from the
+figure.
 """
 
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
-from dataclasses import asdict
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -19,12 +22,12 @@ import numpy.typing as npt
 
 from calibration.budget import COVERAGE
 from calibration.checks.light_codes import CodeAgreement
+from calibration.citation import origin_lines
 from calibration.figures.all_figures import BY_NAME, FIGURES
-from calibration.figures.figure import Worst
+from calibration.figures.figure import QUESTIONS, Drawing, Group, Outcome, SummaryRow, Worst
 from calibration.figures.light import ADDITIVITY, LINEARITY
 from calibration.figures.truth import TRUTH_WORST_DEG
 from calibration.measurements import TableMeasurements
-from calibration.report.page import Picture, page
 from calibration.report.plots import (
     WORST_CELLS,
     LabelledPlace,
@@ -46,12 +49,27 @@ from calibration.report.plots import (
 )
 from calibration.sampling import largest_window
 from calibration.table.lut import REPORT_FORMAT, REPORT_JSON, REPORT_PAGE, REPORT_VERSION
-from calibration.verdict import BuildResult, findings, judged_values, retake_command, retake_json, retaken_frames
+from calibration.verdict import (
+    COMMAND,
+    BuildResult,
+    JudgedValue,
+    ProbableCause,
+    detail_and_remedy,
+    findings,
+    is_mended_by_retaking,
+    judged_values,
+    places_text,
+    retake_command,
+    retake_json,
+    retaken_frames,
+)
 from drivers.raw.rawfile import read_raw
 from experiment.chart.model import Chart
 from experiment.measures.stains import Stains
 from experiment.session.folder import Session
+from foundation.errors import counted, first_of
 from foundation.files import write_whole
+from foundation.pages import render
 from foundation.plots import png_of
 
 PLACES = (7, 5)
@@ -237,14 +255,14 @@ def worst_of_figures(table: TableMeasurements, chart: Chart) -> dict[str, Worst]
     return {name: worst for name, worst in found if worst is not None}
 
 
-def _pictures(result: BuildResult, session: Session, worsts: Mapping[str, Worst]) -> list[Picture]:
+def _pictures(result: BuildResult, session: Session, worsts: Mapping[str, Worst]) -> list[_Picture]:
     """Return the pictures: first chart, lights, errors and noise, then those of the groups."""
     table = result.figures
     chart, registration = session.chart, table.registration
     frame = half_size(read_raw(session.folder / table.session.registered_file))
     return [
         *_first_pictures(result, session, frame, worsts),
-        Picture(
+        _Picture(
             "Residuals of the registration",
             "Left: how far the cells moved the map from what the tags and the lens alone give, which is the paper's "
             "waviness. Right: the residual of each block of cells, magnified; short arrows without order are noise.",
@@ -253,7 +271,7 @@ def _pictures(result: BuildResult, session: Session, worsts: Mapping[str, Worst]
             "residuals",
         ),
         *_worst_pictures(chart, table, frame, worsts),
-        Picture(
+        _Picture(
             "The light on the print",
             "Shape of the light under the frame that was registered, from its white references; it is divided out of "
             f"samples and ground truth. Contours are 2 % apart. {_primaries_caption(table)}",
@@ -262,7 +280,7 @@ def _pictures(result: BuildResult, session: Session, worsts: Mapping[str, Worst]
             "field",
         ),
         *_print_picture(chart, table.cells.stains),
-        Picture(
+        _Picture(
             "The course of the session",
             "Black level, movement and blur of the chart, bare paper under white, how far cells are off their codes' "
             "colours, and the white references used, frame by frame; the worst frame of each is ringed. All cells are "
@@ -271,7 +289,7 @@ def _pictures(result: BuildResult, session: Session, worsts: Mapping[str, Worst]
             "radiometry",
             "course",
         ),
-        Picture(
+        _Picture(
             "The worst cells",
             f"The {WORST_CELLS} cells whose rim and middle differ most under white, in standard deviations, each "
             "between its neighbours; the frame is the samples.",
@@ -280,7 +298,7 @@ def _pictures(result: BuildResult, session: Session, worsts: Mapping[str, Worst]
             "cells",
         ),
         *_residual_picture(chart, table, frame),
-        Picture(
+        _Picture(
             "What the ground truth may be off by",
             f"Left: the expanded uncertainty (k = {COVERAGE:g}) of each light's direction, shared out among its causes "
             "by their squares; lights in the order of it, the worst first. Right: that of each cell's mean by its "
@@ -294,7 +312,7 @@ def _pictures(result: BuildResult, session: Session, worsts: Mapping[str, Worst]
 
 def _first_pictures(
     result: BuildResult, session: Session, frame: npt.NDArray[np.float32], worsts: Mapping[str, Worst]
-) -> list[Picture]:
+) -> list[_Picture]:
     """Return what a scientist looks at first: chart, lights, errors, noise."""
     table, chart = result.figures, session.chart
     registration, window = table.registration, table.cells.window
@@ -304,28 +322,28 @@ def _first_pictures(
     truth = worsts[TRUTH_WORST_DEG.name].light if TRUTH_WORST_DEG.name in worsts else None
     ringed = "" if truth is None else f" Ringed is light {truth}, whose ground truth is known worst."
     return [
-        Picture(
+        _Picture(
             "The chart as registered",
             f"{table.session.registered_file}, contrast stretched, with the tags as found; below, magnified: the "
             f"outline of every cell and the pixels of its {window**2} samples, in the corners and in the middle.",
             png_of(draw_registration, frame, chart, registration, window),
             name="chart",
         ),
-        Picture(
+        _Picture(
             "The lights",
             "rb-chromaticities of the lights as projected, as the camera sees them on bare paper (the ground truth), "
             f"and the latter in their colours. Rings are black bodies.{ringed}",
             png_of(draw_chromaticities, codes, black_body, table.lights.white, seen, truth),
             name="lights",
         ),
-        Picture(
+        _Picture(
             "Where cells err",
             "Left: how far cells and their neighbours are off their codes' colours elsewhere on the sheet. Right: how "
             "well the place of each cell is known. The worst cell of each is ringed.",
             png_of(draw_errors, table, chart),
             name="errors",
         ),
-        Picture(
+        _Picture(
             "The noise",
             "Left: variance of one sample over its level, medians of cells of like levels and the fitted curve (read "
             "noise, photons, unequal photosites). Right: what that makes of signal over noise.",
@@ -337,7 +355,7 @@ def _first_pictures(
 
 def _worst_pictures(
     chart: Chart, table: TableMeasurements, frame: npt.NDArray[np.float32], worsts: Mapping[str, Worst]
-) -> list[Picture]:
+) -> list[_Picture]:
     """Return the picture of the places where figures are worst."""
     places = [
         (f"{BY_NAME[name].title}: {worst.what}", worst.place)
@@ -351,17 +369,17 @@ def _worst_pictures(
         "beyond a limit. Worst frames are ringed in the course of the session, the worst light among the lights."
     )
     drawn = png_of(draw_places, frame, chart, table.registration, places)
-    return [Picture("Where the worst is", caption, drawn, "geometry", "worst")]
+    return [_Picture("Where the worst is", caption, drawn, "geometry", "worst")]
 
 
-def _place_pictures(result: BuildResult, session: Session) -> list[Picture]:
+def _place_pictures(result: BuildResult, session: Session) -> list[_Picture]:
     """Return a picture of each frame in which something is beyond its limit at a place, which is circled."""
     by_file: dict[str, list[LabelledPlace]] = {}
     for name, found in findings(result.verdict, result.figures).items():
         cause = found.decision.cause.name if found.is_known else "cause not known"
         for place in found.places:
             by_file.setdefault(place.file, []).append((f"{BY_NAME[name].title}: {cause}", place))
-    pictures: list[Picture] = []
+    pictures: list[_Picture] = []
     for file, places in list(by_file.items())[:MOST_FRAMES]:
         picture = half_size(read_raw(session.folder / file))
         drawn = png_of(draw_places, picture, session.chart, result.figures.registration, places)
@@ -369,11 +387,11 @@ def _place_pictures(result: BuildResult, session: Session) -> list[Picture]:
             f"{file}, contrast stretched, with what is beyond its limits circled; places lie as in the frame that was "
             "registered first."
         )
-        pictures.append(Picture(f"Where it is: {Path(file).stem}", caption, drawn))
+        pictures.append(_Picture(f"Where it is: {Path(file).stem}", caption, drawn))
     return pictures
 
 
-def _residual_picture(chart: Chart, table: TableMeasurements, picture: npt.NDArray[np.float32]) -> list[Picture]:
+def _residual_picture(chart: Chart, table: TableMeasurements, picture: npt.NDArray[np.float32]) -> list[_Picture]:
     """Return the picture of what the field leaves of the references, none where there are none."""
     places_mm = np.array([reference.centre_mm for reference in chart.white_references], dtype=np.float64).reshape(-1, 2)
     residual = reference_residuals(picture, places_mm, table.registration, table.registered_frame)
@@ -385,7 +403,7 @@ def _residual_picture(chart: Chart, table: TableMeasurements, picture: npt.NDArr
         "fall-off that the field does not follow."
     )
     return [
-        Picture(
+        _Picture(
             "What the field leaves",
             caption,
             png_of(draw_reference_residuals, chart, places_mm, residual),
@@ -404,7 +422,7 @@ def _primaries_caption(table: TableMeasurements) -> str:
     )
 
 
-def _print_picture(chart: Chart, stains: Stains) -> list[Picture]:
+def _print_picture(chart: Chart, stains: Stains) -> list[_Picture]:
     """Return the picture of the print, or none where nothing is known of it: a clean sheet would be a claim."""
     if not stains.known:
         return []
@@ -413,4 +431,147 @@ def _print_picture(chart: Chart, stains: Stains) -> list[Picture]:
         "that deviates most. Noise is a fine grain of some tenths of a per cent; stains, folds and shadows have a "
         "shape. Crosses are cells listed for it."
     )
-    return [Picture("The print", caption, png_of(draw_print, chart, stains), "radiometry", "print")]
+    return [_Picture("The print", caption, png_of(draw_print, chart, stains), "radiometry", "print")]
+
+
+MOST_UNFIT = 200
+"""Unfit cells that are listed; all of them are in lut.json, and a page of thousands is read by nobody."""
+
+_WORDS: dict[Outcome, str] = {"refuse": "refuse", "accept with remarks": "remark", "accept": "accept"}
+"""Outcomes, the worst first, as the page says them."""
+
+_ORDER: tuple[Outcome, ...] = tuple(_WORDS)
+
+
+@dataclass(frozen=True)
+class _Picture:
+    """A picture of the report, PNG, with its heading and what it shows.
+
+    `group` is the one it is folded with; None for those that stand open on top. `name` is what figures say of it.
+    """
+
+    heading: str
+    caption: str
+    png: bytes
+    group: Group | None = None
+    name: Drawing | None = None
+
+
+@dataclass(frozen=True)
+class _Row:
+    """A judged value with what helps and where its worst is, as far as these are to be said."""
+
+    judged: JudgedValue
+    remedy: str
+    worst: str
+
+
+def page(
+    result: BuildResult,
+    pictures: Sequence[_Picture],
+    places: Sequence[_Picture] = (),
+    worsts: Mapping[str, Worst] | None = None,
+) -> str:
+    """Return the text of `report.html`: verdict, what to do, what to look at first, then all figures in groups.
+
+    `places` are pictures of what is beyond a limit, `worsts` where the worst of figures is, by name.
+    """
+    table, verdict = result.figures, result.verdict
+    found, beyond = findings(verdict, table), len(verdict.refused) + len(verdict.remarks)
+    rows = [
+        _Row(row, _remedy(row, found.get(row.figure.name), table), "" if worst is None else worst.where)
+        for row in sorted(verdict.rows, key=lambda row: _ORDER.index(row.outcome))
+        for worst in [(worsts or {}).get(row.figure.name)]
+    ]
+    simulated = ", taken in the simulated laboratory" if table.origin.rig == "simulated" else ""
+    return render(
+        "calibration.report",
+        "report.html",
+        title=f"Table of {table.session.lights} lights, {table.session.camera}",
+        taken=f"Session {table.session.folder.name}{simulated}",
+        words=_WORDS,
+        outcome=verdict.outcome,
+        sentence={
+            "accept": "Accepted: every figure is within its limit.",
+            "accept with remarks": f"Accepted with remarks on {len(verdict.remarks)} of {len(verdict.rows)} figures.",
+            "refuse": f"Refused: {len(verdict.refused)} of {len(verdict.rows)} figures are beyond what can be used.",
+        }[verdict.outcome],
+        usable=not verdict.refused,
+        todo=rows[:beyond],
+        again=_again(result),
+        causes=[_cause(each) for each in found.values()],
+        first=[*places, *(picture for picture in pictures if picture.group is None)],
+        drawn={picture.name for picture in pictures if picture.name is not None},
+        groups=[_group(group, rows, table, pictures) for group in QUESTIONS],
+        origin=origin_lines(table.origin),
+        unfit=table.cells.unfit,
+        most_unfit=MOST_UNFIT,
+    ).text
+
+
+def summary(table: TableMeasurements, group: Group | None = None) -> list[SummaryRow]:
+    """Return the lines that say how good a table is, in their order: of all figures, or of a group's."""
+    session = table.session
+    lines = (line for one in FIGURES if group in (None, one.group) for line in one.lines)
+    found = (line.row(table) for line in sorted(lines, key=lambda line: line.place))
+    rows = [row for row in found if row is not None]
+    if group not in (None, "geometry"):
+        return rows
+    return [
+        SummaryRow("Lights", str(session.lights), "with an accepted frame"),
+        SummaryRow("Frame registered", session.registered_file, ""),
+        *rows,
+    ]
+
+
+def _group(
+    group: Group, rows: Sequence[_Row], table: TableMeasurements, pictures: Sequence[_Picture]
+) -> dict[str, Any]:
+    """Return a group of figures, folded unless something in it is beyond its limit."""
+    own = [row for row in rows if row.judged.figure.group == group]
+    beyond = sum(row.judged.outcome != "accept" for row in own)
+    within = f"{beyond} beyond their limits" if beyond else "all within their limits"
+    return {
+        "name": group,
+        "question": QUESTIONS[group],
+        "beyond": beyond,
+        "summary": f"{counted(len(own), 'figure')}, {within}",
+        "rows": own,
+        "lines": summary(table, group),
+        "pictures": [picture for picture in pictures if picture.group == group],
+    }
+
+
+def _again(result: BuildResult) -> dict[str, Any] | None:
+    """Return which frames are to be taken again and how; None where taking frames again does not help."""
+    records = retaken_frames(result.verdict, result.figures)
+    if not records:
+        return None
+    return {
+        "count": counted(len(records), "frame"),
+        "files": first_of([record.file for record in records]),
+        "command": COMMAND,
+        "mends": is_mended_by_retaking(result.verdict, result.figures),
+    }
+
+
+def _remedy(row: JudgedValue, found: ProbableCause | None, table: TableMeasurements) -> str:
+    """Return what helps against what is beyond a limit; "" where nothing is."""
+    if row.outcome == "accept":
+        return ""
+    _, remedy = detail_and_remedy(row.figure, table)
+    if found is None or not remedy:
+        return remedy
+    return found.decision.cause.remedy if found.is_known else f"it may help to {remedy}"
+
+
+def _cause(found: ProbableCause) -> dict[str, Any]:
+    """Return a finding with its probable cause, frames, place and command."""
+    return {
+        "title": BY_NAME[found.figure].title,
+        "cause": found.decision.cause.name,
+        "rule": found.decision.rule,
+        "command": retake_command(found.frames) if found.is_of_frames else "",
+        "places": places_text(found),
+        "evidence": found.evidence.in_words(),
+    }

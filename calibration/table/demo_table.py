@@ -9,7 +9,7 @@ from tempfile import TemporaryDirectory
 from typing import Final
 
 from foundation.errors import InputError, StorageError
-from foundation.files import sha256_of
+from foundation.files import cache_folder, sha256_of
 from foundation.version import software
 
 DEMO: Final = "demo:"
@@ -30,8 +30,6 @@ def table_folder(given: Path, cache: Path | None = None) -> Path:
     """
     if str(given) != DEMO:
         return given
-    from foundation.files import cache_folder
-
     cache = cache or cache_folder()
     if cache is None:
         raise InputError(

@@ -25,7 +25,7 @@ import contextlib
 from dataclasses import dataclass
 from enum import IntEnum
 
-from drivers.links.link import Pipe, PipeStalled, UsbPipes
+from drivers.links.usb import Pipe, PipeStalled, UsbPipes
 from drivers.ptp.codes import ResponseCode
 from drivers.ptp.protocol import (
     MAX_PARAMETERS,

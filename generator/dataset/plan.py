@@ -33,7 +33,7 @@ from generator.files import FORMATS, Format, libraries_of
 from generator.pictures.sources import PictureFile
 from generator.rendering import DEFAULT, Rendering
 from generator.rendering.black_points import KEEP, BlackPoint
-from generator.rendering.matrices import ColourMatrix
+from generator.rendering.matrices import ColourMatrix, matrix_for
 from generator.stores import is_remote
 from generator.variation.variation import NO_VARIATION, Variation
 
@@ -140,8 +140,6 @@ class DatasetOptions:
 
     def describe_rendering(self, lut: Lut) -> dict[str, Any]:
         """Return how images are rendered as plain values; nothing for codes with the print's black kept."""
-        from generator.rendering.matrices import matrix_for
-
         described: dict[str, Any] = {}
         if self.rendering == "colorimetric":
             used = self.matrix or matrix_for(lut)

@@ -35,8 +35,7 @@ from typing import ClassVar
 import usb.core
 from usb.backend import IBackend
 
-from drivers.links.link import STILL_IMAGE_CLASS
-from drivers.links.usb import open_usb
+from drivers.links.usb import STILL_IMAGE_CLASS, open_usb
 from drivers.ptp.codes import VENDOR_CANON_USB, ResponseCode
 from drivers.ptp.protocol import NoAnswer, PtpRequest, Responder
 from drivers.ptp.usb import (

@@ -29,7 +29,7 @@ from drivers.presenter import Colour
 from foundation.compiled import processor_count
 from sim.optics import APERTURE_VARIANCE, PhotographicLens, lens_falloff, projector_falloff
 from sim.world.disturbances import UNDISTURBED, Situation, moved, moved_back
-from sim.world.rendering import PAPER, Print, Sheet, View, label_map
+from sim.world.rendering import GRID_PX, PAPER, Print, Sheet, View, counts, label_map
 from sim.world.room import (
     REFERENCE_APERTURE,
     REFERENCE_EXPOSURE,
@@ -100,8 +100,6 @@ class World:
         `settings`: light grows with shutter time and ISO speed and falls with the square of the f-number. Returns
         (rows, columns) uint16, the whole sensor's counts, masked borders included; never above saturation.
         """
-        from sim.world.rendering import counts
-
         body, room = self.body, self.room
         of_lamp = lamp * room.wheel_light(settings.shutter_s, self._random(4, *key)) * np.array(situation.lamp)
         light, weights = self._lighting(colour, settings, of_lamp, situation)
@@ -391,8 +389,6 @@ class World:
         """Return (rows, columns, 2) float64, mm: the places on the print that some rows of photosites see."""
         from scipy.ndimage import map_coordinates
 
-        from sim.world.rendering import GRID_PX
-
         row, column = np.mgrid[first:last, : self.body.visible.width]
         at = np.stack([row, column]) / GRID_PX + 1
         return np.stack([map_coordinates(nodes[..., axis], at, order=1) for axis in (0, 1)], axis=-1)
@@ -408,8 +404,6 @@ class World:
 
     def _nodes(self, situation: Situation, channel: str = "G") -> NDArray[np.float64]:
         """Return (ny, nx, 2) float64: the place on the print of every 16th photosite, one node beyond on each side."""
-        from sim.world.rendering import GRID_PX
-
         visible = self.body.visible
         y, x = (np.arange(-1, (size - 1) // GRID_PX + 3) * GRID_PX for size in (visible.height, visible.width))
         photosites = np.stack(np.meshgrid(x, y), axis=-1).astype(np.float64)

@@ -13,7 +13,7 @@ import pytest
 from drivers.camera import CapturedFrame, capture
 from drivers.canon.camera import CanonEos
 from drivers.canon.records import OtherRecord, TransferRequest, decode_events, encode_events
-from drivers.links.link import UsbPipes
+from drivers.links.usb import UsbPipes
 from drivers.ptp.codes import Operation, ResponseCode
 from drivers.ptp.protocol import Answer, NoAnswer, PtpRequest, PtpResponse, Responder
 from foundation.errors import DeviceError, DeviceRefused

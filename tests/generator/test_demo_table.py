@@ -49,7 +49,7 @@ def test_any_other_folder_is_itself(tmp_path: Path) -> None:
 
 
 def test_without_a_place_the_remedy_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("foundation.files.cache_folder", lambda: None)
+    monkeypatch.setattr("calibration.table.demo_table.cache_folder", lambda: None)
     with pytest.raises(InputError, match="XDG_CACHE_HOME"):
         table_folder(Path("demo:"))
 

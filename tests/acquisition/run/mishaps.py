@@ -20,8 +20,8 @@ from acquisition.run.devices import Devices
 from acquisition.run.run import RunOutcome, take_session
 from drivers.camera import ExposureSettings
 from drivers.canon.camera import CanonEos
-from drivers.links.link import Link, PeerLink, Pipe, UsbPipes
-from drivers.links.usb import open_usb
+from drivers.links.link import Link, PeerLink
+from drivers.links.usb import Pipe, UsbPipes, open_usb
 from drivers.pjlink import PjLinkProjector
 from drivers.presenter import BLACK, Colour
 from drivers.projector import Power, Severity

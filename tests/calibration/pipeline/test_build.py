@@ -17,8 +17,7 @@ from calibration.cli import main
 from calibration.figures.figure import QUESTIONS
 from calibration.figures.geometry import cell_sides_px
 from calibration.pipeline.build import build, check
-from calibration.report.page import summary
-from calibration.report.report import worst_of_figures
+from calibration.report.report import summary, worst_of_figures
 from calibration.table.lut import Lut, open_lut
 from calibration.verdict import BuildResult
 from drivers.camera import ExposureSettings

@@ -12,8 +12,7 @@ from pathlib import Path
 import pytest
 
 from calibration.pipeline.build import build
-from calibration.report.page import summary
-from calibration.report.report import report_json
+from calibration.report.report import report_json, summary
 from calibration.verdict import BuildResult
 from drivers.presenter import WHITE, Colour
 from experiment.lights import Illumination

@@ -13,7 +13,7 @@ import pytest
 
 from calibration.cli import main
 from calibration.pipeline.build import build, check
-from calibration.report.page import summary
+from calibration.report.report import summary
 from calibration.table.lut import open_lut
 from calibration.table.verification import find_faults
 from calibration.verdict import BuildResult

@@ -11,7 +11,7 @@ import pytest
 from calibration.cli import main
 from calibration.pipeline.baseline import BuildOptions
 from calibration.pipeline.build import build, check
-from calibration.report.page import summary as report_summary
+from calibration.report.report import summary as report_summary
 from calibration.table.lut import open_lut
 from calibration.table.verification import describe, find_faults
 from calibration.verdict import BuildResult, judge, judged_values, remark

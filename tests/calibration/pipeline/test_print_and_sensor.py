@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from calibration.pipeline.build import build
-from calibration.report.page import summary
+from calibration.report.report import summary
 from calibration.table.lut import open_lut
 from calibration.verdict import judged_values
 from drivers.presenter import WHITE, Colour

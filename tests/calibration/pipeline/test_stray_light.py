@@ -14,7 +14,7 @@ from calibration.figures.all_figures import FIGURES
 from calibration.figures.light import TOO_DARK
 from calibration.pipeline.baseline import BuildOptions
 from calibration.pipeline.build import build
-from calibration.report.page import summary
+from calibration.report.report import summary
 from calibration.verdict import BuildResult, judge, judged_values, remark
 from drivers.presenter import Colour
 from experiment.session.records import SessionStep

@@ -14,7 +14,7 @@ from calibration.cli import main
 from calibration.pipeline.baseline import BuildOptions
 from calibration.pipeline.build import TableProgress, append, build, check
 from calibration.radiometry.dark_frames import DarkLight, DarkLightEstimate, reflectances, winsorised_means
-from calibration.report.page import summary
+from calibration.report.report import summary
 from calibration.table.lut import open_lut
 from calibration.verdict import BuildResult
 from drivers.presenter import BLACK

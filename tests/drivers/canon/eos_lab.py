@@ -8,8 +8,7 @@ from typing import Any
 
 from drivers.camera import CapturedFrame, capture
 from drivers.canon.camera import CanonEos
-from drivers.links.link import UsbPipes
-from drivers.links.usb import open_usb
+from drivers.links.usb import UsbPipes, open_usb
 from drivers.ptp.protocol import Responder, Transport
 from drivers.ptp.usb import UsbTransport
 from foundation.clock import SimulatedClock

@@ -8,8 +8,7 @@ from importlib import resources
 import pytest
 import usb.core
 
-from drivers.links.link import Pipe, PipeStalled
-from drivers.links.usb import UDEV_RULE, UsbDevice, list_devices, open_usb
+from drivers.links.usb import UDEV_RULE, Pipe, PipeStalled, UsbDevice, list_devices, open_usb
 from drivers.ptp.protocol import PtpRequest
 from drivers.ptp.usb import UsbTransport
 from foundation.clock import SimulatedClock

@@ -8,8 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.links.link import Pipe, PipeStalled, UsbPipes
-from drivers.links.usb import open_usb
+from drivers.links.usb import Pipe, PipeStalled, UsbPipes, open_usb
 from drivers.ptp import usb as container
 from drivers.ptp.codes import EventCode, Operation, ResponseCode
 from drivers.ptp.protocol import PtpEvent, PtpRequest, PtpResponse, next_transaction

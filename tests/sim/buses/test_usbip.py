@@ -15,8 +15,8 @@ import usbip.host
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.links.link import Pipe, PipeStalled
 from drivers.links.network import TcpServer
+from drivers.links.usb import Pipe, PipeStalled
 from drivers.ptp.protocol import DeviceInfo, PtpRequest, PtpResponse
 from drivers.ptp.usb import ContainerReader, DataPiece, DataStart, UsbTransport, encode
 from foundation.clock import SimulatedClock
