@@ -13,6 +13,8 @@ from calibration.verdict import BuildResult
 from experiment.session.folder import Session
 from tests.calibration.lab import LIGHTS
 
+pytestmark = pytest.mark.slow
+
 VERSION_1 = Path(__file__).parent / "table" / "table_v1"
 
 Command = Callable[..., tuple[int, str, str]]
@@ -51,7 +53,6 @@ def test_info_tells_of_a_table_of_version_1(command: Command) -> None:
     assert "not listed" in out
 
 
-@pytest.mark.slow
 def test_a_check_tells_nothing_that_one_frame_cannot(session: Session, command: Command) -> None:
     code, out, _ = command("--check", session.folder)
     assert code == 0
@@ -111,7 +112,6 @@ def test_a_published_table_comes_back_byte_by_byte(lut: Path, command: Command, 
     assert "holds no table" in err
 
 
-@pytest.mark.slow
 def test_append_says_how_far_the_table_is(session: Session, command: Command, tmp_path: Path) -> None:
     shutil.copytree(session.folder, tmp_path / "session")
     last = next((tmp_path / "session" / "frames").glob("*light_012*"))

@@ -55,6 +55,7 @@ def test_figures_are_listed_in_the_order_of_their_definitions() -> None:
     assert {figure.group for figure in FIGURES} == QUESTIONS.keys()
 
 
+@pytest.mark.slow
 def test_a_name_stands_in_its_figure() -> None:
     """A figure has one home: at most two other files hold its name, as a key or a word of their own."""
     texts = {path: path.read_text() for package in PACKAGES for path in (ROOT / package).rglob("*.py")}

@@ -19,6 +19,7 @@ from tests.calibration.lab import Lab, Paint, hang, hang_chart
 WAVING = Room(waviness_mm=5.0, seed=5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("lab", "rms_px", "worst_px"),
     [

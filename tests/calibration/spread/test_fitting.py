@@ -127,3 +127,61 @@ def test_rows_weigh_by_their_level_s_scatter_and_outliers_little() -> None:
     assert usual == pytest.approx((1, 1 / 25), rel=0.1)
     # Huber's weight falls as the distance grows.
     assert 0.01 < weights[0] / usual[0] < 0.06
+
+
+@pytest.mark.parametrize("power", [1.0, 2.0, 3.0, 4.5])
+def test_a_kernel_s_share_of_a_power_law_is_that_of_the_sizes_about_its_own(power: float) -> None:
+    scale = np.array(NEAR_PX + FAR_PX)
+    # σ^(1 - power) dσ, summed over sizes that are nearest to each kernel's by their ratio, as far out as in.
+    ratio = np.sqrt([scale[1] / scale[0], scale[-1] / scale[-2]])
+    low, high = float(np.log(scale[0] / ratio[0])), float(np.log(scale[-1] * ratio[1]))
+    sizes = np.exp(low + (high - low) / 400_000 * np.arange(400_001.0))
+    middle = np.sqrt(sizes[1:] * sizes[:-1])
+    amount: npt.NDArray[np.float64] = middle ** (1 - power) * np.diff(sizes)
+    nearest = np.abs(np.log(middle[:, None] / scale)).argmin(axis=1)
+    expected = np.bincount(nearest, amount) / amount.sum()
+    np.testing.assert_allclose(fitting._law(power), expected, rtol=1e-3)  # pyright: ignore[reportPrivateUsage]
+
+
+@pytest.mark.parametrize("few", [False, True])
+def test_what_is_supposed_of_lenses_has_odds_that_sum_to_one_and_a_covariance(few: bool) -> None:
+    lenses = fitting._supposed_lenses(few)  # pyright: ignore[reportPrivateUsage]
+    assert sum(lens.odds for lens in lenses) == pytest.approx(1)
+    assert min(lens.odds for lens in lenses) > 0
+    veil = far_groups()[-1]
+    for lens in lenses[:: max(1, len(lenses) // 6)]:
+        usual = fitting._usual_shares(3 if few else 5, lens)  # pyright: ignore[reportPrivateUsage]
+        np.testing.assert_allclose(usual, usual.T)
+        assert np.linalg.eigvalsh(usual).min() > 0
+        np.testing.assert_allclose(np.diag(usual)[veil], (lens.veil * fitting.USUAL_VEIL) ** 2)
+        # Channels share what is not their own.
+        alike = usual[veil[0], veil[1]] / usual[veil[0], veil[0]]
+        assert alike == pytest.approx(1 - lens.veil_apart**2)
+        if lens.power:
+            near = groups_of_terms()[0]
+            law = fitting._law(lens.power)[0]  # pyright: ignore[reportPrivateUsage]
+            size = fitting._SCATTERED * law  # pyright: ignore[reportPrivateUsage]
+            off = fitting._OFF_LAW * size  # pyright: ignore[reportPrivateUsage]
+            np.testing.assert_allclose(np.diag(usual)[near], size**2 + off**2)
+
+
+def test_a_sensor_that_falls_short_bends_neither_black_nor_white() -> None:
+    level = np.array([0.0, 0.25, 0.5, 1.0])
+    np.testing.assert_allclose(fitting.bent(level, np.array([1.0, 1.0, 0.8, 1.0])), [0, 3 / 16, 0.2, 0])
+
+
+def test_folds_are_patches_of_the_page_and_none_is_lost() -> None:
+    random = np.random.default_rng(1)
+    places, points = random.uniform(0, 1, (900, 2)) * (300, 200), random.permutation(900)[:600]
+    ordered, folds = fitting._by_fold(points, places, (300.0, 200.0))  # pyright: ignore[reportPrivateUsage]
+    assert sorted(ordered.tolist()) == sorted(points.tolist())
+    assert [fold.start for fold in folds] == [0, *(fold.stop for fold in folds[:-1])]
+    assert folds[-1].stop == len(ordered)
+    side = 300 / fitting._PATCHWORK  # pyright: ignore[reportPrivateUsage]
+    fold_of = np.empty(900, dtype=np.int64)
+    for number, fold in enumerate(folds):
+        fold_of[ordered[fold]] = number
+        assert fold.stop - fold.start > 50
+    patches = np.floor(places / side).astype(np.int64)
+    for patch in np.unique(patches[points], axis=0):
+        assert len(set(fold_of[points][(patches[points] == patch).all(axis=1)].tolist())) == 1

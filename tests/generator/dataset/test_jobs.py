@@ -39,6 +39,7 @@ def lut(make_lut: Callable[..., Lut], tmp_path: Path, monkeypatch: pytest.Monkey
 
 
 class TestBits:
+    @pytest.mark.slow
     def test_the_pictures_print_is_that_of_its_reduced_codes(self, lut: Lut) -> None:
         assert main(("lut", "out", "--sources", "pictures", "--illuminations", "1", "--bits", "2", "--seed", "3")) == 0
         dataset = open_dataset("out")

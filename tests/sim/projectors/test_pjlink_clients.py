@@ -225,6 +225,7 @@ def test_aiopjlink_reads_health_and_names(served: Served) -> None:
     served.talk(conversation)
 
 
+@pytest.mark.slow
 def test_aiopjlink_is_refused_with_a_wrong_password() -> None:
     clock = SimulatedClock()
     with serve_pjlink(SimulatedProjector(clock), password="right") as server:

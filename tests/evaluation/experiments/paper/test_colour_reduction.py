@@ -139,6 +139,7 @@ def test_images_as_they_are_give_what_evaluate_gives() -> None:
         assert np.abs(coarse.errors["recovery"] - raw.errors["recovery"]).max() > near
 
 
+@pytest.mark.slow
 def test_the_table_has_every_method_and_number() -> None:
     found = bits_removed([Photo(photo(3)), Photo(photo(4))], bits_methods(sigma=2), (0, 5))
     table = bits_table(found, "recovery", "made up")

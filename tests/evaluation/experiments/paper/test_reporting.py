@@ -25,6 +25,7 @@ def drawn(draw: Any, *arguments: Any) -> list[Any]:
     return figure.axes
 
 
+@pytest.mark.slow
 def test_each_method_has_its_medians_and_that_of_the_images_as_they_are() -> None:
     found = bits_removed([Photo(photo(seed)) for seed in range(3)], bits_methods(sigma=2), (0, 5))
     (axes,) = drawn(reporting._draw_bits, found, "recovery")  # pyright: ignore[reportPrivateUsage]

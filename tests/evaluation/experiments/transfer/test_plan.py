@@ -230,6 +230,7 @@ def test_another_picture_of_that_name_is_missing(maker: Maker, tmp_path: Path) -
     assert list(found) == ["c.png"]
 
 
+@pytest.mark.slow
 def test_random_colours_are_made_again(maker: Maker) -> None:
     place = maker.folder / "random"
     scenes = random_scenes(2, 7, 5, seed=4)
