@@ -17,7 +17,7 @@ from calibration.spread.added_light import LEAST_LEVEL
 
 _Array = npt.NDArray[np.float64]
 
-_BLACK_COUNTS = 0.1
+_BLACK_COUNTS = 0.05
 """Standard uncertainty of a frame's black level, counts, beyond what its frames' scatter shows (judgement: masked
 photosites give .03)."""
 
@@ -31,14 +31,14 @@ _USUAL_TOO_DARK = 0.2
 """Share of the dark light by which dark frames differ from what is there in the lights', where no light shows it
 (judgement)."""
 
-_FLICKER = 1e-4
+_FLICKER = 5e-5
 """Relative: a lamp that flickers, or a wheel that is cut, within an exposure (judgement: half-second exposures; Heinz
 et al. 2018)."""
 
 _STRAY = 1e-4
 """Relative: light from beside the print where no figure shows it (judgement)."""
 
-_COMMON = 0.5
+_COMMON = 0.75
 """Share of the mean square of these two that all channels have in common: a lamp flickers as a whole, a wheel is cut in
 one primary; walls send back the light that is shown, in their own colour (judgement)."""
 

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -51,15 +52,13 @@ _CODE_DEGREE = 4
 _LOOSE = 10.0
 """Standard deviation of how much of a primary a light has, before it is fitted: nothing is known."""
 
-_FLICKER = 0.003
-"""The same beside what all primaries have in common, where the light is all of each: a lamp between two frames."""
-
 _OWN_SPECTRUM = 0.001
 """The same of how it differs from channel to channel: a primary keeps its spectrum."""
 
-_ADDS = 0.02
-"""By how much amounts of primaries may differ from one another for their light to be theirs alone: a projector that
-brightens white adds light of another spectrum."""
+_WHITES = ((0.003, _OWN_SPECTRUM, 0.6), (0.05, _OWN_SPECTRUM, 0.3), (_LOOSE, _LOOSE, 0.1))
+"""What full white may be: how its primaries differ beside what they have in common, how each does from channel to
+channel, and how likely that is beforehand (chosen). The primaries as they are alone; these, of a wheel that exposures
+cut; and light of another spectrum besides, of a projector that brightens white."""
 
 _GROUPS = 12
 """Groups of like levels, in each of which the scatter is measured."""
@@ -175,8 +174,12 @@ def superposition(
         return Superposition.usual(full, Unmeasured.for_few(patches, needed))
     seen, known = np.stack([together, *alone])[:, usable], known[usable]
     hats, size = _hats(seen / full), _AMOUNTS + len(NODES)
-    priors = [_prior(full, scale, white and _adds(seen)) for scale in _SCALES]
-    solution, covariance = np.concatenate([np.ones(3), np.zeros(size - 3)]), np.zeros((size, size))
+    whites = _WHITES if white else ((_LOOSE, _LOOSE, 1.0),)
+    priors = [(_prior(full, scale, like, own), odds) for scale, (like, own, odds) in product(_SCALES, whites)]
+    # Unknowns are what is there beside this: sums of squares of the light itself would drown what tells priors apart.
+    usual = np.zeros(size)
+    usual[:3] = 1.0 if white else np.linalg.lstsq(seen[1:].reshape(3, -1).T, seen[0].ravel(), rcond=None)[0]
+    solution, covariance = usual, np.zeros((size, size))
     for _ in range(_ROUNDS):
         matrix, right, misfit = np.zeros((size, size)), np.zeros(size), 1.0
         for channel in range(3):
@@ -194,26 +197,34 @@ def superposition(
             rows, told = root[:, None] * known, root[:, None] * design
             clean = rows @ np.linalg.lstsq(rows, told, rcond=None)[0]
             matrix += clean.T @ clean
-            right += clean.T @ (root * value)
+            right += clean.T @ (root * (value - design @ usual))
             misfit = max(misfit, _misfit(rows, root * left))
-        solution, covariance = _posterior(matrix / misfit, right / misfit, priors)
+        beside, covariance = _posterior(matrix / misfit, right / misfit, priors)
+        solution = usual + beside
     return Superposition(full, solution[_AMOUNTS:], covariance[_AMOUNTS:, _AMOUNTS:], None)
 
 
-def _posterior(matrix: _Array, right: _Array, priors: Sequence[_Array]) -> tuple[_Array, _Array]:
+def _posterior(matrix: _Array, right: _Array, priors: Sequence[tuple[_Array, float]]) -> tuple[_Array, _Array]:
     """Return mean (U,) and covariance (U, U) of the unknowns: of each prior's solution by how likely it makes the data.
+
+    `priors`: the inverse (U, U) of each one's covariance, and how likely it is beforehand.
 
     Bayesian model averaging (J. A. Hoeting and others, Statistical Science 14, 1999): of a small bend the usual prior
     says more than a chart of few cells, of a large one the cells do.
     """
-    covariances = [np.linalg.inv(matrix + prior) for prior in priors]
-    means = [covariance @ right for covariance in covariances]
-    evidence = np.array(
-        [
-            0.5 * (right @ mean + np.linalg.slogdet(covariance)[1] + np.linalg.slogdet(prior)[1])
-            for mean, covariance, prior in zip(means, covariances, priors, strict=True)
-        ]
-    )
+    covariances: list[_Array] = []
+    means: list[_Array] = []
+    evidence = np.zeros(len(priors))
+    for number, (prior, odds) in enumerate(priors):
+        # Brought to a diagonal of 1: amounts of light and counts near black differ by ten powers of ten.
+        size = np.sqrt(np.diag(matrix + prior))
+        scaled = (matrix + prior) / np.outer(size, size)
+        covariance: _Array = np.linalg.inv(scaled) / np.outer(size, size)
+        mean: _Array = np.linalg.solve(scaled, right / size) / size
+        known = np.linalg.slogdet(scaled)[1] + 2 * np.log(size).sum()
+        evidence[number] = 0.5 * (right @ mean - known + np.linalg.slogdet(prior)[1]) + np.log(odds)
+        covariances.append(covariance)
+        means.append(mean)
     weights = np.exp(evidence - evidence.max())
     weights /= weights.sum()
     mean = np.einsum("m,mu->u", weights, means)
@@ -232,17 +243,8 @@ def printed_predictors(codes: npt.ArrayLike, references: npt.NDArray[np.integer]
     return np.block([[cells, corner[0]], [corner[1], alike]])
 
 
-def _adds(seen: _Array) -> bool:
-    """Return whether the primaries make the light: amounts (3,) solved for in the brightest patches are alike."""
-    bright = seen[0].sum(axis=1) >= np.quantile(seen[0].sum(axis=1), 0.8)
-    together, *alone = seen[:, bright].mean(axis=1)
-    amounts: _Array = np.asarray(np.linalg.lstsq(np.array(alone).T, together, rcond=None)[0], dtype=np.float64)
-    return bool(np.ptp(amounts) <= _ADDS and abs(float(amounts.mean()) - 1) <= 5 * _ADDS)
-
-
-def _prior(full: float, scale: float, adds: bool) -> _Array:
-    """Return the inverse of the prior covariance of all unknowns."""
-    like, own = (_FLICKER, _OWN_SPECTRUM) if adds else (_LOOSE, _LOOSE)
+def _prior(full: float, scale: float, like: float, own: float) -> _Array:
+    """Return the inverse of the prior covariance of all unknowns; `like`, `own`: as in `_WHITES`."""
     prior = np.zeros((_AMOUNTS + len(NODES), _AMOUNTS + len(NODES)))
     prior[:3, :3] = np.linalg.inv(_LOOSE**2 * np.ones((3, 3)) + like**2 * np.eye(3))
     prior[3:_AMOUNTS, 3:_AMOUNTS] = np.eye(_AMOUNTS - 3) / own**2
