@@ -56,7 +56,8 @@ def test_noise_is_not_taken_for_shape(seed: int, level: float) -> None:
 
 def test_the_error_of_white_holds_that_of_its_field() -> None:
     """Cells where no reference is: by the references' scatter alone errors were 1.5 times as large, and up to 12."""
-    random, level, off = np.random.default_rng(8), np.array([3000.0, 700.0, 5000.0]), []
+    random, level = np.random.default_rng(8), np.array([3000.0, 700.0, 5000.0])
+    off: list[npt.NDArray[np.float64]] = []
     true = level * falloff(CENTRES).mean(axis=0)
     for _ in range(3):
         places = random.random((144, 2)) * PAGE * (0.85, 1)
