@@ -1,5 +1,8 @@
 # Two commands on a fresh machine with Python 3.11+ and make: `make demo` and `make test`. Each installs what it needs.
 
+# Where it is set, each worker of pytest would compile every test anew.
+unexport PYTHONDONTWRITEBYTECODE
+
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
