@@ -81,7 +81,7 @@ class Accumulator:
     - `highest_at`: (C,) int64, the light under which it was reached; −1 for a white frame.
     - `outside`: (C,) bool, whether a cell was cut off in a frame.
     - `covered`: (C,) bool, whether a cell did not look like the chart's in a frame in which the chart was registered.
-    - `place_error`: (C,) float64 half-size px, two standard errors of a cell's place, the worst of the frames in
+    - `place_error`: (C,) float64 half-size px, what a cell's place may be off by, the worst of the frames in
       which the chart was registered; over the clearance of its samples (`Registration.clearance`).
     - `even_sum`: (C, S, 3) float32, sum of the frames of even light, counts above black.
     - `even_noise2`: (C, 3) float64, sum of the variances of one sample in these frames, counts².
@@ -316,7 +316,7 @@ class Accumulator:
             elif self.place_error[colour] > MAX_PLACE_ERROR_PX:
                 cause = (
                     f"misplaced: its place is known to {self.place_error[colour]:.2f} px, {MAX_PLACE_ERROR_PX:g} px "
-                    "allowed (k = 2); the print waves there, or little of it is seen"
+                    "allowed; the print waves there, or little of it is seen"
                 )
             elif lit_by_others[colour] > MOST_ADDED:
                 cause = (

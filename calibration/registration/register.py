@@ -33,8 +33,8 @@ from foundation.errors import RegistrationError
 from foundation.robust import sigma_of
 
 MAX_PLACE_ERROR_PX = 0.5
-"""Two standard errors of the place of a cell of 10 px, at most: at 0.5 px the outermost of its 25 pixels, rounding
-included, has 0.1 % of its light from the next cell at a blur of 0.7 px (`calibration.sampling`)."""
+"""What the place of a cell of 10 px may be off by, at most (`Registration.expanded_px`): at 0.5 px the outermost of its
+25 pixels, rounding included, has 0.1 % of its light from the next cell at a blur of 0.7 px (`calibration.sampling`)."""
 
 CLEARANCE_PX = 1.75
 """From there to the edge of a cell of 10 px, for which the limits of places were found."""
@@ -134,8 +134,12 @@ class Registration:
         return self.place_errors.at(points_mm)
 
     def expanded_px(self, points_mm: npt.ArrayLike) -> _Array:
-        """Return two standard errors (N,) float64 px of the places (N, 2), as they matter to cells of 10 px."""
-        return 2 * self.uncertainty_px(points_mm) / self.clearance
+        """Return what places (N, 2) may be off by, (N,) float64 px, as it matters to cells of 10 px.
+
+        Two standard errors; three of a chart without tags, whose short waves its outline alone shows.
+        """
+        errors = 2 if self.framing.field is None else 3
+        return errors * self.uncertainty_px(points_mm) / self.clearance
 
     def uncertain(self, points_mm: npt.ArrayLike) -> _Mask:
         """Return which points (N,) bool are known too badly to be sampled."""
