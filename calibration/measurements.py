@@ -172,6 +172,12 @@ class LightMeasurements:
     stray: StrayLight | None = None
 
     @property
+    def brightest(self) -> _Array:
+        """(3,) float64 counts of bare paper under the brightest light."""
+        brightest: _Array = self.white[int(np.argmax(self.white.sum(axis=1)))]
+        return brightest
+
+    @property
     def off_codes_deg(self) -> _Array | None:
         """(L,) float64 degrees, how far each white is off its codes for certain; None after a check.
 
@@ -351,5 +357,5 @@ class TableMeasurements:
     @property
     def _full_white(self) -> _Array:
         """(3,) float64 counts of bare paper under white, or under the brightest light where no white was taken."""
-        whites, lights = [frame.paper.white for frame in self.white_frames], self.lights.white
-        return np.mean(whites, axis=0) if whites else lights[int(np.argmax(lights.sum(axis=1)))]
+        whites = [frame.paper.white for frame in self.white_frames]
+        return np.mean(whites, axis=0) if whites else self.lights.brightest

@@ -311,12 +311,11 @@ def _too_dark(table: TableMeasurements) -> float | None:
     lights, dark = table.lights, table.dark_frames.light
     if lights.subtracted is None or lights.additivity is None or not _are_named_right(table):
         return None
-    white = lights.white[int(np.argmax(lights.white.sum(axis=1)))]
     beyond, doubt = -lights.additivity.off / 2, table.white_scatter
     if table.sensor.superposition.measured:
         doubt = np.hypot(doubt, lights.additivity.error / 2)
     certain = beyond - 2 * doubt
-    allowed = _DARK_ALLOWS * np.maximum(dark, 0) / white + doubt
+    allowed = _DARK_ALLOWS * np.maximum(dark, 0) / lights.brightest + doubt
     return float(certain.max()) if (beyond > 0).all() and (beyond <= allowed).all() and (certain > 0).any() else 0.0
 
 

@@ -112,7 +112,7 @@ def _darkness(table: TableMeasurements, white: _Array, cells: _Array) -> Compone
         error = error + dark.error**2 + changes + _too_dark(table, light) ** 2
         source = "scatter of the dark frames; what lights of several primaries have beyond the primaries' sum"
         assumed = lights.additivity is None or len(dark.lights) < 2
-    at_cells = error / white[int(np.argmax(white.sum(axis=1)))] ** 2
+    at_cells = error / np.maximum(lights.brightest, 1e-9) ** 2
     return Component(
         "darkness", "black level and dark light", assumed, source, _diagonal(error / white**2), at_cells / cells**2 * (
             1.0 if lights.subtracted is None else np.minimum(cells, 1.0) ** 2
@@ -129,14 +129,13 @@ def _too_dark(table: TableMeasurements, dark: _Array) -> _Array:
     found = table.lights.additivity
     if found is None:
         return _USUAL_TOO_DARK * dark
-    white = table.lights.white[int(np.argmax(table.lights.white.sum(axis=1)))]
-    beyond = np.sqrt(found.off**2 + found.error**2 + table.white_scatter**2) * white
+    beyond = np.sqrt(found.off**2 + found.error**2 + table.white_scatter**2) * table.lights.brightest
     return np.minimum(beyond / 2, dark)
 
 
 def _linearity(table: TableMeasurements, white: _Array, cells: _Array) -> Component:
     found = table.sensor.superposition
-    paper = white[int(np.argmax(white.sum(axis=1)))]
+    paper = np.maximum(table.lights.brightest, 1e-9)
     level = np.maximum(cells, LEAST_LEVEL) * paper
     source = (
         "red, green and blue alone against a light that is made of them"

@@ -184,6 +184,7 @@ class PaperReader:
         self._at_places = page_polynomial(places_mm, page_mm, MAX_ORDER) @ self._terms
         # Term by term, so that the compiled loop runs along the cells.
         self._at_centres = np.ascontiguousarray((page_polynomial(centres_mm, page_mm, MAX_ORDER) @ self._terms).T)
+        self._means = product(self._at_centres, self._base_at_centres) / len(centres_mm)
 
     def read(self, seen: _Array, what: str = "the frame") -> tuple[Paper, _Array]:
         """Return what a frame's paper shows, and the frame's field (C, 3) float64 at the cells' centres.
@@ -197,13 +198,14 @@ class PaperReader:
                 "the chart, bring all of it into the picture, and expose so that bare paper stays below saturation"
             )
         basis, values, known = self._at_places[there], seen[there], self._base_at_places[there]
-        shape = self._base_at_centres.copy()
+        shape, means = self._base_at_centres.copy(), self._means
         factors: list[tuple[_Array, ...]] = list(self.base.coefficients)
         if not any(factors):
             shared = self._shared_shape(basis, values)
             if shared is not None:
                 known = known * shared[0][:, None]
                 shape *= shared[1][:, None]
+                means = product(self._at_centres, shape) / len(shape)
                 factors = [(shared[2],), (shared[2],), (shared[2],)]
         # On a base that is known, what is left of the light is plain: the frame's references are judged by a bend.
         judging = self._counts[-1] if not any(self.base.coefficients) else _PLAIN
@@ -226,7 +228,7 @@ class PaperReader:
             white[channel] = float((weights * flat).sum() / weights.sum())
             residual = flat - white[channel]
             if len(own) == len(solution):
-                error[channel] = fit.level_error(product(self._at_centres, before[:, channel]) / len(before))
+                error[channel] = fit.level_error(means[:, channel])
             else:
                 error[channel] = np.sqrt(float((weights * residual**2).sum())) / float(weights.sum())
             # All references count here: a stain that the fit rightly ignores must still be seen.
@@ -290,17 +292,18 @@ class _Fit:
         By the references' scatter, and by how much other numbers of terms, as likely as they are, would give another
         mean.
         """
-        root = np.sqrt(self.weights)
-        rows, values, terms = self.design * root[:, None], self.values * root, len(self.solution)
-        left = values - rows[:, :terms] @ self.solution
-        variance = float(left @ left) / max(float(self.weights.sum()) - terms, 1.0)
-        own = mean[:terms]
-        square = variance * float(own @ np.linalg.pinv(rows[:, :terms].T @ rows[:, :terms], hermitian=True) @ own)
-        level = float(own @ self.solution)
+        weighted, terms = self.design * self.weights[:, None], len(self.solution)
+        normal, right = weighted.T @ self.design, weighted.T @ self.values
+        left = self.values - self.design[:, :terms] @ self.solution
+        variance = float(self.weights @ left**2) / max(float(self.weights.sum()) - terms, 1.0)
+        square, level = 0.0, float(mean[:terms] @ self.solution)
         for count, likely in self.likely:
-            if count != terms and likely > _UNLIKELY:
-                other = mean[:count] @ np.linalg.lstsq(rows[:, :count], values, rcond=None)[0]
-                square += likely * (float(other) - level) ** 2
+            if count == terms or likely > _UNLIKELY:
+                by_right = np.linalg.lstsq(normal[:count, :count], mean[:count], rcond=None)[0]
+                if count == terms:
+                    square += variance * float(by_right @ mean[:count])
+                else:
+                    square += likely * (float(by_right @ right[:count]) - level) ** 2
         return float(np.sqrt(square))
 
 
