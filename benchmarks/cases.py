@@ -4,7 +4,8 @@ Each `NamedCase` is a room, frames that are not what the plan says, and what a v
 causes, words of wrong ones. `try_case` takes a short session in it, builds its table and holds it against the truth:
 
 - *silent*: a light is `WRONG_DEG` off, or a cell's mean of 300 counts and more by `WRONG_SHARE`, its light's brightness
-  included, and the verdict is to accept or says nothing of a right cause;
+  included, by more than twice what the table states of it (k = 2), and the verdict is to accept or says nothing of a
+  right cause;
 - *wrong cause*: the verdict says what is not so, or nothing of a right cause, whether a table came of it or not;
 - *false remark*: something is remarked on where nothing is the matter;
 - *unsaid*: the table is right, and what should be said of it is not.
@@ -567,10 +568,11 @@ class Outcome:
 
     @property
     def is_wrong(self) -> bool:
-        """Whether there is a table, and a light or a cell in it is wrong."""
+        """Whether there is a table, and a light or a cell in it is wrong, by more than twice what is stated of it."""
         truth = self.truth
-        return truth is not None and (
-            bool(truth.light_deg.max() > WRONG_DEG) or truth.worst_with_brightness > WRONG_SHARE
+        return truth is not None and bool(
+            (truth.light_deg > np.maximum(WRONG_DEG, 2 * truth.light_stated)).any()
+            or (truth.cell_error > np.maximum(WRONG_SHARE, 2 * truth.cell_stated))[truth.lit].any()
         )
 
     def mentions(self, words: str) -> bool:

@@ -43,7 +43,7 @@ from sim.world.disturbances import UNDISTURBED, Situation
 from sim.world.rendering import Print
 from sim.world.room import Room
 from sim.world.sensors import Body
-from sim.world.world import World
+from sim.world.world import PAPER, World
 
 SETTINGS = ExposureSettings(iso=100, aperture=8.0, shutter_s=0.5)
 TAKEN_AT = datetime(2024, 3, 1, 9, 0, tzinfo=UTC)
@@ -227,7 +227,8 @@ def short_session(
 class TableTruth:
     """A table against the room that it should show; L lights, C cells.
 
-    - `light_deg`: (L,) float64, angle between the ground truth and the light of bare paper.
+    - `light_deg`: (L,) float64, angle between the ground truth and bare paper's light, its mean over the cells.
+    - `light_stated`, `cell_stated`: (L,) float64 degrees and (C, 3) float64, what the table states of both.
     - `brightness`: (L,) float64, the light's brightness over the truth, 1 for the median light.
     - `level`: (L, C, 3) float64 counts that cells should have in the table.
     - `error`: (L, C, 3) float64, mean of the samples over the truth, less 1, noise taken out; the light's own error and
@@ -237,6 +238,8 @@ class TableTruth:
     """
 
     light_deg: _Array
+    light_stated: _Array
+    cell_stated: _Array
     brightness: _Array
     level: _Array
     error: _Array
@@ -259,10 +262,9 @@ class TableTruth:
         return float(np.abs(self.error[self.lit]).max(initial=0))
 
     @property
-    def worst_with_brightness(self) -> float:
-        """Largest error where cells are lit, the light's brightness included."""
-        whole = (1 + self.error) * self.brightness[:, None, None] - 1
-        return float(np.abs(whole[self.lit]).max(initial=0))
+    def cell_error(self) -> _Array:
+        """(L, C, 3) float64, size of the errors of cells' means, their light's brightness included."""
+        return np.abs((1 + self.error) * self.brightness[:, None, None] - 1)
 
     def cells_beyond(self, share: float) -> int:
         """Return how many fit cells are off by more than a share under some light, in some channel, where lit."""
@@ -291,12 +293,13 @@ def compare(
     lights = lut.illuminations
     cells_mm = chart.centres_mm[chart.cell_of_colour]
     codes = chart.rgb[chart.cell_of_colour]
-    white = np.array([world.white(light.colour, SETTINGS) for light in lights])
+    paper = [PAPER] * len(cells_mm)
+    white = np.array([world.seen(paper, cells_mm, light.colour, SETTINGS).mean(axis=0) for light in lights])
     records = {frame.record.illumination: frame for frame in result.figures.frames if frame.record.kind == "light"}
     steps = {step.illumination: step for step in plan_steps(lights, every) if step.kind == "light"}
     level, error = (np.zeros((len(lights), len(codes), 3)) for _ in range(2))
     for number, light in enumerate(lights):
-        relative = world.reflected(codes, light.colour, SETTINGS) / white[number]
+        relative = world.reflected(codes, light.colour, SETTINGS) / world.white(light.colour, SETTINGS)
         level[number] = relative * lut.white[number]
         means = lut.samples[number].astype(np.float64).mean(axis=1)
         figures, change = records[number], changes(steps[number])
@@ -314,7 +317,11 @@ def compare(
     fit = np.ones(len(codes), dtype=np.bool_)
     fit[unfit] = False
     offset = offsets_px(result.figures.registration, world, cells_mm, session.folder / records[0].record.file)
-    return TableTruth(angles_deg(white, lut.white), share / np.median(share), level, error, fit, offset)
+    stated_light, stated_cell = lut.truth_uncertainty_deg, lut.cell_uncertainty
+    assert stated_light is not None
+    assert stated_cell is not None
+    light = angles_deg(white, lut.white)
+    return TableTruth(light, stated_light, stated_cell, share / np.median(share), level, error, fit, offset)
 
 
 def noise_of(

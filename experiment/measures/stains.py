@@ -10,6 +10,7 @@ Rules that hold inside:
   or paper, and next to nothing in common with the cell's own place.
 - A cell is judged by its neighbourhood: one deviating cell is the prediction's error or noise. Next to a stain it is
   judged alone as well, for only half of the neighbourhood of a cell at a stain's rim is stained; that half must show.
+- Codes of which two values are equal are predicted by others of which they are.
 - Charts of less than `LEAST_BITS` cannot be judged: between four levels of a code curvature does not change slowly.
 - A deviation must be significant and large enough to matter. What is found is listed, never corrected.
 - A stain takes of each cell a share of its light, a reflection adds to each as much. So the light that cells of a place
@@ -66,6 +67,9 @@ _ROUNDS = 3
 
 _LEAST_KNOWN = 9
 """Codes of the 25 across an axis that must be known for their median to be a curvature."""
+
+_LEAST_TIED = 3
+"""Codes with two equal values that must be known for their median to be a bend."""
 
 _LEAST_NEIGHBOURS = 5
 """Cells of a neighbourhood that must be known for its mean to count."""
@@ -184,7 +188,8 @@ def _log_ratios(trusted: _Array, level: _Array, usable: _Mask, bits: int) -> _Ar
     """Return (C, 3) log of each cell over what its neighbours in colour predict, NaN where they cannot.
 
     Along each axis of the code the mean of both neighbours' logarithms predicts the cell's, but for the curvature,
-    which changes slowly across the axis and is taken out as the median over the codes beside.
+    which changes slowly across the axis and is taken out as the median over the codes beside. Where two values of a
+    code are equal there is a bend, too: black replaces as much ink as all three have in common.
     """
     side = 1 << bits
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -198,6 +203,7 @@ def _log_ratios(trusted: _Array, level: _Array, usable: _Mask, bits: int) -> _Ar
         edge[axis] = [0, side - 1]
         second[tuple(edge)] = np.nan
         second -= _beside(second, axis)
+        second -= _at_ties(second, axis)
         there = np.isfinite(second)
         total += np.where(there, second, 0)
         count += there
@@ -224,6 +230,28 @@ def _beside(cube: _Array, axis: int) -> _Array:
     low, high = (np.maximum(known - 1, 0) // 2)[None], (known // 2)[None]
     middle = 0.5 * (np.take_along_axis(ranked, low, axis=0) + np.take_along_axis(ranked, high, axis=0))[0]
     return np.where(known >= _LEAST_KNOWN, middle, np.nan)
+
+
+def _at_ties(second: _Array, axis: int) -> _Array:
+    """Return the median (n, n, n, 3) over the codes whose value along an axis equals one across it; 0 elsewhere.
+
+    Of codes of like values, in which the third value is below, equal or above; NaN where too few are known.
+    """
+    values = np.indices(second.shape[:3])
+    found = np.zeros_like(second)
+    for other in {0, 1, 2} - {axis}:
+        third = np.sign(values[3 - axis - other] - values[axis])
+        for side in (-1, 0, 1):
+            tied = np.nonzero((values[axis] == values[other]) & (third == side))
+            value, bends = values[axis][tied], second[tied]
+            known = np.isfinite(bends).all(axis=1)
+            usual = np.full_like(bends, np.nan)
+            for one in np.unique(value):
+                alike = bends[known & (np.abs(value - one) <= 1)]
+                if len(alike) >= _LEAST_TIED:
+                    usual[value == one] = np.median(alike, axis=0)
+            found[tied] = usual
+    return found
 
 
 def _of_neighbourhoods(log_ratios: _Array, near: npt.NDArray[np.intp]) -> tuple[_Array, _Array]:

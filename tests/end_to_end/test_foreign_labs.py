@@ -129,12 +129,13 @@ def test_words_are_found_whatever_their_case() -> None:
     assert not found.mentions("hand")
 
 
-def truth_of(light_deg: float, error: float) -> TableTruth:
-    """Return one light over two cells of 1000 counts, all off alike."""
+def truth_of(light_deg: float, error: float, stated: float = 0.0) -> TableTruth:
+    """Return one light over two cells of 1000 counts, all off alike; so much, degrees and share, is stated of both."""
     cells = np.full((1, 2, 3), 1000.0)
     return TableTruth(
-        np.array([light_deg]), np.ones(1), cells, np.full_like(cells, error), np.ones(2, np.bool_), np.zeros((3, 2, 2))
-    )
+        np.array([light_deg]), np.array([stated]), np.full((2, 3), stated), np.ones(1), cells,
+        np.full_like(cells, error), np.ones(2, np.bool_), np.zeros((3, 2, 2)),
+    )  # fmt: skip
 
 
 @pytest.mark.parametrize(
@@ -154,6 +155,7 @@ def test_a_room_is_silent_where_nothing_says_why_it_is_wrong(
 ) -> None:
     verdict = "accept with remarks" if says else "accept"
     assert is_silent(Outcome(verdict, (), says, truth_of(light_deg, error))) is silent
+    assert not is_silent(Outcome(verdict, (), says, truth_of(light_deg, error, stated=0.25)))
     assert not is_silent(Outcome("refuse", (), says, None))
 
 

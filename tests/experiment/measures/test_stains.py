@@ -49,6 +49,19 @@ def test_nothing_else_adds_light_to_cells_that_are_kept(stains: Stains) -> None:
     assert added_light(stains) < 0.002
 
 
+def test_cells_of_codes_with_equal_values_beside_each_other_are_no_stain() -> None:
+    # Black ink stands for as much as all inks have in common, so that levels bend where two values are equal.
+    codes = np.stack(np.meshgrid(*[np.linspace(0, 1, 8)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+    tied = np.count_nonzero(codes == codes.max(axis=1, keepdims=True), axis=1) > 1
+    level = 6000 * (0.1 + 0.9 * codes**2.2) * np.exp(-0.8 * (1 - codes.max(axis=1, keepdims=True)))
+    level = np.asarray(level * np.random.default_rng(4).normal(1, 0.003, level.shape), dtype=np.float64)
+    places = np.zeros((len(codes), 2))
+    places[np.argsort(tied, kind="stable")] = np.column_stack(np.divmod(np.arange(len(codes)), 16)) * 5.0
+    assert not find_stains(level, places, 3).stained.any()
+    stained = level * np.where(np.linalg.norm(places - [100, 40], axis=1) < 20, 0.95, 1)[:, None]
+    assert find_stains(stained, places, 3).stained.sum() > 20
+
+
 def test_the_spots_are_the_places_that_deviate() -> None:
     assert not spots_of(print_with(0))
     (spot, *_) = spots_of(print_with(40, 0.03))
