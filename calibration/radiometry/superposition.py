@@ -136,9 +136,14 @@ class Superposition:
 
         What is measured is not taken out of the counts: it counts as an error of its full size.
         """
+        off, variance = self.beside(level, reference)
+        return off**2 + variance
+
+    def beside(self, level: _Array, reference: _Array) -> tuple[_Array, _Array]:
+        """Return the relative deviation (...) of levels less that of references, and the square of its error."""
         (found, weights), (at_reference, of_reference) = self.relative(level), self.relative(reference)
         weights = weights - of_reference
-        return (found - at_reference) ** 2 + np.einsum("...k,kl,...l->...", weights, self.covariance, weights)
+        return found - at_reference, np.einsum("...k,kl,...l->...", weights, self.covariance, weights)
 
     def white_covariance(self, white: _Array) -> _Array:
         """Return the mean square (L, 3, 3) float64 of the relative error that it leaves in whites (L, 3), counts."""
