@@ -6,9 +6,9 @@ Rules that hold inside:
 - The table appears whole or not at all; what it needs of the disk is asked for before the work.
 - Its provenance says that it was computed, from what, and with which settings; no frame is listed.
 
-A light's frame is treated as `calibration.pipeline.measuring` treats a photographed one that lies exactly where it was
-registered: black subtracted, field and white read from the white references, samples divided by the field, and by how
-much the field of a cell differs from that of paper. So the ground truth has the error that a photographed one has.
+A light's frame is treated as `calibration.pipeline.accumulator` treats a photographed one that lies exactly where it
+was registered: black subtracted, field and white read from the white references, samples divided by the field, and by
+how much the field of a cell differs from that of paper. So the ground truth has the error that a photographed one has.
 """
 
 from __future__ import annotations

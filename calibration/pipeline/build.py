@@ -36,7 +36,15 @@ import numpy.typing as npt
 from calibration.figures.all_figures import FIGURES
 from calibration.figures.figure import Figure
 from calibration.measurements import LinearityMeasurements, TableMeasurements
-from calibration.pipeline.accumulator import Accumulator, EarlyMeasurement, stored_names
+from calibration.pipeline.accumulator import (
+    Accumulator,
+    EarlyMeasurement,
+    MeasuredFrame,
+    measure_primaries,
+    measure_registered_frame,
+    sample_dark_frame,
+    stored_names,
+)
 from calibration.pipeline.baseline import (
     PAPER_OPTIONS,
     BuildOptions,
@@ -54,12 +62,6 @@ from calibration.pipeline.baseline import (
 )
 from calibration.pipeline.collecting import check_figures, table_figures
 from calibration.pipeline.linearity import read_linearity
-from calibration.pipeline.measuring import (
-    MeasuredFrame,
-    measure_primaries,
-    measure_registered_frame,
-    sample_dark_frame,
-)
 from calibration.radiometry.drift import LEAST_WHITES, applied_drift, corrected, corrections
 from calibration.radiometry.greys import references_csv
 from calibration.table.lut import (
