@@ -6,7 +6,7 @@ Rules that hold inside:
 - The table appears whole or not at all; what it needs of the disk is asked for before the work.
 - Its provenance says that it was computed, from what, and with which settings; no frame is listed.
 
-A light's frame is treated as `calibration.pipeline.accumulator` treats a photographed one that lies exactly where it
+A light's frame is treated as `calibration.pipeline.frames` treats a photographed one that lies exactly where it
 was registered: black subtracted, field and white read from the white references, samples divided by the field, and by
 how much the field of a cell differs from that of paper. So the ground truth has the error that a photographed one has.
 """
@@ -23,7 +23,7 @@ import numpy as np
 import numpy.typing as npt
 
 from calibration.citation import OriginRecord
-from calibration.pipeline.baseline import ChartPoints, usable_means
+from calibration.pipeline.frames import ChartPoints, usable_means
 from calibration.radiometry.drift import corrections
 from calibration.radiometry.greys import references_csv
 from calibration.radiometry.primaries import Primaries

@@ -36,24 +36,9 @@ import numpy.typing as npt
 from calibration.figures.all_figures import FIGURES
 from calibration.figures.figure import Figure
 from calibration.measurements import LinearityMeasurements, TableMeasurements
-from calibration.pipeline.accumulator import (
-    Accumulator,
-    EarlyMeasurement,
-    MeasuredFrame,
-    measure_primaries,
-    measure_registered_frame,
-    sample_dark_frame,
-    stored_names,
-)
 from calibration.pipeline.baseline import (
-    PAPER_OPTIONS,
-    BuildOptions,
-    ChangedFrame,
-    DecodedFrame,
     ReportProgress,
-    SelectedFrames,
     baseline_of,
-    decode_frame,
     select_frames,
     source_frames,
     with_lens,
@@ -61,6 +46,21 @@ from calibration.pipeline.baseline import (
     with_superposition,
 )
 from calibration.pipeline.collecting import check_figures, table_figures
+from calibration.pipeline.frames import (
+    PAPER_OPTIONS,
+    Accumulator,
+    BuildOptions,
+    ChangedFrame,
+    DecodedFrame,
+    EarlyMeasurement,
+    MeasuredFrame,
+    SelectedFrames,
+    decode_frame,
+    measure_primaries,
+    measure_registered_frame,
+    sample_dark_frame,
+    stored_names,
+)
 from calibration.pipeline.linearity import read_linearity
 from calibration.radiometry.drift import LEAST_WHITES, applied_drift, corrected, corrections
 from calibration.radiometry.greys import references_csv

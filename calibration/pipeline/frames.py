@@ -1,10 +1,16 @@
-"""What one frame shows, and what the frames taken in so far have given.
+"""The frames of a table: each is read once and measured, with what holds for all of them, and taken in.
 
-A frame is measured: how the chart has moved, its paper and greys, its samples. Then it is taken in: there is one frozen
-value after each frame, which a checkpoint stores.
+- What a user may choose about how a table is built (`BuildOptions`), where the chart lies from a frame in which it was
+  registered until it moves too far from there (`RegisteredFrame`), and what holds for all frames (`Baseline`, made by
+  `calibration.pipeline.baseline`).
+- A frame as read, its hash checked (`DecodedFrame`); as measured: how the chart has moved, its paper and greys, its
+  samples (`MeasuredFrame`).
+- What the frames taken in so far have given (`Accumulator`): one frozen value after each, which a checkpoint stores.
 
 Rules that hold inside:
 
+- Cells are in the order of colour indices, as in the table, and not in the chart's own order. References follow the
+  cells, the white ones before the grey ones.
 - A frame is measured with the baseline, the frame registered last, and the dark light, and with nothing else, so that
   frames can be measured in any order and by any thread.
 - The chart must lie where it was registered: a movement up to a tenth of a pixel is neglected, up to half a pixel the
@@ -15,11 +21,13 @@ Rules that hold inside:
 - The dark light of a frame is that of the last dark frame before it, or of the first, for frames before that.
 - A cell that is cut off, clipped, covered or not of one colour is listed with its cause. It is never filled.
 
-C cells of S samples.
+C cells of S samples, W white references, N grey references; places on the print in millimetres, in frames in half-size
+pixels.
 """
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
@@ -28,18 +36,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 from scipy.spatial import cKDTree
+from threadpoolctl import threadpool_limits
 
+from calibration.checks.frame_consistency import ConsistencyCheck
 from calibration.measurements import FrameMeasurements
-from calibration.pipeline.baseline import (
-    Baseline,
-    DecodedFrame,
-    RegisteredFrame,
-    SelectedFrames,
-    beyond_print,
-    decode_frame,
-    sites_of,
-    usable_means,
-)
 from calibration.radiometry.dark_frames import (
     DarkFrameFigures,
     DarkLight,
@@ -49,30 +49,56 @@ from calibration.radiometry.dark_frames import (
     dark_summary,
     measure_dark_frame,
     median_noise,
+    reflectances,
     winsorised_means,
 )
+from calibration.radiometry.greys import GreyLevels, PhotonTransfer
 from calibration.radiometry.primaries import Primaries
-from calibration.registration.register import MAX_PLACE_ERROR_PX
+from calibration.radiometry.superposition import Superposition
+from calibration.registration.register import MAX_PLACE_ERROR_PX, Registration, register
 from calibration.sampling import (
+    WINDOW,
+    WINDOWS,
+    Sites,
     gather,
     gather_means,
     gather_values,
     has_dead_photosite,
     patch_means,
     sample_noise,
+    sites_at,
     table_values,
     unevenness,
 )
-from calibration.spread.added_light import MOST_ADDED, AddedLight
+from calibration.spread.added_light import MOST_ADDED, AddedLight, added_light
+from calibration.spread.correction import (
+    FrameCorrection,
+    LensCorrection,
+)
 from calibration.spread.surroundings import FrameLevels
 from calibration.table.lut import Unfit
-from drivers.raw.rawfile import CLIPPING_SHARE
+from drivers.raw.rawfile import (
+    CHANNELS,
+    CLIPPING_SHARE,
+    Channel,
+    Mosaic,
+    Plane,
+    decode_raw,
+    filled_fault,
+    frame_black,
+    strongest_channel,
+)
+from drivers.raw.storage import Area
+from experiment.chart.model import Chart
+from experiment.config import CitationSettings
+from experiment.framing.field import Corners
 from experiment.framing.pictures import REREGISTER_PX, STILL_PX, Shift, gauges_of, shift_between
-from experiment.measures.paper import Paper
+from experiment.measures.paper import Paper, PaperReader
 from experiment.measures.stains import Stains, find_stains
 from experiment.session.folder import Session
 from experiment.session.records import FrameRecord
-from foundation.errors import RegistrationError
+from foundation.errors import FormatError, InputError, RegistrationError
+from foundation.files import read_whole
 from foundation.records import from_plain, to_plain
 
 _BRIGHTEST_PERCENTILE = 99.5
@@ -81,6 +107,371 @@ _BRIGHTEST_PERCENTILE = 99.5
 _BEGIN_ANEW = "begin the build anew"
 
 _Array = npt.NDArray[np.float64]
+_Arrays = dict[str, npt.NDArray[Any]]
+
+_TAKEN_AGAIN = "or take it again: acquire run LAB.toml SESSION finds such frames by itself"
+
+_LEAST_BITS = 3
+"""Bits of a channel from which on neighbours in colour predict a cell."""
+
+
+@dataclass(frozen=True)
+class BuildOptions:
+    """How a table is built; by default 25 samples, the paper's, from which black and the lens's spread are subtracted.
+
+    - `window`: pixels along the side of a cell's window: one of `calibration.sampling.WINDOWS`.
+    - `subtract_dark`: whether the light of the dark frames is subtracted from samples and ground truth.
+    - `corners`: four corners (x, y) of the field of cells in the frame that is registered first, half-size px,
+      clockwise from the printed top-left, for a chart without tags; None to have it found.
+    - `correct_drift`: whether the lamp's drift between white frames is taken out of samples and ground truth at the
+      end.
+    - `lens_correction`: whether what the lens spreads beside its sharp core is subtracted from samples and ground
+      truth, where the print proves that it does.
+    - `citation`: what the lab states of the table's origin; None for what the session's settings state. No sample
+      depends on it.
+    """
+
+    window: int = WINDOW
+    subtract_dark: bool = False
+    corners: Corners | None = None
+    correct_drift: bool = False
+    lens_correction: bool = True
+    citation: CitationSettings | None = None
+
+    def __post_init__(self) -> None:
+        if self.window not in WINDOWS:
+            raise InputError(
+                f"a window of {self.window} pixels was asked for; {', '.join(map(str, WINDOWS[:-1]))} or {WINDOWS[-1]} "
+                "expected: a window has a middle pixel, and cells are about 10 pixels wide"
+            )
+
+    @property
+    def samples(self) -> int:
+        """Samples of each cell."""
+        return self.window**2
+
+
+PAPER_OPTIONS = BuildOptions()
+"""The paper's options, which hold where none are given."""
+
+
+@dataclass(frozen=True, eq=False)
+class ChartPoints:
+    """The points of a chart that are sampled.
+
+    - `cells_mm`: (C, 2) float64 mm, centres of the cells in the order of colour indices.
+    - `whites_mm`, `greys_mm`: (W, 2) and (N, 2) float64 mm, centres of the white and of the grey references.
+    - `levels`: the level of each grey reference.
+    """
+
+    cells_mm: _Array
+    whites_mm: _Array
+    greys_mm: _Array
+    levels: GreyLevels
+
+    @staticmethod
+    def of(chart: Chart) -> ChartPoints:
+        """Return the points of a chart."""
+        whites = [reference for reference in chart.references if reference.is_white]
+        greys = [reference for reference in chart.references if not reference.is_white]
+        whites_mm, greys_mm = (
+            np.array([reference.centre_mm for reference in references]).reshape(-1, 2) for references in (whites, greys)
+        )
+        return ChartPoints(chart.centres_mm[chart.cell_of_colour], whites_mm, greys_mm, GreyLevels.of(greys))
+
+    @property
+    def references_mm(self) -> _Array:
+        """(W + N, 2) float64 mm, centres of the references."""
+        return np.concatenate([self.whites_mm, self.greys_mm])
+
+
+@dataclass(frozen=True, eq=False)
+class RegisteredFrame:
+    """A frame in which the chart was registered; it holds for those after it until the chart moves too far.
+
+    - `registration`: the chart's place in it.
+    - `cells`: where the C cells are sampled.
+    - `references`: where the W + N references are sampled.
+    - `gauges`: the frame around its tags, or the outline of its field, to measure movements against.
+    - `lens`: corrects frames sampled at these places for what the lens spreads; None where nothing is corrected.
+    """
+
+    file: str
+    registration: Registration
+    cells: Sites
+    references: Sites
+    gauges: dict[Channel, Plane]
+    lens: FrameCorrection | None = None
+
+
+def register_frame(
+    decoded: DecodedFrame, chart: Chart, points: ChartPoints, options: BuildOptions, near: Registration | None = None
+) -> RegisteredFrame:
+    """Return a frame with the chart registered in it."""
+    registration = register(decoded.mosaic, chart, decoded.record.file, options.corners, near)
+    cells, references = sites_of(registration, points, decoded.mosaic.block_planes().shape[2:], options.window)
+    gauges: dict[Channel, Plane] = {
+        channel: gauges_of(decoded.mosaic, channel, decoded.black, registration.framing) for channel in CHANNELS
+    }
+    return RegisteredFrame(decoded.record.file, registration, cells, references, gauges)
+
+
+def sites_of(
+    registration: Registration, points: ChartPoints, shape: tuple[int, ...], window: int
+) -> tuple[Sites, Sites]:
+    """Return the sites of the cells and of the references.
+
+    `shape` is rows and columns of the half-size frame, `window` the pixels along a window's side.
+    """
+    height, width = shape
+    cells, references = (
+        sites_at(registration.to_pixels(places), (height, width), window)
+        for places in (points.cells_mm, points.references_mm)
+    )
+    return cells, references
+
+
+@dataclass(frozen=True)
+class SensorLayout:
+    """What all frames of a session have in common: visible area, shape of the sensor, Bayer pattern."""
+
+    visible: Area
+    shape: tuple[int, ...]
+    pattern: str
+
+    @staticmethod
+    def of(mosaic: Mosaic) -> SensorLayout:
+        """Return the layout of a frame."""
+        return SensorLayout(mosaic.visible, mosaic.sensor.shape, mosaic.pattern)
+
+    def __str__(self) -> str:
+        return f"{self.shape[1]}×{self.shape[0]} photosites {self.pattern}"
+
+
+@dataclass(frozen=True, eq=False)
+class Baseline:
+    """What holds for all frames of a session; made by `baseline_of`.
+
+    - `chart`, `points`: the chart, and its points: C cells, W white and N grey references.
+    - `options`: how the table is built.
+    - `camera`, `layout`: maker and model, and the sensor's layout, the same in all frames.
+    - `first`: the frame that is registered first.
+    - `whites`: (W, 3) float64 counts above black of its white references; NaN where one cannot be used.
+    - `means`: (C + W + N, 3) float64 counts above black of its cells and references.
+    - `paper`: reads flat field and white of frames, with the shape of this one's as base.
+    - `transfer`: photon-transfer curve of its cells.
+    - `consistency_check`: compares other frames' cells with those of this one.
+    - `primaries`: the primaries each alone; None where they were not given or cannot be used.
+    - `lens`: what the lens spreads beside its sharp core, measured; None where it was not, or could not be.
+    - `superposition`: what the first frame and those of the primaries show of the sensor's linearity; None where one of
+      them is lacking, or the chart has moved in it.
+    """
+
+    chart: Chart
+    points: ChartPoints
+    options: BuildOptions
+    camera: str
+    layout: SensorLayout
+    first: RegisteredFrame
+    whites: _Array
+    means: _Array
+    paper: PaperReader
+    transfer: PhotonTransfer
+    consistency_check: ConsistencyCheck
+    primaries: Primaries | None = None
+    lens: LensCorrection | None = None
+    superposition: Superposition | None = None
+
+    @property
+    def levels(self) -> _Array:
+        """(C, 3) float64, of each cell in the first frame, bare paper 1."""
+        paper, at_cells = self.paper.read(self.whites, self.first.file)
+        return self.means[: len(at_cells)] / (at_cells * np.maximum(paper.white, 1e-9))
+
+    def require_layout(self, mosaic: Mosaic, what: str) -> None:
+        """Refuse a frame, called `what`, whose sensor or setting is not that of the first."""
+        found = SensorLayout.of(mosaic)
+        if found != self.layout:
+            raise FormatError(
+                f"{what}: the sensor has {found}, that of {self.first.file} {self.layout}; a session has one camera "
+                "with one setting, so take the session anew"
+            )
+
+    def register(self, decoded: DecodedFrame) -> RegisteredFrame:
+        """Return a later frame with the chart registered in it; errors are those of `register_frame`."""
+        # A chart without tags hangs as in the first frame, so that a build that goes on has it the same way up.
+        registered = register_frame(decoded, self.chart, self.points, self.options, self.first.registration)
+        lens = self.correction(registered.registration, registered.cells, registered.references)
+        return replace(registered, lens=lens)
+
+    def correction(self, registration: Registration, cells: Sites, references: Sites) -> FrameCorrection | None:
+        """Return what corrects the lens in frames that are sampled at these places; None where nothing is corrected."""
+        if self.lens is None or not self.corrects_lens:
+            return None
+        return self.lens.of(registration, cells, references)
+
+    @property
+    def corrects_lens(self) -> bool:
+        """Whether frames are corrected for what the lens spreads."""
+        return self.lens is not None and self.options.lens_correction and self.lens.spread.proven
+
+    def movement(self, mosaic: Mosaic, black: _Array, channel: Channel, what: str) -> Shift:
+        """Return how far the chart has moved in a frame since the first one.
+
+        `black`: (2, 2) float64 counts.
+        """
+        self.require_layout(mosaic, what)
+        framing = self.first.registration.framing
+        return shift_between(self.first.gauges[channel], framing, gauges_of(mosaic, channel, black, framing))
+
+    def patches(self, mosaic: Mosaic, black: _Array) -> tuple[_Array, npt.NDArray[np.uint16]]:
+        """Return what a frame has where cells and references were in the first one.
+
+        `black`: (2, 2) float64 counts. Returns (C + W + N, 3) float64 counts above black; NaN where a patch does not
+        lie in the frame. Returns (C + W + N,) uint16, the highest raw count of each patch.
+        """
+        means: list[_Array] = []
+        peaks: list[npt.NDArray[np.uint16]] = []
+        for sites in (self.first.cells, self.first.references):
+            samples, highest = gather(mosaic, black, sites)
+            means.append(np.where(sites.inside[:, None], samples.mean(axis=1, dtype=np.float64), np.nan))
+            peaks.append(highest)
+        return np.concatenate(means), np.concatenate(peaks)
+
+    def added_light(self) -> AddedLight:
+        """Return the light that lies on parts of the print in the first frame, whatever is printed there."""
+        count = len(self.points.cells_mm)
+        if self.chart.bits < _LEAST_BITS:
+            return AddedLight.none(count)
+        paper, _ = self.paper.read(self.whites, self.first.file)
+        white = np.maximum(paper.white, 1e-9)
+        noise = self.transfer.variance(self.levels * white) / self.options.samples / white**2
+        usable = compared_cells(self.chart, self.first)
+        with threadpool_limits(limits=1, user_api="blas"):
+            return added_light(self.levels, noise, usable, self.points.cells_mm, self.chart.page_mm, self.chart.bits)
+
+    def dark_light_estimate(self) -> DarkLightEstimate:
+        """Return the estimate of the dark light before any dark frame, with the reflectances of the first frame."""
+        inside = np.concatenate([self.first.cells.inside, self.first.references.inside])
+        return DarkLightEstimate.none(self.reflectances(), inside, self.options.samples)
+
+    def reflectances(self) -> _Array:
+        """Return the reflectance (C + W + N, 3) float64 of cells and references in the first frame, bare paper 1."""
+        paper, shape = self.paper.read(self.whites, self.first.file)
+        field = np.concatenate([shape, paper.field.at(self.points.references_mm)])
+        return reflectances(self.means, field, paper.white)
+
+
+def beyond_print(decoded: DecodedFrame, beyond: Sites) -> _Array:
+    """Return the mean (3,) float64 counts above black of what lies behind the print; 0 where it is not seen."""
+    if not len(beyond.rows):
+        return np.zeros(3)
+    return gather_means(decoded.mosaic, decoded.black, beyond).mean(axis=0)
+
+
+def compared_cells(chart: Chart, registered: RegisteredFrame) -> npt.NDArray[np.bool_]:
+    """Return which cells (C,) are inside the frame and look like the chart's."""
+    return registered.cells.inside & ~registered.registration.mismatched_cells[chart.cell_of_colour]
+
+
+def usable_means(
+    samples: npt.NDArray[np.float32], highest: npt.NDArray[np.uint16], sites: Sites, saturation: int
+) -> _Array:
+    """Return the means (N, 3) float64, counts above black, of patches; NaN where one is cut off or clipped.
+
+    `samples`: (N, S, 3) float32 counts above black. `highest`: (N,) uint16, the highest raw count of each patch.
+    `saturation`: raw count of saturation.
+    """
+    means = samples.mean(axis=1, dtype=np.float64)
+    means[~(sites.inside & (highest < CLIPPING_SHARE * saturation))] = np.nan
+    return means
+
+
+class ChangedFrame(FormatError):
+    """A frame's file is gone, or is not what was taken; the next run of the session takes it again by itself."""
+
+
+@dataclass(frozen=True, eq=False)
+class DecodedFrame:
+    """A frame as read.
+
+    `mosaic`: its counts.
+
+    - `black`: (2, 2) float64 counts, black level of each position of the block.
+    - `strongest`: the channel with the brightest paper.
+    - `saturation`: raw count of saturation, as far as it can be seen in this frame.
+    """
+
+    record: FrameRecord
+    mosaic: Mosaic
+    black: _Array
+    strongest: Channel
+    saturation: int
+
+
+@dataclass(frozen=True, eq=False)
+class SelectedFrames:
+    """The frames that a table is made of.
+
+    - `records`: every light's last accepted frame, and the accepted white and dark ones, in the order taken.
+    - `lights_without`: lights that have no accepted frame.
+    - `registered`: the frame in which the chart is registered first.
+    - `primaries`: the frames of red, green and blue alone; () where one of the three is lacking.
+    - `more_whites`: of a chart of few colours, further frames of the light in which it is registered.
+    """
+
+    records: tuple[FrameRecord, ...]
+    lights_without: tuple[int, ...]
+    registered: FrameRecord
+    primaries: tuple[FrameRecord, ...]
+    more_whites: tuple[FrameRecord, ...]
+
+    @cached_property
+    def first_lit(self) -> FrameRecord:
+        """The first frame that is not dark."""
+        return next(record for record in self.records if record.kind != "dark")
+
+    @property
+    def newest(self) -> FrameRecord:
+        """The frame that was taken last, dark ones apart."""
+        lit = (record for record in self.records if record.kind != "dark")
+        return max(lit, key=lambda record: record.attempt)
+
+    def is_even(self, record: FrameRecord) -> bool:
+        """Return whether a frame's samples show how even cells are: the white ones, or the first with any light.
+
+        A file counts once, whatever it stands for: its noise is the same each time, and would not average out.
+        """
+        first = next((one for one in self.records if one.kind == "white" and one.sha256 == record.sha256), None)
+        return record == first or record is self.first_lit
+
+
+def decode_frame(session: Session, record: FrameRecord) -> DecodedFrame:
+    """Return a frame as read from its file, whose SHA-256 is checked first."""
+    path = session.folder / record.file
+    try:
+        data = read_whole(path)
+    except FileNotFoundError as error:
+        raise ChangedFrame(
+            f"{path} is missing, but the session's journal counts it; restore the file from a copy, {_TAKEN_AGAIN}"
+        ) from error
+    except OSError as error:
+        raise FormatError(f"cannot read {path}: {error.strerror}; check its permissions and the disk") from error
+    found = hashlib.sha256(data).hexdigest()
+    if found != record.sha256:
+        raise ChangedFrame(
+            f"{path} is not the file that was taken: its SHA-256 is {found[:16]}…, the journal says "
+            f"{record.sha256[:16]}…; restore the file from a copy, {_TAKEN_AGAIN}"
+        )
+    mosaic = decode_raw(data, path, known_whole=session.frames_are_known_whole)
+    fault = filled_fault(mosaic.counts, mosaic.black, mosaic.white_level)
+    if fault is not None:
+        raise FormatError(
+            f"{path} is no whole frame: {fault}; restore the file from a copy, or take it again: acquire run LAB.toml "
+            "SESSION --retake with the number of its light"
+        )
+    black = frame_black(mosaic)
+    return DecodedFrame(record, mosaic, black, strongest_channel(mosaic, black), mosaic.saturation())
 
 
 @dataclass(frozen=True, eq=False)
@@ -282,8 +673,6 @@ def _to_subtract(
     added = at.lens.added(FrameLevels(means, beyond_print(decoded, at.lens.beyond))).astype(np.float32)
     return added if dark is None else added + dark.patches
 
-
-_Arrays = dict[str, npt.NDArray[Any]]
 
 _Figures = tuple[FrameMeasurements | DarkFrameFigures, ...]
 
