@@ -38,8 +38,14 @@ sees more."""
 DEAD_LEVEL = 300.0
 """Counts that a cell must have for a dead photosite to be distinguished from noise: half of it is 21 σ."""
 
+NOISY = 1e-8
+"""Chance that noise alone lists a cell: a variance 3.5 times the model's for 25 samples."""
+
 _NOISE_BINS = 32
 """Levels at which noise is read: a full chart has a thousand patches in each, a chart of 512 colours sixteen."""
+
+_CURVE_BINS = 48
+"""The same for the photon-transfer curve: seven hundred cells of a full chart in each."""
 
 WINDOWS = (3, 5, 7, 9)
 """Sides of windows, half-size px: odd, so that a cell has a middle pixel; a cell is about 10 px wide."""
@@ -273,12 +279,8 @@ def sample_noise(samples: npt.NDArray[np.floating]) -> npt.NDArray[np.float64]:
     middle = (samples[:, inner] if inner.sum() >= 9 else samples).astype(np.float64)
     level, variance = middle.mean(axis=1), middle.var(axis=1, ddof=1)
     noise = np.empty_like(level)
-    degrees = middle.shape[1] - 1
     for channel in range(3):
-        order = np.argsort(level[:, channel])
-        bins: list[npt.NDArray[np.int64]] = np.array_split(order, max(1, min(_NOISE_BINS, len(order) // 16)))
-        at = np.array([float(np.median(level[part, channel])) for part in bins])
-        usual = np.array([float(np.median(variance[part, channel])) for part in bins]) / median_of_variance(degrees)
+        at, usual = noise_levels(level[:, channel], variance[:, channel], middle.shape[1], 1, _NOISE_BINS)
         noise[:, channel] = np.interp(level[:, channel], at, np.sqrt(usual))
     return noise
 
@@ -292,6 +294,78 @@ def median_of_variance(degrees: int) -> float:
     0.919
     """
     return (1 - 2 / (9 * degrees)) ** 3
+
+
+@dataclass(frozen=True, eq=False)
+class PhotonTransfer:
+    """The sensor's noise as the cells show it, per channel of half-size RGB; green is the mean of two photosites.
+
+    - `gain_e`: (3,) float64 electrons per count.
+    - `read_noise`: (3,) float64 counts.
+    - `response`: (3,) float64, standard deviation of the photosites' response, a share.
+    - `misfit`: (3,) float64, RMS of the levels' variances about the curve, relative.
+    - `ratio`: (N,) float64, each cell's variance over the model's, the largest of its channels.
+    - `allowed`: the ratio from which a cell is noisier than its level explains.
+    """
+
+    gain_e: _Array
+    read_noise: _Array
+    response: _Array
+    misfit: _Array
+    ratio: _Array
+    allowed: float
+
+    def variance(self, level: _Array) -> _Array:
+        """Return the variance (..., 3) float64, counts², of one sample at levels (..., 3), counts above black."""
+        lit = np.maximum(level, 0)
+        return self.read_noise**2 + lit / self.gain_e + (self.response * lit) ** 2
+
+    @property
+    def noisy(self) -> npt.NDArray[np.bool_]:
+        """(N,) bool, whether a cell is noisier than its level allows."""
+        return self.ratio > self.allowed
+
+
+def noise_levels(
+    level: _Array, variance: _Array, samples: int, least: int = 4, most: int = _CURVE_BINS
+) -> tuple[_Array, _Array]:
+    """Return the noise of one channel at levels, between `least` and `most` of them: medians of cells of like levels.
+
+    `level`, `variance`: (N,) float64 mean, counts above black, and variance of one sample, counts², of each cell.
+    Returns levels (B,), counts above black, and variances (B,), counts², both float64.
+    """
+    median = median_of_variance(samples - 1)
+    order = np.argsort(level)
+    bins: list[npt.NDArray[np.int64]] = np.array_split(order, max(least, min(most, len(order) // 16)))
+    at = np.array([float(np.median(level[part])) for part in bins if len(part)])
+    return at, np.array([float(np.median(variance[part])) for part in bins if len(part)]) / median
+
+
+def photon_transfer(level: _Array, variance: _Array, samples: int = 25) -> PhotonTransfer:
+    """Return the curve through cells: non-negative least squares on the medians of cells of like levels.
+
+    `level`: (N, 3) float64 mean of each cell, counts above black. `variance`: (N, 3) float64 variance of one sample of
+    each, counts².
+    """
+    from scipy.optimize import nnls
+    from scipy.stats import chi2
+
+    terms, misfit = np.zeros((3, 3)), np.zeros(3)
+    ratio = np.zeros(len(level))
+    for channel in range(3):
+        at, seen = noise_levels(level[:, channel], variance[:, channel], samples)
+        design = np.column_stack([np.ones_like(at), np.maximum(at, 0), np.maximum(at, 0) ** 2])
+        weight = 1 / np.maximum(seen, 1e-9)
+        scale = np.maximum(np.abs(design * weight[:, None]).max(axis=0), 1e-30)
+        terms[:, channel] = nnls(design * weight[:, None] / scale, seen * weight)[0] / scale
+        misfit[channel] = float(np.sqrt(np.mean((design @ terms[:, channel] * weight - 1) ** 2)))
+        here = np.maximum(level[:, channel], 0)
+        model = terms[0, channel] + terms[1, channel] * here + terms[2, channel] * here**2
+        ratio = np.maximum(ratio, variance[:, channel] / np.maximum(model, 1e-9))
+    allowed = float(chi2.isf(NOISY, samples - 1)) / (samples - 1)
+    with np.errstate(divide="ignore"):
+        gain = np.where(terms[1] > 0, 1 / terms[1], np.inf)
+    return PhotonTransfer(gain, np.sqrt(terms[0]), np.sqrt(terms[2]), misfit, ratio, allowed)
 
 
 def bleed(cell_px: float, blur_px: float, window: int = WINDOW) -> float:

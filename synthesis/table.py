@@ -25,10 +25,9 @@ import numpy.typing as npt
 from calibration.citation import OriginRecord
 from calibration.pipeline.frames import ChartPoints, usable_means
 from calibration.radiometry.drift import corrections
-from calibration.radiometry.greys import references_csv
 from calibration.radiometry.primaries import Primaries
 from calibration.sampling import Sites, gather, gather_values, patch_means
-from calibration.table.lut import REFERENCES, LutWriter, Provenance, Unfit, frames_sha256
+from calibration.table.lut import REFERENCES, LutWriter, Provenance, Unfit, frames_sha256, references_csv
 from drivers.camera import ExposureSettings
 from drivers.raw.rawfile import CLIPPING_SHARE
 from experiment.chart.model import Chart

@@ -39,10 +39,9 @@ from calibration.pipeline.frames import (
     register_frame,
     usable_means,
 )
-from calibration.radiometry.greys import PhotonTransfer, photon_transfer
 from calibration.radiometry.primaries import Primaries, pure_lights
 from calibration.radiometry.superposition import MOVED, NO_PRIMARIES, Superposition, printed_predictors, superposition
-from calibration.sampling import gather
+from calibration.sampling import PhotonTransfer, gather, photon_transfer
 from calibration.spread.correction import (
     FrameCorrection,
     LensCorrection,

@@ -63,7 +63,6 @@ from calibration.pipeline.frames import (
 )
 from calibration.pipeline.linearity import read_linearity
 from calibration.radiometry.drift import LEAST_WHITES, applied_drift, corrected, corrections
-from calibration.radiometry.greys import references_csv
 from calibration.table.lut import (
     CELLS,
     REFERENCES,
@@ -76,6 +75,7 @@ from calibration.table.lut import (
     LutWriter,
     Provenance,
     frames_sha256,
+    references_csv,
 )
 from calibration.verdict import COMMAND, BuildResult, judge, judged_values, refusal, retake_json
 from experiment.framing.pictures import Shift, annotated_png

@@ -52,13 +52,13 @@ from calibration.radiometry.dark_frames import (
     reflectances,
     winsorised_means,
 )
-from calibration.radiometry.greys import GreyLevels, PhotonTransfer
 from calibration.radiometry.primaries import Primaries
 from calibration.radiometry.superposition import Superposition
 from calibration.registration.register import MAX_PLACE_ERROR_PX, Registration, register
 from calibration.sampling import (
     WINDOW,
     WINDOWS,
+    PhotonTransfer,
     Sites,
     gather,
     gather_means,
@@ -89,7 +89,7 @@ from drivers.raw.rawfile import (
     strongest_channel,
 )
 from drivers.raw.storage import Area
-from experiment.chart.model import Chart
+from experiment.chart.model import Chart, Reference
 from experiment.config import CitationSettings
 from experiment.framing.field import Corners
 from experiment.framing.pictures import REREGISTER_PX, STILL_PX, Shift, gauges_of, shift_between
@@ -100,6 +100,7 @@ from experiment.session.records import FrameRecord
 from foundation.errors import FormatError, InputError, RegistrationError
 from foundation.files import read_whole
 from foundation.records import from_plain, to_plain
+from foundation.robust import MAD_TO_SIGMA
 
 _BRIGHTEST_PERCENTILE = 99.5
 """Of the cells' levels, what is taken for paper white: the brightest of all may be a reflection."""
@@ -153,6 +154,55 @@ class BuildOptions:
 
 PAPER_OPTIONS = BuildOptions()
 """The paper's options, which hold where none are given."""
+
+_OUTLIER_SIGMAS = 6.0
+"""Robust standard deviations from the median beyond which a patch is covered or dirty."""
+
+_FEW_PATCHES = 4
+"""Patches up to which none is left out: of so few, none is surely the one that is wrong."""
+
+
+@dataclass(frozen=True, eq=False)
+class GreyLevels:
+    """The printed levels of grey of a chart.
+
+    - `names`: one for each level, brightest first.
+    - `level`: (N,) int64, the level of each grey reference.
+    """
+
+    names: tuple[str, ...]
+    level: npt.NDArray[np.int64]
+
+    @classmethod
+    def of(cls, references: Sequence[Reference]) -> GreyLevels:
+        """Return the levels among references, one for each printed code."""
+        codes = sorted({reference.rgb for reference in references}, reverse=True)
+        first = {reference.rgb: reference.name for reference in reversed(references)}
+        return cls(
+            tuple(first[code] for code in codes),
+            np.array([codes.index(reference.rgb) for reference in references], dtype=np.int64),
+        )
+
+    def read(self, seen: _Array, field: _Array) -> tuple[_Array, _Array]:
+        """Return the value and standard error (G, 3) float64 of each level, counts, NaN where no patch can be used.
+
+        `seen`: (N, 3) mean counts above black of each patch, NaN where it cannot be used. `field`: (N, 3) the field at
+        each patch.
+        """
+        flat = seen / field
+        value, error = np.full((len(self.names), 3), np.nan), np.full((len(self.names), 3), np.nan)
+        for number in range(len(self.names)):
+            patches = flat[self.level == number]
+            patches = patches[np.isfinite(patches).all(axis=1)]
+            if len(patches) == 0:
+                continue
+            middle = np.median(patches, axis=0)
+            scale = MAD_TO_SIGMA * np.median(np.abs(patches - middle), axis=0) + 1e-9
+            near = (np.abs(patches - middle) < _OUTLIER_SIGMAS * scale).all(axis=1)
+            kept = patches[near] if len(patches) > _FEW_PATCHES else patches
+            value[number] = kept.mean(axis=0)
+            error[number] = kept.std(axis=0, ddof=1) / np.sqrt(len(kept)) if len(kept) > 1 else np.nan
+        return value, error
 
 
 @dataclass(frozen=True, eq=False)
