@@ -22,7 +22,7 @@ from acquisition.cli import main
 from acquisition.run.rig.opening import open_rig
 from acquisition.run.run import run_session
 from drivers.camera import capture
-from drivers.canon.camera import CanonEos
+from drivers.canon import CanonEos
 from drivers.pjlink import PjLinkProjector
 from drivers.raw.rawfile import read_raw
 from experiment.chart.model import load_chart
