@@ -38,7 +38,7 @@ Hashes = Callable[[Path], dict[tuple[str, str], list[str]]]
 
 FORKS = multiprocessing.get_context("forkserver")
 """Programs beside this one, without waiting for their imports each time."""
-FORKS.set_forkserver_preload([__name__, "acquisition.run.run", "acquisition.run.notices", "sim.camera.eos"])
+FORKS.set_forkserver_preload([__name__, "acquisition.run.run", "acquisition.run.run", "sim.camera.eos"])
 
 PLACES = {
     "renaming": (Path, "replace"),
